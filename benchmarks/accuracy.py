@@ -15,11 +15,11 @@ from timing import Row
 import imulab as il
 from imulab.procedures.centrifuge.manifest import Manifest, Run
 from imulab.procedures.centrifuge.simulate import Simulation, Truth, typical_truth
-from imulab.procedures.changes import compare_records
+from imulab.procedures.gyro_array.elements import find_elements
 from imulab.procedures.gyro_array.fuse import FuseOptions, open_stream
-from imulab.procedures.gyro_array.model import find_elements
-from imulab.procedures.tumble.gyro import fit_gyro
-from imulab.procedures.tumble.plan import plan_tumble
+from imulab.procedures.tumble.gyro.fit import fit_gyro_triad
+from imulab.procedures.tumble.plan import plan_attitudes
+from imulab.procedures.views import compare_records
 from imulab.recording import Recording
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -71,7 +71,7 @@ def _recovery() -> list[Row]:
 def _plans() -> list[Row]:
     made = []
     for count, order, table in PLANS:
-        found = plan_tumble(order=order, attitudes=count).uncertainties(1.0)
+        found = plan_attitudes(order=order, attitudes=count).uncertainties(1.0)
         worst = {stem: max(value for name, value in found.items() if name.startswith(stem)) for stem in table}
         made.append(
             (
@@ -181,7 +181,7 @@ def _xsens() -> list[Row]:
         ("Xsens MTi: farthest parameter from a plain scipy fit, in standard uncertainties", f"{off:.3f}", ""),
     ]  # fmt: skip
     for fit_bias, asked in ((False, "0.00152"), (True, "0.00124")):
-        fit = fit_gyro(record, attitudes, read["gyro"], fit_bias=fit_bias, sensitivity="no")
+        fit = fit_gyro_triad(record, attitudes, read["gyro"], fit_bias=fit_bias, sensitivity="no")
         ours = reference.gyro_inverse_k(published, fit.scale_factor, fit.misalignment)
         worst = np.abs(ours / [4777.99, 4764.30, 4773.40] - 1).max()
         title = f"Xsens MTi gyroscopes, {12 if fit_bias else 9} parameters, no g-sensitivity"
@@ -189,7 +189,7 @@ def _xsens() -> list[Row]:
             (f"{title}: half the sum of squared angles, rad²", f"{fit.cost / 2:.5f}", f"<= {asked}"),
             (f"{title}: farthest 1/K from the reference, in its gauge", f"{100 * worst:.3f} %", "<= 0.1 %"),
         ]
-    fit = fit_gyro(record, attitudes, read["gyro"])
+    fit = fit_gyro_triad(record, attitudes, read["gyro"])
     made.append(
         ("Xsens MTi gyroscopes, g-sensitivity from rest: half the sum of squared angles", f"{fit.cost / 2:.5f}", "")
     )

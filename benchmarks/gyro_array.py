@@ -16,7 +16,7 @@ from timing import measured, seconds
 
 import imulab as il
 from imulab.device.unit import array_stream
-from imulab.estimation.allan import allan_deviation
+from imulab.estimation.noise_coefficients import allan_deviation
 from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
 from imulab.recording import Recording
 
@@ -162,7 +162,7 @@ def _noise() -> list[tuple[str, str, str]]:
     peaks = [
         measured("-c", noise + call)[1]
         for call in (
-            "from imulab.estimation.allan import allan_deviation; allan_deviation(z, 100.0)",
+            "from imulab.estimation.noise_coefficients import allan_deviation; allan_deviation(z, 100.0)",
             "import allantools; allantools.oadev(z, rate=100.0, data_type='freq', taus='octave')",
         )
     ]

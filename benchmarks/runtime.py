@@ -18,8 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import madeup
 from imulab.device.unit import DeviceUnit
 from imulab.exporters import export
-from imulab.procedures.unit_tables import tables_of
-from imulab.procedures.warmup.choices import MODELS
+from imulab.procedures.apply import tables_of
+from imulab.procedures.warmup import MODELS
 
 CORE = Path(__file__).resolve().parents[1] / "runtime"
 SAMPLES = 1_000_000

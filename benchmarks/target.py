@@ -18,7 +18,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import imulab as il
 import madeup
-from imulab.device.array_settings import Fusion
+from imulab.device.tables import Fusion
 from imulab.exporters import ExportOptions, export
 from imulab.records.calibration import Calibration
 

@@ -9,8 +9,8 @@ import numpy as np
 from timing import Row, exponent, seconds
 
 import imulab as il
-from imulab.procedures.tumble.gyro import fit_gyro
-from imulab.procedures.tumble.plan import plan_tumble
+from imulab.procedures.tumble.gyro.fit import fit_gyro_triad
+from imulab.procedures.tumble.plan import plan_attitudes
 from imulab.procedures.tumble.solve import Problem, solve_norm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -95,11 +95,11 @@ def monte_carlo() -> list[Row]:
 
 
 def planning() -> list[Row]:
-    (planned,) = seconds(lambda: plan_tumble(order=4, attitudes=24), repeats=3)
+    (planned,) = seconds(lambda: plan_attitudes(order=4, attitudes=24), repeats=3)
     recording = il.simulate_tumble(order=1, attitudes=38, seed=1)
     attitudes = il.find_attitudes(recording)
     record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
-    (gyro,) = seconds(lambda: fit_gyro(record, attitudes, recording), repeats=5)
+    (gyro,) = seconds(lambda: fit_gyro_triad(record, attitudes, recording), repeats=5)
     return [
         ("plan of 24 attitudes, order 4", f"{planned:.2f} s", "<= 3 s"),
         ("gyroscope triad from 37 turns, 26,400 samples", f"{gyro:.2f} s", "<= 1 s"),

@@ -14,9 +14,9 @@ from imulab.cli import main as commands
 from imulab.demo import run
 from imulab.procedures.centrifuge.manifest import make_manifest
 from imulab.procedures.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Truth
-from imulab.procedures.reports import exhibits_of
+from imulab.procedures.views import exhibits_of
 from imulab.report import Card, render, render_index
-from imulab.report.elements import BAD, GOOD, Exhibits, Figure
+from imulab.report.traces import BAD, GOOD, Exhibits, Figure
 
 LEVELS = (1, 2, 5, 10, 15, 20, 30, 40)
 FIGURES = Path(__file__).resolve().parent / "figures"

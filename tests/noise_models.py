@@ -3,8 +3,7 @@
 import numpy as np
 from scipy.fft import dct
 
-from imulab.estimation.noise.intervals import profile
-from imulab.estimation.noise.likelihood import fit, time_limits
+from imulab.estimation.noise.likelihood import fit, profile, time_limits
 from imulab.estimation.noise.spectrum import Spectrum, bins
 from imulab.estimation.noise.terms import NAMES, prepare, terms
 

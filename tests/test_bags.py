@@ -88,7 +88,7 @@ def test_a_bare_mcap_file_and_a_bag_in_two_files(tmp_path, truth):
 def test_blocks_join_to_the_whole(tmp_path, truth, monkeypatch):
     monkeypatch.setattr("imulab.readers.streams._ROWS", 100)
     path = bags.write(tmp_path, "sqlite", imus(truth))
-    monkeypatch.setattr("imulab.readers.rosfiles._AT_ONCE", 64)
+    monkeypatch.setattr("imulab.readers.rosbag._AT_ONCE", 64)
     blocks = list(il.read_blocks(path))
     assert len(blocks) > 3
     assert blocks[1].first_row == len(blocks[0]) + 1

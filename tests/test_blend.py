@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from imulab.estimation.order_blend import blend, noise_share
+from imulab.estimation.least_squares import blend, noise_share
 
 
 def test_a_step_of_three_terms_without_gain_is_two_thirds_noise_and_a_large_gain_leaves_four_over_it() -> None:

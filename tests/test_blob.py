@@ -10,13 +10,12 @@ import pytest
 import imulab as il
 import madeup
 from imulab.cli import main
-from imulab.device.blob import Blob, is_blob, load_blob, make_blob
 from imulab.device.tables import pack
+from imulab.device.unit import Blob, is_blob, load_blob, make_blob
 from imulab.errors import RecordError
 from imulab.exporters import export
-from imulab.procedures.apply import apply, apply_blocks, loaded, warnings_of
-from imulab.procedures.loading import load_any
-from imulab.procedures.unit_tables import tables_of, tables_of_all
+from imulab.procedures.apply import apply, apply_blocks, loaded, tables_of, tables_of_all, warnings_of
+from imulab.procedures.registry import load_any
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer as Writer1
 
 import bags
 from imulab.errors import ReadError
-from imulab.readers.unpacking import Budget, raise_limit, unpack
+from imulab.readers.formats import Budget, raise_limit, unpack
 
 MEMORY = 1 << 30
 SECONDS = 20  # of the processor, start of Python included, on a machine that others use as well

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from imulab.fleet.panels import staggered
-from imulab.report.bulk import bulk, edge_marks, edge_note
+from imulab.fleet.figures import staggered
+from imulab.report.traces import bulk, edge_marks, edge_note
 
 
 def test_a_single_far_value_does_not_flatten_the_rest():

@@ -13,12 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import imulab as il
-from imulab.atomic_write import replacing, write_text
 from imulab.errors import OptionError, RecordError
-from imulab.procedures.apply import loaded
-from imulab.procedures.loading import load, loads, loads_sealed
-from imulab.procedures.reports import exhibits_of
-from imulab.procedures.unit_tables import tables_of
+from imulab.files import replacing, write_text
+from imulab.procedures.apply import loaded, tables_of
+from imulab.procedures.registry import load, loads, loads_sealed
+from imulab.procedures.views import exhibits_of
 from imulab.recording import Source
 from imulab.records.calibration import (
     Calibration,

@@ -14,9 +14,9 @@ from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.procedures.centrifuge.manifest import make_manifest
 from imulab.procedures.centrifuge.plan import plan_centrifuge
 from imulab.procedures.centrifuge.simulate import Simulation, typical_truth
-from imulab.procedures.reports import exhibits_of, rendered
+from imulab.procedures.views import exhibits_of, rendered
 from imulab.recording import Recording
-from imulab.report.elements import Figure
+from imulab.report.traces import Figure
 
 G = 9.80665
 DEG_H = np.pi / 180 / 3600

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.procedures.centrifuge.curve import fit_curve
 from imulab.procedures.centrifuge.manifest import load_manifest, make_manifest, manifest_text
+from imulab.procedures.centrifuge.parameters import fit_curve
 from imulab.procedures.centrifuge.simulate import Simulation, typical_truth
 
 G = 9.80665

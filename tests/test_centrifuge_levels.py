@@ -7,10 +7,9 @@ import pytest
 
 import imulab as il
 from imulab.errors import OptionError
-from imulab.procedures.centrifuge.curve import fit_curve
-from imulab.procedures.centrifuge.manifest import make_manifest
-from imulab.procedures.centrifuge.model import fog_share
-from imulab.procedures.centrifuge.repeat import Deviations, find_repeatability
+from imulab.procedures.centrifuge.levels import Deviations, find_repeatability
+from imulab.procedures.centrifuge.manifest import fog_share, make_manifest
+from imulab.procedures.centrifuge.parameters import fit_curve
 from imulab.procedures.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
 from reference import centrifuge as reference
 

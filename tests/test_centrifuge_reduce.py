@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.procedures.centrifuge.cells import Samples, compress
 from imulab.procedures.centrifuge.levels import axis_lines
+from imulab.procedures.centrifuge.lines import Samples, compress, solve
 from imulab.procedures.centrifuge.manifest import Manifest, Run, make_manifest
-from imulab.procedures.centrifuge.regress import solve
 from imulab.procedures.centrifuge.run import reduce_run
 from imulab.procedures.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
 from reference import centrifuge as reference

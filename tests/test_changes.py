@@ -8,7 +8,7 @@ from scipy import stats
 
 from imulab.cli import main
 from imulab.errors import RecordError
-from imulab.procedures.changes import compare_records
+from imulab.procedures.views import compare_records
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
 NAMES = ("x_K0", "x_direction", "y_K0")

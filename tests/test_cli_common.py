@@ -8,7 +8,8 @@ import sys
 
 import pytest
 
-from imulab.cli import main, speech
+from imulab.cli import main
+from imulab.cli import options as speech
 from imulab.errors import listed, meant
 
 

@@ -14,9 +14,9 @@ import imulab as il
 from imulab.cli import common, main
 from imulab.cli.app import command
 from imulab.estimation.noise_coefficients import coefficients_dict
-from imulab.procedures.noise.checkfigures import as_json
+from imulab.procedures.noise.check import as_json
 from imulab.quantities import quantity
-from imulab.records.json_text import json_text
+from imulab.records.calibration import json_text
 
 FUNCTIONS = {
     "apply": il.apply,

@@ -9,7 +9,7 @@ import pytest
 import imulab as il
 import madeup
 from imulab.cli import main
-from imulab.device.blob import load_blob
+from imulab.device.unit import load_blob
 from imulab.errors import DataError
 from imulab.procedures.apply import loaded, warnings_of
 from imulab.recording import Recording

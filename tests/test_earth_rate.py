@@ -8,7 +8,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.thermal.gyrorecord import gyro_predicted
+from imulab.procedures.thermal.record import gyro_predicted
 from reference import thermal_gyro as reference
 
 G, EARTH = reference.G, reference.EARTH

@@ -8,7 +8,7 @@ import pytest
 
 import madeup
 from imulab.cli import main
-from imulab.exporters import c
+from imulab.exporters import firmware_c
 
 
 @pytest.fixture
@@ -87,8 +87,8 @@ def test_a_serial_cannot_end_a_comment(folder, capsys):
 def test_sources_that_were_changed_after_they_were_compiled_are_not_exported(folder, capsys, monkeypatch, change):
     """After a pull without a build the sources would be of two versions, and none of them that of the desk."""
     source = folder / "runtime"
-    shutil.copytree(c._CHECKOUT, source)
-    monkeypatch.setattr(c, "_CHECKOUT", source)
+    shutil.copytree(firmware_c._CHECKOUT, source)
+    monkeypatch.setattr(firmware_c, "_CHECKOUT", source)
     if change == "edited":
         (source / "warmup.c").write_text((source / "warmup.c").read_text() + "/* newer */\n")
     else:

@@ -10,7 +10,7 @@ from scipy import optimize
 import imulab as il
 from conftest import table
 from imulab.exporters import ExportOptions, export
-from imulab.procedures.tumble.refit import refit_linear as linear_record
+from imulab.procedures.tumble.device import refit_linear as linear_record
 from reference import programs
 from reference import tumble as reference
 

@@ -11,15 +11,14 @@ import imulab as il
 import madeup
 from conftest import REPOSITORY
 from imulab.cli import main
-from imulab.device.array_settings import Fusion
-from imulab.device.methods import METHODS
-from imulab.device.tables import pack
+from imulab.device import METHODS
+from imulab.device.tables import Fusion, pack
 from imulab.device.unit import ArraySettings, DeviceUnit, Stream, array_table
 from imulab.exporters import export
-from imulab.exporters.c import _header
+from imulab.exporters.firmware_c import _header
+from imulab.procedures.apply import tables_of
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.unit_tables import tables_of
-from imulab.procedures.warmup.choices import MODELS
+from imulab.procedures.warmup import MODELS
 
 G = madeup.G
 MANY = 1_000_000

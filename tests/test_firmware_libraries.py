@@ -14,7 +14,7 @@ import madeup
 from conftest import REPOSITORY
 from imulab.device.unit import DeviceUnit
 from imulab.exporters import export
-from imulab.procedures.unit_tables import tables_of
+from imulab.procedures.apply import tables_of
 from reference import magnetometer
 
 G = madeup.G

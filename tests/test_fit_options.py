@@ -10,7 +10,7 @@ import typer
 import imulab as il
 from imulab.cli import app
 from imulab.errors import OptionError
-from imulab.procedures.options import read_options
+from imulab.procedures.procedure import read_options
 from imulab.procedures.registry import PROCEDURES
 
 COMMANDS = {

@@ -261,7 +261,7 @@ def test_manifest_and_files_may_be_urls(tmp_path, monkeypatch):
     assert plain(tmp_path / "url" / "SN001.json") == plain(tmp_path / "path" / "SN001.json")
     import fsspec
 
-    from imulab.fleet import sources
+    from imulab.fleet import manifest as sources
 
     monkeypatch.setattr(sources, "SCHEMES", (*sources.SCHEMES, "memory"))
     memory = fsspec.filesystem("memory")

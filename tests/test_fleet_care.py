@@ -7,10 +7,10 @@ import pytest
 
 import imulab as il
 from fleets import make_fleet, records, write_manifest
+from imulab.fleet.engine import work
+from imulab.fleet.manifest import sha256_of
 from imulab.fleet.run import run_fleet
-from imulab.fleet.sources import sha256_of
 from imulab.fleet.store import Store
-from imulab.fleet.work import work
 
 
 def run(manifest, folder):

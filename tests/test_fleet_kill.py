@@ -237,9 +237,9 @@ def test_a_cluster_makes_the_same_records_whatever_dies(cluster, fleet, referenc
 
 def test_workers_that_do_not_see_the_folder_send_their_records_back(fleet, reference, tmp_path):
     """A worker elsewhere: it is given no folder, as the driver does when its folder turns out to be another one."""
+    from imulab.fleet.engine import DONE, LEFT, Job, work
     from imulab.fleet.manifest import load_fleet
     from imulab.fleet.store import Store
-    from imulab.fleet.work import DONE, LEFT, Job, work
 
     manifest = load_fleet(str(fleet))
     unit = manifest.units[0]

@@ -14,24 +14,24 @@ from pathlib import Path
 import pytest
 
 from fleets import command, make_fleet, wait_for, workers_of
-from imulab.fleet import processes
+from imulab.fleet import engine
 
 NAME = "OMP_NUM_THREADS"
 
 
 def test_results_come_as_they_are_ready_and_all_come():
-    found = list(processes.run(pow, ((2, k) for k in range(400)), 2))  # more calls than wait at a time
+    found = list(engine.run(pow, ((2, k) for k in range(400)), 2))  # more calls than wait at a time
     assert sorted(found) == [2**k for k in range(400)]
 
 
 def test_an_error_in_a_process_is_raised_here():
     with pytest.raises(ZeroDivisionError):
-        list(processes.run(divmod, [(1, 0)], 1))
+        list(engine.run(divmod, [(1, 0)], 1))
 
 
 def test_a_process_that_ends_is_reported():
-    with pytest.raises(processes.WorkersLostError):
-        list(processes.run(os._exit, [(3,)], 2))
+    with pytest.raises(engine.WorkersLostError):
+        list(engine.run(os._exit, [(3,)], 2))
 
 
 def test_a_folder_for_temporary_files_may_have_a_long_name(tmp_path):
@@ -79,7 +79,7 @@ def test_processes_end_with_the_one_that_started_them(tmp_path, kind):
 
 
 def test_one_call_has_a_process_of_its_own():
-    (found,) = processes.run(os.getpid, [()], 1)
+    (found,) = engine.run(os.getpid, [()], 1)
     assert found != os.getpid()
 
 
@@ -95,20 +95,20 @@ def test_each_process_uses_one_thread_and_this_ones_settings_stay(monkeypatch, b
     monkeypatch.delenv(NAME, raising=False)
     if before is not None:
         monkeypatch.setenv(NAME, before)
-    calls = processes.run(os.getenv, [(NAME,)] * 3, 2)
+    calls = engine.run(os.getenv, [(NAME,)] * 3, 2)
     assert list(calls) == ["1"] * 3
     assert os.environ.get(NAME) == before
 
 
 def test_runs_of_several_threads_have_their_own_results():
     with ThreadPoolExecutor(3) as threads:
-        runs = [threads.submit(lambda k=k: list(processes.run(pow, [(k, 2)] * 200, 2))) for k in range(3)]
+        runs = [threads.submit(lambda k=k: list(engine.run(pow, [(k, 2)] * 200, 2))) for k in range(3)]
         assert [run.result() for run in runs] == [[k * k] * 200 for k in range(3)]
 
 
 def test_no_more_processes_than_this_one_may_use(monkeypatch):
     code = "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
-    code += "from imulab.fleet.processes import available; print(available())"
+    code += "from imulab.fleet.engine import available; print(available())"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "1\n"
 
 
@@ -123,7 +123,7 @@ def faults_of_a_second_use() -> int:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's")
 def test_memory_that_one_unit_has_used_is_kept_for_the_next():
-    (kept,) = processes.run(faults_of_a_second_use, [()], 1)
+    (kept,) = engine.run(faults_of_a_second_use, [()], 1)
     pages = 5 * (3 << 20) // resource.getpagesize()
     assert kept < 0.05 * pages
 
@@ -141,13 +141,13 @@ def test_what_is_ended_in_vain_ends_without_a_word(capfd):
 
     given, hook = results(), threading.excepthook
     next(given)
-    processes._close(given)
+    engine._close(given)
     assert threading.excepthook is hook
     assert capfd.readouterr().err == ""
 
 
 def test_calls_that_nobody_waits_for_any_more_are_not_begun(tmp_path):
-    made = processes.run(os.mkdir, ((str(tmp_path / str(k)),) for k in range(10**6)), 2)
+    made = engine.run(os.mkdir, ((str(tmp_path / str(k)),) for k in range(10**6)), 2)
     next(made)
     made.close()
     assert 1 <= len(list(tmp_path.iterdir())) < 1000

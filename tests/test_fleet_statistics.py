@@ -11,23 +11,24 @@ import scipy.stats
 from fleets import G, make_fleet, write_attitudes, write_manifest
 from imulab.cli import main
 from imulab.errors import ImulabError
-from imulab.fleet.display import display_of, to_parameter_unit
+from imulab.fleet.engine import Summary
+from imulab.fleet.figures import summary_table
 from imulab.fleet.history import Past
-from imulab.fleet.limits import Limits, load_limits
 from imulab.fleet.manifest import FleetManifest
 from imulab.fleet.report import fleet_exhibits
-from imulab.fleet.reporttables import summary_table
 from imulab.fleet.run import FleetState, run_fleet
 from imulab.fleet.statistics import (
+    Limits,
     capability,
     change_limit,
     changes_since,
     days_of,
     line_drift,
     line_statistics,
+    load_limits,
     outlier_limit,
 )
-from imulab.fleet.work import Summary
+from imulab.fleet.table import display_of, to_parameter_unit
 from imulab.records.calibration import Parameter
 
 

@@ -10,14 +10,14 @@ import pytest
 import imulab as il
 import madeup
 from imulab.cli import main
-from imulab.device.blob import load_blob
 from imulab.device.tables import pack
+from imulab.device.unit import load_blob
 from imulab.errors import RecordError
-from imulab.procedures.loading import loads
+from imulab.procedures.apply import tables_of_all
+from imulab.procedures.registry import loads
 from imulab.procedures.tumble.simulate import simulate_tumble
-from imulab.procedures.unit_tables import tables_of_all
 from imulab.recording import Recording
-from imulab.records.json_text import content_sha256
+from imulab.records.calibration import content_sha256
 
 HIDDEN = ["\n", "\x1b[2J", "\x85", "\u2028", "\u2029", "\u202e", "\u2066", "\x00", "\x7f"]
 

@@ -9,7 +9,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.errors import ImulabError, OptionError
 from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
-from imulab.procedures.inputs import as_blocks
+from imulab.procedures.result import as_blocks
 
 TEMPERATURES = (-40.0, 0.0, 60.0)
 

@@ -15,11 +15,11 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.errors import DataError, ImulabError, OptionError, RecordError
-from imulab.procedures.reports import exhibits_of
+from imulab.procedures.views import exhibits_of
 from imulab.report import plots as plots_module
-from imulab.report.channels import thinned
-from imulab.report.elements import Figure
+from imulab.report.noise_figures import thinned
 from imulab.report.plots import Plot
+from imulab.report.traces import Figure
 from test_report import browse
 
 G = 9.80665

@@ -7,11 +7,11 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError, ObservabilityError, RecordError, UnitError
-from imulab.procedures.gyro_array.align import align, nominal_orientation
+from imulab.procedures.gyro_array.alignment import align, nominal_orientation
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
 from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
-from imulab.procedures.reports import exhibits_of
+from imulab.procedures.views import exhibits_of
 from imulab.recording import Recording
 from test_gyro_array_fuse import array_recording
 

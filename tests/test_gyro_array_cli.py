@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.device.array_settings import Fusion
-from imulab.device.methods import METHODS
-from imulab.procedures.gyro_array.compare import compare_methods
-from imulab.procedures.gyro_array.experiments import run_experiment
+from imulab.device import METHODS
+from imulab.device.tables import Fusion
+from imulab.display import Note
+from imulab.procedures.gyro_array.compare import compare_methods, run_experiment
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse
 from imulab.procedures.gyro_array.simulate import Fault, simulate_array
-from imulab.procedures.reports import exhibits_of
-from imulab.verdict import Note
+from imulab.procedures.views import exhibits_of
 from test_gyro_array_fuse import array_recording, dynamic
 
 G = 9.80665
@@ -233,7 +232,7 @@ def test_compare_finds_errors_reduction_and_limit():
 
 def test_compare_measures_bandwidth_and_warns_of_filtering(monkeypatch):
     from imulab.procedures.gyro_array import fuse as fuse_module
-    from imulab.procedures.gyro_array import kalman
+    from imulab.procedures.gyro_array import fuse as kalman
 
     recording = simulate_array(experiment="static", duration=200.0, seed=2)
     found = compare_methods(recording)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from imulab.device.unit import array_stream
+from imulab.procedures.gyro_array.elements import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK
 from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
 from imulab.procedures.gyro_array.fused import Fused
-from imulab.procedures.gyro_array.health import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK
 from test_gyro_array_fuse import array_recording, dynamic
 
 SEEDS = (1, 2, 3, 4)

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.device.array_settings import ArraySettings
-from imulab.device.blob import Blob, make_blob
-from imulab.device.methods import METHODS
-from imulab.device.unit import Stream, array_stream
+from imulab.device import METHODS
+from imulab.device.tables import ArraySettings
+from imulab.device.unit import Blob, Stream, array_stream, make_blob
+from imulab.procedures.apply import tables_of
+from imulab.procedures.gyro_array.elements import find_elements
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream
-from imulab.procedures.gyro_array.memory import parse_memory
-from imulab.procedures.gyro_array.model import find_elements
+from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream, parse_memory
 from imulab.procedures.gyro_array.simulate import Fault, simulate_array
-from imulab.procedures.unit_tables import tables_of
 from imulab.recording import Recording
 from reference import gyro_array as reference
 
@@ -172,7 +170,7 @@ def test_robust_comes_within_2_percent_of_the_best_fixed_weights(seed):
 
 
 def test_the_gain_of_kalman_is_that_of_an_iterated_riccati_equation():
-    from imulab.procedures.gyro_array.kalman import steady_gain
+    from imulab.procedures.gyro_array.fuse import steady_gain
 
     white, walk, rate_walk, dt = np.array([0.04, 0.06, 0.08]), np.array([1e-3, 2e-3, 1e-3]), 0.3, 0.02
     gain = steady_gain(white, walk, rate_walk, dt)

@@ -5,11 +5,10 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError
-from imulab.procedures.gyro_array.checks import Checks
 from imulab.procedures.gyro_array.compare import compare_methods
+from imulab.procedures.gyro_array.elements import Checks, common_motion, find_rest
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
-from imulab.procedures.gyro_array.rest import common_motion, find_rest
 from imulab.recording import Recording
 from test_gyro_array_calibrate import UPSIDE_DOWN, motion
 from test_gyro_array_fuse import array_recording as recording_of

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from imulab.procedures.gyro_array.elements import find_elements
 from imulab.procedures.gyro_array.fuse import FuseOptions, open_stream
-from imulab.procedures.gyro_array.model import find_elements
 from test_gyro_array_fuse import array_recording
 
 pytestmark = pytest.mark.slow

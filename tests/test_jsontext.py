@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imulab.records.json_text import content_sha256, json_text, sealed_text
+from imulab.records.calibration import content_sha256, json_text, sealed_text
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 whole = st.integers() | st.integers(-(2**70), 2**70)

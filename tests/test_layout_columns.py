@@ -77,7 +77,7 @@ def test_outputs_become_readings_in_other_kinds_of_file_too(layout, tmp_path):
 @pytest.mark.parametrize("size", [7, 64, 1 << 21])
 @pytest.mark.parametrize("bits", [8, 16, 32])
 def test_a_counter_that_begins_again_is_carried_on_and_its_gaps_stay(layout, file, monkeypatch, size, bits):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     numbers = 2**bits - 5 + np.arange(0, 20)
     kept = np.delete(numbers, [3, 4, 5, 11])
     content = b"".join(b"%d 1\n" % (number % 2**bits) for number in kept.tolist())
@@ -96,7 +96,7 @@ COUNTER = 'sample_rate = 100\n[columns]\ntime = { from = 0, unit = "count"%s }\n
 def test_a_counter_that_starts_anew_before_it_is_full_is_time_that_runs_backwards(
     layout, file, monkeypatch, last, size
 ):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     numbers = [*range(last - 9, last + 1), 0, 1, 2]
     recording = read(file("".join(f"{number}\n" for number in numbers).encode()), layout(COUNTER % ""))
     np.testing.assert_array_equal(recording.time, np.array(numbers) / 100)
@@ -106,7 +106,7 @@ def test_a_counter_that_starts_anew_before_it_is_full_is_time_that_runs_backward
 
 @pytest.mark.parametrize("size", [7, 1 << 21])
 def test_a_counter_is_carried_on_before_it_is_scaled(layout, file, monkeypatch, size):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     numbers = np.arange(240, 280)
     content = b"".join(b"%d\n" % (number % 256) for number in numbers.tolist())
     recording = read(file(content), layout(COUNTER % ", scale = 3.7"))

@@ -104,7 +104,7 @@ def test_what_is_no_date_is_not_read(text):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_dates_become_seconds_since_the_first_row_across_a_change_of_the_clocks(file, monkeypatch, size):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     rows = ["02:59:59.999999000+02:00", "02:00:00.000000250+01:00", "02:00:00.000001+01:00", "02:00:00.000001+01:00"]
     recording = read(file("".join(f"2026-10-25T{row},1\n" for row in rows)), columns("time", "accel_x", date=True))
     assert recording.units["time"] == "s"
@@ -128,7 +128,7 @@ def test_dates_become_seconds_since_the_first_row_across_a_change_of_the_clocks(
     ],
 )
 def test_a_row_without_a_date_or_with_an_earlier_one_is_named(file, monkeypatch, size, line, message):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     content = f"2026-11-22 15:04:05,1\n2026-11-22 15:04:06,1\n{line}\n2026-11-22 15:04:09,1\n"
     with pytest.raises(ReadError) as caught:
         read(file(content), columns("time", "accel_x", date=True))
@@ -155,7 +155,7 @@ MIXED = "GPS,1,2,3,4\nIMU,0,1.5,x\n\nIMU , 1,2.5,y\nIMUX,9,9,9\n#IMU,9,9,9\nIMU,
 
 @pytest.mark.parametrize("size", SIZES)
 def test_only_lines_with_the_prefix_count_and_without_it(file, monkeypatch, size):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     recording = read(file(MIXED.replace("2,3.5", "2,3.5,z")), columns("time", "accel_x", prefix="IMU"))
     assert recording.time.tolist() == [0, 1, 2]
     assert recording.column("accel_x").tolist() == [1.5, 2.5, 3.5]
@@ -164,7 +164,7 @@ def test_only_lines_with_the_prefix_count_and_without_it(file, monkeypatch, size
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_bad_line_with_the_prefix_is_named_by_its_line_in_the_file(file, monkeypatch, size):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     with pytest.raises(ReadError, match=r"row 3 \(line 7\): expected 3 fields, found 2"):
         read(file(MIXED), columns("time", "accel_x", prefix="IMU"))
     bad = MIXED.replace("2,3.5", "2,?,z")
@@ -191,7 +191,7 @@ SPARSE = '# made up\nTime,ax,gx,T\n0,1,,\n1,,5,\n2,3,6,20.5\n3,nan,7,\n4,5,8\n5\
 
 @pytest.mark.parametrize("size", SIZES)
 def test_rows_that_lack_what_is_asked_for_are_skipped_and_counted(file, monkeypatch, size):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     layout = """
 delimiter = ","
 skip_incomplete = true

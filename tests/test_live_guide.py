@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from imulab.gravity import Gravity
-from imulab.live.guide import Attitude, Guide
+from imulab.live.guide import Attitude, Guide, Target, read_targets, share_of
 from imulab.live.session import Session
-from imulab.live.simulated import simulated_unit
-from imulab.live.targets import Target, read_targets, share_of
-from imulab.procedures.tumble.plan import plan_tumble
+from imulab.live.sources import simulated_unit
+from imulab.procedures.tumble.plan import plan_attitudes
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.units import STANDARD_GRAVITY as G
 
@@ -69,7 +68,7 @@ def attitudes_planned(seed: int) -> int:
     """The least number of attitudes, planned for that number before the session, that gets the unit's bias to it."""
     for count in range(12, MOST):
         if count not in PLANS:
-            PLANS[count] = plan_tumble(attitudes=count, order=2).directions
+            PLANS[count] = plan_attitudes(attitudes=count, order=2).directions
         unit, guide = Unit(seed), Guide(2, Gravity(G, "test"), (BIAS,))
         for number, up in enumerate(PLANS[count], start=1):
             guide.attitudes.append(unit.at(up, number))
@@ -86,7 +85,7 @@ def attitudes_predicted() -> int:
         for count in range(12, MOST)
         if max(
             u
-            for name, u in plan_tumble(attitudes=count, order=2).uncertainties(NOISE / G).items()
+            for name, u in plan_attitudes(attitudes=count, order=2).uncertainties(NOISE / G).items()
             if name.startswith("bias")
         )
         <= BIAS.value / G

@@ -12,9 +12,9 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.errors import OptionError
-from imulab.live.recorder import Recorder
+from imulab.live.guide import read_targets
+from imulab.live.runner import Recorder
 from imulab.live.session import Session
-from imulab.live.targets import read_targets
 from imulab.live.view import in_words
 
 FIT = ["--gravity", "9.81+-0", "--order", "1"]

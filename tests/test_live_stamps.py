@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from imulab.live.formats import Stream
+from imulab.live.session import Watch
 from imulab.live.stamps import Counts
-from imulab.live.warnings import Watch
 from imulab.recording import Recording
 
 

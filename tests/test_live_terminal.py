@@ -19,8 +19,8 @@ import pytest
 from rich.console import Console
 
 import imulab as il
+from imulab.live.guide import read_targets
 from imulab.live.session import Session
-from imulab.live.targets import read_targets
 from imulab.live.terminal import draw, turned
 
 

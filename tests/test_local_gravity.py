@@ -7,7 +7,7 @@ import imulab as il
 from conftest import table
 from imulab.errors import OptionError
 from imulab.gravity import ANOMALY, gravity_option, stated_gravity
-from imulab.procedures.changes import compare_records
+from imulab.procedures.views import compare_records
 from reference import tumble as reference
 
 G = 9.81362

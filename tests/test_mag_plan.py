@@ -7,7 +7,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.tumble.mag.headings import plan_headings
+from imulab.procedures.tumble.mag.heading import plan_headings
 from imulab.procedures.tumble.plan import roll_pitch
 from imulab.recording import Recording
 from reference import magnetometer as reference

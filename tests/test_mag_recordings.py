@@ -8,9 +8,9 @@ import pytest
 
 import bags
 import imulab as il
+from imulab.display import Note
 from imulab.errors import OptionError
 from imulab.units import to_si
-from imulab.verdict import Note
 from reference.flightlogs import dataflash, ulog
 
 AXES = "xyz"

@@ -8,7 +8,7 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.errors import DataError, OptionError
-from imulab.procedures.tumble.mag.stated import stated_place
+from imulab.procedures.tumble.mag.solve import stated_place
 from imulab.recording import Recording
 from reference import magnetometer as reference
 

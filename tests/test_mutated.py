@@ -11,16 +11,16 @@ import pytest
 
 import imulab as il
 from imulab.cli.show import describe_blob, describe_record
-from imulab.device.blob import make_blob
+from imulab.device.unit import make_blob
 from imulab.errors import ImulabError, RecordError
-from imulab.procedures.changes import compare_records
+from imulab.procedures.apply import tables_of_all
 from imulab.procedures.gyro_array.simulate import simulate_array
-from imulab.procedures.loading import load_any, loads
+from imulab.procedures.registry import load_any, loads
 from imulab.procedures.tumble.simulate import simulate_tumble
-from imulab.procedures.unit_tables import tables_of_all
+from imulab.procedures.views import compare_records
 from imulab.procedures.warmup.simulate import simulate_power_cycle
 from imulab.recording import Recording
-from imulab.records.json_text import content_sha256
+from imulab.records.calibration import content_sha256
 from test_centrifuge_apply import record_of
 
 VALUES = [

@@ -8,9 +8,9 @@ import pytest
 from scipy.signal import lfilter
 
 from imulab.errors import DataError, OptionError
-from imulab.estimation.allan import allan_deviation
 from imulab.estimation.column_noise import analyse, columns_noise, noise_lines
 from imulab.estimation.noise.simulate import simulated
+from imulab.estimation.noise_coefficients import allan_deviation
 from imulab.estimation.sampling import sampling_rate
 from imulab.recording import Recording
 

@@ -11,7 +11,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.estimation.noise.agreement import agreement
-from imulab.estimation.noise.cosine import transformed
+from imulab.estimation.noise.spectrum import transformed
 from imulab.estimation.noise.terms import prepare
 from imulab.procedures.noise.check import times
 from noise_models import empty

@@ -9,21 +9,20 @@ from scipy.signal import butter, cheby1, lfilter
 
 import imulab as il
 from imulab.errors import DataError, OptionError
-from imulab.estimation.noise import cosine
-from imulab.estimation.noise.band import allow, usable_band, within
+from imulab.estimation.noise import spectrum as cosine
+from imulab.estimation.noise.analysis import ramp_coefficients, regress, without
+from imulab.estimation.noise.analysis import test_of_fit as hold
 from imulab.estimation.noise.cleaning import find_steps, spikes_removed, step_coefficients
-from imulab.estimation.noise.cosine import (
+from imulab.estimation.noise.likelihood import allow, fit, time_limits, usable_band, within
+from imulab.estimation.noise.rest import at_rest
+from imulab.estimation.noise.simulate import flicker_sum, simulated
+from imulab.estimation.noise.spectrum import (
     Accumulator,
     cosine_coefficients,
     smooth_count,
     transformed,
     variances_of_coefficients,
 )
-from imulab.estimation.noise.likelihood import fit, time_limits
-from imulab.estimation.noise.moments import test_of_fit as hold
-from imulab.estimation.noise.regression import ramp_coefficients, regress, without
-from imulab.estimation.noise.rest import at_rest
-from imulab.estimation.noise.simulate import flicker_sum, simulated
 from imulab.estimation.noise.terms import NAMES, prepare, terms
 from reference import noise as reference
 

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab import disk
+from imulab import recording as disk
 from imulab.cli import main
 from imulab.cli.options import GivenFiles
 from imulab.errors import ImulabError
-from imulab.estimation.noise.long_rest import long_rest
-from imulab.estimation.noise.rest import at_rest
-from imulab.procedures.noise import logs, task
-from imulab.procedures.noise.checkfigures import as_json
-from imulab.procedures.run import run_task
+from imulab.estimation.noise.rest import at_rest, long_rest
+from imulab.procedures.noise import fit, procedure
+from imulab.procedures.noise.check import as_json
+from imulab.procedures.registry import run_task
 from imulab.recording import Recording
-from imulab.records.json_text import json_text
+from imulab.records.calibration import json_text
 
 RATE = 50.0
 
@@ -119,7 +118,7 @@ def test_a_faulty_log_is_looked_at_as_a_whole(kind):
 def test_a_large_file_gives_the_record_of_a_small_one(tmp_path, monkeypatch, kind):
     file = tmp_path / "log.csv"
     il.write_csv(Recording(holes(faulty(kind)), UNITS, {"serial": "7"}), file)
-    options = {option.name: None for option in task.OPTIONS} | {"regress": "temperature"}
+    options = {option.name: None for option in procedure.OPTIONS} | {"regress": "temperature"}
 
     def outcome():
         try:
@@ -139,11 +138,11 @@ def test_a_large_file_gives_the_record_of_a_small_one(tmp_path, monkeypatch, kin
 
 def test_the_rows_are_not_kept(monkeypatch):
     """What is held does not grow with the log beyond the samples that are transformed as a whole."""
-    from imulab.estimation.noise import cosine
-    from imulab.estimation.noise import long_rest as module
+    from imulab.estimation.noise import rest as module
+    from imulab.estimation.noise import spectrum
 
-    monkeypatch.setattr(cosine, "WHOLE", 1 << 12)
-    monkeypatch.setattr(cosine, "STRETCH", 1 << 11)
+    monkeypatch.setattr(spectrum, "WHOLE", 1 << 12)
+    monkeypatch.setattr(spectrum, "STRETCH", 1 << 11)
     seen = []
     add = module.Accumulator.add
 
@@ -164,7 +163,7 @@ def test_functions_and_check_read_a_large_file_in_blocks(tmp_path, monkeypatch, 
     record = il.fit_noise(file, columns="gyro_x,gyro_y").calibration
     small = il.check_noise(record, later)
     monkeypatch.setattr(disk, "LARGE", 0)
-    monkeypatch.setattr(logs, "as_recording", None)  # as a whole it is not read
+    monkeypatch.setattr(fit, "as_recording", None)  # as a whole it is not read
     large = il.fit_noise(file, columns="gyro_x,gyro_y").calibration
     assert large.sources == record.sources
     values = {name: each.value for name, each in record.parameters.items()}
@@ -219,7 +218,7 @@ def test_a_large_file_that_has_to_be_looked_at_as_a_whole_is_not_in_memory(tmp_p
     small = il.fit_noise(file).calibration
     assert any({"zeros": "exact zeros", "held": "stands in 2 rows"}[kind] in note for note in small.warnings)
     monkeypatch.setattr(disk, "LARGE", 0)
-    monkeypatch.setattr(logs, "as_recording", None)
+    monkeypatch.setattr(fit, "as_recording", None)
     held = []
     rest_of = at_rest
 

@@ -11,8 +11,8 @@ from imulab.cli import main
 from imulab.errors import DataError, OptionError, UnitError
 from imulab.estimation.noise.simulate import simulated
 from imulab.procedures.noise.figures import exhibits
-from imulab.procedures.reports import rendered
-from imulab.records.json_text import sealed_text
+from imulab.procedures.views import rendered
+from imulab.records.calibration import sealed_text
 
 DEGREE = np.pi / 180
 COUNT = 60_000

@@ -9,10 +9,8 @@ from scipy.signal import lfilter
 import imulab as il
 from imulab.errors import DataError
 from imulab.estimation.noise.cleaning import knocks_removed
-from imulab.estimation.noise.long_rest import long_rest
-from imulab.estimation.noise.plausible import doubtful_units
-from imulab.estimation.noise.readings import dropouts, own_readings
-from imulab.estimation.noise.rest import at_rest
+from imulab.estimation.noise.readings import doubtful_units, dropouts, own_readings
+from imulab.estimation.noise.rest import at_rest, long_rest
 from imulab.estimation.noise.simulate import simulated
 
 SIGMA, COUNT = 0.1, 40_000

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 import imulab as il
 from imulab.estimation.column_noise import analyse
-from imulab.report.elements import Figure
 from imulab.report.noise_figures import exhibits_of_noise, interval
+from imulab.report.traces import Figure
 
 RATE = 50.0
 

@@ -8,7 +8,7 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.errors import OptionError
-from imulab.procedures.noise.coefficients import coefficient
+from imulab.procedures.noise.schema import coefficient
 from imulab.procedures.noise.simulate import noise_log
 
 DEGREE, G = np.pi / 180, 9.80665

@@ -3,12 +3,21 @@
 import numpy as np
 import pytest
 
-from imulab.estimation.noise.choice import CANDIDATES, Averaged, average, choose
+from imulab.estimation.noise.analysis import CANDIDATES, Averaged, average, choose
 from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
-from imulab.estimation.noise.intervals import profile
-from imulab.estimation.noise.likelihood import deviance, fit, information, time_limits
-from imulab.estimation.noise.terms import NAMES, Bins, allan_variance, letters, prepare, terms
-from imulab.estimation.noise.use import at_band_edge, bias_square, walk_square, white_square
+from imulab.estimation.noise.likelihood import deviance, fit, information, profile, time_limits
+from imulab.estimation.noise.terms import (
+    NAMES,
+    Bins,
+    allan_variance,
+    at_band_edge,
+    bias_square,
+    letters,
+    prepare,
+    terms,
+    walk_square,
+    white_square,
+)
 from imulab.estimation.special import ndtr, ndtri
 from noise_models import AUTO, IN_TIME, LONG, TRUTHS, drawn, empty, intervals, transformed, values
 from reference import noise as reference

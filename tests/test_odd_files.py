@@ -9,7 +9,7 @@ import pytest
 
 from imulab.cli import main
 from imulab.errors import ReadError
-from imulab.fleet.sources import local_file
+from imulab.fleet.manifest import local_file
 
 
 @pytest.fixture
@@ -71,11 +71,15 @@ def test_links_that_go_round_in_a_circle(imulab, tmp_path, recording, command):
 
 @pytest.mark.parametrize(
     "command",
-    [["show", "a.csv", "--layout", "imulab.toml"], ["centrifuge", "reduce", "imulab.toml"], ["tumble", "fit", "a.csv"]],
+    [
+        ["show", "a.csv", "--layout", "imulab.files"],
+        ["centrifuge", "reduce", "imulab.files"],
+        ["tumble", "fit", "a.csv"],
+    ],
 )
 def test_toml_nested_deeper_than_python_reads(imulab, tmp_path, recording, command):
-    (tmp_path / "imulab.toml").write_text("a = " + "[" * 5000 + "]" * 5000)
-    refused(imulab(*command), "imulab.toml: the ", "nests its tables or lists")
+    (tmp_path / "imulab.files").write_text("a = " + "[" * 5000 + "]" * 5000)
+    refused(imulab(*command), "imulab.files: the ", "nests its tables or lists")
 
 
 def closed(tmp_path, command, *streams):

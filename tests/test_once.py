@@ -13,8 +13,8 @@ import imulab as il
 from fleets import write_manifest
 from imulab.cli import main
 from imulab.errors import ReadError
-from imulab.fleet import sources
-from imulab.fleet.sources import local_file, masked
+from imulab.fleet import manifest as sources
+from imulab.fleet.manifest import local_file, masked
 
 ROWS = "time [s],accel_x [g]\n" + "".join(f"{i / 100},{i % 7}\n" for i in range(3000))
 

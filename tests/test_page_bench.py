@@ -34,9 +34,8 @@ from imulab.live.page import bench as bench_module
 from imulab.live.page import server
 from imulab.live.page.bench import Workbench
 from imulab.live.page.files import Files, checked
-from imulab.live.page.forms import forms
-from imulab.live.page.jobs import Jobs
-from imulab.live.page.parts import to_json
+from imulab.live.page.jobs import Jobs, forms
+from imulab.live.page.server import to_json
 
 COMMANDS = dict(commands_of(command()))
 FORMS = forms(COMMANDS.items())

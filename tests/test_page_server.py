@@ -24,8 +24,7 @@ from websockets.sync.client import connect
 
 from imulab.errors import OptionError
 from imulab.live.page import server
-from imulab.live.page.parts import Hub, Line, Part, to_json
-from imulab.live.page.security import Guard, inside, receive_file
+from imulab.live.page.server import Guard, Hub, Line, Part, inside, receive_file, to_json
 
 LIMIT = 1000
 

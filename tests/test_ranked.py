@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imulab.estimation.ranked import distinct, median, medians, quantile
+from imulab.estimation.rows import distinct, median, medians, quantile
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 10, 101])

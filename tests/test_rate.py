@@ -10,7 +10,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.rate.manifest import RateTest, Run, load_test, manifest_text
+from imulab.procedures.rate.schema import RateTest, Run, load_test, manifest_text
 from imulab.procedures.rate.simulate import RateRecordings
 from reference import rate as reference
 

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
+from imulab.procedures.rate.schema import RateTest, Run, manifest_text
 from imulab.procedures.rate.simulate import RateRecordings
 from reference import rate as reference
 

@@ -5,7 +5,7 @@ import pytest
 
 import imulab as il
 from imulab.procedures.rate.dwells import find_dwells
-from imulab.procedures.rate.manifest import RateTest, Run
+from imulab.procedures.rate.schema import RateTest, Run
 from reference.rate import DEGREE
 
 UP = [0, 10, 50, 100, 200, 300]

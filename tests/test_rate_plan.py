@@ -9,7 +9,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.rate.manifest import load_test
+from imulab.procedures.rate.schema import load_test
 from imulab.procedures.rate.simulate import RateRecordings
 from reference import rate as reference
 

@@ -6,8 +6,7 @@ import pytest
 import imulab as il
 import madeup
 from imulab.cli import main
-from imulab.procedures.rate.orders import choose_orders
-from imulab.procedures.rate.solve import Problem
+from imulab.procedures.rate.solve import Problem, choose_orders
 from reference import rate as reference
 from test_rate import BIAS, SCALE, TURN, whole
 

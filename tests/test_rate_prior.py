@@ -8,7 +8,7 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.procedures.rate.simulate import RateRecordings
-from imulab.procedures.reports import exhibits_of
+from imulab.procedures.views import exhibits_of
 
 HOW = {"noise": "0.02 deg/s", "rate": "50 Hz", "hold": "4 s", "rates": "0,50,100,200"}
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.procedures.rate.manifest import RateTest, Run
+from imulab.procedures.rate.schema import RateTest, Run
 from imulab.procedures.rate.simulate import RateRecordings
 from reference import rate as reference
 from test_rate_turn import turned

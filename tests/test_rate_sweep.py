@@ -10,7 +10,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.rate.regression import KERNELS, moments
+from imulab.procedures.rate.dwells import KERNELS, moments
 from reference.rate import DEGREE
 
 FREQUENCY, OVER = 200, 20

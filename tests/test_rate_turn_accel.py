@@ -9,7 +9,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.rate.turnaxes import _scattered
+from imulab.procedures.rate.turns import _scattered
 from reference import rate as reference
 from test_rate_accel import ARM, BIAS, SCALE, TURN, G, accel, of_another_unit
 

@@ -252,7 +252,7 @@ def test_a_file_of_many_blocks_equals_the_file_read_whole(file, monkeypatch, siz
     path = file(LONG)
     whole = read(path)
     assert len(whole) == 200
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     joined, blocks = read(path), list(read_blocks(path))
     assert len(blocks) > 3
     assert joined.source == whole.source
@@ -277,7 +277,7 @@ def test_a_file_of_many_blocks_equals_the_file_read_whole(file, monkeypatch, siz
 def test_rows_are_numbered_through_all_blocks(file, monkeypatch, size, line, message):
     lines = LONG.split(b"\r\n")  # the first holds the head and row 1
     lines[149] = line
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     with pytest.raises(ReadError) as caught:
         read(file(b"\n".join(lines)))
     assert message in str(caught.value)
@@ -326,7 +326,7 @@ def test_a_layout_takes_columns_by_name_below_skipped_lines(file, head):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_head_comments_above_foreign_rows_are_skipped(file, monkeypatch, size):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     recording = read(file(b"# a\n#b c\n#\n" + b"10 1 2\n" * 5), toml(file, COLUMNS))
     assert recording.column("accel_x").tolist() == [2] * 5
     assert recording.place(0) == "row 1 (line 4)"
@@ -339,7 +339,7 @@ def test_a_byte_order_mark_above_foreign_rows_is_skipped(file):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_sample_rate_makes_the_time_through_all_blocks(file, monkeypatch, size):
-    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
     head = 'sample_rate = { value = 0.0625, unit = "kHz" }\n'
     layout = toml(file, head + '[columns]\naccel_x = { from = 0, unit = "V" }\n')
     recording = read(file(b"".join(b"%d\n" % k for k in range(100))), layout)

@@ -8,16 +8,14 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.cli.options import GivenFiles
-from imulab.device.golden import golden_gyroscopes
 from imulab.device.tables import DeviceTable, Field, whole
-from imulab.procedures.options import LAYOUT, measure, read_options
-from imulab.procedures.procedure import Procedure, Section, Task, source_of
-from imulab.procedures.registry import PROCEDURES
-from imulab.procedures.run import run_task
-from imulab.procedures.tumble.apply import apply_gyro
+from imulab.device.unit import golden_gyroscopes
+from imulab.procedures.procedure import LAYOUT, Procedure, Section, Task, measure, read_options, source_of
+from imulab.procedures.registry import PROCEDURES, run_task
+from imulab.procedures.tumble.device import apply_gyro
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.triads import Accelerometers, Triads
-from imulab.report import elements
+from imulab.report import traces
 
 RATE = (0.01, -0.02, 0.03)
 OPTIONS = (measure("skip", "Time at the start to leave out, s.", "time", "s", "0 s"), LAYOUT)
@@ -54,8 +52,8 @@ def _tables(record):
 
 def _exhibits(record):
     rows = [[name, f"{record.value(name):.3f}"] for name in NAMES]
-    return elements.Exhibits(
-        "What drifts at rest.", [("samples", "1000")], [elements.ReportTable("Drift", "", ["", ""], rows)]
+    return traces.Exhibits(
+        "What drifts at rest.", [("samples", "1000")], [traces.ReportTable("Drift", "", ["", ""], rows)]
     )
 
 

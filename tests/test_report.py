@@ -11,10 +11,9 @@ import pytest
 import imulab as il
 from conftest import table
 from imulab.errors import RecordError
-from imulab.procedures.reports import exhibits_of
+from imulab.procedures.views import exhibits_of
 from imulab.report import render_page
-from imulab.report.elements import Exhibits, Figure, ReportTable, format_uncertain
-from imulab.report.narrow import narrow
+from imulab.report.traces import Exhibits, Figure, ReportTable, format_uncertain, narrow
 from reference import tumble as reference
 
 G = 9.80665

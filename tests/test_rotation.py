@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from imulab.procedures.tumble.rotation import frame_rotations, weighted_turns
+from imulab.procedures.tumble.gyro.rotation import frame_rotations, weighted_turns
 
 EPS = np.finfo(float).eps
 

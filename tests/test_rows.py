@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.display import Note
 from imulab.errors import DataError
 from imulab.estimation.rows import leave_out
-from imulab.procedures.tumble.gyro import fit_gyro
+from imulab.procedures.tumble.gyro.fit import fit_gyro_triad
 from imulab.recording import Recording
-from imulab.verdict import Note
 from test_tumble_hold import errors, fitted, held
 
 EVERY = 50
@@ -137,14 +137,14 @@ def test_gyroscopes_turn_as_without_the_rows(fault):
     recording = il.simulate_tumble(order=1, attitudes=24, seed=3, gravity=9.81362)
     attitudes = il.find_attitudes(recording)
     record = il.fit_tumble(attitudes, order=1, gravity=9.81362).calibration
-    clean = fit_gyro(record, attitudes, recording)
+    clean = fit_gyro_triad(record, attitudes, recording)
     bad, _ = spoilt(recording, fault, "gyro")
-    found = fit_gyro(record, attitudes, bad)
+    found = fit_gyro_triad(record, attitudes, bad)
     assert any("left out" in note for note in found.notes)
     u = np.sqrt(np.diag(clean.covariance))[:3]
     assert np.abs(found.scale_factor - clean.scale_factor).max() < 3 * u.max()
     with pytest.raises(DataError, match="expected at most 5 %"):
-        fit_gyro(record, attitudes, spoilt(recording, zeroed, "gyro", every=10)[0])
+        fit_gyro_triad(record, attitudes, spoilt(recording, zeroed, "gyro", every=10)[0])
 
 
 def still_array(count=12000, elements=6, seed=2):

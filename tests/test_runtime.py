@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import madeup
-from imulab.device import _runtime
-from imulab.device.methods import METHODS
+from imulab.device import METHODS, _runtime
 from imulab.device.tables import pack
 from imulab.device.unit import (
     ALONE,
@@ -23,8 +22,8 @@ from imulab.device.unit import (
     fuse_table,
 )
 from imulab.errors import DataError, OptionError, RecordError
-from imulab.procedures.unit_tables import tables_of
-from imulab.procedures.warmup.choices import MODELS
+from imulab.procedures.apply import tables_of
+from imulab.procedures.warmup import MODELS
 
 
 def readings(samples=600, elements=6, axes=1, seed=1):

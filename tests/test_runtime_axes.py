@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imulab.device.methods import METHODS
+from imulab.device import METHODS
 from imulab.device.unit import ArraySettings, Stream
 
 SAMPLES = 2000

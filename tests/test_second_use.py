@@ -7,7 +7,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.verdict import Bad, verdict_of
+from imulab.display import Bad, verdict_of
 
 G = "9.81362"
 

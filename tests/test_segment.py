@@ -9,8 +9,9 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from imulab.errors import DataError, ImulabError, SegmentError, UnitError
-from imulab.procedures.tumble import held, segment
-from imulab.procedures.tumble.segment import find_attitudes
+from imulab.procedures.tumble import attitudes as held
+from imulab.procedures.tumble import attitudes as segment
+from imulab.procedures.tumble.attitudes import find_attitudes
 from imulab.recording import Recording
 from reference import tumble as reference
 

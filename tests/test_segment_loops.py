@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imulab.procedures.tumble import _segment
-from imulab.procedures.tumble.segment import find_attitudes
+from imulab.procedures.tumble.attitudes import find_attitudes
 from reference import segment as reference
 from reference.tumble import random_attitudes
 from test_segment import DIRECTIONS, G, disturbed, recording, tumble

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imulab.cli import main
-from imulab.estimation.steps import find_step
+from imulab.estimation.rows import find_step
 
 
 def noise(rng, n, exponent):

@@ -12,9 +12,8 @@ from imulab.cli import main
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.record import predicted
-from imulab.procedures.thermal.rows import Problem
 from imulab.procedures.thermal.simulate import thermal_truth
-from imulab.procedures.thermal.solve import solve
+from imulab.procedures.thermal.solve import Problem, solve
 from reference import thermal as reference
 
 G = reference.G

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.procedures.thermal.gyrorecord import gyro_scale_predicted
-from imulab.procedures.thermal.record import deviation_of_force
+from imulab.procedures.thermal.record import deviation_of_force, gyro_scale_predicted
 from reference import thermal as reference
 
 G = reference.G

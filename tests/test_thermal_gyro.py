@@ -10,9 +10,8 @@ import imulab as il
 from imulab.cli import main
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.apply import apply_blocks
-from imulab.procedures.thermal.gyro import fit_gyroscopes
-from imulab.procedures.thermal.gyroholds import RatesAtRest
-from imulab.procedures.thermal.gyrorecord import gyro_predicted
+from imulab.procedures.thermal.gyro import RatesAtRest, fit_gyroscopes
+from imulab.procedures.thermal.record import gyro_predicted
 from reference import thermal_gyro as reference
 from reference.thermal import directions
 

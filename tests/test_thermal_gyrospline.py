@@ -12,7 +12,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.thermal.gyro import fit_gyroscopes
-from imulab.procedures.thermal.gyrorecord import gyro_predicted
+from imulab.procedures.thermal.record import gyro_predicted
 from reference import thermal_gyro as reference
 from reference.thermal import natural_spline
 from test_thermal_gyro import HOURLY, UNITS, G, at_rest, recordings

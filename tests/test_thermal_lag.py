@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.procedures.thermal.degrees import Drift, drift_of, findings
 from imulab.procedures.thermal.figures import exhibits
-from imulab.procedures.thermal.lag import Drift, drift_of, findings
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.record import predicted
-from imulab.procedures.thermal.rows import Problem
-from imulab.procedures.thermal.solve import solve
+from imulab.procedures.thermal.solve import Problem, solve
 from imulab.recording import Recording
 from reference import thermal as reference
 

@@ -7,8 +7,8 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.thermal.design import Design, exchange, nodes, way
 from imulab.procedures.thermal.model import Laws
+from imulab.procedures.thermal.plan import Design, exchange, nodes, way
 from imulab.procedures.thermal.solve import Problem, solve
 from imulab.procedures.tumble.plan import sphere_candidates
 from reference import thermal as reference

@@ -9,8 +9,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.procedures.thermal import solve as solving
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.rows import Problem
-from imulab.procedures.thermal.solve import solve
+from imulab.procedures.thermal.solve import Problem, solve
 from reference import thermal as reference
 
 G = reference.G
@@ -85,7 +84,7 @@ def test_a_thermal_record_is_the_prior_of_a_tumble_test_at_its_temperature(made)
 
 
 def test_a_thermal_prior_holds_the_laws_and_the_scatter_at_that_temperature(made):
-    from imulab.procedures.thermal.prior import at_temperature
+    from imulab.procedures.thermal.device import at_temperature
     from imulab.procedures.thermal.record import predicted
 
     record, _ = made

@@ -5,11 +5,10 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.thermal.holds import find_holds
+from imulab.display import Note
+from imulab.procedures.thermal.holds import find_holds, stretches_at_rest, wandering
 from imulab.procedures.thermal.record import predicted
-from imulab.procedures.thermal.rest import stretches_at_rest, wandering
 from imulab.recording import Recording
-from imulab.verdict import Note
 from imulab.writers import write
 from reference import thermal as reference
 

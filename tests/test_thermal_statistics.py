@@ -13,8 +13,7 @@ from scipy.optimize import least_squares
 import imulab as il
 from imulab.procedures.thermal.degrees import clusters_of, left_out, seen, splits
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.rows import Problem
-from imulab.procedures.thermal.solve import concluded, solve
+from imulab.procedures.thermal.solve import Problem, concluded, solve
 from reference import thermal as reference
 from test_thermal import AT, LAWS, problem, truth
 

@@ -8,10 +8,9 @@ import pytest
 
 import imulab as il
 from imulab.estimation.least_squares import coverage_factor
-from imulab.procedures.thermal.lag import Drift, drift_of
+from imulab.procedures.thermal.degrees import Drift, bias_shift_from_unobserved, drift_of
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.solve import solve
-from imulab.procedures.thermal.untold import untold
 from reference import thermal as reference
 from test_thermal import problem
 
@@ -45,7 +44,7 @@ def test_what_one_ramp_does_not_tell_costs_as_much_as_is_said():
         triad = reference.Triad(rng, degrees=(3, 1, 0))
         given = one_ramp(rng, triad)
         found = solve(given, laws, tau=0.0)
-        (text, *_) = untold(given, found, Drift(), "ramp")
+        (text, *_) = bias_shift_from_unobserved(given, found, Drift(), "ramp")
         said.append(float(re.search(r"scale factor follows .* errs biases by (\S+) mg", text)[1]))
         biases = laws.design(AT)[:, :3] @ found.coefficients
         errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))
@@ -77,7 +76,11 @@ def test_a_lag_that_fast_ramps_do_not_tell_is_said_with_what_it_costs():
         found = solve(problem_, laws, tau=0.0)
         drift = drift_of(problem_, found, 0.0)
         assert "only warm" in drift.reason
-        texts = [text for text in untold(problem_, found, drift, "ramp") if "behind the thermometer" in text]
+        texts = [
+            text
+            for text in bias_shift_from_unobserved(problem_, found, drift, "ramp")
+            if "behind the thermometer" in text
+        ]
         said += [float(re.search(r"errs biases by (\S+) mg", text)[1]) for text in texts]
         biases = laws.design(AT)[:, :3] @ found.coefficients
         errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))

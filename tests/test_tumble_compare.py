@@ -10,8 +10,8 @@ from scipy import stats
 import imulab as il
 from conftest import sap5_table, table
 from imulab.errors import RecordError, UnitError
-from imulab.procedures.changes import compare_records
-from imulab.procedures.tumble.compare import check_tumble
+from imulab.procedures.tumble.check import check_tumble
+from imulab.procedures.views import compare_records
 from reference import tumble as reference
 
 G = 9.80665

@@ -8,7 +8,7 @@ import pytest
 
 import imulab as il
 from conftest import table
-from imulab.device.blob import load_blob
+from imulab.device.unit import load_blob
 from imulab.errors import OptionError, RecordError
 from imulab.exporters import ExportOptions, export
 from imulab.procedures.tumble.model import norm_and_jacobian, parameter_count

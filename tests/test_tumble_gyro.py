@@ -10,12 +10,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import imulab as il
-from imulab.earth import EarthRate
 from imulab.errors import DataError, OptionError, SegmentError
-from imulab.procedures.reports import exhibits_of
-from imulab.procedures.tumble.gyro import PAIRS, fit_gyro, gyro_names
-from imulab.procedures.tumble.gyrorecord import with_gyro
-from imulab.procedures.tumble.rotation import frame_rotations, weighted_turns
+from imulab.gravity import EarthRate
+from imulab.procedures.tumble.gyro.fit import PAIRS, fit_gyro_triad, gyro_names, with_gyro
+from imulab.procedures.tumble.gyro.rotation import frame_rotations, weighted_turns
+from imulab.procedures.views import exhibits_of
 from reference import tumble as reference
 
 G = 9.80665
@@ -71,7 +70,7 @@ def test_the_truth_is_found_within_its_uncertainty(fit_bias):
         recording = il.simulate_tumble(order=1, attitudes=24, seed=seed)
         attitudes = il.find_attitudes(recording)
         record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
-        fit = fit_gyro(record, attitudes, recording, fit_bias=fit_bias)
+        fit = fit_gyro_triad(record, attitudes, recording, fit_bias=fit_bias)
         scores.append((values(fit) - truth_of(recording)) / np.sqrt(np.diag(fit.covariance)))
         assert fit.sensitivity is None  # the simulated gyroscopes have none, and none is claimed
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.4
@@ -85,7 +84,7 @@ def test_slow_beginnings_of_turns_do_not_bias_what_noisy_accelerometers_go_with(
         recording = il.simulate_tumble(order=1, attitudes=24, seed=seed, noise=4e-3 * G)
         attitudes = il.find_attitudes(recording)
         record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
-        fit = fit_gyro(record, attitudes, recording, sensitivity="no")
+        fit = fit_gyro_triad(record, attitudes, recording, sensitivity="no")
         scores.append(((values(fit) - truth_of(recording)) / np.sqrt(np.diag(fit.covariance)))[:3])
     assert np.sqrt(np.mean(np.square(scores))) < 1.35  # 2.3 with turns that begin where the accelerometers say
 
@@ -103,7 +102,7 @@ def test_twists_about_the_vertical_that_only_the_gyroscopes_feel_leave_the_bias_
     twisted = recording.with_columns(
         {f"gyro_{a}": recording.columns[f"gyro_{a}"] + (rate @ t.T)[:, i] * truth[i] for i, a in enumerate("xyz")}, {}
     )
-    quiet, fit = (fit_gyro(record, attitudes, r) for r in (recording, twisted))
+    quiet, fit = (fit_gyro_triad(record, attitudes, r) for r in (recording, twisted))
     sigma = np.sqrt(np.diag(quiet.covariance))
     assert np.abs((values(fit) - truth_of(recording)) / sigma).max() < 4
     assert np.sqrt(np.diag(fit.covariance)).max() < 2 * sigma.max()
@@ -120,7 +119,7 @@ def test_the_uncertainty_of_the_accelerometers_record_is_carried_along():
             for i, noise in enumerate((6e-3, 0.3e-3), start=1)
         )
         record = il.fit_tumble(il.find_attitudes(hasty), order=1, gravity=G).calibration
-        fit = fit_gyro(record, il.find_attitudes(careful), careful, sensitivity="no")
+        fit = fit_gyro_triad(record, il.find_attitudes(careful), careful, sensitivity="no")
         scores.append((values(fit) - truth_of(careful)) / np.sqrt(np.diag(fit.covariance)))
     rms = np.sqrt(np.mean(np.square(scores), axis=0))
     assert 0.8 < np.sqrt(np.mean(rms**2)) < 1.2
@@ -138,7 +137,7 @@ def test_units_held_by_hand_are_still_where_their_gyroscopes_are(name, real_data
     recording = il.read(real_data / "mpu9150" / name, tmp_path / "mpu.toml")
     attitudes = il.find_attitudes(recording)
     record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
-    rest, turns = (fit_gyro(record, attitudes, recording, fit_bias=b, sensitivity="no") for b in (False, True))
+    rest, turns = (fit_gyro_triad(record, attitudes, recording, fit_bias=b, sensitivity="no") for b in (False, True))
     assert rest.cost < 1e-4  # 0.0175 and 0.0088 with turns that begin where the accelerometers end to be still
     apart = (values(turns) - values(rest)) / np.sqrt(np.diag(turns.covariance))
     assert np.abs(apart).max() < 3
@@ -150,7 +149,7 @@ def test_counts_need_no_nominal_scale_factor(case, scale):
     recording, attitudes, record = case
     per_rad = {f"gyro_{a}": np.round(np.radians(recording.columns[f"gyro_{a}"]) * scale * 1e3) for a in "xyz"}
     counts = recording.with_columns(per_rad, {f"gyro_{a}": "count" for a in "xyz"})
-    fit = fit_gyro(record, attitudes, counts)
+    fit = fit_gyro_triad(record, attitudes, counts)
     expected = truth_of(recording)
     np.testing.assert_allclose(fit.scale_factor, np.radians(expected[:3]) * scale * 1e3, rtol=2e-3)
 
@@ -162,12 +161,12 @@ def test_sensitivity_to_acceleration_is_found_from_rest(case):
     drifting = recording.with_columns(
         {f"gyro_{a}": recording.columns[f"gyro_{a}"] + extra[:, i] for i, a in enumerate("xyz")}, {}
     )
-    fit = fit_gyro(record, attitudes, drifting, earth=EarthRate(0.0))  # the simulated Earth does not turn
+    fit = fit_gyro_triad(record, attitudes, drifting, earth=EarthRate(0.0))  # the simulated Earth does not turn
     scale = np.radians(truth_of(recording)[:3])
     np.testing.assert_allclose(
         fit.sensitivity, sensitivity / scale[:, None], atol=5 * np.sqrt(np.diag(fit.sensitivity_covariance)).max()
     )
-    ignored = fit_gyro(record, attitudes, drifting, sensitivity="no")
+    ignored = fit_gyro_triad(record, attitudes, drifting, sensitivity="no")
     assert fit.cost < 0.1 * ignored.cost
 
 
@@ -180,12 +179,12 @@ def test_a_zero_that_drifts_along_a_path_over_the_sphere_is_no_sensitivity():
     record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
     drift = 0.05 * recording.columns["time"] / recording.columns["time"][-1]
     drifting = recording.with_columns({f"gyro_{a}": recording.columns[f"gyro_{a}"] + drift for a in "xyz"}, {})
-    assert fit_gyro(record, attitudes, drifting).sensitivity is None
+    assert fit_gyro_triad(record, attitudes, drifting).sensitivity is None
 
 
 def test_the_record_holds_both_triads_and_corrects_both(case, tmp_path):
     recording, attitudes, record = case
-    both = with_gyro(record, fit_gyro(record, attitudes, recording), recording, recording)
+    both = with_gyro(record, fit_gyro_triad(record, attitudes, recording), recording, recording)
     both.save(tmp_path / "both.json")
     loaded = il.load(tmp_path / "both.json")
     assert loaded == both
@@ -213,7 +212,7 @@ def test_the_record_holds_both_triads_and_corrects_both(case, tmp_path):
 
 def test_applying_to_counts_gives_rad_per_second_and_other_units_are_refused(case):
     recording, attitudes, record = case
-    both = with_gyro(record, fit_gyro(record, attitudes, recording), recording, recording)
+    both = with_gyro(record, fit_gyro_triad(record, attitudes, recording), recording, recording)
     radians = recording.with_columns(
         {f"gyro_{a}": np.radians(recording.columns[f"gyro_{a}"]) for a in "xyz"}, {f"gyro_{a}": "rad/s" for a in "xyz"}
     )
@@ -230,23 +229,23 @@ def test_applying_to_counts_gives_rad_per_second_and_other_units_are_refused(cas
 def test_clipped_turns_are_left_out_and_named(case):
     recording, attitudes, record = case
     clipped = recording.with_columns({f"gyro_{a}": np.clip(recording.columns[f"gyro_{a}"], -80, 80) for a in "xyz"}, {})
-    fit = fit_gyro(record, attitudes, clipped)
+    fit = fit_gyro_triad(record, attitudes, clipped)
     assert 8 <= len(fit.residuals) < 25  # of 29
     assert np.abs((values(fit) - truth_of(recording)) / np.sqrt(np.diag(fit.covariance))).max() < 4
     warnings = with_gyro(record, fit, clipped, clipped).warnings
     assert any("turns left out, clipped: gyro_" in w and "at the end of their range (from " in w for w in warnings)
     narrow = recording.with_columns({"gyro_x": np.clip(recording.columns["gyro_x"], -5, 5)}, {})
     with pytest.raises(SegmentError, match=r"turns between attitudes \(\d+ more are clipped\); expected at least 8"):
-        fit_gyro(record, attitudes, narrow)
+        fit_gyro_triad(record, attitudes, narrow)
 
 
 def test_the_top_of_a_turn_in_coarse_steps_is_not_clipped(case):
     recording, attitudes, record = case
     coarse = recording.with_columns({f"gyro_{a}": np.round(recording.columns[f"gyro_{a}"]) for a in "xyz"}, {})
-    assert len(fit_gyro(record, attitudes, coarse).residuals) == 29
+    assert len(fit_gyro_triad(record, attitudes, coarse).residuals) == 29
     index = np.arange(len(recording)) // 4 * 4  # a gyroscope read at a quarter of the rate of the log
     slow = recording.with_columns({f"gyro_{a}": recording.columns[f"gyro_{a}"][index] for a in "xyz"}, {})
-    assert len(fit_gyro(record, attitudes, slow).residuals) == 29
+    assert len(fit_gyro_triad(record, attitudes, slow).residuals) == 29
 
 
 @pytest.mark.parametrize(
@@ -257,26 +256,26 @@ def test_a_clock_that_is_off_is_said(case, late, words):
     time = recording.columns["time"]
     other = recording.with_columns({"time": time + 30.0 + late}, {})
     own = il.find_attitudes(recording.with_columns({"time": time + 30.0}, {}))
-    late_fit = fit_gyro(record, own, other)
+    late_fit = fit_gyro_triad(record, own, other)
     assert any(re.search(words, note) for note in late_fit.notes), late_fit.notes
     assert np.abs((values(late_fit) - truth_of(recording)) / np.sqrt(np.diag(late_fit.covariance))).max() < 5
     same = recording.with_columns({"time": time + 30.0}, {})
-    assert fit_gyro(record, own, same).notes == ()
+    assert fit_gyro_triad(record, own, same).notes == ()
 
 
 def test_a_fit_that_has_not_settled_is_no_result(case, monkeypatch):
     recording, attitudes, record = case
-    module = sys.modules["imulab.procedures.tumble.gyrosolve"]
+    module = sys.modules["imulab.procedures.tumble.gyro.solve"]
     settled = module.least_squares
     monkeypatch.setattr(module, "least_squares", partial(settled, max_evaluations=1))
     with pytest.raises(DataError, match=r"does not converge on these \d+ turns \(condition number \d+\)"):
-        fit_gyro(record, attitudes, recording)
+        fit_gyro_triad(record, attitudes, recording)
 
 
 def test_a_record_of_another_unit_is_said(case):
     _, _, record = case
     other = il.simulate_tumble(order=1, attitudes=24, seed=2)
-    notes = fit_gyro(record, il.find_attitudes(other), other).notes
+    notes = fit_gyro_triad(record, il.find_attitudes(other), other).notes
     assert "gyro: the record is of SIM-0001, the recording of SIM-0002" in notes
     assert any("|f| scatters by" in note and "is it of this unit?" in note for note in notes)
 
@@ -285,18 +284,18 @@ def test_bad_input_is_named(case):
     recording, attitudes, record = case
     swapped = recording.with_columns({"gyro_x": recording.columns["gyro_y"], "gyro_y": recording.columns["gyro_x"]}, {})
     with pytest.raises(DataError, match=r"gyro_x gyro_y gyro_z: the turns miss .* swapped or reversed axes"):
-        fit_gyro(record, attitudes, swapped)
+        fit_gyro_triad(record, attitudes, swapped)
     hole = recording.with_columns({"gyro_y": np.where(np.arange(len(recording)) == 99, np.nan, 0.0)}, {})
     with pytest.raises(DataError, match=r"row 100.*column gyro_y"):
-        fit_gyro(record, attitudes, hole)
+        fit_gyro_triad(record, attitudes, hole)
     with pytest.raises(OptionError, match="expected one of auto yes no"):
-        fit_gyro(record, attitudes, recording, sensitivity="maybe")
+        fit_gyro_triad(record, attitudes, recording, sensitivity="maybe")
     later = recording.with_columns({"time": recording.columns["time"] + 1e4}, {})
     with pytest.raises(DataError, match="do the two recordings share one clock"):
-        fit_gyro(record, attitudes, later)
+        fit_gyro_triad(record, attitudes, later)
     few = replace(recording, columns={n: v[:4000] for n, v in recording.columns.items()})
     with pytest.raises(SegmentError, match="turns between attitudes; expected at least 8"):
-        fit_gyro(record, il.find_attitudes(few), few)
+        fit_gyro_triad(record, il.find_attitudes(few), few)
 
 
 @pytest.fixture(scope="module")
@@ -332,7 +331,7 @@ def test_the_published_xsens_figures_are_half_sums_without_g_sensitivity(xsens, 
 @pytest.mark.parametrize(("fit_bias", "half_sum"), HALF_SUMS)
 def test_xsens_reaches_the_published_figures(xsens, fit_bias, half_sum):
     record, attitudes, recording, _ = xsens
-    fit = fit_gyro(record, attitudes, recording, fit_bias=fit_bias, sensitivity="no")
+    fit = fit_gyro_triad(record, attitudes, recording, fit_bias=fit_bias, sensitivity="no")
     accelerometers = reference.upper_triangular_fit(attitudes.mean, 9.81744)
     assert len(fit.residuals) == 37
     assert fit.cost / 2 <= half_sum
@@ -343,7 +342,7 @@ def test_xsens_reaches_the_published_figures(xsens, fit_bias, half_sum):
 @pytest.mark.parametrize(("fit_bias", "half_sum"), HALF_SUMS)
 def test_g_sensitivity_found_at_rest_explains_nine_tenths_of_the_xsens_residuals(xsens, fit_bias, half_sum):
     record, attitudes, recording, _ = xsens
-    fit = fit_gyro(record, attitudes, recording, fit_bias=fit_bias)
+    fit = fit_gyro_triad(record, attitudes, recording, fit_bias=fit_bias)
     assert fit.sensitivity is not None
     assert fit.cost / 2 <= half_sum / 10
     # In our own gauge; the published fits leave g-sensitivity out.

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.display import Bad, Note
 from imulab.errors import OptionError
-from imulab.procedures.reports import exhibits_of
-from imulab.procedures.tumble.gyro import fit_gyro
-from imulab.procedures.tumble.gyrorecord import with_gyro
-from imulab.verdict import Bad, Note
+from imulab.procedures.tumble.gyro.fit import fit_gyro_triad, with_gyro
+from imulab.procedures.views import exhibits_of
 from reference.turns import GRAVITY, accelerometers, gyroscopes, random_path, random_unit
 
 
@@ -52,13 +51,13 @@ def said(record, fit, recording):
 
 def test_the_clock_is_a_common_part_of_all_three_scale_factors():
     unit, record, attitudes, recording = campaign(1)
-    plain, wide = (fit_gyro(record, attitudes, recording, clock=u) for u in (0.0, 1e-3))
+    plain, wide = (fit_gyro_triad(record, attitudes, recording, clock=u) for u in (0.0, 1e-3))
     s = plain.scale_factor
     added = wide.covariance - plain.covariance
     np.testing.assert_allclose(added[:3, :3], 1e-6 * np.outer(s, s), rtol=1e-6)
     np.testing.assert_allclose(added[:3, 9:], -1e-6 * np.outer(s, plain.bias), rtol=1e-3)
     np.testing.assert_array_equal(wide.scale_factor, plain.scale_factor)
-    default = fit_gyro(record, attitudes, recording)
+    default = fit_gyro_triad(record, attitudes, recording)
     assert default.clock.uncertainty == pytest.approx(50e-6, rel=0.3)
     assert np.abs(scores(unit, default)).max() < 5
 
@@ -67,7 +66,7 @@ def test_two_clocks_are_compared_and_their_difference_is_part_of_the_uncertainty
     found = []
     for seed in range(6):
         unit, record, attitudes, recording = campaign(seed, apart=True, fast=2e-3, late=0.2)
-        fit = fit_gyro(record, attitudes, recording)
+        fit = fit_gyro_triad(record, attitudes, recording)
         other = fit.clock.comparison
         # The accelerometers' clock, the true one, runs slow against the gyroscopes'.
         found.append((other.rate - (1 / 1.002 - 1)) / other.rate_uncertainty)
@@ -76,7 +75,7 @@ def test_two_clocks_are_compared_and_their_difference_is_part_of_the_uncertainty
         assert re.search(r"runs -\d{4} ppm \(u \d+ ppm\)", note)
         assert np.abs(scores(unit, fit)).max() < 5
         assert 1.5e-3 < fit.clock.uncertainty < 2.5e-3
-        mended = fit_gyro(record, attitudes, recording, clock_of="accel")
+        mended = fit_gyro_triad(record, attitudes, recording, clock_of="accel")
         assert np.abs(mended.scale_factor / unit.scale - 1).max() < 4e-4
         assert np.abs(scores(unit, mended)).max() < 5
         assert not [w for w in mended.notes if "against the gyroscopes'" in w]
@@ -85,7 +84,7 @@ def test_two_clocks_are_compared_and_their_difference_is_part_of_the_uncertainty
 
 def test_clocks_that_agree_add_nothing_and_are_not_spoken_of():
     _, record, attitudes, recording = campaign(3, apart=True)
-    fit = fit_gyro(record, attitudes, recording)
+    fit = fit_gyro_triad(record, attitudes, recording)
     assert fit.notes == ()
     assert abs(fit.clock.comparison.rate) < 4 * fit.clock.comparison.rate_uncertainty
     assert abs(fit.clock.comparison.delay) < 2e-3
@@ -93,7 +92,7 @@ def test_clocks_that_agree_add_nothing_and_are_not_spoken_of():
 
 def test_late_samples_of_the_gyroscopes_do_no_harm_and_are_noted():
     unit, record, attitudes, recording = campaign(2, late=0.01)
-    fit = fit_gyro(record, attitudes, recording)
+    fit = fit_gyro_triad(record, attitudes, recording)
     (note,) = fit.notes
     assert isinstance(note, Note)
     assert float(re.search(r"come \+([\d.]+) ms after", note)[1]) == pytest.approx(10, abs=2)
@@ -104,13 +103,13 @@ def test_late_samples_of_the_gyroscopes_do_no_harm_and_are_noted():
 def test_scale_factors_that_change_with_the_rate_are_said_with_their_size():
     for seed in range(4):
         _, record, attitudes, recording = campaign(seed, cubic=1e-3)  # 0.1 % at 100 deg/s
-        fit = fit_gyro(record, attitudes, recording)
+        fit = fit_gyro_triad(record, attitudes, recording)
         (note,) = [w for w in fit.notes if "depends on the rate" in w]
         assert "on a rate table" in note
         found = fit.nonlinearity
         true = 1e-3 * (found.largest / np.radians(100)) ** 2
         assert np.abs((found.odd - true) / found.odd_uncertainty).max() < 5
-        straight = fit_gyro(*campaign(seed)[1:])
+        straight = fit_gyro_triad(*campaign(seed)[1:])
         assert not [w for w in straight.notes if "depends on the rate" in w]
 
 
@@ -148,7 +147,7 @@ def lost(count, *, stamped):
 def test_turns_with_a_knock_or_with_lost_samples_are_named_and_do_not_count(change, words, turns):
     for seed in range(3):
         unit, record, attitudes, recording = campaign(seed, change=change)
-        fit = fit_gyro(record, attitudes, recording)
+        fit = fit_gyro_triad(record, attitudes, recording)
         notes = [w for w in fit.notes if re.search(words, w)]
         assert turns <= len(notes) <= turns + 1
         assert np.abs(scores(unit, fit)).max() < 5
@@ -172,13 +171,13 @@ def test_one_attitude_cut_out_of_the_recording_leaves_the_verdict_good():
 
 
 def test_nothing_is_set_aside_without_reason():
-    aside = sum(len(fit_gyro(*campaign(seed)[1:]).aside) for seed in range(20, 36))
+    aside = sum(len(fit_gyro_triad(*campaign(seed)[1:]).aside) for seed in range(20, 36))
     assert aside <= 2  # of 16 times 23 turns
 
 
 def test_turns_beyond_the_range_are_left_out():
     unit, record, attitudes, recording = campaign(5, limit=np.radians(120))
-    fit = fit_gyro(record, attitudes, recording)
+    fit = fit_gyro_triad(record, attitudes, recording)
     assert any("left out, clipped" in w for w in fit.notes)
     assert np.abs(scores(unit, fit)).max() < 5
 
@@ -199,7 +198,7 @@ def faster(factor):
 )
 def test_a_wrong_unit_or_sample_rate_is_no_result(options, words):
     _, record, attitudes, recording = campaign(4, **options)
-    both = with_gyro(record, fit_gyro(record, attitudes, recording), recording, recording)
+    both = with_gyro(record, fit_gyro_triad(record, attitudes, recording), recording, recording)
     (warning,) = [w for w in both.warnings if words in w]
     assert isinstance(warning, Bad)
     assert both.verdict.state == "bad"
@@ -210,8 +209,10 @@ def test_three_scale_factors_that_are_off_alike_are_said():
     alike = recording.with_columns(
         {f"gyro_{a}": 1.02 * recording.columns[f"gyro_{a}"] / unit.scale[i] for i, a in enumerate("xyz")}, {}
     )
-    assert any("all by the same" in w for w in said(record, fit_gyro(record, attitudes, alike), alike))
-    assert not any("all by the same" in w for w in said(record, fit_gyro(record, attitudes, recording), recording))
+    assert any("all by the same" in w for w in said(record, fit_gyro_triad(record, attitudes, alike), alike))
+    assert not any(
+        "all by the same" in w for w in said(record, fit_gyro_triad(record, attitudes, recording), recording)
+    )
 
 
 def test_a_g_sensitivity_with_which_turns_miss_more_is_not_taken_by_itself():
@@ -224,10 +225,12 @@ def test_a_g_sensitivity_with_which_turns_miss_more_is_not_taken_by_itself():
         still |= (recording.columns["time"] >= a) & (recording.columns["time"] <= b)
     only_at_rest = {f"gyro_{a}": recording.columns[f"gyro_{a}"] + extra[:, i] * still for i, a in enumerate("xyz")}
     everywhere = {f"gyro_{a}": recording.columns[f"gyro_{a}"] + extra[:, i] for i, a in enumerate("xyz")}
-    assert fit_gyro(record, attitudes, recording.with_columns(everywhere, {})).sensitivity is not None
-    fit = fit_gyro(record, attitudes, recording.with_columns(only_at_rest, {}))
+    assert fit_gyro_triad(record, attitudes, recording.with_columns(everywhere, {})).sensitivity is not None
+    fit = fit_gyro_triad(record, attitudes, recording.with_columns(only_at_rest, {}))
     assert fit.sensitivity is None
-    assert fit_gyro(record, attitudes, recording.with_columns(only_at_rest, {}), sensitivity="yes").cost > fit.cost
+    assert (
+        fit_gyro_triad(record, attitudes, recording.with_columns(only_at_rest, {}), sensitivity="yes").cost > fit.cost
+    )
     assert np.abs(scores(unit, fit)[:9]).max() < 5
 
 
@@ -238,7 +241,7 @@ def test_a_g_sensitivity_with_which_turns_miss_more_is_not_taken_by_itself():
 def test_options_that_cannot_be_are_refused(options, words):
     _, record, attitudes, recording = campaign(1)
     with pytest.raises(OptionError, match=words):
-        fit_gyro(record, attitudes, recording, **options)
+        fit_gyro_triad(record, attitudes, recording, **options)
 
 
 def test_the_command_takes_the_clock(imulab, tmp_path):
@@ -284,12 +287,12 @@ def test_stamps_that_jitter_are_evened_where_the_turns_say_that_the_samples_do_n
     for seed in range(8):
         for size in (0.004, 0.04):
             unit, record, attitudes, recording = campaign(seed, change=jittered(size))
-            fit = fit_gyro(record, attitudes, recording)
+            fit = fit_gyro_triad(record, attitudes, recording)
             assert any("jitter by" in w for w in fit.notes)
             assert np.abs(scores(unit, fit)).max() < 5
             plain += (fit.scale_factor / unit.scale - 1).tolist()
         unit, record, attitudes, recording = campaign(seed, change=polled)
-        fit = fit_gyro(record, attitudes, recording)
+        fit = fit_gyro_triad(record, attitudes, recording)
         assert not any("jitter by" in w for w in fit.notes)
         wrong += (fit.scale_factor / unit.scale - 1).tolist()
     assert np.sqrt(np.mean(np.square(plain))) < 6e-5  # 790 ppm at 0.04 s as they come
@@ -300,7 +303,7 @@ def test_counted_time_stamps_are_noted_unless_the_clock_is_stated():
     _, record, attitudes, recording = campaign(1)
     assert any(
         "--clock 10000ppm" in w and isinstance(w, Note)
-        for w in said(record, fit_gyro(record, attitudes, recording), recording)
+        for w in said(record, fit_gyro_triad(record, attitudes, recording), recording)
     )
-    stated = fit_gyro(record, attitudes, recording, clock=0.01)
+    stated = fit_gyro_triad(record, attitudes, recording, clock=0.01)
     assert not any("--clock" in w for w in said(record, stated, recording))

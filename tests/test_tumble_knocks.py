@@ -8,11 +8,11 @@ import pytest
 
 import imulab as il
 from conftest import table
+from imulab.display import Note
 from imulab.errors import OptionError
-from imulab.procedures.reports import exhibits_of
-from imulab.procedures.tumble.gyro import fit_gyro
-from imulab.procedures.tumble.outliers import _best_subset, _extended, _Whitened
-from imulab.verdict import Note
+from imulab.procedures.tumble.gyro.fit import fit_gyro_triad
+from imulab.procedures.tumble.orders import _best_subset, _extended, _Whitened
+from imulab.procedures.views import exhibits_of
 from reference import tumble as reference
 
 G = 9.80665
@@ -165,6 +165,6 @@ def test_turns_beside_an_attitude_that_was_set_aside_are_left_out():
     knocked = replace(attitudes, mean=mean)
     record = il.fit_tumble(knocked, order=1, gravity=G).calibration
     assert record.fit["set_aside"] == [10]
-    clean, found = (fit_gyro(record, held, recording) for held in (attitudes, knocked))
+    clean, found = (fit_gyro_triad(record, held, recording) for held in (attitudes, knocked))
     assert len(found.residuals) == len(clean.residuals) - 2
     assert any("2 turns left out, beside attitudes that the record set aside (10)" in note for note in found.notes)

@@ -9,6 +9,7 @@ from scipy import optimize
 
 import madeup
 from imulab.device.unit import DeviceUnit
+from imulab.procedures.apply import tables_of
 from imulab.procedures.tumble.model import (
     fit_lengths,
     invert,
@@ -17,7 +18,6 @@ from imulab.procedures.tumble.model import (
     norm_and_jacobian,
     parameter_names,
 )
-from imulab.procedures.unit_tables import tables_of
 from reference import tumble as reference
 
 G = 9.80665

@@ -8,9 +8,9 @@ from scipy import stats
 
 import imulab as il
 from conftest import sap5_table, table
+from imulab.display import Note
 from imulab.errors import ObservabilityError, OptionError
-from imulab.procedures.tumble.plan import plan_tumble
-from imulab.verdict import Note
+from imulab.procedures.tumble.plan import plan_attitudes
 from reference import tumble as reference
 
 G = 9.80665
@@ -20,7 +20,7 @@ SAP5 = ("ab", "ai", "bh", "fb", "hj", "hj2")
 
 @pytest.fixture(scope="module")
 def planned():
-    return plan_tumble(order=3, attitudes=24).directions
+    return plan_attitudes(order=3, attitudes=24).directions
 
 
 def triad(rng, k2=0.0, k3=0.0):

@@ -8,7 +8,7 @@ import pytest
 import imulab as il
 from conftest import table
 from imulab.procedures.tumble.attitudes import Trace
-from imulab.procedures.tumble.patterns import FALSE_ALARM
+from imulab.procedures.tumble.orders import FALSE_ALARM
 from reference import tumble as reference
 
 G = 9.80665

@@ -10,14 +10,16 @@ from scipy.spatial.transform import Rotation
 import imulab as il
 from imulab.errors import ObservabilityError, OptionError
 from imulab.procedures.tumble.plan import (
+    attitude_picture,
+    directions_of,
     fixture_candidates,
     head_candidates,
     information_rows,
-    plan_tumble,
+    plan_attitudes,
+    plan_recording,
     roll_pitch,
     turning,
 )
-from imulab.procedures.tumble.sheet import attitude_picture, directions_of, plan_recording
 from imulab.records.calibration import Calibration, Covariance
 from reference import tumble as reference
 
@@ -41,7 +43,7 @@ def worst(plan, stem):
 )
 def test_plans_are_no_worse_than_the_table_of_the_method(count, order, table):
     """Worst axis per unit noise, chosen by A-optimality; the table has two digits, so half of the last is added."""
-    plan = plan_tumble(order=order, attitudes=count)
+    plan = plan_attitudes(order=order, attitudes=count)
     for stem, value in table.items():
         assert worst(plan, stem) < value + 0.05, stem
 
@@ -49,7 +51,7 @@ def test_plans_are_no_worse_than_the_table_of_the_method(count, order, table):
 @pytest.mark.parametrize(("count", "order"), [(24, 2), (24, 4), (48, 3)])
 def test_the_axes_of_a_plan_are_alike_at_no_cost_in_the_sum(count, order):
     """x, y and z of each kind within 4 %, the sum within 1 % of the least that is found without balancing."""
-    plan = plan_tumble(order=order, attitudes=count)
+    plan = plan_attitudes(order=order, attitudes=count)
     variance = np.diag(plan.covariance).reshape(-1, 3)
     assert np.sqrt(variance.max(axis=1) / variance.min(axis=1)).max() < 1.04
     least = {(24, 2): 8.2386, (24, 4): 191.69, (48, 3): 15.990}[count, order]  # of seeds 1 to 8
@@ -58,7 +60,7 @@ def test_the_axes_of_a_plan_are_alike_at_no_cost_in_the_sum(count, order):
 
 @pytest.mark.parametrize("criterion", ["A", "D"])
 def test_a_plan_is_better_in_its_criterion_than_random_attitudes_and_than_the_other(criterion):
-    plans = {c: plan_tumble(order=4, attitudes=18, criterion=c) for c in "AD"}
+    plans = {c: plan_attitudes(order=4, attitudes=18, criterion=c) for c in "AD"}
     cost = {
         "A": lambda plan: np.trace(plan.covariance),
         "D": lambda plan: np.linalg.slogdet(plan.covariance)[1],
@@ -71,7 +73,7 @@ def test_a_plan_is_better_in_its_criterion_than_random_attitudes_and_than_the_ot
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_the_prediction_is_the_cramer_rao_bound_of_a_nominal_sensor(order):
-    plan = plan_tumble(order=order, attitudes=3 * (order + 2) + 4)
+    plan = plan_attitudes(order=order, attitudes=3 * (order + 2) + 4)
     truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(order)}
     noise = 1e-5
     bound = reference.bound(plan.directions, truth, order, G, np.full((len(plan.directions), 3), noise * G))
@@ -81,7 +83,7 @@ def test_the_prediction_is_the_cramer_rao_bound_of_a_nominal_sensor(order):
 
 
 def test_no_two_attitudes_have_the_same_axis_vertical():
-    plan = plan_tumble(order=1, attitudes=60)
+    plan = plan_attitudes(order=1, attitudes=60)
     cosine = plan.directions @ plan.directions.T - 2 * np.eye(60)
     assert np.degrees(np.arccos(cosine.max())) >= 2.999
 
@@ -96,22 +98,22 @@ def test_no_two_attitudes_have_the_same_axis_vertical():
 )
 def test_a_plan_with_distinct_verticals_has_no_axis_vertical_twice(order, attitudes, candidates):
     """Within 5 degrees, up or down; without the rule, or with z vertical before, plans differ as they must."""
-    plan = plan_tumble(order=order, attitudes=attitudes, candidates=candidates, distinct_verticals=True)
+    plan = plan_attitudes(order=order, attitudes=attitudes, candidates=candidates, distinct_verticals=True)
     vertical = np.abs(plan.directions) > np.cos(np.radians(5))
     assert vertical.sum(axis=0).max() <= 1
     assert len(plan.directions) == attitudes
     assert plan.again == []
-    free = plan_tumble(order=order, attitudes=attitudes, candidates=candidates)
+    free = plan_attitudes(order=order, attitudes=attitudes, candidates=candidates)
     assert np.trace(plan.covariance) < 1.3 * np.trace(free.covariance)
 
 
 def test_distinct_verticals_count_what_is_there_and_refuse_what_cannot_be():
     up = np.array([[0.0, 0.0, 1.0]])
-    more = plan_tumble(order=1, attitudes=12, already=up, distinct_verticals=True)
+    more = plan_attitudes(order=1, attitudes=12, already=up, distinct_verticals=True)
     assert np.abs(more.directions[:, 2]).max() < np.cos(np.radians(5))
     cube = np.vstack([np.eye(3), -np.eye(3), separated(12)])
     with pytest.raises(OptionError, match=r"list: 1\d candidate attitudes lie 3 deg apart and repeat no vertical axis"):
-        plan_tumble(order=1, attitudes=18, candidates=cube, source="list", distinct_verticals=True)
+        plan_attitudes(order=1, attitudes=18, candidates=cube, source="list", distinct_verticals=True)
 
 
 def test_the_command_plans_for_the_linearised_method_and_says_when_attitudes_are_few(imulab, tmp_path):
@@ -149,7 +151,7 @@ def test_the_command_plans_for_the_linearised_method_and_says_when_attitudes_are
 @pytest.mark.parametrize("make", [fixture_candidates, head_candidates])
 def test_a_fixture_gets_only_attitudes_that_it_has(make):
     candidates = make(np.radians(15))
-    plan = plan_tumble(order=2, attitudes=18, candidates=candidates)
+    plan = plan_attitudes(order=2, attitudes=18, candidates=candidates)
     nearest = (plan.directions @ candidates.T).max(axis=1)
     np.testing.assert_allclose(nearest, 1.0, atol=1e-12)
     assert len(np.unique(np.round(plan.directions, 6), axis=0)) == 18
@@ -157,9 +159,9 @@ def test_a_fixture_gets_only_attitudes_that_it_has(make):
 
 def test_a_head_with_steps_of_90_degrees_is_blind():
     with pytest.raises(OptionError, match="6 different candidate attitudes; expected at least 9"):
-        plan_tumble(order=1, attitudes=9, candidates=head_candidates(np.radians(90)))
+        plan_attitudes(order=1, attitudes=9, candidates=head_candidates(np.radians(90)))
     with pytest.raises(ObservabilityError, match="misalignment_zx misalignment_zy"):
-        plan_tumble(
+        plan_attitudes(
             order=1, attitudes=9, candidates=np.vstack([np.eye(3), -np.eye(3), [[0.6, 0.8, 0]] * 2, np.eye(3) + 1e-3])
         )
 
@@ -178,9 +180,9 @@ def test_attitudes_are_put_down_twice_for_want_of_others():
     apart = separated(24)
     twin = apart[0] + np.radians(1) * np.cross(apart[0], [1.0, 0, 0])
     listed = np.vstack([apart[:23], twin / np.linalg.norm(twin)])
-    alone = plan_tumble(order=2, attitudes=23, candidates=listed)
+    alone = plan_attitudes(order=2, attitudes=23, candidates=listed)
     assert alone.again == []
-    plan = plan_tumble(order=2, attitudes=24, candidates=listed, source="list.csv")
+    plan = plan_attitudes(order=2, attitudes=24, candidates=listed, source="list.csv")
     ((one, other),) = plan.again
     assert other == 24  # after all others
     np.testing.assert_allclose(plan.directions[one - 1], plan.directions[23], atol=np.radians(3))
@@ -190,14 +192,14 @@ def test_attitudes_are_put_down_twice_for_want_of_others():
         for i in (information_rows(np.vstack([apart[:23], up]), 2) for up in apart[:23])
     )
     assert np.trace(plan.covariance) == pytest.approx(best, rel=1e-3)
-    more = plan_tumble(order=2, attitudes=6, candidates=apart, already=apart)
+    more = plan_attitudes(order=2, attitudes=6, candidates=apart, already=apart)
     assert more.again == []
     assert (more.directions @ apart.T).max(axis=1) == pytest.approx(np.ones(6))
 
 
 def test_a_fixture_of_eighteen_positions_serves_forty_holds_evenly():
     ups = separated(18)
-    plan = plan_tumble(order=2, attitudes=40, candidates=ups)
+    plan = plan_attitudes(order=2, attitudes=40, candidates=ups)
     times = np.bincount(np.argmax(plan.directions @ ups.T, axis=1), minlength=18)
     assert set(times) == {2, 3}
     assert sorted(np.argmax(plan.directions[:18] @ ups.T, axis=1)) == list(range(18))
@@ -205,7 +207,7 @@ def test_a_fixture_of_eighteen_positions_serves_forty_holds_evenly():
 
 def test_attitudes_already_there_are_taken_into_account():
     faces = np.vstack([np.eye(3), -np.eye(3)])
-    more = plan_tumble(order=1, attitudes=6, already=faces)
+    more = plan_attitudes(order=1, attitudes=6, already=faces)
     assert more.already == 6
     rng = np.random.default_rng(1)
     truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)}
@@ -219,20 +221,20 @@ def test_attitudes_already_there_are_taken_into_account():
 
 
 def test_roll_and_pitch_are_those_of_another_library():
-    plan = plan_tumble(order=2, attitudes=20)
+    plan = plan_attitudes(order=2, attitudes=20)
     for up, (roll, pitch) in zip(plan.directions, roll_pitch(plan.directions), strict=True):
         body_to_level = Rotation.from_euler("ZYX", [0.3, pitch, roll])
         np.testing.assert_allclose(body_to_level.inv().apply([0, 0, 1]), up, atol=1e-12)
 
 
 def test_the_order_turns_less_than_the_list_as_chosen():
-    plan = plan_tumble(order=4, attitudes=48)
+    plan = plan_attitudes(order=4, attitudes=48)
     shuffled = np.random.default_rng(1).permutation(plan.directions)
     assert turning(plan.directions) < 0.5 * turning(shuffled)
 
 
 def test_a_plan_reads_back_and_feeds_the_simulator_and_the_fit(tmp_path):
-    plan = plan_tumble(order=2, attitudes=18)
+    plan = plan_attitudes(order=2, attitudes=18)
     il.write_csv(plan_recording(plan), tmp_path / "plan.csv")
     read = directions_of(il.read(tmp_path / "plan.csv"))
     np.testing.assert_allclose(read, plan.directions, atol=1e-6)
@@ -263,7 +265,7 @@ def test_three_degrees_off_cost_a_tenth():
     """As the sheet says."""
     rng = np.random.default_rng(8)
     for order, count in ((1, 12), (2, 24), (4, 24)):
-        plan = plan_tumble(order=order, attitudes=count)
+        plan = plan_attitudes(order=order, attitudes=count)
         planned, worst = np.sqrt(np.diag(plan.covariance)), []
         for _ in range(100):
             off = plan.directions + np.radians(3) / np.sqrt(2) * rng.standard_normal((count, 3))
@@ -291,7 +293,7 @@ def test_pictures_show_the_face_that_is_up():
 )
 def test_impossible_plans_are_refused(options, message):
     with pytest.raises(OptionError, match=message):
-        plan_tumble(**options)
+        plan_attitudes(**options)
 
 
 def test_the_command_writes_a_plan_and_a_sheet(imulab, tmp_path):

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import madeup
-from imulab.device.gyroscopes import monotone_range
-from imulab.device.tables import KINDS, pack
+from imulab.device.tables import KINDS, monotone_range, pack
 from imulab.device.unit import ArraySettings, DeviceUnit, array_table
 from imulab.errors import RecordError
-from imulab.procedures.unit_tables import tables_of
+from imulab.procedures.apply import tables_of
 from imulab.procedures.warmup.device import warmup_table
 from imulab.records.calibration import Parameter
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 import imulab as il
+from imulab.display import Bad, Note, Verdict, verdict_of
 from imulab.errors import RecordError
-from imulab.procedures.loading import loads
+from imulab.procedures.registry import loads
 from imulab.procedures.tumble.simulate import simulate_tumble
-from imulab.records.json_text import content_sha256
-from imulab.verdict import Bad, Note, Verdict, verdict_of
+from imulab.records.calibration import content_sha256
 
 
 @pytest.fixture(scope="module")

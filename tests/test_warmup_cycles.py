@@ -7,8 +7,7 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError, UnitError
-from imulab.procedures.warmup.curves import bin_edges
-from imulab.procedures.warmup.cycles import common_axes, find_power_cycle, gauss_nodes, merge
+from imulab.procedures.warmup.cycles import bin_edges, common_axes, find_power_cycle, gauss_nodes, merge
 from imulab.recording import Recording
 
 

@@ -9,11 +9,9 @@ from scipy.stats import binom
 import imulab as il
 from imulab import simulate_power_cycle
 from imulab.errors import DataError
-from imulab.procedures.warmup.curves import make_curves
-from imulab.procedures.warmup.cycles import find_power_cycle
-from imulab.procedures.warmup.model import evaluate
+from imulab.procedures.warmup.cycles import find_power_cycle, make_curves
+from imulab.procedures.warmup.model import coefficient_covariance, evaluate, solve, statistics
 from imulab.procedures.warmup.simulate import warmup_truth
-from imulab.procedures.warmup.solve import coefficient_covariance, solve, statistics
 from imulab.recording import Recording
 from reference import warmup as reference
 

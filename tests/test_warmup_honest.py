@@ -11,12 +11,12 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
+from imulab.display import Bad
 from imulab.exporters import export
-from imulab.procedures.loading import load_any
-from imulab.procedures.reports import exhibits_of
+from imulab.procedures.registry import load_any
+from imulab.procedures.views import exhibits_of
 from imulab.procedures.warmup.fit import fit_warmup
 from imulab.procedures.warmup.model import evaluate, record_table
-from imulab.verdict import Bad
 
 AT = (-20.0, 0.0, 20.0)
 AXES = ("gyro_x", "gyro_y")

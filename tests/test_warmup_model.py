@@ -6,8 +6,7 @@ from scipy.interpolate import PchipInterpolator
 
 from few_bits import evaluate_float32, to_int16
 from imulab.errors import RecordError
-from imulab.procedures.warmup.model import WarmupTable, edge_jumps, evaluate, exit_jump, table_from
-from imulab.procedures.warmup.solve import amplitude_slopes
+from imulab.procedures.warmup.model import WarmupTable, amplitude_slopes, edge_jumps, evaluate, exit_jump, table_from
 from reference import warmup as reference
 
 AT = np.array([-40.0, -30, -20, -10, 0, 40, 50, 60])

@@ -7,10 +7,8 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError, OptionError
-from imulab.procedures.warmup.curves import make_curves
-from imulab.procedures.warmup.cycles import find_power_cycle
-from imulab.procedures.warmup.model import evaluate
-from imulab.procedures.warmup.solve import coefficients_of, fitted_noise, solve, statistics
+from imulab.procedures.warmup.cycles import find_power_cycle, make_curves
+from imulab.procedures.warmup.model import coefficients_of, evaluate, fitted_noise, solve, statistics
 from imulab.recording import Recording
 from test_warmup_fit import END, HOUR, cycle_of
 

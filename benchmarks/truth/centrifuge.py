@@ -9,7 +9,7 @@ import numpy as np
 from _centrifuge_rig import G, Rig
 from scenario import Scenario, Trial
 
-from imulab.verdict import Note
+from imulab.display import Note
 
 _FORCES = np.array([1.0, 5.0, 10.0, 15.0, 20.0]) * G
 _ONE = Rig()

@@ -11,10 +11,9 @@ from scenario import Scenario, Trial
 from scipy.stats import t as student
 
 import imulab as il
+from imulab.display import Note
 from imulab.errors import ImulabError
-from imulab.procedures.tumble.gyro import fit_gyro
-from imulab.procedures.tumble.gyrorecord import with_gyro
-from imulab.verdict import Note
+from imulab.procedures.tumble.gyro.fit import fit_gyro_triad, with_gyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 from reference import moving_array, turns
@@ -72,7 +71,7 @@ def gyro(
     try:
         attitudes = il.find_attitudes(accelerometers)
         record = il.fit_tumble(attitudes, order=1, gravity=turns.GRAVITY).calibration
-        fit = fit_gyro(record, attitudes, recording, clock_of=clock_of)
+        fit = fit_gyro_triad(record, attitudes, recording, clock_of=clock_of)
         both = with_gyro(record, fit, recording, accelerometers)
     except ImulabError as error:
         return Trial(warned=words in str(error))

@@ -26,7 +26,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from imulab._version import VERSION as __version__  # noqa: N811
-from imulab.views import Views, hand_down
+from imulab.display import Views, hand_down
 
 if TYPE_CHECKING:
     from imulab.errors import ImulabError as ImulabError
@@ -34,14 +34,12 @@ if TYPE_CHECKING:
     from imulab.fleet.run import fleet_status as fleet_status
     from imulab.fleet.run import run_fleet as run_fleet
     from imulab.gravity import normal_gravity as normal_gravity
-    from imulab.procedures.allan import allan_deviation as allan_deviation
     from imulab.procedures.apply import apply as apply
     from imulab.procedures.centrifuge.fit import CentrifugeFit as CentrifugeFit
     from imulab.procedures.centrifuge.fit import fit_centrifuge as fit_centrifuge
     from imulab.procedures.centrifuge.manifest import load_manifest as load_manifest
     from imulab.procedures.centrifuge.plan import plan_centrifuge as plan_centrifuge
-    from imulab.procedures.centrifuge.rig import simulate_centrifuge as simulate_centrifuge
-    from imulab.procedures.changes import compare_records as compare_records
+    from imulab.procedures.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
     from imulab.procedures.exporting import export as export
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
@@ -51,7 +49,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.public import fuse as fuse
     from imulab.procedures.gyro_array.public import merge_array as merge_array
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
-    from imulab.procedures.loading import load as load
+    from imulab.procedures.noise.allan import allan_deviation as allan_deviation
     from imulab.procedures.noise.check import check_noise as check_noise
     from imulab.procedures.noise.fit import NoiseFit as NoiseFit
     from imulab.procedures.noise.fit import fit_noise as fit_noise
@@ -63,23 +61,25 @@ if TYPE_CHECKING:
     from imulab.procedures.rate.simulate import simulate_rate as simulate_rate
     from imulab.procedures.rate.turns import TurnsFit as TurnsFit
     from imulab.procedures.rate.turns import fit_turns as fit_turns
-    from imulab.procedures.reports import write_report as write_report
+    from imulab.procedures.registry import load as load
     from imulab.procedures.thermal.check import check_thermal as check_thermal
     from imulab.procedures.thermal.fit import ThermalFit as ThermalFit
     from imulab.procedures.thermal.fit import fit_thermal as fit_thermal
     from imulab.procedures.thermal.plan import plan_thermal as plan_thermal
     from imulab.procedures.thermal.simulate import simulate_thermal as simulate_thermal
     from imulab.procedures.tumble.attitudes import Attitudes as Attitudes
-    from imulab.procedures.tumble.compare import check_tumble as check_tumble
+    from imulab.procedures.tumble.attitudes import find_attitudes as find_attitudes
+    from imulab.procedures.tumble.check import check_tumble as check_tumble
     from imulab.procedures.tumble.fit import TumbleFit as TumbleFit
     from imulab.procedures.tumble.fit import fit_tumble as fit_tumble
-    from imulab.procedures.tumble.gyrofit import fit_gyro as fit_gyro
+    from imulab.procedures.tumble.gyro.fit import fit_gyro as fit_gyro
     from imulab.procedures.tumble.mag.fit import MagFit as MagFit
     from imulab.procedures.tumble.mag.fit import fit_mag as fit_mag
-    from imulab.procedures.tumble.planning import plan_tumble as plan_tumble
-    from imulab.procedures.tumble.segment import find_attitudes as find_attitudes
+    from imulab.procedures.tumble.plan import plan_tumble as plan_tumble
+    from imulab.procedures.tumble.simulate import simulate_fleet as simulate_fleet
     from imulab.procedures.tumble.simulate import simulate_tumble as simulate_tumble
-    from imulab.procedures.tumble.simulated_line import simulate_fleet as simulate_fleet
+    from imulab.procedures.views import compare_records as compare_records
+    from imulab.procedures.views import write_report as write_report
     from imulab.procedures.warmup.cycles import find_power_cycle as find_power_cycle
     from imulab.procedures.warmup.fit import WarmupFit as WarmupFit
     from imulab.procedures.warmup.fit import fit_warmup as fit_warmup
@@ -89,7 +89,7 @@ if TYPE_CHECKING:
     from imulab.procedures.warmup.spreadsheet import warmup_table as warmup_table
     from imulab.readers import read as read
     from imulab.readers import read_blocks as read_blocks
-    from imulab.readers.join import join_recordings as join_recordings
+    from imulab.readers.streams import join_recordings as join_recordings
     from imulab.recording import Recording as Recording
     from imulab.records.calibration import Calibration as Calibration
     from imulab.writers import write as write
@@ -99,11 +99,11 @@ _HOME = {
     "ArrayFit": "procedures.gyro_array.fit",
     "FuseOptions": "procedures.gyro_array.fuse",
     "Fused": "procedures.gyro_array.fused",
-    "allan_deviation": "procedures.allan",
+    "allan_deviation": "procedures.noise.allan",
     "calibrate_array": "procedures.gyro_array.public",
     "check_noise": "procedures.noise.check",
     "check_thermal": "procedures.thermal.check",
-    "check_tumble": "procedures.tumble.compare",
+    "check_tumble": "procedures.tumble.check",
     "compare_methods": "procedures.gyro_array.public",
     "fuse": "procedures.gyro_array.public",
     "run_fleet": "fleet.run",
@@ -121,11 +121,11 @@ _HOME = {
     "TumbleFit": "procedures.tumble.fit",
     "WarmupFit": "procedures.warmup.fit",
     "apply": "procedures.apply",
-    "compare_records": "procedures.changes",
+    "compare_records": "procedures.views",
     "export": "procedures.exporting",
-    "find_attitudes": "procedures.tumble.segment",
+    "find_attitudes": "procedures.tumble.attitudes",
     "find_power_cycle": "procedures.warmup.cycles",
-    "fit_gyro": "procedures.tumble.gyrofit",
+    "fit_gyro": "procedures.tumble.gyro.fit",
     "fit_mag": "procedures.tumble.mag.fit",
     "NoiseFit": "procedures.noise.fit",
     "fit_noise": "procedures.noise.fit",
@@ -135,21 +135,21 @@ _HOME = {
     "fit_tumble": "procedures.tumble.fit",
     "fit_warmup": "procedures.warmup.fit",
     "fleet_status": "fleet.run",
-    "join_recordings": "readers.join",
-    "load": "procedures.loading",
+    "join_recordings": "readers.streams",
+    "load": "procedures.registry",
     "load_manifest": "procedures.centrifuge.manifest",
     "merge_array": "procedures.gyro_array.public",
     "normal_gravity": "gravity",
     "plan_centrifuge": "procedures.centrifuge.plan",
     "plan_noise": "procedures.noise.plan",
     "plan_rate": "procedures.rate.plan",
-    "plan_tumble": "procedures.tumble.planning",
+    "plan_tumble": "procedures.tumble.plan",
     "plan_thermal": "procedures.thermal.plan",
     "plan_warmup": "procedures.warmup.plan",
     "read": "readers",
     "read_blocks": "readers",
-    "simulate_centrifuge": "procedures.centrifuge.rig",
-    "simulate_fleet": "procedures.tumble.simulated_line",
+    "simulate_centrifuge": "procedures.centrifuge.simulate",
+    "simulate_fleet": "procedures.tumble.simulate",
     "simulate_noise": "procedures.noise.simulate",
     "simulate_power_cycle": "procedures.warmup.simulate",
     "simulate_rate": "procedures.rate.simulate",
@@ -160,7 +160,7 @@ _HOME = {
     "write": "writers",
     "write_csv": "writers",
     "write_fleet_report": "fleet.report",
-    "write_report": "procedures.reports",
+    "write_report": "procedures.views",
 }
 
 __all__ = ["__version__", *_HOME]

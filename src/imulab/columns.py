@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from imulab.display import has_hidden
 from imulab.errors import UnitError, quoted
-from imulab.printable import has_hidden
 from imulab.units import parse_unit
 
 

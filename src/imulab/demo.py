@@ -12,13 +12,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from imulab.atomic_write import write_text
+from imulab.display import Verdict
 from imulab.errors import ImulabError, OptionError
-from imulab.procedures.loading import load
-from imulab.procedures.reports import exhibits_of
+from imulab.files import write_text
+from imulab.procedures.registry import load
+from imulab.procedures.views import exhibits_of
 from imulab.report import Card, render_index
-from imulab.report.elements import Figure
-from imulab.verdict import Verdict
+from imulab.report.traces import Figure
 
 
 @dataclass(frozen=True)

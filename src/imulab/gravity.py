@@ -1,4 +1,6 @@
-"""Local gravity: as stated, as normal gravity on and above the WGS 84 ellipsoid, or as a recording's head says.
+"""Local gravity, and the Earth's rate in a unit at rest.
+
+Gravity is as stated, normal gravity on and above the WGS 84 ellipsoid, or what a recording's head says.
 
 Source: NIMA TR8350.2 (World Geodetic System 1984), third edition, equations 4-1 (Somigliana) and 4-3
 (second-order free-air); constants from its tables 3.3 and 3.4.
@@ -12,13 +14,17 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from imulab.display import Note
 from imulab.errors import OptionError, quoted
 from imulab.quantities import in_si, quantity, with_uncertainty
 from imulab.units import STANDARD_GRAVITY, from_si
-from imulab.verdict import Note
 
 if TYPE_CHECKING:
     from imulab.recording import Recording
+
+
+# Local gravity: as stated, as normal gravity on and above the WGS 84 ellipsoid, or as a recording's head says.
+
 
 _EQUATORIAL_GRAVITY = 9.7803253359  # m/s^2
 _SOMIGLIANA_K = 0.00193185265241
@@ -318,3 +324,46 @@ def normal_gravity(latitude: float | str, height: float | str = 0.0) -> float:
     ratio = height / _SEMI_MAJOR_AXIS
     free_air = 1 - 2 * (1 + _FLATTENING + _M - 2 * _FLATTENING * sine_squared) * ratio + 3 * ratio**2
     return on_ellipsoid * free_air
+
+
+# The Earth's rate in a unit at rest: along the vertical known by the latitude, across it of unknown heading.
+
+
+EARTH = 7.292115e-5
+"""Rate of the Earth, rad/s (WGS 84)."""
+
+
+@dataclass(frozen=True)
+class EarthRate:
+    """The Earth's rate at a latitude, rad: north of the equator it points up, south of it down."""
+
+    latitude: float
+
+    @property
+    def vertical(self) -> float:
+        """Its part along up, rad/s."""
+        return EARTH * math.sin(self.latitude)
+
+    @property
+    def level(self) -> float:
+        """The size of its level part, to the north, rad/s."""
+        return EARTH * math.cos(self.latitude)
+
+    def note(self) -> Note:
+        """Return what a record says of it."""
+        vertical, level = (f"{from_si(rate, 'deg/h'):.1f} deg/h" for rate in (self.vertical, self.level))
+        return Note(
+            f"gyro: of the Earth's rate at latitude {math.degrees(self.latitude):.4g} deg the vertical part, "
+            f"{vertical}, was taken off; the level part, {level}, whose heading is unknown, is in the uncertainties"
+        )
+
+
+def at_latitude(latitude: float | str | None, name: str = "latitude") -> EarthRate | None:
+    """Return the Earth's rate at a latitude, rad or a text, None where none is given; `name` is what messages call it.
+
+    Raises
+    ------
+    OptionError
+        It is no latitude.
+    """
+    return None if latitude is None else EarthRate(checked_latitude(in_si(latitude, name, "angle", "deg"), name))

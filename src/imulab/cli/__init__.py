@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from imulab.printable import printable
+from imulab.display import printable
 
 _INTERRUPTED, _INTERRUPTED_PIPE, _TERMINATED = 130, 141, 143  # 128 + the signal, as a shell reports it
 
@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None, *, project: bool = True) -> int
     # Before NumPy is loaded: the matrices here are small, and threads for them cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        from imulab.cli.speech import begin
+        from imulab.cli.options import begin
 
         with begin(project=project):
             return _main(arguments)
@@ -41,7 +41,7 @@ def _main(arguments: Sequence[str] | None) -> int:
 
     from imulab.cli.app import command
     from imulab.cli.common import usage
-    from imulab.cli.speech import explained, release
+    from imulab.cli.options import explained, release
     from imulab.errors import ImulabError
 
     for stream in (sys.stdout, sys.stderr):

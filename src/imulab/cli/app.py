@@ -100,7 +100,14 @@ def command(arguments: Sequence[str] = ()) -> Any:
         _module("records").add_commands(app)
     for name in _SINGLE:
         if name in wanted:
-            app.command(name)(getattr(_module(name), name))
+            app.command(name)(
+                getattr(
+                    _module(
+                        {"allan": "noise", "convert": "records", "export": "records", "open": "live"}.get(name, name)
+                    ),
+                    name,
+                )
+            )
     root: Any = typer.main.get_command(app)
     for path, summary in _SUMMARIES.items():
         found = root

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from json import dumps
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import one_of, reading, with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -18,23 +18,106 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    one_of,
     progress_bar,
     quantity,
+    reading,
     warn,
     whole_number,
     with_notes,
+    with_options,
 )
-from imulab.device.methods import METHODS, STARTS
+from imulab.device import METHODS, STARTS
+from imulab.display import aligned
 from imulab.errors import OptionError
-from imulab.procedures.gyro_array.choices import EXPERIMENTS, FAULTS, MOUNTINGS, OF_THE_SOURCE, UNITS
-from imulab.procedures.gyro_array.task import MEMORY, METHOD, OPTIONS
-from imulab.procedures.options import READING
+from imulab.procedures.gyro_array import EXPERIMENTS, FAULTS, MOUNTINGS, OF_THE_SOURCE, UNITS
+from imulab.procedures.gyro_array.compare import Comparison, ExperimentRow
+from imulab.procedures.gyro_array.elements import unit_of_angle
+from imulab.procedures.gyro_array.figures import method_texts
+from imulab.procedures.gyro_array.procedure import MEMORY, METHOD, OPTIONS
+from imulab.procedures.procedure import READING
+from imulab.report.traces import plain_number
 
 if TYPE_CHECKING:
-    from imulab.device.blob import Blob
+    from imulab.device.unit import Blob
     from imulab.procedures.gyro_array.fuse import Fuser
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
+
+
+# What the array commands print.
+
+
+_TITLE = {
+    "static": "at rest, 100 Hz, 2000 s",
+    "dynamic": "on a rate table, -12.5 cos(0.2 pi t - 0.2 pi) deg/s, 50 Hz, 100 s",
+}
+
+
+def describe_experiment(name: str, seeds: int, rows: list[ExperimentRow]) -> str:
+    """Return the two tables of an experiment: without and with a calibrated start."""
+    lines = [f"{name}: 6 gyros {_TITLE[name]}; medians of {seeds} seeds"]
+    for calibrated in (False, True):
+        lines += ["", f"{'with' if calibrated else 'without'} a calibrated start"]
+        body = [
+            [r.method, *(plain_number(v, 4) for v in (r.rate_std, r.rate_max, r.angle_std, r.angle_max))]
+            for r in rows
+            if r.calibrated == calibrated
+        ]
+        lines += aligned(["method", "rate std deg/s", "rate max deg/s", "angle std deg", "angle max deg"], body)
+    return "\n".join(lines)
+
+
+def experiment_json(name: str, seeds: int, rows: list[ExperimentRow]) -> str:
+    """Return the same as JSON."""
+    return dumps({"experiment": name, "seeds": seeds, "rows": [asdict(row) for row in rows]}, indent=1)
+
+
+def describe_comparison(found: Comparison) -> str:
+    """Return a table of all seven methods for each axis."""
+    model, data = found.record.model, found.record.data
+    lines = [
+        f"{found.elements.count} gyros on each axis, {found.record.fit['samples']} samples at "
+        f"{found.record.fit['sample_rate']['value']:.6g} Hz; truth: {model['truth']}"
+    ]
+    for a, axis in enumerate(found.elements.axes):
+        unit = found.elements.units[a]
+        angle, factor = unit_of_angle(unit)
+        halves = any(not isinstance(rows, str) and rows[a].split_half is not None for rows in found.figures.values())
+        titles = [
+            "method", f"rate std {unit}", f"rate max {unit}", f"angle std {angle}", f"angle max {angle}", "reduction",
+            "noise/limit", "bandwidth Hz", *([f"split-half {unit}"] if halves else []),
+        ]  # fmt: skip
+        body, reasons = [], []
+        for method, rows in found.figures.items():
+            if isinstance(rows, str):
+                body.append([method, *["–"] * (len(titles) - 1)])
+                reasons.append(f"({method} cannot run: {rows})")
+                continue
+            body.append([method, *method_texts(rows[a], factor, 4, halves=halves)])
+        lines += ["", *([f"axis {axis}"] if axis else []), *aligned(titles, body), *reasons]
+        lines.append(
+            f"single gyro, mean of {_gyros_of_mean(found.elements.names[a], data['working'][a])}: "
+            f"{plain_number(data['single'][a], 4)} {unit}; limit of one sample {plain_number(data['limit'][a], 4)} "
+            f"{unit}"
+        )
+    lines.append(
+        "rate std with the mean removed; reduction: single gyro over method; bandwidth at -3 dB, half the sampling "
+        "rate where nothing is filtered"
+    )
+    return "\n".join(lines)
+
+
+def _gyros_of_mean(names: Sequence[str], working: Sequence[str]) -> str:
+    """Return which gyros the mean single gyro is the mean of."""
+    if len(working) == len(names):
+        return "all"
+    failed = " ".join(name for name in names if name not in working)
+    return f"the {len(working)} that work (not {failed})" if working else "none"
+
+
+# ``imulab array``: simulate, merge, calibrate, fuse and compare.
+
 
 _METHOD = replace(METHOD, help=f"{' '.join(METHODS)}; the calibration's, or robust.")
 _MEMORY = replace(MEMORY, help="growing, growing:COUNT, or a gain between 0 and 1; the calibration's, or growing.")
@@ -128,8 +211,8 @@ def calibrate(
     json: AsJson = False,
 ) -> None:
     """Calibrate an array's elements: bias, noise and correlation at rest; sign and scale or alignment in motion."""
-    from imulab.cli.result import finish
-    from imulab.procedures.run import run_task
+    from imulab.cli.show import finish
+    from imulab.procedures.registry import run_task
 
     check_outputs([output, report], [name for name in (still, moving, options["layout"], options["noise"]) if name])
     files = [still] if moving is None else [still, moving]
@@ -151,8 +234,7 @@ def fuse(
     output: OutputFile = None,
 ) -> None:
     """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes."""
-    from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser
-    from imulab.procedures.gyro_array.memory import carried, fusion_text
+    from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, carried, fusion_text
     from imulab.quantities import interval
     from imulab.readers import read_blocks
     from imulab.writers import check_writable, write, write_csv_to
@@ -189,8 +271,8 @@ def fuse(
 def _load(name: str, option: str) -> Calibration:
     from pathlib import Path
 
-    from imulab.procedures.gyro_array.model import check_calibration
-    from imulab.procedures.loading import load
+    from imulab.procedures.gyro_array.elements import check_calibration
+    from imulab.procedures.registry import load
 
     if option == "--initial-bias" and not Path(name).exists():
         raise OptionError(f"--initial-bias {name!r}: expected first, zero, or the file of a record")
@@ -200,9 +282,9 @@ def _load(name: str, option: str) -> Calibration:
 
 
 def _load_any(name: str) -> Calibration | Blob:
-    from imulab.device.blob import Blob
-    from imulab.procedures.gyro_array.model import check_calibration
-    from imulab.procedures.loading import load_any
+    from imulab.device.unit import Blob
+    from imulab.procedures.gyro_array.elements import check_calibration
+    from imulab.procedures.registry import load_any
 
     record = load_any(name)
     if not isinstance(record, Blob):
@@ -222,7 +304,7 @@ def _flushed(first: Recording, rest: Iterator[Recording]) -> Iterator[Recording]
 def _print_findings(fuser: Fuser, *, verdict: bool) -> None:
     """Print what there is to know of what was fused; the verdict first, where standard output is not the rate."""
     from imulab.cli.show import verdict_line
-    from imulab.verdict import verdict_of
+    from imulab.display import verdict_of
 
     lines = fuser.notes() + (fuser.health.lines() if fuser.health is not None else [])
     if verdict:
@@ -244,8 +326,7 @@ def compare(
     json: AsJson = False,
 ) -> None:
     """Run every method over one recording, or over the source's experiments, and say what fusing buys."""
-    from imulab.cli import arraytext
-    from imulab.cli.result import write_both
+    from imulab.cli.show import write_both
 
     if (file is None) == (experiment is None):
         raise OptionError("array compare: expected FILE, or --experiment static|dynamic")
@@ -255,19 +336,15 @@ def compare(
     if experiment is not None:
         if output or report or options["memory"]:
             raise OptionError("array compare: -o, --report and --memory need a FILE")
-        from imulab.procedures.gyro_array.experiments import run_experiment
+        from imulab.procedures.gyro_array.compare import run_experiment
 
         with progress_bar("seeds", count) as progress:
             rows = run_experiment(experiment, seeds=count, progress=progress)
-        print(
-            arraytext.experiment_json(experiment, count, rows)
-            if json
-            else arraytext.experiment(experiment, count, rows)
-        )
+        print(experiment_json(experiment, count, rows) if json else describe_experiment(experiment, count, rows))
         return
     from imulab.cli.show import verdict_line
     from imulab.procedures.gyro_array.compare import compare_methods
-    from imulab.procedures.gyro_array.memory import carried, fusion_text
+    from imulab.procedures.gyro_array.fuse import carried, fusion_text
     from imulab.readers import read
 
     record = None if calibration is None else _load(calibration, "--calibration")
@@ -277,7 +354,7 @@ def compare(
     write_both(comparison.record, output, report)
     if not json:
         print(verdict_line(comparison.record.verdict))
-    print(comparison.record.to_json().rstrip("\n") if json else arraytext.comparison(comparison))
+    print(comparison.record.to_json().rstrip("\n") if json else describe_comparison(comparison))
     for name, what in ((output, "record"), (report, "report")):
         if name and not json:
             print(f"{what}: {name}")

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -16,10 +15,11 @@ from imulab.cli.options import (
     check_outputs,
     progress_bar,
     warn,
+    with_options,
 )
+from imulab.display import aligned
 from imulab.errors import OptionError
-from imulab.procedures.centrifuge.task import OPTIONS
-from imulab.shown import aligned
+from imulab.procedures.centrifuge.procedure import OPTIONS
 
 if TYPE_CHECKING:
     from imulab.procedures.centrifuge.plan import Plan
@@ -104,7 +104,7 @@ def simulate(
     """Simulate the test of a tuned gyroscope of 3.3 deg/h/g: a manifest, a CSV file for each run, and the truth."""
     from pathlib import Path
 
-    from imulab.procedures.centrifuge.rig import simulate_centrifuge
+    from imulab.procedures.centrifuge.simulate import simulate_centrifuge
 
     if manifest is not None:
         for name in ("levels", "radius", "net_rate", "cycles", "both_senses"):
@@ -139,9 +139,9 @@ def reduce(
     """
     from pathlib import Path
 
-    from imulab.cli.result import finish
+    from imulab.cli.show import finish
     from imulab.procedures.centrifuge.manifest import load_manifest
-    from imulab.procedures.run import run_task
+    from imulab.procedures.registry import run_task
 
     test = load_manifest(manifest)
     files = [str(Path(manifest).parent / run.file) for run in test.runs]
@@ -152,7 +152,7 @@ def reduce(
 
 
 def _plan_json(result: Plan) -> str:
-    from imulab.records.json_text import json_text
+    from imulab.records.calibration import json_text
 
     def of(value: float | None, unit: str) -> dict[str, Any]:
         return {"value": None if value is None or value == float("inf") else value, "unit": unit}

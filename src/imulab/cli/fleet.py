@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import one_of
-from imulab.cli.options import AsJson, call, check_outputs, progress_bar, warn
+from imulab.cli.options import AsJson, call, check_outputs, one_of, progress_bar, warn
+from imulab.display import SENTENCES
 from imulab.errors import OptionError
 from imulab.fleet import ENGINES
-from imulab.verdict import SENTENCES
 
 if TYPE_CHECKING:
     from imulab.fleet.run import FleetState
@@ -134,7 +133,7 @@ def simulate(
     Recordings of two calibrations of each unit, two manifests and limits. The zero of z drifts over the units, unit 5
     is far off, and unit 7 changes between its two calibrations.
     """
-    from imulab.procedures.tumble.simulated_line import simulate_fleet
+    from imulab.procedures.tumble.simulate import simulate_fleet
 
     if not output:
         raise OptionError("output '': expected the name of a folder to write to")

@@ -1,26 +1,143 @@
-"""``imulab live``: a guided test while the unit is connected, from the plug to the record."""
+"""``imulab live``.
+
+A guided test while the unit is connected, in the terminal or on a page; ``imulab open``, the workbench.
+"""
 
 from __future__ import annotations
 
+import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imulab.cli.fit_options import with_options
-from imulab.cli.live_page import NoBrowser, PageHost, PagePort, again, checked_page, on_page
-from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, whole_number
+from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, warn, whole_number, with_options
 from imulab.errors import OptionError
-from imulab.procedures.options import FLAG, LAYOUT
-from imulab.procedures.tumble.task import GRAVITY, ORDER, TASK
+from imulab.procedures.procedure import FLAG, LAYOUT
+from imulab.procedures.tumble.procedure import GRAVITY, ORDER, TASK
 
 if TYPE_CHECKING:
+    from imulab.live.page.bench import Workbench
+    from imulab.live.page.files import Files
     from imulab.live.runner import Runner
     from imulab.reading import Layout
     from imulab.records.calibration import Calibration
+
+
+# What `imulab live --page` and `imulab open` share: the options of the page, and a session that is shown there.
+
+
+FOLDER = "imulab-files"
+_NOT_OFFERED = ("live", "open", "demo", "fleet ")
+PagePort = Annotated[str | None, typer.Option("--port", metavar="N", help="Port of the page; a free one if not given.")]
+PageHost = Annotated[
+    str | None,
+    typer.Option(
+        "--host", metavar="ADDRESS", help="Address of this machine to listen at, for others; 0.0.0.0 or ::, all."
+    ),
+]
+NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Print the address of the page, and open no browser.")]
+
+
+def port_number(text: str | None) -> int:
+    """Return the port to listen at; 0, a free one, of None."""
+    port = 0 if text is None else whole_number(text, "--port")
+    if not 0 <= port <= 65535:
+        raise OptionError(f"--port {port}: expected 0 (a free one) to 65535")
+    return port
+
+
+def checked_host(text: str | None) -> str | None:
+    """Return the address to listen at, with a warning where others reach it; None, this machine alone, of None."""
+    if text is not None and text not in ("localhost", "::1") and not text.startswith("127."):
+        warn(f"whoever reaches {text} and has the address below can use the page; it is not encrypted")
+    return text
+
+
+def checked_page(page: bool, port: str | None, host: str | None, *, no_browser: bool, plain: bool) -> int | None:
+    """Return the port of the page, None where there is to be none."""
+    if not page:
+        for given, name in ((port, "--port"), (host, "--host"), (no_browser or None, "--no-browser")):
+            if given is not None:
+                raise OptionError(f"{name}: expected --page with it")
+        return None
+    if plain:
+        raise OptionError("--page together with --plain: expected one or the other")
+    from imulab.live.page import require_server
+
+    require_server()
+    return port_number(port)
+
+
+def again(save: str, texts: Mapping[str, str | None], output: str | None, record: Calibration) -> str:
+    """Return the command that makes the same record from the recording."""
+    from imulab.live.view import FURTHER
+
+    given = [word for key, text in texts.items() if text is not None for word in (f"--{key}", text)]
+    further = [name for name in FURTHER if f"{name}_bias_x" in record.parameters]
+    others = ["--with", ",".join(further)] if further else []
+    return shlex.join(["imulab", "tumble", "fit", save, *given, *others, *(["-o", output] if output else [])])
+
+
+def workbench(given: Sequence[str] = (), later: Sequence[str] = ()) -> tuple[Workbench, Files]:
+    """Return the workbench and its files: those of its folder, those given, and those that may come later."""
+    from imulab.cli.app import command
+    from imulab.cli.common import commands_of
+    from imulab.live.page.bench import Workbench
+    from imulab.live.page.files import Files
+    from imulab.live.page.jobs import forms
+
+    offered = [(path, each) for path, each in commands_of(command()) if not path.startswith(_NOT_OFFERED)]
+    files = Files(Path(FOLDER), given, later)
+    return Workbench(files, forms(offered)), files
+
+
+def on_page(
+    runner: Runner,
+    made: Callable[[], Calibration],
+    command: Callable[[Calibration], str],
+    outputs: Sequence[str | None],
+    *,
+    port: int,
+    host: str | None,
+    browser: bool,
+) -> None:
+    """Show a session on the page, the workbench beside it, until it is ended there or by Ctrl-C.
+
+    `outputs` are the names of the record, None where none was given, and of the other files to be written.
+
+    Raises
+    ------
+    ImulabError
+        Why the session ended, where it was no ordinary end.
+    KeyboardInterrupt
+        It was ended before there was a record.
+    """
+    from imulab.live.page.guided import GuidedPart
+    from imulab.live.page.server import serve
+
+    part = GuidedPart(runner, made, command, Path(outputs[0] or "record.json").name)
+    bench, files = workbench(later=[name for name in (runner.recorder.path, *outputs) if name])
+    try:
+        serve([part, bench], port, host=checked_host(host), browser=browser)
+    except KeyboardInterrupt:
+        if part.record is None:
+            raise
+    else:
+        if part.record is None and part.error is None:
+            note(runner.kept())
+    finally:
+        files.end()
+    if part.error is not None:
+        raise part.error
+
+
+# ``imulab live``: a guided test while the unit is connected, from the plug to the record.
+
 
 _WAIT = 0.05
 _EVERY = 0.1
@@ -60,10 +177,10 @@ def live(
 
     The recording is written out every second; at its end the record is that of `imulab tumble fit` on it.
     """
+    from imulab.live.guide import read_targets
     from imulab.live.runner import Runner
     from imulab.live.session import Session
     from imulab.live.sources import open_source
-    from imulab.live.targets import read_targets
 
     if source == "serial:":
         _list_ports()
@@ -95,7 +212,7 @@ def live(
 
 def _make_record(save: str, fitted: dict[str, str | None], output: str | None, report: str | None) -> Calibration:
     """Fit the recording with all triads that it has, write and show the record, and say how to make it."""
-    from imulab.cli.result import finish
+    from imulab.cli.show import finish
 
     record, further, why = _all_triads(save, fitted)
     finish(record, output, report, json=False)
@@ -105,8 +222,8 @@ def _make_record(save: str, fitted: dict[str, str | None], output: str | None, r
 
 def _all_triads(save: str, fitted: dict[str, str | None]) -> tuple[Calibration, list[str], list[str]]:
     """Fit a recording; a further triad that is refused is left out, so that no session is in vain. Return why, too."""
-    from imulab.live.further import fit_triads, further_of
-    from imulab.procedures.run import run_task
+    from imulab.live.view import fit_triads, further_of
+    from imulab.procedures.registry import run_task
     from imulab.readers import read
 
     def fit(further: list[str]) -> Calibration:
@@ -191,8 +308,8 @@ def _corrected(runner: Runner, record: Calibration) -> None:
 
     from rich.live import Live
 
-    from imulab.live.corrected import corrected_reading
     from imulab.live.terminal import keys, pressed
+    from imulab.live.view import corrected_reading
     from imulab.procedures.apply import loaded
 
     ready, gravity = loaded(record), runner.session.guide.local_gravity
@@ -240,3 +357,34 @@ def _drawn(runner: Runner, *, typed: bool) -> None:
             if events or monotonic() - drawn > _EVERY:
                 screen.update(draw(runner.session.view(), *screen.console.size, by_hand=by_hand), refresh=True)
                 drawn = monotonic()
+
+
+# ``imulab open``: the workbench, in the browser of this machine.
+
+
+def open(  # noqa: A001 -- the name of the command
+    files: Annotated[
+        list[str] | None, typer.Argument(metavar="[FILE...]", help="Recordings and records to begin with.")
+    ] = None,
+    port: PagePort = None,
+    host: PageHost = None,
+    no_browser: NoBrowser = False,
+) -> None:
+    """Open the workbench in the browser: drop a recording, see it, calibrate it, take record, report and firmware.
+
+    Prints one line with the address, which only this machine reaches. What is dropped or made is kept in the folder
+    imulab-files. Ctrl-C ends it.
+    """
+    from imulab.live.page import require_server
+
+    number = port_number(port)
+    require_server()
+    from imulab.live.page.server import serve
+
+    part, session = workbench(files or [])
+    session.make()
+    try:
+        serve([part], number, host=checked_host(host), browser=not no_browser)
+    finally:
+        if session.end():
+            note(f"what was dropped and made is in {FOLDER}")

@@ -1,4 +1,4 @@
-"""``imulab noise``: fit, plan, check, simulate."""
+"""``imulab noise``: fit, plan, check, simulate; and ``imulab allan``, the noise of any recording."""
 
 from __future__ import annotations
 
@@ -7,21 +7,28 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import READ, lists, reading, with_options
 from imulab.cli.options import (
+    READ,
     AsJson,
     GivenFiles,
     OutputFile,
     RecordFile,
+    RecordingFile,
     ReportFile,
     call,
     check_outputs,
+    lists,
     note,
+    one_of,
     quantity,
+    reading,
     warn,
+    with_options,
 )
+from imulab.display import printable
 from imulab.errors import OptionError, RecordError
-from imulab.procedures.noise.task import OPTIONS
+from imulab.estimation import TAUS
+from imulab.procedures.noise.procedure import OPTIONS
 from imulab.quantities import labelled
 
 if TYPE_CHECKING:
@@ -30,6 +37,69 @@ if TYPE_CHECKING:
     from imulab.estimation.noise.rest import Rest
     from imulab.procedures.noise.plan import NoisePlan
     from imulab.recording import Recording
+
+
+# ``imulab allan``: the noise of any recording.
+
+
+@with_options(READ)
+def allan(
+    file: RecordingFile,
+    *,
+    taus: Annotated[str, one_of(TAUS, "dense: 24 a decade.")] = "octave",
+    options: dict[str, str | None],
+    report: ReportFile = None,
+    json: AsJson = False,
+) -> None:
+    """Print Allan deviation and noise coefficients of every sensor column of a recording at rest."""
+    from imulab.estimation.column_noise import analyse
+    from imulab.readers import read, read_blocks
+    from imulab.recording import is_large, on_disk
+
+    check_outputs([report], [name for name in (file, options["layout"]) if name])
+    how = reading(options)
+    recording = on_disk(read_blocks(file, **how)) if is_large(file) else read(file, **how)
+    with labelled("--{}", ["taus"]):
+        found = analyse(recording, taus)
+    if report:
+        from imulab.files import write_text
+        from imulab.report.noise_figures import noise_page
+
+        write_text(report, noise_page(found, recording))
+    if json:
+        from json import dumps
+
+        print(dumps(found, indent=1, ensure_ascii=False, allow_nan=False))
+    else:
+        print(describe(found))
+        if report:
+            print(f"report: {report}")
+    for message in found["warnings"]:
+        warn(message)
+
+
+def describe(found: dict[str, Any]) -> str:
+    """Return coefficients and curves as tables."""
+    from imulab.display import aligned
+    from imulab.report.noise_figures import coefficient_rows, shown_unit
+    from imulab.report.traces import plain_number
+
+    lines = [f"{printable(found['file'])}: {found['samples']} samples at {found['sample_rate']['value']:.6g} Hz", ""]
+    lines += aligned(["column", "coefficient", "value", "u", "unit"], coefficient_rows(found))
+    names = list(found["columns"])
+    units = {name: shown_unit(found["columns"][name]["unit"], "bias_instability") for name in names}
+    lines += ["", "Allan deviation"]
+    tau = found["columns"][names[0]]["tau"]
+    body = [
+        [plain_number(t, 4), *(plain_number(found["columns"][n]["deviation"][k] * units[n][1], 4) for n in names)]
+        for k, t in enumerate(tau)
+    ]
+    lines += aligned(["tau s", *(f"{n} {units[n][0]}" for n in names)], body)
+    return "\n".join(lines)
+
+
+# ``imulab noise``: fit, plan, check, simulate.
+
 
 White = Annotated[
     str | None, typer.Option(metavar="N", help="White noise, 0.3 deg/sqrt(h) or 100 ug/sqrt(Hz); SI without a unit.")
@@ -79,9 +149,9 @@ def fit(
 
     Prints the terms with their 95 % intervals, and what a filter wants; -o writes the record, --report its figures.
     """
-    from imulab.cli.result import finish
+    from imulab.cli.show import finish
     from imulab.procedures.noise.wants import check_program, noise_for
-    from imulab.procedures.run import run_task
+    from imulab.procedures.registry import run_task
 
     check_outputs([output, report], [*files, *([options["layout"]] if options["layout"] else [])])
     hertz = None if rate is None else quantity(rate, "--rate", "frequency", "Hz")
@@ -119,8 +189,8 @@ def plan(
     json: AsJson = False,
 ) -> None:
     """Say how long to record at rest for a wanted accuracy of each noise term."""
+    from imulab.display import aligned
     from imulab.procedures.noise.plan import plan_noise
-    from imulab.shown import aligned
 
     check_outputs([output], [source] if source else [])
     if output is not None and not output.lower().endswith(".csv"):
@@ -141,8 +211,8 @@ def plan(
 
 
 def _print_plan(result: NoisePlan) -> None:
-    from imulab.procedures.noise.record import unit_of
-    from imulab.records.json_text import json_text
+    from imulab.procedures.noise.fit import unit_of
+    from imulab.records.calibration import json_text
 
     terms = [
         {
@@ -182,13 +252,12 @@ def check(
 
     Several logs add up. Says what differs by how much; a log that is of the same noise fails once in twenty tests.
     """
-    from imulab.cli.speech import coloured
-    from imulab.procedures.loading import load
-    from imulab.procedures.noise.check import check_logs
-    from imulab.procedures.noise.checkfigures import as_json, as_text, check_page
-    from imulab.procedures.noise.logs import read_log
+    from imulab.cli.options import coloured
+    from imulab.display import Note
+    from imulab.procedures.noise.check import as_json, as_text, check_logs, check_page
+    from imulab.procedures.noise.fit import read_log
     from imulab.procedures.procedure import source_of
-    from imulab.verdict import Note
+    from imulab.procedures.registry import load
 
     check_outputs([report], [name for name in (record, *files, options["layout"]) if name])
     held = load(record)
@@ -208,11 +277,11 @@ def check(
         except RecordError as error:
             raise RecordError(f"{record}: {error}") from None
     if report:
-        from imulab.atomic_write import write_text
+        from imulab.files import write_text
 
         write_text(report, check_page(result, held, record=record, files=files))
     if json:
-        from imulab.records.json_text import json_text
+        from imulab.records.calibration import json_text
 
         print(json_text(as_json(result)), end="")
     else:

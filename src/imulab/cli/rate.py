@@ -6,15 +6,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import READ, reading, with_options
-from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs, read_recording, warn
+from imulab.cli.options import (
+    READ,
+    AsJson,
+    GivenFiles,
+    OutputFile,
+    ReportFile,
+    call,
+    check_outputs,
+    read_recording,
+    reading,
+    warn,
+    with_options,
+)
 from imulab.errors import OptionError
-from imulab.procedures.rate.choices import FENCE, RATES
-from imulab.procedures.rate.task import OPTIONS
+from imulab.procedures.rate import FENCE, RATES
+from imulab.procedures.rate.procedure import OPTIONS
 
 if TYPE_CHECKING:
-    from imulab.procedures.rate.plan import RatePlan
-    from imulab.procedures.rate.turnplan import TurnPlan
+    from imulab.procedures.rate.plan import RatePlan, TurnPlan
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
@@ -51,8 +61,8 @@ def plan(
     json: AsJson = False,
 ) -> None:
     """Say how long to stay at each rate and what the test will give, and write the manifest that rate fit takes."""
+    from imulab.display import aligned
     from imulab.procedures.rate.plan import RatePlan, plan_rate
-    from imulab.shown import aligned
 
     check_outputs([output], [noise] if noise else [])
     if output is not None and not output.lower().endswith((".toml", ".csv")):
@@ -76,7 +86,7 @@ def plan(
 
 def _plan_json(result: RatePlan | TurnPlan) -> str:
     from imulab.procedures.rate.plan import RatePlan
-    from imulab.records.json_text import json_text
+    from imulab.records.calibration import json_text
 
     if not isinstance(result, RatePlan):
         reached = [{"turns": n, "relative_uncertainty": u} for n, u in enumerate(result.reached.tolist(), 1)]
@@ -140,9 +150,9 @@ def fit(
     """
     from pathlib import Path
 
-    from imulab.cli.result import finish
-    from imulab.procedures.rate.manifest import load_test
-    from imulab.procedures.run import run_task
+    from imulab.cli.show import finish
+    from imulab.procedures.rate.schema import load_test
+    from imulab.procedures.registry import run_task
 
     runs = load_test(file).runs if file.lower().endswith(".toml") and "://" not in file else ()
     inputs = [file, options["layout"], options["accel"], options["prior"]]
@@ -173,7 +183,7 @@ def turn(
     json: AsJson = False,
 ) -> None:
     """Find the scale factors of gyroscopes from whole turns by hand against a fence, no equipment needed."""
-    from imulab.cli.result import finish
+    from imulab.cli.show import finish
     from imulab.procedures.rate.turns import fit_turns
 
     check_outputs([output, report], [name for name in (file, options["layout"], accel, prior) if name])

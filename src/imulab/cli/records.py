@@ -1,35 +1,140 @@
-"""Commands on records and recordings of every procedure: apply, show, report, demo."""
+"""Commands on records and recordings of every procedure: apply, show, report, demo, convert, export."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imulab.cli.convert import write_out
-from imulab.cli.fit_options import READ, reading, with_options
 from imulab.cli.options import (
+    READ,
     AsJson,
     OutputFile,
     RecordFile,
+    RecordingFile,
+    call,
     check_outputs,
     is_json,
+    lists,
     naming,
     note,
+    one_of,
     quantity,
+    reading,
     warn,
     with_notes,
+    with_options,
 )
 from imulab.errors import ImulabError, OptionError, RecordError
 
 if TYPE_CHECKING:
-    from imulab.device.blob import Blob
+    from imulab.device.unit import Blob
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
+
+
+# ``imulab convert``: any recording to native CSV or Parquet.
+
+
+@with_options(READ)
+def convert(
+    file: RecordingFile,
+    options: dict[str, str | None],
+    with_files: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with",
+            metavar="FILE[@LAYOUT]",
+            help="Another sensor of the same unit, on the same clock, whose columns are added; repeatable.",
+        ),
+    ] = None,
+    output: OutputFile = None,
+) -> None:
+    """Write a recording of any kind as native CSV or Parquet to OUT, or as CSV to standard output."""
+    from imulab.readers import read, read_blocks
+    from imulab.readers.streams import file_and_layout, join_recordings
+
+    others = [file_and_layout(text) for text in with_files or []]
+    inputs = [name for pair in ((file, options["layout"]), *others) for name in pair if name]
+    check_outputs([output], inputs)
+    blocks: Iterable[Recording] = read_blocks(file, **reading(options))
+    if others:
+        first = read(file, **reading(options))
+        blocks = [join_recordings(first, [read(other, layout) for other, layout in others])]
+    write_out(with_notes(blocks), output)
+
+
+def write_out(blocks: Iterable[Recording], output: str | None) -> None:
+    """Write blocks to a file by its ending, or as CSV to standard output."""
+    from imulab.writers import check_writable, write, write_csv_to
+
+    if output:
+        check_writable(output)
+        write(blocks, output)
+        return
+    # The first block is made before anything is written, so that a refusal leaves no head behind.
+    rest = iter(blocks)
+    write_csv_to(chain([next(rest)], rest), sys.stdout.buffer)
+    sys.stdout.buffer.flush()
+
+
+# ``imulab export``: records to firmware, autopilots and toolboxes.
+
+
+def export(
+    records: Annotated[list[str], typer.Argument(metavar="RECORD...", help="Calibration records of one unit.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="TARGET",
+            help="c blob px4 ardupilot kalibr openvins ros fusion motioncal.",
+            autocompletion=lists("imulab.exporters:EXPORTERS"),
+        ),
+    ],
+    output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")],
+    lossy: Annotated[
+        bool, typer.Option("--lossy", help="Leave out what the target cannot hold, and fit the rest anew.")
+    ] = False,
+    device_id: Annotated[str, typer.Option("--device-id", metavar="N", help="PX4: number of the sensor.")] = "0",
+    noise: Annotated[
+        str | None, typer.Option("--noise", metavar="FILE", help="Noise record, or what 'allan --json' printed.")
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option("--method", help="c, blob: how an array fuses; what its record carries if not given.")
+    ] = None,
+    memory: Annotated[
+        str | None, typer.Option("--memory", help="c, blob: growing, growing:COUNT, or a gain between 0 and 1.")
+    ] = None,
+    mag_mount: Annotated[
+        str,
+        one_of(
+            ("external", "internal"),
+            "px4, ardupilot: whether the magnetometers have a rotation of their own there, which holds their mounting.",
+            "--mag-mount",
+        ),
+    ] = "external",
+) -> None:
+    """Write calibration records in the form of firmware, an autopilot or a toolbox."""
+    from imulab.procedures.exporting import export as write
+
+    if not output:
+        raise OptionError("-o '': expected a folder to write to")
+    files = call(
+        write, to=to, records=records, folder=output, lossy=lossy, device_id=device_id, noise=noise, method=method,
+        memory=memory, mag_mount=mag_mount, tell=warn,
+    )  # fmt: skip
+    for file in files:
+        print(f"{to}: {file}")
+
+
+# Commands on records and recordings of every procedure: apply, show, report, demo.
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -60,10 +165,10 @@ def apply(
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
-    from imulab.power_on import with_power_on_temperature
     from imulab.procedures.apply import apply_blocks, loaded, with_heading
-    from imulab.procedures.loading import load_any
+    from imulab.procedures.registry import load_any
     from imulab.readers import read_blocks
+    from imulab.recording import with_power_on_temperature
 
     if len(files) < 2:
         raise OptionError("apply: expected at least one RECORD and the FILE to correct")
@@ -116,9 +221,9 @@ class _Rows:
 
 def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
-    from imulab.power_on import TAKEN_FROM
+    from imulab.display import Note
     from imulab.procedures.apply import results_in, warnings_of
-    from imulab.verdict import Note
+    from imulab.recording import TAKEN_FROM
 
     tests = results_in(records)
     counts, largest, name = [0] * len(tests), [0.0] * len(tests), ""
@@ -165,8 +270,8 @@ def show(
         return
     (file,) = files
     from imulab.cli.show import describe_blob, describe_record, describe_recording, recording_json
-    from imulab.device.blob import is_blob, load_blob
-    from imulab.procedures.loading import load
+    from imulab.device.unit import is_blob, load_blob
+    from imulab.procedures.registry import load
     from imulab.readers import read_blocks
 
     if options["layout"] is None and is_blob(file):
@@ -183,10 +288,10 @@ def show(
 
 def _show_formats(names: list[str], *, json: bool) -> None:
     """Print what can be read, or the layouts of these names."""
+    from imulab.display import aligned
+    from imulab.files import load_toml
     from imulab.readers import formats, shipped
     from imulab.readers.layout import EXAMPLE, shipped_file, shipped_names
-    from imulab.shown import aligned
-    from imulab.toml import load_toml
 
     tables = {}
     for name in names:
@@ -212,8 +317,8 @@ def _show_formats(names: list[str], *, json: bool) -> None:
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:
     from imulab.cli.show import describe_changes
-    from imulab.procedures.changes import compare_records
-    from imulab.procedures.loading import load
+    from imulab.procedures.registry import load
+    from imulab.procedures.views import compare_records
 
     records = [load(first), load(second)]
     comparison = compare_records(*records)
@@ -233,8 +338,8 @@ def report(
     output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.html", help="Report to write.")],
 ) -> None:
     """Draw the report of a record."""
-    from imulab.procedures.loading import load
-    from imulab.procedures.reports import write_report
+    from imulab.procedures.registry import load
+    from imulab.procedures.views import write_report
 
     check_outputs([output], [file])
     write_report(load(file), output)

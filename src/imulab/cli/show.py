@@ -1,28 +1,152 @@
-"""Records and recordings in a few lines of plain text."""
+"""Records, recordings and plans in a few lines of plain text, and what every fit does with its result."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from imulab.cli.speech import coloured
-from imulab.errors import ReadError
-from imulab.printable import printable
-from imulab.procedures.changes import TITLES, change_rows, verdict
-from imulab.procedures.reports import exhibits_of
+from imulab.cli.options import call, check_outputs, coloured, note, warn
+from imulab.display import SENTENCES, Verdict, aligned, printable
+from imulab.errors import OptionError, ReadError
+from imulab.files import replacing
+from imulab.procedures.tumble.model import parameter_units
+from imulab.procedures.tumble.plan import TumblePlan, plan_tumble, roll_pitch
+from imulab.procedures.views import TITLES, change_rows, exhibits_of, verdict
 from imulab.recording import Array, Recording
-from imulab.records.calibration import Calibration
+from imulab.records.calibration import Calibration, json_text
 from imulab.records.comparison import Comparison
-from imulab.records.json_text import json_text
-from imulab.report.elements import ReportTable
-from imulab.shown import aligned
-from imulab.verdict import SENTENCES, Verdict
+from imulab.report.traces import ReportTable
+from imulab.units import STANDARD_GRAVITY
+from imulab.writers import write_csv_to
 
 if TYPE_CHECKING:
-    from imulab.device.blob import Blob
+    from imulab.device.unit import Blob
+    from imulab.procedures.thermal.plan import ThermalPlan
+
+
+# What every fit does with its result: write it, print it, say what a user must know.
+
+
+def write_both(record: Calibration, output: str | None, report: str | None) -> None:
+    """Write a record and its report, both or none."""
+    from imulab.procedures.views import rendered
+
+    with ExitStack() as stack:
+        # Both files are opened before either is finished, so that neither is left alone behind an error.
+        to_record = stack.enter_context(replacing(output)) if output else None
+        to_report = stack.enter_context(replacing(report)) if report else None
+        if to_record:
+            to_record.write(record.to_json().encode("utf-8"))
+        if to_report:
+            to_report.write(rendered(record).encode("utf-8"))
+
+
+def finish(
+    record: Calibration,
+    output: str | None,
+    report: str | None,
+    *,
+    json: bool,
+    describe: Callable[[Calibration], str] | None = None,
+) -> None:
+    """Write a record and its report, both or none, and say what was found, in full or as `describe` has it."""
+    write_both(record, output, report)
+    if json:
+        print(record.to_json(), end="")
+    else:
+        print(describe(record) if describe else describe_record(record, provenance=False))
+        for name, what in ((output, "record"), (report, "report")):
+            if name:
+                print(f"{what}: {name}")
+    for message in record.warnings:
+        (warn if message in record.verdict.reasons else note)(message)
+
+
+# ``imulab tumble plan`` and ``thermal plan``: a plan to CSV, sheet and what is printed.
+
+
+def run(*, output: str | None, report: str | None, json: bool, **options: Any) -> None:
+    """Plan, print the prediction, and write what was asked for."""
+    check_plan_outputs(output, report, [name for name in (options["add"], options["from_"]) if name])
+    plan = call(plan_tumble, **options)
+    write_plan(plan, output, report)
+    if json:
+        print(_as_json(plan), end="")
+        return
+    lead, titles, rows = plan.shown()
+    print("\n".join([lead, *aligned(titles, rows)]))
+    say_written(output, report)
+
+
+def check_plan_outputs(output: str | None, report: str | None, inputs: list[str]) -> None:
+    """Check before the work that the plan can be written; errors as for `check_outputs`."""
+    check_outputs([output, report], inputs)
+    if output is not None and not output.lower().endswith(".csv"):
+        raise OptionError(f"{output}: expected a name that ends in .csv")
+
+
+def write_plan(plan: TumblePlan | ThermalPlan, output: str | None, report: str | None) -> None:
+    """Write the table and the sheet, both or neither."""
+    with ExitStack() as stack:
+        to_csv = stack.enter_context(replacing(output)) if output else None
+        to_sheet = stack.enter_context(replacing(report)) if report else None
+        if to_csv:
+            write_csv_to(plan.recording(), to_csv)
+        if to_sheet:
+            to_sheet.write(plan.sheet().encode("utf-8"))
+
+
+def say_written(output: str | None, report: str | None) -> None:
+    """Say what was written."""
+    for name, what in ((output, "plan"), (report, "sheet")):
+        if name:
+            print(f"{what}: {name}")
+
+
+def _as_json(plan: TumblePlan) -> str:
+    """Return the plan for scripts, in SI under the names of a record."""
+    angles = roll_pitch(plan.directions)
+    units = parameter_units(plan.order, "m/s^2")
+    # A bias in units of g is so many times gravity, a k_n in 1/g^(n-1) so many times its inverse power.
+    powers = {"m/s^2": 1, "1/(m/s^2)": -1} | {f"1/(m/s^2)^{n}": -n for n in range(2, plan.order)}
+    predicted = plan.uncertainties(plan.noise)
+    headings = plan.headings
+    attitudes = [
+        {"up": up, "roll": {"value": roll, "unit": "rad"}, "pitch": {"value": pitch, "unit": "rad"}}
+        for up, (roll, pitch) in zip(plan.directions.tolist(), angles.tolist(), strict=True)
+    ]
+    parameters = {
+        name: {"standard_uncertainty": u * STANDARD_GRAVITY ** powers.get(unit, 0), "unit": unit}
+        for (name, u), unit in zip(predicted.items(), units, strict=True)
+    }
+    if headings is not None:
+        for index, (attitude, north) in enumerate(zip(attitudes, headings.north.tolist(), strict=True)):
+            attitude |= {"north": north, "facing": headings.facing(index)}
+        parameters |= {
+            name: {"standard_uncertainty": u, "unit": "1" if name.startswith(("mag_bias", "mag_scale")) else "rad"}
+            for name, u in headings.uncertainties().items()
+        }
+    return json_text(
+        {
+            "order": plan.order,
+            "criterion": plan.criterion,
+            "condition_number": float(plan.condition_number),
+            "noise": {"value": plan.noise * STANDARD_GRAVITY, "unit": "m/s^2"},
+            "already": plan.already,
+            "warnings": [] if plan.finding is None else [plan.finding],
+            "attitudes": attitudes,
+            "again": [list(pair) for pair in plan.again],
+            "parameters": parameters,
+        }
+    )
+
+
+# Records and recordings in a few lines of plain text.
+
 
 _GAP = 1.5
 

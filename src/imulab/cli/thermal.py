@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import READ, one_of, reading, with_options
 from imulab.cli.options import (
+    READ,
     AsJson,
     GivenFiles,
     OutputFile,
@@ -17,15 +17,18 @@ from imulab.cli.options import (
     call,
     check_outputs,
     note,
+    one_of,
     read_recording,
+    reading,
     warn,
+    with_options,
 )
-from imulab.procedures.thermal.choices import LAWS, TEMPERATURES
-from imulab.procedures.thermal.task import OPTIONS
-from imulab.procedures.tumble.choices import STARTS
+from imulab.procedures.thermal import LAWS, TEMPERATURES
+from imulab.procedures.thermal.procedure import OPTIONS
+from imulab.procedures.tumble import STARTS
 
 if TYPE_CHECKING:
-    from imulab.procedures.thermal.planned import ThermalPlan
+    from imulab.procedures.thermal.plan import ThermalPlan
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
@@ -76,9 +79,9 @@ def plan(
     json: AsJson = False,
 ) -> None:
     """Choose soaks, temperatures and attitudes for the time there is, and say what the laws will give."""
-    from imulab.cli.plan import check_plan_outputs, say_written, write_plan
+    from imulab.cli.show import check_plan_outputs, say_written, write_plan
+    from imulab.display import aligned
     from imulab.procedures.thermal.plan import plan_thermal
-    from imulab.shown import aligned
 
     check_plan_outputs(output, report, [name for name in (noise, source) if Path(name).is_file()])
     made = call(
@@ -100,7 +103,7 @@ def plan(
 
 def _plan_json(made: ThermalPlan) -> str:
     """Return the plan for scripts, in SI."""
-    from imulab.records.json_text import json_text
+    from imulab.records.calibration import json_text
 
     def force(value: float) -> dict[str, Any]:
         return {"value": value, "unit": "m/s^2"}
@@ -188,8 +191,8 @@ def fit(
 
     Full and partial tumbles at several temperatures, and recordings at rest in which the temperature drifts.
     """
-    from imulab.cli.result import finish
-    from imulab.procedures.run import run_task
+    from imulab.cli.show import finish
+    from imulab.procedures.registry import run_task
 
     given = [name for name in (options["layout"], options["prior"]) if name]
     check_outputs([output, report], [*files, *given])
@@ -223,13 +226,12 @@ def check(
     Attitudes at any temperature within the record's range, or rest ramps. A record that still holds fails once in
     twenty tests.
     """
-    from imulab.cli.speech import coloured
+    from imulab.cli.options import coloured
+    from imulab.display import Note
     from imulab.errors import RecordError
     from imulab.procedures.apply import warnings_of
-    from imulab.procedures.loading import load
-    from imulab.procedures.thermal.check import check_thermal
-    from imulab.procedures.thermal.checkfigures import as_json, as_text, check_page
-    from imulab.verdict import Note
+    from imulab.procedures.registry import load
+    from imulab.procedures.thermal.check import as_json, as_text, check_page, check_thermal
 
     check_outputs([report], [name for name in (record, *files, options["layout"]) if name])
     held = load(record)
@@ -247,11 +249,11 @@ def check(
             for entry in one.corrected_by
         ]
     if report:
-        from imulab.atomic_write import write_text
+        from imulab.files import write_text
 
         write_text(report, check_page(found, held, record=record, files=files, warnings=notes))
     if json:
-        from imulab.records.json_text import json_text
+        from imulab.records.calibration import json_text
 
         print(json_text(as_json(found)), end="")
     else:

@@ -1,14 +1,16 @@
-"""``imulab tumble``: simulate and fit."""
+"""``imulab tumble``: simulate, fit and check."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
-from imulab.cli.fit_options import READ, one_of, reading, with_options
 from imulab.cli.options import (
+    READ,
     AsJson,
     GivenFiles,
     OutputFile,
@@ -17,28 +19,92 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    coloured,
+    one_of,
     progress_bar,
     quantity,
     read_recording,
+    reading,
     warn,
     whole_number,
+    with_options,
 )
-from imulab.cli.result import finish
-from imulab.procedures.options import FLAG
-from imulab.procedures.tumble.choices import (
-    CLOCKS,
-    CRITERIA,
-    HEMISPHERES,
-    LOSSES,
-    MAG_ORDERS,
-    METHODS,
-    SENSITIVITIES,
-    STARTS,
-)
-from imulab.procedures.tumble.task import GRAVITY, OPTIONS
+from imulab.cli.show import finish
+from imulab.procedures.procedure import FLAG
+from imulab.procedures.tumble import CLOCKS, CRITERIA, HEMISPHERES, LOSSES, MAG_ORDERS, METHODS, SENSITIVITIES, STARTS
+from imulab.procedures.tumble.check import meaning, measured, next_step, of_magnetometers
+from imulab.procedures.tumble.procedure import GRAVITY, OPTIONS
+from imulab.procedures.tumble.record import small_g
+from imulab.records.calibration import json_text
 
 if TYPE_CHECKING:
+    from imulab.procedures.tumble.attitudes import Attitudes
+    from imulab.procedures.tumble.check import Check
+    from imulab.procedures.tumble.mag.check import MagCheck
     from imulab.records.calibration import Calibration
+
+
+# ``imulab tumble check``: what a test of a record by fresh attitudes found, for people and for scripts.
+
+
+def as_text(check: Check, attitudes: Attitudes, held: Calibration, record: str, file: str) -> str:
+    """Return the verdict with its p, what to do next, and the residual of every attitude."""
+    lines = [
+        f"{coloured('pass' if check.passed else 'fail')}: {meaning(check)}",
+        *next_step(check, record, file),
+        measured(check, attitudes),
+        *of_magnetometers(check, attitudes, held.model.get("field", {}).get("unit", "1")),
+    ]
+    for index, value in enumerate(check.residuals.tolist()):
+        beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""
+        expected = ""
+        if check.standard_uncertainty is not None:
+            expected = f" ± {small_g(check.standard_uncertainty[index])}"
+        field = ""
+        if check.mag is not None:
+            field = f", |m| {100 * check.mag.magnitude[index]:+.2f} %, dip {np.degrees(check.mag.dip[index]):+.2f} deg"
+        lines.append(f"{attitudes.label(index)}: {small_g(value)}{expected}{field}{beyond}")
+    return "\n".join(lines)
+
+
+def as_json(check: Check, attitudes: Attitudes, notes: Sequence[str]) -> str:
+    """Return the same as JSON, in SI."""
+    uncertainty = [None] * len(attitudes) if check.standard_uncertainty is None else check.standard_uncertainty.tolist()
+    return json_text(
+        {
+            "verdict": "pass" if check.passed else "fail",
+            "p": check.probability,
+            "chi_square": check.chi_square,
+            "degrees_of_freedom": len(attitudes),
+            "limit": None if check.limit is None else {"value": check.limit, "unit": "m/s^2"},
+            "gravity": check.gravity.entry(),
+            "attitudes": [
+                {"label": attitudes.label(i), "residual": value, "standard_uncertainty": u}
+                for i, (value, u) in enumerate(zip(np.asarray(check.residuals).tolist(), uncertainty, strict=True))
+            ],
+            **({} if check.mag is None else {"mag": _of_mag(check.mag)}),
+            "notes": [str(note) for note in notes],
+        }
+    ).rstrip()
+
+
+def _of_mag(mag: MagCheck) -> dict[str, Any]:
+    return {
+        "p": mag.probability,
+        "common": {
+            name: {"value": value, "standard_uncertainty": u, "unit": unit}
+            for name, value, u, unit in zip(
+                ("magnitude", "dip"), mag.common.tolist(), mag.common_uncertainty.tolist(), ("1", "rad"), strict=True
+            )
+        },
+        "magnitude": mag.magnitude.tolist(),
+        "dip": {"value": mag.dip.tolist(), "unit": "rad"},
+        "hard_iron_change": {"value": mag.hard_iron.tolist(), "p": mag.explained},
+    }
+
+
+# ``imulab tumble``: simulate and fit.
+
 
 _OF_THE_RECORD = replace(GRAVITY[0], help="Local gravity, m/s^2; else of the file's head, else of the record.")
 _OF_THE_TRIAD = replace(GRAVITY[0], help="Local gravity, m/s^2; else of the accelerometers' record, else of the head.")
@@ -96,7 +162,7 @@ def plan(
     json: AsJson = False,
 ) -> None:
     """Choose the attitudes to measure, and predict the uncertainty of every parameter."""
-    from imulab.cli.plan import run
+    from imulab.cli.show import run
 
     run(
         output=output, report=report, json=json, attitudes=attitudes, noise=noise, order=order, criterion=criterion,
@@ -146,7 +212,7 @@ def fit(
 
     Prints what was found; -o writes the calibration record, --report its figures.
     """
-    from imulab.procedures.run import run_task
+    from imulab.procedures.registry import run_task
 
     check_outputs([output, report], [name for name in (file, options["layout"], options["prior"]) if name])
     trials = None if options["monte_carlo"] is None else whole_number(options["monte_carlo"], "--monte-carlo")
@@ -187,8 +253,8 @@ def gyro(
     json: AsJson = False,
 ) -> None:
     """Calibrate a gyroscope triad on top of the accelerometers' record; writes one record with both triads."""
-    from imulab.procedures.loading import load
-    from imulab.procedures.tumble.gyrofit import fit_gyro
+    from imulab.procedures.registry import load
+    from imulab.procedures.tumble.gyro.fit import fit_gyro
 
     inputs = [name for name in (file, accel, accel_file, options["layout"], accel_layout, noise) if name]
     check_outputs([output, report], inputs)
@@ -214,10 +280,10 @@ def gyro(
 def _of_gyroscopes(record: Calibration, accelerometers: str) -> str:
     """Return what a fit of the gyroscopes found, without the accelerometers, whose record it rests on."""
     from imulab.cli.show import verdict_line
-    from imulab.procedures.reports import exhibits_of
+    from imulab.display import aligned
     from imulab.procedures.tumble.figures import gyro_headline
-    from imulab.report.elements import ReportTable
-    from imulab.shown import aligned
+    from imulab.procedures.views import exhibits_of
+    from imulab.report.traces import ReportTable
 
     table = next(item for item in exhibits_of(record).items if isinstance(item, ReportTable))
     rows = [row for row in table.rows if row[0].startswith("gyro_")]
@@ -271,9 +337,9 @@ def mag(
 ) -> None:
     """Calibrate a magnetometer triad in the accelerometers' frame from the same attitudes, into one record of both."""
     from imulab.gravity import gravity_option
-    from imulab.procedures.loading import load
+    from imulab.procedures.registry import load
     from imulab.procedures.tumble.mag.fit import fit_mag
-    from imulab.procedures.tumble.mag.stated import stated_place
+    from imulab.procedures.tumble.mag.solve import stated_place
 
     check_outputs([output, report], [name for name in (file, accel, options["layout"]) if name])
     known = None if accel is None else load(accel)
@@ -301,13 +367,12 @@ def check(
 
     A record that still holds fails once in twenty tests.
     """
-    from imulab.cli.check import as_json, as_text
     from imulab.errors import RecordError
     from imulab.gravity import gravity_option
     from imulab.procedures.apply import warnings_of
-    from imulab.procedures.loading import load
-    from imulab.procedures.tumble.compare import check_tumble
-    from imulab.procedures.tumble.segment import find_attitudes
+    from imulab.procedures.registry import load
+    from imulab.procedures.tumble.attitudes import find_attitudes
+    from imulab.procedures.tumble.check import check_tumble
 
     check_outputs([report], [name for name in (record, file, options["layout"]) if name])
     held = load(record)
@@ -324,8 +389,8 @@ def check(
         corrected[-1] += "; a record is checked by what the unit puts out, so the test means nothing here"
     notes = (*corrected, *warnings_of(held, recording), *result.notes)
     if report:
-        from imulab.atomic_write import write_text
-        from imulab.procedures.tumble.checkfigures import check_page
+        from imulab.files import write_text
+        from imulab.procedures.tumble.check import check_page
 
         write_text(report, check_page(result, attitudes, held, record=record, file=file, warnings=notes))
     print(as_json(result, attitudes, notes) if json else as_text(result, attitudes, held, record, file))

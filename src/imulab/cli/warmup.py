@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import one_of, with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -15,11 +14,13 @@ from imulab.cli.options import (
     call,
     check_outputs,
     naming,
+    one_of,
     warn,
+    with_options,
 )
 from imulab.errors import OptionError
-from imulab.procedures.warmup.choices import LAWS, TEMPERATURES
-from imulab.procedures.warmup.task import OPTIONS
+from imulab.procedures.warmup import LAWS, TEMPERATURES
+from imulab.procedures.warmup.procedure import OPTIONS
 
 if TYPE_CHECKING:
     from imulab.procedures.warmup.plan import WarmupPlan
@@ -79,7 +80,7 @@ def plan(
 def _print_plan(result: WarmupPlan) -> None:
     from dataclasses import asdict
 
-    from imulab.records.json_text import json_text
+    from imulab.records.calibration import json_text
 
     print(
         json_text(
@@ -133,8 +134,8 @@ def fit(
 
     Prints the comparison of the models; -o writes the calibration record, --report its figures.
     """
-    from imulab.cli.result import finish
-    from imulab.procedures.run import run_task
+    from imulab.cli.show import finish
+    from imulab.procedures.registry import run_task
 
     check_outputs([output, report], [*files, *([options["layout"]] if options["layout"] else [])])
     finish(run_task("warmup", files, options, GivenFiles()), output, report, json=json)
@@ -149,7 +150,7 @@ def table(
 ) -> None:
     """Write a record's table as CSV for a spreadsheet, or make a record of such a table."""
     from imulab.cli.options import is_json
-    from imulab.device.blob import is_blob
+    from imulab.device.unit import is_blob
     from imulab.procedures.warmup.spreadsheet import warmup_table
 
     check_outputs([output], [file])

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from imulab.columns import INERTIAL, kind_of
+from imulab.display import Note
 from imulab.errors import DataError, OptionError
-from imulab.estimation.allan import AllanCurve, allan_deviation
-from imulab.estimation.noise.analysis import Analysis, analyses
-from imulab.estimation.noise.choice import CANDIDATES, average
-from imulab.estimation.noise.cosine import transformed
-from imulab.estimation.noise.plausible import doubtful_units
-from imulab.estimation.noise.readings import own_readings
+from imulab.estimation.noise.analysis import CANDIDATES, Analysis, analyses, average
+from imulab.estimation.noise.readings import doubtful_units, own_readings
+from imulab.estimation.noise.spectrum import transformed
 from imulab.estimation.noise.terms import allan_variance
 from imulab.estimation.noise_coefficients import (
+    AllanCurve,
     NoiseCoefficients,
+    allan_deviation,
     coefficients_dict,
     fits,
     mean_uncertainty,
@@ -29,12 +29,10 @@ from imulab.estimation.noise_coefficients import (
     undetermined,
     unseen,
 )
-from imulab.estimation.rows import leave_out
+from imulab.estimation.rows import Step, deviation_of_steps, find_step, leave_out
 from imulab.estimation.sampling import bridged, sampling_rate, steady_part
-from imulab.estimation.steps import Step, deviation_of_steps, find_step
 from imulab.recording import Array, Recording
 from imulab.units import from_si, parse_unit, si_unit
-from imulab.verdict import Note
 
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 """How far the zero of a sensor at rest may drift, SI, and the unit to say it in."""

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from imulab.disk import stored_as
 from imulab.errors import DataError
-from imulab.estimation.ranked import median, quantile
-from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.estimation.rows import median, quantile
+from imulab.recording import Array, Recording, check_finite, check_time, stored_as
 from imulab.units import to_si
 
 WIDEST_GAP = 10.0

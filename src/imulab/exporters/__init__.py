@@ -8,12 +8,23 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from imulab.device.array_settings import Fusion
+from imulab.device.tables import Fusion
 from imulab.errors import OptionError, listed
 from imulab.records.calibration import Calibration
 
-EXPORTERS = ("c", "blob", "px4", "ardupilot", "kalibr", "openvins", "ros", "fusion", "motioncal")
-"""Targets, a module each, which has ``export(records, folder, options) -> list of the files written``."""
+_HOMES = {
+    "c": "firmware_c",
+    "blob": "firmware_c",
+    "px4": "autopilots",
+    "ardupilot": "autopilots",
+    "kalibr": "kalibr",
+    "openvins": "kalibr",
+    "ros": "matrices",
+    "fusion": "matrices",
+    "motioncal": "matrices",
+}
+"""Targets and their modules, which have ``export_TARGET(records, folder, options) -> list of the files written``."""
+EXPORTERS = tuple(_HOMES)
 
 
 def _nothing(message: str) -> None:
@@ -64,5 +75,6 @@ def export(
     if target not in EXPORTERS:
         raise OptionError(f"unknown target {target!r}; known targets: {listed(EXPORTERS, target)}")
     chosen = options or ExportOptions()
-    files: list[Path] = import_module(f"imulab.exporters.{target}").export(records, Path(folder), chosen)
+    module = import_module(f"imulab.exporters.{_HOMES[target]}")
+    files: list[Path] = getattr(module, f"export_{target}")(records, Path(folder), chosen)
     return files

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from imulab._version import VERSION
-from imulab.atomic_write import write_text
+from imulab.display import printable
 from imulab.errors import OptionError, RecordError
 from imulab.exporters import ExportOptions
-from imulab.printable import printable
+from imulab.files import write_text
 from imulab.procedures.registry import PROCEDURES, procedure_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration

@@ -1,24 +1,252 @@
-"""What the report of a fleet shows: its parameters over units and dates, and what changed since last time."""
+"""What the report of a fleet shows.
+
+Parameters over units and dates, units that stand out, what changed since last time, and failures.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.errors import first_of
-from imulab.fleet import panels as small
-from imulab.fleet.display import Display, display_of
-from imulab.fleet.reporttables import number
+from imulab.fleet.run import FleetState
 from imulab.fleet.statistics import FEWEST_FOR_OUTLIERS, Drift, FleetChange, ParameterStatistics, change_limit
+from imulab.fleet.table import Display, Row, display_of
 from imulab.recording import Array
-from imulab.report import panels as grid
-from imulab.report.bulk import bulk, edge_marks, edge_note
-from imulab.report.elements import BAD, GOOD, QUIET, Figure
-from imulab.report.traces import rounded, scatter
+from imulab.report import traces as grid
+from imulab.report.traces import (
+    BAD,
+    GOOD,
+    QUIET,
+    Figure,
+    ReportTable,
+    bulk,
+    edge_marks,
+    edge_note,
+    format_uncertain,
+    plain_number,
+    rounded,
+    scatter,
+)
+
+# What is drawn in the panels of a fleet, one for each parameter.
+
+
+_DAYS = 4.0
+"""Dates that span no more than so many days are told apart by their time."""
+
+
+def staggered(marked: NDArray[np.bool_], top: int) -> list[float]:
+    """Return heights for marks at the side of a histogram, one below the other from above the highest bar down."""
+    order = np.cumsum(marked) - 1
+    return [round(top * (1.15 - 0.15 * (k % 7)), 3) for k in order.tolist()]
+
+
+def limits_in_view(item: ParameterStatistics, shown: Display, values: Array) -> list[float]:
+    """Return the limits of a parameter that lie near enough to the values that are shown to be drawn."""
+    if item.capability is None:
+        return []
+    limits = item.capability.limits
+    ends = sorted(shown.of(end) for end in (limits.lower, limits.upper) if math.isfinite(end))
+    span = max(float(np.ptp(values)), 1e-300)
+    return [end for end in ends if values.min() - 2 * span <= end <= values.max() + 2 * span]
+
+
+def bin_edges(values: Array) -> Array:
+    """Return the edges of bins by Freedman and Diaconis over the bulk, at most 60 over all."""
+    low, high = float(values.min()), float(values.max())
+    if not high > low:
+        half = abs(low) * 1e-6 or 0.5
+        return np.linspace(low - half, high + half, 4)
+    quarters = np.quantile(values, [0.25, 0.75])
+    width = 2 * float(quarters[1] - quarters[0]) / len(values) ** (1 / 3) or (high - low) / 10
+    return np.linspace(low, high, int(np.clip(math.ceil((high - low) / width), 5, 60)) + 1)
+
+
+def date(day: float) -> str:
+    """Return days since 1970 as Plotly's dates."""
+    return datetime.fromtimestamp(day * 86400.0, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def date_axis(days: Array) -> dict[str, Any]:
+    """Return an axis of dates with three ticks, whatever it spans: the first date, the middle and the last."""
+    first, last = float(np.nanmin(days)), float(np.nanmax(days))
+    margin = 0.04 * max(last - first, 1 / 24)
+    form = "%m-%d<br>%Y" if last - first > _DAYS else "%H:%M<br>%m-%d"
+    ticks = [datetime.fromtimestamp(86400.0 * day, UTC) for day in (first, (first + last) / 2, last)]
+    return {
+        "type": "date",
+        "range": [date(first - margin), date(last + margin)],
+        "tickvals": [date(first), date((first + last) / 2), date(last)],
+        "ticktext": [tick.strftime(form) for tick in ticks],
+    }
+
+
+def which_are_drawn(statistics: Sequence[ParameterStatistics], panels: Sequence[ParameterStatistics]) -> str:
+    """Say that not all parameters are drawn, where that is so."""
+    if len(panels) == len(statistics):
+        return ""
+    return f"{len(panels)} of {len(statistics)} parameters, those to be looked at first; the table has all. "
+
+
+# The tables of a fleet's report: every parameter, units that stand out, changes, failures.
+
+
+_MOST_ROWS = 40
+
+
+def number(value: float, digits: int = 4) -> str:
+    """Return a number as text, an infinite or unknown one as a dash."""
+    return plain_number(value, digits) if math.isfinite(value) else "–"
+
+
+def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> ReportTable:
+    """Return one line for each parameter: where it lies, how it spreads, what stands out, drifts, and is capable of."""
+    rows = []
+    for item in statistics:
+        shown = display_of(item.unit)
+        factor = abs(shown.factor)
+        robust = item.robust_deviation * factor
+        median = shown.of(item.median)
+        stated = item.uncertainties[np.isfinite(item.uncertainties)]
+        typical = float(np.median(stated)) * factor if stated.size else 0.0
+        places = _places(robust or typical or abs(median))
+        several = len(item.values) > 1
+        drift = "–"
+        if item.drift is not None:
+            slope, error = format_uncertain(item.drift.per_day * factor, item.drift.standard_uncertainty * factor)
+            drift = f"{slope} ± {error}" + (" !" if item.drift.significant else "")
+        capable, beyond = "–", "–"
+        if item.capability is not None:
+            capable = f"{item.capability.cpk:.2f} (≥ {item.capability.at_least:.2f})"
+            beyond = str(len(item.capability.beyond))
+        rows.append(
+            [
+                item.name,
+                shown.unit,
+                str(len(item.values)),
+                f"{median:.{places}f}",
+                number(robust, 3) if several else "–",
+                number(item.deviation * factor, 3) if several else "–",
+                number(typical, 3) if stated.size else "–",
+                str(int(item.outliers.sum())) if item.enough else "–",
+                drift,
+                capable,
+                beyond,
+            ]
+        )
+    titles = ["parameter", "unit", "units", "median", "robust σ", "σ", "typical u", "stand out", "drift per day"]
+    return ReportTable(
+        f"{title}: every parameter",
+        "Robust σ is 1.4826 times the median distance from the median; where σ is much larger, single units stand out. "
+        "Where the typical standard uncertainty u is not well below σ, the spread is the calibration's, not the "
+        "sensors'. Drift is a straight line over the date, ± one standard uncertainty, ! where chance would give it "
+        "less than once in a thousand. Cpk = min(USL − mean, mean − LSL) / 3σ, with its one-sided 95 % bound.",
+        [*titles, "Cpk", "beyond"],
+        rows,
+    )
+
+
+def _places(scale: float) -> int:
+    """Decimals that show a hundredth of a scale."""
+    if not scale > 0 or not math.isfinite(scale):
+        return 3
+    return min(max(0, 2 - math.floor(math.log10(scale))), 9)
+
+
+def outlier_table(statistics: Sequence[ParameterStatistics]) -> ReportTable | None:
+    """List the units that stand out, furthest first."""
+    rows = []
+    for item in statistics:
+        shown = display_of(item.unit)
+        for i in np.flatnonzero(item.outliers).tolist():
+            value, error = format_uncertain(
+                float(shown.of(float(item.values[i]))), float(item.uncertainties[i]) * abs(shown.factor)
+            )
+            rows.append(
+                (abs(float(item.z[i])), [item.serials[i], item.name, value, error, shown.unit, f"{item.z[i]:+.1f}"])
+            )
+    if not rows:
+        return None
+    rows.sort(key=lambda row: -row[0])
+    more = f" The first {_MOST_ROWS} of {len(rows)}." if len(rows) > _MOST_ROWS else ""
+    return ReportTable(
+        "Units that stand out",
+        "Robust z: distance from the median in robust standard deviations." + more,
+        ["serial", "parameter", "value", "u", "unit", "robust z"],
+        [row for _, row in rows[:_MOST_ROWS]],
+    )
+
+
+def change_table(changes: Sequence[FleetChange]) -> ReportTable | None:
+    """List the largest changes since the last calibration."""
+    if not changes:
+        return None
+    ranked = sorted(changes, key=lambda change: (change.same_files, -abs(change.deviations or 0.0)))
+    limit = change_limit(sum(not change.same_files for change in changes))
+    rows = []
+    for change in ranked[:_MOST_ROWS]:
+        shown = display_of(change.unit)
+        factor = abs(shown.factor)
+        u = None if change.standard_uncertainty is None else change.standard_uncertainty * factor
+        difference, error = format_uncertain((change.new - change.old) * shown.factor, u)
+        z = change.deviations
+        remark = "same files, fitted again" if change.same_files else "changed" if z and abs(z) > limit else ""
+        rows.append(
+            [
+                change.serial, change.name, difference, error, shown.unit,
+                "–" if z is None else f"{z:+.1f}", change.before[:16].replace("T", " "), remark,
+            ]
+        )  # fmt: skip
+    again = sum(change.same_files for change in changes)
+    return ReportTable(
+        "Largest changes since the last calibration",
+        f"{len(changes)} parameters have an earlier value; the first {len(rows)} by their change in normal "
+        "deviations, with the uncertainties of both calibrations."
+        + (" Values of the same files fitted again share their noise: no uncertainty applies." if again else ""),
+        ["serial", "parameter", "change", "u", "unit", "deviations", "last calibration", "remark"],
+        rows,
+    )
+
+
+def verdict_table(state: FleetState) -> ReportTable | None:
+    """List the verdict of every unit that has a record, the gravest first."""
+    good = [row for row in state.rows if row.verdict == "good"]
+    rows = [*state.doubtful, *good]
+    if not rows:
+        return None
+    more = f" The first {_MOST_ROWS} of {len(rows)}; parameters.csv has all." if len(rows) > _MOST_ROWS else ""
+    return ReportTable(
+        "The verdict of each unit",
+        "Look: understand the reason before you use the record. Bad: do not use it as it is. "
+        "imulab show SERIAL.json has all that a record says." + more,
+        ["serial", "procedure", "verdict", "reason"],
+        [[row.unit.serial, row.unit.procedure, row.verdict, row.first_reason or "–"] for row in rows[:_MOST_ROWS]],
+        message=f"{len(good)} of {len(rows)} are good.",
+    )
+
+
+def failure_table(failures: Sequence[Row]) -> ReportTable | None:
+    """List the units that failed."""
+    if not failures:
+        return None
+    more = f" The first {_MOST_ROWS} of {len(failures)}." if len(failures) > _MOST_ROWS else ""
+    return ReportTable(
+        "Units that failed",
+        "They have no record; the next run tries them again." + more,
+        ["serial", "file", "reason"],
+        [[row.unit.serial, "; ".join(row.unit.files), row.reason] for row in failures[:_MOST_ROWS]],
+    )
+
+
+# What the report of a fleet shows: its parameters over units and dates, and what changed since last time.
+
 
 MOST_PANELS = 24
 _MOST_POINTS = 1500
@@ -44,7 +272,7 @@ def distributions(title: str, statistics: Sequence[ParameterStatistics]) -> list
     pages = grid.pages(panels)
     return [
         _distributions(grid.paged(f"{title}: distribution over the units", n, len(pages)), page,
-                       small.which_are_drawn(statistics, panels))
+                       which_are_drawn(statistics, panels))
         for n, page in enumerate(pages)
     ]  # fmt: skip
 
@@ -59,9 +287,9 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
         x, y = grid.names(index)
         far = bulk(values)
         inside = np.ones(len(values), dtype=bool) if far is None else ~far.beyond
-        edges = small.bin_edges(values[inside])
+        edges = bin_edges(values[inside])
         counts, edges = np.histogram(values[inside], bins=edges)
-        limits = small.limits_in_view(item, shown, values[inside])
+        limits = limits_in_view(item, shown, values[inside])
         traces.append(
             {
                 "type": "bar",
@@ -82,7 +310,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
             far = replace(far, low=min(far.low, *limits, far.high), high=max(far.high, *limits, far.low))
             labels = [f"{s} {number(float(v))}" for s, v in zip(item.serials, values, strict=True)]
             traces += edge_marks(
-                far, values, small.staggered(far.beyond, int(counts.max())), labels, axes=(x, y), upright=False
+                far, values, staggered(far.beyond, int(counts.max())), labels, axes=(x, y), upright=False
             )
             layout[grid.axis_key(x)]["range"] = [far.low, far.high]
             layout[grid.axis_key(y)]["range"] = [0, 1.25 * int(counts.max())]
@@ -124,7 +352,7 @@ def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> list[Fig
     name = f"{title}: over the {'date' if dated else 'units in the order of the manifest'}"
     pages = grid.pages(panels)
     return [
-        _over_date(grid.paged(name, n, len(pages)), page, small.which_are_drawn(statistics, panels), dated=dated)
+        _over_date(grid.paged(name, n, len(pages)), page, which_are_drawn(statistics, panels), dated=dated)
         for n, page in enumerate(pages)
     ]
 
@@ -139,7 +367,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, 
         x, y = grid.names(index)
         out = item.outliers
         places = item.days if dated else np.arange(1.0, len(values) + 1)
-        where = [small.date(day) for day in places] if dated else places.tolist()
+        where = [date(day) for day in places] if dated else places.tolist()
         order = np.argsort(places, kind="stable")
         usual = order[~out[order]]
         usual = usual[:: max(1, math.ceil(len(usual) / _MOST_POINTS))]
@@ -153,7 +381,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, 
         if item.drift is not None:
             traces.append(_drift_line(item.drift, shown, x, y))
         grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
-        layout[grid.axis_key(x)] |= small.date_axis(places) if dated else {"nticks": 5}
+        layout[grid.axis_key(x)] |= date_axis(places) if dated else {"nticks": 5}
         far = bulk(values)
         if far is not None:
             labels = [f"{s} {number(float(v))}" for s, v in zip(item.serials, values, strict=True)]
@@ -185,7 +413,7 @@ def _drift_line(drift: Drift, shown: Display, x: str, y: str) -> dict[str, Any]:
     """Draw the fitted drift from the first date to the last."""
     ends = np.array([drift.value_at_start, drift.value_at_start + drift.per_day * drift.days])
     colour, dash = (BAD, "dash") if drift.significant else (QUIET, "solid")
-    days = [small.date(drift.start), small.date(drift.start + drift.days)]
+    days = [date(drift.start), date(drift.start + drift.days)]
     line = {"color": colour, "width": 2, "dash": dash}
     return scatter(days, rounded(shown.of(ends)), "lines", line=line, xaxis=x, yaxis=y, hoverinfo="skip")
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from imulab.errors import OptionError
-from imulab.fleet.sources import masked
-from imulab.fleet.work import Summary
+from imulab.fleet.engine import Summary
+from imulab.fleet.manifest import masked
 from imulab.records.calibration import Parameter
 
 _MANY = 500

@@ -9,11 +9,11 @@ from os import PathLike
 from pathlib import Path
 
 from imulab.arguments import Folder
-from imulab.atomic_write import write_text
 from imulab.errors import OptionError, first_of
-from imulab.fleet import figures, reporttables
+from imulab.files import write_text
+from imulab.fleet import figures
+from imulab.fleet.engine import Summary
 from imulab.fleet.history import History, open_history
-from imulab.fleet.limits import load_limits
 from imulab.fleet.run import HISTORY, FleetState, default_history, fleet_status, own_files, read_by, refuse_overwriting
 from imulab.fleet.statistics import (
     FEWEST_FOR_OUTLIERS,
@@ -22,14 +22,14 @@ from imulab.fleet.statistics import (
     change_limit,
     changes_since,
     line_statistics,
+    load_limits,
     not_compared,
     parameter_units,
 )
 from imulab.fleet.store import Store
-from imulab.fleet.work import Summary
 from imulab.procedures.registry import PROCEDURES
 from imulab.report import render_page
-from imulab.report.elements import Exhibits, Figure, ReportTable
+from imulab.report.traces import Exhibits, Figure, ReportTable
 
 _NAMED = 4
 _FEWEST_TO_DRAW = 4
@@ -139,8 +139,8 @@ def fleet_exhibits(
         facts.append(("changed since last", str(len(moved))))
     if moved:
         phrases.append(f"{first_of(sorted(moved), _NAMED)} changed since the last calibration")
-    items: list[Figure | ReportTable | None] = [reporttables.failure_table(state.failures)]
-    verdicts = reporttables.verdict_table(state)
+    items: list[Figure | ReportTable | None] = [figures.failure_table(state.failures)]
+    verdicts = figures.verdict_table(state)
     items += [verdicts] if state.doubtful else []
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = PROCEDURES[procedure].line_title
@@ -148,11 +148,11 @@ def fleet_exhibits(
         enough = max(len(item.values) for item in mine) >= _FEWEST_TO_DRAW
         items += [
             *(figures.distributions(title, mine) if enough else []),
-            reporttables.summary_table(title, mine),
+            figures.summary_table(title, mine),
             *(figures.over_date(title, mine) if enough else []),
             figures.change_figure(title, [change for change in changes if change.procedure == procedure]),
         ]
-    items += [reporttables.outlier_table(statistics), reporttables.change_table(changes)]
+    items += [figures.outlier_table(statistics), figures.change_table(changes)]
     items += [] if state.doubtful else [verdicts]
     return Exhibits("; ".join(phrases) + ".", facts, [item for item in items if item is not None])
 

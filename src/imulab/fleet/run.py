@@ -13,20 +13,28 @@ from pathlib import Path
 
 from imulab._version import VERSION
 from imulab.arguments import Folder
-from imulab.atomic_write import real_path, write_text
+from imulab.display import SENTENCES, Shown
 from imulab.errors import OptionError, first_of
-from imulab.fleet.engine import Engine, open_engine
+from imulab.files import real_path, write_text
+from imulab.fleet.engine import (
+    DONE,
+    FAILED,
+    KEPT,
+    LEFT,
+    Engine,
+    Job,
+    Outcome,
+    Summary,
+    WorkersLostError,
+    open_engine,
+    summarise,
+)
 from imulab.fleet.history import History, open_history
-from imulab.fleet.manifest import FleetManifest, FleetUnit, load_fleet
-from imulab.fleet.processes import WorkersLostError
-from imulab.fleet.sources import is_url
+from imulab.fleet.manifest import FleetManifest, FleetUnit, is_url, load_fleet
 from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
-from imulab.fleet.work import DONE, FAILED, KEPT, LEFT, Job, Outcome, Summary, summarise
 from imulab.procedures.registry import PROCEDURES
 from imulab.quantities import whole
-from imulab.shown import Shown
-from imulab.verdict import SENTENCES
 
 _FRUITLESS = 5
 """Losses of workers in a row, without a unit done between them, before giving up."""

@@ -20,10 +20,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from imulab.atomic_write import write_text
 from imulab.errors import OptionError, RecordError
+from imulab.files import write_text
 from imulab.fleet.manifest import FleetManifest, FleetUnit
-from imulab.procedures.loading import load_sealed
+from imulab.procedures.registry import load_sealed
 from imulab.records.calibration import Calibration
 
 MOST_ATTEMPTS = 3

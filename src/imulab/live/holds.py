@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.procedures.tumble.attitudes import POOL_DEGREES
-from imulab.procedures.tumble.held import SMALLEST_BLOCK
+from imulab.procedures.tumble.attitudes import POOL_DEGREES, SMALLEST_BLOCK
 from imulab.recording import Array
 
 BLOCK = 0.1

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from imulab.live.view import Known, View, in_words
 from imulab.recording import Array
-from imulab.report.elements import format_uncertain
+from imulab.report.traces import format_uncertain
 from imulab.units import STANDARD_GRAVITY
 
 _COLOURS = {"waiting": "white", "moving": "yellow", "settling": "yellow", "still": "cyan", "accepted": "green"}

@@ -1,4 +1,4 @@
-"""Records and blobs to corrected recordings: the C core does the arithmetic, the registry knows each section."""
+"""Records and blobs to corrected recordings: the C core does the arithmetic with the tables of a unit."""
 
 from __future__ import annotations
 
@@ -11,21 +11,64 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from imulab.columns import KINDS, triad
-from imulab.device.blob import Blob
-from imulab.device.unit import DeviceUnit
+from imulab.device.tables import DeviceTable, Fusion
+from imulab.device.unit import Blob, DeviceUnit
+from imulab.display import SENTENCES, Note
 from imulab.errors import DataError, OptionError, RecordError
-from imulab.power_on import with_power_on_temperature
-from imulab.procedures.inputs import Record, as_record, as_recording
-from imulab.procedures.loading import load_any
-from imulab.procedures.order import check_after, check_order, entry, thermals_of
+from imulab.procedures.correction_order import check_after, check_order, entry, thermals_of
 from imulab.procedures.procedure import Procedure, Section
-from imulab.procedures.registry import joined_of, procedure_of, section
-from imulab.procedures.unit_tables import tables_of
+from imulab.procedures.registry import joined_of, load_any, procedure_of, section
+from imulab.procedures.result import Record, as_record, as_recording
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
-from imulab.recording import Recording
+from imulab.recording import Recording, with_power_on_temperature
 from imulab.records.calibration import Calibration
-from imulab.verdict import SENTENCES, Note
+
+# The tables of a unit: the numbers of its records in the order of the C core's structs, and of their application.
+
+
+def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
+    """Return the tables of a record, in the order in which they are applied.
+
+    An array fuses by `fusion`; by what its record carries where that is None.
+
+    Raises
+    ------
+    RecordError
+        The record lacks a parameter or has one that cannot be.
+    """
+    return procedure_of(record).tables(record, fusion)
+
+
+def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[DeviceTable]:
+    """Return the tables of several records of one unit, in their order; an array fuses by `fusion` where it is given.
+
+    The columns of each name its record by its SHA-256, so that what a blob corrected is known by the records in it.
+
+    Raises
+    ------
+    RecordError
+        Two records give the same section, are of different units, or would correct one error twice or out of turn.
+    """
+    serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
+    if len(serials) > 1:
+        raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
+    tables = [
+        replace(table, columns={**table.columns, "record": record.sealed()[0]})
+        for record in records
+        for table in tables_of(record, fusion)
+    ]
+    kinds = [table.kind for table in tables]
+    twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
+    if twice:
+        raise RecordError(f"two records give a {twice[0]} table; a unit has one")
+    check_order(kinds)
+    check_after((table.kind, table.columns, (table.columns["record"],)) for table in tables)
+    return tables
+
+
+# Records and blobs to corrected recordings: the C core does the arithmetic, the registry knows each section.
+
 
 _FAR_IN_TEMPERATURE = 20.0
 

@@ -11,16 +11,15 @@ from typing import Any
 
 from imulab import exporters
 from imulab.arguments import Folder
-from imulab.device.array_settings import Fusion
+from imulab.device.tables import Fusion
+from imulab.display import SENTENCES
 from imulab.errors import ImulabError, OptionError, listed
 from imulab.exporters import EXPORTERS, MAG_MOUNTS, ExportOptions
-from imulab.procedures.inputs import Record, as_record
-from imulab.procedures.loading import load
-from imulab.procedures.registry import procedure_of
-from imulab.procedures.unit_tables import tables_of
+from imulab.procedures.apply import tables_of
+from imulab.procedures.registry import load, procedure_of
+from imulab.procedures.result import Record, as_record
 from imulab.quantities import whole
 from imulab.records.calibration import Calibration
-from imulab.verdict import SENTENCES
 
 _FIRMWARE = ("c", "blob")
 _DEVICE_IDS = 2**32

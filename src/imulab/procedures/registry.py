@@ -1,22 +1,32 @@
-"""The registry: the procedures, with all that the rest of the package asks of them.
+"""The registry of procedures, records loaded by the procedure that they name.
+
+A procedure's fit from files and texts.
 
 Nobody else tells procedures apart by name. A further procedure is a folder with a class, and a line here.
+
+Going through one function is what makes a fleet's parameters equal the single command's to the last bit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 
-from imulab.errors import RecordError
-from imulab.procedures.centrifuge.entry import CentrifugeProcedure
-from imulab.procedures.gyro_array.entry import GyroArrayProcedure
-from imulab.procedures.noise.entry import NoiseProcedure
-from imulab.procedures.procedure import Procedure, Section
-from imulab.procedures.rate.entry import RateProcedure
-from imulab.procedures.thermal.entry import ThermalProcedure
-from imulab.procedures.tumble.entry import TumbleProcedure
-from imulab.procedures.warmup.entry import WarmupProcedure
+from imulab.device.unit import Blob, is_blob, load_blob
+from imulab.errors import RecordError, file_name, readable
+from imulab.procedures.centrifuge.procedure import CentrifugeProcedure
+from imulab.procedures.gyro_array.procedure import GyroArrayProcedure
+from imulab.procedures.noise.procedure import NoiseProcedure
+from imulab.procedures.procedure import FLAG, Files, Procedure, Section
+from imulab.procedures.rate.procedure import RateProcedure
+from imulab.procedures.thermal.procedure import ThermalProcedure
+from imulab.procedures.tumble.procedure import TumbleProcedure
+from imulab.procedures.warmup.procedure import WarmupProcedure
 from imulab.records.calibration import Calibration
+from imulab.records.reading import parsed
+
+# The registry: the procedures, with all that the rest of the package asks of them.
+
 
 PROCEDURES: dict[str, Procedure] = {
     procedure.command: procedure
@@ -63,3 +73,91 @@ def sections() -> Iterator[Section]:
 def section(kind: str) -> Section | None:
     """Return a kind of section, None where no procedure has it."""
     return next((known for known in sections() if known.kind == kind), None)
+
+
+# Calibration records from their files, each checked by the procedure that it names; records and blobs alike.
+
+
+def load(path: str | Path) -> Calibration:
+    """Read a calibration record.
+
+    Raises
+    ------
+    RecordError
+        The file is missing, is no record, is of a newer version, was altered, or lacks something.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), gravity=9.81)
+    >>> fit.save("sn42.json")
+    >>> il.load("sn42.json").procedure
+    'tumble'
+    """
+    return load_sealed(path)[0]
+
+
+def load_sealed(path: str | Path) -> tuple[Calibration, str]:
+    """Read a calibration record and its ``content_sha256``; errors as for `load`."""
+    with readable(path, RecordError):
+        data = Path(file_name(path)).read_bytes()
+    return loads_sealed(data, str(path))
+
+
+def loads(data: bytes, name: str) -> Calibration:
+    """Read a calibration record from the bytes of its file; errors as for `load`."""
+    return loads_sealed(data, name)[0]
+
+
+def load_any(path: str | Path) -> Calibration | Blob:
+    """Read a record or a blob; errors as for `load` and `load_blob`."""
+    return load_blob(path) if is_blob(path) else load(path)
+
+
+def loads_sealed(data: bytes, name: str) -> tuple[Calibration, str]:
+    """Return a record from the bytes of its file, and its ``content_sha256``; errors as for `load`."""
+    record, seal = parsed(data, name)
+    try:
+        for procedure in PROCEDURES.values():
+            if procedure.name == record.procedure:
+                procedure.check(record)
+    except RecordError as error:
+        raise RecordError(f"{name}: {error}") from None
+    return record, seal
+
+
+# A procedure's fit, from files and the texts of its options to a record: what single commands and the fleet both
+# run.
+
+
+def _silent(_: int) -> None:
+    pass
+
+
+def run_task(
+    name: str,
+    files: Sequence[str],
+    options: Mapping[str, str | None],
+    access: Files,
+    *,
+    label: str = FLAG,
+    progress: Callable[[int], None] = _silent,
+) -> Calibration:
+    """Fit one unit; `options` are texts, None where not given.
+
+    What is wrong of a record that an option names, ``prior: ...``, is said with the name of its file.
+
+    Raises
+    ------
+    ImulabError
+        What the procedure's fit, its readers and its options raise.
+    """
+    task = PROCEDURES[name].task
+    values = task.values({key: text for key, text in options.items() if text is not None}, label)
+    try:
+        return task.fit(files, values, access, progress)
+    except RecordError as error:
+        file = options.get(str(error).partition(":")[0])
+        if file is None:
+            raise
+        raise RecordError(f"{file}: {error}") from None

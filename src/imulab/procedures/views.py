@@ -1,35 +1,230 @@
-"""What recordings and records show of themselves, and what is done with them next: `imulab.views.Views`.
+"""What recordings and records show of themselves: reports, comparisons, and what is done with them next.
 
 `Recording` and `Calibration` lie below all procedures; their methods ask the package for this module when called.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from html import escape
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
+from imulab import report
+from imulab.display import LINES, SENTENCES, WIDTH, aligned, html_table
 from imulab.errors import OptionError, RecordError, listed
+from imulab.files import write_page
 from imulab.procedures.apply import apply
 from imulab.procedures.exporting import export as export_records
-from imulab.procedures.inputs import as_recording
-from imulab.procedures.loading import load as load
 from imulab.procedures.procedure import Row
-from imulab.procedures.registry import procedure_of
-from imulab.procedures.reports import exhibits_of, parameter_rows
-from imulab.procedures.reports import write_report as write_report
+from imulab.procedures.registry import joined_of, procedure_of
+from imulab.procedures.registry import load as load
+from imulab.procedures.result import Drawn, Record, as_record, as_recording
 from imulab.reading import Reading
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
-from imulab.report.channels import channel_figures
-from imulab.report.elements import format_uncertain
+from imulab.records.comparison import Change, Comparison, compared
+from imulab.report.noise_figures import channel_figures
 from imulab.report.plots import Plot, Plots
-from imulab.shown import LINES, WIDTH, aligned, html_table
-from imulab.verdict import SENTENCES
+from imulab.report.traces import (
+    BAD,
+    GOOD,
+    QUIET,
+    Exhibits,
+    Figure,
+    ReportTable,
+    figure_axis,
+    format_uncertain,
+    plain_number,
+    scatter,
+)
+
+# What a procedure shows of a record: its report, and the comparison of two records of a unit.
+
+
+def exhibits_of(record: Calibration) -> Exhibits:
+    """Return the figures and tables of a record.
+
+    Raises
+    ------
+    RecordError
+        Its procedure is not known, or it lacks the data that they need.
+    """
+    exhibits = procedure_of(record).exhibits(record)
+    for procedure in joined_of(record):
+        more = procedure.joined(record)
+        exhibits = replace(
+            exhibits,
+            headline=f"{exhibits.headline} {more.headline}",
+            facts=[*exhibits.facts, *more.facts],
+            items=[*exhibits.items, *more.items],
+        )
+    return exhibits
+
+
+def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
+    """Return the factor from SI and the unit in which people read the change of a parameter."""
+    return procedure_of(record).change_unit(change, record)
+
+
+def parameter_rows(record: Calibration) -> Sequence[Row]:
+    """Return the parameters of a record in the units in which people read them."""
+    return procedure_of(record).rows(record)
+
+
+def rendered(record: Calibration) -> str:
+    """Return the report of a record as HTML text; errors as for `exhibits_of`."""
+    return report.render(record, exhibits_of(record), procedure_of(record).title)
+
+
+def write_report(record: Record, path: str | Path) -> None:
+    """Write the report of a record as one HTML file that opens without a network.
+
+    Parameters
+    ----------
+    record
+        A record, or its file.
+    path
+        HTML file to write.
+
+    Raises
+    ------
+    RecordError
+        The record cannot be read, or lacks the data that its figures need.
+    OptionError
+        The file cannot be written there, or what is given is no record.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81)
+    >>> il.write_report(fit.calibration, "sn42.html")
+    """
+    write_page(path, rendered(as_record(record, "write_report")))
+
+
+# Two records of one unit beside each other, as they show themselves.
+
+
+@dataclass(frozen=True, repr=False)
+class Changes(Drawn, Comparison):
+    """Two records of one unit.
+
+    Attributes
+    ----------
+    changes
+        Parameters that both have, second record less first: difference, standard uncertainty, whether significant.
+    probability
+        Of differences as large as all of them together, were nothing changed; None where a covariance is missing.
+    left_out
+        Parameters that one record alone has, or that mean something else in the other.
+    models
+        In what the two models differ, a text each: a change may come from that.
+    record
+        The first of the two.
+    """
+
+    record: Calibration = field(kw_only=True)
+
+    subject: ClassVar[str] = "Two records of a unit"
+
+    def exhibits(self) -> Exhibits:
+        """Return each change in units of its uncertainty, and as a table."""
+        together = "" if self.probability is None else f"; all together: p = {self.probability:.2g} if nothing changed"
+        models = f"; the records differ in {', '.join(self.models)}" if self.models else ""
+        headline = f"{verdict(self)}{together}{models}."
+        table = ReportTable("Changes", "", TITLES, change_rows(self, self.record))
+        return Exhibits(headline[0].upper() + headline[1:], [], [_figure(self, table.rows), table])
+
+
+TITLES = ["parameter", "change", "u", "change / u", "unit", ""]
+"""Of `change_rows`."""
+
+
+def compare_records(first: Record, second: Record) -> Changes:
+    """Compare two records of one unit by one procedure, in units of their combined uncertainty.
+
+    ``d = p_2 - p_1``, ``u^2(d) = u_1^2 + u_2^2`` less what both have in common; a change counts as significant where
+    ``|d| / u`` exceeds what chance gives one of all the parameters in twenty comparisons (Bonferroni).
+
+    Parameters
+    ----------
+    first, second
+        Records, or their files.
+
+    Raises
+    ------
+    RecordError
+        They are of different procedures or in different units, or one states no uncertainty.
+    OptionError
+        One is no record.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> first, second = (il.fit_tumble(il.simulate_tumble(gravity=9.81), order=n, gravity=9.81) for n in (1, 2))
+    >>> il.compare_records(first.calibration, second.calibration).models
+    ('order 1 and 2',)
+    """
+    one, other = (as_record(record, "compare_records") for record in (first, second))
+    procedure = procedure_of(one)
+    pair = procedure.comparable(one, other) if other.procedure == one.procedure else (one, other)
+    return Changes(**vars(compared(*pair, procedure.same_meaning)), record=one)
+
+
+def verdict(comparison: Comparison) -> str:
+    """Return which parameters changed."""
+    changed = [change.name for change in comparison.changes if change.significant]
+    judged = sum(change.standard_uncertainty is not None for change in comparison.changes)
+    named = f"{len(changed)} of {judged} parameters changed: {' '.join(changed)}"
+    return named if changed else "no significant change"
+
+
+def change_rows(comparison: Comparison, record: Calibration) -> list[list[str]]:
+    """Return each change in the units in which people read it, of records like this one."""
+    rows = []
+    for change in comparison.changes:
+        factor, unit = change_unit(change, record)
+        u = change.standard_uncertainty
+        texts = (plain_number(change.difference * factor, 3), "not stated")
+        difference, uncertainty = texts if u is None else format_uncertain(change.difference * factor, u * abs(factor))
+        deviations = "–" if change.deviations is None else f"{change.deviations:+.1f}"
+        rows.append([change.name, difference, uncertainty, deviations, unit, "changed" if change.significant else ""])
+    return rows
+
+
+def _figure(comparison: Comparison, rows: list[list[str]]) -> Figure:
+    judged = [(c, row) for c, row in zip(comparison.changes, rows, strict=True) if c.deviations is not None]
+    marks = [change.significant for change, _ in judged]
+    trace = scatter(
+        [change.deviations for change, _ in judged], [change.name for change, _ in judged], "markers",
+        error_x={"type": "constant", "value": 1, "color": QUIET, "thickness": 1},
+        marker={"size": 9, "color": [BAD if mark else GOOD for mark in marks],
+                "symbol": ["diamond" if mark else "circle" for mark in marks]},
+        text=[f"{row[1]} ± {row[2]} {row[4]}" for _, row in judged],
+        hovertemplate="%{y}: %{x:.1f} u<br>%{text}<extra></extra>",
+    )  # fmt: skip
+    return Figure(
+        title="Change of each parameter in units of its standard uncertainty",
+        message=f"{sum(marks)} of {len(marks)} parameters changed." if any(marks) else "No significant change.",
+        caption="Second record less first; bars: one standard uncertainty. Red diamonds: more than chance explains "
+        "among so many parameters.",
+        traces=[trace],
+        layout={
+            "xaxis": figure_axis("change / u", zeroline=True, zerolinecolor=QUIET),
+            "yaxis": figure_axis("", automargin=True, autorange="reversed", dtick=1),
+            "showlegend": False,
+        },
+        height=120 + 22 * len(judged),
+    )
+
+
+# What recordings and records show of themselves, and what is done with them next: `imulab.display.Views`.
+
 
 _COLOURS = {"good": "#1f6f8b", "look": "#b58a1b", "bad": "#c8553d"}
 _STYLE = "border-left: 4px solid {}; padding: 2px 10px; margin: 6px 0"

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
 from imulab.columns import kind_of
+from imulab.display import Note
 from imulab.errors import ImulabError, ReadError, UnitError, file_name
 from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import IfNeeded, load_layout
@@ -24,7 +25,6 @@ from imulab.readers.selection import Selection
 from imulab.readers.text import TextFile
 from imulab.reading import Layout, Window
 from imulab.recording import Array, Recording, Source
-from imulab.verdict import Note
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
@@ -184,7 +184,7 @@ class _Hash:
         path = Path(file)
         parts = [path]
         if path.is_dir():
-            from imulab.readers.rosfolder import files_of
+            from imulab.readers.rosbag import files_of
 
             parts = files_of(path, str(file))
         for part in parts:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import ReadError
-from imulab.readers.readings import Readings
+from imulab.readers.layout import Readings
 from imulab.reading import Layout
 from imulab.recording import Array, Recording
 

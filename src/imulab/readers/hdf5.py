@@ -10,8 +10,7 @@ from typing import Any
 
 from imulab.errors import ReadError
 from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
-from imulab.readers.formats import library
-from imulab.readers.unpacking import Budget
+from imulab.readers.formats import Budget, library
 from imulab.reading import Layout
 from imulab.recording import Array, Recording
 

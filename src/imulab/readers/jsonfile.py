@@ -15,13 +15,13 @@ from typing import Any, NoReturn
 import numpy as np
 
 import imulab.readers._text as _text
+from imulab.display import Note
 from imulab.errors import ReadError, meant
 from imulab.readers.arrays import origins, recordings
 from imulab.readers.text import _DATE
 from imulab.reading import Layout
 from imulab.recording import Array, Recording
 from imulab.records.calibration import FORMAT
-from imulab.verdict import Note
 
 LARGEST = 20_000_000
 """Bytes of a file: what they hold may take 35 times as many in memory."""

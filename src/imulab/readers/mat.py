@@ -19,7 +19,7 @@ import numpy as np
 
 from imulab.errors import ReadError
 from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
-from imulab.readers.unpacking import Budget, unpack
+from imulab.readers.formats import Budget, unpack
 from imulab.reading import Layout
 from imulab.recording import Array, Recording
 

@@ -14,7 +14,7 @@ from imulab.columns import parse_column_title
 from imulab.errors import ReadError
 from imulab.readers.arrays import ROWS, origins, to_floats
 from imulab.readers.formats import library
-from imulab.readers.readings import Readings
+from imulab.readers.layout import Readings
 from imulab.reading import Layout
 from imulab.recording import CORRECTED_BY, Array, Recording
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from imulab.columns import triad
+from imulab.display import Note
 from imulab.errors import OptionError, ReadError
 from imulab.readers import logs
 from imulab.readers.selection import Selection
 from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Recording
-from imulab.verdict import Note
 
 MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16

@@ -1,1 +1,26 @@
-"""Calibration records: what was found, written whole, read back checked, and compared."""
+"""Calibration records: what a procedure determined, written whole, read back checked, and compared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from imulab.errors import readable
+
+# Whether a file is a record, told by its first bytes.
+
+
+_LARGEST_RECORD = 1 << 26
+
+
+def is_json(file: str) -> bool:
+    """Return whether a file is a record rather than a recording: an object that holds one of two marks of records."""
+    from imulab.records.calibration import FORMAT
+
+    if file == "-" or (Path(file).exists() and not Path(file).is_file()):
+        return False  # a pipe can be read only once, as a recording
+    with readable(file), Path(file).open("rb") as stream:
+        if not stream.read(64).lstrip().startswith(b"{"):
+            return False
+        stream.seek(0)
+        content = stream.read(_LARGEST_RECORD)
+        return FORMAT.encode() in content or b'"content_sha256"' in content

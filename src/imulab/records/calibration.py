@@ -1,4 +1,4 @@
-"""The calibration record: what a procedure found, with uncertainty, provenance and the data behind its figures.
+"""The calibration record: what a procedure determined, with uncertainty, provenance and the data behind its figures.
 
 A record is JSON, one procedure a file. It is written whole or not at all, holds finite numbers only, and carries
 a SHA-256 of each source file and of its own content, so that an altered record is noticed.
@@ -6,6 +6,8 @@ a SHA-256 of each source file and of its own content, so that an altered record 
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,15 +21,11 @@ from numpy.typing import NDArray
 
 from imulab._version import VERSION
 from imulab.arguments import checked
-from imulab.atomic_write import write_text
+from imulab.display import UNJUDGED, AnyPlot, AnyPlots, Verdict, first_hidden, has_hidden, printable, verdict_of, views
 from imulab.errors import RecordError
+from imulab.files import write_text
 from imulab.frames import data_frame
-from imulab.printable import first_hidden, has_hidden, printable
 from imulab.recording import Source
-from imulab.records.json_text import content_sha256, sealed_text
-from imulab.records.json_text import json_text as json_text
-from imulab.verdict import UNJUDGED, Verdict, verdict_of
-from imulab.views import AnyPlot, AnyPlots, views
 
 if TYPE_CHECKING:
     from typing import Unpack
@@ -37,6 +35,55 @@ if TYPE_CHECKING:
 
     from imulab.reading import Data, Reading
     from imulab.recording import Recording
+
+
+# Plain JSON values as text: with an indent as a file, without spaces and with sorted keys to be hashed.
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Return JSON with an indent of 1, and a line break.
+
+    Raises
+    ------
+    TypeError
+        A value is not of JSON's kinds (NumPy's are not).
+    ValueError
+        A number is not finite.
+    """
+    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def sealed_text(content: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the `content_sha256` of a record's content, and the text of its file with it as the last key.
+
+    Raises
+    ------
+    TypeError
+        A value is not of JSON's kinds (NumPy's are not).
+    ValueError
+        A number is not finite, or a text is no Unicode.
+    """
+    sha256 = content_sha256(content)
+    return sha256, json_text({**content, "content_sha256": sha256})
+
+
+def content_sha256(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the record's JSON without ``content_sha256``: keys sorted, no spaces, UTF-8.
+
+    Raises
+    ------
+    TypeError
+        A value is not of JSON's kinds (NumPy's are not).
+    ValueError
+        A number is not finite, or a text is no Unicode.
+    """
+    plain = {key: value for key, value in content.items() if key != "content_sha256"}
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+
+
+# The calibration record: what a procedure found, with uncertainty, provenance and the data behind its figures.
+
 
 FORMAT = "imulab.calibration"
 SCHEMA_VERSION = 1

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from imulab.errors import RecordError, listed
-from imulab.estimation.noise.use import bias_square
+from imulab.estimation.noise.terms import bias_square
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.sections import Above0, Part, Size, part

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from imulab._version import VERSION
+from imulab.display import as_judged, first_hidden
 from imulab.errors import RecordError
-from imulab.printable import first_hidden
-from imulab.records.calibration import BLOB_MAGIC, FORMAT, SCHEMA_VERSION, Calibration
-from imulab.records.json_text import content_sha256
+from imulab.records.calibration import BLOB_MAGIC, FORMAT, SCHEMA_VERSION, Calibration, content_sha256
 from imulab.records.sections import check_sizes, read
-from imulab.verdict import as_judged
 
 _CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
 _ROUNDING = 1.0 + 1e-6
@@ -25,7 +23,7 @@ _NEEDED = ("procedure", "sensor", "created", "software", "sources", "model", "pa
 def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
     """Return a record from the bytes of its file, and its ``content_sha256``.
 
-    What its procedure says of its sections is still to be checked: `imulab.procedures.loading.load` does both.
+    What its procedure says of its sections is still to be checked: `imulab.procedures.registry.load` does both.
 
     Raises
     ------

@@ -12,10 +12,9 @@ from hashlib import sha256
 from importlib.resources import files
 from typing import Any
 
+from imulab.display import SENTENCES, Verdict
 from imulab.records.calibration import Calibration
-from imulab.report.elements import Exhibits, Figure, ReportTable
-from imulab.report.narrow import narrow
-from imulab.verdict import SENTENCES, Verdict
+from imulab.report.traces import Exhibits, Figure, ReportTable, narrow
 
 _HEADS = {"good": "Good", "look": "Look first", "bad": "Stop"}
 _LINK = re.compile(r"<(?=\s*/?\s*a\b)", re.IGNORECASE)

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, overload
 from uuid import uuid4
 
-from imulab.atomic_write import replacing, write_text
 from imulab.errors import OptionError, file_name, listed, quoted
+from imulab.files import replacing, write_text
 from imulab.report import json_for_script, render_page
-from imulab.report.elements import INK, Exhibits, Figure
+from imulab.report.traces import INK, Exhibits, Figure
 
 PICTURES = ("png", "svg", "pdf")
 _WIDTH = 900

@@ -1,14 +1,174 @@
-"""What figures are made of: axes, curves and bands, the dashes and marks that tell them apart, maps of correlation."""
+"""What reports are made of.
+
+Figures and tables, axes, curves and bands, panels side by side, and marks for points far outside.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.recording import Array
-from imulab.report.elements import BAD, GOOD
+
+# What a report shows: figures and tables, made from a record by its procedure, laid out by `imulab.report`.
+
+
+GOOD, BAD, QUIET, INK = "#1f6f8b", "#c8553d", "#9aa5ad", "#22303a"
+"""Colours: what holds, what stands out, what is background, text."""
+LEGEND = {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}
+"""The key of a figure: above the plot, where a second line of it pushes the plot down."""
+ALARM = 0.5
+"""An observation with less than this share of its weight is drawn as standing out."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A Plotly figure (traces and layout as plain JSON values), a title, how to read it, and what it shows."""
+
+    title: str
+    caption: str
+    traces: list[dict[str, Any]]
+    layout: dict[str, Any] = field(default_factory=dict)
+    height: int = 380
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class ReportTable:
+    """A table: column titles, rows of text, how to read it, the row to highlight, and what it shows."""
+
+    title: str
+    caption: str
+    columns: list[str]
+    rows: list[list[str]]
+    highlight: int | None = None
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class Exhibits:
+    """What a procedure shows of a record.
+
+    Attributes
+    ----------
+    headline
+        The result in one sentence.
+    facts
+        Label and value of the few numbers to see first.
+    items
+        Figures and tables in the order of the report.
+    """
+
+    headline: str
+    facts: list[tuple[str, str]]
+    items: list[Figure | ReportTable]
+
+    @property
+    def figures(self) -> list[Figure]:
+        """The figures alone."""
+        return [item for item in self.items if isinstance(item, Figure)]
+
+
+def plain_number(value: float, digits: int) -> str:
+    """Return a number with at least `digits` significant digits, never in powers of ten."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:.0f}"
+    places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:.{places}f}"
+
+
+def format_uncertain(value: float, uncertainty: float | None, digits: int = 2) -> tuple[str, str]:
+    """Return a value and its uncertainty as text, both to the last of `digits` significant digits of the latter."""
+    if uncertainty is None or not uncertainty > 0 or not math.isfinite(uncertainty):
+        return f"{value:.6g}", "not stated"
+    places = digits - 1 - math.floor(math.log10(uncertainty))
+    if round(uncertainty, places) >= 10 ** (digits - places):
+        places -= 1
+    if places < 0:
+        return f"{round(value, places):.0f}", f"{round(uncertainty, places):.0f}"
+    return f"{value:z.{places}f}", f"{uncertainty:.{places}f}"
+
+
+# Figures for a phone: panels that stand side by side go beneath one another.
+
+
+_LEAST, _MOST = 150, 300
+_GAP = 74
+_KEY_LINE = 21
+"""Height of a panel, room between panels for ticks and titles, and height of a line of the key, pixels."""
+_MOST_NUMBERS = 8
+
+
+def narrow(figure: Figure) -> dict[str, Any] | None:
+    """Return layout and height of a figure for a narrow screen; None where they stay as they are."""
+    layout = {key: _with_fewer_numbers(value) for key, value in figure.layout.items()}
+    keys = _legend_lines(figure)
+    panels = [key[5:] for key in layout if key.startswith("xaxis") and "yaxis" + key[5:] in layout]
+    if len({tuple(layout["xaxis" + panel].get("domain", (0, 1))) for panel in panels}) < 2:
+        if not keys and layout == figure.layout:
+            return None
+        return {"layout": layout, "height": figure.height + keys * _KEY_LINE}
+    margin = {"l": 62, "r": 14, "t": 30, "b": 55, **{k: v for k, v in layout.get("margin", {}).items() if k == "l"}}
+    shares = [_domain(layout["yaxis" + panel]) for panel in panels]
+    tallest = max(high - low for low, high in shares) * (figure.height - 75)
+    size = min(max(tallest, _LEAST), _MOST)
+    plot = len(panels) * size + (len(panels) - 1) * _GAP
+    changed: dict[str, Any] = {}
+    places: dict[tuple[float, float], float] = {}
+    first = layout["yaxis" + panels[0]].get("title", {})
+    for number, panel in enumerate(panels):
+        top = 1 - number * (size + _GAP) / plot
+        x, y = layout["xaxis" + panel], layout["yaxis" + panel]
+        places[(round(_domain(x)[0], 9), round(_domain(y)[1], 9))] = top
+        changed["xaxis" + panel] = {**x, "domain": [0, 1]}
+        title = y.get("title", {}) if y.get("title", {}).get("text") else first
+        changed["yaxis" + panel] = {**y, "domain": [max(top - size / plot, 0.0), top], "title": title}
+        if "showticklabels" in y:
+            changed["yaxis" + panel]["showticklabels"] = True
+    notes = [_moved(note, places) for note in layout.get("annotations", [])]
+    legend = {**layout.get("legend", {}), "y": 1 + 26 / plot, "yanchor": "bottom"}
+    return {
+        "layout": {**layout, **changed, "annotations": notes, "legend": legend, "margin": margin},
+        "height": round(plot + margin["t"] + margin["b"] + keys * _KEY_LINE),
+    }
+
+
+def _with_fewer_numbers(axis: Any) -> Any:
+    """Return an axis that is numbered evenly, with no more numbers than a narrow screen has room for."""
+    if not isinstance(axis, dict) or axis.get("type") == "log" or not {"dtick", "range"} <= axis.keys():
+        return axis
+    low, high = axis["range"]
+    return {**axis, "dtick": max(axis["dtick"], math.ceil((high - low) / _MOST_NUMBERS))}
+
+
+def _domain(axis: dict[str, Any]) -> tuple[float, float]:
+    low, high = axis.get("domain", (0.0, 1.0))
+    return float(low), float(high)
+
+
+def _moved(note: dict[str, Any], places: dict[tuple[float, float], float]) -> dict[str, Any]:
+    """Return a note, the title of a panel with its panel."""
+    if note.get("xref") != "paper" or note.get("yref") != "paper":
+        return note
+    top = places.get((round(note["x"], 9), round(note["y"], 9)))
+    return note if top is None else {**note, "x": 0, "y": top}
+
+
+def _legend_lines(figure: Figure) -> int:
+    if figure.layout.get("showlegend") is False:
+        return 0
+    named = [t for t in figure.traces if t.get("name") and t.get("showlegend", True) and t["type"] != "heatmap"]
+    return math.ceil(len(named) / 2) if len(named) > 1 else 0
+
+
+# What figures are made of: axes, curves and bands, the dashes and marks that tell them apart, maps of correlation.
+
 
 MARGIN = {"l": 70, "r": 20, "t": 64, "b": 55}
 """A legend above the plot has room below the buttons in the corner."""
@@ -17,14 +177,14 @@ SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-
 """What tells lines apart without colour, by their number."""
 
 
-def axis(title: str, **more: Any) -> dict[str, Any]:
+def figure_axis(title: str, **more: Any) -> dict[str, Any]:
     """Return the layout of an axis."""
     return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", **more}
 
 
 def log_axis(title: str, **more: Any) -> dict[str, Any]:
     """Return the layout of a logarithmic axis."""
-    return axis(title, **{"type": "log", "dtick": 1, "exponentformat": "none"} | more)
+    return figure_axis(title, **{"type": "log", "dtick": 1, "exponentformat": "none"} | more)
 
 
 def short_log_axis(title: str, **more: Any) -> dict[str, Any]:
@@ -64,3 +224,213 @@ def strongest_pair(matrix: Array, names: Sequence[str]) -> str:
     """Return the two that are most correlated, and by how much, such as ``a and b, -0.93``."""
     i, j = divmod(int(np.argmax(np.abs(np.triu(matrix, 1)))), len(names))
     return f"{names[i]} and {names[j]}, {matrix[i, j]:+.2f}"
+
+
+# Axes that show the bulk of the points, and marks at their edge for the few that lie far beyond.
+
+
+_FAR = 12.0
+_MOST_OUT = 0.1
+_WORTH = 2.5
+_PAD = 0.08
+_FEWEST = 5
+_MOST_LABELS = 4
+
+
+@dataclass(frozen=True)
+class Bulk:
+    """Range of an axis, and which values lie beyond it, shape (n,)."""
+
+    low: float
+    high: float
+    beyond: NDArray[np.bool_]
+
+
+def bulk(values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.0) -> Bulk | None:
+    """Return the range that shows the bulk of some values, or None where all of them fit on one axis.
+
+    A value is far off where it is 12 robust standard deviations from the median. The axis is clipped only where at
+    most a tenth of the values is far off, and where they would make it 2.5 times as long.
+
+    Parameters
+    ----------
+    values
+        Shape (n,); what is not finite does not count.
+    usual
+        Which values belong to the bulk, where that is known, shape (n,).
+    room
+        Added at both ends, for bars of uncertainty.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    finite = np.isfinite(values)
+    if np.count_nonzero(finite) < _FEWEST:
+        return None
+    if usual is None:
+        distance = np.abs(values - np.median(values[finite]))
+        usual = distance <= _FAR * MAD_TO_SIGMA * float(np.median(distance[finite]))
+        if np.count_nonzero(finite & ~usual) > _MOST_OUT * len(values):
+            return None
+    inside = values[finite & usual]
+    if not inside.size or not np.ptp(inside) + room > 0:
+        return None
+    low, high = float(inside.min()) - room, float(inside.max()) + room
+    if np.ptp(values[finite]) <= _WORTH * (high - low):
+        return None
+    pad = _PAD * (high - low)
+    low, high = low - pad, high + pad
+    return Bulk(low, high, finite & ((values < low) | (values > high)))
+
+
+def edge_marks(
+    found: Bulk, values: Array, beside: Sequence[Any], labels: Sequence[str], *, axes: tuple[str, str] = ("x", "y"),
+    upright: bool = True,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Return triangles at the edge of an axis for the values beyond it, with a label each where they are few.
+
+    Parameters
+    ----------
+    found, values
+        The range and the values that it was found of.
+    beside
+        Place of each value on the other axis.
+    labels
+        What stands beside the triangle of each value: its size with the unit.
+    axes
+        Names of the plot's axes.
+    upright
+        Whether the values are on the y axis, otherwise on the x axis.
+    """
+    traces = []
+    for above in (False, True):
+        index = np.flatnonzero(found.beyond & ((values > found.high) if above else (values < found.low))).tolist()
+        if not index:
+            continue
+        edge = [found.high if above else found.low] * len(index)
+        other = [beside[i] for i in index]
+        symbol, place = {
+            (True, True): ("triangle-up", "bottom center"), (True, False): ("triangle-down", "top center"),
+            (False, True): ("triangle-right", "middle left"), (False, False): ("triangle-left", "middle right"),
+        }[upright, above]  # fmt: skip
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "markers+text" if len(index) <= _MOST_LABELS else "markers",
+                "x": other if upright else edge,
+                "y": edge if upright else other,
+                "text": [labels[i] for i in index],
+                "textposition": place,
+                "textfont": {"color": BAD},
+                "marker": {"color": BAD, "size": 11, "symbol": symbol},
+                "cliponaxis": False,
+                "showlegend": False,
+                "xaxis": axes[0],
+                "yaxis": axes[1],
+                "hovertemplate": "%{text}<extra></extra>",
+            }
+        )
+    return traces
+
+
+def edge_note(count: int) -> str:
+    """Return the sentence of a caption that explains the triangles; nothing where there are none."""
+    if not count:
+        return ""
+    return (
+        " 1 point beyond the axis is drawn as a triangle at its edge, with its value."
+        if count == 1
+        else f" {count} points beyond the axis are drawn as triangles at its edge, with their values (hover where they "
+        "are many)."
+    )
+
+
+# Small multiples: a grid of panels, three across, and what is drawn in them.
+
+
+COLUMNS = 3
+_GAP_ACROSS = 0.075
+_ROW_HEIGHT = 215
+_ROWS = 4
+
+Item = TypeVar("Item")
+
+
+def names(index: int) -> tuple[str, str]:
+    """Return what Plotly calls the axes of a panel."""
+    return ("x", "y") if index == 0 else (f"x{index + 1}", f"y{index + 1}")
+
+
+def axis_key(name: str) -> str:
+    """Return the key of an axis in the layout."""
+    return f"{name[0]}axis{name[1:]}"
+
+
+def height(count: int) -> int:
+    """Return the height of so many panels, pixels."""
+    return 62 + _ROW_HEIGHT * math.ceil(count / COLUMNS)
+
+
+def pages(panels: Sequence[Item]) -> list[Sequence[Item]]:
+    """Return the panels in figures of even size, none too high for a page."""
+    count = math.ceil(len(panels) / (COLUMNS * _ROWS))
+    size = COLUMNS * math.ceil(len(panels) / max(count, 1) / COLUMNS)
+    return [panels[first : first + size] for first in range(0, len(panels), size)]
+
+
+def paged(title: str, index: int, count: int) -> str:
+    """Return a title with its number, where several figures share it."""
+    return title if count == 1 else f"{title}, {index + 1} of {count}"
+
+
+def grid() -> dict[str, Any]:
+    """Return the layout that panels are put into."""
+    return {
+        "showlegend": False,
+        "shapes": [],
+        "annotations": [],
+        "bargap": 0.02,
+        "margin": {"l": 50, "r": 15, "t": 52, "b": 35},
+    }
+
+
+def panel(layout: dict[str, Any], index: int, count: int, title: str, up: str = "") -> None:
+    """Put the axes and title of panel `index` of `count` into a layout; `up`: what the y axes are of."""
+    rows = math.ceil(count / COLUMNS)
+    row, column = divmod(index, COLUMNS)
+    width = (1 - _GAP_ACROSS * (COLUMNS - 1)) / COLUMNS
+    left = column * (width + _GAP_ACROSS)
+    gap = 0.32 / rows
+    height = (1 - gap * (rows - 1)) / rows
+    top = 1 - row * (height + gap)
+    x, y = names(index)
+    axis = {"zeroline": False, "gridcolor": "#e6eaed", "exponentformat": "none", "tickfont": {"size": 11}}
+    layout[axis_key(x)] = {**axis, "domain": [left, left + width], "anchor": y, "nticks": 5}
+    layout[axis_key(y)] = {**axis, "domain": [max(top - height, 0.0), top], "anchor": x, "nticks": 5}
+    if up and column == 0:
+        layout[axis_key(y)]["title"] = {"text": up, "font": {"size": 11}, "standoff": 4}
+    layout["annotations"].append(
+        {
+            "text": title,
+            "x": left,
+            "y": top,
+            "xref": "paper",
+            "yref": "paper",
+            "xanchor": "left",
+            "yanchor": "bottom",
+            "showarrow": False,
+            "font": {"size": 13},
+        }
+    )
+
+
+def line(x: str, y: str, place: float, colour: str, dash: str, height: float = 1) -> dict[str, Any]:
+    """Return an upright line through a panel, from its foot to a share of its height."""
+    return {
+        "type": "line",
+        "xref": x,
+        "yref": f"{y} domain",
+        "x0": place,
+        "x1": place,
+        "y0": 0,
+        "y1": height,
+        "line": {"color": colour, "width": 1.5, "dash": dash},
+    }

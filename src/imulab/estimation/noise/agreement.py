@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.noise.choice import CANDIDATES, choose
-from imulab.estimation.noise.cosine import frequencies
+from imulab.estimation.noise.analysis import CANDIDATES, choose
 from imulab.estimation.noise.likelihood import Flags, score, time_limits
-from imulab.estimation.noise.spectrum import Spectrum
+from imulab.estimation.noise.spectrum import Spectrum, frequencies
 from imulab.estimation.noise.terms import Bins, prepare
 from imulab.recording import Array
 

@@ -1,24 +1,448 @@
-"""The noise of one column, from its stretches at rest to a model: band, allowance, candidates, intervals, test."""
+"""The noise of one column, from its stretches at rest to a model.
+
+The candidate terms, the choice among them and the test of fit.
+
+Source: generalised least squares; the cosine coefficients of the noise are independent, with the model's variances.
+
+Source: Guerrier, Skaloud, Stebler and Victoria-Feser (2013). The record is continued by its mirror image, so that its
+Allan variances are sums over squares of cosine coefficients, whose covariance is known.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from imulab.estimation.noise.band import Allowance, Band, allow, usable_band, within
-from imulab.estimation.noise.choice import CANDIDATES, Averaged, Choice, average, choose
 from imulab.estimation.noise.cleaning import STEP, Step, find_steps, step_coefficients
-from imulab.estimation.noise.cosine import Stretch, variances_of_coefficients
-from imulab.estimation.noise.intervals import profile
-from imulab.estimation.noise.likelihood import Flags, fit, time_limits
-from imulab.estimation.noise.moments import Fit, test_of_fit
-from imulab.estimation.noise.regression import Regression, regress, without
-from imulab.estimation.noise.spectrum import Spectrum
-from imulab.estimation.noise.terms import Bins, letters, prepare, terms
+from imulab.estimation.noise.likelihood import (
+    Allowance,
+    Band,
+    Fits,
+    Flags,
+    allow,
+    fit,
+    profile,
+    time_limits,
+    usable_band,
+    within,
+)
+from imulab.estimation.noise.spectrum import Spectrum, Stretch, binned, variances_of_coefficients
+from imulab.estimation.noise.terms import NAMES, Bins, letters, prepare, terms
 from imulab.recording import Array
+
+# Drift that follows a covariate, time or temperature, told apart from slow noise: least squares under the noise
+# model.
+
+
+Refit = Callable[[Sequence[Spectrum]], tuple[Sequence[Array], float]]
+"""Fits a model to spectra; returns its variance in each bin of each of them, (b,), and its deviance."""
+_REGRESSION_ROUNDS = 3
+_PLAIN, _PENALTY, _GAIN = 3.0, 4.0, 6.0
+
+
+@dataclass(frozen=True)
+class Regression:
+    """How samples follow covariates.
+
+    Attributes
+    ----------
+    slope, standard_uncertainty
+        In the unit of the samples over that of the covariate, shape (k,).
+    gain
+        By how much the deviance falls that all of them together are taken out.
+    residual
+        The stretches without what follows the covariates.
+    """
+
+    slope: Array
+    standard_uncertainty: Array
+    gain: float
+    residual: tuple[Stretch, ...]
+
+    @property
+    def follows(self) -> bool:
+        """Whether a slope is beyond 3 standard uncertainties, and the deviance, at 4 a parameter, falls by 6."""
+        z = np.abs(self.slope) / self.standard_uncertainty
+        return bool(z.max() > _PLAIN and self.gain - _PENALTY * len(z) >= _GAIN)
+
+
+def ramp_coefficients(stretch: Stretch) -> Array:
+    """Return the slow coefficients of time, s, over a stretch, shape (J,)."""
+    n = stretch.count
+    j = np.arange(1, len(stretch.slow) + 1)
+    # sum_i i cos(pi j (i + 1/2)/n) = -(1 - (-1)^j)/(4 sin^2(pi j/2n)) cos(pi j/2n)
+    half = np.pi * j / (2 * n)
+    return np.asarray(-np.sqrt(2 / n) * stretch.interval * (j % 2) * np.cos(half) / (2 * np.sin(half) ** 2))
+
+
+def regress(
+    stretches: Sequence[Stretch], covariates: Sequence[Array], refit: Refit, rounds: int = _REGRESSION_ROUNDS
+) -> Regression:
+    """Regress stretches on covariates, with the noise model fitted again to what is left, in three rounds.
+
+    ``b = (X' Lambda^-1 X)^-1 X' Lambda^-1 c``, the coefficients of the stretches one below the other.
+
+    Parameters
+    ----------
+    stretches
+        One or more of the same column.
+    covariates
+        Of each stretch the slow coefficients of each covariate, shape (k, J); all k are fitted at once.
+    refit
+        Fits the noise model to spectra.
+    """
+    spectra = [each for stretch in stretches for each in stretch.spectra]
+    variances, before = refit(spectra)
+    residual: tuple[Stretch, ...] = tuple(stretches)
+    after = before
+    for _ in range(rounds):
+        slope, covariance = _slopes(stretches, covariates, variances)
+        residual = tuple(
+            without(stretch, slope @ np.atleast_2d(x)) for stretch, x in zip(stretches, covariates, strict=True)
+        )
+        variances, after = refit([each for stretch in residual for each in stretch.spectra])
+    slope, covariance = _slopes(stretches, covariates, variances)
+    return Regression(slope, np.sqrt(np.diag(covariance)), before - after, residual)
+
+
+def _slopes(
+    stretches: Sequence[Stretch], covariates: Sequence[Array], variances: Sequence[Array]
+) -> tuple[Array, Array]:
+    size, start = len(np.atleast_2d(covariates[0])), 0
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    for stretch, given in zip(stretches, covariates, strict=True):
+        stop = start + len(stretch.spectra)
+        weight = counted(stretch) / variances_of_coefficients(variances[start:stop], stretch)
+        x = np.atleast_2d(given)
+        normal += x * weight @ x.T
+        right += x * weight @ stretch.slow
+        start = stop
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    return np.asarray(covariance @ right), covariance
+
+
+def counted(stretch: Stretch) -> Array:
+    """Return how much each slow coefficient counts, shape (J,): what its bin counts of its coefficients."""
+    counts = np.zeros(len(stretch.slow))
+    f = np.arange(1, len(counts) + 1) / stretch.count
+    for spectrum in stretch.spectra:
+        share = spectrum.freedom / (spectrum.last - spectrum.first + 1)
+        place = np.searchsorted(spectrum.first / spectrum.count, f + 1e-12, side="right") - 1
+        inside = (place >= 0) & (f <= spectrum.last[-1] / spectrum.count + 1e-12)
+        counts[inside] = np.minimum(share[place[inside]], 1.0)
+    return np.where(stretch.used, counts, 0.0)
+
+
+def without(stretch: Stretch, taken: Array) -> Stretch:
+    """Return a stretch whose slow coefficients are less by `taken`, shape (J,), and its spectra accordingly."""
+    slow = stretch.slow - taken
+    spectrum = stretch.spectra[0]
+    low = spectrum.last <= len(slow)
+    edges = (spectrum.first[low], spectrum.last[low])
+    power = spectrum.power.copy()
+    power[low] = binned(slow**2, stretch.used, edges, spectrum.interval, spectrum.count).power
+    return replace(stretch, slow=slow, spectra=(replace(spectrum, power=power), *stretch.spectra[1:]))
+
+
+# The test of fit: Allan variances of a record against those of the model, by the method of wavelet moments.
+
+
+_SHORTEST, _LONGEST = 4.0, 10.0  # tau f_max at least; parts of the record at least
+_STEP = 1e-4
+_NODES = 32
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a model fits.
+
+    Attributes
+    ----------
+    statistic, freedom, probability
+        J, its degrees of freedom, and the probability of a larger J of a good model; 1 where there is nothing to test.
+    tau
+        Averaging times, s, shape (t,).
+    variance, predicted
+        Allan variances of the record (its mirror image continuing it) and of the model, shape (t,).
+    values
+        The parameters that fit the Allan variances best, one step of Gauss and Newton from the model, shape (8,).
+    """
+
+    statistic: float
+    freedom: int
+    probability: float
+    tau: Array
+    variance: Array
+    predicted: Array
+    values: Array
+
+
+def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> Fit:
+    """Hold the Allan variances at octaves of averaging time, 4/f_max to L/10, against a model.
+
+    ``J = r' Omega^-1 r``, r the difference that is left when the parameters are fitted to it, of cube roots, which are
+    nearly normal (Wilson and Hilferty 1931), Omega the covariance of the Allan variances under the model.
+
+    Parameters
+    ----------
+    spectra
+        What the model was fitted to.
+    values
+        Its parameters in the order of `NAMES`, shape (8,).
+    highest
+        f_max, Hz.
+    """
+    from imulab.estimation.special import chdtrc
+
+    interval, length = spectra[0].interval, max(each.length for each in spectra)
+    lowest = max(1, int(np.ceil(_SHORTEST / highest / interval - 1e-9)))
+    octaves = max(0, int(np.floor(np.log2(max(length / _LONGEST / interval / lowest, 0.5)))) + 1)
+    m = lowest * 2 ** np.arange(octaves)
+    tau = m.astype(np.float64) * interval
+    bins, present = prepare(spectra), np.flatnonzero(values > 0)
+    nothing = Fit(0.0, 0, 1.0, tau, np.empty(0), np.empty(0), values)
+    if octaves <= len(present):
+        return nothing
+    weight = np.concatenate([_weights(each, m) for each in spectra], axis=1)
+    counted = np.concatenate([_share(each) for each in spectra])
+    kept = bins.freedom > 0
+    weight[:, ~kept] = 0
+    moved = np.tile(values, (len(present) + 1, 1))
+    moved[np.arange(1, len(moved)), present] *= 1 + _STEP
+    variance = bins.variances(moved)
+    predicted = variance @ (weight * counted).T
+    slope = ((predicted[1:] - predicted[0]) / _STEP).T
+    spread = weight * counted * variance[0] * np.sqrt(2 / np.where(kept, bins.freedom, np.inf))
+    found = weight @ (counted * bins.power)
+    scale = 1 / predicted[0]
+    root = np.linalg.cholesky((spread * scale[:, None]) @ (spread * scale[:, None]).T)
+    # The cube root of what is distributed as chi-square over its freedom is nearly normal, about 1 - 2/(9 freedom).
+    square = np.sum((spread * scale[:, None]) ** 2, axis=1)
+    ratio = 3 * (np.cbrt(np.maximum(found * scale, 0.0)) - (1 - square / 9))
+    r = np.linalg.solve(root, ratio)
+    basis = np.linalg.solve(root, slope * scale[:, None])
+    step, _, rank, _ = np.linalg.lstsq(basis, r, rcond=1e-6)
+    freedom = octaves - int(rank)
+    statistic = float(np.sum((r - basis @ step) ** 2))
+    better = values.copy()
+    better[present] *= np.exp(np.clip(step, -2, 2))
+    probability = float(chdtrc(freedom, statistic)) if freedom else 1.0
+    return Fit(statistic, freedom, probability, tau, found, predicted[0], better)
+
+
+def allan_of_bins(records: Sequence[Sequence[Spectrum]]) -> tuple[Array, Array]:
+    """Return octaves of averaging time up to a quarter of a record, s, and the Allan variance there, shapes (t,).
+
+    Sums over the bins of each record, which its mirror image continues and whose lines are left out: they need no
+    samples. Records count by how many means they hold.
+    """
+    interval, longest = records[0][0].interval, max(each.length for record in records for each in record)
+    m = 2 ** np.arange(max(0, int(np.log2(longest / interval / 4))) + 1)
+    total, weight = np.zeros(len(m)), np.zeros(len(m))
+    for record in records:
+        counts = np.maximum(max(each.length for each in record) / (m * interval) - 3, 0.0)
+        for each in record:
+            power = np.where(each.freedom > 0, each.power, 0.0)
+            total += counts * (_weights(each, m) @ (_share(each) * power))
+        weight += counts
+    return np.asarray(m * interval, dtype=np.float64), np.asarray(total / weight)
+
+
+def _share(spectrum: Spectrum) -> Array:
+    """Which part of all coefficients of the record each bin holds, those left out as lines included."""
+    return np.asarray((spectrum.last - spectrum.first + 1) / spectrum.count)
+
+
+def _weights(spectrum: Spectrum, m: np.ndarray) -> Array:
+    """Mean over each bin of ``2 sin^4(m w/2)/(m^2 sin^2(w/2))``, w = pi j/n, for means of m samples, shape (t, b)."""
+    width = (spectrum.last - spectrum.first + 1).astype(np.float64)
+    share = (np.arange(_NODES) + 0.5) / _NODES
+    # Midpoints stand for the j of a bin; those of a narrow one are repeated.
+    offset = np.floor(share * width[:, None])
+    half = np.pi * (spectrum.first[:, None] + offset) / (2 * spectrum.count)
+    return np.stack([np.mean(2 * np.sin(k * half) ** 4 / (k * np.sin(half)) ** 2, axis=1) for k in m])
+
+
+# Which terms the noise of a record has, and what all models that it allows say together.
+
+
+CANDIDATES = ("N", "NK", "NB", "NG", "NBK", "NGK", "NGB", "NGG", "NGGK")
+PER_PARAMETER, _RIVAL, _QUANTISATION = 4.0, 4.0, 12.0
+"""What a parameter must gain in deviance, how near a rival is, what quantisation noise must gain."""
+_LARGEST_VARIANCE = 2.0
+"""Of the logarithm of a square: beyond it the expansion that it comes from says nothing more."""
+_HALVINGS = 60
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Candidate models fitted to the spectra of columns.
+
+    Attributes
+    ----------
+    models
+        Which parameters each candidate has, shape (c, m, 8), c columns and m candidates.
+    values, deviance, covariance
+        As in `likelihood.Fits`, shapes (c, m, 8), (c, m) and (c, m, 8, 8).
+    """
+
+    models: Flags
+    values: Array
+    deviance: Array
+    covariance: Array
+
+    @property
+    def _cost(self) -> Array:
+        return np.asarray(self.deviance + PER_PARAMETER * self.models.sum(axis=-1))
+
+    @property
+    def chosen(self) -> NDArray[np.int64]:
+        """The candidate of the least deviance plus 4 for each parameter, shape (c,)."""
+        return np.asarray(self._cost.argmin(axis=-1))
+
+    @property
+    def rivals(self) -> Flags:
+        """Candidates within 4 of the chosen one, shape (c, m)."""
+        near = self._cost - self._cost.min(axis=-1, keepdims=True) < _RIVAL
+        near[np.arange(len(near)), self.chosen] = False
+        return np.asarray(near)
+
+    @property
+    def weights(self) -> Array:
+        """``exp(-deviance/2 - parameters)`` over their sum, shape (c, m).
+
+        A parameter counts half of what it does in the choice: with the same price averages are too sure of the fewest
+        terms, and the mean over a tenth of a log of a Gauss-Markov process as long is within 2 u in 87 %, not 91 %.
+        """
+        exponent = self.deviance / 2 + self.models.sum(axis=-1)
+        weights = np.exp(exponent.min(axis=-1, keepdims=True) - exponent)
+        return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
+
+
+def choose(
+    bins: Bins,
+    limits: tuple[float, float],
+    power: Array,
+    freedom: Array,
+    candidates: tuple[str, ...] = CANDIDATES,
+    full_band: bool = False,
+) -> Choice:
+    """Fit candidate models to the spectra of columns.
+
+    Quantisation noise joins all candidates of a column where it gains 12 in the best one; it shows only in spectra that
+    reach up to half the sampling rate (`full_band`).
+
+    Parameters
+    ----------
+    bins, limits, power, freedom
+        As for `likelihood.fit`; power and freedom have shape (c, b).
+    candidates
+        Letters of the models; a single one is fitted as it is.
+    full_band
+        Whether the spectra reach up to half the sampling rate.
+    """
+    models = np.array([terms(each) for each in candidates])
+    found = _fitted(bins, models, limits, power, freedom)
+    if not full_band or len(candidates) == 1:
+        return found
+    best = found.chosen
+    with_q = models | terms("Q")
+    joins = np.zeros(len(power), dtype=np.bool_)
+    for index in sorted(set(best.tolist())):
+        columns = np.flatnonzero(best == index)
+        tried = fit(bins, with_q[index : index + 1], limits, power[columns], freedom[columns])
+        joins[columns] = found.deviance[columns, index] - tried.deviance >= _QUANTISATION
+    if not joins.any():
+        return found
+    again = _fitted(bins, with_q, limits, power[joins], freedom[joins])
+    for name in Choice.__annotations__:
+        getattr(found, name)[joins] = getattr(again, name)
+    return found
+
+
+def _fitted(bins: Bins, models: Flags, limits: tuple[float, float], power: Array, freedom: Array) -> Choice:
+    found: Fits = fit(bins, models, limits, power, freedom)
+    shape = (len(power), len(models))
+    return Choice(
+        np.repeat(models[None], len(power), axis=0),
+        found.values.reshape(*shape, -1),
+        found.deviance.reshape(shape),
+        found.covariance.reshape(*shape, len(NAMES), len(NAMES)),
+    )
+
+
+@dataclass(frozen=True)
+class Averaged:
+    """A positive quantity, a variance, as all candidates together have it: a mixture of lognormal distributions.
+
+    Attributes
+    ----------
+    squares
+        Of each candidate, shape (c, m, t).
+    spread
+        Variance of the logarithms of these, shape (c, m, t).
+    weights
+        Of the candidates, shape (c, m).
+    """
+
+    squares: Array
+    spread: Array
+    weights: Array
+
+    @property
+    def mean(self) -> Array:
+        """Weighted mean of the squares, shape (c, t)."""
+        return np.asarray(np.einsum("cm,cmt->ct", self.weights, self.squares))
+
+    @property
+    def expected(self) -> Array:
+        """Weighted mean of the expectations ``square exp(spread/2)``, shape (c, t)."""
+        return np.asarray(np.einsum("cm,cmt->ct", self.weights, self.squares * np.exp(self.spread / 2)))
+
+    def quantile(self, probability: float) -> Array:
+        """Return what the square is below with a probability, shape (c, t); 0 where that is the share of no noise."""
+        from imulab.estimation.special import ndtr
+
+        with np.errstate(divide="ignore"):
+            centre = np.log(self.squares)
+        width = np.sqrt(self.spread) + 1e-9
+        finite = np.isfinite(centre)
+        low = np.where(finite, centre - 9 * width, np.inf).min(axis=1)
+        high = np.where(finite, centre + 9 * width, -np.inf).max(axis=1)
+        nothing = (self.weights[:, :, None] * ~finite).sum(axis=1) >= probability
+        low, high = np.where(nothing, 0.0, low), np.where(nothing, 0.0, high)
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            below = np.einsum("cm,cmt->ct", self.weights, ndtr((middle[:, None] - centre) / width))
+            low, high = np.where(below < probability, middle, low), np.where(below < probability, high, middle)
+        return np.where(nothing, 0.0, np.exp(high))
+
+
+def average(choice: Choice, square: Callable[[Array], Array]) -> Averaged:
+    """Return a quantity over all candidates, with the uncertainty that the covariance of each gives it.
+
+    Parameters
+    ----------
+    choice
+        The fitted candidates of columns.
+    square
+        Parameters (..., 8) -> variance (..., t), for example `allan_variance` at some averaging times.
+    """
+    step = 1e-4
+    shifts = np.concatenate([np.zeros((1, len(NAMES))), step * np.eye(len(NAMES)), -step * np.eye(len(NAMES))])
+    each = square(choice.values[..., None, :] * np.exp(shifts))
+    safe = np.maximum(each, 1e-300)
+    slope = np.log(safe[..., 1 : len(NAMES) + 1, :] / safe[..., len(NAMES) + 1 :, :]) / (2 * step)
+    spread = np.einsum("cmpt,cmpq,cmqt->cmt", slope, choice.covariance, slope)
+    return Averaged(each[..., 0, :], np.clip(spread, 0, _LARGEST_VARIANCE), choice.weights)
+
+
+# The noise of one column, from its stretches at rest to a model: band, allowance, candidates, intervals, test.
+
 
 _RICHEST = "NGGK"
 

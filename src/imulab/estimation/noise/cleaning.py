@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.ranked import median, medians, quantile
+from imulab.estimation.rows import median, medians, quantile
 from imulab.recording import Array
 
 _BLOCK, _SPIKE = 50, 6.0

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imulab.estimation.noise.band import within
-from imulab.estimation.noise.intervals import profile
-from imulab.estimation.noise.likelihood import Flags, fit, information, time_limits
+from imulab.estimation.noise.likelihood import Flags, fit, information, profile, time_limits, within
 from imulab.estimation.noise.spectrum import Spectrum, bins
 from imulab.estimation.noise.terms import prepare
 from imulab.recording import Array

@@ -1,4 +1,6 @@
-"""Noise models fitted to a spectrum by maximum likelihood, many models and spectra at a time.
+"""Noise models fitted to a spectrum by maximum likelihood, up to which frequency.
+
+The intervals of their parameters from the profile of the likelihood.
 
 Source: Whittle (1953); the likelihood is exact for white noise plus walk. Fisher scoring in the logarithms of the
 parameters, damped; starts from multiplicative updates of the variances with time constants on a grid.
@@ -6,16 +8,198 @@ parameters, damped; starts from multiplicative updates of the variances with tim
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.noise.spectrum import Spectrum
+from imulab.estimation.noise.spectrum import Spectrum, frequencies
 from imulab.estimation.noise.terms import LINEAR, NAMES, SIGMA, TIME, Bins
+from imulab.estimation.rows import NORMAL_95
 from imulab.recording import Array
+
+# Up to which frequency a noise model is held against a spectrum, and how exactly: no spectrum is quite the model's.
+
+
+_AGREE, _SIGMAS, _SHARP = 0.03, 3.0, 0.2
+"""How far two octaves may be apart, beyond so many sigma; up to where these sigma tell of an agreement at all."""
+_FULL, _NEARLY_FULL = 0.999, 0.24
+_MANY, _FEWEST = 200, 16
+"""Coefficients of a bin that tells the ripple; such bins that are needed to tell it."""
+_OFF_SIGMAS, _OFF = 5.0, 0.10
+_BOUND, _EXPECTED = 6.635, 0.9819
+"""Of the squared deviation of a bin in terms of its variance: at most so much counts, and what is then expected."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """The usable band of a spectrum.
+
+    Attributes
+    ----------
+    highest
+        f_max, Hz: half the sampling rate where the band is full.
+    full
+        Whether that is the whole band of the samples.
+    flat
+        Whether there is white noise at its end: where no two octaves agree, the band is full and this is False.
+    roll_off
+        Relative standard uncertainty of N from what may be left of a filter's roll-off.
+    """
+
+    highest: float
+    full: bool
+    flat: bool = True
+    roll_off: float = field(default=0.0, compare=False)
+
+    def filtered(self, interval: float) -> bool:
+        """Return whether it ends below a sensor's filter; at a quarter of the sampling rate it does where none is."""
+        return self.flat and self.highest * interval < _NEARLY_FULL
+
+
+def usable_band(spectra: Sequence[Spectrum]) -> Band:
+    """Return the band whose two highest octaves agree: f_max is halved from half the rate until they do, and once more.
+
+    They agree within 3 % + 3 sigma. Of these 3 % a long record makes a term of its own, and N comes out too small: so
+    the band ends an octave lower, unless 3 sigma are more than 20 %. Quantisation of an angle rises with frequency:
+    where white noise and quantisation together, ``a + b s^2``, bring the three highest octaves to agreement, or the
+    highest octave is plainly above the next, the band is full.
+    """
+    nyquist = 0.5 / spectra[0].interval
+    f, p, d = (np.concatenate(each) for each in zip(*((frequencies(s), s.power, s.freedom) for s in spectra)))  # noqa: B905
+    highest = nyquist
+    if not _same_level(f, p, d, highest, 2) and _rising(f, p, d, nyquist):
+        return Band(nyquist, True)
+    while highest == nyquist or d[f <= highest / 4].sum() > _MANY:
+        if _same_level(f, p, d, highest, 2):
+            far, u = _apart(f, p, d, highest, 2)
+            full = highest > _FULL * nyquist
+            if _SIGMAS * u[0] > _SHARP or (full and far[0] < -_SIGMAS * u[0]):
+                # One of first order takes 0.76 of what these octaves are apart from the band, and N half of that.
+                left = 0.0 if full else 0.38 * float(max(far[0], 0.0) + u[0]) / math.sqrt(3)
+                return Band(highest, full, roll_off=left)
+            # One of first order leaves a quarter of it an octave lower, and N has half of that at most.
+            return Band(highest / 2, False, roll_off=float(_AGREE + _SIGMAS * u[0]) / 8 / math.sqrt(3))
+        highest /= 2
+    return Band(nyquist, True, False)
+
+
+def _same_level(f: Array, p: Array, d: Array, highest: float, octaves: int) -> bool:
+    """Whether the highest octaves have the same level, each against the highest."""
+    far, u = _apart(f, p, d, highest, octaves)
+    return bool((np.abs(far) <= _AGREE + _SIGMAS * u).all())
+
+
+def _apart(f: Array, p: Array, d: Array, highest: float, octaves: int) -> tuple[Array, Array]:
+    """Logarithms of the levels of octaves in terms of the highest one, and their uncertainties; inf where one is 0."""
+    level, freedom = [], []
+    for k in range(octaves):
+        inside = (f <= highest / 2**k * (1 + 1e-9)) & (f > highest / 2 ** (k + 1)) & (d > 0)
+        freedom.append(float(d[inside].sum()))
+        level.append(float((p * d)[inside].sum()) / max(freedom[-1], 1.0))
+    if min(freedom) <= 0 or min(level) <= 0:
+        return np.full(octaves - 1, np.inf), np.zeros(octaves - 1)
+    u = np.sqrt(2 / np.array(freedom[1:]) + 2 / freedom[0])
+    return np.asarray(np.log(np.array(level[1:]) / level[0])), np.asarray(u)
+
+
+def _rising(f: Array, p: Array, d: Array, nyquist: float) -> bool:
+    """Whether white noise and quantisation of an angle explain the three highest octaves."""
+    top = (f > nyquist / 8) & (d > 0) & (p > 0)
+    square = 4 * np.sin(np.pi / 2 * f[top] / nyquist) ** 2
+    root = np.sqrt(d[top]) / p[top]
+    a, b = np.linalg.lstsq(np.column_stack([root, root * square]), root * p[top])[0]
+    if b <= 0 or a <= 0:
+        return False
+    return _same_level(f[top], p[top] / (a + b * square), d[top], nyquist, 3)
+
+
+def within(spectrum: Spectrum, highest: float) -> Spectrum:
+    """Return a spectrum whose bins beyond a frequency, Hz, count nothing."""
+    inside = spectrum.last / (2 * spectrum.length) <= highest * (1 + 1e-9)
+    return replace(spectrum, freedom=np.where(inside, spectrum.freedom, 0.0))
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """What a spectrum may be off its model, and where it is farther off.
+
+    Attributes
+    ----------
+    ripple
+        eps, the relative standard deviation of the level of bins beyond their scatter.
+    spectra
+        With the freedom that this leaves, and nothing for the bins that are off.
+    off
+        Lowest and highest frequency of each run of bins that were left out, Hz, and by which factor they are off.
+    """
+
+    ripple: float
+    spectra: tuple[Spectrum, ...]
+    off: tuple[tuple[float, float, float], ...]
+
+
+def allow(spectra: Sequence[Spectrum], variances: Sequence[Array]) -> Allowance:
+    """Return spectra that count no more than they agree with the variances of a model in their bins, shapes (b,).
+
+    ``eps^2`` is the variance of ``ln(P/lambda)`` beyond 2/d over bins with d > 200, by maximum likelihood with bounded
+    influence: the bins that count most decide, where a median over all bins would find ripple of 1 to 4 % in noise that
+    has none. d becomes ``d/(1 + d eps^2/2)``. Bins that are then off by 5 sigma and 10 % are left out.
+    """
+    logarithm = [
+        np.log(np.maximum(s.power, 1e-300) / v) + 1 / np.maximum(s.freedom, 1)
+        for s, v in zip(spectra, variances, strict=True)
+    ]
+    log = np.concatenate(logarithm)
+    freedom = np.concatenate([s.freedom for s in spectra])
+    ripple = _ripple(log, freedom)
+    far = _far_bins(log, freedom, ripple)
+    ripple = _ripple(log[~far], freedom[~far])  # what is left out is no ripple
+    far = _far_bins(log, freedom, ripple)
+    edges = np.cumsum([len(s.power) for s in spectra])[:-1]
+    parts, off = [], []
+    for spectrum, part, out in zip(spectra, logarithm, np.split(far, edges), strict=True):
+        left = spectrum.freedom / (1 + spectrum.freedom * ripple**2 / 2)
+        parts.append(replace(spectrum, freedom=np.where(out, 0.0, left)))
+        runs = np.flatnonzero(np.diff(np.concatenate([[0], out.astype(int), [0]]))).reshape(-1, 2)
+        for start, stop in runs.tolist():
+            low, high = (each / (2 * spectrum.length) for each in (spectrum.first[start], spectrum.last[stop - 1]))
+            off.append((float(low), float(high), float(np.exp(part[start:stop].mean()))))
+    return Allowance(ripple, tuple(parts), tuple(off))
+
+
+def _far_bins(logarithm: Array, freedom: Array, ripple: float) -> NDArray[np.bool_]:
+    """Which bins are off by 5 sigma and 10 %, the ripple allowed for."""
+    u = np.sqrt(2 / np.maximum(freedom, 1) + ripple**2)
+    size = np.abs(logarithm)
+    return np.asarray((freedom > _FEWEST) & (size > np.log1p(_OFF)) & (size > _OFF_SIGMAS * u))
+
+
+def _ripple(logarithm: Array, freedom: Array) -> float:
+    """Scatter of the levels of bins beyond what their numbers of coefficients explain."""
+    many = freedom > _MANY
+    if np.count_nonzero(many) < _FEWEST:
+        return 0.0
+    square, chance = logarithm[many] ** 2, 2 / freedom[many]
+
+    def beyond(eps: float) -> float:
+        spread = chance + eps**2
+        return float(np.sum((np.minimum(square / spread, _BOUND) - _EXPECTED) / spread))
+
+    if beyond(0.0) <= 0:
+        return 0.0
+    low, high = 0.0, float(np.sqrt(square.max()))
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if beyond(middle) > 0 else (low, middle)
+    return high
+
+
+# Noise models fitted to a spectrum by maximum likelihood, many models and spectra at a time.
+
 
 Flags = NDArray[np.bool_]
 _SIZES = [*range(LINEAR), *SIGMA]
@@ -308,3 +492,131 @@ def _inverse(fisher: Array, free: Flags) -> Array:
     scaled = np.where(both, fisher / outer, 0.0)
     np.einsum("rpp->rp", scaled)[...] += np.where(free, 1e-9, 1.0)
     return np.where(both, np.linalg.inv(scaled) / outer, 0.0)
+
+
+# Intervals of the parameters of a noise model from the profile of its likelihood.
+
+
+_LEVEL = 3.84
+"""The 95 % point of chi-square with one degree of freedom."""
+_END_TRIALS, _EXACT = 14, 0.01
+"""Trials for an end at most, and how close the root of the deviance must come to that of the level."""
+_FIRST = 1.0
+"""The longest first step of a logarithm."""
+
+
+def profile(
+    bins: Bins, values: Array, models: Flags, limits: tuple[float, float], power: Array, freedom: Array
+) -> tuple[Array, Array]:
+    """Return the lower and upper ends of the 95 % intervals of the parameters of best fits, shapes (r, 8).
+
+    An end is where the deviance, least in all other parameters, is 3.84 above its minimum. A lower end that is never
+    reached is 0, an end of a time constant its limit. Parameters that a model has not got have NaN.
+
+    Parameters
+    ----------
+    bins, limits
+        As for `likelihood.fit`.
+    values
+        The best fits, shape (r, 8).
+    models
+        Which parameters each model has, shape (r, 8).
+    power, freedom
+        Of the spectrum of each row, shape (r, b).
+    """
+    best = score(bins, values, values > 0, limits, power, freedom)
+    row, parameter = (np.repeat(each, 2) for each in np.nonzero(models))
+    side = np.tile([-1.0, 1.0], len(row) // 2)
+    ends = _Ends(bins, limits, power[row], freedom[row], best.deviance[row], parameter, side)
+    # What is nothing in the best fit may be something when another parameter is held.
+    start = with_a_little(bins, best.values, models, limits)[row]
+    absent = best.values[row, parameter] == 0
+    spread = np.sqrt(best.covariance[row, parameter, parameter])
+    start[absent, parameter[absent]], spread[absent] = ends.just_visible(best.values[row[absent]], absent), _FIRST
+    found = np.full((2, *values.shape), np.nan)
+    found[(side > 0).astype(int), row, parameter] = ends.find(start, np.clip(NORMAL_95 * spread, 1e-6, _FIRST))
+    return found[0], found[1]
+
+
+@dataclass(frozen=True)
+class _Ends:
+    """One end of the interval of one parameter in each row."""
+
+    bins: Bins
+    limits: tuple[float, float]
+    power: Array
+    freedom: Array
+    lowest: Array
+    parameter: NDArray[np.int64]
+    side: Array
+
+    def just_visible(self, values: Array, absent: Flags) -> Array:
+        """A tenth of the size at which terms that the best fit has not got would show; a time constant as it is."""
+        parameter = self.parameter[absent]
+        middle = np.full(len(parameter), np.sqrt(self.limits[0] * self.limits[1]))
+        unit = self.bins.markov(middle)[0]
+        linear = parameter < LINEAR
+        unit[linear] = self.bins.unit[parameter[linear]]
+        information = 0.5 * (self.freedom[absent] * (unit / self.bins.variances(values)) ** 2).sum(axis=1)
+        return np.where(np.isin(parameter, TIME), middle, 0.1 * information**-0.25)
+
+    def find(self, values: Array, first: Array) -> Array:
+        """Find the ends by secants of the root of the deviance, from best values and first steps of logarithms."""
+        timed = np.isin(self.parameter, TIME)
+        floor, ceiling = (
+            np.where(timed, np.log(edge), far) for edge, far in zip(self.limits, (-700, 700), strict=True)
+        )
+        values, found = values.copy(), self._never_reached(values)
+        low = np.log(values[np.arange(len(values)), self.parameter])
+        below = np.full(len(low), -np.sqrt(_LEVEL))
+        high, above, last = np.full((3, len(low)), np.nan)
+        trial = low + self.side * first
+        for _ in range(_END_TRIALS):
+            rows = np.flatnonzero(np.isnan(found))
+            if not rows.size:
+                break
+            at = np.clip(trial[rows], floor[rows], ceiling[rows])
+            root, values[rows] = self._held(values[rows], at, rows)
+            out = root > 0
+            at_limit = ~out & (
+                (at <= floor[rows]) & (self.side[rows] < 0) | (at >= ceiling[rows]) & (self.side[rows] > 0)
+            )
+            done = (np.abs(root) < _EXACT) | at_limit
+            end = np.where(at_limit, np.where(self.side[rows] < 0, *self.limits), np.exp(at))
+            found[rows[done]] = end[done]
+            moved = np.where(at == low[rows], 1.0, np.abs(at - low[rows]))
+            reach = np.clip(moved * -root / np.maximum(root - below[rows], 1e-9), 0.1 * first[rows], 2.0)
+            # A bound that stays where it was for the second time counts half (the Illinois rule).
+            again = last[rows] == out
+            above[rows] = np.where(out, root, np.where(again, above[rows] / 2, above[rows]))
+            below[rows] = np.where(out, np.where(again, below[rows] / 2, below[rows]), root)
+            high[rows], low[rows] = np.where(out, at, high[rows]), np.where(out, low[rows], at)
+            last[rows] = out
+            between = low[rows] - below[rows] * (high[rows] - low[rows]) / (above[rows] - below[rows])
+            trial[rows] = np.where(np.isnan(high[rows]), low[rows] + self.side[rows] * reach, between)
+        return np.where(np.isnan(found), np.exp(np.clip(trial, floor, ceiling)), found)
+
+    def _never_reached(self, start: Array) -> Array:
+        """0 for lower ends of terms without which the model fits as well, NaN for all others."""
+        found = np.full(len(start), np.nan)
+        rows = np.flatnonzero((self.side < 0) & ~np.isin(self.parameter, TIME))
+        without = start[rows].copy()
+        without[np.arange(len(rows)), self.parameter[rows]] = 0
+        for sigma, time in zip(SIGMA, TIME, strict=True):
+            without[without[:, sigma] == 0, time] = 0
+        some = (without > 0).any(axis=1)
+        rows, without = rows[some], without[some]
+        rest = score(self.bins, without, without > 0, self.limits, self.power[rows], self.freedom[rows])
+        found[rows[rest.deviance - self.lowest[rows] < _LEVEL]] = 0.0
+        return found
+
+    def _held(self, values: Array, at: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Root of the deviance above its minimum, less that of the level, with the parameter held, and the best fit."""
+        held, index = values.copy(), np.arange(len(rows))
+        held[index, self.parameter[rows]] = np.exp(at)
+        free = held > 0
+        free[index, self.parameter[rows]] = False
+        fitted = score(self.bins, held, free, self.limits, self.power[rows], self.freedom[rows])
+        root = np.sqrt(np.maximum(fitted.deviance - self.lowest[rows], 0)) - np.sqrt(_LEVEL)
+        # What vanished here may be something again at the next trial.
+        return root, np.where(fitted.values > 0, fitted.values, np.where(np.isin(np.arange(8), TIME), held, 0.1 * held))

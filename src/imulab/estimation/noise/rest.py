@@ -1,25 +1,44 @@
-"""A recording at rest, column by column, as stretches that a noise model can be fitted to; or why that cannot be."""
+"""Logs at rest, column by column, as stretches that a noise model can be fitted to.
+
+Logs of any length block by block.
+
+Rows without numbers and gaps are bridged, or end a stretch, as in a log that is in memory. Of a log with other faults
+nothing comes: it has to be looked at as a whole, where the messages are made.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
+from imulab.display import Note
 from imulab.errors import DataError
-from imulab.estimation.column_noise import moved_columns
-from imulab.estimation.noise.cosine import Stretch, slow_coefficients, transformed
-from imulab.estimation.noise.plausible import doubtful_units
-from imulab.estimation.noise.readings import LEVELS, own_readings
+from imulab.estimation.column_noise import most_reach, moved_columns
+from imulab.estimation.noise.readings import LEVELS, doubtful_units, dropouts, own_readings
+from imulab.estimation.noise.spectrum import Accumulator, Stretch, slow_coefficients, transformed
 from imulab.estimation.noise_coefficients import resolution
-from imulab.estimation.ranked import distinct
-from imulab.estimation.sampling import WIDEST_GAP, bridged, sampling_rate, steady_part, usual_step
-from imulab.estimation.steps import deviation_of_steps
+from imulab.estimation.rows import deviation_of_steps, distinct
+from imulab.estimation.sampling import (
+    BRIDGED,
+    SAME_RATE,
+    WIDEST_GAP,
+    bridged,
+    bridged_line,
+    mislabelled,
+    sampling_rate,
+    steady_part,
+    usual_step,
+)
 from imulab.recording import Array, Recording, check_time
-from imulab.verdict import Note
+from imulab.units import parse_unit
+
+# A recording at rest, column by column, as stretches that a noise model can be fitted to; or why that cannot be.
+
 
 FEWEST, SHORT = 500, 100.0
 """Samples of a stretch at least; s below which only white noise and limits of the rest can be told."""
@@ -228,3 +247,282 @@ def _clipped(values: Array) -> float | None:
             if is_clipped(piled, int(np.count_nonzero(values == below))):
                 return float(limit)
     return None
+
+
+# A log at rest of any length, block by block as it is read: its rows go into spectra, and are not kept.
+
+
+_FEW = 100
+"""Steps of time whose usual one tells the rate."""
+
+
+class _AsWholeError(Exception):
+    """The log has to be looked at as a whole."""
+
+
+@dataclass(frozen=True)
+class LongRest(Rest):
+    """A recording at rest whose rows are gone: `recording` has none. Else as `Rest`.
+
+    Attributes
+    ----------
+    found
+        Spectra by column, stretch by stretch.
+    temperature
+        Slow coefficients of the temperature, stretch by stretch; None where it does not change.
+    """
+
+    found: dict[str, list[Stretch]] = field(default_factory=dict)
+    temperature: list[Array] | None = None
+
+    def stretches(self, name: str) -> list[Stretch]:
+        """Return the spectra of a column, stretch by stretch."""
+        return self.found[name]
+
+    def slow(self, name: str) -> list[Array] | None:
+        """Return the slow coefficients of the temperature, stretch by stretch; None where it does not change."""
+        return self.temperature if name == "temperature" else None
+
+
+def long_rest(blocks: Iterable[Recording], names: Sequence[str]) -> LongRest | None:
+    """Return a log at rest from its blocks of rows, one after the other; None where it has to be looked at as a whole.
+
+    Parameters
+    ----------
+    blocks
+        Of one file.
+    names
+        Columns to fit.
+    """
+    log = _Log(list(names))
+    try:
+        for block in blocks:
+            log.add(block)
+        return log.rest()
+    except _AsWholeError:
+        return None
+
+
+class _Level:
+    """What tells whether a column is one at rest: means over a second, steps, the outermost levels on both sides."""
+
+    def __init__(self, samples: Array, size: int) -> None:
+        self._size = size
+        self._fine = len(distinct(samples)) >= LEVELS
+        self._unfinished, self._last = samples[:0], samples[:0]
+        self._least, self._most = np.inf, -np.inf
+        self._sums = np.zeros(3)
+        self._outer: tuple[dict[float, int], dict[float, int]] = ({}, {})
+
+    def add(self, samples: Array) -> None:
+        """Take the next samples, shape (k,)."""
+        steps = np.diff(np.concatenate([self._last, samples]))
+        self._last = samples[-1:].copy()
+        self._sums += len(steps), steps.sum(), np.einsum("i,i", steps, steps)
+        held = np.concatenate([self._unfinished, samples])
+        means = held[: len(held) // self._size * self._size].reshape(-1, self._size).mean(axis=1)
+        self._unfinished = held[len(means) * self._size :].copy()
+        if len(means):
+            self._least, self._most = min(self._least, means.min()), max(self._most, means.max())
+        for sign, outer in zip((1.0, -1.0), self._outer, strict=True):
+            left = sign * samples
+            for _ in range(2):
+                if len(left):
+                    level = float(left.max())
+                    outer[level] = outer.get(level, 0) + int(np.count_nonzero(left == level))
+                    left = left[left < level]
+            for level in sorted(outer)[:-2]:
+                del outer[level]
+
+    def settled(self, quantity: str) -> bool:
+        """Whether the column is at rest, with noise and within its range."""
+        count, total, square = self._sums.tolist()
+        noise = float(np.sqrt(max(square / count - (total / count) ** 2, 0.0) / (2 * self._size)))
+        clipped = self._fine and any(is_clipped(*(outer[k] for k in sorted(outer)[::-1])) for outer in self._outer)
+        varies = all(len(outer) == 2 for outer in self._outer)
+        return varies and not clipped and self._most - self._least <= most_reach(quantity, noise)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A stretch: its samples, those of them that were missing, spectra by column, slow coefficients of temperature."""
+
+    count: int
+    filled: int
+    spectra: dict[str, Stretch]
+    temperature: Array | None
+
+
+class _Log:
+    """Takes blocks of rows, and gives stretches."""
+
+    def __init__(self, names: list[str]) -> None:
+        self._names = names
+        self._head: Recording | None = None
+        self._notes: dict[str, None] = {}
+        self._waiting: Recording | None = None
+        self._rows = self._bad = 0
+        self._first_bad = ""
+        self._coarse: list[str] = []
+        self._time = np.empty(0)
+        self._usual = self._longest = 0.0
+        self._steps, self._duration = 0, 0.0
+        self._levels: dict[str, _Level] = {}
+        self._last: dict[str, float] = {}
+        self._warm, self._range = False, np.array([np.inf, -np.inf])
+        self._gathered: dict[str, Accumulator] = {}
+        self._count = self._filled = 0
+        self._parts: list[_Part] = []
+
+    def add(self, block: Recording) -> None:
+        """Take the next rows; the last ones without numbers wait for what comes."""
+        self._notes |= dict.fromkeys(block.notes)
+        if self._waiting is not None:
+            columns = {k: np.concatenate([self._waiting.columns[k], v]) for k, v in block.columns.items()}
+            block = replace(block, columns=columns, first_row=self._waiting.first_row)
+        fine = self._finite(block)
+        stop = len(fine) - int(np.argmax(fine[::-1])) if fine.any() else 0
+        self._waiting = _rows(block, stop, len(block)) if stop < len(block) else None
+        if stop:
+            self._take(_rows(block, 0, stop), fine[:stop])
+
+    def rest(self) -> LongRest:
+        """Return the log; it takes no more rows."""
+        if self._head is None:
+            raise _AsWholeError
+        if self._waiting is not None:
+            self._take(self._waiting, self._finite(self._waiting))
+        self._end()
+        head, interval = self._head, self._duration / self._steps
+        settled = all(self._levels[name].settled(parse_unit(head.units[name]).quantity) for name in self._names)
+        most = max(part.count for part in self._parts)
+        parts = [part for part in self._parts if part.count >= max(FEWEST, SHARE * most)]
+        if not settled or not parts or self._bad > BRIDGED * self._rows:
+            raise _AsWholeError
+        kept, filled = sum(part.count for part in parts), sum(part.filled for part in parts)
+        bad = [bridged_line(head.name, self._bad, self._first_bad)] if self._bad else []
+        slow = [part.temperature for part in parts if part.temperature is not None]
+        lengths = [part.count for part in parts]
+        return LongRest(
+            head,
+            interval,
+            tuple((0, count, None) for count in lengths),
+            filled,
+            (
+                *(f"{head.name}: {note}" for note in self._notes),
+                *bad,
+                *mislabelled(head, 1 / interval),
+                *self._coarse,
+                *notes_of_gaps(head.name, interval, lengths, filled, self._rows + filled - kept, self._rows),
+            ),
+            {name: [part.spectra[name] for part in parts] for name in self._names},
+            slow if self._warm and self._range[1] > self._range[0] else None,
+        )
+
+    def _finite(self, block: Recording) -> NDArray[np.bool_]:
+        return np.asarray(np.logical_and.reduce([np.isfinite(block.column(name)) for name in self._names]))
+
+    def _take(self, block: Recording, fine: NDArray[np.bool_]) -> None:
+        time = block.time
+        if time is None or not np.isfinite(time).all():
+            raise _AsWholeError
+        columns = {name: np.asarray(block.si(name), dtype=np.float64) for name in self._names}
+        if any(dropouts(values) is not None for values in columns.values()):
+            raise _AsWholeError
+        if not fine.all():
+            self._first_bad = self._first_bad or block.place(int(np.argmin(fine)))
+            self._bad += int(np.count_nonzero(~fine))
+            columns = {name: self._joined(name, values) for name, values in columns.items()}
+        steps = np.diff(np.concatenate([self._time, time]))
+        if len(steps) and not steps.min() > 0:
+            raise _AsWholeError
+        if self._head is None:
+            self._begin(block, steps, columns)
+        elif len(steps) >= _FEW and abs(np.log(usual_step(steps)[0] / self._usual)) > SAME_RATE:
+            raise _AsWholeError
+        for name, level in self._levels.items():
+            level.add(columns[name])
+        if self._warm:
+            warmth = np.asarray(block.si("temperature"), dtype=np.float64)
+            self._warm = bool(np.isfinite(warmth).all())
+            self._range = np.array([min(self._range[0], warmth.min()), max(self._range[1], warmth.max())])
+            columns["temperature"] = warmth
+        self._add(steps, columns)
+        self._rows += len(time)
+        self._time = time[-1:].copy()
+
+    def _joined(self, name: str, values: Array) -> Array:
+        """Straight lines in place of what is no number, from the last sample before the block."""
+        values = np.concatenate([[self._last.get(name, np.nan)], values])
+        known = np.flatnonzero(np.isfinite(values))
+        if not len(known):
+            raise _AsWholeError
+        return np.asarray(np.interp(np.arange(1, len(values)), known, values[known]))
+
+    def _begin(self, block: Recording, steps: Array, columns: dict[str, Array]) -> None:
+        if len(steps) < FEWEST:
+            raise _AsWholeError
+        self._head, filled = _rows(block, 0, 0), bridged(block, self._names)[0]
+        if own_readings(filled, self._names)[1]:
+            raise _AsWholeError
+        rate = 1 / usual_step(steps)[0]
+        self._coarse = [*notes_of_steps(filled, self._names), *doubtful_units(filled, self._names, rate)]
+        self._warm = "temperature" in block
+        self._usual, self._longest = usual_step(steps)
+        self._levels = {name: _Level(columns[name], max(1, round(1 / self._usual))) for name in self._names}
+        self._renew()
+
+    def _renew(self) -> None:
+        self._gathered = {name: Accumulator(self._usual) for name in self._names}
+        if self._warm:
+            self._gathered["temperature"] = Accumulator(self._usual, despike=False)
+        self._count = self._filled = 0
+
+    def _add(self, steps: Array, columns: dict[str, Array]) -> None:
+        """Put rows into the stretch; beyond a long gap begins another."""
+        wide = steps > self._longest
+        self._steps += int(np.count_nonzero(~wide))
+        self._duration += float(steps[~wide].sum())
+        many = np.where(wide, np.maximum(np.round(steps / self._usual), 1.0), 1.0)
+        rows = len(columns[self._names[0]])
+        first = rows - len(steps)  # 1 where the first row of the block is that of the log, and no step leads to it
+        edges = [0, *(np.flatnonzero(many > WIDEST_GAP) + first).tolist(), rows]
+        for number, (start, stop) in enumerate(pairwise(edges)):
+            if number:
+                self._end()
+                self._renew()
+            if stop > start:
+                inside = many[start + 1 - first if number else 0 : stop - first]
+                self._extend(inside, {name: values[start:stop] for name, values in columns.items()})
+
+    def _extend(self, steps: Array, columns: dict[str, Array]) -> None:
+        """Add rows to the stretch, and the lines across missing ones; steps in samples lead to each but a first row."""
+        begun = len(columns[self._names[0]]) == len(steps)
+        place = np.cumsum(np.concatenate([[0.0], steps]))
+        even = place[-1] == len(steps)
+        wanted = np.arange(float(begun), place[-1] + 1)
+        for name, gathered in self._gathered.items():
+            values = columns.get(name)
+            if values is not None:
+                known = [self._last[name], *values] if begun and not even else values
+                gathered.add(values if even else np.interp(wanted, place, known))
+        self._last = {name: float(values[-1]) for name, values in columns.items()}
+        self._count += len(wanted)
+        self._filled += len(wanted) - len(columns[self._names[0]])
+
+    def _end(self) -> None:
+        """End the stretch."""
+        if len(self._parts) == MOST:
+            raise _AsWholeError
+        spectra, slow = {}, None
+        if self._count >= FEWEST:
+            interval = self._duration / self._steps
+            spectra = {name: self._gathered.pop(name).stretch(interval) for name in self._names}
+            slow = self._gathered.pop("temperature").slow() if self._warm else None
+        self._parts.append(_Part(self._count, self._filled, spectra, slow))
+
+
+def _rows(block: Recording, start: int, stop: int) -> Recording:
+    """Rows of a block."""
+    columns = {name: values[start:stop] for name, values in block.columns.items()}
+    return replace(block, columns=columns, first_row=block.first_row + start)

@@ -1,14 +1,26 @@
-"""The spectrum that noise models are fitted to: mean squares of cosine coefficients in bins of frequency."""
+"""The spectrum that noise models are fitted to.
+
+Samples at rest, of any number, into mean squares of cosine coefficients in bins of frequency.
+
+A log of up to 4 million samples is transformed as a whole. Of a longer one, stretches of 262,144 samples give the
+spectrum from a frequency on, and means of m samples the spectrum below it: all bins are in terms of the full rate, and
+the memory needed does not grow with the log.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.ranked import distinct
+from imulab.estimation.noise.cleaning import Line, knocks_removed, line_groups, spikes_removed, strong_lines_removed
+from imulab.estimation.rows import distinct
 from imulab.recording import Array
+
+# The spectrum that noise models are fitted to: mean squares of cosine coefficients in bins of frequency.
+
 
 _ALONE, _PER_DECADE = 24, 60
 
@@ -63,3 +75,276 @@ def bins(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     starts = distinct(np.concatenate([np.arange(1, _ALONE + 1), edges]))
     first = starts[starts < count]
     return first, np.append(first[1:] - 1, count - 1)
+
+
+# The cosine transform of samples at rest, of any number of them, into the spectrum that noise models are fitted to.
+
+
+WHOLE, STRETCH = 1 << 22, 1 << 18
+"""Samples that are transformed as a whole; samples of a stretch of a longer log."""
+_MEANS = 1 << 21
+"""Means that are kept at most: twice as many samples go into each when there are more."""
+_SHARE = 32
+"""Of the means' frequencies only the lowest 32nd is used: averaging takes .08 % from a slow noise at its end."""
+SLOW = 1 << 19
+_FINE = 1 << 10
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What the fit needs of one column of one stretch at rest.
+
+    Attributes
+    ----------
+    spectra
+        One, or of a long log that of its means and that of its stretches at the full rate.
+    slow
+        The lowest coefficients of the whole, c_1 .. c_J, J <= 524288, shape (J,): for steps and covariates.
+    used
+        Which of these are in the spectra, not left out as lines, shape (J,).
+    lines
+        The lines that were left out, the largest first.
+    spikes
+        Samples that were replaced.
+    knocks
+        Start and length, s, of each part that was replaced because it is not of the noise around it.
+    """
+
+    spectra: tuple[Spectrum, ...]
+    slow: Array
+    used: NDArray[np.bool_]
+    lines: tuple[Line, ...]
+    spikes: int
+    knocks: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of samples, of which there are ``count - 1`` coefficients."""
+        return self.spectra[0].count
+
+    @property
+    def interval(self) -> float:
+        """Time between samples, s."""
+        return self.spectra[0].interval
+
+
+def smooth_count(count: int) -> int:
+    """Return the largest number up to `count` >= 1 that is 2^a 3^b 5^c, whose transform is fast.
+
+    Examples
+    --------
+    >>> smooth_count(1007)
+    1000
+    """
+    best, five = 1, 1
+    while five <= count:
+        three = five
+        while three <= count:
+            best = max(best, three << ((count // three).bit_length() - 1))
+            three *= 3
+        five *= 5
+    return best
+
+
+def cosine_coefficients(samples: Array) -> Array:
+    """Return ``c_j = sqrt(2/n) sum_i x_i cos(pi j (i + 1/2)/n)``, j = 1 .. n - 1, of samples of shape (n,).
+
+    Examples
+    --------
+    >>> [f"{c:.4f}" for c in cosine_coefficients(np.array([2.0, 0.0, 0.0, -1.0]))]
+    ['1.9598', '0.5000', '0.8118']
+    """
+    centred, n = samples - samples.mean(), len(samples)
+    # Even samples, then odd ones backwards: their Fourier transform, turned, is the cosine transform.
+    turned = np.fft.rfft(np.concatenate([centred[::2], centred[1::2][::-1]]))
+    # The angles of the turn are a coarse one and a fine one each: a thousandth of their exponentials is enough.
+    fine, coarse = np.arange(_FINE), _FINE * np.arange(len(turned) // _FINE + 1)
+    turn = np.multiply.outer(np.exp(-0.5j * np.pi / n * coarse), np.exp(-0.5j * np.pi / n * fine))
+    turned *= turn.ravel()[: len(turned)]
+    return np.asarray(np.concatenate([turned.real[1:], -turned.imag[n - len(turned) : 0 : -1]]) * np.sqrt(2 / n))
+
+
+class Accumulator:
+    """Takes the samples of one column block by block, as they are read, and gives what the fit needs of them.
+
+    Parameters
+    ----------
+    interval
+        Time between samples, s.
+    despike
+        Whether spikes are replaced by the line through the medians around them.
+
+    Examples
+    --------
+    >>> gathered = Accumulator(0.01)
+    >>> for seed in range(3):
+    ...     gathered.add(np.random.default_rng(seed).standard_normal(1000))
+    >>> gathered.stretch().count
+    3000
+    """
+
+    def __init__(self, interval: float, despike: bool = True) -> None:
+        self._interval, self._despike = interval, despike
+        self._waiting: list[Array] = []
+        self._held = self._spikes = self._stretches = 0
+        self._squares = np.empty(0)
+        self._knocks: list[NDArray[np.int64]] = []
+        self._means, self._filled, self._averaged = np.empty(0), 0, 1
+
+    def add(self, samples: Array) -> None:
+        """Take the next samples, finite, shape (k,)."""
+        held = self._held + len(samples)
+        if held > WHOLE or (self._stretches and held >= STRETCH):
+            samples = np.concatenate([*self._waiting, samples]) if self._held else samples
+            stop = held // STRETCH * STRETCH
+            for start in range(0, stop, STRETCH):
+                self._transform(samples[start : start + STRETCH])
+            samples, self._waiting, self._held = samples[stop:], [], 0
+        self._waiting.append(np.array(samples, dtype=np.float64))
+        self._held += len(samples)
+
+    def stretch(self, interval: float | None = None) -> Stretch:
+        """Return the spectra of all samples; the accumulator takes no more.
+
+        Parameters
+        ----------
+        interval
+            Time between samples, s, where it is known better now.
+        """
+        self._interval = interval or self._interval
+        held = self._all()
+        self._waiting = []
+        if not self._stretches:
+            return self._whole(held)
+        if len(held):
+            held = self._cleaned(held)
+            self._average(held)
+        return self._two_parts()
+
+    def slow(self) -> Array:
+        """Return the lowest coefficients alone, of a covariate, lines and all, shape (J,); it takes no more then."""
+        if self._stretches:
+            return self.stretch().slow
+        held = self._all()
+        return cosine_coefficients(held[: smooth_count(len(held))])[:SLOW]
+
+    def _all(self) -> Array:
+        return self._waiting[0] if len(self._waiting) == 1 else np.concatenate([*self._waiting, np.empty(0)])
+
+    def _cleaned(self, samples: Array) -> Array:
+        if not self._despike:
+            return samples
+        samples, knocks = knocks_removed(samples)
+        self._knocks.append(knocks + self._stretches * STRETCH)
+        samples, count = spikes_removed(samples)
+        self._spikes += count
+        return samples
+
+    def _knocked(self) -> tuple[tuple[float, float], ...]:
+        edges = np.concatenate([np.empty((0, 2), dtype=np.int64), *self._knocks])
+        return tuple((start * self._interval, (stop - start) * self._interval) for start, stop in edges.tolist())
+
+    def _whole(self, samples: Array) -> Stretch:
+        count = smooth_count(len(samples))
+        c = cosine_coefficients(self._cleaned(samples)[:count])
+        first, last = bins(count)
+        fine, lines = line_groups(c * c, first, last, 1, count, self._interval)
+        c, strong = strong_lines_removed(c, lines, self._interval)
+        squares = c * c
+        if strong:
+            fine, weak = line_groups(squares, first, last, 1, count, self._interval)
+            lines = tuple(sorted([*strong, *weak], key=lambda line: -line.amplitude))
+        spectrum = binned(squares, fine, (first, last), self._interval, count)
+        return Stretch((spectrum,), c[:SLOW].copy(), fine[:SLOW], lines, self._spikes, self._knocked())
+
+    def _transform(self, samples: Array) -> None:
+        samples = self._cleaned(samples)
+        self._average(samples)
+        c = cosine_coefficients(samples)
+        self._squares = c * c if not self._stretches else self._squares + c * c
+        self._stretches += 1
+
+    def _average(self, samples: Array) -> None:
+        """Add the means of samples, whose number is a multiple of that of a mean but at the end of the log."""
+        if not len(self._means):
+            self._means = np.empty(_MEANS)
+        if self._filled + len(samples) // self._averaged > _MEANS:
+            half = self._means[: self._filled].reshape(-1, 2).mean(axis=1)
+            self._filled = len(half)
+            self._means[: len(half)] = half
+            self._averaged *= 2
+        count = len(samples) // self._averaged
+        part = samples[: count * self._averaged].reshape(count, self._averaged)
+        self._means[self._filled : self._filled + count] = part.mean(axis=1)
+        self._filled += count
+
+    def _two_parts(self) -> Stretch:
+        many = smooth_count(self._filled)
+        count = many * self._averaged
+        used = many // _SHARE
+        slow = cosine_coefficients(self._means[:many])[:used] * np.sqrt(self._averaged)
+        edges = bins(count)
+        low = edges[1] <= used
+        kept = (edges[0][low], edges[1][low])
+        fine, lines = line_groups(slow**2, *kept, 1, count, self._interval)
+        parts = [binned(slow**2, fine, kept, self._interval, count)]
+        first, last = bins(STRETCH)
+        squares = self._squares / self._stretches
+        high = first > (kept[1][-1] + 0.5) * STRETCH / count  # what lies between the two parts is lost: half a bin
+        fine_above, more = line_groups(squares, first, last, self._stretches, STRETCH, self._interval)
+        above = binned(squares, fine_above, (first[high], last[high]), self._interval, STRETCH)
+        parts.append(
+            Spectrum(self._interval, STRETCH, above.first, above.last, above.power, above.freedom * self._stretches)
+        )
+        edge = above.first[0] / (2 * STRETCH * self._interval)
+        named = [*lines, *(each for each in more if each.frequency >= edge)]
+        lines = tuple(sorted(named, key=lambda line: -line.amplitude))
+        return Stretch(tuple(parts), slow, fine, lines, self._spikes, self._knocked())
+
+
+def binned(
+    squares: Array,
+    fine: NDArray[np.bool_],
+    edges: tuple[NDArray[np.int64], NDArray[np.int64]],
+    interval: float,
+    count: int,
+) -> Spectrum:
+    """Return the spectrum of squares of coefficients, c_1 .. c_J, shape (J,), of which only those `fine` count."""
+    first, last = edges
+    inside = slice(int(first[0]) - 1, int(last[-1]))
+    starts = first - first[0]
+    freedom = np.add.reduceat(fine[inside].astype(np.float64), starts)
+    total = np.add.reduceat(np.where(fine[inside], squares[inside], 0.0), starts)
+    # A bin without any coefficient counts nothing, but its logarithm must exist.
+    power = np.where(freedom > 0, total / np.maximum(freedom, 1), 1.0)
+    return Spectrum(interval, count, first, last, power, freedom)
+
+
+def transformed(samples: Array, interval: float, despike: bool = True) -> Stretch:
+    """Return the spectra of samples in memory, finite, shape (n,): see `Accumulator`."""
+    gathered = Accumulator(interval, despike)
+    gathered.add(samples)
+    return gathered.stretch()
+
+
+def slow_coefficients(samples: Array, interval: float) -> Array:
+    """Return the lowest coefficients of a covariate in memory, finite, shape (n,): see `Accumulator.slow`."""
+    gathered = Accumulator(interval, despike=False)
+    gathered.add(samples)
+    return gathered.slow()
+
+
+def frequencies(spectrum: Spectrum) -> Array:
+    """Return the middle of each bin, Hz, shape (b,)."""
+    return np.asarray((spectrum.first + spectrum.last) / (4 * spectrum.length))
+
+
+def variances_of_coefficients(variances: Sequence[Array], stretch: Stretch) -> Array:
+    """Return the variance of each slow coefficient, shape (J,), from those of the bins of each spectrum, (b,).
+
+    Straight lines in the logarithms of frequency and variance join the bins.
+    """
+    f = np.concatenate([frequencies(each) for each in stretch.spectra])
+    j = np.arange(1, len(stretch.slow) + 1)
+    wanted = np.log(j / (2 * stretch.count * stretch.interval))
+    return np.asarray(np.exp(np.interp(wanted, np.log(f), np.log(np.concatenate(variances)))))

@@ -27,13 +27,10 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from imulab.errors import OptionError, quoted
-from imulab.live.page.files import Files
-from imulab.live.page.forms import Form
-from imulab.live.page.jobs import Job, Jobs
-from imulab.live.page.openings import Opening, Openings
-from imulab.live.page.parts import Hub, Message, Part, to_json
-from imulab.live.page.security import receive_file, report_response
-from imulab.procedures.options import ELEMENT, READING
+from imulab.live.page.files import Files, Opening, Openings
+from imulab.live.page.jobs import Form, Job, Jobs
+from imulab.live.page.server import Hub, Message, Part, receive_file, report_response, to_json
+from imulab.procedures.procedure import ELEMENT, READING
 
 _WIDEST = 4000
 _LONGEST = 1 << 20

@@ -19,7 +19,7 @@ import numpy as np
 from imulab.columns import triad
 from imulab.errors import ImulabError
 from imulab.live.page.curves import Head, Writer
-from imulab.procedures.options import ELEMENT, READING, part_of, read_options
+from imulab.procedures.procedure import ELEMENT, READING, part_of, read_options
 from imulab.recording import Array, Recording
 
 _EVERY = 0.15
@@ -65,7 +65,7 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
 
 def attitudes(folder: Path, head: Head, name: str) -> dict[str, Any]:
     """Return the static attitudes of a recording that a `Writer` has written; errors as a text."""
-    from imulab.procedures.tumble.segment import find_attitudes
+    from imulab.procedures.tumble.attitudes import find_attitudes
 
     names = triad("accel")
     if not head.timed or not set(names) <= set(head.units):

@@ -39,17 +39,15 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from imulab.errors import ImulabError, OptionError, quoted
-from imulab.live.corrected import corrected_reading
 from imulab.live.formats import UnknownFormatError
-from imulab.live.page.parts import Hub, Message, Part
-from imulab.live.page.security import report_response
+from imulab.live.page.server import Hub, Message, Part, report_response
 from imulab.live.runner import Runner
 from imulab.live.session import Event
-from imulab.live.view import View, in_words
+from imulab.live.view import View, corrected_reading, in_words
 from imulab.procedures.apply import loaded
-from imulab.procedures.reports import exhibits_of, parameter_rows, rendered
+from imulab.procedures.views import exhibits_of, parameter_rows, rendered
 from imulab.records.calibration import Calibration
-from imulab.report.elements import format_uncertain
+from imulab.report.traces import format_uncertain
 
 _WAIT, _EVERY = 0.05, 0.1
 _TOLD = 0.3

@@ -1,4 +1,11 @@
-"""The server of the page: `imulab live SOURCE --page` and `imulab open` put different parts into the same one.
+"""The server of the page, what the page is put together from, and who may speak to it.
+
+The server listens on this machine only, unless it is told otherwise. That alone does not keep other pages of the same
+browser out, so every request also needs the token of this run, the address as its Host, and this page as its Origin.
+
+Messages are JSON objects with a ``type``; each part documents its own. All parts share two from the server: ``hello``
+(``areas``: the names of the parts, ``version``) is the first on every socket, and ``refused`` (``text``: why) answers a
+message that could not be done.
 
 Addresses: ``/`` the page, ``/static/..`` its files, ``/ws`` the socket, ``/api/..`` those of the parts. What a part is,
 and what is said on the socket, is in `parts`.
@@ -9,29 +16,356 @@ from __future__ import annotations
 import asyncio
 import errno
 import json
+import math
+import secrets
 import signal
 import socket
 import sys
 import threading
 import webbrowser
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import asdict, is_dataclass
+from http.cookies import CookieError, SimpleCookie
 from importlib.resources import files
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
+from urllib.parse import parse_qs
 
+import numpy as np
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
-from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Message as AsgiMessage
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from imulab._version import VERSION
-from imulab.errors import ImulabError, OptionError
-from imulab.live.page.parts import Hub, Line, Message, Part, to_json
-from imulab.live.page.security import EVERY, LOCAL, Guard, in_address, new_token
+from imulab.errors import ImulabError, OptionError, quoted
+
+# Who may speak to the server, what the browser may do with its answers, and which files it reaches.
+
+
+TOKEN_HEADER = "x-imulab-token"
+LOCAL, EVERY = "127.0.0.1", ("0.0.0.0", "::")
+_NAMES = (LOCAL, "localhost")
+_HTTP_PORT = 80
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""Nothing inline, nothing from elsewhere: a file's text that reached the page as HTML would still not run."""
+_REPORT_POLICY = "sandbox allow-scripts allow-popups allow-modals"
+_HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-resource-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cache-control": "no-cache",
+}
+_STRANGER = "This is not the address that imulab has shown: open that one, with its token."
+_FOREIGN = "Another page has asked for this: refused."
+
+
+def new_token() -> str:
+    """Return a token that nobody can guess."""
+    return secrets.token_urlsafe(24)
+
+
+def in_address(host: str) -> str:
+    """Return a host as it stands in an address: IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+def _parted(host: str) -> tuple[str, str, str]:
+    """Return name, colon and port of the header Host; the colons of IPv6 stand in brackets."""
+    name, bracket, rest = host.rpartition("]")
+    before, colon, port = rest.partition(":")
+    return name + bracket + before, colon, port
+
+
+class Guard:
+    """Lets a request through that comes from the page itself, and puts the policy on every answer.
+
+    Parameters
+    ----------
+    app
+        What is guarded.
+    token
+        Given in the address of ``/``, which a cookie of its own then stands for; programs give it in the header
+        ``X-Imulab-Token``.
+    limit
+        Bytes that one request may bring.
+    once
+        Given in the address in place of the token, a single time: other users of the machine see the address that a
+        browser is started with.
+    host
+        The address that is listened at.
+    """
+
+    def __init__(self, app: ASGIApp, token: str, limit: int, once: str = "", host: str = LOCAL) -> None:
+        self._host = host
+        self._app, self._token, self._limit, self._once = app, token, limit, once
+        self._key = new_token()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or hand it on."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        answer = self._refusal(scope)
+        if answer is not None and scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 1008, "reason": ""})
+            return
+
+        async def headed(message: AsgiMessage) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        if answer is not None:
+            await answer(scope, receive, headed)
+        else:
+            await self._app(scope, self._counted(receive), headed)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        """Return the answer to a request that goes no further; None for the others."""
+        headers, port = Headers(scope=scope), scope["server"][1]
+        host = headers.get("host", "")
+        name, colon, given = _parted(host)
+        if not self._is_here(name) or given != ("" if port == _HTTP_PORT and not colon else str(port)):
+            return PlainTextResponse(_STRANGER, 421)
+        if headers.get("origin", f"http://{host}") != f"http://{host}" or (
+            headers.get("sec-fetch-site", "none") in ("cross-site", "same-site") and scope.get("path") != "/"
+        ):
+            return PlainTextResponse(_FOREIGN, 403)
+        if scope["type"] == "http":
+            length = headers.get("content-length", "0")
+            if not length.isdigit() or int(length) > self._limit:
+                return PlainTextResponse(f"Too large: at most {self._limit >> 20} MiB at once.", 413)
+        cookie = f"imulab_{port}"
+        given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
+        if scope["type"] == "http" and scope["path"] == "/" and self._opens(given):
+            answer = RedirectResponse("/", 303)
+            answer.set_cookie(cookie, self._key, httponly=True, samesite="strict", path="/")
+            return answer
+        if _same(headers.get(TOKEN_HEADER, ""), self._token) or _same(_cookie(headers, cookie), self._key):
+            return None
+        return PlainTextResponse(_STRANGER, 403)
+
+    def _is_here(self, name: str) -> bool:
+        """Whether a name is one of the address that is listened at: a foreign name may lead here, too."""
+        if self._host in EVERY and (name.replace(".", "").isdigit() or name.startswith("[")):
+            return True
+        return name.lower() in (*_NAMES, in_address(self._host).lower())
+
+    def _opens(self, given: str) -> bool:
+        """Whether what an address holds lets its browser in."""
+        if self._once and _same(given, self._once):
+            self._once = ""
+            return True
+        return _same(given, self._token)
+
+    def _counted(self, receive: Receive) -> Receive:
+        """Return `receive` for a body that ends with an error where it is longer than is taken."""
+        taken = 0
+
+        async def counted() -> AsgiMessage:
+            nonlocal taken
+            message = await receive()
+            if message["type"] == "http.request":
+                taken += len(message.get("body", b""))
+                if taken > self._limit:
+                    raise OptionError(f"too large: expected at most {self._limit >> 20} MiB at once")
+            return message
+
+        return counted
+
+
+def _same(one: str, other: str) -> bool:
+    return secrets.compare_digest(one.encode("utf-8"), other.encode("utf-8"))
+
+
+def _cookie(headers: Headers, name: str) -> str:
+    try:
+        found = SimpleCookie(headers.get("cookie", "")).get(name)
+    except CookieError:
+        return ""
+    return found.value if found else ""
+
+
+def inside(folder: Path, name: str) -> Path:
+    """Return the path of a file right in the session's folder.
+
+    Raises
+    ------
+    OptionError
+        The name leads elsewhere: it is none of a file, has a folder before it, or is a link out of the folder.
+    """
+    path = folder / name
+    plain = name not in ("", ".", "..") and not set(name) & {"/", "\\", "\0", ":"}
+    if not plain or path.resolve().parent != folder.resolve():
+        raise OptionError(f"{quoted(name)}: expected the name of a file in the session's folder, without a path")
+    return path
+
+
+def report_response(text: str) -> HTMLResponse:
+    """Return a report as an answer: a page of its own that cannot reach the session, though it has scripts."""
+    return HTMLResponse(text, headers={"content-security-policy": _REPORT_POLICY})
+
+
+async def receive_file(request: Request, path: Path) -> int:
+    """Write the body of a request to a file as it comes, whole or not at all; return its length.
+
+    Raises
+    ------
+    OptionError
+        It is longer than the guard lets through, or cannot be written.
+    """
+    from imulab.files import replacing
+
+    size = 0
+    with replacing(path) as out:
+        async for piece in request.stream():
+            out.write(piece)
+            size += len(piece)
+    return size
+
+
+# What the page is put together from: each part brings its addresses and its messages on the socket.
+
+
+Message = dict[str, Any]
+_MOST_WAITING = 1000
+
+
+class Part:
+    """One area of the page; `guided.GuidedPart` is the guided session.
+
+    Attributes
+    ----------
+    name
+        Of its area in ``index.html`` and of its module under ``static``.
+    routes
+        Addresses beside those of the others.
+    handlers
+        What is called with a page's message, by its type, in the server's thread: what takes long belongs in
+        another. An ImulabError that it raises becomes ``refused``.
+    """
+
+    name: ClassVar[str] = ""
+
+    def __init__(self) -> None:
+        self.routes: Sequence[BaseRoute] = ()
+        self.handlers: Mapping[str, Callable[[Message], object]] = {}
+
+    def begin(self, hub: Hub) -> None:
+        """Begin, once the server runs: from now on `hub.tell` reaches the pages."""
+
+    def greet(self) -> Iterable[Message]:
+        """Yield what a page is told when it has come, or has come back."""
+        return ()
+
+    def end(self) -> None:
+        """End what runs beside the server; it may be called again."""
+
+
+class Hub:
+    """The pages that are connected, and the way to them from every thread."""
+
+    def __init__(self) -> None:
+        self._lines: set[Line] = set()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self.stop: Callable[[], None] = lambda: None
+        """Ends the server, from every thread."""
+
+    @property
+    def pages(self) -> int:
+        """How many pages are connected."""
+        return len(self._lines)
+
+    def tell(self, message: Message, *, latest: bool = False) -> None:
+        """Tell every page, from any thread; with `latest`, in place of what still waits of the same type."""
+        text = to_json(message)
+        if self._loop is not None:
+            with suppress(RuntimeError):  # the server has ended
+                self._loop.call_soon_threadsafe(self._put, str(message["type"]), text, latest)
+
+    def begin(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Begin to pass messages on."""
+        self._loop = loop
+
+    def join(self, line: Line) -> None:
+        """Connect a page."""
+        self._lines.add(line)
+
+    def leave(self, line: Line) -> None:
+        """Let go of a page."""
+        self._lines.discard(line)
+
+    def _put(self, kind: str, text: str, latest: bool) -> None:
+        for line in self._lines:
+            line.put(kind, text, latest=latest)
+
+
+class Line:
+    """What waits for one page: a slow one gets the latest view, and does not hold the others up."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[str] = deque(maxlen=_MOST_WAITING)
+        self._latest: dict[str, str] = {}
+        self._some = asyncio.Event()
+
+    def put(self, kind: str, text: str, *, latest: bool = False) -> None:
+        """Add a message."""
+        if latest:
+            self._latest[kind] = text
+        else:
+            self._waiting.append(text)
+        self._some.set()
+
+    async def get(self) -> list[str]:
+        """Return what waits, once there is something."""
+        await self._some.wait()
+        self._some.clear()
+        found = [*self._waiting, *self._latest.values()]
+        self._waiting.clear()
+        self._latest.clear()
+        return found
+
+
+def to_json(message: object) -> str:
+    """Return a message as JSON; dataclasses as objects, numbers that are none as null, lone surrogates as ``?``."""
+    text = json.dumps(_plain(message), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+# The server of the page: `imulab live SOURCE --page` and `imulab open` put different parts into the same one.
+
 
 UPLOAD_LIMIT = 4 << 30
 """Bytes of one request, 4 GiB."""

@@ -8,31 +8,364 @@ import numpy as np
 
 from imulab.errors import RecordError
 from imulab.estimation.least_squares import coverage_factor
-from imulab.procedures.centrifuge.findings import (
-    axis_label,
-    change_uncertainty,
-    curve_at,
-    facts,
-    headline,
-    numbers,
-    prefixes,
+from imulab.procedures.centrifuge.manifest import curve
+from imulab.procedures.centrifuge.schema import (
+    Centrifuge,
+    CycleRow,
+    Error,
+    Fit,
+    Level,
+    Line,
+    Run,
+    centrifuge_of,
+    force_of,
+    level_of,
 )
-from imulab.procedures.centrifuge.sections import Centrifuge, centrifuge_of, force_of, level_of
-from imulab.procedures.centrifuge.tables import (
-    PER_G,
-    budget_table,
-    curve_table,
-    cycle_tables,
-    level_table,
-    parameters_table,
-    relative,
-    run_table,
-)
+from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable
-from imulab.report.panels import axis_key, names
-from imulab.report.traces import SYMBOLS, axis, band, rounded, scatter
+from imulab.report.traces import (
+    BAD,
+    GOOD,
+    INK,
+    LEGEND,
+    QUIET,
+    SYMBOLS,
+    Exhibits,
+    Figure,
+    ReportTable,
+    axis_key,
+    band,
+    figure_axis,
+    format_uncertain,
+    names,
+    plain_number,
+    rounded,
+    scatter,
+)
 from imulab.units import STANDARD_GRAVITY, from_si
+
+# The tables of a centrifuge record, in the units that people read: deg/h/g, per cent, arcsec, µrad/g.
+
+
+PER_G = float(from_si(STANDARD_GRAVITY, "deg/h"))
+"""deg/h/g in one rad/s/(m/s^2)."""
+
+ENGINEERING = {
+    "K": (PER_G, "deg/h/g"),
+    "K0": (PER_G, "deg/h/g"),
+    "zeta": (100.0, "%"),
+    "c1": (1e6 * STANDARD_GRAVITY, "ppm/g"),
+    "c2": (1e6 * STANDARD_GRAVITY**2, "ppm/g²"),
+    "direction": (180 / np.pi, "deg"),
+    "cross": (PER_G * STANDARD_GRAVITY, "deg/h/g²"),
+}
+"""By the stem of a parameter: factor from SI, and unit."""
+_BUDGET = {
+    "rad": (180 * 3600 / np.pi, "arcsec"),
+    "rad/(m/s^2)": (1e6 * STANDARD_GRAVITY, "µrad/g"),
+    "s": (1e3, "ms"),
+    "rad/s": (180 / np.pi, "deg/s"),
+    "1": (100.0, "%"),
+    "m": (1e6, "µm"),
+}
+
+
+def parameters_table(record: Calibration, fit: Fit) -> ReportTable:
+    """Return every parameter with its uncertainty and interval."""
+    rows = []
+    for name, parameter in record.parameters.items():
+        stem = next((part for part in name.split("_")[1:] if part != "down"), "")
+        factor, unit = ENGINEERING.get(stem, (1.0, parameter.unit))
+        value, u = parameter.value * factor, (parameter.standard_uncertainty or 0.0) * factor
+        ends = " to ".join(format_uncertain(value + sign * fit.coverage_factor_95[name] * u, u)[0] for sign in (-1, 1))
+        nu = fit.degrees_of_freedom[name]
+        rows.append([name, *format_uncertain(value, u), ends, unit, "many" if nu > 999 else f"{nu:.0f}"])
+    return ReportTable(
+        title="Parameters",
+        caption="K_i: drift per specific force at level i; zeta_i = K_i/K_1 − 1; K(a) = K0 (1 + c1 a + c2 a²), a "
+        "term that is absent is 0; "
+        f"direction: from X toward Y. Noise: {fit.noise}; 95 % intervals by Student's t.",
+        columns=["parameter", "value", "standard uncertainty", "95 % interval", "unit", "degrees of freedom"],
+        rows=rows,
+    )
+
+
+def level_table(record: Calibration, levels: list[Level], sets: list[str]) -> ReportTable:
+    """Return K and zeta at each level."""
+    columns = ["level", "specific force, g", "runs"]
+    for prefix in sets:
+        label = prefix.rstrip("_").replace("_", " ")
+        columns += [f"K {label}, deg/h/g", "u", f"zeta {label}, %", "u"]
+    rows = []
+    for level in levels:
+        number = level.level
+        row = [str(number), f"{from_si(level.specific_force.value, 'g'):.4g}", str(len(level.runs))]
+        for prefix in sets:
+            K = record.parameters.get(f"{prefix}K_{number}")
+            zeta = record.parameters.get(f"{prefix}zeta_{number}")
+            row += (
+                ["–", "–"] if K is None else format_uncertain(K.value * PER_G, (K.standard_uncertainty or 0.0) * PER_G)
+            )
+            row += (
+                ["–", "–"]
+                if zeta is None
+                else format_uncertain(100 * zeta.value, 100 * (zeta.standard_uncertainty or 0.0))
+            )
+        rows.append(row)
+    return ReportTable(
+        "K and zeta at each level", "u: standard uncertainty. All zeta share the error of K_1.", columns, rows
+    )
+
+
+def curve_table(fit: Fit, sets: list[str]) -> ReportTable:
+    """Return the models of the curve that were tried."""
+    rows = []
+    for prefix in sets:
+        found = fit.curves[prefix.rstrip("_")]
+        axis = prefix.rstrip("_").replace("_", " ")
+        rows += [
+            [axis, each.model, str(each.coefficients), f"{each.chi_square:.2f}", "chosen" * each.chosen]
+            for each in found.tried
+        ]
+    return ReportTable(
+        "Terms of the curve",
+        "Weighted fits to the K_i. A term is taken where it lowers chi-square by more than its 5 % point; a term that "
+        "was not taken is 0, with the uncertainty of all these models together.",
+        ["axis", "terms beside K0", "coefficients", "chi-square", ""],
+        rows,
+    )
+
+
+def cycle_tables(cycles: list[CycleRow]) -> list[ReportTable]:
+    """Return zeta of each power cycle by itself, where there are several; older records do not hold it."""
+    if len(cycles) < 2:
+        return []
+    sets = [key for key in ("x", "y", "x_down", "y_down") if any(cycle.of(key) for cycle in cycles)]
+    names = [n for n in dict.fromkeys(n for c in cycles for key in sets[:1] for n in c.of(key)) if "zeta" in n]
+    if not names:
+        return []
+    rows = []
+    for cycle in cycles:
+        for key in sets:
+            found = cycle.of(key)
+            cells = [
+                " ± ".join(format_uncertain(100 * z.value, 100 * (z.standard_uncertainty or 0.0))) if z else "–"
+                for z in (found.get(name) for name in names)
+            ]
+            rows.append([str(cycle.power_cycle), key.replace("_", " "), *cells])
+    return [
+        ReportTable(
+            "zeta of each power cycle, %",
+            "Each K_i against K_1 of the same power cycle, ± its standard uncertainty.",
+            ["power cycle", "axis", *names],
+            rows,
+        )
+    ]
+
+
+def budget_table(fit: Fit) -> ReportTable:
+    """Return the error budget."""
+    rows = []
+    for entry in fit.error_budget:
+        factor, unit = _BUDGET.get(entry.unit, (1.0, entry.unit))
+        rows.append(
+            [entry.error, "yes" if entry.bounded else "no", *_sized(entry, factor), unit, _share(entry.effect),
+             "–" if entry.removed is None else _share(entry.removed), entry.basis]
+        )  # fmt: skip
+    return ReportTable(
+        "Error budget (X axis)",
+        "Effect on K at the highest level: what is left, and what subtraction or combination removed. Bounded: by "
+        "these data; where not, value and effect are those of the size named.",
+        ["error", "bounded", "value", "u", "unit", "effect on K", "removed", "from"],
+        rows,
+    )
+
+
+def _sized(entry: Error, factor: float) -> tuple[str, str]:
+    value, u = entry.value, entry.standard_uncertainty
+    if value is None:
+        return "–", "–" if u is None else plain_number(u * factor, 2)
+    if u is None or u == 0:
+        return plain_number(value * factor, 3), "–"
+    return format_uncertain(value * factor, u * factor)
+
+
+def relative(value: float, other: float) -> float:
+    """Return how much larger a value is than another, as a share; nan where that is 0."""
+    return value / other - 1 if other else float("nan")
+
+
+def _share(value: float) -> str:
+    if value == 0:
+        return "0"
+    percent = 100 * abs(value)
+    return "< 0.0001 %" if percent < 1e-4 else f"{plain_number(percent, 2)} %"
+
+
+def run_table(runs: list[Run]) -> ReportTable:
+    """Return what was measured in each run; a column that says the same of all runs goes to the caption."""
+    axes = [axis for axis in "xy" if any(run.line(axis) is not None for run in runs)]
+    origins = list(dict.fromkeys(run.table_rate_from for run in runs if run.role == "loaded"))
+    varied = ["cycle"] * (len({run.power_cycle for run in runs}) > 1)
+    varied += ["spin axis"] * (len({run.spin_axis for run in runs}) > 1)
+    columns = ["run", "file", *varied, "g", "sense", "table rate, deg/s"]
+    columns += ["from"] * (len(origins) > 1)
+    columns += ["periods"]
+    columns += [*(f"{axis.upper()} drift ± u, deg/h" for axis in axes), "FOG line, deg/h"]
+    rows = []
+    for index, run in enumerate(runs):
+        row = [str(index + 1), " ".join([run.file, *([] if run.window is None else [run.window])])]
+        row += [str(run.power_cycle if name == "cycle" else run.spin_axis) for name in varied]
+        if run.role == "static":
+            rows.append([*row, "0", "static", *["–"] * (len(columns) - len(row) - 2)])
+            continue
+        row += [
+            f"{from_si(run.specific_force.value, 'g'):.4g}",
+            f"{run.sense:+d}",
+            f"{from_si(run.table_rate_used.value, 'deg/s'):.5f}",
+        ]
+        row += [run.table_rate_from] * (len(origins) > 1)
+        row += [f"{run.periods:.0f}"]
+        row += ["–" if (line := run.line(axis)) is None else " ± ".join(_line(line)) for axis in axes]
+        rows.append([*row, _line(run.fog)[0]])
+    source = f" Table rates from: {origins[0]}." if len(origins) == 1 else ""
+    caption = (
+        "Drift: what X and Y show at the table rate, less what the FOG shows there (rotation), with its standard "
+        f"uncertainty u. Sense −1: both rates reversed.{source}"
+    )
+    return ReportTable("Runs", caption, columns, rows)
+
+
+def _line(entry: Line) -> tuple[str, str]:
+    size = from_si(float(np.hypot(entry.A, entry.B)), "deg/h")
+    u = from_si(float(np.sqrt(max(np.trace(np.array(entry.covariance)), 0.0) / 2)), "deg/h")
+    return format_uncertain(size, u)
+
+
+# What a centrifuge record says of each axis: its curve, a headline, facts, and a summary with uncertainties.
+
+
+def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
+    """Return the curve of each axis, and what it changes up to the highest level, with uncertainties."""
+    sets, top = prefixes(record), force_of(record, max(level.level for level in centrifuge_of(record).levels))
+    rows = []
+    for prefix in sets:
+        cells = []
+        for name in ("K0", "c1", "c2"):
+            factor, _ = ENGINEERING[name]
+            found = record.parameters.get(f"{prefix}{name}")
+            u = 0.0 if found is None else (found.standard_uncertainty or 0.0) * factor
+            cells.append("–" if found is None else " ± ".join(format_uncertain(found.value * factor, u)))
+        K, _ = curve_at(record, prefix, np.array([top]))
+        change = 100 * relative(float(K[0]), record.value(f"{prefix}K0"))
+        cells.append(" ± ".join(format_uncertain(change, 100 * change_uncertainty(record, prefix, top))))
+        rows.append([axis_label(prefix), *cells])
+    return [
+        "axis",
+        *(f"{name}, {ENGINEERING[name][1]}" for name in ("K0", "c1", "c2")),
+        f"change at {text_in_g(top)}, %",
+    ], rows
+
+
+def headline(record: Calibration, prefix: str) -> str:
+    """Return the g-sensitivity in one sentence, and by how much it departs from the linear."""
+    levels = numbers(record, prefix)
+    last = levels[-1]
+    first, top = text_in_g(force_of(record, levels[0])), text_in_g(force_of(record, last))
+    if last == levels[0]:
+        return f"{axis_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{last}')} at {first}."
+    zeta = record.parameter(f"{prefix}zeta_{last}")
+    measured = _change(zeta.value, zeta.standard_uncertainty)
+    curved = change_uncertainty(record, prefix, force_of(record, last))
+    if centrifuge_of(record).model.curve[prefix.rstrip("_")] == "constant":
+        return (
+            f"{axis_label(prefix)} drifts linearly with g, by {_per_g(record, f'{prefix}K0')} from {first} to {top}; "
+            f"the factor at {top} is {measured} than that at {first}."
+        )
+    K, _ = curve_at(record, prefix, np.array([force_of(record, last)]))
+    fitted = _change(relative(float(K[0]), record.value(f"{prefix}K0")), curved)
+    return (
+        f"{axis_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{levels[0]}')} at {first}, its drift factor; "
+        f"at {top} the factor is {measured} measured directly against {first}, and {fitted} by the curve through all "
+        "levels."
+    )
+
+
+def facts(record: Calibration, sets: list[str]) -> list[tuple[str, str]]:
+    """Return the figures that the head of a report shows: name and value."""
+    found = []
+    for prefix in sets[:2]:
+        K0 = record.parameter(f"{prefix}K0")
+        value, u = format_uncertain(K0.value * PER_G, (K0.standard_uncertainty or 0.0) * PER_G, digits=1)
+        digits = u.replace(".", "").lstrip("0")
+        found.append((f"K0 {axis_label(prefix)}, deg/h/g", f"{value}({digits})"))
+    r = centrifuge_of(record)
+    loaded = [row for row in r.runs if row.role == "loaded"]
+    found += [
+        ("curve", ", ".join(dict.fromkeys(r.model.curve.values()))),
+        ("levels", str(len(r.levels))),
+        ("loaded runs", str(len(loaded))),
+        ("highest level", text_in_g(r.model.highest_specific_force.value)),
+    ]
+    return found
+
+
+def _per_g(record: Calibration, name: str) -> str:
+    K = record.parameter(name)
+    value, u = format_uncertain(K.value * PER_G, (K.standard_uncertainty or 0.0) * PER_G)
+    return f"{value} ± {u} deg/h per g"
+
+
+def _change(share: float, uncertainty: float | None) -> str:
+    change, u = format_uncertain(100 * abs(share), 100 * (uncertainty or 0.0))
+    return f"{change} ± {u} % {'smaller' if share < 0 else 'larger'}"
+
+
+def change_uncertainty(record: Calibration, prefix: str, force: float) -> float:
+    """Return the standard uncertainty of K(a)/K0 - 1 from those of c1 and c2."""
+    names = [n for n in (f"{prefix}c1", f"{prefix}c2") if n in record.parameters]
+    if not names:
+        return 0.0
+    C = record.covariance.block(names)
+    gradient = np.array([force if n.endswith("c1") else force**2 for n in names])
+    return float(np.sqrt(max(gradient @ C @ gradient, 0.0)))
+
+
+def curve_at(record: Calibration, prefix: str, force: Array) -> tuple[Array, Array]:
+    """Return K(a), rad/s/(m/s^2), and its standard uncertainty at specific forces, m/s^2, shapes (n,)."""
+    terms = {
+        t: record.value(f"{prefix}{t}") if f"{prefix}{t}" in record.parameters else 0.0 for t in ("K0", "c1", "c2")
+    }
+    K = curve(force, **terms)
+    names = [n for n in ("K0", "c1", "c2") if f"{prefix}{n}" in record.parameters]
+    C = record.covariance.block([f"{prefix}{n}" for n in names])
+    gradient = {"K0": K / terms["K0"], "c1": terms["K0"] * force, "c2": terms["K0"] * force**2}
+    J = np.stack([gradient[n] for n in names], axis=1)
+    return K, np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, C, J), 0.0))
+
+
+def prefixes(record: Calibration) -> list[str]:
+    """Return the sets of parameters that a record has: ``x_``, ``y_``, ``x_down_`` ..."""
+    return [p for p in ("x_", "y_", "x_down_", "y_down_") if f"{p}K0" in record.parameters]
+
+
+def numbers(record: Calibration, prefix: str) -> list[int]:
+    """Return the levels of a set, rising."""
+    return [row.level for row in centrifuge_of(record).levels if f"{prefix}K_{row.level}" in record.parameters]
+
+
+def axis_label(prefix: str) -> str:
+    """Return what people call a set of parameters: ``X``, or ``X, spin axis down``."""
+    return prefix[0].upper() + (", spin axis down" if "down" in prefix else "")
+
+
+def text_in_g(force: float) -> str:
+    """Return a specific force, m/s^2, in g."""
+    return f"{from_si(force, 'g'):.3g} g"
+
+
+# The figures and tables of a centrifuge record, from the record alone.
+
 
 _POINTS = 121
 _SHOWN_SPECTRA = 3
@@ -145,8 +478,8 @@ def _panels(titles: list[str], below: str, gap: float = 0.09) -> dict[str, Any]:
     for number, title in enumerate(titles):
         x, y = names(number)
         start = number * (width + gap)
-        layout[axis_key(x)] = axis(below, domain=[start, start + width], anchor=y, automargin=True)
-        layout[axis_key(y)] = axis(title, anchor=x, automargin=True)
+        layout[axis_key(x)] = figure_axis(below, domain=[start, start + width], anchor=y, automargin=True)
+        layout[axis_key(y)] = figure_axis(title, anchor=x, automargin=True)
     return layout
 
 

@@ -11,15 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from imulab.errors import DataError, OptionError, ReadError, listed, quoted
-from imulab.procedures.centrifuge.budget import error_budget
-from imulab.procedures.centrifuge.choices import CURVES, METHODS
-from imulab.procedures.centrifuge.corrections import corrected, find_corrections
+from imulab.procedures.centrifuge import CURVES, METHODS
 from imulab.procedures.centrifuge.levels import Levels, level_numbers, pool_levels
 from imulab.procedures.centrifuge.manifest import Manifest, Run, load_manifest
-from imulab.procedures.centrifuge.parameters import Estimates, estimate
+from imulab.procedures.centrifuge.parameters import Estimates, corrected, estimate, find_corrections
+from imulab.procedures.centrifuge.plan import error_budget
 from imulab.procedures.centrifuge.record import make_record
-from imulab.procedures.centrifuge.run import LoadedRun, reduce_run
-from imulab.procedures.centrifuge.static import StaticRun, reduce_static
+from imulab.procedures.centrifuge.run import LoadedRun, StaticRun, reduce_run, reduce_static
 from imulab.procedures.result import Result
 from imulab.readers import read_blocks
 from imulab.recording import Array, Recording, Source

@@ -1,4 +1,10 @@
-"""The manifest of a centrifuge test: which file was recorded at which rates, with which radius.
+"""The manifest of a centrifuge test, which file was recorded at which level, and what such a test measures.
+
+A line at the phase chi is written as the complex number ``Z = A + i B`` for ``A cos chi + B sin chi``. chi is the angle
+from the X input axis to the specific force, turning X to Y: ``arg Z`` is where in the gyroscope's frame the drift is
+largest. What is fixed in the arm reaches Y a quarter turn after X: Y shows ``i Z`` where X shows ``Z``.
+
+Source: CN102636185A; IEEE Std 813 (two-axis gyroscopes), IEEE Std 836 (precision centrifuge), IEEE Std 528.
 
 TOML; the keys are those of docs/centrifuge.md. An unknown key is refused by name, so that a misspelt one does not pass.
 """
@@ -9,14 +15,121 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from imulab.errors import ReadError, UnitError, file_name
-from imulab.procedures.centrifuge.entries import Window, example, overlap, quantity_of, window_of, window_text
-from imulab.procedures.centrifuge.model import specific_force
-from imulab.quantity_entries import check_keys, number_of, scale_factor_of, unit_of
-from imulab.toml import load_toml
+from imulab.files import check_keys, load_toml, number_of, scale_factor_of, unit_of
+from imulab.recording import Array
 from imulab.units import STANDARD_GRAVITY, from_si, to_si
+
+# What a centrifuge test measures: specific force, the drift K(a) a, and the names of its parameters.
+
+
+Force = TypeVar("Force", float, Array)
+
+K_UNIT = "rad/s/(m/s^2)"
+CURVE_UNITS = {"K0": K_UNIT, "c1": "1/(m/s^2)", "c2": "1/(m/s^2)^2"}
+CROSS_UNIT = "rad/s/(m/s^2)^2"
+EARTH_RATE = 7.292115e-5
+"""rad/s (WGS 84)."""
+
+
+def specific_force(arm_rate: float, radius: float) -> float:
+    """Return the specific force ``a = w^2 R``, m/s^2, of an arm rate, rad/s, at a radius, m."""
+    return arm_rate**2 * radius
+
+
+def curve(force: Force, K0: float, c1: float = 0.0, c2: float = 0.0) -> Force:
+    """Return ``K(a) = K0 (1 + c1 a + c2 a^2)``, rad/s/(m/s^2), at specific forces, m/s^2."""
+    return K0 * (1 + (c1 + c2 * force) * force)
+
+
+def fog_share(axes: int) -> np.ndarray:
+    """Return the matrix from the lines of (X, [Y,] FOG) to those of the residuals (X - FOG, [Y - i FOG])."""
+    return np.array([[1, 0, -1], [0, 1, -1j]] if axes == 2 else [[1, -1]], dtype=np.complex128)
+
+
+def real_covariance(covariance: np.ndarray) -> Array:
+    """Return the covariance of (Re z_1, Im z_1, Re z_2, ...) of circular complex numbers with ``E[z z*] = covariance``.
+
+    Circular: noise that does not know the phase of the line, so that both of its components are alike.
+    """
+    size = len(covariance)
+    real = np.empty((2 * size, 2 * size))
+    real[0::2, 0::2] = real[1::2, 1::2] = covariance.real / 2
+    real[1::2, 0::2] = covariance.imag / 2
+    real[0::2, 1::2] = -covariance.imag / 2
+    return real
+
+
+# Entries of a manifest: quantities and windows, each refused with its place where it cannot be.
+
+
+Window = tuple[float | None, float | None]
+"""First and last time of a part of a file, s, either None for no bound."""
+
+
+def quantity_of(entry: Any, key: str, kind: str, name: str) -> tuple[float, float]:
+    """Return value and standard uncertainty of ``{ value, standard_uncertainty, unit }`` in SI."""
+    place = f"{name}: {key}"
+    if not isinstance(entry, dict) or not {"value", "unit"} <= set(entry):
+        raise ReadError(f"{place}: expected {example(key)}, found {entry!r}")
+    check_keys(entry, ("value", "unit", "standard_uncertainty") if key == "radius" else ("value", "unit"), place)
+    unit = unit_of(entry["unit"], kind, place)
+    value = to_si(number_of(entry["value"], place), unit)
+    uncertainty = to_si(number_of(entry.get("standard_uncertainty", 0.0), place), unit)
+    if not value > 0:
+        raise ReadError(f"{place} {entry['value']!r}: expected more than 0")
+    if uncertainty < 0:
+        raise ReadError(f"{place}: standard_uncertainty {entry['standard_uncertainty']!r}: expected 0 or more")
+    return value, uncertainty
+
+
+def example(key: str) -> str:
+    """Return how a key of a manifest is written."""
+    return {
+        "radius": 'radius = { value = 2.0, standard_uncertainty = 2e-5, unit = "m" }',
+        "gravity": 'gravity = { value = 9.8015, unit = "m/s^2" }',
+        "rates": 'rates = { unit = "deg/s", standard_uncertainty = 0.0005 }',
+        "reference": 'reference = { value = 1.0, unit = "g" }',
+        "scale_factor": 'fog = { value = 1250.0, unit = "count/(deg/s)" }',
+        "run": "tables [[run]], one for each file",
+    }[key]
+
+
+def window_text(window: Window) -> str:
+    """Return a window as a manifest writes it, FROM:TO in seconds."""
+    return ":".join("" if end is None else f"{end:.12g}" for end in window)
+
+
+def overlap(one: Window, other: Window) -> bool:
+    """Return whether two windows have more than a bound in common; a window overlaps itself unless it is empty."""
+
+    def ends(window: Window) -> tuple[float, float]:
+        first, last = window
+        return (-math.inf if first is None else first), (math.inf if last is None else last)
+
+    (first, last), (begin, end) = ends(one), ends(other)
+    return first < end and begin < last
+
+
+def window_of(text: Any, place: str) -> Window | None:
+    """Return a window that a manifest writes as FROM:TO in seconds."""
+    if text is None:
+        return None
+    try:
+        first, last = (float(end) if end.strip() else None for end in str(text).split(":"))
+    except ValueError:
+        first = last = math.nan
+    if any(math.isnan(end) for end in (first, last) if end is not None) or not overlap((first, last), (first, last)):
+        raise ReadError(f'{place}: window {text!r}: expected FROM:TO in seconds, such as "100:1000", "100:" or ":900"')
+    return first, last
+
+
+# The manifest of a centrifuge test: which file was recorded at which rates, with which radius.
+
 
 COLUMNS = ("dtg_x", "dtg_y", "fog")
 ROLES = ("static", "loaded")

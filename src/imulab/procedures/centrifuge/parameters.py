@@ -1,4 +1,9 @@
-"""Levels to parameters: K, zeta, the curve, its direction and the cross terms, with one covariance over all of them.
+"""Levels to parameters.
+
+K, zeta, the curve K(a) and its terms, and errors that a test shows beyond three standard uncertainties.
+
+The FOG's line is taken off X and Y as the axis would have seen it: turned back by the FOG's delay, scaled and turned
+by the mismatch that Earth rate shows. Each correction's uncertainty is common to all runs.
 
 Every parameter is a function of the levels' lines; its derivative carries their covariance. The radius is common:
 with a relative error rho of R every K is off by -rho, c1 by -rho, c2 by -2 rho, zeta not at all.
@@ -6,16 +11,312 @@ with a relative error rho of R every K is off by -rho, c1 by -rho, c2 by -2 rho,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from imulab.estimation.least_squares import chi_square_probability, coverage_factor
-from imulab.procedures.centrifuge.curve import CurveFit, fit_curve
-from imulab.procedures.centrifuge.levels import Level, Levels, as_vector
-from imulab.procedures.centrifuge.manifest import Manifest
-from imulab.procedures.centrifuge.model import CROSS_UNIT, CURVE_UNITS, K_UNIT
+from imulab.errors import OptionError, listed
+from imulab.estimation.least_squares import blend, chi_square_limit, chi_square_probability, coverage_factor
+from imulab.procedures.centrifuge import CURVES
+from imulab.procedures.centrifuge.levels import (
+    Level,
+    Levels,
+    Measured,
+    Repeatability,
+    RunLine,
+    as_vector,
+    delays,
+    mismatch,
+    pooled,
+)
+from imulab.procedures.centrifuge.lines import Complex, three_sigma
+from imulab.procedures.centrifuge.manifest import CROSS_UNIT, CURVE_UNITS, K_UNIT, Manifest
+from imulab.procedures.centrifuge.run import LoadedRun
 from imulab.recording import Array
+
+# The fitted curve K(a) = K0 (1 + c1 a + c2 a^2), and which of its terms the levels call for.
+
+
+_NESTED = ("constant", "c1", "c1+c2")
+_GAIN = 0.05
+_CURVE_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class CurveFit:
+    """A curve through the K_i of one axis.
+
+    Attributes
+    ----------
+    model
+        Key of `CURVES`.
+    coefficients
+        Of 1, a, a^2: ``K(a) = p0 + p1 a + p2 a^2``; zero where the model has no such term.
+    from_levels
+        Matrix that turns the K_i into them, shape (3, n).
+    covariance
+        Of `coefficients`, shape (3, 3): given the model where it was given; whichever of them is right where it was
+        chosen here (`imulab.estimation.least_squares`).
+    chi_square, freedom
+        Of the residuals.
+    tried
+        Model, number of coefficients, chi-square and whether it was chosen, of every model that the levels allow.
+    """
+
+    model: str
+    coefficients: Array
+    from_levels: Array
+    covariance: Array
+    chi_square: float
+    freedom: int
+    tried: tuple[tuple[str, int, float, bool], ...]
+
+    @property
+    def probability(self) -> float | None:
+        """Of so large a chi-square if the model holds; None without degrees of freedom."""
+        return chi_square_probability(self.chi_square, self.freedom) if self.freedom > 0 else None
+
+
+def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") -> CurveFit:
+    """Fit K(a) by generalised least squares.
+
+    A term is taken where it lowers chi-square by more than the 5 % point of chi-square with one degree of freedom;
+    where even the largest model leaves more scatter than the covariance explains, chi-square counts in units of that
+    scatter (F-test). What is chosen so has its own values, and the uncertainty of all models together.
+
+    Parameters
+    ----------
+    force
+        Specific force of the levels, m/s^2, shape (n,).
+    K, covariance
+        Shapes (n,), (n, n).
+    model
+        ``auto``, ``constant``, ``c1``, ``c2`` or ``c1+c2``.
+
+    Raises
+    ------
+    OptionError
+        The model is unknown, or has more coefficients than there are levels.
+    """
+    if model != "auto" and model not in CURVES:
+        raise OptionError(f"curve {model!r}: expected one of {listed(('auto', *CURVES), model)}")
+    if model != "auto" and len(CURVES[model]) + 1 > len(K):
+        raise OptionError(f"curve {model!r}: {len(K)} levels; expected at least {len(CURVES[model]) + 1}")
+    names = [name for name, terms in CURVES.items() if len(terms) + 1 <= max(len(K) - 1, 1) or name == model]
+    whitened = np.asarray(np.linalg.cholesky(_regular(covariance, K)), dtype=np.float64)
+    found = {name: _solve(force, K, whitened, CURVES[name]) for name in names}
+    chosen = model
+    if model == "auto":
+        largest = max(names, key=lambda name: len(CURVES[name]))
+        freedom = len(K) - 1 - len(CURVES[largest])
+        scale = max(1.0, min(value[2] for value in found.values()) / freedom) if freedom > 0 else 1.0
+        chosen = min(names, key=lambda name: found[name][2] / scale + chi_square_limit(1, _GAIN) * len(CURVES[name]))
+    coefficients, matrix, chi_square = found[chosen]
+    given = matrix @ covariance @ matrix.T
+    return CurveFit(
+        chosen, coefficients, matrix,
+        _blended(force, K, whitened, covariance, coefficients, given) if model == "auto" else given,
+        chi_square, len(K) - 1 - len(CURVES[chosen]),
+        tuple((name, 1 + len(CURVES[name]), found[name][2], name == chosen) for name in names),
+    )  # fmt: skip
+
+
+def _blended(force: Array, K: Array, root: Array, covariance: Array, chosen: Array, given: Array) -> Array:
+    """Covariance of the chosen coefficients whichever model is right: nowhere less than that given the model."""
+    nested = [name for name in _NESTED if len(CURVES[name]) < len(K)]
+    steps = [_solve(force, K, root, CURVES[name]) for name in nested]
+    squares = np.array([chi_square for *_, chi_square in steps])
+    found = blend(
+        np.array([coefficients for coefficients, *_ in steps]),
+        np.array([matrix @ covariance @ matrix.T for _, matrix, _ in steps]),
+        -np.diff(squares), np.ones(len(steps) - 1), prior=0.0,
+    )  # fmt: skip
+    scale = np.max(force) ** np.arange(3.0)
+    values, vectors = np.linalg.eigh((found.about(chosen) - given) * np.outer(scale, scale))
+    more: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scale, scale)
+    return given + more
+
+
+def _regular(covariance: Array, K: Array) -> Array:
+    """Keep a covariance of (nearly) noise-free data invertible, and rounding from looking significant."""
+    floor = max(float(np.diagonal(covariance).max()) * 1e-12, (_CURVE_ROUNDING * float(np.abs(K).max())) ** 2, 1e-60)
+    regular: Array = covariance + floor * np.eye(len(covariance))
+    return regular
+
+
+def _solve(force: Array, K: Array, root: Array, terms: tuple[int, ...]) -> tuple[Array, Array, float]:
+    top = float(force.max())
+    powers = (0, *terms)
+    design = np.stack([(force / top) ** power for power in powers], axis=1)
+    white = np.linalg.solve(root, design)
+    matrix = np.zeros((3, len(K)))
+    matrix[list(powers)] = np.linalg.pinv(white) @ np.linalg.inv(root) / (top ** np.array(powers, dtype=float))[:, None]
+    coefficients = matrix @ K
+    left = np.linalg.solve(root, K - design @ (coefficients[list(powers)] * top ** np.array(powers, dtype=float)))
+    return coefficients, matrix, float(left @ left)
+
+
+# Errors that a test shows beyond three standard uncertainties: corrected, and what is left of them made part of u.
+
+
+_FLOOR = 1e-4
+"""What changes K by less than this part is left alone, however small its uncertainty."""
+_QUARTER = np.array([1.0, 1j])
+"""Y sees what is fixed in the arm a quarter turn from X."""
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """What the reduction does about errors that the test shows.
+
+    Attributes
+    ----------
+    fog
+        Run index to the factors of the FOG's line in each axis, shape (axes,).
+    common
+        What one standard uncertainty of each correction does to each run's lines: run index to rad/s, shape
+        (k, axes).
+    corrected
+        Names of entries of the error budget.
+    warnings
+        What was found, a sentence each.
+    """
+
+    fog: dict[int, Complex] = field(default_factory=dict)
+    common: dict[int, Complex] = field(default_factory=dict)
+    corrected: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def find_corrections(runs: Sequence[LoadedRun], lines: dict[int, RunLine], *, correct: bool = True) -> Corrections:
+    """Return what the lines of a test call for.
+
+    Parameters
+    ----------
+    runs, lines
+        As reduced, without any correction.
+    correct
+        Whether to correct what is found; otherwise all of it is uncertainty (method ``fourier``).
+    """
+    test = Measured([run for run in runs if run.index in lines], lines)
+    axes = len(test.runs[0].channels) - 1
+    late, shown = _delay(test, lines, axes, correct=correct)
+    turn: Complex = np.exp(-1j * test.table * late)
+    factor: Complex = turn[:, None] * np.ones(axes)
+    if not test.both:
+        for axis in range(axes):
+            change, more = _difference(test, axis, axes, late, correct=correct)
+            factor[:, axis] += turn * change
+            shown += more
+    if not shown:
+        return Corrections()
+    stacked = np.stack([item.common for item in shown], axis=1)
+    return Corrections(
+        {run.index: factor[i] for i, run in enumerate(test.runs)} if correct else {},
+        {run.index: stacked[i] for i, run in enumerate(test.runs)},
+        tuple(name for item in shown for name in item.named) if correct else (),
+        tuple(item.warning for item in shown),
+    )
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """An error that a test shows; `common` is what a standard uncertainty of it does to the lines, (runs, axes)."""
+
+    common: Complex
+    warning: str
+    named: tuple[str, ...] = ()
+
+
+def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: bool) -> tuple[float, list[_Finding]]:
+    """How much the FOG's line is turned back by, s, and what was found of delays."""
+    found = delays(test)
+    if found is None:
+        return 0.0, []
+    late = 0.0
+    shown: list[_Finding] = []
+    top = float(np.abs(test.table).max())
+    turning = _is_clear(found.own, found.own_uncertainty) and abs(found.own) * top > _FLOOR
+    size = max(abs(found.fog), abs(found.late)) if turning else abs(found.late)
+    clear = _is_clear(found.fog, found.fog_uncertainty) or (_is_clear(found.late, found.uncertainty) and not turning)
+    if clear and size * top * test.fog_share > _FLOOR:
+        named: tuple[str, ...] = ()
+        if correct and not turning:
+            late, size, named = found.late, found.uncertainty, ("delay of the FOG", "delay of X")
+            done = "its line was turned back by that, and what is uncertain of it is in u"
+        else:
+            done = "added to u, not corrected, since " + (
+                "X turns against table_angle too, which a delay of X or differential flexure may do"
+                if turning
+                else "method fourier corrects nothing"
+            )
+        turn = np.exp(-1j * test.table * late)
+        shown.append(
+            _Finding(
+                (1j * size * test.table * turn * test.fog)[:, None] * _QUARTER[:axes],
+                f"the FOG is {1e3 * found.fog:.3g} ± {1e3 * found.fog_uncertainty:.1g} ms late against table_angle, "
+                f"which changes K at the highest level by up to {100 * abs(found.fog) * top * test.fog_share:.2g} %: "
+                f"{done}; mend the timing or the filters of the channels",
+                named,
+            )
+        )
+    if turning:
+        drift = np.array([lines[run.index].line * run.force for run in test.runs])
+        shown.append(
+            _Finding(
+                1j * found.own * test.table[:, None] * drift,
+                f"X turns against table_angle as if it were {1e3 * found.own:.3g} ± {1e3 * found.own_uncertainty:.1g} "
+                "ms late (differential flexure looks the same): added to the uncertainty of the direction, which it "
+                f"changes by up to {np.degrees(abs(found.own) * top):.2g} deg at the highest level",
+            )
+        )
+    return late, shown
+
+
+def _difference(test: Measured, axis: int, axes: int, late: float, *, correct: bool) -> tuple[Complex, list[_Finding]]:
+    """What to add to the factor of the FOG's line in an axis, by run, and what Earth rate shows of it."""
+    change = np.zeros(len(test.runs), dtype=np.complex128)
+    shown: list[_Finding] = []
+    ratio = mismatch(test, axis, late)
+    if ratio is None:
+        return change, shown
+    sense = np.array([run.run.sense for run in test.runs])
+    turn = np.exp(-1j * test.table * late)
+    for name, scale, value, unit in (
+        ("scale mismatch", "per mille", ratio.scale, np.ones(len(sense))),
+        ("FOG azimuth", "mrad", ratio.azimuth, 1j * sense),
+    ):
+        if not (_is_clear(value, ratio.uncertainty, ratio.freedom) and abs(value) * test.fog_share > _FLOOR):
+            continue
+        change += unit * value
+        size = ratio.uncertainty if correct else abs(value)
+        shown.append(
+            _Finding(
+                -size * (unit * turn * test.fog)[:, None] * _QUARTER[:axes] * (np.arange(axes) == axis),
+                f"Earth rate shows a {name} of {1e3 * value:.3g} ± {1e3 * ratio.uncertainty:.1g} {scale} between "
+                f"{'XY'[axis]} and the FOG, which would change K at the highest level by up to "
+                f"{100 * abs(value) * test.fog_share:.2g} %: "
+                f"{'corrected' if correct else 'method fourier does not correct it'}, and what is uncertain of it "
+                "is in u; both senses of rotation remove it",
+                (name,) if axis == 0 else (),
+            )
+        )
+    return change, shown
+
+
+def corrected(runs: Sequence[LoadedRun], found: Corrections) -> list[LoadedRun]:
+    """Return the runs with the factors of their FOG's line and what is common to all of them."""
+    return [replace(run, fog_factor=found.fog.get(run.index), common=found.common.get(run.index)) for run in runs]
+
+
+def _is_clear(value: float, uncertainty: float, freedom: float | None = None) -> bool:
+    return abs(value) > three_sigma(freedom) * uncertainty
+
+
+# Levels to parameters: K, zeta, the curve, its direction and the cross terms, with one covariance over all of them.
+
 
 _ROUNDING = 1e-7
 """Turning of the drift, rad, below which it is not warned of however small the noise."""
@@ -313,3 +614,52 @@ def _freedom(J: Array, V: Array, common: Array, radius: Array, levels: Levels, w
     total = variance + radius**2
     result: Array = np.clip(total**2 / np.maximum(spent, 1e-300), 1.0, 1e9)
     return result
+
+
+# K and zeta of each power cycle by itself: how far a test repeats.
+
+
+def power_cycles(levels: Levels, method: str) -> list[dict[str, Any]]:
+    """Return K_i and zeta_i of every power cycle, with what noise and rates leave uncertain of them.
+
+    ``zeta_i = K_i / K_1 - 1`` with both K of the same cycle; a cycle without the reference has no zeta. Prefixes are
+    those of the parameters.
+    """
+    repeatability = Repeatability(run=levels.repeatability.run, run_freedom=levels.repeatability.run_freedom)
+    rows: list[dict[str, Any]] = []
+    for cycle in sorted({cycle for level in levels.items for cycle in level.cycles}):
+        row: dict[str, Any] = {"power_cycle": cycle}
+        for level in levels.items:
+            group = [levels.lines[index] for index in level.runs]
+            mine = [line for line in group if line.source.run.power_cycle == cycle]
+            if not mine:
+                continue
+            own = pooled(level.number, level.spin_axis, mine, repeatability, level.directed)
+            for axis, letter in enumerate("xy"[: len(own.line)]):
+                size = float(abs(own.line[axis]))
+                unit = np.array([own.line[axis].real, own.line[axis].imag]) / max(size, 1e-300)
+                pair = slice(2 * axis, 2 * axis + 2)
+                u = float(np.sqrt(unit @ own.covariance[pair, pair] @ unit))
+                if level.directed and method == "least-squares":
+                    size -= float(own.component_variance[axis]) / (2 * max(size, 1e-300))
+                found = row.setdefault(letter if level.spin_axis == "up" else f"{letter}_down", {})
+                found[f"K_{level.number}"] = {"value": size, "standard_uncertainty": u, "unit": K_UNIT}
+        for found in row.values():
+            if isinstance(found, dict) and "K_1" in found:
+                found |= _zeta_of_cycle(found)
+        rows.append(row)
+    return rows
+
+
+def _zeta_of_cycle(found: dict[str, Any]) -> dict[str, Any]:
+    first = found["K_1"]
+    zeta = {}
+    for name, K in found.items():
+        if name == "K_1":
+            continue
+        ratio = K["value"] / first["value"]
+        relative = np.hypot(K["standard_uncertainty"] / K["value"], first["standard_uncertainty"] / first["value"])
+        zeta[name.replace("K", "zeta")] = {
+            "value": ratio - 1, "standard_uncertainty": float(abs(ratio) * relative), "unit": "1",
+        }  # fmt: skip
+    return zeta

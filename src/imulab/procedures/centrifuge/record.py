@@ -7,15 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from imulab.procedures.centrifuge.cycles import power_cycles
-from imulab.procedures.centrifuge.entries import window_text
 from imulab.procedures.centrifuge.levels import Levels, RunLine, amplitude_lost, axis_lines
-from imulab.procedures.centrifuge.manifest import Manifest
-from imulab.procedures.centrifuge.model import real_covariance
-from imulab.procedures.centrifuge.parameters import Estimates
-from imulab.procedures.centrifuge.run import LoadedRun
-from imulab.procedures.centrifuge.spectra import in_degrees
-from imulab.procedures.centrifuge.static import StaticRun
+from imulab.procedures.centrifuge.lines import in_degrees
+from imulab.procedures.centrifuge.manifest import Manifest, real_covariance, window_text
+from imulab.procedures.centrifuge.parameters import Estimates, power_cycles
+from imulab.procedures.centrifuge.run import LoadedRun, StaticRun
 from imulab.recording import Array, Source
 from imulab.records.calibration import Calibration, Covariance, Parameter
 

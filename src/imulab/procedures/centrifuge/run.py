@@ -1,23 +1,442 @@
-"""One run of a centrifuge test, streamed: its blocks to lines with their noise."""
+"""One run of a centrifuge test, streamed.
+
+Its channels, where it is steady, its lines with their noise, or the means of a static run.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from imulab.errors import DataError
-from imulab.procedures.centrifuge.cells import Cells, Samples, TooSlowError, compress, pieces_of
-from imulab.procedures.centrifuge.channels import Channels
-from imulab.procedures.centrifuge.fourier import PeriodResult, PeriodSums
+from imulab.errors import DataError, ImulabError, UnitError
+from imulab.estimation.rows import MAD_TO_SIGMA
+from imulab.procedures.centrifuge.lines import (
+    COLUMNS,
+    CONSTANT,
+    FAINT,
+    LINE,
+    PEAK,
+    ROOM,
+    SEARCH,
+    SECOND,
+    THIRD,
+    Cells,
+    Complex,
+    PeriodResult,
+    PeriodSums,
+    Rates,
+    Samples,
+    TooSlowError,
+    compress,
+    detrended,
+    even_series,
+    find_rates,
+    hann_spectrum,
+    in_degrees,
+    interpolated,
+    pieces_of,
+    refine,
+    residual_noise,
+    scatter,
+    search_line,
+    solve,
+)
 from imulab.procedures.centrifuge.manifest import Manifest, Run
-from imulab.procedures.centrifuge.rates import Rates, find_rates, residual_noise
-from imulab.procedures.centrifuge.regress import LINE, ROOM, SECOND, THIRD, Complex, scatter
-from imulab.procedures.centrifuge.spectra import detrended, even_series, hann_spectrum
-from imulab.procedures.centrifuge.steady import steady_part
-from imulab.recording import Array, Recording
-from imulab.units import from_si
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.units import from_si, parse_unit, to_si
+
+# The channels of a run's recording: its columns as rates in SI, checked, block by block.
+
+
+class Channels:
+    """Samples of a run; the names of its channels are known once the first block has come.
+
+    Attributes
+    ----------
+    names
+        `dtg_x`, [`dtg_y`,] `fog`.
+    """
+
+    def __init__(self, blocks: Iterable[Recording], manifest: Manifest, index: int) -> None:
+        self._blocks, self._manifest, self._index = blocks, manifest, index
+        self.names: tuple[str, ...] = ()
+
+    def __iter__(self) -> Iterator[Samples]:
+        """Yield the blocks of the run in SI, checked.
+
+        Raises
+        ------
+        DataError
+            A column is missing, a sample is not finite, time does not rise.
+        UnitError
+            A column in count or V without a scale factor in that unit; an angle that is none.
+        ImulabError
+            What the reader refuses.
+        """
+        place = self._manifest.place(self._index)
+        file = self._manifest.runs[self._index].file
+        try:
+            yield from self._samples()
+        except ImulabError as error:
+            name, found, rest = str(error).partition(": ")
+            # What does not name the run names its file alone, as it was opened: that is in `place` already.
+            raise type(error)(f"{place}: {rest if found and name.endswith(file) else error}") from None
+
+    def _samples(self) -> Iterator[Samples]:
+        end = -np.inf
+        for block in self._blocks:
+            for name in ("time", "dtg_x", "fog"):
+                if name not in block:
+                    raise DataError(f"no column {name}; found {' '.join(block.columns)}")
+            self.names = ("dtg_x", "dtg_y", "fog") if "dtg_y" in block else ("dtg_x", "fog")
+            if not len(block):
+                continue
+            angle = None
+            checked = [*self.names]
+            if "table_angle" in block:
+                if parse_unit(block.units["table_angle"]).quantity != "angle":
+                    raise UnitError(f"column table_angle is in {block.units['table_angle']}; expected deg or rad")
+                checked.append("table_angle")
+                angle = block.si("table_angle")
+            check_finite(block, checked)
+            time = check_time(block)
+            if not time[0] > end:
+                raise DataError(
+                    f"{block.place(0)}, column time: time runs backwards or stands still: expected more than "
+                    f"{end:.9g} s, found {time[0]:.9g} s"
+                )
+            end = float(time[-1])
+            yield Samples(time, np.stack([_rate(block, name, self._manifest) for name in self.names]), angle)
+
+
+def _rate(block: Recording, name: str, manifest: Manifest) -> Array:
+    """A column as rate, rad/s."""
+    unit = parse_unit(block.units[name])
+    if unit.quantity == "rate":
+        return block.si(name)
+    known = manifest.scale_factors.get(name)
+    if known is None:
+        raise UnitError(
+            f"column {name} is in {unit.symbol}: expected a unit of rate, or {name} under [scale_factor] in the "
+            "manifest"
+        )
+    if known[1] != unit.symbol:
+        raise UnitError(f"column {name} is in {unit.symbol}, but its scale factor is in {known[1]} per rate")
+    rate: Array = block.column(name) / known[0]
+    return rate
+
+
+# Where a run is steady: rate ramps at its ends are cut, others are refused.
+
+
+_MISMATCH = to_si(0.5, "deg/s")
+_STANDS_OUT = 8.0
+_UNSTEADY = 0.05
+_SLOW, _SLOW_WARNING = 0.1, 0.02
+_RATE_CHANGE = 1e-3
+_ROUNDS = 8
+_SEGMENTS, _STEADILY = 8, 0.9
+
+
+def steady_part(cells: Cells, place: str) -> tuple[Cells, list[str]]:
+    """Cut a rate ramp at either end of a run, and say so.
+
+    With an encoder a ramp shows in its rate, otherwise in the lines' phase and size from block to block.
+
+    Raises
+    ------
+    DataError
+        The rate changes in the middle or all along, or most of the run would be cut.
+    """
+    whole = cells
+    first, last = 0, len(cells.centre)
+    if cells.series_angle is not None:
+        first, last = _steady_encoder(cells, place)
+        cells = whole.cut(first, last)
+    warnings: list[str] = []
+    for _ in range(_ROUNDS):
+        found = _unsteady_blocks(cells, place)
+        if found is None:
+            break
+        low, high, message = found
+        if low == 0 and high == len(cells.centre):
+            warnings += message
+            break
+        first, last = first + low, first + high
+        cells = whole.cut(first, last)
+    if last - first < len(whole.centre) / 2:
+        raise DataError(f"{place}: the rates are steady in less than half of the run; expected a run at steady rates")
+    period = whole.cell * whole.step
+    begin, end = whole.start + first * period, whole.start + last * period
+    total = whole.start + whole.duration
+    if first:
+        warnings.append(
+            f"{place}: a rate ramp in the first {begin - whole.start:.1f} s was cut; used from {begin:.1f} s"
+        )
+    if last < len(whole.centre):
+        warnings.append(f"{place}: a rate ramp in the last {total - end:.1f} s was cut; used up to {end:.1f} s")
+    return cells, warnings
+
+
+def _steady_encoder(cells: Cells, place: str) -> tuple[int, int]:
+    """Cells (half-open) over which the encoder's rate is steady."""
+    angle = cells.series_angle
+    assert angle is not None
+    begin = cells.series_begin
+    deviation = np.unwrap(angle - cells.table_rate * (begin - cells.start))[:: cells.bins]
+    rate = np.diff(deviation) / np.diff(begin[:: cells.bins])
+    count = len(deviation)
+    if count < 4:
+        return 0, count
+    usual = float(np.median(rate))
+    if abs(usual) > _MISMATCH:
+        found = cells.table_rate + usual
+        sense = "; is the sense of the run wrong?" if found * cells.table_rate < 0 else ""
+        raise DataError(
+            f"{place}: column table_angle turns at {in_degrees(found)}, expected table_rate "
+            f"{in_degrees(cells.table_rate)}{sense}"
+        )
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(rate - usual)))
+    limit = max(_RATE_CHANGE * abs(cells.table_rate), 6 * spread)
+    good = np.abs(rate - usual) <= limit
+    runs = good[:-2] & good[1:-1] & good[2:] if count >= 5 else good
+    if not runs.any():
+        raise DataError(
+            f"{place}: column table_angle: the rate is nowhere steady; expected {in_degrees(cells.table_rate)}"
+        )
+    first = int(np.argmax(runs))
+    last = len(good) - int(np.argmax(runs[::-1]))
+    if not good[first:last].all():
+        index = first + int(np.argmin(good[first:last]))
+        raise DataError(
+            f"{place}: column table_angle: the rate changes from {in_degrees(cells.table_rate + usual)} to "
+            f"{in_degrees(cells.table_rate + float(rate[index]))} at {cells.centre[index]:.1f} s; expected steady rates"
+        )
+    quarter = max(1, (last - first) // 4)
+    ends = rate[first : first + quarter], rate[last - quarter : last]
+    change = float(ends[1].mean() - ends[0].mean())
+    noise = float(np.hypot(*(part.std() / np.sqrt(quarter) for part in ends)))
+    if abs(change) > max(_RATE_CHANGE * abs(cells.table_rate), 5 * noise):
+        raise DataError(
+            f"{place}: column table_angle: the rate drifts by {in_degrees(change)} over the run; expected steady rates"
+        )
+    # A cell whose end is still ramping counts as ramp.
+    return first if first == 0 else first + 1, count if last == len(good) else last
+
+
+def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | None:
+    """Cells to keep and warnings, where blocks of the run show other lines than the rest; None where all agree."""
+    shift = 0.0 if cells.series_angle is not None else _strongest_shift(cells)
+    if shift is None:
+        _check_wandering(cells, place)
+        return None
+    solution = solve(cells, shift, _peak_shift(cells, cells.net_rate))
+    found = scatter(cells, solution)
+    if found is None or len(found.centre) < 6:
+        return None
+    size = np.abs(solution.line(LINE))
+    # Against the median of the blocks: the line of the whole run has the disturbance in it.
+    middle = np.median(found.deviation.real, axis=0) + 1j * np.median(found.deviation.imag, axis=0)
+    deviation = np.abs(found.deviation - middle)
+    sigma = np.median(deviation, axis=0) / 1.1774
+    # Below `FAINT` nothing is seen of a gyroscope: a simulated line without noise has no scatter to compare with.
+    bad: NDArray[np.bool_] = np.any(deviation > _STANDS_OUT * sigma + _UNSTEADY * size + FAINT, axis=1)
+    count = len(bad)
+    low = int(np.argmin(bad))
+    high = count - int(np.argmin(bad[::-1]))
+    if bad.all() or bad[low:high].any():
+        index = low + int(np.argmax(bad[low:high]))
+        raise DataError(
+            f"{place}: the line at the table rate changes near {found.centre[index]:.1f} s; expected steady rates "
+            "(a rate ramp or a disturbance inside the run)"
+        )
+    if low > 0 or high < count:
+        return int(found.edges[low]), int(found.edges[high]), []
+    return 0, len(cells.centre), _slow_change(found.deviation, size, place)
+
+
+def _check_wandering(cells: Cells, place: str) -> None:
+    """Refuse a run without a line at the table rate in which a clear line moves steadily: a ramp all along."""
+    series = [even_series(cells, values - values.mean()) for values in cells.series]
+    count = len(series[0]) // _SEGMENTS
+    if count < 4 * _SEGMENTS:
+        return
+    window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
+    rates = 2 * np.pi * np.fft.rfftfreq(count, cells.series_step)
+    above = rates > max(1.5 * abs(cells.net_rate), 2.5 * rates[1])
+    for values in series:
+        segments = values[: count * _SEGMENTS].reshape(_SEGMENTS, count)
+        height = np.abs(np.fft.rfft(window * (segments - segments.mean(axis=1, keepdims=True)), axis=1))[:, above]
+        clear = height.max(axis=1) > PEAK * np.median(height, axis=1)
+        peak = rates[above][np.argmax(height, axis=1)]
+        if clear.sum() < 0.6 * _SEGMENTS or np.ptp(peak[clear]) < 3 * rates[1]:
+            continue
+        if abs(np.corrcoef(np.flatnonzero(clear), peak[clear])[0, 1]) > _STEADILY:
+            raise DataError(
+                f"{place}: a line moves from {in_degrees(float(peak[clear][0]))} to "
+                f"{in_degrees(float(peak[clear][-1]))}; "
+                f"expected steady rates, table_rate {in_degrees(abs(cells.table_rate))} (a rate ramp?)"
+            )
+
+
+def _slow_change(deviation: Complex, size: Array, place: str) -> list[str]:
+    """Judge a line that wanders slowly: steps from block to block much smaller than the wandering itself."""
+    if len(deviation) < 16:
+        return []
+    power = (np.abs(deviation) ** 2).mean(axis=0)
+    steps = (np.abs(np.diff(deviation, axis=0)) ** 2).mean(axis=0)
+    slow = np.where(steps < 0.5 * power, np.sqrt(power) / np.maximum(size, 1e-300), 0.0)
+    slow = np.where(np.sqrt(power) > FAINT, slow, 0.0)
+    worst = float(slow.max())
+    if worst > _SLOW:
+        raise DataError(
+            f"{place}: the line at the table rate wanders by {100 * worst:.0f} % over the run; expected steady rates "
+            "(a slow rate ramp?)"
+        )
+    if worst > _SLOW_WARNING:
+        return [
+            f"{place}: the line at the table rate wanders by {100 * worst:.1f} % over the run; are the rates steady?"
+        ]
+    return []
+
+
+def _strongest_shift(cells: Cells) -> float | None:
+    """Shift of the table rate by the channel whose line stands out most; None where none does."""
+    best, where = 0.0, None
+    for channel in range(len(cells.series)):
+        shift, height = search_line(cells, cells.series[channel], cells.table_rate, SEARCH)
+        if height > best:
+            best, where = height, (channel, shift)
+    if where is None or best < PEAK:
+        return None
+    refined = refine(cells, where[0], where[1], None)
+    return where[1] if refined is None else refined.table_shift
+
+
+def _peak_shift(cells: Cells, rate: float) -> float:
+    """Shift of the FOG's strongest line within the search range of the net rate, or none where it is not clear."""
+    shift, height = search_line(cells, cells.series[-1], rate, SEARCH)
+    return shift if height > PEAK else 0.0
+
+
+# A static run of a centrifuge test: the mean of each channel, once it is sure that nothing moved.
+
+
+_STEP = to_si(5.0, "deg/h")
+"""A second off the straight line through the record by less than this is no motion, however small the noise."""
+_STEP_SIGMA, _STEP_STEPS = 10.0, 8.0
+_DRIFT = to_si(20.0, "deg/h")
+"""More than a warm gyroscope drifts over a static record, or a table held by its servo shakes."""
+_LINE = to_si(1.0, "deg/h")
+"""More than rest shows at a rate that the table has in this test."""
+_LOWEST_BIN = 3
+"""A drift that bends shows in the first bins of a spectrum."""
+_AROUND = 16
+_FEWEST = 64
+_TURNED = np.radians(0.05)
+
+
+@dataclass(frozen=True)
+class StaticRun:
+    """Mean of each channel over a static run, rad/s, shape (k,), and its duration, s."""
+
+    run: Run
+    index: int
+    channels: tuple[str, ...]
+    mean: Array
+    samples: int
+    duration: float
+
+
+def reduce_static(blocks: Iterable[Recording], manifest: Manifest, index: int) -> StaticRun:
+    """Return the means of a static run.
+
+    Raises
+    ------
+    DataError
+        It moves: a channel steps, drifts or shows a line at a rate that a centrifuge may have, or the table turns.
+    """
+    place = manifest.place(index)
+    channels = Channels(blocks, manifest, index)
+    try:
+        cells = compress(channels, 2 * np.pi, 1.0)  # cells of one second
+    except TooSlowError:
+        raise DataError(f"{place}: expected 8 samples per second or more in a static run") from None
+    if cells is None:
+        raise DataError(f"{place}: shorter than one second; expected a static run of some minutes")
+    count = cells.moments[:, CONSTANT, CONSTANT]
+    sums = cells.moments[:, CONSTANT, COLUMNS:]
+    fastest = max((run.table_rate for run in manifest.runs), default=0.0)
+    motion = _turn(cells) or _line(cells, channels.names, 1.1 * fastest) or _step(cells, channels.names)
+    if motion:
+        raise DataError(f"{place}: a static run that moves: column {motion}; expected a record at rest")
+    mean = sums.sum(axis=0) / count.sum() + cells.offset
+    return StaticRun(manifest.runs[index], index, channels.names, mean, cells.samples, cells.duration)
+
+
+def _turn(cells: Cells) -> str | None:
+    if cells.series_angle is None:
+        return None
+    reach = float(np.ptp(np.unwrap(cells.series_angle)))
+    return f"table_angle goes over {np.degrees(reach):.3g} deg" if reach > _TURNED else None
+
+
+def _line(cells: Cells, names: tuple[str, ...], fastest: float) -> str | None:
+    """What a channel shows as a line: Earth rate at the net rate, tilt at the table rate of a rig that turns."""
+    for name, values in zip(names, cells.series, strict=True):
+        series = even_series(cells, detrended(cells.series_time, values))
+        count = len(series)
+        if count < _FEWEST:
+            return None
+        window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
+        height: Array = np.asarray(2 * np.abs(np.fft.rfft(window * series)) / window.sum(), dtype=np.float64)
+        rates: Array = np.asarray(2 * np.pi * np.fft.rfftfreq(count, cells.series_step), dtype=np.float64)
+        padded = np.pad(height, _AROUND, mode="reflect")
+        floor = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * _AROUND + 1), axis=1)
+        high = height > np.maximum(
+            PEAK * np.maximum(floor, np.median(height)), np.where(rates > fastest, _DRIFT, _LINE)
+        )
+        high[:_LOWEST_BIN] = False
+        if high.any():
+            index = int(np.argmax(np.where(high, height, 0.0)))
+            rate = interpolated(rates[index - 1 : index + 2], height[index - 1 : index + 2])
+            return (
+                f"{name} shows a line of {from_si(float(height[index]), 'deg/h'):.3g} deg/h at {in_degrees(rate, 4)}, "
+                "as if the gyroscope turned"
+            )
+    return None
+
+
+def _step(cells: Cells, names: tuple[str, ...]) -> str | None:
+    """What a channel's means over one second do besides noise: a step, or a drift that is none of a warm gyroscope."""
+    count = cells.moments[:, CONSTANT, CONSTANT]
+    means = cells.moments[:, CONSTANT, COLUMNS:] / count[:, None]
+    squares = np.einsum("ckk->ck", cells.moments[:, COLUMNS:, COLUMNS:])
+    within = np.sqrt(np.median(np.maximum(squares / count[:, None] - means**2, 0.0), axis=0) / count[0])
+    time = cells.centre - cells.centre.mean()
+    slope = time @ means / max(float(time @ time), 1e-300)
+    flat = means - time[:, None] * slope
+    left = np.abs(flat - np.median(flat, axis=0))
+    steps = MAD_TO_SIGMA / np.sqrt(2) * np.median(np.abs(np.diff(flat, axis=0)), axis=0) if len(flat) > 3 else 0.0
+    limit = np.maximum(np.maximum(_STEP_SIGMA * within, _STEP_STEPS * steps), _STEP)
+    if (left > limit).any():
+        cell, channel = np.unravel_index(int(np.argmax(left / limit)), left.shape)
+        return (
+            f"{names[channel]} is {from_si(float(left[cell, channel]), 'deg/h'):.3g} deg/h off its mean at "
+            f"{cells.centre[cell]:.1f} s"
+        )
+    drift = np.abs(slope) * np.ptp(cells.centre)
+    if (drift > np.maximum(limit, _DRIFT)).any():
+        worst = int(np.argmax(drift / np.maximum(limit, _DRIFT)))
+        return f"{names[worst]} drifts by {from_si(float(drift[worst]), 'deg/h'):.3g} deg/h over the record"
+    return None
+
+
+# One run of a centrifuge test, streamed: its blocks to lines with their noise.
+
 
 _MOST_LOST = 0.5
 _SPECTRUM_HALF_WIDTH = 24

@@ -1,4 +1,7 @@
-"""What fusing really buys: every method over one recording, with errors, limit, Allan curves and bandwidth."""
+"""What fusing really buys.
+
+Every method over one recording or over the source's experiments, with errors and bandwidths.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +13,246 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from imulab.device.methods import METHODS
-from imulab.errors import DataError, ImulabError
-from imulab.estimation.allan import allan_deviation
+from imulab.device import METHODS
+from imulab.errors import DataError, ImulabError, OptionError, listed
+from imulab.estimation.noise_coefficients import allan_deviation
+from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.estimation.sampling import sampling_rate
-from imulab.procedures.gyro_array.bandwidth import Response, responses
-from imulab.procedures.gyro_array.checks import Checks
-from imulab.procedures.gyro_array.clocks import on_one_clock
-from imulab.procedures.gyro_array.compare_figures import exhibits_of_comparison
-from imulab.procedures.gyro_array.fuse import FuseOptions, fuse, open_stream
+from imulab.procedures.gyro_array import EXPERIMENTS, OF_THE_SOURCE
+from imulab.procedures.gyro_array.elements import (
+    EXCLUDED,
+    FEWEST_ROBUST,
+    JUMPED,
+    NON_FINITE,
+    STUCK,
+    Checks,
+    Elements,
+    array_calibration,
+    feedback_notes,
+    find_elements,
+    fixed_weights,
+    on_one_clock,
+)
+from imulab.procedures.gyro_array.figures import exhibits_of_comparison
+from imulab.procedures.gyro_array.fit import calibrate_array
+from imulab.procedures.gyro_array.fuse import FuseOptions, fuse, memory_text, open_stream
 from imulab.procedures.gyro_array.fused import Fused
-from imulab.procedures.gyro_array.memory import memory_text
-from imulab.procedures.gyro_array.model import FEWEST_ROBUST, Elements, array_calibration, feedback_notes, find_elements
-from imulab.procedures.gyro_array.sections import MethodRow
-from imulab.procedures.gyro_array.single import Singles, single_gyros
+from imulab.procedures.gyro_array.schema import MethodRow
+from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance
-from imulab.report.elements import Exhibits
+from imulab.report.traces import Exhibits
+
+# What a comparison compares with: the gyros of an array that work, and the least noise of any fixed weights.
+
+
+_IN_USE = 0.5
+_FEWEST = 2
+
+
+@dataclass(frozen=True)
+class Singles:
+    """The gyros of one axis on their own.
+
+    Attributes
+    ----------
+    working
+        Whether each gyro counts, shape (n,): never stuck nor jumped, finite and in use under `robust` in half of the
+        samples or more.
+    noise
+        Mean over these of the standard deviation of the rate error, in the samples in which each was in use.
+    limit
+        (1' C^-1 1)^-1/2, C the covariance of the noise from sample to sample of all gyros that are in use in half of
+        the samples or more; 0 where it is unknown.
+    middle
+        The gyro with the median noise.
+    """
+
+    working: np.ndarray
+    noise: float
+    limit: float
+    middle: int
+
+
+def single_gyros(error: Array, flags: np.ndarray | None) -> Singles:
+    """Return what the gyros of one axis do on their own.
+
+    A gyro that failed says nothing of what fusing buys: the mean of all would be the size of the fault. Where none
+    works, or health is not known, every gyro with a finite reading counts.
+
+    Parameters
+    ----------
+    error
+        Readings less the truth, shape (m, n).
+    flags
+        Health under `robust`, shape (m, n), or None.
+    """
+    used: np.ndarray = np.isfinite(error)
+    if flags is not None:
+        used = used & ((flags & (NON_FINITE | EXCLUDED)) == 0)
+    there: np.ndarray = np.mean(used, axis=0) >= _IN_USE
+    working = there.copy()
+    if flags is not None:
+        working &= ((flags & (STUCK | JUMPED)) == 0).all(axis=0)
+    if not working.any():
+        used = np.isfinite(error)
+        there = working = np.any(used, axis=0)
+    noise = np.full(len(working), np.nan)
+    for i in np.flatnonzero(working):
+        noise[i] = error[used[:, i], i].std()
+    order = [int(i) for i in np.argsort(noise) if working[i]]
+    return Singles(
+        working=working,
+        noise=float(np.mean(noise[working])) if working.any() else 0.0,
+        limit=_limit(np.where(used, error, np.nan)[:, there]),
+        middle=order[len(order) // 2] if order else 0,
+    )
+
+
+def _limit(error: Array) -> float:
+    """Limit of errors with nan where a gyro was out of use, each pair over the samples that it shares."""
+    step = np.diff(error, axis=0)
+    known = np.isfinite(step)
+    step = np.where(known, step, 0.0)
+    shared = known.T.astype(np.float64) @ known
+    covariance = step.T @ step / np.maximum(2 * shared, 1)
+    live = np.diag(covariance) > 0
+    if not live.any() or shared.min() < _FEWEST:
+        return 0.0
+    try:
+        limit = fixed_weights(covariance[np.ix_(live, live)])[1]
+    except np.linalg.LinAlgError:
+        return 0.0
+    return limit if math.isfinite(limit) else 0.0
+
+
+# Response of a method of fusion to a small white probe that all gyros see.
+
+
+_PROBE_SAMPLES = 16_384
+_SEGMENT = 256
+_HALF_POWER = math.sqrt(0.5)
+_FROZEN, _UNUSUAL = 0.5, 20.0  # s; times as long as usual
+_FOLLOWED = 0.95
+_FEWEST_PAIRS = 4
+
+
+@dataclass(frozen=True)
+class Response:
+    """Bandwidth, Hz, at -3 dB (half the sampling rate where nothing is filtered), and gain for slow motion.
+
+    `gain_uncertainty` is the standard uncertainty of the gain, `blind` the gyros that do not move.
+    """
+
+    bandwidth: float
+    gain: float
+    gain_uncertainty: float
+    blind: tuple[str, ...] = ()
+
+
+def responses(
+    readings: Array, elements: Elements, options: FuseOptions, record: Calibration | None, rate: float
+) -> list[Response]:
+    """Return the response of each axis.
+
+    The method runs twice, with and without the probe: |S_pr| / S_pp of probe p and response r (Welch, windowed halves
+    that overlap). The probe is as large as the gyros' noise. A gyro does not see it while it repeats itself for longer
+    than the steps of its output make it (`_frozen`), as a dead gyro sees no motion.
+
+    Parameters
+    ----------
+    readings
+        As logged, shape (m, axes, n); the first 16,384 samples are used.
+    record
+        The calibration in `options`, where there is one: the probe goes through the elements' matrices.
+    """
+    readings = readings[:_PROBE_SAMPLES]
+    step = np.diff(readings, axis=0)
+    rng = np.random.default_rng(0)
+    probe = rng.standard_normal(readings.shape[:2]) * _noise(step)
+    seen = np.repeat(probe[:, :, None], elements.count, axis=2)
+    if record is not None:
+        matrices = array_calibration(record, elements).matrices
+        if matrices is not None:
+            seen = np.einsum("nab,mb->man", np.linalg.inv(matrices), probe)
+    frozen = _frozen(step, rate)
+    seen[frozen] = 0.0
+    plain, shaken = (
+        open_stream(options, elements, rate, readings).process(np.ascontiguousarray(part)).rate
+        for part in (readings, readings + seen)
+    )
+    response = shaken - plain
+    skip = len(response) // 4
+    found = []
+    for a in range(len(elements.axes)):
+        gain, uncertainty = _transfer(probe[skip:, a], np.nan_to_num(response[skip:, a]))
+        frequency = np.linspace(0, rate / 2, len(gain))
+        below = np.flatnonzero(gain[1:] < _HALF_POWER)
+        edge = rate / 2
+        if below.size:
+            k = int(below[0]) + 1
+            high, low = gain[k - 1], gain[k]
+            share = (high - _HALF_POWER) / (high - low) if high > _HALF_POWER else 0.0
+            edge = float(frequency[k - 1] + share * (frequency[k] - frequency[k - 1]))
+        blind = tuple(name for i, name in enumerate(elements.names[a]) if frozen[:, a, i].mean() > 1 - _FOLLOWED)
+        found.append(Response(edge, float(gain[0]), uncertainty, blind))
+    return found
+
+
+def _noise(step: Array) -> Array:
+    """Typical noise of the gyros on each axis, from the median of their changes, shape (axes,); 1 where there is none.
+
+    The median gyro's: neither spikes nor a turn during a part of the recording make the probe larger.
+    """
+    found = np.ones(step.shape[1])
+    for a in range(step.shape[1]):
+        sizes = [np.median(np.abs(column[np.isfinite(column)])) for column in step[:, a].T if np.isfinite(column).any()]
+        size = MAD_TO_SIGMA * float(np.median(sizes)) / math.sqrt(2) if sizes else 0.0
+        found[a] = size if size > 0 else 1.0
+    return found
+
+
+def _frozen(step: Array, rate: float) -> np.ndarray:
+    """Samples at which a gyro repeats itself, shape (m, axes, n), by its changes from sample to sample.
+
+    That is for half a second or more, and for 20 times as long as it usually does: the output of a healthy gyro whose
+    steps are as large as its noise repeats itself, too.
+    """
+    same = np.concatenate([np.zeros((1, *step.shape[1:]), dtype=bool), step == 0])
+    frozen = np.zeros(same.shape, dtype=bool)
+    for a, i in np.ndindex(*same.shape[1:]):
+        changes = np.append(np.flatnonzero(~same[:, a, i]), len(same))
+        runs = np.diff(changes)
+        long = (runs > _FROZEN * rate) & (runs > _UNUSUAL * np.median(runs) * (len(runs) > 1))
+        frozen[:, a, i] = np.repeat(long, runs)
+    return frozen
+
+
+def _transfer(probe: Array, response: Array) -> tuple[Array, float]:
+    """Size of the transfer function, by half-overlapping windowed segments (Welch), and its u at the lowest frequency.
+
+    The uncertainty is a jackknife that leaves out pairs of segments, which overlap.
+    """
+    size = min(_SEGMENT, len(probe))
+    window = np.hanning(size)
+    starts = range(0, len(probe) - size + 1, max(1, size // 2))
+    spectra = [
+        (np.fft.rfft(window * probe[s : s + size]), np.fft.rfft(window * response[s : s + size])) for s in starts
+    ]
+    cross = np.array([np.conj(p) * r for p, r in spectra])
+    own = np.array([np.abs(p) ** 2 for p, _ in spectra])
+    gain: Array = np.abs(cross.sum(axis=0)) / np.maximum(own.sum(axis=0), 1e-300)
+    pairs = np.arange(0, len(spectra), 2)
+    if len(pairs) < _FEWEST_PAIRS:
+        return gain, math.inf
+    left = [np.add.reduceat(part[:, 0], pairs) for part in (cross, own)]
+    without = np.abs(cross[:, 0].sum() - left[0]) / np.maximum(own[:, 0].sum() - left[1], 1e-300)
+    return gain, float(np.sqrt((len(pairs) - 1) / len(pairs) * ((without - without.mean()) ** 2).sum()))
+
+
+# What fusing really buys: every method over one recording, with errors, limit, Allan curves and bandwidth.
+
 
 _TRACE = 800
 _QUIET_FACTOR = 3.0
@@ -367,3 +592,81 @@ def _filtering(
                 "is low-pass filtering, which does not lower the angle error"
             )
     return found
+
+
+# The source's two experiments, over many seeds: every method with and without a calibrated start.
+
+
+CALIBRATION_TIME = 60.0
+"""Duration of the recording at rest that a calibrated start comes from, s."""
+
+
+@dataclass(frozen=True)
+class ExperimentRow:
+    """Medians over the seeds for one method: rate error, deg/s, and angle error, deg, each as std and largest."""
+
+    method: str
+    calibrated: bool
+    rate_std: float
+    rate_max: float
+    angle_std: float
+    angle_max: float
+
+
+def run_experiment(
+    experiment: str,
+    *,
+    seeds: int = 20,
+    noise: NoiseModel | None = None,
+    methods: tuple[str, ...] = METHODS,
+    progress: Callable[[int], None] = lambda _: None,
+) -> list[ExperimentRow]:
+    """Run one of the source's set-ups (6 gyros) over many seeds.
+
+    A calibrated start takes the biases, and for `covariance` and `kalman` the noise, from 60 s at rest before the run.
+
+    Raises
+    ------
+    OptionError
+        The experiment is unknown, or there is no seed.
+    """
+    if experiment not in OF_THE_SOURCE:
+        raise OptionError(f"experiment {experiment!r}: expected one of {listed(OF_THE_SOURCE, experiment)}")
+    if not 1 <= seeds <= 10_000:
+        raise OptionError(f"seeds {seeds}: expected 1 to 10000")
+    rate = EXPERIMENTS[experiment][0]
+    found: dict[tuple[str, bool], list[tuple[float, float, float, float]]] = {}
+    for seed in range(1, seeds + 1):
+        recording = simulate_array(experiment=experiment, seed=seed, **vars(noise or NoiseModel()))
+        # The stretch at rest comes first; the same gyros with the same turn-on biases.
+        still = simulate_array(
+            experiment="static",
+            rate=rate,
+            duration=CALIBRATION_TIME,
+            session=1,
+            seed=seed,
+            **vars(noise or NoiseModel()),
+        )
+        record = calibrate_array(still).calibration
+        elements = find_elements(recording)
+        readings = elements.readings(recording)
+        truth = elements.truth(recording)
+        assert truth is not None
+        for method in methods:
+            for calibrated in (False, True):
+                if method == "covariance" and not calibrated:
+                    continue
+                start = record if calibrated and method == "feedback" else "first"
+                options = FuseOptions(
+                    method=method,
+                    initial_bias=start,
+                    calibration=record if calibrated and method != "feedback" else None,
+                )
+                stream = open_stream(options, elements, rate, readings[:10_000])
+                error = stream.process(readings, flags=False).rate[:, 0] - truth[:, 0]
+                found.setdefault((method, calibrated), []).append(rate_figures(error, rate))
+        progress(seed)
+    return [
+        ExperimentRow(method, calibrated, *map(float, np.median(np.array(values), axis=0)))
+        for (method, calibrated), values in sorted(found.items(), key=lambda item: item[0][1])
+    ]

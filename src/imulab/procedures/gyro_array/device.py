@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.array_settings import ArraySettings, Fusion, array_table, fusion_of
-from imulab.device.tables import DeviceTable
+from imulab.device.tables import ArraySettings, DeviceTable, Fusion, array_table, fusion_of
 from imulab.device.unit import fuse_table
 from imulab.errors import RecordError
-from imulab.procedures.gyro_array.model import check_calibration
-from imulab.procedures.gyro_array.sections import array_of
+from imulab.procedures.gyro_array.elements import check_calibration
+from imulab.procedures.gyro_array.schema import array_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 

@@ -8,25 +8,27 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.array_settings import Fusion
+from imulab.device.tables import Fusion
+from imulab.display import Note
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
-from imulab.estimation.allan import AllanCurve
 from imulab.estimation.column_noise import noise_lines
-from imulab.estimation.noise_coefficients import COEFFICIENTS, coefficients_dict
+from imulab.estimation.noise_coefficients import COEFFICIENTS, AllanCurve, coefficients_dict
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.estimation.sampling import sampling_rate
-from imulab.procedures.gyro_array.align import Alignment
-from imulab.procedures.gyro_array.checks import Checks
-from imulab.procedures.gyro_array.clocks import on_one_clock
-from imulab.procedures.gyro_array.latency import align_in_time, latency_notes
-from imulab.procedures.gyro_array.model import Elements, feedback_notes, find_elements, fixed_weights
-from imulab.procedures.gyro_array.rest import find_rest
-from imulab.procedures.gyro_array.restnoise import AtRest, at_rest, unseen
+from imulab.procedures.gyro_array.alignment import Alignment, AtRest, align_in_time, at_rest, latency_notes, unseen
+from imulab.procedures.gyro_array.elements import (
+    Checks,
+    Elements,
+    feedback_notes,
+    find_elements,
+    find_rest,
+    fixed_weights,
+    on_one_clock,
+)
 from imulab.procedures.result import Result
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import parse_unit, to_si
-from imulab.verdict import Note
 
 _FEWEST_SAMPLES = 200
 _FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix

@@ -1,4 +1,10 @@
-"""Fusion of an array's readings into one rate, by the C core, whole or block by block."""
+"""Fusion of an array's readings into one rate, by the C core, whole or block by block.
+
+The gain of the virtual gyro; method and memory as texts and in blobs.
+
+Source: Bayard and Ploen, US patent 6882964 (2003). The bias that all gyros share cannot be told from the rate, so the
+biases are kept to a sum that does not change; what is left is observable and has one steady-state gain.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +16,220 @@ from typing import Any
 import numpy as np
 
 from imulab.arguments import check_fields
-from imulab.device.array_settings import MOST_COUNT
-from imulab.device.blob import Blob
-from imulab.device.methods import METHODS, STARTS
-from imulab.errors import DataError, OptionError, listed
-from imulab.estimation.rows import HISTORY, zero_rows
-from imulab.procedures.gyro_array.blobs import blob_stream, fusion_of_blob
-from imulab.procedures.gyro_array.checks import Checks
-from imulab.procedures.gyro_array.clocks import Clock, to_one_clock
-from imulab.procedures.gyro_array.fused import Fused
-from imulab.procedures.gyro_array.health import Health
-from imulab.procedures.gyro_array.kalman import RATE_WALK, default_bias_walk, noise_about_mean, steady_gain
-from imulab.procedures.gyro_array.memory import memory_text
-from imulab.procedures.gyro_array.model import (
+from imulab.device import METHODS, STARTS
+from imulab.device.tables import MOST_COUNT, ArraySettings, Fusion, fusion_of
+from imulab.device.unit import Blob
+from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
+from imulab.estimation.rows import HISTORY, MAD_TO_SIGMA, zero_rows
+from imulab.procedures.gyro_array.elements import (
     FEWEST_ROBUST,
     ArrayCalibration,
+    Checks,
+    Clock,
     Elements,
+    Health,
     array_calibration,
+    count_of_axes,
     feedback_notes,
     find_elements,
+    to_one_clock,
 )
-from imulab.procedures.gyro_array.sections import model_of
+from imulab.procedures.gyro_array.fused import Fused
+from imulab.procedures.gyro_array.schema import model_of
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
-from imulab.units import from_si, parse_unit
+from imulab.units import conversion_factor, from_si, parse_unit
+
+# Gain of the virtual gyro: a rate that walks, and a bias of each gyro that walks.
+
+
+RATE_WALK = math.radians(1.4)
+"""Default process noise, rad/s/sqrt(s): follows 12.5 deg/s at 0.1 Hz, sampled at 50 Hz, without a visible lag."""
+_BIAS_WALK = 0.004
+_LOWEST = 0.05
+
+
+def steady_gain(white: Array, walk: Array, rate_walk: float, step: float) -> Array:
+    """Return the steady-state gain of the state (rate, bias_1 .. bias_n), shape (n + 1, n).
+
+    ``x' = x + (q, V c) sqrt(step)``, ``z = x_0 + b + white``; V spans the vectors of sum 0, from the discrete Riccati
+    equation in (rate, c).
+
+    Parameters
+    ----------
+    white
+        Standard deviation of one sample, shape (n,).
+    walk
+        Rate random walk of each gyro, per sqrt(s), shape (n,).
+    rate_walk
+        Walk of the true rate, per sqrt(s).
+    step
+        Time between samples, s.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    n = len(white)
+    basis = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, : n - 1]]))[0][:, 1:]
+    size = float(np.mean(white**2))
+    h = np.column_stack([np.ones(n), basis])
+    q = np.zeros((n, n))
+    q[0, 0] = rate_walk**2 * step / size
+    q[1:, 1:] = basis.T @ np.diag(walk**2) @ basis * step / size
+    q[1:, 1:] += 1e-12 * np.eye(n - 1)
+    r = np.diag(white**2) / size
+    ahead = solve_discrete_are(np.eye(n), h.T, q, r)
+    gain = ahead @ h.T @ np.linalg.inv(h @ ahead @ h.T + r)
+    full: Array = np.vstack([gain[:1], basis @ gain[1:]])
+    return full
+
+
+def noise_about_mean(readings: Array) -> Array:
+    """Standard deviation of each gyro's noise from its residuals about the array mean, shape (axes, n).
+
+    ``var_i = n / (n - 2) [m_i - sum_j m_j / (n (n - 1))]``, m_i the variance of the residual (the N-cornered hat); not
+    below 5 % of the mean variance. Rows with readings that are not finite are left out; ones where nothing is left.
+    """
+    _, axes, n = readings.shape
+    found = np.ones((axes, n))
+    for a in range(axes):
+        rows = readings[np.isfinite(readings[:, a]).all(axis=1), a]
+        if n < 3 or len(rows) < 50:
+            continue
+        residual = rows - rows.mean(axis=1, keepdims=True)
+        # Successive differences: a scale factor that differs shows in motion, but hardly from sample to sample.
+        # The median of their size, so that spikes do not count.
+        m = (MAD_TO_SIGMA * np.median(np.abs(np.diff(residual, axis=0)), axis=0)) ** 2 / 2
+        variance = n / (n - 2) * (m - m.sum() / (n * (n - 1)))
+        if variance.mean() > 0:
+            found[a] = np.sqrt(np.maximum(variance, _LOWEST * variance.mean()))
+    return found
+
+
+def default_bias_walk(white: Array) -> Array:
+    """Rate random walk where no record states one: 0.4 % of a sample's noise per sqrt(s)."""
+    return _BIAS_WALK * white
+
+
+# The array of an exported blob: how it fuses, and its stream.
+
+
+def fusion_of_blob(blob: Blob) -> Fusion:
+    """Return how an exported blob fuses.
+
+    Raises
+    ------
+    RecordError
+        It holds no array.
+    """
+    return fusion_of(_array_section(blob))
+
+
+@dataclass(frozen=True)
+class _InUnits:
+    """A stream in rad/s behind readings in another unit."""
+
+    stream: Any
+    factor: Array
+
+    def process(self, readings: Array, **more: Any) -> Any:
+        out = self.stream.process(readings * self.factor[:, None], **more)
+        return replace(out, rate=out.rate / self.factor)
+
+
+def blob_stream(blob: Blob, elements: Elements, recording: str) -> _InUnits:
+    """Return the stream of an exported blob."""
+    from imulab.device.unit import Stream
+
+    section = _array_section(blob)
+    if (section["elements"], section["axes"]) != (elements.count, len(elements.axes)):
+        raise RecordError(
+            f"{recording}: {elements.count} gyros on {count_of_axes(len(elements.axes))}; the blob {blob.name} holds "
+            f"{section['elements']} on {count_of_axes(section['axes'])}"
+        )
+    for row, unit in zip(elements.names, elements.units, strict=True):
+        if parse_unit(unit).quantity != "rate":
+            raise UnitError(f"{recording}: column {row[0]} is in {unit}; the blob {blob.name} is in rad/s")
+    factor = np.array([conversion_factor(unit, "rad/s") for unit in elements.units])
+    settings = ArraySettings(section["method"], elements.count, len(elements.axes), rate=section["rate"])
+    return _InUnits(Stream.of_blob(blob.data, settings), factor)
+
+
+def _array_section(blob: Blob) -> Any:
+    """What a blob says of its array."""
+    section = next((s for s in blob.text["sections"] if s["kind"] == "array"), None)
+    if section is None:
+        raise RecordError(f"{blob.name}: the blob holds no array")
+    return section
+
+
+# Method and memory as texts, and as a calibration carries them.
+
+
+def carried(calibration: Calibration | Blob | None) -> Fusion:
+    """Return the method and memory that a calibration record or a blob carries: robust and growing where none does."""
+    if isinstance(calibration, Blob):
+        return fusion_of_blob(calibration)
+    return fusion_of(None if calibration is None else calibration.model.get("fusion"))
+
+
+def fusion_of_record(record: Calibration, method: str | None, memory: str | None) -> Fusion:
+    """Return how a unit is to fuse: by the texts that are given, else as its record carries.
+
+    Raises
+    ------
+    OptionError
+        A text is unknown.
+    """
+    return fusion_text(method, memory, "{}", carried(record))
+
+
+def memory_text(memory: str | float, start: int) -> str:
+    """Return ``growing memory``, ``growing memory from 100 on`` or ``memory 0.01``."""
+    if isinstance(memory, float):
+        return f"memory {memory:g}"
+    return "growing memory" + (f" from {start} on" if start > 1 else "")
+
+
+def fusion_text(method: str | None, memory: str | None, label: str = "--{}", held: Fusion | None = None) -> Fusion:
+    """Return method and memory of two texts, each that of `held` where it is None.
+
+    Raises
+    ------
+    OptionError
+        One is unknown.
+    """
+    before = held or Fusion()
+    if method is not None and method not in METHODS:
+        raise OptionError(f"{label.format('method')} {method!r}: expected one of {listed(METHODS, method)}")
+    gain, start = before.memory, before.start
+    if memory is not None:
+        kind, start = parse_memory(memory, label.format("memory"))
+        gain = kind if isinstance(kind, float) else None
+    return Fusion(method or before.method, gain, start)
+
+
+def parse_memory(text: str, option: str = "--memory") -> tuple[str | float, int]:
+    """Return memory and starting count of a text such as ``growing``, ``growing:100`` or ``0.01``.
+
+    Raises
+    ------
+    OptionError
+        It is none of these.
+    """
+    kind, colon, count = text.partition(":")
+    if kind == "growing" and (not colon or (count.isascii() and count.isdecimal() and 0 < int(count) <= MOST_COUNT)):
+        return "growing", int(count) if colon else 1
+    try:
+        gain = float(text)
+    except ValueError:
+        gain = np.nan
+    if not 0 < gain < 1:
+        raise OptionError(f"{option} {text!r}: expected growing, growing:COUNT, or a gain between 0 and 1")
+    return gain, 1
+
+
+# Fusion of an array's readings into one rate, by the C core, whole or block by block.
+
 
 _NEED_THREE = ("robust", "support", "least-squares")
 _FOR_NOISE = 10_000

@@ -7,14 +7,24 @@ from typing import ClassVar
 
 import numpy as np
 
-from imulab.procedures.gyro_array.health import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK, Health
-from imulab.procedures.gyro_array.model import Elements
-from imulab.procedures.gyro_array.traces import curves, of_axis
+from imulab.procedures.gyro_array.elements import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK, Elements, Health
+from imulab.procedures.gyro_array.figures import curves, of_axis
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording
-from imulab.report.channels import thinned
-from imulab.report.elements import BAD, GOOD, INK, QUIET, Exhibits, Figure, ReportTable
-from imulab.report.traces import DASHES, axis, rounded, scatter
+from imulab.report.noise_figures import thinned
+from imulab.report.traces import (
+    BAD,
+    DASHES,
+    GOOD,
+    INK,
+    QUIET,
+    Exhibits,
+    Figure,
+    ReportTable,
+    figure_axis,
+    rounded,
+    scatter,
+)
 
 STATES = (
     (EXCLUDED, "excluded", "circle-open", QUIET),
@@ -119,8 +129,8 @@ def _rate(fused: Fused) -> Figure:
         if len(traces) > len(names)
         else "No gyro was flagged.",
         traces=traces,
-        x=axis("time, s"),
-        y=axis(f"rate, {' '.join(units)}"),
+        x=figure_axis("time, s"),
+        y=figure_axis(f"rate, {' '.join(units)}"),
     )
 
 
@@ -156,7 +166,7 @@ def _states(fused: Fused) -> list[Figure]:
                     title=f"State of each gyro{of_axis(letter)}",
                     caption=f"A mark where a gyro was in that state in one of {len(edges)} equal pieces of time.",
                     traces=traces,
-                    x=axis("time, s", range=[float(fused.time[0]), float(fused.time[-1])]),
+                    x=figure_axis("time, s", range=[float(fused.time[0]), float(fused.time[-1])]),
                     y={"automargin": True, "categoryorder": "array", "categoryarray": [*names],
                        "range": [len(names) - 0.5, -0.5]},
                     height=max(260, 30 * len(names) + 120),

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from imulab.columns import kind_of, triad
+from imulab.display import Shown
 from imulab.errors import DataError, UnitError
 from imulab.estimation.sampling import WIDEST_GAP, usual_step
-from imulab.procedures.gyro_array.model import MOST_ELEMENTS
+from imulab.procedures.gyro_array.elements import MOST_ELEMENTS
 from imulab.recording import Array, Recording, check_time
-from imulab.shown import Shown
 from imulab.units import conversion_factor, parse_unit
 
 _MOST_POINTS = 1 << 20

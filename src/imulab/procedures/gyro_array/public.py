@@ -9,19 +9,17 @@ from typing import Annotated, Any, Unpack, cast
 
 from numpy.typing import NDArray
 
-from imulab.device.blob import Blob, is_blob, load_blob
-from imulab.device.methods import STARTS
+from imulab.device import STARTS
+from imulab.device.unit import Blob, is_blob, load_blob
 from imulab.errors import DataError, OptionError
 from imulab.procedures.gyro_array import compare, fit
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.fit import ArrayFit
-from imulab.procedures.gyro_array.fuse import FuseOptions
+from imulab.procedures.gyro_array.fuse import RATE_WALK, FuseOptions, carried, fusion_text
 from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
 from imulab.procedures.gyro_array.fused import Fused
-from imulab.procedures.gyro_array.kalman import RATE_WALK
-from imulab.procedures.gyro_array.memory import carried, fusion_text
 from imulab.procedures.gyro_array.merge import Merged, merge_recordings
-from imulab.procedures.inputs import Record, as_record, as_recording, check_keywords
+from imulab.procedures.result import Record, as_record, as_recording, check_keywords
 from imulab.quantities import in_si, interval
 from imulab.reading import Data, Part, Reading, Window
 from imulab.recording import Recording

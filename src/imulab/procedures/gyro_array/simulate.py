@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import OptionError, listed
-from imulab.procedures.gyro_array.choices import EXPERIMENTS, FAULTS, MOUNTINGS, UNITS
+from imulab.procedures.gyro_array import EXPERIMENTS, FAULTS, MOUNTINGS, UNITS
 from imulab.quantities import in_si, quantity, whole
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, parse_unit

@@ -1,1 +1,63 @@
-"""The noise of a sensor at rest: its model, and the numbers that filters want."""
+"""The noise of a sensor at rest: its model, and the numbers that filters want; and what the options may be."""
+
+from __future__ import annotations
+
+from imulab.errors import OptionError, listed
+
+# What the options of the noise procedure may be.
+
+
+HORIZON = 10.0
+"""s over which a filter predicts alone."""
+NO_COVARIATE = "no"
+COVARIATES = ("time", "temperature")
+SAY_STEPS = "say"
+STEPS = (SAY_STEPS, "remove")
+LETTERS = {"N": "white", "B": "1/f", "K": "random walk", "G": "Gauss-Markov", "Q": "quantisation of the angle"}
+_REJECTED = 0.01
+
+
+def rejected(probability: float, columns: int) -> bool:
+    """Return whether a test of fit speaks against a model: a good one of so many columns does so in 1 % of records."""
+    return probability < _REJECTED / columns
+
+
+def check_terms(text: str, called: str = "terms") -> str:
+    """Return the letters of a model, or ``auto``.
+
+    Raises
+    ------
+    OptionError
+        They are none.
+    """
+    if text == "auto":
+        return text
+    if "N" not in text or any(
+        letter not in LETTERS or text.count(letter) > (2 if letter == "G" else 1) for letter in text
+    ):
+        known = ", ".join(f"{letter} {name}" for letter, name in LETTERS.items())
+        raise OptionError(
+            f"{called} {text!r}: expected auto, or N and any of the others, each once, G up to twice: {known}"
+        )
+    return text
+
+
+def check_options(
+    terms: str, horizon: float | None, band: float | None, regress: str | None, steps: str | None, label: str = "{}"
+) -> None:
+    """Check what can be checked before there is data; `label` is how messages call an option.
+
+    Raises
+    ------
+    OptionError
+        An option has a value that cannot be used.
+    """
+    check_terms(terms, label.format("terms"))
+    if horizon is not None and not 0 < horizon < 1e6:
+        raise OptionError(f"{label.format('horizon')} {horizon:g} s: expected more than 0")
+    if band is not None and not 0 < band < 1e9:
+        raise OptionError(f"{label.format('band')} {band:g} Hz: expected more than 0")
+    if regress not in (None, NO_COVARIATE, *COVARIATES):
+        raise OptionError(f"{label.format('regress')} {regress!r}: expected one of {listed(COVARIATES, str(regress))}")
+    if steps is not None and steps not in STEPS:
+        raise OptionError(f"{label.format('steps')} {steps!r}: expected one of {listed(STEPS, steps)}")

@@ -6,16 +6,28 @@ from typing import Any
 
 import numpy as np
 
-from imulab.estimation.noise.choice import PER_PARAMETER
-from imulab.estimation.noise.terms import LINEAR, allan_terms, terms
-from imulab.estimation.noise.use import at_band_edge
-from imulab.procedures.noise.choices import rejected
-from imulab.procedures.noise.engineering import density, label, shown, split
-from imulab.procedures.noise.sections import Binned, Column, Fit, drawn_of, fit_of
+from imulab.estimation.noise.analysis import PER_PARAMETER
+from imulab.estimation.noise.terms import LINEAR, allan_terms, at_band_edge, terms
+from imulab.procedures.noise import rejected
+from imulab.procedures.noise.schema import Binned, Column, Fit, density, drawn_of, fit_of, label, shown, split
 from imulab.records.calibration import Calibration
-from imulab.report import panels
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable, plain_number
-from imulab.report.traces import MARGIN, band, log_axis, rounded, scatter
+from imulab.report import traces as panels
+from imulab.report.traces import (
+    BAD,
+    GOOD,
+    INK,
+    LEGEND,
+    MARGIN,
+    QUIET,
+    Exhibits,
+    Figure,
+    ReportTable,
+    band,
+    log_axis,
+    plain_number,
+    rounded,
+    scatter,
+)
 
 _DIGITS = 5
 _PARTS = ("white", "1/f", "walk", "quantisation", "Gauss-Markov", "second Gauss-Markov")

@@ -10,23 +10,19 @@ from typing import Any
 
 import numpy as np
 
+from imulab.display import Shown
 from imulab.errors import OptionError, listed
 from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
 from imulab.estimation.noise.rest import FEWEST, SHORT
-from imulab.estimation.noise.terms import NAMES
-from imulab.estimation.noise.use import edge_as_white
-from imulab.procedures.inputs import Record, as_record
-from imulab.procedures.noise.coefficients import Markov, given_terms
-from imulab.procedures.noise.engineering import label, shown
-from imulab.procedures.noise.sections import fit_of
+from imulab.estimation.noise.terms import NAMES, edge_as_white
+from imulab.procedures.noise.schema import Markov, fit_of, given_terms, label, shown
 from imulab.procedures.noise.simulate import RATE, names_given, terms_of
+from imulab.procedures.result import Record, as_record
 from imulab.quantities import fraction, in_si
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
-from imulab.report.elements import LEGEND, QUIET, Figure, plain_number
 from imulab.report.plots import Plot
-from imulab.report.traces import DASHES, log_axis, rounded, scatter
-from imulab.shown import Shown
+from imulab.report.traces import DASHES, LEGEND, QUIET, Figure, log_axis, plain_number, rounded, scatter
 from imulab.writers import write_csv
 
 WANTED = "10 %"

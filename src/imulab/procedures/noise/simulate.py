@@ -10,10 +10,9 @@ import numpy as np
 
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.noise.simulate import simulated
-from imulab.procedures.inputs import Record, as_record
-from imulab.procedures.noise.coefficients import Markov, by_name, given_terms
-from imulab.procedures.noise.record import unit_of
-from imulab.procedures.noise.sections import fit_of
+from imulab.procedures.noise.fit import unit_of
+from imulab.procedures.noise.schema import Markov, by_name, fit_of, given_terms
+from imulab.procedures.result import Record, as_record
 from imulab.quantities import in_si, whole
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from imulab.errors import OptionError, RecordError, listed
-from imulab.procedures.noise.sections import Fit, fit_of
+from imulab.procedures.noise.schema import Fit, fit_of
 from imulab.records.calibration import Calibration
 
 STEPS = {"px4": 0.010, "ardupilot": 0.012}

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.gyroscopes import gyro_powers, gyro_table
-from imulab.device.tables import DeviceTable
+from imulab.device.tables import DeviceTable, gyro_powers, gyro_table
 from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, UnitError
-from imulab.procedures.rate.choices import AXES
-from imulab.procedures.rate.sections import model_of
+from imulab.procedures.rate import AXES
+from imulab.procedures.rate.schema import model_of
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, from_si, parse_unit

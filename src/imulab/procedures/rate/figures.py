@@ -7,14 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from imulab.procedures.rate.engineering import prior_table
-from imulab.procedures.rate.engineering import rows as engineering_rows
-from imulab.procedures.rate.sections import OfAxis, Rate, Seen, rate_of
-from imulab.procedures.rate.sweeprecord import sweep_table
-from imulab.procedures.rate.turnrecord import turns_exhibits
+from imulab.procedures.rate.record import sweep_table
+from imulab.procedures.rate.schema import OfAxis, Rate, Seen, prior_table, rate_of
+from imulab.procedures.rate.schema import rows as engineering_rows
+from imulab.procedures.rate.turns import turns_exhibits
 from imulab.records.calibration import Calibration
-from imulab.report.elements import GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
-from imulab.report.traces import axis, rounded, scatter
+from imulab.report.traces import (
+    GOOD,
+    INK,
+    LEGEND,
+    Exhibits,
+    Figure,
+    ReportTable,
+    figure_axis,
+    format_uncertain,
+    plain_number,
+    rounded,
+    scatter,
+)
 from imulab.units import from_si
 
 _PPM = 1e6
@@ -102,7 +112,11 @@ def _left(name: str, seen: Seen) -> Figure:
         caption="Each dwell, in ppm of the largest rate; bars: one standard uncertainty by its noise. Rising and "
         "falling rates that lie apart are hysteresis; a bend that both follow is nonlinearity.",
         traces=traces,
-        layout={"xaxis": axis("rate, deg/s"), "yaxis": axis("residual, ppm of the largest rate"), "legend": LEGEND},
+        layout={
+            "xaxis": figure_axis("rate, deg/s"),
+            "yaxis": figure_axis("residual, ppm of the largest rate"),
+            "legend": LEGEND,
+        },
     )
 
 

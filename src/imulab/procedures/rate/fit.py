@@ -11,22 +11,33 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.earth import EARTH
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
-from imulab.gravity import checked_latitude
-from imulab.procedures.inputs import Record, as_record, as_recording
-from imulab.procedures.rate.axes import TableAxes, find_axes, length_said, other_unit_said, with_accelerometers
-from imulab.procedures.rate.choices import AXES, MOUNTINGS, ORDERS, gyros_of, part_of_one, rates_of
+from imulab.gravity import EARTH, checked_latitude
+from imulab.procedures.rate import AXES, MOUNTINGS, ORDERS, gyros_of, part_of_one, rates_of
+from imulab.procedures.rate.axes import (
+    TableAxes,
+    find_axes,
+    length_said,
+    other_unit_said,
+    prior_at,
+    with_accelerometers,
+    with_prior,
+)
 from imulab.procedures.rate.dwells import Dwells, find_dwells, gyro_columns
-from imulab.procedures.rate.linearity import Linearity, linearity_of
-from imulab.procedures.rate.manifest import RateTest, Run, load_test, refuse_folder
-from imulab.procedures.rate.orders import choose_orders
-from imulab.procedures.rate.parameters import g_sensitivity
-from imulab.procedures.rate.prior import prior_at, with_prior
 from imulab.procedures.rate.record import make_record
+from imulab.procedures.rate.schema import RateTest, Run, load_test, refuse_folder
 from imulab.procedures.rate.simulate import RateRecordings
-from imulab.procedures.rate.solve import Problem, Solution, solve, without_lean
-from imulab.procedures.result import Result
+from imulab.procedures.rate.solve import (
+    Linearity,
+    Problem,
+    Solution,
+    choose_orders,
+    g_sensitivity,
+    linearity_of,
+    solve,
+    without_lean,
+)
+from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Recording

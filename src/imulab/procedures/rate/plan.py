@@ -1,4 +1,6 @@
-"""How long a rate table must stay at each rate, and what the test will then give.
+"""How long a rate table must stay at each rate, or how many turns by hand are needed.
+
+What the test will then give.
 
 The mean of a dwell of length T has the variance ``N^2 / T + (0.664 B)^2``, N the angle random walk and B the bias
 instability (IEEE Std 952). What the test gives is the covariance of its fit, `solve`, at dwells of that variance.
@@ -14,24 +16,95 @@ from typing import Any
 
 import numpy as np
 
-from imulab.atomic_write import write_text
-from imulab.earth import EARTH
+from imulab.display import Shown
 from imulab.errors import ObservabilityError, OptionError, RecordError, listed
-from imulab.gravity import checked_latitude
-from imulab.procedures.inputs import Record, as_record
-from imulab.procedures.rate.choices import FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
-from imulab.procedures.rate.engineering import shown as as_read
-from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
-from imulab.procedures.rate.parameters import model_parameters
-from imulab.procedures.rate.solve import Problem, solve
-from imulab.procedures.rate.turnplan import TurnPlan, plan_turns
+from imulab.files import write_text
+from imulab.gravity import EARTH, checked_latitude
+from imulab.procedures.rate import FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
+from imulab.procedures.rate.schema import RateTest, Run, manifest_text
+from imulab.procedures.rate.schema import shown as as_read
+from imulab.procedures.rate.solve import Problem, model_parameters, solve
+from imulab.procedures.result import Record, as_record
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
 from imulab.recording import Array
-from imulab.report.elements import BAD, GOOD, LEGEND, Figure, plain_number
 from imulab.report.plots import Plot
-from imulab.report.traces import axis, short_log_axis
-from imulab.shown import Shown
+from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis, plain_number, short_log_axis
 from imulab.units import from_si
+
+# How many whole turns by hand against a fence reach a wanted uncertainty of scale factors.
+
+
+_TURNS = 1000
+
+
+@dataclass(frozen=True, repr=False)
+class TurnPlan(Shown):
+    """How many whole turns by hand reach a wanted uncertainty: n on and n back, with a stop after each.
+
+    Attributes
+    ----------
+    turns
+        n.
+    wanted
+        Of the scale factor, relative.
+    reached
+        Relative standard uncertainty for 1 to n turns on and as many back, shape (n,).
+    """
+
+    turns: int
+    wanted: float
+    reached: Array
+
+    @property
+    def stops(self) -> int:
+        """Rests at the fence, the first included."""
+        return 2 * self.turns + 1
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return how many turns it takes, and what fewer would give."""
+        rows = [[str(n), str(2 * n + 1), f"{1e6 * u:.3g}"] for n, u in enumerate(self.reached.tolist(), 1)]
+        head = (
+            f"{self.turns} turn{'s' * (self.turns > 1)} on and {self.turns} back about each axis, {self.stops} stops, "
+            f"reach {1e6 * self.reached[-1]:.3g} ppm; wanted {1e6 * self.wanted:.6g} ppm"
+        )
+        return head, ["turns each way", "stops", "u of the scale factor, ppm"], rows
+
+    def plot(self) -> Plot:
+        """Return the uncertainty over the number of turns, beside the wanted one."""
+        number = list(range(1, self.turns + 1))
+        traces: list[dict[str, Any]] = [
+            {"type": "scatter", "mode": "lines+markers", "name": "reached", "x": number,
+             "y": (1e6 * self.reached).tolist(), "line": {"color": GOOD, "width": 2}},
+            {"type": "scatter", "mode": "lines", "name": "wanted", "x": number, "y": [1e6 * self.wanted] * self.turns,
+             "line": {"color": BAD, "width": 1.5, "dash": "dash"}},
+        ]  # fmt: skip
+        layout = {
+            "xaxis": figure_axis("turns each way", dtick=max(1, round(self.turns / 20))),
+            "yaxis": short_log_axis("u(S)/S, ppm"),
+            "legend": LEGEND,
+        }
+        caption = "u(S)/S: relative standard uncertainty of the scale factor."
+        return Plot(Figure("Turns by hand", caption, traces, layout, message=f"{self.shown()[0]}."), "Plan of turns")
+
+
+def plan_turns(wanted: float, fence: float) -> TurnPlan:
+    """Return the plan of turns by hand: ``u = fence / sqrt(2) / (2 pi sqrt(sum (j_k - mean j)^2))``."""
+    if not 0 < fence < 1:
+        raise OptionError(f"fence {fence:g}: expected the uncertainty of the difference of two stops, such as 0.5 deg")
+    reached: list[float] = []
+    for n in range(1, _TURNS + 1):
+        made = np.concatenate([np.arange(n + 1), np.arange(n)])  # turns made at each stop, on and back
+        reached.append(fence / math.sqrt(2) / (2 * math.pi * float(np.sqrt(np.sum((made - made.mean()) ** 2)))))
+        if reached[-1] <= wanted:
+            return TurnPlan(n, wanted, np.array(reached))
+    raise OptionError(
+        f"turn {1e6 * wanted:.3g} ppm: {_TURNS} turns on and back reach {1e6 * reached[-1]:.3g} ppm; expected a rate "
+        "table (rate fit) for that"
+    )
+
+
+# How long a rate table must stay at each rate, and what the test will then give.
+
 
 _OF = ("full", "reading")
 _FLOOR = 0.664
@@ -161,7 +234,7 @@ class RatePlan(Shown):
              "line": {"color": BAD, "width": 1.5, "dash": "dash"}},
         ]  # fmt: skip
         layout = {
-            "xaxis": axis("rate, deg/s"),
+            "xaxis": figure_axis("rate, deg/s"),
             "yaxis": short_log_axis("u, ppm of full scale"),
             "legend": LEGEND,
         }

@@ -12,15 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from imulab.atomic_write import write_text
-from imulab.earth import EARTH
+from imulab.display import Shown
 from imulab.errors import OptionError, readable
-from imulab.gravity import checked_latitude
-from imulab.procedures.rate.choices import AXES, RATES, rates_of
-from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
+from imulab.files import write_text
+from imulab.gravity import EARTH, checked_latitude
+from imulab.procedures.rate import AXES, RATES, rates_of
+from imulab.procedures.rate.schema import RateTest, Run, manifest_text
 from imulab.quantities import fraction, in_si, whole
 from imulab.recording import Array, Recording
-from imulab.shown import Shown
 from imulab.units import from_si
 from imulab.writers import write_csv
 

@@ -1,26 +1,46 @@
-"""All dwells of a test to bias, scale factor, misalignment and nonlinearity, by generalised least squares.
+"""Dwells to bias, scale factor, misalignment and nonlinearity.
 
-    M_i = S_i (A_i + b_i),  A_i = s_i + k2_i s_i^2 + ...,  s = T w
+The least squares, the choice of the order, and what the scale factors make of the temperature.
+
+M_i = S_i (A_i + b_i),  A_i = s_i + k2_i s_i^2 + ...,  s = T w
 
 Of gyroscope i in run m, whose table axis is body axis j, the means follow ``B_ij w`` plus a zero of that run, and
 for j = i the powers of w; ``B = diag(S) T``. The covariance of the means holds their noise, the errors of single rates,
 which all visits and all gyroscopes share, the level part of the Earth's rate that the table's turning does not average,
 and what scatters beyond that. Source: generalised least squares (Aitken 1935); added variance: Mandel and Paule, Anal.
 Chem. 42 (1970) 1194.
+
+What dwells leave of a polynomial is compared rate by rate: an error of one commanded rate is shared by all its visits,
+which therefore are no further evidence of a bend. Source: F-test of nested models; leave-one-out prediction.
+
+All are fractions of the largest rate or of the scale factor, so that the uncertainty that all rates share drops out.
+Terms: IEEE Std 528; definitions in docs/rate.md.
+
+``M = S (1 + c (t - mean t)) s + ...``: a column ``w (t - mean t)`` beside those of the fit, weighted least squares.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.earth import EARTH
-from imulab.estimation.least_squares import chi_square_probability
-from imulab.recording import Array
+from imulab.estimation.least_squares import chi_square_probability, coverage_factor, f_test
+from imulab.gravity import EARTH
+from imulab.procedures.rate import AXES
+from imulab.procedures.rate.axes import TableAxes
+from imulab.procedures.rate.dwells import Dwells
+from imulab.procedures.rate.schema import RateTest
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Parameter
+from imulab.units import STANDARD_GRAVITY, parse_unit
+
+# All dwells of a test to bias, scale factor, misalignment and nonlinearity, by generalised least squares.
+
 
 _CHANCE = 0.01
 _HALVINGS = 60
@@ -295,3 +315,592 @@ def _diagonal(blocks: list[Array]) -> Array:
         found[a : a + block.shape[0], b : b + block.shape[1]] = block
         a, b = a + block.shape[0], b + block.shape[1]
     return found
+
+
+# Which powers of the rate a gyroscope's output supports: by F-test, and by each rate predicted from the others.
+
+
+HIGHEST = 5
+_AS_NOISE = 0.2
+"""Probability beyond which what is left of the rates is their noise, which then is known better than by them."""
+
+
+def choose_orders(problem: Problem) -> tuple[int, ...]:
+    """Return the highest power of the rate of each gyroscope that its dwells support; 1 where none was turned about.
+
+    A higher order is taken if its gain is more than noise and the scatter of the rates explain (chi-square and F-test,
+    1 %), against the order chosen so far and that below it, and if it predicts each rate from the others better, by
+    more than the standard error of that comparison.
+    """
+    return tuple(_order_of(problem, i) for i in range(len(problem.gyros)))
+
+
+def _order_of(problem: Problem, gyro: int) -> int:
+    own = problem.axis == problem.gyros[gyro]
+    if not own.any():
+        return 1
+    key = np.unique(np.round(problem.table[own] * problem.sign[own], 6), return_inverse=True)[1]
+    count = int(key.max()) + 1
+    zeros = (problem.run[own][:, None] == np.unique(problem.run[own])).astype(np.float64)
+    rate = problem.rate[own] / np.abs(problem.rate[own]).max()
+    powers = np.column_stack([rate**p for p in range(1, max(min(HIGHEST, count - 2), 1) + 1)])
+    values = problem.mean[own, gyro]
+    slope = float(np.ptp(values) / max(np.ptp(problem.rate[own]), 1e-300))
+    stated = problem.rate_uncertainty[own] * slope
+    of_rate = np.outer(stated, stated) * (key[:, None] == key)
+    noise = problem.variance[own, gyro] + (_EXACT * np.abs(values).max()) ** 2
+    lower = np.linalg.cholesky(np.diag(noise) + of_rate)
+    visits = (key[:, None] == np.arange(count)).astype(np.float64)
+
+    def cost(columns: Array) -> float:
+        white = np.linalg.solve(lower, np.column_stack([columns, values]))
+        left = white[:, -1] - white[:, :-1] @ np.linalg.lstsq(white[:, :-1], white[:, -1], rcond=None)[0]
+        return float(left @ left)
+
+    def predicted(columns: Array) -> Array:
+        white = np.linalg.solve(lower, np.column_stack([columns, values]))
+        found = []
+        for k in range(count):
+            rest, which = key != k, key == k
+            fit = np.linalg.lstsq(white[rest, :-1], white[rest, -1], rcond=None)[0]
+            spread = noise[which].sum() / which.sum() ** 2 + of_rate[which, which][0]
+            found.append(float((values[which] - columns[which] @ fit).mean() ** 2 / spread))
+        return np.array(found)
+
+    within = cost(np.column_stack([zeros, visits]))
+    models = {p: np.column_stack([powers[:, :p], zeros]) for p in range(1, powers.shape[1] + 1)}
+    costs = {p: max(cost(columns) - within, 0.0) for p, columns in models.items()}
+    chosen, best = 1, predicted(models[1])
+    for order in range(2, len(models) + 1):
+        if not all(_significant(costs, below, order, count) for below in {chosen, order - 1}):
+            continue
+        squares = predicted(models[order])
+        gain = best - squares
+        if gain.mean() > gain.std(ddof=1) / np.sqrt(count):
+            chosen, best = order, squares
+    return chosen
+
+
+def _significant(costs: Mapping[int, float], below: int, order: int, count: int) -> bool:
+    by_noise = chi_square_probability(costs[below] - costs[order], order - below)
+    if chi_square_probability(costs[order], count - order - 1) > _AS_NOISE:
+        return by_noise < _CHANCE
+    return max(by_noise, f_test(costs[below], below + 1, costs[order], order + 1, count)) < _CHANCE
+
+
+# What a straight line leaves of a gyroscope's output over the rate: nonlinearity, asymmetry and hysteresis.
+
+
+_ONE_SIDED = 1.645
+_SMALL = 1e-3
+_BY_PARTS = 15
+"""Degrees of freedom of what the parts of a sweep say of its delay: half of them, since frequencies differ."""
+_RATES, _POWERS, _SURE = 7, 5, 3.29
+"""Different rates that tell a kink from powers of the rate, such powers, and standard uncertainties of 1 in 1000."""
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """Of one gyroscope; fractions, with standard uncertainties.
+
+    Attributes
+    ----------
+    rate, residual, uncertainty
+        Of each dwell about its axis: rad/s, and what is left of the line, a fraction of the largest rate, shape (n,).
+    direction
+        1 where the rate was rising, -1 where it was falling, 0 at turning points, shape (n,).
+    nonlinearity, hysteresis
+        Largest of several, and the standard uncertainty of that one; the largest itself is never 0, nor normal.
+    asymmetry
+        Value and standard uncertainty.
+    probability
+        That noise alone leaves as much of the line.
+    by_noise
+        What the largest residual stays below with 95 % by noise alone.
+    loop
+        Probability that noise alone makes the loop between rising and falling rates; None where no rate was visited
+        both ways.
+    fitted_loop
+        Rising less falling at rate 0 by all rates, the loop as ``1 - (w/w_max)^2``, and its standard uncertainty.
+    repeatability
+        Standard deviation of the scale factor over runs, and what noise makes of it; None with one run.
+    threshold
+        Least rate that shows, and its standard uncertainty by the rates below it, rad/s; None without small rates.
+    by_polynomial
+        Largest residual of the powers of the rate that were taken.
+    kink
+        By how much the slopes of positive and negative rates differ beside five powers of the rate, where noise alone
+        does that less than once in a thousand tests; else None.
+    """
+
+    rate: Array
+    residual: Array
+    uncertainty: Array
+    direction: NDArray[np.int64]
+    nonlinearity: tuple[float, float]
+    asymmetry: tuple[float, float] | None
+    hysteresis: tuple[float, float] | None
+    probability: float
+    by_noise: float
+    loop: float | None
+    fitted_loop: tuple[float, float] | None
+    repeatability: tuple[float, float] | None
+    threshold: tuple[float, float] | None
+    by_polynomial: float
+    kink: float | None
+
+
+def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linearity:
+    """Return what a line, and powers up to `order`, leave of gyroscope number `gyro` over the rates about its axis."""
+    own = problem.axis == problem.gyros[gyro]
+    rate, runs = problem.rate[own], problem.run[own]
+    values = problem.mean[own, gyro] / scale
+    variance = problem.variance[own, gyro] / scale**2 + (_EXACT * np.abs(rate).max()) ** 2
+    key = np.unique(np.round(problem.table[own] * problem.sign[own], 6), return_inverse=True)[1]
+    of_rate = problem.rate_uncertainty[own] ** 2
+    zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
+    largest = max(float(np.abs(rate).max()), 0.0 if problem.reach is None else float(problem.reach[own].max()))
+    left, _ = _fitted(np.column_stack([rate, zeros]), values, variance)
+    means = np.array(
+        [
+            [left[key == k].mean(), variance[key == k].sum() / (key == k).sum() ** 2 + of_rate[key == k].mean()]
+            for k in np.unique(key)
+        ]
+    )
+    spread = np.sqrt(means[:, 1])
+    worst = int(np.argmax(np.abs(means[:, 0])))
+    freedom = len(means) - 2
+    chi_square = float(np.sum((means[:, 0] / spread) ** 2))
+    probability = chi_square_probability(chi_square, freedom) if freedom > 0 else 1.0
+    reach = coverage_factor(None, 1 - 0.05 / len(means))
+    branch = np.zeros(len(rate), dtype=np.int64) if problem.branch is None else problem.branch[own] * problem.sign[own]
+    direction = np.where(branch != 0, branch, _directions(rate, runs))
+    powers = np.column_stack([*(rate**power for power in range(1, order + 1)), zeros])
+    rest = _fitted(powers, values, variance)[0]
+    beyond = _beyond_noise(key, direction, zeros, values, variance)
+    error = np.zeros(len(rate)) if problem.loop_error is None else problem.loop_error[own]
+    loop, fitted_loop, hysteresis = _hysteresis(
+        left / largest, variance / largest**2, key, runs, direction, rate / largest, error, beyond
+    )
+    return Linearity(
+        rate=rate,
+        residual=left / largest,
+        uncertainty=np.sqrt(variance) / largest,
+        direction=direction,
+        nonlinearity=(float(abs(means[worst, 0])) / largest, float(spread[worst]) / largest),
+        asymmetry=_asymmetry(rate, values, variance, zeros, direction, of_rate),
+        hysteresis=hysteresis,
+        probability=probability,
+        by_noise=reach * float(spread.max()) / largest,
+        loop=loop,
+        fitted_loop=fitted_loop,
+        repeatability=_repeatability(rate, values, variance, runs),
+        threshold=_threshold(rate, problem.table[own], left, variance, key),
+        by_polynomial=max(abs(float(rest[key == k].mean())) for k in np.unique(key)) / largest,
+        kink=_kink(rate / largest, values / largest, (variance + of_rate) / largest**2, zeros, len(means)),
+    )
+
+
+def _fitted(columns: Array, values: Array, variance: Array) -> tuple[Array, Array]:
+    """Return what is left of a weighted fit, and its coefficients with their covariance, shape (p, p + 1)."""
+    weight, size = 1 / np.sqrt(variance), np.abs(columns).max(axis=0)
+    scaled = columns / size * weight[:, None]
+    inverse = np.linalg.pinv(scaled)
+    found = inverse @ (values * weight) / size
+    return values - columns @ found, np.column_stack([found, inverse @ inverse.T / np.outer(size, size)])
+
+
+def _directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return whether the rate rose (1) or fell (-1) into and out of each dwell, 0 elsewhere."""
+    found = np.zeros(len(rate), dtype=np.int64)
+    for run in np.unique(runs):
+        which = np.flatnonzero(runs == run)
+        step = np.sign(np.round(np.diff(rate[which]), 6))
+        inner = np.where(step[:-1] == step[1:], step[1:], 0.0)
+        found[which[1:-1]] = inner.astype(np.int64)
+    return found
+
+
+def _asymmetry(
+    rate: Array, values: Array, variance: Array, zeros: Array, direction: NDArray[np.int64], of_rate: Array
+) -> tuple[float, float] | None:
+    """Return (S+ - S-)/S by two slopes and one zero, beside the loop of hysteresis; None for rates of one sign."""
+    if not (rate > 0).any() or not (rate < 0).any():
+        return None
+    columns = [np.maximum(rate, 0), np.minimum(rate, 0), zeros]
+    first = np.concatenate([[True], (zeros[1:] != zeros[:-1]).any(axis=1)])
+    came = np.where(first, 0.0, np.sign(np.round(np.diff(rate, prepend=0.0), 6)))
+    if direction.any():  # the branch of a loop that the first dwell of a run is on is not known
+        columns += [came * (1 - (rate / np.abs(rate).max()) ** 2), first.astype(np.float64)]
+    found = _fitted(np.column_stack(columns), values, variance + of_rate)[1]
+    u = np.sqrt(max(found[0, 1] + found[1, 2] - 2 * found[0, 2], 0.0))
+    return float(found[0, 0] - found[1, 0]), float(u)
+
+
+def _kink(rate: Array, values: Array, variance: Array, zeros: Array, count: int) -> float | None:
+    """Return the difference of slopes beside powers of the rate, all over the largest, where it is significant."""
+    if count < _RATES:
+        return None
+    powers = range(1, min(_POWERS, count - 3) + 1)
+    columns = np.column_stack([np.abs(rate), *(rate**power for power in powers), zeros])
+    left, found = _fitted(columns, values, variance)
+    freedom = len(values) - np.linalg.matrix_rank(columns)
+    beyond = max(float(np.sum(left**2 / variance)) / freedom, 1.0) if freedom > 0 else 1.0
+    return 2 * float(found[0, 0]) if abs(found[0, 0]) > _SURE * np.sqrt(found[0, 1] * beyond) else None
+
+
+def _beyond_noise(
+    key: NDArray[Any], direction: NDArray[np.int64], zeros: Array, values: Array, variance: Array
+) -> tuple[float, int] | None:
+    """Return chi-square and degrees of freedom of visits of one rate from one side, where they scatter beyond noise."""
+    cells = np.unique(3 * key + direction, return_inverse=True)[1]
+    columns = np.column_stack([cells[:, None] == np.arange(cells.max() + 1), zeros]).astype(np.float64)
+    freedom = len(values) - int(np.linalg.matrix_rank(columns))
+    chi_square = float(np.sum(_fitted(columns, values, variance)[0] ** 2 / variance))
+    return (chi_square, freedom) if freedom and chi_square_probability(chi_square, freedom) < _CHANCE else None
+
+
+def _hysteresis(
+    left: Array,
+    variance: Array,
+    key: NDArray[Any],
+    runs: NDArray[Any],
+    direction: NDArray[np.int64],
+    rate: Array,
+    error: Array,
+    beyond: tuple[float, int] | None,
+) -> tuple[float | None, tuple[float, float] | None, tuple[float, float] | None]:
+    """Return the probability of a loop by noise, that loop, and the largest rising less falling, over the largest rate.
+
+    `error` is what not knowing the delay of a sweep adds to a loop at rate 0, infinite where it tells no loop.
+    """
+    from imulab.estimation.special import ndtr, stdtr
+
+    rows = []
+    for k in np.unique(key):
+        pairs = []
+        for run in np.unique(runs):
+            up, down = (np.flatnonzero((key == k) & (runs == run) & (direction == d)) for d in (1, -1))
+            if up.size and down.size and np.isfinite(error[up[0]]):
+                u2 = variance[up].sum() / up.size**2 + variance[down].sum() / down.size**2
+                pairs.append((float(left[up].mean() - left[down].mean()), float(u2), float(error[up[0]]) ** 2))
+        if pairs:
+            means = np.array(pairs).mean(axis=0)
+            rows.append((float(rate[key == k].mean()), means[0], *(means[1:] / len(pairs))))
+    if not rows:
+        return None, None, None
+    table = np.array(rows)
+    worst = int(np.argmax(np.abs(table[:, 1])))
+    loop = 1 - table[:, 0] ** 2
+    size = float(table[worst, 1]), float(np.sqrt(table[worst, 2] + table[worst, 3] * loop[worst] ** 2))
+    spread = float(np.sum(loop**2 / table[:, 2]))
+    if len(rows) < 2 or spread <= 0:
+        return None, None, size
+    slope = float(np.sum(loop * table[:, 1] / table[:, 2])) / spread
+    chi_square = float(np.sum((table[:, 1] - slope * loop) ** 2 / table[:, 2]))
+    t = float(abs(slope) / np.sqrt(1 / spread + table[:, 3].max()))
+    found = [2 * float(stdtr(_BY_PARTS, -t) if table[:, 3].any() else ndtr(-t))]
+    freedom, wide = len(rows) - 1, [1.0]
+    if chi_square_probability(chi_square, freedom) < _CHANCE:  # the loop has another shape, or dwells scatter more
+        wide.append(chi_square / freedom)
+        found.append(2 * float(stdtr(freedom, -t / np.sqrt(wide[-1]))))
+    if beyond:
+        wide.append(beyond[0] / beyond[1])
+        found.append(2 * float(stdtr(beyond[1], -t / np.sqrt(wide[-1]))))
+    return max(found), (slope, float(np.sqrt(max(wide) / spread + table[:, 3].max()))), size
+
+
+def _repeatability(rate: Array, values: Array, variance: Array, runs: NDArray[np.int64]) -> tuple[float, float] | None:
+    """Return the standard deviation of the scale factor over runs, relative, and that which noise makes."""
+    found = []
+    for run in np.unique(runs):
+        which = runs == run
+        if which.sum() > 2:
+            columns = np.column_stack([rate[which], np.ones(int(which.sum()))])
+            found.append(_fitted(columns, values[which], variance[which])[1][0, :2])
+    if len(found) < 2:
+        return None
+    table = np.array(found)
+    return float(table[:, 0].std(ddof=1)), float(np.sqrt(table[:, 1].mean()))
+
+
+def _threshold(
+    rate: Array, table: Array, left: Array, variance: Array, key: NDArray[Any]
+) -> tuple[float, float] | None:
+    """Return the least rate from which on the output exceeds half of what the line says, by 95 %, and its uncertainty.
+
+    None where no rate of the table is below a thousandth of the largest and all of them show.
+    """
+    zero = 1 / float(np.sum(1 / variance))
+    rows = []
+    for k in np.unique(key[np.abs(table) > 1e-9 * np.abs(table).max()]):
+        which = key == k
+        size = abs(float(rate[which].mean()))
+        response = float(np.sign(rate[which].mean()) * (rate + left)[which].mean())
+        u = np.sqrt(variance[which].sum() / which.sum() ** 2 + zero)
+        rows.append((size, response - _ONE_SIDED * u > size / 2))
+    rows.sort()
+    sizes, shows = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    if not shows[-1] or (shows.all() and sizes[0] > _SMALL * sizes[-1]):
+        return None
+    first = int(np.max(np.flatnonzero(~shows) + 1, initial=0))
+    below = float(sizes[first - 1]) if first else 0.0
+    return float(sizes[first]), float(sizes[first] - below) / np.sqrt(12)
+
+
+# How scale factors follow the temperature, where a column of it spans enough and does not merely follow time.
+
+
+_SPAN = 5.0  # K
+_FOLLOWS = 0.9
+"""Share of the temperature's variance that a line over time explains, beyond which the two cannot be told apart."""
+
+
+def temperature_slopes(
+    recordings: Sequence[Recording], dwells: Sequence[Dwells], problem: Problem, solution: Solution
+) -> dict[str, Parameter]:
+    """Return ``gyro_scale_factor_slope_i``, 1/K, of each gyroscope whose runs tell it from a drift over time."""
+    temperature = _temperatures(recordings, dwells)
+    if temperature is None:
+        return {}
+    means = without_lean(problem, [found[: len(problem.faces)] for found in solution.coefficients])
+    time = np.arange(len(temperature), dtype=np.float64)  # of dwells in order: runs have clocks of their own
+    found = {}
+    for i, axis in enumerate(problem.gyros):
+        own = problem.axis == axis
+        if not own.any() or np.ptp(temperature[own]) < _SPAN or _explained(temperature[own], time[own]) > _FOLLOWS:
+            continue
+        warmer = temperature[own] - temperature[own].mean()
+        columns = design(problem, i, solution.orders[i])[own]
+        columns = columns[:, np.abs(columns).max(axis=0) > 0]
+        columns = np.column_stack([problem.rate[own] * warmer, warmer, columns])
+        weight = 1 / np.sqrt(problem.variance[own, i] + (1e-10 * np.abs(means).max()) ** 2)
+        size = np.abs(columns).max(axis=0)
+        scaled = columns / size * weight[:, None]
+        inverse = np.linalg.pinv(scaled)
+        left = means[own, i] * weight
+        slope = inverse @ left
+        freedom = len(left) - np.linalg.matrix_rank(scaled)
+        if freedom < 1:
+            continue
+        beyond = max(float(np.sum((left - scaled @ slope) ** 2)) / freedom, 1.0)
+        scale = float(solution.coefficients[i][problem.faces.index(axis)])
+        u = float(np.sqrt((inverse @ inverse.T)[0, 0] * beyond)) / size[0] / abs(scale)
+        found[f"gyro_scale_factor_slope_{AXES[axis]}"] = Parameter(float(slope[0] / size[0]) / scale, u, "1/K")
+    return found
+
+
+def _temperatures(recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> Array | None:
+    """Return the mean temperature of each dwell, degC; None where a recording has no column of it."""
+    found = []
+    for recording, of in zip(recordings, dwells, strict=True):
+        if "temperature" not in recording or parse_unit(recording.units["temperature"]).quantity != "temperature":
+            return None
+        time, values = recording.si("time"), recording.si("temperature")
+        first, last = np.searchsorted(time, of.start), np.searchsorted(time, of.stop, side="right")
+        found += [float(values[a:b].mean()) for a, b in zip(first, last, strict=True)]
+    return np.array(found) if np.isfinite(found).all() else None
+
+
+def _explained(values: Array, time: Array) -> float:
+    return float(np.corrcoef(values, time)[0, 1] ** 2)
+
+
+# From the coefficients of a rate test to bias, scale factor, misalignment, powers of the rate and g-sensitivity.
+
+
+_APART = 0.3
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A parameter: its derivative by all coefficients, what the table's common error does to it, and the mounting's."""
+
+    name: str
+    unit: str
+    value: float
+    line: Array
+    common: float = 0.0
+    mounted: float = 0.0
+
+
+def _entries(problem: Problem, solution: Solution, i: int, unit: str) -> list[_Entry]:
+    """Return the parameters of gyroscope number `i`: quotients of its coefficients by its scale factor."""
+    faces, size, found, order = problem.faces, len(problem.faces), solution.coefficients[i], solution.orders[i]
+    axis, first = AXES[problem.gyros[i]], sum(map(len, solution.coefficients[:i]))
+    own, count = faces.index(problem.gyros[i]), sum(map(len, solution.coefficients))
+    scale = float(found[own])
+    unity = np.eye(len(found))
+    zeros = [np.concatenate([np.zeros(size + order - 1), row]) for row in _of_zeros(problem)[0]]
+
+    def spread(part: Array) -> Array:
+        return np.concatenate([np.zeros(first), part, np.zeros(count - first - len(part))])
+
+    def quotient(name: str, of: str, at: Array, mounted: float = 0.0) -> _Entry:
+        value = float(at @ found) / scale
+        return _Entry(name, of, value, spread((at - value * unity[own]) / scale), mounted=mounted)
+
+    return [
+        quotient(f"gyro_bias_{axis}", "rad/s", zeros[0]),
+        _Entry(f"gyro_scale_factor_{axis}", f"{unit}/(rad/s)", scale, spread(unity[own]), common=scale),
+        *(
+            quotient(f"gyro_misalignment_{axis}{AXES[face]}", "rad", unity[k], 1.0)
+            for k, face in enumerate(faces)
+            if k != own
+        ),
+        *(
+            quotient(f"gyro_k{p}_{axis}", "1/(rad/s)" + (f"^{p - 1}" if p > 2 else ""), unity[size + p - 2])
+            for p in range(2, order + 1)
+        ),
+        *(
+            quotient(f"gyro_g_sensitivity_{axis}{b}", "rad/s/(m/s^2)", at)
+            for b, at in zip(AXES, zeros[1:], strict=False)
+        ),
+    ]
+
+
+def model_parameters(
+    test: RateTest, problem: Problem, solution: Solution, unit: str, axes: TableAxes | None = None
+) -> tuple[list[str], Array, Array, list[str], dict[str, float]]:
+    """Return names, values, covariance and units of bias, scale factor, misalignment and powers of the rate.
+
+    And the degrees of freedom of those whose uncertainty few faces show.
+    """
+    measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
+    found = [entry for i in measured for entry in _entries(problem, solution, i, unit)]
+    found.sort(key=lambda entry: _ORDER.index(entry.name.rpartition("_")[0]))
+    jacobian = np.array([entry.line for entry in found])
+    shared = np.array([entry.common for entry in found]) * (test.relative_uncertainty or 0.0)
+    mounting = (test.mounting_uncertainty or 0.0) if axes is None else 0.0
+    own = np.array([entry.mounted for entry in found]) * mounting**2
+    names = [entry.name for entry in found]
+    few: dict[str, tuple[float, float]] = {}
+    for i in measured:
+        axis = AXES[problem.gyros[i]]
+        added, freedom = _between_faces(problem, solution, problem.gyros[i])
+        of_zeros = [f"gyro_bias_{axis}", *(f"gyro_g_sensitivity_{axis}{b}" for b in AXES)]
+        for name, value in zip(of_zeros, added.tolist(), strict=False):
+            own[names.index(name)] = value
+            if value:
+                few[name] = (value, freedom)
+    matrix = np.asarray(jacobian @ solution.covariance @ jacobian.T + np.outer(shared, shared) + np.diag(own))
+    if axes is not None:
+        matrix += _by_axes(problem, found, axes)
+    values = np.array([entry.value for entry in found])
+    # Welch and Satterthwaite: the share that few faces show has few degrees of freedom
+    variance = dict(zip(names, np.diag(matrix).tolist(), strict=True))
+    freedoms = {name: nu * (variance[name] / added) ** 2 for name, (added, nu) in few.items()}
+    return names, values, matrix, [entry.unit for entry in found], freedoms
+
+
+def _by_axes(problem: Problem, found: Sequence[_Entry], axes: TableAxes) -> Array:
+    """Return the covariance that the table axes' own makes: ``dT = -T dA A^-1``, columns of A the axes of the faces."""
+    groups = _faces_of_runs(problem)
+    sides = {axis: sum(1 for other, _ in groups if other == axis) for axis, _ in groups}
+
+    def faces(of: Array) -> Array:
+        matrix = np.zeros((3, 3))
+        for (axis, sign), runs in groups.items():
+            matrix[:, axis] += sign * of[runs].mean(axis=0) / sides[axis]
+        return matrix
+
+    inverse, values = np.linalg.inv(faces(axes.direction)), {entry.name: entry.value for entry in found}
+    turn = np.array([[values[f"gyro_misalignment_{a}{b}"] if a != b else 1.0 for b in AXES] for a in AXES])
+
+    def moved(change: Array) -> Array:
+        x = -turn @ change @ inverse
+        row = []
+        for entry in found:
+            kind, _, pair = entry.name.rpartition("_")
+            i = AXES.index(pair[0])
+            if kind == "gyro_scale_factor":
+                row.append(entry.value * x[i, i])
+            elif kind == "gyro_misalignment":
+                row.append(x[i, AXES.index(pair[1])] - entry.value * x[i, i])
+            else:
+                row.append(0.0)
+        return np.array(row)
+
+    by_record = np.array([moved(faces(change)) for change in axes.changes]).reshape(-1, len(found))
+    by_dwells = []
+    for (axis, _), runs in groups.items():
+        u = float(np.sqrt(np.sum(axes.spread[runs] ** 2))) / len(runs) / sides[axis]
+        for k in range(3):
+            if k != axis:
+                change = np.zeros((3, 3))
+                change[k, axis] = u
+                by_dwells.append(moved(change))
+    rest = np.array(by_dwells)
+    return np.asarray(by_record.T @ axes.correlation @ by_record + rest.T @ rest)
+
+
+_ORDER = ["gyro_bias", "gyro_scale_factor", "gyro_misalignment", *(f"gyro_k{power}" for power in range(2, 6)),
+          "gyro_g_sensitivity"]  # fmt: skip
+
+
+def _faces_of_runs(problem: Problem) -> dict[tuple[int, int], list[int]]:
+    """Return the runs of each face: body axis along the table's, and which way it points."""
+    found: dict[tuple[int, int], list[int]] = {}
+    for run in range(problem.runs):
+        first = int(np.argmax(problem.run == run))
+        found.setdefault((int(problem.axis[first]), int(problem.sign[first])), []).append(run)
+    return found
+
+
+def _of_zeros(problem: Problem) -> tuple[Array, float]:
+    """Return the weights of the runs' zeros in the bias and, where the faces tell them apart, in G, and the freedom.
+
+    Every face counts alike, and its runs alike; shape (4, runs), or (1, runs) where the bias holds the mean of G f.
+    """
+    groups = list(_faces_of_runs(problem).values())
+    first = [int(np.argmax(problem.run == runs[0])) for runs in groups]
+    force = np.array(
+        [STANDARD_GRAVITY * problem.sign[at] * np.eye(3)[problem.axis[at]] for at in first]
+        if problem.force is None
+        else [problem.force[runs].mean(axis=0) for runs in groups]
+    )
+    columns = np.column_stack([np.ones(len(groups)), force / STANDARD_GRAVITY])
+    weights = np.zeros((4, problem.runs))
+    if len(groups) < 4 or np.linalg.svd(columns, compute_uv=False)[-1] < _APART:
+        axes = [int(problem.axis[at]) for at in first]
+        for axis, runs in zip(axes, groups, strict=True):
+            weights[0, runs] = 1 / len(set(axes)) / axes.count(axis) / len(runs)
+        return weights[:1], len(groups) - 1
+    inverse = np.linalg.pinv(columns)
+    inverse[1:] /= STANDARD_GRAVITY
+    for k, runs in enumerate(groups):
+        weights[:, runs] = inverse[:, [k]] / len(runs)
+    return weights, len(groups) - 4
+
+
+def g_sensitivity(problem: Problem, solution: Solution) -> Array | None:
+    """Return S G of each gyroscope, output per m/s^2, shape (g, 3); None where the faces do not tell it from b."""
+    weights, _ = _of_zeros(problem)
+    if len(weights) < 4:
+        return None
+    return np.array([weights[1:] @ found[len(found) - problem.runs :] for found in solution.coefficients])
+
+
+def _between_faces(problem: Problem, solution: Solution, axis: int) -> tuple[Array, float]:
+    """Return what faces scatter beyond noise adds to the variances of b and G of a gyroscope, and its freedom.
+
+    (rad/s)^2 .., shape (k,): the expected share of the noise is taken off, so that it does not count twice.
+    """
+    i = problem.gyros.index(axis)
+    found, first = solution.coefficients[i], sum(map(len, solution.coefficients[:i]))
+    scale, at = float(found[problem.faces.index(axis)]), len(found) - problem.runs
+    zeros = found[at:] / scale
+    noise = solution.covariance[first + at : first + len(found), first + at : first + len(found)] / scale**2
+    weights, freedom = _of_zeros(problem)
+    groups = list(_faces_of_runs(problem).values())
+    if freedom < 1:
+        return np.zeros(len(weights)), 0
+    mean = np.zeros((len(groups), problem.runs))
+    for row, runs in zip(mean, groups, strict=True):
+        row[runs] = 1 / len(runs)
+    share = np.array([weights[:, runs].sum(axis=1) for runs in groups])
+    # the columns whose pseudoinverse the weights are: one, and the force where there are four
+    columns = np.linalg.pinv(share.T) if len(weights) > 1 else np.ones((len(groups), 1))
+    rest = (np.eye(len(groups)) - columns @ np.linalg.pinv(columns)) @ mean
+    beyond = max(float(np.sum((rest @ zeros) ** 2) - np.trace(rest @ noise @ rest.T)), 0.0) / freedom
+    return np.asarray(np.sum(share**2, axis=0) * beyond), freedom

@@ -1,4 +1,10 @@
-"""Whole turns by hand against a fence to the scale factors of gyroscopes.
+"""Whole turns by hand against a fence.
+
+The rests between them, the scale factors of gyroscopes, their axes, what spoils a turn, and the record.
+
+Of turn k about the vertical, n_k times round, the gyroscopes' integrals are ``2 pi n_k B a_k``, ``B = diag(S) T``, with
+a_k the axis in the body: the mean of f, weighted by the rate, of ``f = g a + c cos + s sin + w^2 r + w' q``, in which
+the lever arm and the tilt of the table come apart from it. Source: rotation about a fixed axis; least squares.
 
 Between two rests at the fence the unit went through a whole number of turns n, so that the turns which the gyroscopes
 state, composed, miss by ``2 pi n dS/S``. Each stop lies at the fence but for its own error, and belongs to the turn
@@ -7,34 +13,675 @@ before and to that after: ``u(S)/S = u_stop / (2 pi sqrt(sum (j_k - mean j)^2))`
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Unpack
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Unpack
 
 import numpy as np
 
-from imulab.errors import DataError, OptionError
-from imulab.estimation.least_squares import chi_square_probability
-from imulab.procedures.inputs import Record, as_record, as_recording
-from imulab.procedures.rate.axes import BY_ACCELEROMETERS, other_unit_said, with_accelerometers
-from imulab.procedures.rate.choices import AXES, FENCE, gyros_of, part_of_one
-from imulab.procedures.rate.prior import prior_at, with_prior
-from imulab.procedures.rate.turnaxes import check_accel, with_axes
-from imulab.procedures.rate.turnrecord import turns_record
-from imulab.procedures.rate.turnrests import AxisTurns, Motions, carried, composed, find_motions
-from imulab.procedures.result import Result
+from imulab.display import UNJUDGED, Bad, Note
+from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
+from imulab.estimation.least_squares import chi_square_probability, coverage_factor
+from imulab.procedures.rate import AXES, FENCE, gyros_of, part_of_one
+from imulab.procedures.rate.axes import (
+    BY_ACCELEROMETERS,
+    corrected_means,
+    length_said,
+    length_uncertainty,
+    moved_by_parameters,
+    other_unit_said,
+    prior_at,
+    unit_vectors,
+    with_accelerometers,
+    with_prior,
+)
+from imulab.procedures.rate.schema import prior_table, turns_of
+from imulab.procedures.rate.schema import rows as engineering_rows
+from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
-from imulab.recording import Array
-from imulab.records.calibration import Calibration
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.report.traces import (
+    BAD,
+    GOOD,
+    INK,
+    LEGEND,
+    Exhibits,
+    Figure,
+    ReportTable,
+    figure_axis,
+    format_uncertain,
+    plain_number,
+    rounded,
+    scatter,
+)
+from imulab.units import from_si, parse_unit, to_si
+
+# What spoils a turn by hand unseen: stamps that come in bursts, gaps in the turning, and an output at its end.
+
+
+_QUICK, _MANY = 0.25, 0.25
+_KEEPS = 0.1  # s
+_GAP = 3.0
+_SHAKE = (2 * np.pi * 2.0) ** 2 / 12
+"""Of a rate that a hand varies at 2 Hz, what a straight line across a gap leaves: times the rate and the gap cubed."""
+_STILL_SAMPLES = 10
+_QUIET = 0.5
+
+
+def even_stamps(time: Array, name: str) -> tuple[Array, list[str]]:
+    """Return time stamps, s, evened where they come in bursts, and the note that says so.
+
+    A quarter of the steps or more are shorter than a quarter of the mean, as no sensor samples, and the stamps keep to
+    a straight line within 0.1 s and ten samples.
+    """
+    step = np.diff(time)
+    mean = float(step.mean())
+    if float((step < _QUICK * mean).mean()) < _MANY:
+        return time, []
+    count = np.arange(len(time), dtype=np.float64)
+    even = np.polynomial.Polynomial.fit(count, time, 1)(count)
+    if float(np.abs(time - even).max()) > _KEEPS + _STILL_SAMPLES * mean:
+        return time, []
+    note = Note(
+        f"{name}: the time stamps come in bursts (steps of {1e3 * float(step.min()):.3g} to "
+        f"{1e3 * float(step.max()):.3g} ms): taken as even, {1 / float(even[1] - even[0]):.5g} Hz"
+    )
+    return np.asarray(even), [note]
+
+
+def check_motions(time: Array, rate: Array, rests: list[tuple[int, int]], fence: float, name: str) -> None:
+    """Refuse a gap inside a turn that may hide more than the fence, and an output that stands still at its end.
+
+    Raises
+    ------
+    DataError
+        There is one; the message names the time.
+    """
+    usual = float(np.median(np.diff(time)))
+    repeats = np.mean([np.mean(np.diff(rate[a:b], axis=0) == 0, axis=0) for a, b in rests], axis=0)
+    for (_, end), (start, _) in pairwise(rests):
+        part, at = rate[end - 1 : start + 1], time[end - 1 : start + 1]
+        step = np.diff(at)
+        beside = np.maximum(np.linalg.norm(part[1:], axis=1), np.linalg.norm(part[:-1], axis=1))
+        hidden = np.where(step > _GAP * usual, _SHAKE * beside * step**3, 0.0)
+        worst = int(np.argmax(hidden))
+        if hidden[worst] > fence:
+            raise DataError(
+                f"{name}: samples are missing from {at[worst]:.2f} to {at[worst + 1]:.2f} s, while the unit turned at "
+                f"{np.degrees(beside[worst]):.0f} deg/s: the angle of that turn is not known; leave it out (--window)"
+            )
+        for axis in range(3):
+            values = np.abs(part[:, axis])
+            top = values == values.max()
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], top, [False]]).astype(int))).reshape(-1, 2)
+            longest = edges[int(np.argmax(edges[:, 1] - edges[:, 0]))]
+            if longest[1] - longest[0] >= _STILL_SAMPLES and repeats[axis] < _QUIET:
+                raise DataError(
+                    f"{name}: gyro_{AXES[axis]} stands still at {np.degrees(values.max()):.5g} deg/s from "
+                    f"{at[longest[0]]:.2f} to {at[longest[1] - 1]:.2f} s: its output is saturated; turn more slowly"
+                )
+
+
+# Rests of a recording of turns by hand, and how far the unit turned between them.
+
+
+_BLOCK = 0.1  # s
+_LEAST, _TRIM = 6, 1
+_STILL, _OF_LARGEST, _NOISE, _OUT, _OUT_WIDE, _WIDEST = 5.0, 0.02, 4.0, 3.0, 2.0, 10
+_TURNED = np.radians(15)
+
+
+@dataclass(frozen=True)
+class AxisTurns:
+    """The turns about one body axis.
+
+    Attributes
+    ----------
+    count, angle
+        Turns made, signed, and the angle that the gyroscope states, rad, shape (k,).
+    residual, uncertainty
+        What is left of each angle by the scale factor found, and its standard uncertainty, rad, shape (k,).
+    scale, scale_uncertainty
+        Stated over true angle.
+    freedom
+        Turns less one where they scatter beyond the fence, and that scatter is in the uncertainty; else None.
+    motion
+        Number of each turn among the motions, shape (k,).
+    """
+
+    count: Array
+    angle: Array
+    residual: Array
+    uncertainty: Array
+    scale: float
+    scale_uncertainty: float
+    freedom: int | None
+    motion: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Motions:
+    """What happened between rests, m of them.
+
+    Attributes
+    ----------
+    start, stop
+        End of the rest before and start of the rest after, s, shape (m,).
+    angle
+        Net turn by the gyroscopes as they state it, whole turns included, about each body axis, rad, shape (m, 3).
+    closing
+        Rotation vector from the attitude before to that after, rad, shape (m, 3).
+    zero
+        Standard uncertainty of the angle by that of the zero between both rests, rad, shape (m, 3).
+    before, after
+        Mean specific force at the rests, m/s^2, shape (m, 3); None without accelerometers.
+    steps
+        Turns of each sample of a motion, rad, one array of shape (n, 3) each.
+    span
+        First and last sample of each motion.
+    period
+        Usual time between two samples, s.
+    bias
+        Mean output at rest, rad/s, shape (3,), and its standard uncertainty.
+    notes
+        What was done to the recording.
+    """
+
+    start: Array
+    stop: Array
+    angle: Array
+    closing: Array
+    zero: Array
+    before: Array | None
+    after: Array | None
+    steps: tuple[Array, ...]
+    bias: Array
+    bias_uncertainty: Array
+    span: tuple[tuple[int, int], ...]
+    period: float
+    notes: tuple[str, ...] = ()
+
+
+def find_motions(recording: Recording, fence: float) -> Motions:
+    """Find rests, and what the gyroscopes say of the motion between each two.
+
+    Raises
+    ------
+    SegmentError
+        There are fewer than two rests.
+    DataError
+        The gyroscopes are not in a unit of rate, or a turn lacks samples or is saturated.
+    """
+    names = [f"gyro_{axis}" for axis in AXES]
+    check_finite(recording, [name for name in names if name in recording])
+    time, notes = even_stamps(check_time(recording), recording.name)
+    unit = recording.triad_unit("gyro")
+    if parse_unit(unit).quantity != "rate":
+        raise DataError(f"{recording.name}: gyroscopes in {unit}; turns are counted in a unit of rate, such as deg/s")
+    rate = to_si(recording.triad("gyro"), unit)
+    force = to_si(recording.triad("accel"), recording.triad_unit("accel")) if "accel_x" in recording else None
+    rests = _rests(time, rate)
+    if len(rests) < 2:
+        raise SegmentError(
+            f"{recording.name}: {len(rests)} rests of 0.5 s found, expected one before and one after each turn: lay "
+            "the unit against its fence, and wait 2 s"
+        )
+    check_motions(time, rate, rests, fence, recording.name)
+    zero = np.array([rate[a:b].mean(axis=0) for a, b in rests])
+    spread = np.array([_of_mean(rate[a:b]) for a, b in rests])
+    middle = np.array([(time[a] + time[b - 1]) / 2 for a, b in rests])
+    rows = []
+    for k in range(len(rests) - 1):
+        a, b = rests[k][1] - 1, rests[k + 1][0]
+        share = ((time[a : b + 1] - middle[k]) / (middle[k + 1] - middle[k]))[:, None]
+        free = rate[a : b + 1] - zero[k] * (1 - share) - zero[k + 1] * share
+        steps = (free[1:] + free[:-1]) / 2 * np.diff(time[a : b + 1])[:, None]
+        duration = float(time[b] - time[a])
+        rows.append((time[a], time[b], steps, duration / 2 * np.sqrt(spread[k] ** 2 + spread[k + 1] ** 2), (a, b)))
+    means = None if force is None else np.array([force[a:b].mean(axis=0) for a, b in rests])
+    return Motions(
+        start=np.array([row[0] for row in rows]),
+        stop=np.array([row[1] for row in rows]),
+        angle=np.array([row[2].sum(axis=0) for row in rows]),
+        closing=np.array([rotation_vector(composed(row[2])) for row in rows]),
+        zero=np.array([row[3] for row in rows]),
+        before=None if means is None else means[:-1],
+        after=None if means is None else means[1:],
+        steps=tuple(row[2] for row in rows),
+        bias=zero.mean(axis=0),
+        bias_uncertainty=zero.std(axis=0, ddof=1) / np.sqrt(len(zero)),
+        span=tuple(row[4] for row in rows),
+        period=float(np.median(np.diff(time))),
+        notes=tuple(notes),
+    )
+
+
+def _rests(time: Array, rate: Array) -> list[tuple[int, int]]:
+    """Return first sample and end of each stretch in which the gyroscopes are still."""
+    size = max(2, round(_BLOCK / float(np.median(np.diff(time)))))
+    count = len(rate) // size
+    if count < 2 * _LEAST:
+        return []
+    blocks = rate[: count * size].reshape(count, size, 3)
+    means, variance = blocks.mean(axis=1), blocks.var(axis=1).sum(axis=1)
+    quiet = float(np.quantile(variance, 0.1))
+    calm = variance <= _STILL**2 * quiet + 1e-24
+    zero = np.median(means[calm][: 2 * _LEAST], axis=0)
+    off = np.linalg.norm(means - zero, axis=1)
+    still = calm & (off < max(_OF_LARGEST * float(off.max()), _NOISE * np.sqrt(quiet / size)))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
+    steady = [_steady(means, a, b) for a, b in edges.tolist() if b - a >= _LEAST]
+    return [((a + _TRIM) * size, (b - _TRIM) * size) for a, b in steady if b - a >= _LEAST]
+
+
+def _steady(means: Array, first: int, last: int) -> tuple[int, int]:
+    """Return first block and end of a rest without what at its ends stands out of it, as a turn that begins slowly."""
+    width = int(np.clip((last - first) // 5, 1, _WIDEST))
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(means[first:last], axis=0)])
+    part = (sums[width:] - sums[:-width]) / width
+    off = np.linalg.norm(part - np.median(part, axis=0), axis=1)
+    usual = np.flatnonzero(off <= (_OUT if width == 1 else _OUT_WIDE) * np.median(off))
+    return first + int(usual[0]), first + int(usual[-1]) + width
+
+
+def _of_mean(rate: Array) -> Array:
+    """Return the standard uncertainty of a mean by those of its four quarters, or by the middle two, shape (3,).
+
+    By these where the mean lies further from theirs, as a slow start or end of a turn in the rest makes it.
+    """
+    quarter = len(rate) // 4
+    means = rate[: 4 * quarter].reshape(4, quarter, 3).mean(axis=1)
+    return np.asarray(np.maximum(means.std(axis=0, ddof=1) / 2, np.abs(means.mean(axis=0) - means[1:3].mean(axis=0))))
+
+
+def composed(steps: Array) -> Array:
+    """Return the quaternion of small turns one after the other, rad, shape (n, 3), by halving their number.
+
+    Each is taken from its integrated rates by the turn before (Bortz, IEEE Trans. AES-7 (1971) 61): ``a x b / 12``.
+    """
+    steps = steps + np.vstack([np.zeros(3), np.cross(steps[:-1], steps[1:]) / 12])
+    size = np.linalg.norm(steps, axis=1, keepdims=True)
+    found = np.hstack([np.cos(size / 2), steps * np.sinc(size / 2 / np.pi) / 2])
+    while len(found) > 1:
+        if len(found) % 2:
+            found = np.vstack([found, [1.0, 0.0, 0.0, 0.0]])
+        a, b = found[::2], found[1::2]
+        scalar = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(axis=1, keepdims=True)
+        vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
+        found = np.hstack([scalar, vector])
+    return np.asarray(found[0] / np.linalg.norm(found[0]))
+
+
+def rotation_vector(quaternion: Array) -> Array:
+    """Return the shortest rotation vector of a quaternion, rad, shape (3,)."""
+    q = quaternion if quaternion[0] >= 0 else -quaternion
+    size = float(np.linalg.norm(q[1:]))
+    return np.asarray(q[1:] * (2 * np.arctan2(size, q[0]) / max(size, 1e-300)))
+
+
+def carried(quaternion: Array, direction: Array) -> Array:
+    """Return what a fixed direction becomes in body components through a turn of the body, shape (3,)."""
+    w, v = quaternion[0], -quaternion[1:]
+    return np.asarray(direction + 2 * w * np.cross(v, direction) + 2 * np.cross(v, np.cross(v, direction)))
+
+
+# Misalignment from whole turns by hand, whose axis in the body accelerometers tell.
+
 
 _TURN = 2 * np.pi
+_SMOOTH = 0.05  # s
+_BATCHES = 8
+_FACE = np.cos(np.radians(30))
+_CHANCE = 0.01
+_EXACT = 1e-12
+
+
+def check_accel(accel: Calibration, recording: Recording) -> None:
+    """Refuse a record without accelerometers, and a recording without their columns.
+
+    Raises
+    ------
+    RecordError, DataError
+        See above.
+    """
+    if "bias_x" not in accel.parameters:
+        raise RecordError(f"accel: a {accel.procedure} record without accelerometers; expected one of tumble fit")
+    for name in (f"accel_{axis}" for axis in AXES):
+        if name not in recording:
+            raise DataError(f"{recording.name}: no column {name}; the axis of turns by accelerometers needs all three")
+
+
+def with_axes(
+    record: Calibration, recording: Recording, motions: Motions, found: Mapping[str, AxisTurns], accel: Calibration
+) -> Calibration:
+    """Return the record of turns with scale factors and misalignments in the frame of the accelerometers.
+
+    Raises
+    ------
+    ObservabilityError
+        The unit was not turned about x, y and z.
+    DataError
+        The accelerometers see another axis upright than that of a turn.
+    """
+    lacking = [axis for axis in AXES if axis not in found]
+    if lacking:
+        raise ObservabilityError(
+            f"{recording.name}: no turns about {' '.join(lacking)}; accel tells misalignments from turns about x, y "
+            "and z: lay the unit on three faces"
+        )
+    turned = [(axis, k) for axis in range(3) for k in found[AXES[axis]].motion]
+    outputs = recording.triad("accel")
+    count = np.concatenate([found[axis].count for axis in AXES])
+    seen = [_upright(outputs, motions, k, axis, n) for (axis, k), n in zip(turned, count.tolist(), strict=True)]
+    force, spread = np.array([mean for mean, _ in seen]), np.array([u for _, u in seen])
+    unit = recording.triad_unit("accel")
+
+    def corrected(by: Calibration) -> Array:
+        return corrected_means(by, force, unit)
+
+    seen_force = corrected(accel)
+    direction = _axes(seen_force, turned, motions, recording.name)
+    shifts, correlation = moved_by_parameters(accel, corrected)
+    sign = np.sign(np.sum(direction * seen_force, axis=1))[:, None]
+    changes = sign * unit_vectors(seen_force + shifts) - direction
+    of_length = np.linalg.norm(seen_force, axis=1) * np.linalg.norm(spread, axis=1)
+    of_length = np.hypot(of_length, length_uncertainty(seen_force, shifts, correlation))
+    places = [f"the turn at {motions.start[k]:.1f} to {motions.stop[k]:.1f} s" for _, k in turned]
+    said = length_said(accel, seen_force, of_length, places)
+    scale = np.array([found[axis].scale for axis in AXES])
+    u_scale = np.array([found[axis].scale_uncertainty for axis in AXES])
+    across = np.array([motions.angle[k] for _, k in turned]) / _TURN
+    noise = np.array([motions.zero[k] for _, k in turned]) / _TURN
+    noise = np.hypot(noise, count[:, None] * spread * scale)
+    groups = [np.array([axis == j for axis, _ in turned]) for j in range(3)]
+
+    def gains(of: Array, c: Array, y: Array) -> Array:
+        """Return B from the axes, what the composed turns say along their own axis, and the integrals across."""
+        sides = np.column_stack([_by_count(of[own], count[own]) for own in groups])
+        felt = y.copy()
+        for j in range(3):
+            felt[j, j] = np.sqrt(c[j] ** 2 - np.sum(np.delete(y[:, j], j) ** 2))
+        return np.asarray(felt @ np.linalg.inv(sides))
+
+    crossed = np.column_stack([(count[own] @ across[own]) / (count[own] @ count[own]) for own in groups])
+    matrix = gains(direction, scale, crossed)
+    u_crossed = np.zeros((3, 3))
+    for j, own in enumerate(groups):
+        left = across[own] - count[own][:, None] * (direction[own] @ matrix.T)
+        u_crossed[:, j] = _scattered(left, count[own], noise[own])
+    covariance = _covariance(gains, direction, scale, crossed, u_scale, u_crossed, changes, correlation)
+    return replace(_extended(record, matrix, covariance), warnings=(*record.warnings, *said), verdict=UNJUDGED)
+
+
+def _upright(outputs: Array, motions: Motions, k: int, axis: int, count: float) -> tuple[Array, Array]:
+    """Return the mean output along the axis of a turn, shape (3,), and its uncertainty over g by parts of the turn."""
+    first, last = motions.span[k]
+    step, size = motions.steps[k], np.linalg.norm(motions.steps[k], axis=1)
+    angle = np.cumsum(step[:, axis])
+    angle *= _TURN * count / angle[-1]
+    period = motions.period
+    width = max(1, round(_SMOOTH / period))
+    rate = np.convolve(step[:, axis], np.full(width, 1 / width), mode="same") / period
+    rise = np.gradient(rate)
+    columns = [np.ones(len(rate)), np.cos(angle), np.sin(angle), rate**2, rise]
+    matrix = np.column_stack([column / max(float(np.abs(column).max()), 1e-300) for column in columns])
+    values = (outputs[first + 1 : last + 1] + outputs[first:last]) / 2
+    weight = np.sqrt(size / size.max())[:, None]
+    normal = np.linalg.pinv((matrix * weight).T @ (matrix * weight))
+    found = normal @ (matrix * weight**2).T @ values
+    left = (values - matrix @ found) * weight**2
+    edges = np.linspace(0, len(left), _BATCHES + 1).astype(np.int64)[:-1]
+    scores = np.add.reduceat(left[:, None, :] * matrix[:, :, None], edges, axis=0)
+    shift = np.einsum("j,bjk->bk", normal[0], scores)
+    return found[0], np.sqrt(np.sum(shift**2, axis=0)) / float(np.linalg.norm(found[0]))
+
+
+def _axes(force: Array, turned: list[tuple[int, int]], motions: Motions, name: str) -> Array:
+    """Return the axis of each turn in the body, of unit length, along the positive axis that it is next to."""
+    direction = force / np.linalg.norm(force, axis=1)[:, None]
+    for (axis, k), along in zip(turned, direction, strict=True):
+        if abs(along[axis]) < _FACE:
+            upright = AXES[int(np.argmax(np.abs(along)))]
+            raise DataError(
+                f"{name}: the turn at {motions.start[k]:.1f} to {motions.stop[k]:.1f} s is about {AXES[axis]} by the "
+                f"gyroscopes, but by the accelerometers {upright} is upright; expected turns on a level table"
+            )
+    signs = [np.sign(along[axis]) for (axis, _), along in zip(turned, direction, strict=True)]
+    return np.asarray(direction * np.array(signs)[:, None])
+
+
+def _by_count(direction: Array, count: Array) -> Array:
+    """Return the mean of axes, weighted as the integrals of the turns about them are."""
+    return np.asarray(count**2 @ direction / (count @ count))
+
+
+def _scattered(left: Array, count: Array, noise: Array) -> Array:
+    """Return the uncertainty of slopes over turns made, of three gyroscopes; by the scatter where it exceeds noise."""
+    noise = np.maximum(noise, _EXACT * np.abs(count)[:, None])  # data without noise leave rounding
+    variance = (count**2 @ noise**2) / (count @ count) ** 2
+    freedom = len(count) - 1
+    if not freedom:
+        return np.asarray(np.sqrt(variance))
+    chi_square = np.sum((left / noise) ** 2, axis=0)
+    beyond = np.array([chi_square_probability(float(value), freedom) < _CHANCE for value in chi_square])
+    return np.asarray(np.sqrt(variance * np.where(beyond, chi_square / freedom, 1.0)))
+
+
+def _values(matrix: Array) -> Array:
+    """Return scale factors and then misalignments of ``B = diag(S) T``, shape (9,)."""
+    scale = np.diag(matrix)
+    turn = matrix / scale[:, None]
+    return np.concatenate([scale, turn[~np.eye(3, dtype=bool)]])
+
+
+def _covariance(
+    gains: Callable[[Array, Array, Array], Array], direction: Array, scale: Array, crossed: Array, u_scale: Array,
+    u_crossed: Array, changes: Array, correlation: Array,
+) -> Array:  # fmt: skip
+    """Return the covariance of `_values` by stops, by integrals across, and by the accelerometers' record."""
+    at = _values(gains(direction, scale, crossed))
+    rows = []
+    for j in range(3):
+        moved = scale.copy()
+        moved[j] += u_scale[j]
+        rows.append(_values(gains(direction, moved, crossed)) - at)
+        for i in range(3):
+            if i != j:
+                other = crossed.copy()
+                other[i, j] += u_crossed[i, j]
+                rows.append(_values(gains(direction, scale, other)) - at)
+    own = np.array(rows)
+    of_record = np.array([_values(gains(direction + change, scale, crossed)) - at for change in changes])
+    of_record = of_record.reshape(-1, len(at))
+    return np.asarray(own.T @ own + of_record.T @ correlation @ of_record)
+
+
+def _extended(record: Calibration, matrix: Array, covariance: Array) -> Calibration:
+    """Return the record of turns with these scale factors, misalignments and their covariance."""
+    unit = str(record.model["gyro_output_unit"])
+    clock = float(record.fit["clock"] or 0.0)
+    values = _values(matrix) * np.concatenate([np.full(3, from_si(1.0, unit)), np.ones(6)])
+    factor = values / _values(matrix)
+    names = [f"gyro_scale_factor_{a}" for a in AXES]
+    names += [f"gyro_misalignment_{a}{b}" for a in AXES for b in AXES if a != b]
+    common = np.where(np.arange(9) < 3, values, 0.0) * clock
+    joined = covariance * np.outer(factor, factor) + np.outer(common, common)
+    biases = {name: p for name, p in record.parameters.items() if name.startswith("gyro_bias")}
+    parameters = dict(biases)
+    for name, value, u in zip(names, values.tolist(), np.sqrt(np.diag(joined)).tolist(), strict=True):
+        before = record.parameters.get(name)
+        interval = None if before is None else before.interval_95
+        if before is not None and interval is not None and before.standard_uncertainty:
+            wide = (interval[1] - interval[0]) / 2 / before.standard_uncertainty * u
+            interval = (value - wide, value + wide)
+        kind = "rad" if "misalignment" in name else f"{unit}/(rad/s)"
+        parameters[name] = Parameter(value, u, kind, interval_95=interval)
+    whole = np.zeros((len(parameters),) * 2)
+    whole[:3, :3] = record.covariance.block(list(biases))
+    whole[3:, 3:] = joined
+    return replace(
+        record,
+        parameters=parameters,
+        covariance=Covariance(tuple(parameters), tuple(map(tuple, whole.tolist()))),
+        model={**record.model, "frame": BY_ACCELEROMETERS},
+    )
+
+
+# The calibration record of whole turns, and what its report shows.
+
+
+_FAR = 0.1
+_LOOKS = {"x": ("circle", INK), "y": ("diamond", GOOD), "z": ("square", BAD)}
+
+
+def turns_record(
+    recording: Recording, motions: Motions, found: Mapping[str, AxisTurns], fence: float, clock: float | None
+) -> Calibration:
+    """Turn the scale factors found into the record."""
+    unit = recording.triad_unit("gyro")
+    nominal = float(from_si(1.0, unit))
+    parameters = {
+        f"gyro_bias_{a}": Parameter(
+            float(motions.bias[AXES.index(a)]) / of.scale,
+            float(motions.bias_uncertainty[AXES.index(a)]) / of.scale,
+            "rad/s",
+        )
+        for a, of in found.items()
+    }
+    for a, of in found.items():
+        u = float(np.hypot(of.scale_uncertainty, of.scale * (clock or 0.0)))
+        reach = None if of.freedom is None else coverage_factor(float(of.freedom)) * u
+        parameters[f"gyro_scale_factor_{a}"] = Parameter(
+            of.scale * nominal,
+            u * nominal,
+            f"{unit}/(rad/s)",
+            interval_95=None if reach is None else ((of.scale - reach) * nominal, (of.scale + reach) * nominal),
+        )
+    spread = np.array([p.standard_uncertainty or 0.0 for p in parameters.values()])
+    matrix = np.diag(spread**2)
+    names = list(parameters)
+    for i, a in enumerate(names):
+        for k, b in enumerate(names):
+            if i != k and a.startswith("gyro_scale") and b.startswith("gyro_scale"):
+                matrix[i, k] = parameters[a].value * parameters[b].value * (clock or 0.0) ** 2
+    turned = sorted((k, a, j) for a, of in found.items() for j, k in enumerate(of.motion))
+    return Calibration(
+        procedure="rate",
+        parameters=parameters,
+        covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
+        model={"gyro_order": 1, "gyro_output_unit": unit, "axes": "".join(found), "from": "turns"},
+        fit={"turns": len(turned), "fence": {"value": fence, "unit": "rad"}, "clock": clock},
+        options={"fence": fence},
+        data={
+            "turns": {
+                "axis": [a for _, a, _ in turned],
+                "start": [float(motions.start[k]) for k, _, _ in turned],
+                "stop": [float(motions.stop[k]) for k, _, _ in turned],
+                "count": [float(found[a].count[j]) for _, a, j in turned],
+                "angle": [float(found[a].angle[j]) for _, a, j in turned],
+                "residual": [float(found[a].residual[j]) for _, a, j in turned],
+                "standard_uncertainty": [float(found[a].uncertainty[j]) for _, a, j in turned],
+            }
+        },
+        sensor={key: text for key in ("serial", "model", "element") if (text := recording.metadata.get(key))},
+        sources=() if recording.source is None else (recording.source,),
+        warnings=(*motions.notes, *_findings(found, clock)),
+    )
+
+
+def _findings(found: Mapping[str, AxisTurns], clock: float | None) -> list[str]:
+    said: list[str] = []
+    for a, of in found.items():
+        if abs(of.scale - 1) > _FAR:
+            said.append(Bad(f"gyro_{a}: the scale factor is off by {100 * (of.scale - 1):+.3g} %: is the unit right?"))
+        if of.freedom is not None:
+            said.append(Note(f"gyro_{a}: the turns scatter more than the fence; its interval is Student's t of them"))
+        if not ((of.count > 0).any() and (of.count < 0).any()):
+            said.append(
+                Note(
+                    f"gyro_{a} was turned one way round only: what is even in the rate, and an error of the zero, "
+                    "is in its scale factor; turn as many back"
+                )
+            )
+    if clock is None:
+        said.append(
+            Note(
+                "the scale factors are those per clock: a sample rate that is off is in them; state what it is known "
+                "to (--clock)"
+            )
+        )
+    return said
+
+
+def turns_exhibits(record: Calibration) -> Exhibits:
+    """Return the figures and tables of a record of turns."""
+    found = turns_of(record)
+    seen = found.data.turns
+    rows = []
+    for row in engineering_rows(record):
+        value, u = format_uncertain(row.value, row.standard_uncertainty)
+        rows.append([row.name, value, u, row.unit])
+    worst = max(
+        (p.standard_uncertainty or 0.0) / abs(p.value) for n, p in record.parameters.items() if "scale_factor" in n
+    )
+    degrees = [[float(np.degrees(v)) for v in c] for c in (seen.angle, seen.residual, seen.standard_uncertainty)]
+    table = [
+        [a, f"{start:.1f}", f"{stop:.1f}", f"{count:+.0f}", f"{angle:.2f}", f"{left:+.3f}", f"{u:.2g}"]
+        for a, start, stop, count, angle, left, u in zip(
+            seen.axis, seen.start, seen.stop, seen.count, *degrees, strict=True
+        )
+    ]
+    number = list(range(1, len(table) + 1))
+    traces: list[dict[str, Any]] = []
+    for name, (symbol, colour) in _LOOKS.items():
+        which = [k for k, of in enumerate(seen.axis) if of == name]
+        if which:
+            rest, bars = (rounded([degrees[k][j] for j in which]) for k in (1, 2))
+            traces.append(
+                scatter(
+                    [number[j] for j in which], rest, "markers", name=f"gyro_{name}",
+                    marker={"color": colour, "symbol": symbol, "size": 8},
+                    error_y={"type": "data", "array": bars, "thickness": 1, "width": 2},
+                )
+            )  # fmt: skip
+    several = len(table) > len(set(seen.axis))  # of one turn about each axis nothing is left
+    figure = Figure(
+        title="What is left of each turn",
+        caption="By the scale factor of these turns. Bars: one standard uncertainty, of both stops and of the zero.",
+        traces=traces,
+        layout={"xaxis": figure_axis("turn", dtick=1), "yaxis": figure_axis("residual, deg"), "legend": LEGEND},
+    )
+    fence = float(np.degrees(found.fit.fence.value))
+    return Exhibits(
+        f"{found.fit.turns} turns against a fence of {plain_number(fence, 2)} deg: scale factors are known to "
+        f"{plain_number(1e6 * worst, 3)} ppm or better.",
+        [("turns", str(found.fit.turns)), ("fence", f"{plain_number(fence, 2)} deg")],
+        [
+            ReportTable("Parameters", "Per clock where no uncertainty of it was stated.",
+                        ["parameter", "value", "u", "unit"], rows),
+            *([prior_table(found.fit.prior, record)] if "prior" in record.fit else []),
+            ReportTable(
+                "Turns",
+                "Stated angle of each, and what is left of it by the scale factor of these turns.",
+                ["gyro", "from, s", "to, s", "turns", "angle, deg", "residual, deg", "u, deg"],
+                table,
+            ),
+            *([figure] if several else []),
+        ],
+    )  # fmt: skip
+
+
+# Whole turns by hand against a fence to the scale factors of gyroscopes.
+
+
 _SAME, _OTHER = np.radians(10), np.radians(30)
 _PART, _WHOLE, _FIRST, _OFF = 0.4, 0.12, 0.2, 0.1
 """Parts of a turn: less is none; what whole turns miss by at most, and the first that tell the scale; of the scale."""
 _ASKEW = 0.4
 """Turn about a second axis over that about the first, beyond which the axes of a turn cannot be told."""
-_CHANCE = 0.01
 _FACTORS = np.geomspace(0.4, 2.5, 41)
 _CARRIES = np.radians(15)
 

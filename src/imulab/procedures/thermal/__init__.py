@@ -1,1 +1,82 @@
-"""Accelerometers calibrated over temperature: one error model for the range in which a unit is used."""
+"""Accelerometers and gyroscopes calibrated over temperature; and the words and numbers that the options take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from imulab.errors import OptionError
+
+# The words and numbers that the options of a thermal calibration take.
+
+
+LAWS = ("cubic", "rough")
+DEGREES = (3, 2, 1)
+"""Of bias, scale factor and misalignment."""
+HIGHEST = 5
+TEMPERATURES = "-20,0,25,45,60"
+APART = 5.0
+"""K: temperatures that lie closer count as one."""
+LEAST_SPAN = 10.0
+LEAST_KNOTS = 5
+"""Temperatures from which a spline of the bias is tried."""
+SETTLE = 300.0
+TURNED, FOLLOWED = 9, 3
+"""Attitudes of a recording whose turns tell scale factors of gyroscopes; temperatures at which these follow it."""
+
+STRETCHES, TURNS = 1e-4, 1e-5
+"""What scale factors and misalignments of such sensors usually move by, 1/K and rad/K."""
+
+
+def further_of(given: str | Sequence[str], option: str) -> tuple[str, ...]:
+    """Return the names of further triads, of which there is one, ``gyro``.
+
+    Raises
+    ------
+    OptionError
+        There is another.
+    """
+    names = tuple(name.strip() for name in given.split(",")) if isinstance(given, str) else tuple(given)
+    if not set(names) <= {"gyro"} or len(names) > 1:
+        raise OptionError(f"{option} {','.join(names)!r}: expected gyro")
+    return names
+
+
+def degrees_of(text: str, option: str) -> str | tuple[int, int, int]:
+    """Return ``auto``, or three degrees from a text such as ``3,2,1``.
+
+    Raises
+    ------
+    OptionError
+        It is neither.
+    """
+    found, spline = laws_of(text, option)
+    if spline:
+        raise OptionError(f"{option} {text!r}: expected degrees such as 3,2,1; a spline is for a fit")
+    return found
+
+
+def laws_of(text: str, option: str) -> tuple[str | tuple[int, int, int], bool]:
+    """Return ``auto`` or the degrees that a text states, and whether the bias is a spline: ``3,2,1``, ``spline,2,1``.
+
+    Raises
+    ------
+    OptionError
+        It is none of them.
+    """
+    if text == "auto":
+        return text, False
+    parts = [part.strip() for part in text.split(",")]
+    spline = parts[0] == "spline"
+    degrees = [str(DEGREES[0]), *parts[1:]] if spline else parts
+    if len(degrees) != 3 or not all(part.isdecimal() and int(part) <= HIGHEST for part in degrees):
+        raise OptionError(
+            f"{option} {text!r}: expected auto, or the degrees of bias, scale factor and misalignment, 0 to {HIGHEST}, "
+            "such as 3,2,1, or spline,2,1 for a bias with a knot at each temperature"
+        )
+    return (int(degrees[0]), int(degrees[1]), int(degrees[2])), spline
+
+
+def degrees_text(text: str, option: str) -> str:
+    """Return a text that `laws_of` can read; raises OptionError as it does."""
+    laws_of(text, option)
+    return text

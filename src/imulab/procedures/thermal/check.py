@@ -1,4 +1,4 @@
-"""New recordings against a record over temperature, to test whether it still holds."""
+"""New recordings against a record over temperature, to test whether it still holds, and how that is shown."""
 
 from __future__ import annotations
 
@@ -8,28 +8,159 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Unpack
 
 import numpy as np
+from numpy.typing import NDArray
 
+from imulab._version import VERSION
 from imulab.columns import triad
-from imulab.earth import at_latitude
+from imulab.display import Bad, Note, verdict_of
 from imulab.errors import DataError, OptionError, RecordError, UnitError
-from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Record, as_record, as_recording
-from imulab.procedures.result import Drawn
-from imulab.procedures.thermal.checks import check_holds, prepared
-from imulab.procedures.thermal.gyrocheck import GyroCheck, check_gyros
-from imulab.procedures.thermal.holds import Holds, find_holds
-from imulab.procedures.thermal.model import Laws, forces
-from imulab.procedures.thermal.parted import parted
-from imulab.procedures.thermal.record import of_record
-from imulab.procedures.thermal.rows import Problem, linearise, together
-from imulab.procedures.thermal.sections import thermal_of
+from imulab.gravity import EarthRate, Gravity, at_latitude, at_place, local_gravity
+from imulab.procedures.result import Drawn, Record, as_record, as_recording
+from imulab.procedures.thermal.degrees import parted
+from imulab.procedures.thermal.figures import own_points
+from imulab.procedures.thermal.gyro import RatesAtRest, notes_on_turns, rates_at_rest, rows_of, without_turns
+from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepared
+from imulab.procedures.thermal.model import AXES, Laws, forces
+from imulab.procedures.thermal.record import gyro_scale_predicted, names_and_units, of_record
+from imulab.procedures.thermal.schema import thermal_of
+from imulab.procedures.thermal.solve import Problem, linearise, together
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
-from imulab.report.elements import Exhibits
-from imulab.units import conversion_factor, from_si
-from imulab.verdict import Note
+from imulab.report import render_page
+from imulab.report.traces import BAD, GOOD, LEGEND, QUIET, Exhibits, Figure, ReportTable, figure_axis, rounded, scatter
+from imulab.units import conversion_factor, from_si, parse_unit, to_si
+
+# The gyroscopes of new recordings against a record over temperature: their outputs at rest under its laws.
+
+
+_UNSAID = (
+    "the record does not say how far the gyroscopes' biases move from one power cycle to the next, so an offset that a "
+    "whole recording has in common is not tested: state --gyro-turn-on-scatter"
+)
+
+
+@dataclass(frozen=True)
+class GyroCheck:
+    """How well the gyroscopes' laws still hold.
+
+    Attributes
+    ----------
+    holds
+        Place of each tested hold among those of the check, shape (n,).
+    residuals, standard_uncertainty
+        Law less output of each hold and axis, rad/s, shape (n, 3).
+    within, between
+        Probabilities as in `ThermalCheck`.
+    """
+
+    holds: NDArray[np.int64]
+    residuals: Array
+    standard_uncertainty: Array
+    within: float | None
+    between: float | None
+
+    @property
+    def worst(self) -> tuple[int, int]:
+        """Hold, of those tested, and axis whose output is farthest off."""
+        row, axis = np.unravel_index(int(np.argmax(np.abs(self.residuals))), self.residuals.shape)
+        return int(row), int(axis)
+
+
+def check_gyros(
+    record: Calibration,
+    holds: Holds,
+    force: Array,
+    turn_on_scatter: float | str | None,
+    earth: EarthRate | None = None,
+) -> tuple[GyroCheck | None, list[str]]:
+    """Test the outputs at rest under specific forces in g, shape (n, 3); return what is found, and what is to be said.
+
+    Raises
+    ------
+    UnitError
+        The gyroscopes are in another unit than those of the record.
+    OptionError
+        The scatter is below 0.
+    """
+    model = thermal_of(record).model
+    if model.gyro is None:
+        return None, []
+    lacking = [one.name for one in holds.recordings if any(name not in one for name in triad("gyro"))]
+    if lacking or any(one.time is None for one in holds.recordings):
+        which = lacking[0] if lacking else next(one.name for one in holds.recordings if one.time is None)
+        return None, [
+            Note(f"{which}: no columns gyro_x gyro_y gyro_z over time, so the record's gyroscopes are not tested")
+        ]
+    tau, rank = _scatter(record, turn_on_scatter)
+    fit = thermal_of(record).fit.gyro
+    assert fit is not None
+    # In a record without a latitude the vertical part is in the g-sensitivities: taken off, it would count twice.
+    known = earth if fit.latitude is not None or not model.gyro.g_sensitivity else None
+    laws = model.gyro_laws
+    try:
+        held, aside = without_turns(replace(_rates(record, holds, force), earth=known), laws)
+    except DataError as error:  # faulty columns of gyroscopes say nothing against the accelerometers
+        return None, [f"gyroscopes not tested: {error}"]
+    names, _ = names_and_units(laws, sensitivity=model.gyro.g_sensitivity)
+    size = 3 * laws.terms[0]
+    factor = np.eye(len(names)) / model.gravity.value
+    factor[:size, :size] = laws.to_powers()[:size, :size]
+    inverse = np.linalg.inv(factor)
+    coefficients = inverse @ np.array([record.value(name) for name in names])
+    covariance = inverse @ record.cov(*names) @ inverse.T
+    rows = rows_of(held, laws, coefficients, ())
+    excess = fit.excess.value**2
+    noise = together(rows, excess, np.zeros(2))
+    whole = together(rows, excess, np.array([tau or 0.0, 0.0])) + rows.jacobian @ covariance @ rows.jacobian.T
+    within, between = parted(rows, whole, noise, np.zeros((len(whole), 0)), rank, by_share=False)
+    residual, u = (each.reshape(-1, 3) for each in (rows.residual, np.sqrt(np.diag(whole))))
+    notes = [*held.notes, *notes_on_turns(holds, aside), *([_UNSAID] if tau is None else [])]
+    return GyroCheck(held.index, residual, u, within, between), notes
+
+
+def _rates(record: Calibration, holds: Holds, force: Array) -> RatesAtRest:
+    """Return the outputs at rest by the record's scale factors at each temperature."""
+    gyro = thermal_of(record).model.gyro
+    assert gyro is not None
+    of_rate = parse_unit(gyro.output_unit).quantity == "rate"
+    for recording in holds.recordings:
+        unit = recording.triad_unit("gyro")
+        if unit != gyro.output_unit and not (of_rate and parse_unit(unit).quantity == "rate"):
+            raise UnitError(
+                f"{recording.name}: columns gyro_x gyro_y gyro_z are in {unit}, but the record calibrates outputs in "
+                f"{gyro.output_unit}"
+            )
+    if gyro.scale == "nominal":
+        return rates_at_rest(holds, force, np.ones(3))
+    middle = np.array([record.model["reference_temperature"]["value"]])
+    nominal = gyro_scale_predicted(record, middle)[0][:, 0]
+    size = to_si(nominal, gyro.output_unit) if of_rate else nominal
+    held = rates_at_rest(holds, force, size)
+    part = (nominal[:, None] / gyro_scale_predicted(record, held.temperature)[0]).T
+    covariance = held.covariance * part[:, :, None] * part[:, None, :]
+    return replace(held, mean=held.mean * part, covariance=covariance)
+
+
+def _scatter(record: Calibration, given: float | str | None) -> tuple[float | None, int | None]:
+    """Return the scatter of biases between power cycles, rad/s, and the rank of what told it; None where unknown."""
+    if given is not None:
+        tau = in_si(given, "gyro_turn_on_scatter", "rate", "deg/s")
+        if not 0 <= tau < np.inf:
+            raise OptionError(f"gyro_turn_on_scatter {given!r}: expected 0 or more")
+        return tau, 0
+    fit = thermal_of(record).fit.gyro
+    assert fit is not None
+    between = fit.between_recordings
+    if between.from_ == "unknown":
+        return None, None
+    least = 0.0 if between.resolution is None else between.resolution.value
+    return float(np.hypot(between.bias.value, least)), between.rank
+
+
+# New recordings against a record over temperature, to test whether it still holds.
+
 
 FALSE_ALARM = 0.05
 _BEYOND = 1.0  # K outside the record's range: its laws say nothing there
@@ -74,8 +205,6 @@ class ThermalCheck(Drawn):
 
     def exhibits(self) -> Exhibits:
         """Return what its report shows."""
-        from imulab.procedures.thermal.checkfigures import exhibits_of_check
-
         return exhibits_of_check(self)
 
     def __repr__(self) -> str:
@@ -329,3 +458,219 @@ def _directions(problem: Problem, laws: Laws, coefficients: Array) -> Array:
     found = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
     found /= np.linalg.norm(found, axis=1)[:, None]
     return found
+
+
+# What a check of a record over temperature shows: the verdict, and each residual beside its uncertainty.
+
+
+_BEYOND_RANGE = 2.0
+
+
+def _ug(value: float, sign: str = "+") -> str:
+    micro = from_si(float(value), "ug")
+    return f"{micro:{sign}.3g}" if abs(micro) < 999.5 else f"{micro:{sign}.0f}"
+
+
+def _p(value: float | None) -> str:
+    return "not tested" if value is None else f"p = {value:.2g}" if value >= 1e-12 else "p below 1e-12"
+
+
+_SAID = (
+    "|f| differs from g between attitudes or temperatures by more than the record explains",
+    "an offset that whole recordings have in common is larger than power cycles explain",
+    "the gyroscopes at rest differ between attitudes or temperatures by more than the record explains",
+    "an offset of the gyroscopes that whole recordings have in common is larger than power cycles explain",
+)
+
+
+def meaning(check: ThermalCheck) -> str:
+    """Return what the test says, in words."""
+    if check.passed:
+        return "the recordings agree with the record"
+    if check.probability >= 0.05:
+        return "no change of the unit is shown, but a hold is beyond the limit"
+    gyro = check.gyro
+    each = (check.within, check.between, *((gyro.within, gyro.between) if gyro else ()))
+    what = _SAID[int(np.argmin([2.0 if p is None else p for p in each]))]
+    return f"{what}: the unit has changed since the record was made, or gravity, unit or temperature are not as assumed"
+
+
+def as_text(check: ThermalCheck, verdict: str) -> str:
+    """Return the verdict with its p, what to do next, and the residual of every hold."""
+    lines = [f"{verdict}: {meaning(check)}"]
+    if not check.passed:
+        lines.append(
+            "measure again; 'imulab thermal fit' of the old recordings with this one says where they disagree, and a "
+            "record that follows the change takes recordings over temperature anew"
+        )
+    worst = check.worst
+    lines.append(
+        f"{_p(check.probability)} over {len(check.holds)} holds (within recordings {_p(check.within)}, common to each "
+        f"{_p(check.between)}), largest |f| - g {_ug(check.residuals[worst])} ug ({check.holds.label(worst)})"
+    )
+    if check.gyro is not None:
+        gyro, (row, k) = check.gyro, check.gyro.worst
+        lines.append(
+            f"gyroscopes: within recordings {_p(gyro.within)}, common to each {_p(gyro.between)}, largest law less "
+            f"output {_hourly(gyro.residuals[row, k]):+.3g} ± {_hourly(gyro.standard_uncertainty[row, k]):.2g} deg/h "
+            f"({AXES[k]}, {check.holds.label(int(gyro.holds[row]))})"
+        )
+    pairs = zip(check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True)
+    for index, (value, u) in enumerate(pairs):
+        beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""
+        lines.append(f"{check.holds.label(index)}: {_ug(value)} ± {_ug(u, '')} ug{beyond}")
+    return "\n".join(lines)
+
+
+def as_json(check: ThermalCheck) -> dict[str, Any]:
+    """Return the same for scripts, in SI."""
+    rows = zip(
+        check.holds.temperature.tolist(), check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True
+    )
+    return {
+        "verdict": "pass" if check.passed else "fail",
+        "p": check.probability,
+        "p_within": check.within,
+        "p_between": check.between,
+        "limit": None if check.limit is None else {"value": check.limit, "unit": "m/s^2"},
+        "gravity": check.gravity.entry(),
+        "holds": [
+            {"label": check.holds.label(k), "temperature": at, "residual": value, "standard_uncertainty": u}
+            for k, (at, value, u) in enumerate(rows)
+        ],
+        **({} if check.gyro is None else {"gyro": _gyro_as_json(check)}),
+        "notes": [str(note) for note in check.notes],
+    }
+
+
+def _gyro_as_json(check: ThermalCheck) -> dict[str, Any]:
+    gyro = check.gyro
+    assert gyro is not None
+    rows = zip(gyro.holds.tolist(), gyro.residuals.tolist(), gyro.standard_uncertainty.tolist(), strict=True)
+    return {
+        "p_within": gyro.within,
+        "p_between": gyro.between,
+        "holds": [
+            {"label": check.holds.label(k), "residual": residual, "standard_uncertainty": u} for k, residual, u in rows
+        ],
+    }
+
+
+def exhibits_of_check(check: ThermalCheck) -> Exhibits:
+    """Return what the report shows."""
+    worst = f"{_ug(check.residuals[check.worst])} µg"
+    facts = [
+        *(
+            (name, _p(value).removeprefix("p ").removeprefix("= "))
+            for name, value in (
+                ("p, if nothing changed", check.probability),
+                ("p within recordings", check.within),
+                ("p of what each has in common", check.between),
+                *(
+                    (
+                        ("gyroscopes: p within recordings", check.gyro.within),
+                        ("gyroscopes: p of what each has in common", check.gyro.between),
+                    )
+                    if check.gyro
+                    else ()
+                ),
+            )
+        ),
+        ("largest |f| − g", worst),
+    ]
+    rows = [
+        [check.holds.label(k), _ug(value), _ug(u, ""), f"{value / u:+.1f}"]
+        for k, (value, u) in enumerate(zip(check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True))
+    ]
+    table = ReportTable(
+        "Holds",
+        "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all together, "
+        "with what their errors share.",
+        ["hold", "|f| − g, µg", "u, µg", "(|f| − g) / u"],
+        rows,
+    )
+    return Exhibits(
+        f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}.",
+        facts,
+        [_figure(check), *([_gyro_figure(check)] if check.gyro else []), table],
+    )
+
+
+def _figure(check: ThermalCheck) -> Figure:
+    residual, u = (from_si(values, "ug") for values in (check.residuals, check.standard_uncertainty))
+    far = np.abs(residual) > _BEYOND_RANGE * u
+    traces = []
+    for which, colour, symbol in ((~far, GOOD, "circle"), (far, BAD, "diamond")):
+        if which.any():
+            bars = {
+                "type": "data",
+                "array": rounded(_BEYOND_RANGE * u[which]),
+                "color": QUIET,
+                "thickness": 1,
+                "width": 3,
+            }
+            traces.append(
+                scatter(rounded(check.holds.temperature[which]), rounded(residual[which]), "markers", error_y=bars,
+                        marker={"size": 8, "color": colour, "symbol": symbol},
+                        text=[check.holds.label(k) for k in np.flatnonzero(which).tolist()],
+                        hovertemplate="%{text}<br>%{y:.1f} µg<extra></extra>")
+            )  # fmt: skip
+    return Figure(
+        title="Residual |f| − g of each hold under the record, over temperature",
+        message=f"{int(far.sum())} of {len(far)} holds lie beyond twice the standard uncertainty.",
+        caption="Bars: twice the standard uncertainty, from laws, power cycle, temperature and noise; the holds of a "
+        "recording have most of it in common. Red diamonds lie beyond.",
+        traces=traces,
+        layout={
+            "xaxis": figure_axis("temperature, degC"),
+            "yaxis": figure_axis("|f| − g, µg", zeroline=True),
+            "showlegend": False,
+        },
+    )
+
+
+def _gyro_figure(check: ThermalCheck) -> Figure:
+    gyro = check.gyro
+    assert gyro is not None
+    at = check.holds.temperature[gyro.holds]
+    residual, u = (from_si(values, "deg/h") for values in (gyro.residuals, gyro.standard_uncertainty))
+    far = int((np.abs(residual) > _BEYOND_RANGE * u).sum())
+    traces = [
+        own_points(at, residual[:, k], _BEYOND_RANGE * u[:, k], k, name) | {"name": name, "showlegend": True}
+        for k, name in enumerate(AXES)
+    ]
+    return Figure(
+        title="The gyroscopes at rest under the record, over temperature",
+        message=f"{far} of {residual.size} outputs lie beyond twice the standard uncertainty.",
+        caption="Bars: twice the standard uncertainty, from laws, power cycle, temperature, Earth's rate and noise.",
+        traces=traces,
+        layout={
+            "xaxis": figure_axis("temperature, degC"),
+            "yaxis": figure_axis("law less output, deg/h", zeroline=True),
+            "legend": LEGEND,
+        },
+    )
+
+
+def _hourly(rate: float) -> float:
+    return float(from_si(float(rate), "deg/h"))
+
+
+def check_page(
+    check: ThermalCheck, held: Calibration, *, record: str, files: Sequence[str], warnings: Sequence[str]
+) -> str:
+    """Return the report; `warnings` are those of the command."""
+    failed = [] if check.passed else [Bad(meaning(check))]
+    return render_page(
+        f"Thermal check: {'pass' if check.passed else 'fail'}",
+        held.sensor.get("serial", "unit without serial number"),
+        exhibits_of_check(check),
+        verdict=verdict_of([*failed, *warnings]),
+        notes=[note for note in warnings if isinstance(note, Note)],
+        provenance=[
+            ("record", f"{record}, created {held.created}"),
+            *(("recording", file) for file in files),
+            ("gravity", f"{check.gravity.value:.9g} m/s^2"),
+            ("software", f"imulab {VERSION}"),
+        ],
+    )

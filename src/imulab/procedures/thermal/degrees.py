@@ -1,27 +1,53 @@
-"""How the degrees of the laws are chosen, and how well temperatures are predicted that were left out whole.
+"""How the degrees of the laws are chosen, whether biases lag behind the thermometer, what holds do not determine.
+
+And whether the recordings agree as those of one unit do.
 
 From the highest degrees *down*, a step at a time, where a step is insignificant (F at 1 %) and interior temperatures,
 left out whole, are predicted no worse: upward selection stops short where a law has a kink. The same is done with a
 natural cubic spline of the bias. It is taken where its values at the knots differ significantly from a cubic, as far as
 recordings tell that, and it predicts the temperatures left out at most a tenth worse than polynomials do: without one
 of its knots it must bridge twice the distance, which costs polynomials nothing.
+
+The *lag* L is one for the unit, ``p(T - L dT/dt)``; the *loop* h one for each axis, ``h sign(dT/dt) (1 - theta^2)``.
+All four are fitted beside the laws, and each of the two is tested, given the other, by F at 1 %; what is significant
+stays in the fit. Soaks have loops by the side that they were reached from, where heads say it. Corrected outputs use
+L = 0 and h = 0: a unit would have to differentiate its temperature.
+
+A term left out of the laws moves all others: with the Jacobian J and the derivatives A by what is left out, times its
+usual size, both whitened, coefficients err by ``-J^+ A a``, a of size 1. What of A is left beside J, B, tells a to the
+covariance ``(1 + B'B)^-1``. Where what this leaves in the biases matters beside their uncertainty, it is said.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.display import Note
 from imulab.errors import ObservabilityError
-from imulab.estimation.least_squares import Observability, observability
-from imulab.procedures.thermal.choices import APART, DEGREES, LEAST_KNOTS
-from imulab.procedures.thermal.model import GROUPS, Laws, cardinal_spline
-from imulab.procedures.thermal.rows import Problem, Rows, together, whitener
-from imulab.procedures.thermal.solve import Solution, solve
+from imulab.estimation.least_squares import Observability, chi_square_probability, observability
+from imulab.procedures.thermal import APART, DEGREES, LEAST_KNOTS, STRETCHES, TURNS
+from imulab.procedures.thermal.holds import Holds
+from imulab.procedures.thermal.model import AXES, GROUPS, Laws, cardinal_spline
+from imulab.procedures.thermal.solve import (
+    Problem,
+    Rows,
+    Solution,
+    between,
+    excess_of,
+    offset_modes,
+    solve,
+    together,
+    whitener,
+)
 from imulab.recording import Array
+
+# How the degrees of the laws are chosen, and how well temperatures are predicted that were left out whole.
+
 
 Degrees = tuple[int, int, int]
 _INSIGNIFICANT = 0.01
@@ -399,3 +425,445 @@ def spoken_degrees(degrees: Degrees, knots: int = 0) -> str:
     """Return degrees as messages say them: ``bias 3, scale factor 2, misalignment 1``, or a spline of the bias."""
     said = [f"{kind.replace('_', ' ')} {degree}" for (kind, _), degree in zip(GROUPS, degrees, strict=True)]
     return ", ".join([f"bias by a spline with {knots} knots", *said[1:]] if knots else said)
+
+
+# Whether biases lag behind the thermometer, or differ between warming and cooling.
+
+
+_SIGNIFICANT = 0.01
+_STILL = 0.05
+"""Share of the fastest change in a recording below which its sign is that of the thermometer's noise."""
+_SHARED = 0.5
+"""Share of the range in which the unit must both warm and cool: elsewhere a bend of the law looks like a lag."""
+_TELLS = 0.05
+"""Share of the columns of lag and loops that must be left beside the laws and each other."""
+_NAMES = ("lag", *(f"loop_{axis}" for axis in AXES))
+ALL = (0, 1, 2, 3)
+"""Lag and loops of x, y and z, as `Problem.free`."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Lag (s) and loops (g): values, shape (4,), covariance, probability of each of the two if there were none.
+
+    Where they cannot be told, `values` is None and `reason` says why, or is empty where the temperature never drifts.
+    """
+
+    values: Array | None = None
+    covariance: Array | None = None
+    probability: tuple[float, float] = (1.0, 1.0)
+    reason: str = ""
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """What is significant, as `Problem.free`."""
+        lag, loop = (probability < _SIGNIFICANT for probability in self.probability)
+        return (0,) * lag + (1, 2, 3) * loop
+
+
+def moving(holds: Holds) -> Array:
+    """Return the change of the temperature in each hold, K/s; 0 in soaks, and where it hardly moves."""
+    return moved(holds.recording, holds.temperature, holds.rate)
+
+
+def moved(recording: NDArray[Any], temperature: Array, rate: Array) -> Array:
+    """Return `moving` of holds by the recording, temperature, degC, and its change, K/s, of each."""
+    rate = rate.copy()
+    for each in np.unique(recording):
+        own = recording == each
+        soak = np.ptp(temperature[own]) < APART
+        rate[own & (np.abs(rate) < (np.inf if soak else _STILL * np.abs(rate[own]).max()))] = 0.0
+    return rate
+
+
+def drift_of(problem: Problem, solution: Solution, tau: float | None) -> Drift:
+    """Fit lag and loops beside the laws of a solution, and test each given the other."""
+    reason = why_lag_is_unobservable(problem.temperature, problem.rate, solution, solution.laws.size, len(problem.free))
+    if reason == "" and problem.side is not None and len(np.unique(problem.side[problem.side != 0])) == 2:
+        return _of_soaks(problem, solution, tau)
+    if reason is not None:
+        return Drift(reason=reason)
+    whole = solve(replace(problem, free=ALL), solution.laws, tau=tau)
+    if not whole.converged:
+        return Drift(reason="the fit of lag and loop beside the laws did not converge")
+    return tested(whole, solution.laws.size)
+
+
+def tested(whole: Solution, size: int) -> Drift:
+    """Return lag and loops of a solution whose coefficients after the first `size` they are, each tested."""
+    values, covariance = whole.coefficients[size:], whole.covariance[size:, size:]
+    probability = []
+    for part in (slice(0, 1), slice(1, 4)):
+        own = values[part]
+        square = float(own @ np.linalg.solve(covariance[part, part], own)) / len(own)
+        freedom = min(whole.degrees_of_freedom(row) for row in np.eye(size + 4)[size:][part])
+        probability.append(tail(square, len(own), freedom))
+    return Drift(values, covariance, (probability[0], probability[1]))
+
+
+def _of_soaks(problem: Problem, solution: Solution, tau: float | None) -> Drift:
+    """Fit loops beside the laws of soaks that were reached from either side; they say nothing of a lag."""
+    size, loops = solution.laws.size, ALL[1:]
+    if not _told(solution, size, len(problem.free), loops):
+        return Drift(reason="the soaks reached by warming and by cooling do not tell loops and laws apart")
+    whole = solve(replace(problem, free=loops), solution.laws, tau=tau)
+    if not whole.converged:
+        return Drift(reason="the fit of loops beside the laws did not converge")
+    own, covariance = whole.coefficients[size:], np.full((4, 4), np.nan)
+    covariance[1:, 1:] = whole.covariance[size:, size:]
+    square = float(own @ np.linalg.solve(covariance[1:, 1:], own)) / len(own)
+    freedom = min(whole.degrees_of_freedom(row) for row in np.eye(size + 3)[size:])
+    return Drift(np.append(np.nan, own), covariance, (1.0, tail(square, len(own), freedom)))
+
+
+def why_lag_is_unobservable(temperature: Array, rate: Array, solution: Solution, size: int, free: int) -> str | None:
+    """Return why lag and loop are not told: empty where the temperature never drifts, None where they are.
+
+    The solution's columns for what is `free` of them come after the first `size`.
+    """
+    reason = _reason(temperature, rate)
+    if reason is None and not _told(solution, size, free, ALL):
+        return "the holds in which the temperature drifts do not tell lag, loop and laws apart"
+    return reason
+
+
+def _reason(temperature: Array, rate: Array) -> str | None:
+    """Return why the temperatures cannot tell lag from law: empty where they never drift, None where they can."""
+    up, down = (temperature[sign * rate > 0] for sign in (1, -1))
+    if not up.size and not down.size:
+        return ""
+    if not up.size or not down.size:
+        return (
+            f"the recordings only {'warm' if up.size else 'cool'}, which cannot tell a lag behind the thermometer from "
+            "the laws: record the way back too"
+        )
+    both = min(up.max(), down.max()) - max(up.min(), down.min())
+    if both < _SHARED * np.ptp(temperature):
+        return (
+            f"the unit both warms and cools in {max(both, 0.0):.0f} K of {np.ptp(temperature):.0f} K, too "
+            "little to tell a lag behind the thermometer from the laws: record the way back too"
+        )
+    return None
+
+
+def _told(solution: Solution, size: int, free: int, wanted: tuple[int, ...]) -> bool:
+    rows = solution.rows
+    white = whitener(rows, solution.excess**2, solution.scatter.tau)
+    rest = white(np.delete(rows.jacobian, np.s_[size : size + free], axis=1))
+    columns = white(rows.drift[:, list(wanted)])
+    length = np.linalg.norm(columns, axis=0)
+    if not length.min() > 0:
+        return False
+    u, values, _ = np.linalg.svd(rest / np.maximum(np.linalg.norm(rest, axis=0), 1e-300), full_matrices=False)
+    u = u[:, values > 1e-7 * values[0]]
+    columns = columns / length
+    return bool(np.linalg.svd(columns - u @ (u.T @ columns), compute_uv=False)[-1] > _TELLS)
+
+
+def findings(drift: Drift, solution: Solution, name: str) -> list[str]:
+    """Return in words what was found, and what it means for corrected outputs."""
+    if drift.values is None:
+        return [Note(f"{name}: {drift.reason}")] if drift.reason else []
+    assert drift.covariance is not None
+    found, u = [], np.sqrt(np.diag(drift.covariance))
+    if 0 in drift.free:
+        laws = solution.laws
+        slope = laws.slope(np.linspace(laws.low, laws.high, 81)) @ solution.coefficients[: laws.size]
+        lag = float(drift.values[0])
+        who = "biases lag the temperature" if lag > 0 else "the temperature lags the biases"
+        found.append(
+            f"{name}: {who} by {abs(lag):.3g} s (u {u[0]:.2g} s); corrected outputs use none, and are off by up to "
+            f"{1e3 * np.abs(slope[:, :3]).max() * abs(lag) / 60:.2g} mg where it changes by 1 K/min"
+        )
+    if 1 in drift.free:
+        each = ", ".join(f"{axis} {1e3 * h:+.2f}" for axis, h in zip(AXES, drift.values[1:], strict=True))
+        found.append(
+            f"{name}: biases differ between warming and cooling: in the middle of the range they are {each} mg "
+            f"(u {1e3 * u[1:].max():.2g} mg) from their laws in warming, and as much the other way in cooling, which "
+            "corrected outputs keep"
+        )
+    return found
+
+
+def entries(drift: Drift, scale: float, unit: str = "m/s^2") -> dict[str, Any]:
+    """Return ``lag``, ``loop_x`` ... of the record's fit, loops times `scale` in a unit; None where not told."""
+    if drift.values is None:
+        return dict.fromkeys(_NAMES)
+    assert drift.covariance is not None
+    size, u = np.array([1.0, scale, scale, scale]), np.sqrt(np.diag(drift.covariance))
+    return {
+        name: {
+            "value": float(drift.values[k] * size[k]),
+            "standard_uncertainty": float(u[k] * size[k]),
+            "unit": unit if k else "s",
+            "probability": drift.probability[min(k, 1)],
+            "fitted": k in drift.free,
+        }
+        if np.isfinite(u[k])
+        else None
+        for k, name in enumerate(_NAMES)
+    }
+
+
+# What it may cost that the holds do not tell how scale factors follow the temperature, or how biases lag behind it.
+
+
+_USUAL_SLOPES = {1: (STRETCHES, f"{1e6 * STRETCHES:.0f} ppm/K"), 2: (TURNS, f"{1e6 * TURNS:.0f} urad/K")}
+_LAG = 5.0
+"""s, that a sensor on the thermometer's own board may lag behind it."""
+_PLACES = 33
+_WORTH = 0.5
+"""Of the biases' uncertainty: what adds an eighth to it is said."""
+
+
+def bias_shift_from_unobserved(problem: Problem, solution: Solution, drift: Drift, name: str) -> list[str]:
+    """Return what biases may err by, for scale factor, misalignment and lag, where that adds to their uncertainty."""
+    laws, rows = solution.laws, solution.rows
+    groups = [group for group in _USUAL_SLOPES if not laws.degrees[group]]
+    if not groups and not drift.reason:
+        return []
+    white = whitener(rows, solution.excess**2, solution.scatter.tau)
+    jacobian = white(rows.jacobian)
+    inverse = np.linalg.pinv(jacobian, rcond=1e-13)
+    design = laws.design(np.linspace(laws.low, laws.high, _PLACES))[:, :3]
+    covariance = solution.covariance[: laws.size, : laws.size]
+    stated = float(np.sqrt(np.mean(np.einsum("tpc,cd,tpd->tp", design, covariance, design))))
+
+    def error_by(term: Array) -> float:
+        """Return the root mean square error of the biases, over the range, that such terms, (N, k), leave."""
+        shift = inverse @ white(term)
+        beside = white(term) - jacobian @ shift
+        moved = design @ shift[: laws.size]
+        left = np.linalg.inv(np.eye(term.shape[1]) + beside.T @ beside)
+        return float(np.sqrt(np.mean(np.einsum("tpa,ab,tpb->tp", moved, left, moved))))
+
+    temperature = problem.temperature if problem.known is None else np.append(problem.temperature, problem.known[0])
+    place, found = laws.place(temperature)[rows.owner], []  # a prior's owner is -1
+    for group in groups:
+        slope, usual = _USUAL_SLOPES[group]
+        constants = [part.start for part in laws.parts[3 * group : 3 * group + 3]]
+        error = error_by(rows.jacobian[:, constants] * place[:, None] * slope * laws.half)
+        if error > _WORTH * stated:
+            kind = GROUPS[group][0].replace("_", " ")
+            found.append(
+                f"{name}: the holds do not tell whether {kind} follows the temperature, which is taken as constant: "
+                f"one that moves by {usual}, as is usual, errs biases by {1e3 * error:.2g} mg, where their uncertainty "
+                f"is {1e3 * stated:.2g} mg: another axis up while the temperature changes, or attitudes at another "
+                "temperature, would tell"
+            )
+    if drift.reason and (error := error_by(rows.drift[:, :1] * _LAG)) > stated:
+        found.append(
+            f"{name}: the temperature changes fast, and the recordings do not tell a lag behind the thermometer: one "
+            f"of {_LAG:g} s errs biases by {1e3 * error:.2g} mg, where their uncertainty is {1e3 * stated:.2g} mg: let "
+            "it change more slowly, or record the way back too"
+        )
+    return found
+
+
+# Residuals under a record parted in two: what a recording has in common, as power cycles have, and the rest.
+
+
+_SEEN = 1e-6
+
+
+def parted(
+    rows: Rows, whole: Array, noise: Array, unknown: Array, rank: int | None, *, by_share: bool = True
+) -> tuple[float | None, float | None]:
+    """Return the probabilities of the residuals within recordings, and of what each has in common as an offset.
+
+    `whole` and `noise` are covariances with and without laws and power cycles, `unknown` the columns of what each
+    recording leaves free, (N, k). `rank` is that of the offsets that told the scatter between power cycles, 0 where it
+    was stated; where it is None nothing is known of it, and what is in common is not tested. `by_share`: the more of an
+    offset's variance is noise, the more degrees of freedom it has (Satterthwaite); a scatter that came out small by
+    chance makes that share small, too, so that it errs where power cycles move outputs by more than noise does.
+    """
+    from scipy.linalg import solve_triangular
+
+    factor = np.linalg.cholesky(whole)
+
+    def white(columns: Array) -> Array:
+        found: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
+        return found
+
+    turns = _basis(white(unknown))
+    offsets = white(rows.offsets[0])
+    offsets = _basis(offsets - turns @ (turns.T @ offsets))
+    residual = white(rows.residual)
+    residual = residual - turns @ (turns.T @ residual)
+    shared = offsets.T @ residual
+    rest, spare = residual - offsets @ shared, len(residual) - turns.shape[1] - offsets.shape[1]
+    within = chi_square_probability(float(rest @ rest), spare) if spare else None
+    if rank is None or not len(shared):
+        return within, None
+    inner = white(white(noise).T)
+    share = 1 - float(np.trace(offsets.T @ inner @ offsets)) / len(shared) if by_share else 1.0
+    freedom = rank / max(share, 1e-3) ** 2 if rank else np.inf
+    return within, tail(float(shared @ shared) / len(shared), len(shared), freedom)
+
+
+def _basis(columns: Array) -> Array:
+    """Return an orthonormal basis of the columns, shape (n, rank)."""
+    if not columns.shape[1]:
+        return columns
+    u, values, _ = np.linalg.svd(columns, full_matrices=False)
+    kept: NDArray[np.bool_] = values > _SEEN * max(float(values[0]), 1e-300)
+    found: Array = u[:, kept]
+    return found
+
+
+# Do the recordings agree as those of one unit do? What no power cycle explains is said, with who stands apart.
+
+
+_MOVES = 0.002
+"""What biases hardly move by from one power cycle to the next, g."""
+_BENDS = 0.01
+"""The same where few temperatures leave the bends of the law in it."""
+_STRETCHES = 0.005
+"""What scale factors hardly move by."""
+_SCATTERS, _NOISE = 0.25e-3, 4.0
+"""Scatter of |f| within recordings that is asked about: in g, and in units of what the holds' own noise explains."""
+_ENOUGH = 5
+"""Temperatures that show the bends of a law, and recordings of which one can be told to stand apart."""
+_APART = 0.4
+"""Share of their disagreement that the others keep where one recording stands apart."""
+_ATTITUDES = 6
+"""Of a recording whose own scale factors can be told."""
+_CHANCE = 0.005
+"""How often chance lets a recording lie off the others so, in biases or in scale factors."""
+_OFF_BIAS, _OFF_SCALE = 0.5e-3, 3e-4
+"""Less than this is not asked about, in g and in 1."""
+_USUAL = 1e-4
+"""What scale factors may well move by from one power cycle to the next."""
+_HOTTEST = 125.0
+"""degC; sensors are rated to it."""
+
+
+def disagreements(holds: Holds, problem: Problem, solution: Solution, name: str) -> list[str]:
+    """Return what says that recordings are hardly of one unit, mounted alike, at rest, by one thermometer."""
+    bias, scale = solution.scatter.tau.tolist()
+    if not solution.scatter.rank:  # nobody measured it: it was stated
+        bias = 0.0
+    many = int(clusters_of(problem.temperature).max(initial=0)) + 1 >= _ENOUGH
+    differ = [
+        text
+        for size, text in (
+            (bias / (_MOVES if many else _BENDS), f"biases by {1e3 * bias:.3g} mg"),
+            (scale / _STRETCHES, f"scale factors by {100 * scale:.2g} %"),
+        )
+        if size > 1
+    ]
+    rows, found = solution.rows, []
+    own = float(np.median(np.sqrt(np.diag(rows.noise)[rows.magnitude])))
+    scattered = solution.excess > max(_SCATTERS, _NOISE * own)
+    apart = _apart(holds, problem, solution.laws) if differ or scattered else ""
+    if differ and (apart or not solution.scatter.bound):  # a bound holds bends of the law, too
+        found.append(
+            f"{name}: from one recording to the next {' and '.join(differ)} differ, which no power cycle does: are all "
+            f"of one unit, its axes named alike, its temperatures by one thermometer?{apart}"
+        )
+    if scattered:
+        found.append(
+            f"{name}: within recordings |f| scatters by {1e6 * solution.excess:.0f} ug, of which noise explains "
+            f"{1e6 * own:.0f} ug: is a recording of another unit, with axes swapped, or with a jump of its outputs?"
+            f"{'' if differ else apart}"
+        )
+    if not apart:
+        found += _off(holds, problem, solution)
+    if solution.laws.high > _HOTTEST:
+        found.append(
+            f"{name}: temperatures up to {solution.laws.high:.0f} degC, above what sensors are rated to: are these "
+            "degrees Fahrenheit? expected degC or kelvins"
+        )
+    return found
+
+
+def _apart(holds: Holds, problem: Problem, laws: Laws) -> str:
+    """Return which recording the others agree without, as a sentence; nothing where that is none or several."""
+    numbers = np.unique(problem.recording)
+    if len(numbers) < _ENOUGH:
+        return ""
+    left = [_disagreement(_without(problem, problem.recording == number), laws) for number in numbers]
+    order = np.argsort(left)
+    best, second = (left[int(k)] for k in order[:2])
+    if not best < min(_APART * second, _MOVES):
+        return ""
+    return f" Without {holds.recordings[int(numbers[order[0]])].name} the others agree to {1e6 * best:.0f} ug"
+
+
+def _off(holds: Holds, problem: Problem, solution: Solution) -> list[str]:
+    """Return which recording lies far off the laws, by how the others, without it, scatter about theirs.
+
+    Its own offsets of bias, beside the laws, are compared with those of the others by F; of scale factors, which power
+    cycles hardly move, with what noise and the others' scatter allow. Of five recordings under a cubic the others do
+    not tell how far biases scatter: there the scale factors tell it alone.
+    """
+    rows = solution.rows
+    numbers, attitudes = np.unique(problem.recording, return_counts=True)
+    if len(numbers) < _ENOUGH:
+        return []
+    whose = np.where(rows.owner >= 0, problem.recording[rows.owner], -1)
+    asked = []
+    for number in numbers[attitudes >= _ATTITUDES].tolist():
+        if not problem.shared[problem.recording == number].all():
+            continue
+        others = rows_where(rows, whose != number)
+        excess, freedom = excess_of(others, solution.excess**2)
+        scatter, white = between(others, excess), whitener(others, excess, np.zeros(2))
+        own = np.s_[3 * number : 3 * number + 3]
+        stretch, told = max(float(scatter.tau[1]), _USUAL), freedom
+        if stretch > _USUAL:  # few recordings told it
+            bias, scale = (white(given) for given in others.offsets)
+            told = float(len(offset_modes(np.hstack([white(others.jacobian), bias]), scale, white(others.residual))[0]))
+        tests = [(1, np.array([_BENDS, stretch]), told, _OFF_SCALE)]
+        if scatter.rank:
+            tests.append((0, scatter.tau, float(scatter.rank), _OFF_BIAS))
+        for kind, tau, told, least in tests:
+            white = whitener(rows, excess, tau)
+            s, force = offset_modes(white(rows.jacobian), white(rows.offsets[kind][:, own]), white(rows.residual))
+            if not len(s):
+                continue
+            size = float(np.sqrt(np.sum((force / s) ** 2) / 3))
+            chance = len(numbers) * tail(float(np.mean(force**2)), len(s), told)
+            if chance < _CHANCE and size > least:
+                by = f"{1e6 * size:.0f} ppm in scale factors" if kind else f"{1e3 * size:.2g} mg in biases"
+                asked.append((chance, f"{holds.recordings[number].name}: lies off the other recordings by {by}"))
+    return [
+        f"{said}, far more than they differ among themselves: is it of the same unit, at the temperature that it says, "
+        "or have the laws a bend there? come back to that temperature"
+        for _, said in sorted(asked)[:1]
+    ]
+
+
+def _without(problem: Problem, gone: NDArray[np.bool_]) -> Problem:
+    kept = ~gone
+    group = problem.group[kept]
+    tied = group >= 0
+    group[tied] = np.unique(group[tied], return_inverse=True)[1]
+    return replace(
+        problem,
+        reading=problem.reading[kept],
+        covariance=problem.covariance[kept],
+        temperature=problem.temperature[kept],
+        rate=problem.rate[kept],
+        step=problem.step[kept],
+        shared=problem.shared[kept],
+        recording=np.unique(problem.recording[kept], return_inverse=True)[1],
+        group=group,
+        free=(),
+        side=None if problem.side is None else problem.side[kept],
+        wander=None if problem.wander is None else problem.wander[np.ix_(kept, kept)],
+    )
+
+
+def _disagreement(problem: Problem, laws: Laws) -> float:
+    """Return the scatter between and within recordings about polynomials of the highest degrees, g."""
+    limit = max(int(clusters_of(problem.temperature).max(initial=0)) - 1, 0)
+    degrees = (min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit))
+    try:
+        # As if biases moved by much, which a unit among others of its own would otherwise bend the laws by.
+        found = solve(problem, replace(laws, degrees=degrees, knots=()), tau=_BENDS)
+    except np.linalg.LinAlgError:
+        return np.inf
+    if not found.converged:
+        return np.inf
+    return float(np.hypot(found.excess, between(found.rows, found.excess**2).tau[0]))

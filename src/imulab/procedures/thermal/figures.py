@@ -1,24 +1,241 @@
-"""What a thermal record shows: each parameter over temperature with its band, what is left, and how it predicts."""
+"""What a thermal record shows: each parameter over temperature with its band, laws, and gyroscopes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from imulab.procedures.thermal.degrees import spoken_degrees
-from imulab.procedures.thermal.engineering import rows as engineering_rows
-from imulab.procedures.thermal.gyrofigures import gyro_exhibits
-from imulab.procedures.thermal.lag import moved
-from imulab.procedures.thermal.lawfigures import Alone, Curves, law_figure, power_cycles, values_at_middle
+from imulab.procedures.thermal.degrees import moved, spoken_degrees
 from imulab.procedures.thermal.model import AXES, GROUPS
-from imulab.procedures.thermal.record import deviation_of_force, predicted
-from imulab.procedures.thermal.sections import Thermal, thermal_of
+from imulab.procedures.thermal.record import deviation_of_force, gyro_predicted, gyro_scale_predicted, predicted
+from imulab.procedures.thermal.schema import Thermal, thermal_of
+from imulab.procedures.thermal.schema import rows as engineering_rows
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
-from imulab.report.traces import axis, rounded, scatter
-from imulab.units import STANDARD_GRAVITY
+from imulab.report.traces import (
+    BAD,
+    DASHES,
+    GOOD,
+    INK,
+    LEGEND,
+    Exhibits,
+    Figure,
+    ReportTable,
+    band,
+    figure_axis,
+    format_uncertain,
+    plain_number,
+    rounded,
+    scatter,
+)
+from imulab.units import STANDARD_GRAVITY, from_si
+
+# Laws over temperature as figures: the curves, and beneath them how well they are known and what lies off them.
+
+
+COLOURS = (GOOD, "#b58a1b", "#7a5c99")
+SYMBOLS = ("circle", "diamond", "square")
+_UPPER, _LOWER = [0.5, 1.0], [0.0, 0.38]
+"""Shares of the figure's height."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Three laws in the unit of their figure: names, temperatures, degC (n,), values and their u, (3, n)."""
+
+    names: tuple[str, ...]
+    temperature: Array
+    values: Array
+    standard_uncertainty: Array
+
+
+@dataclass(frozen=True)
+class Alone:
+    """What recordings give alone in the same unit: temperatures, degC (m,), values, the laws there and u, (3, m)."""
+
+    temperature: Array
+    values: Array
+    laws: Array
+    standard_uncertainty: Array | None = None
+
+
+def law_figure(
+    title: str, what: str, unit: str, curves: Curves, alone: Alone | None, *, read: str, at_middle: str = ""
+) -> Figure:
+    """Return the figure of three laws.
+
+    Parameters
+    ----------
+    what, unit
+        Of the laws' axis.
+    read
+        How to read band and points.
+    at_middle
+        The values in the middle of the range, in words: the laws are then drawn as changes from these.
+    """
+    temperature, reach = curves.temperature, 2 * curves.standard_uncertainty
+    middle = len(temperature) // 2
+    zero = curves.values[:, middle] if at_middle else np.zeros(len(curves.names))
+    beneath: dict[str, Any] = {"yaxis": "y2", "showlegend": False}
+    traces = []
+    for k, name in enumerate(curves.names):
+        line = {"color": COLOURS[k], "dash": DASHES[k]}
+        around = band(temperature, -reach[k], reach[k], COLOURS[k], **beneath) | {"line": line | {"width": 1}}
+        traces += [
+            scatter(rounded(temperature), rounded(curves.values[k] - zero[k]), "lines", name=name, line=line),
+            around,
+        ]
+        if alone is not None:
+            u = None if alone.standard_uncertainty is None else 2 * alone.standard_uncertainty[k]
+            traces += [
+                own_points(alone.temperature, alone.values[k] - zero[k], None, k, name),
+                own_points(alone.temperature, alone.values[k] - alone.laws[k], u, k, name) | beneath,
+            ]
+    message = (
+        f"The laws are known to {plain_number(float(reach.max()), 2)} {unit} or better (two standard uncertainties)"
+    )
+    if alone is not None:
+        off = plain_number(float(np.abs(alone.values - alone.laws).max()), 2)
+        message += f"; what recordings give alone is up to {off} {unit} off them"
+    changes = f" Change from the value at {temperature[middle]:.3g} degC: {at_middle}." if at_middle else ""
+    plain = {"exponentformat": "none", "automargin": True}
+    return Figure(
+        title=title,
+        message=f"{message}.",
+        caption=f"Above: the laws. Beneath: what is off them, and bands of two standard uncertainties, {read}{changes}",
+        traces=traces,
+        layout={
+            "xaxis": figure_axis("temperature, degC", anchor="y2"),
+            "yaxis": figure_axis(f"{what}, {unit}", domain=_UPPER, **plain),
+            "yaxis2": figure_axis(f"off the law, {unit}", domain=_LOWER, **plain),
+            "legend": LEGEND,
+        },
+        height=560,
+    )
+
+
+def power_cycles(known_from: str) -> str:
+    """Return what bands hold of the scatter between power cycles, known by a record's ``between_recordings.from``."""
+    if known_from == "unknown":
+        return "without what power cycles add, which is not known."
+    return "what power cycles differ by included."
+
+
+def values_at_middle(record: Calibration, names: Sequence[str]) -> str:
+    """Return coefficients of a record in words: as those of powers of T - T0 they are values in the middle."""
+    by_name = {row.name: row for row in engineering_rows(record)}
+    found = [by_name[name] for name in names]
+    each = (f"{row.name[-2:].lstrip('_')} {format_uncertain(row.value, row.standard_uncertainty)[0]}" for row in found)
+    return f"{', '.join(each)} {found[0].unit}"
+
+
+def own_points(temperature: Array, values: Array, reach: Array | None, axis: int, label: str) -> dict[str, Any]:
+    """Return the values of single recordings as points with bars, beside the law of an axis."""
+    bars = {} if reach is None else {
+        "error_y": {"type": "data", "array": rounded(np.abs(reach)), "thickness": 1, "color": COLOURS[axis]}
+    }  # fmt: skip
+    marker = {"symbol": SYMBOLS[axis], "color": COLOURS[axis], "size": 7}
+    return scatter(
+        rounded(temperature), rounded(values), "markers", name=f"{label} alone", showlegend=False, marker=marker, **bars
+    )
+
+
+# What a thermal record shows of its gyroscopes: their biases over temperature with the band, and what is left.
+
+
+def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[str, str]], list[Figure]]:
+    """Return the facts and figures of the gyroscopes of a record over temperatures, degC."""
+    found = thermal_of(record)
+    fit, data = found.fit.gyro, found.data.gyro
+    assert fit is not None
+    assert data is not None
+    values, spread = (from_si(each, "deg/s") for each in gyro_predicted(record, temperature))
+    tau = fit.between_recordings
+    told = f"{plain_number(_hourly(tau.bias.value), 2)} deg/h"
+    told = {"unknown": "not known", "polynomials": f"at most {told}"}.get(tau.from_, f"{told} ({tau.from_})")
+    left = fit.left_out_temperature
+    worst = f"{plain_number(_hourly(max(row.rms for row in left)), 2)} deg/h rms at worst" if left else "–"
+    facts = [
+        ("gyroscope biases", f"known to {plain_number(float(spread.max()) * 3600, 2)} deg/h or better"),
+        ("gyroscope biases, power cycle to power cycle", told),
+        ("gyroscope biases at left-out temperatures", worst),
+    ]
+    if fit.turns is not None:
+        turns = f"{fit.turns.turns}, missed by {plain_number(np.degrees(fit.turns.rms.value), 2)} deg rms"
+        facts.append(("turns", turns))
+        if not found.model.gyro_laws.degrees[1]:
+            # A law that nothing could bend is no figure over temperature.
+            scale, u = gyro_scale_predicted(record, temperature)
+            known = plain_number(1e6 * float((u / np.abs(scale)).max()), 2)
+            told = f"known to {known} ppm where the turns were, and taken as the same at all temperatures"
+            facts.append(("gyroscope scale factors", told))
+    residual = from_si(np.array(data.residual), "deg/h")
+    points = [
+        scatter(rounded(np.array(data.temperature)), rounded(residual[:, k], 4), "markers", name=name,
+                marker={"symbol": SYMBOLS[k], "color": COLOURS[k], "size": 7})
+        for k, name in enumerate(AXES)
+    ]  # fmt: skip
+    place = figure_axis("temperature, degC")
+    figures = [
+        law_figure(
+            "Bias of the gyroscopes over temperature",
+            "bias",
+            "deg/s",
+            Curves(AXES, temperature, values, spread),
+            _recordings(record),
+            read=power_cycles(tau.from_) + " Points: the mean of each recording that stayed at its temperature.",
+        ),
+        Figure(
+            title="What the laws leave of the gyroscopes at rest",
+            caption="Law less output of each hold. A recording whose points lie together away from zero is a power "
+            "cycle whose biases are offset; within it they scatter by noise, the Earth's rate (15 deg/h) and drift.",
+            traces=points,
+            layout={"xaxis": place, "yaxis": figure_axis("law less output, deg/h"), "legend": LEGEND},
+        ),
+    ]
+    if fit.turns is not None and found.model.gyro_laws.degrees[1]:
+        figures.insert(1, _scale_factors(record, temperature, fit.turns.recordings))
+    return facts, figures
+
+
+def _recordings(record: Calibration) -> Alone | None:
+    """Return the mean bias of each recording that stayed at its temperature, deg/s; None where there are none."""
+    data = thermal_of(record).data.gyro
+    assert data is not None
+    steady = np.array(data.rate) == 0
+    names, index = np.unique(np.array(data.recording)[steady], return_inverse=True)
+    if not len(names):
+        return None
+    at = np.array(data.temperature)[steady]
+    laws = gyro_predicted(record, at)[0]
+    values = laws - np.array(data.residual).reshape(-1, 3)[steady].T
+    mean = np.array([np.bincount(index, weights=each) for each in (at, *values, *laws)]) / np.bincount(index)
+    return Alone(mean[0], from_si(mean[1:4], "deg/s"), from_si(mean[4:], "deg/s"))
+
+
+def _scale_factors(record: Calibration, temperature: Array, recordings: int) -> Figure:
+    values, spread = gyro_scale_predicted(record, temperature)
+    factors = 1e6 / np.abs(values[:, [len(temperature) // 2]])
+    return law_figure(
+        "Scale factor of the gyroscopes over temperature",
+        "scale factor",
+        "ppm",
+        Curves(AXES, temperature, factors * values, factors * spread),
+        None,
+        read=f"from turns in {recordings} recordings.",
+        at_middle=values_at_middle(record, [f"gyro_scale_factor_{axis}" for axis in AXES]),
+    )
+
+
+def _hourly(rate: float) -> float:
+    return float(from_si(rate, "deg/h"))
+
+
+# What a thermal record shows: each parameter over temperature with its band, what is left, and how it predicts.
+
 
 _POINTS = 81
 _MANY, _PARTS, _FEWEST = 60, 9, 3
@@ -168,8 +385,8 @@ def _of_force(record: Calibration, found: Thermal, temperature: Any) -> Figure:
         ),
         traces=traces,
         layout={
-            "xaxis": axis("temperature, degC"),
-            "yaxis": axis("standard deviation, µg", rangemode="tozero"),
+            "xaxis": figure_axis("temperature, degC"),
+            "yaxis": figure_axis("standard deviation, µg", rangemode="tozero"),
             "legend": LEGEND,
         },
     )
@@ -203,8 +420,8 @@ def _residuals(found: Thermal) -> Figure:
         "loop that is significant is taken out here, while corrected outputs keep it.",
         traces=traces,
         layout={
-            "xaxis": axis("temperature, degC"),
-            "yaxis": axis("|f| - g, µg"),
+            "xaxis": figure_axis("temperature, degC"),
+            "yaxis": figure_axis("|f| - g, µg"),
             "legend": LEGEND,
             "showlegend": True,
         },

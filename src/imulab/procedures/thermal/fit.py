@@ -9,25 +9,23 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from imulab.earth import EarthRate, at_latitude
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import Observability
-from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Record, as_record, as_recording
-from imulab.procedures.result import Result
-from imulab.procedures.thermal.checks import check_holds, prepared
-from imulab.procedures.thermal.choices import further_of, laws_of
-from imulab.procedures.thermal.degrees import Degrees, LeftOut, Step, choose
-from imulab.procedures.thermal.gyro import fit_gyroscopes
-from imulab.procedures.thermal.gyroholds import check_gyroscopes, rates_at_rest
-from imulab.procedures.thermal.gyrorecord import with_gyroscopes
-from imulab.procedures.thermal.gyroscale import nominal_output, scale_from_turns
-from imulab.procedures.thermal.holds import Holds, find_holds, sides
-from imulab.procedures.thermal.lag import drift_of, moving
+from imulab.gravity import EarthRate, Gravity, at_latitude, at_place, local_gravity
+from imulab.procedures.result import Record, Result, as_record, as_recording
+from imulab.procedures.thermal import further_of, laws_of
+from imulab.procedures.thermal.degrees import Degrees, LeftOut, Step, choose, drift_of, moving
+from imulab.procedures.thermal.gyro import (
+    check_gyroscopes,
+    fit_gyroscopes,
+    nominal_output,
+    rates_at_rest,
+    scale_from_turns,
+)
+from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepared, sides
 from imulab.procedures.thermal.model import GROUPS, Laws, forces
-from imulab.procedures.thermal.record import make_record
-from imulab.procedures.thermal.rows import Problem
-from imulab.procedures.thermal.solve import Solution
+from imulab.procedures.thermal.record import make_record, with_gyroscopes
+from imulab.procedures.thermal.solve import Problem, Solution
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array

@@ -1,26 +1,45 @@
-"""The gyroscopes over temperature: the bias from all holds at rest, linear, with the accelerometers' nuisances.
+"""The gyroscopes over temperature.
 
-    M / S = b(T) + G f + W + offset of the power cycle,   b(T) as in `imulab.procedures.thermal.model`
+Their bias from holds at rest, with the Earth's rate, and scale factors and misalignment from turns.
 
-W is the Earth's rate: what is known of it, and what counts as random, is in `imulab.procedures.thermal.gyroearth`.
+Its vertical part v is the same along up in all holds, as a g-sensitivity is. Without a latitude v is one unknown of
+all, of variance EARTH^2 / 3: the mean over all directions of the Earth's axis. The level part takes another heading in
+each attitude; it is known by its size alone.
+
+A turn about the vertical moves no accelerometer, so the gyroscopes' own stillness decides which samples count.
+
+M / S = b(T) + G f + W + offset of the power cycle,   b(T) as in `imulab.procedures.thermal.model`
+
+W is the Earth's rate: what is known of it, and what counts as random, is in `imulab.procedures.thermal.gyro`.
 Errors of the temperature, offsets between power cycles (tau) and what holds scatter by beyond their noise are those of
 `imulab.procedures.thermal.solve`. The g-sensitivity G, the same at all temperatures, is fitted where it is significant
 at 1 % (F).
+
+Each tumble tells them at its temperature as `imulab.fit_gyro` does, with their covariance. Polynomials through these,
+each weighed by it, are the joint estimate: recordings share no turn. Misalignment is constant, the scale factor too,
+or of degree 1 where there are turns at three temperatures.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.earth import EARTH
-from imulab.errors import ObservabilityError
-from imulab.estimation.ranked import MAD_TO_SIGMA
-from imulab.procedures.thermal.choices import DEGREES, LEAST_KNOTS
+from imulab.columns import triad
+from imulab.device.unit import DeviceUnit
+from imulab.display import Bad, Note
+from imulab.errors import DataError, ObservabilityError, SegmentError, UnitError
+from imulab.estimation.least_squares import chi_square_probability
+from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
+from imulab.gravity import EARTH, EarthRate
+from imulab.procedures.thermal import DEGREES, FOLLOWED, LEAST_KNOTS, STRETCHES, TURNED
 from imulab.procedures.thermal.degrees import (
+    ALL,
     Degrees,
+    Drift,
     LeftOut,
     bends,
     bounded,
@@ -28,20 +47,245 @@ from imulab.procedures.thermal.degrees import (
     knots_at,
     left_out,
     may_be_taken,
+    moving,
     predicts,
     rms_of,
     splits,
     step_down,
+    tested,
     wald,
+    why_lag_is_unobservable,
 )
-from imulab.procedures.thermal.gyroearth import earth_at_rest
-from imulab.procedures.thermal.gyroholds import RatesAtRest
-from imulab.procedures.thermal.holds import Holds
-from imulab.procedures.thermal.lag import ALL, Drift, tested, untold
-from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.rows import Rows, one_hot, whitener
-from imulab.procedures.thermal.solve import Scatter, Solution, between, concluded, excess_of
-from imulab.recording import Array
+from imulab.procedures.thermal.device import tables_of
+from imulab.procedures.thermal.holds import Cut, Holds, averaged, pooled
+from imulab.procedures.thermal.model import AXES, Laws, forces
+from imulab.procedures.thermal.solve import (
+    Problem,
+    Rows,
+    Scatter,
+    Solution,
+    between,
+    concluded,
+    excess_of,
+    one_hot,
+    whitener,
+)
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.gyro.rest import beyond_range
+from imulab.procedures.tumble.gyro.solve import Case, Solved, solve_turns, turn_covariance
+from imulab.procedures.tumble.gyro.turns import by_directions, model, shared_covariance
+from imulab.recording import Array, Recording, check_finite
+from imulab.records.calibration import Calibration
+from imulab.units import parse_unit, to_si
+
+# The Earth's rate in gyroscopes at rest: what is known of it, what all holds share, and what is new in each
+# attitude.
+
+
+VERTICAL = EARTH / np.sqrt(3)
+"""Standard deviation of v without a latitude, rad/s; that of each level component is as large."""
+_ASKEW_SHARE = 0.03
+"""Part of the Earth's rate that is sensed across itself: gyroscopes are askew, or their scale factors off, by that."""
+
+
+def new_in_each(up: Array, earth: EarthRate | None) -> Array:
+    """Return columns of unit variance for what each attitude has of its own, rad/s, shape (n, 3, 3); `up` is (n, 3)."""
+    along = up[:, :, None] * up[:, None, :]
+    level = VERTICAL if earth is None else earth.level / np.sqrt(2)
+    found: Array = level * (np.eye(3) - along) + _ASKEW_SHARE * EARTH * along
+    return found
+
+
+def earth_at_rest(force: Array, attitude: NDArray[np.int64], earth: EarthRate | None) -> tuple[Array, Array]:
+    """Return what is known of the Earth's rate, (3 n,), and columns of unit variance for what is not, (3 n, k).
+
+    Under specific forces (n, 3); `attitude` is the number of the attitude of each hold, (n,).
+    """
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    own = np.einsum("nk,nij->nikj", one_hot(attitude), new_in_each(up, earth)).reshape(up.size, -1)
+    if earth is None:
+        return np.zeros(up.size), np.hstack([own, VERTICAL * up.reshape(-1, 1)])
+    return (earth.vertical * up).ravel(), own
+
+
+# The gyroscopes in the holds of the accelerometers: mean outputs while they, too, were still.
+
+
+_COLUMNS = triad("gyro")
+_STILL = 5.0
+_QUIET = 0.75
+_FEWEST = 12
+_LARGEST = np.radians(60.0)
+"""No gyroscope that anyone calibrates has a larger bias, rad/s."""
+
+
+@dataclass(frozen=True)
+class RatesAtRest:
+    """Holds in which the gyroscopes were still.
+
+    Attributes
+    ----------
+    mean, covariance
+        Mean outputs, shape (n, 3), and their covariances, (n, 3, 3), in rad/s by the nominal scale factors.
+    force
+        Specific force, in g, shape (n, 3).
+    temperature, rate, step, shared, recording
+        As in `Holds`, shape (n,).
+    attitude
+        Number of the attitude: cuts of one hold share it, shape (n,).
+    index
+        Place among the holds, shape (n,).
+    unit
+        Of the outputs, as read.
+    size
+        Nominal output per rad/s that the means are in units of, shape (3,): 1 where the unit is one of rate.
+    notes
+        What a user should know of how they were found.
+    earth
+        The Earth's rate, where the latitude is known.
+    """
+
+    mean: Array
+    covariance: Array
+    force: Array
+    temperature: Array
+    rate: Array
+    step: Array
+    shared: NDArray[np.bool_]
+    recording: NDArray[np.int64]
+    attitude: NDArray[np.int64]
+    index: NDArray[np.int64]
+    unit: str
+    size: Array
+    notes: tuple[str, ...]
+    earth: EarthRate | None = None
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    def part(self, kept: NDArray[np.bool_]) -> RatesAtRest:
+        """Return some of the holds."""
+        return RatesAtRest(
+            self.mean[kept], self.covariance[kept], self.force[kept], self.temperature[kept], self.rate[kept],
+            self.step[kept], self.shared[kept], self.recording[kept], self.attitude[kept], self.index[kept],
+            self.unit, self.size, self.notes, self.earth,
+        )  # fmt: skip
+
+
+def check_gyroscopes(recordings: Sequence[Recording]) -> str:
+    """Return the unit of the gyroscopes of all recordings.
+
+    Raises
+    ------
+    DataError
+        One has none, or no time.
+    UnitError
+        Their units differ.
+    """
+    for recording in recordings:
+        missing = [name for name in _COLUMNS if name not in recording]
+        if missing:
+            raise DataError(
+                f"{recording.name}: no column {missing[0]}; found {' '.join(recording.columns)}: expected the "
+                "gyroscopes in every recording, or no --with gyro"
+            )
+        if recording.time is None:
+            raise DataError(
+                f"{recording.name}: a table of attitudes; expected a recording with a column time for --with gyro, "
+                "since the gyroscopes tell when they were still"
+            )
+    first = recordings[0].triad_unit("gyro")
+    for recording in recordings:
+        if recording.triad_unit("gyro") != first:
+            raise UnitError(
+                f"{recording.name}: columns gyro_x gyro_y gyro_z are in {recording.triad_unit('gyro')}, but in {first} "
+                f"in {recordings[0].name}; expected one unit"
+            )
+    return first
+
+
+def output_in(recording: Recording, size: Array) -> Array:
+    """Return the outputs in rad/s by nominal scale factors, output per rad/s for what is no rate, shape (n, 3)."""
+    unit, output = recording.triad_unit("gyro"), recording.triad("gyro")
+    return (to_si(output, unit) if parse_unit(unit).quantity == "rate" else output) / size
+
+
+def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
+    """Average the gyroscopes over the holds, under specific forces in g, shape (n, 3), by nominal scale factors (3,).
+
+    Raises
+    ------
+    DataError
+        There are none, an axis is dead, or turns all the time.
+    UnitError
+        Their units differ between recordings.
+    """
+    unit = check_gyroscopes(holds.recordings)
+    cuts: list[Cut | None] = [None] * len(holds)
+    notes: list[str] = []
+    for number, recording in enumerate(holds.recordings):
+        check_finite(recording, _COLUMNS)
+        left_out = leave_out(recording, _COLUMNS)
+        output = output_in(left_out.recording, size)
+        own = np.flatnonzero(holds.recording == number)
+        rest, found, moved = _still_cuts(holds, own, output, recording)
+        notes += [f"gyro: {recording.name}: {note}" for note in left_out.notes(rest)] + moved
+        for index, cut in zip(own.tolist(), found, strict=True):
+            cuts[index] = cut
+    kept = np.array([cut is not None for cut in cuts])
+    averages = [cut for cut in cuts if cut is not None]
+    if not averages:
+        raise DataError(f"{holds.recordings[0].name}: columns gyro_x gyro_y gyro_z: they turn in every hold")
+    mean = np.array([cut.mean for cut in averages])
+    if np.abs(np.median(mean, axis=0)).max() > _LARGEST:
+        worst = int(np.argmax(np.abs(np.median(mean, axis=0))))
+        raise DataError(
+            f"{holds.recordings[0].name}: column {_COLUMNS[worst]}: "
+            f"{np.degrees(np.median(mean[:, worst])):.3g} deg/s at rest; expected a bias below "
+            f"{np.degrees(_LARGEST):.0f} deg/s: is the unit {unit} wrong?"
+        )
+    alone = holds.group < 0
+    attitude = np.where(alone, len(holds) + np.arange(len(holds)), holds.group)
+    return RatesAtRest(
+        mean, pooled(averages), force[kept], holds.temperature[kept], moving(holds)[kept], holds.step[kept],
+        holds.shared[kept], holds.recording[kept], attitude[kept], np.flatnonzero(kept), unit, size, tuple(notes),
+    )  # fmt: skip
+
+
+def _still_cuts(
+    holds: Holds, own: NDArray[np.intp], output: Array, recording: Recording
+) -> tuple[NDArray[np.bool_], list[Cut | None], list[str]]:
+    """Return the samples at rest, the average of each hold of a recording or None where it turned, and what is said."""
+    time, temperature = recording.time, recording.si("temperature")
+    assert time is not None
+    first = np.searchsorted(time, holds.start[own])
+    last = np.searchsorted(time, holds.stop[own], side="right")
+    rest = np.zeros(len(time), dtype=np.bool_)
+    pieces = [slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
+    for piece in pieces:
+        rest[piece] = True
+    if (np.ptp(output[rest], axis=0) == 0).any():
+        name = _COLUMNS[int(np.argmin(np.ptp(output[rest], axis=0)))]
+        raise DataError(f"{recording.name}: column {name}: the same output in every sample at rest: a dead axis")
+    median = [np.median(output[piece], axis=0) for piece in pieces]
+    spread = [np.median(np.abs(output[piece] - m), axis=0) for piece, m in zip(pieces, median, strict=True)]
+    steps = [np.diff(np.unique(column)) for column in output[rest].T]
+    sigma = np.maximum(MAD_TO_SIGMA * np.median(spread, axis=0), [step.min() for step in steps])
+    found: list[Cut | None] = []
+    notes = []
+    for index, piece, m in zip(own.tolist(), pieces, median, strict=True):
+        still = (np.abs(output[piece] - m) <= _STILL * sigma).all(axis=1)
+        if still.sum() < max(_QUIET * len(still), _FEWEST):
+            notes.append(f"gyro: {holds.label(index)} left out: the gyroscopes turn, which accelerometers do not see")
+            found.append(None)
+            continue
+        kept = np.flatnonzero(still) + piece.start
+        found.append(averaged(output[kept], temperature[kept], time[kept], 0, len(kept), index))
+    return rest, found, notes
+
+
+# The gyroscopes over temperature: the bias from all holds at rest, linear, with the accelerometers' nuisances.
+
 
 _PASSES = 4
 _SIGNIFICANT = 0.01
@@ -221,7 +465,7 @@ def _lower(solution: Solution, cluster: NDArray[np.int64]) -> Laws | None:
 def _drift(held: RatesAtRest, solution: Solution, sensitivity: bool, tau: float | None) -> Drift:
     """Return lag and loops of the biases, each tested given the other."""
     size = len(solution.coefficients)
-    reason = untold(held.temperature, held.rate, solution, size, 0)
+    reason = why_lag_is_unobservable(held.temperature, held.rate, solution, size, 0)
     if reason is not None:
         return Drift(reason=reason)
     whole = solve(held, solution.laws, tau, sensitivity=sensitivity, free=ALL)
@@ -331,3 +575,338 @@ def notes_on_turns(holds: Holds, aside: NDArray[np.int64]) -> list[str]:
         f"gyro: {holds.label(index)} left out: its outputs differ from the others of its recording: the unit turned"
         for index in aside.tolist()
     ]
+
+
+# Scale factors and misalignment of the gyroscopes: from the turns of each recording, then as laws of the
+# temperature.
+
+
+CRYSTAL = 50e-6
+"""Standard uncertainty of the rate of the clock that all recordings are timed by."""
+_WORST = 0.1
+_LARGE_MISS, _ASKEW = 2.0, 0.2  # deg, rad
+
+
+@dataclass(frozen=True)
+class Turned:
+    """What the turns of a recording say: scale factors and misalignments (9,), and how they miss.
+
+    Their covariance (9, 9), and their derivatives by what all share: the coefficients of the accelerometers' laws and
+    the g-sensitivities, (9, c).
+    """
+
+    values: Array
+    covariance: Array
+    by_shared: Array
+    temperature: float
+    turns: int
+    cost: float
+
+
+@dataclass(frozen=True)
+class ScaleLaws:
+    """Scale factors in units of the nominal ones, then misalignments: coefficients, covariance, and how they agree.
+
+    `laws` have the degrees (0, that of the scale factor, 0); `freedom` is that of the chi-square of the recordings.
+    """
+
+    laws: Laws
+    coefficients: Array
+    covariance: Array
+    recordings: int
+    turns: int
+    miss: float
+    chi_square: float
+    freedom: int
+    notes: tuple[str, ...]
+
+    @property
+    def degree(self) -> int:
+        """Of the scale factor."""
+        return self.laws.degrees[1]
+
+    def functions(self, temperature: Array) -> Array:
+        """Return the functions of the scale factors' laws, shape (n, degree + 1)."""
+        place = self.laws.place(temperature)
+        return np.asarray(np.polynomial.chebyshev.chebvander(place, self.degree), dtype=np.float64)
+
+    def scale_at(self, temperature: Array) -> Array:
+        """Return the scale factors, shape (n, 3)."""
+        rows = self.coefficients[:-6].reshape(3, -1)
+        found: Array = self.functions(temperature) @ rows.T
+        return found
+
+
+def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
+    """Return the output per rad/s to start from, shape (3,): that of the unit, or of the turns where it is no rate.
+
+    Raises
+    ------
+    DataError
+        The unit is no rate, and there are no turns.
+    """
+    if parse_unit(unit).quantity == "rate":
+        return np.ones(3)
+    found, why = [], "no recording has nine attitudes"
+    for number, attitudes in enumerate(holds.attitudes):
+        if not _turns(attitudes):
+            continue
+        try:
+            solved = solve_turns(*_case(holds, number, record, np.ones(3), None, unit), "auto")
+        except SegmentError as error:
+            why = str(error)
+            continue
+        found.append(solved.scale * (1 + solved.theta[:3]))
+    if not found:
+        raise DataError(
+            f"{holds.recordings[0].name}: columns gyro_x gyro_y gyro_z are in {unit}, of which turns between attitudes "
+            f"tell the scale; expected a tumble of {TURNED} attitudes or more: {why}"
+        )
+    return np.asarray(np.mean(found, axis=0), dtype=np.float64)
+
+
+def _turns(attitudes: Attitudes) -> bool:
+    """Whether a recording has attitudes enough for turns to tell anything; one that rests while it drifts has one."""
+    return attitudes.pieces is not None and len(np.unique(attitudes.pieces[:, 2])) >= TURNED
+
+
+def scale_from_turns(
+    holds: Holds, problem: Problem, solution: Solution, record: Calibration, gyros: Gyroscopes, reading: Array
+) -> ScaleLaws | None:
+    """Return the laws of scale factors and misalignments, None where no recording tells them.
+
+    Raises
+    ------
+    DataError
+        The turns miss the change of gravity's direction by far: swapped or reversed axes.
+
+    Parameters
+    ----------
+    record
+        Of the accelerometers.
+    gyros
+        Biases and g-sensitivities at nominal scale factors.
+    reading
+        Output of the accelerometers per unit of `problem`, shape (3,).
+    """
+    found: list[Turned] = []
+    notes: list[str] = []
+    for number, attitudes in enumerate(holds.attitudes):
+        if not _turns(attitudes):
+            continue
+        case, time = _case(holds, number, record, gyros.held.size, gyros, "rad/s")
+        try:
+            solved = solve_turns(case, time, "no")
+        except SegmentError as error:
+            notes.append(Note(f"gyro: no scale factors from {error}"))
+            continue
+        notes += [f"{holds.recordings[number].name}: {note}" for note in solved.notes]
+        freedom = 2 * len(solved.segments.start) - solved.theta.size
+        if freedom < 1 or not solved.converged:
+            notes.append(Note(f"gyro: {case.name}: its turns do not tell scale factors and misalignment apart"))
+            continue
+        temperature = _temperature(holds, number, attitudes)
+        found.append(
+            _turned(solved, _directions(problem, solution, attitudes, reading, temperature), temperature, freedom)
+        )
+    if not found:
+        return None
+    known = block_diagonal(
+        solution.covariance[: solution.laws.size, : solution.laws.size],
+        gyros.solution.covariance[gyros.size : gyros.count, gyros.size : gyros.count]
+        if gyros.sensitivity
+        else np.zeros((9, 9)),
+    )
+    return _laws(found, known, solution.laws, notes)
+
+
+def _turned(solved: Solved, directions: tuple[Array, Array], temperature: Array, freedom: int) -> Turned:
+    """Return what the turns of one recording say; `directions` as of `_directions`."""
+    own, moved = directions
+    segments, jacobian = solved.segments, solved.jacobian
+    shared = shared_covariance(segments, solved.scale, solved.theta, own, solved.rest.zero_uncertainty)
+    size = np.concatenate([solved.scale, np.ones(6)])
+    values = solved.theta * size
+    values[:3] += solved.scale
+    matrix = turn_covariance(solved, shared, freedom)[0]
+    slope = by_directions(segments, solved.scale, solved.theta, len(moved) // 3) @ moved
+    slope = np.hstack([slope, _by_sensitivity(solved)])
+    by_coefficients = -size[:, None] * np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ slope)
+    turns, cost = len(segments.start), float(solved.residual @ solved.residual)
+    matrix = matrix * np.outer(size, size)
+    return Turned(values, matrix, by_coefficients, float(temperature.mean()), turns, cost)
+
+
+def _by_sensitivity(solved: Solved) -> Array:
+    """Return the derivatives of the residuals by the g-sensitivities that were taken off, rad per rad/s/g, (3 m, 9).
+
+    They act as a zero that is theirs times the force: half-way in a turn, less its mean over the holds, which is in the
+    zero at rest.
+    """
+    segments, m = solved.segments, len(solved.segments.start)
+    zero = model(segments, solved.scale, np.concatenate([solved.theta[:9], np.zeros(3)]), fit_bias=True)[1][:, 9:]
+    middle = 0.5 * (segments.before + segments.after)
+    felt = (zero / solved.scale).reshape(m, 3, 3, 1) * (middle - middle.mean(axis=0))[:, None, None, :]
+    return np.asarray(felt.reshape(3 * m, 9), dtype=np.float64)
+
+
+def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> ScaleLaws:
+    """Return the polynomials through what each recording says; `known` is the covariance of what all share."""
+    temperature = np.array([each.temperature for each in found])
+    degree = 1 if clusters_of(temperature).max() + 1 >= FOLLOWED else 0
+    laws = Laws(over.low, over.high, (0, degree, 0))
+    functions = np.polynomial.chebyshev.chebvander(laws.place(temperature), degree)
+    size, n = 3 * (degree + 1), len(found)
+    design = np.zeros((n, 9, size + 6))
+    design[:, :3, :size] = np.einsum("ij,nk->nijk", np.eye(3), functions).reshape(n, 3, size)
+    design[:, 3:, size:] = np.eye(6)
+    rows: Array = design.reshape(9 * n, size + 6)
+    values = np.concatenate([each.values for each in found])
+    by_coefficients = np.vstack([each.by_shared for each in found])
+    whole = by_coefficients @ known @ by_coefficients.T
+    for k, each in enumerate(found):
+        own = slice(9 * k, 9 * k + 9)
+        whole[own, own] += each.covariance
+    weight = np.linalg.inv(whole)
+    matrix = np.linalg.inv(rows.T @ weight @ rows)
+    coefficients = matrix @ (rows.T @ weight @ values)
+    left = values - rows @ coefficients
+    square = float(left @ weight @ left)
+    freedom = 9 * len(found) - len(coefficients)
+    if freedom and chi_square_probability(square, freedom) < _SIGNIFICANT:
+        notes.append(
+            f"gyro: the scale factors of {len(found)} recordings differ by more than their uncertainties explain "
+            f"(chi-square {square:.0f} of {freedom}), which are widened: turn at more temperatures, and further"
+        )
+        matrix = matrix * square / freedom
+    common = np.concatenate([coefficients[:size], np.zeros(6)]) * CRYSTAL
+    matrix = matrix + np.outer(common, common)
+    if not degree:
+        notes += _constant(float(temperature.mean()), over, float(np.sqrt(np.diag(matrix)[:3].max())))
+    middle = coefficients[: size : degree + 1] - 1
+    if np.abs(middle).max() > _WORST:
+        off = " ".join(f"{100 * value:+.3g}" for value in middle)
+        notes.append(
+            Bad(f"gyro: the scale factors are off by {off} % (x y z): is the unit, or the sample rate, wrong?")
+        )
+    turns = sum(each.turns for each in found)
+    miss = float(np.sqrt(sum(each.cost for each in found) / turns))
+    if np.degrees(miss) > _LARGE_MISS or np.abs(coefficients[size:]).max() > _ASKEW:
+        notes.append(
+            Bad(
+                f"gyro: the turns miss the change of gravity's direction by {np.degrees(miss):.2g} deg rms, with axes "
+                f"askew by up to {1e3 * np.abs(coefficients[size:]).max():.0f} mrad: swapped or reversed axes?"
+            )
+        )
+    return ScaleLaws(laws, coefficients, matrix, len(found), turns, miss, square, freedom, tuple(notes))
+
+
+def _constant(temperature: float, over: Laws, stated: float) -> list[str]:
+    """Return what scale factors told at about one temperature may be off by elsewhere, if it counts beside `stated`."""
+    end = max(over.low, over.high, key=lambda each: abs(each - temperature))
+    off = STRETCHES * abs(end - temperature)
+    if off < 0.5 * stated:
+        return []
+    return [
+        f"gyro: turns at about {temperature:.0f} degC do not tell whether scale factors follow the temperature, which "
+        f"are taken as constant: one that moves by {1e6 * STRETCHES:.0f} ppm/K, as is usual, is off by "
+        f"{1e6 * off:.0f} ppm at {end:.0f} degC, where its uncertainty is {1e6 * stated:.0f} ppm: turn the unit at "
+        f"{FOLLOWED} temperatures or more"
+    ]
+
+
+def _temperature(holds: Holds, number: int, attitudes: Attitudes) -> Array:
+    """Return the mean temperature of each attitude, degC."""
+    recording = holds.recordings[number]
+    time, temperature = recording.si("time"), recording.si("temperature")
+    total = np.concatenate([[0.0], np.cumsum(temperature)])
+    first, last = np.searchsorted(time, attitudes.start), np.searchsorted(time, attitudes.stop, side="right")
+    found: Array = (total[last] - total[first]) / (last - first)
+    return found
+
+
+def _case(
+    holds: Holds, number: int, record: Calibration, size: Array, gyros: Gyroscopes | None, unit: str
+) -> tuple[Case, Array]:
+    """Return the turns of one recording, its biases and g-sensitivities taken off, and the times of its samples."""
+    recording, attitudes = holds.recordings[number], holds.attitudes[number]
+    kept = leave_out(recording, triad("gyro")).recording
+    time, temperature = recording.si("time"), recording.si("temperature")
+    unit_of = DeviceUnit.of(tables_of(record)[0])
+    force = np.column_stack(unit_of.thermal(_temperature(holds, number, attitudes), list(attitudes.mean.T))[0])
+    own = np.column_stack(unit_of.thermal(temperature, list(recording.triad("accel").T))[0])
+    output = output_in(kept, size)
+    if gyros is not None:
+        clipped = beyond_range(output)
+        output = output - gyros.at_rest(temperature)
+        if gyros.sensitivity:
+            output = output - own @ gyros.sensitivities(record.model["gravity"]["value"]).T
+        output[clipped] = 2 * np.abs(output).max()  # what was cut off stays so, and is left out with its turn
+    knocked: NDArray[np.bool_] = np.zeros(len(attitudes), dtype=np.bool_)
+    case = Case(recording.name, attitudes, force, time, own, output, unit, fit_bias=False, knocked=knocked)
+    return case, time
+
+
+def _directions(
+    problem: Problem, solution: Solution, attitudes: Attitudes, reading: Array, temperature: Array
+) -> tuple[Array, Array]:
+    """Return the covariance of the attitudes' upward directions, rad^2, (3 n, 3 n), but for the accelerometers' laws.
+
+    And how they move with the coefficients of these, (3 n, c).
+    """
+    n, size = len(attitudes), solution.laws.size
+    design = solution.laws.design(temperature)
+    parameters = design @ solution.coefficients[:size]
+    force, change = forces(parameters, attitudes.mean / reading)
+    moved = np.einsum("nij,njc->nic", change, design)
+    offset = solution.scatter.tau[0] * change[:, :, :3].reshape(3 * n, 3)
+    joint = (offset @ offset.T).reshape(n, 3, n, 3)
+    if attitudes.covariance is not None:
+        sensed = -change[:, :, :3] / parameters[:, None, 3:6]
+        own = np.einsum("nij,njk,nlk->nil", sensed, attitudes.covariance / np.outer(reading, reading), sensed)
+        joint[range(n), :, range(n), :] += own + solution.excess**2 * np.eye(3)
+    length = np.linalg.norm(force, axis=1)
+    up = force / length[:, None]
+    across = (np.eye(3) - up[:, :, None] * up[:, None, :]) / length[:, None, None]
+    found: Array = np.einsum("nij,njmk,mlk->niml", across, joint, across, optimize=True).reshape(3 * n, 3 * n)
+    return found, (across @ moved).reshape(3 * n, size)
+
+
+def rescaled(gyros: Gyroscopes, scale: ScaleLaws) -> Gyroscopes:
+    """Return biases and g-sensitivities of outputs over these scale factors, whose uncertainty is not in them yet."""
+    factor = 1 / scale.scale_at(gyros.held.temperature)
+    held = replace(
+        gyros.held,
+        mean=gyros.held.mean * factor,
+        covariance=gyros.held.covariance * factor[:, :, None] * factor[:, None, :],
+    )
+    return gyros.again(held)
+
+
+def block_diagonal(first: Array, second: Array) -> Array:
+    """Return two matrices along the diagonal of one."""
+    joined = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
+    joined[: len(first), : first.shape[1]], joined[len(first) :, first.shape[1] :] = first, second
+    return joined
+
+
+def joint_covariance(gyros: Gyroscopes, scale: ScaleLaws) -> Array:
+    """Return the covariance of the coefficients of `gyros`, fitted to outputs over S(T), and of those of `scale`."""
+    solution, held = gyros.solution, gyros.held
+    white = whitener(solution.rows, solution.excess**2, solution.scatter.tau)
+    inverse = np.linalg.pinv(white(solution.rows.jacobian), rcond=1e-13)
+    # db / dS: each mean moves by -mean / S for a unit of S.
+    functions, size = scale.functions(held.temperature), len(scale.coefficients) - 6
+    moved = np.zeros((len(held), 3, len(scale.coefficients)))
+    each = -(held.mean / scale.scale_at(held.temperature))[:, :, None] * functions[:, None, :]
+    for k in range(len(AXES)):
+        moved[:, k, k * functions.shape[1] : (k + 1) * functions.shape[1]] = each[:, k]
+    assert functions.shape[1] * len(AXES) == size
+    n = gyros.count
+    slope = (inverse @ white(moved.reshape(-1, len(scale.coefficients))))[:n]
+    joint = np.zeros((n + len(scale.coefficients),) * 2)
+    joint[:n, :n] = solution.covariance[:n, :n] + slope @ scale.covariance @ slope.T
+    joint[:n, n:] = slope @ scale.covariance
+    joint[n:, :n] = joint[:n, n:].T
+    joint[n:, n:] = scale.covariance
+    return joint

@@ -1,9 +1,15 @@
-"""Recordings to holds: mean outputs at a known temperature, and which of them lie in one direction.
+"""Recordings to holds.
+
+Mean outputs at a known temperature, recordings at rest, and whether all are of one unit over temperature.
+
+A bench that is knocked or walked around tips a little each time and does not tip back, so that the error of the
+direction is a random walk. Beside what is smooth in the temperature, polynomials of degree 8, and a part that is new in
+each hold, its size follows by restricted maximum likelihood (Patterson and Thompson, Biometrika 58 (1971) 545).
 
 A hold in which the temperature drifts is cut where it has moved by 1 K: the curvature within a cut then leaves less
 than 0.1 ug. The cuts of a hold are *unmoved*: nothing was turned between them. What interrupts a hold, and rows that
 are no readings, are left out of its means. The scatter of a mean comes from batch
-means after their regression on the temperature, as in `imulab.procedures.tumble.held`.
+means after their regression on the temperature, as in `imulab.procedures.tumble.attitudes`.
 """
 
 from __future__ import annotations
@@ -16,13 +22,96 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.errors import DataError
-from imulab.estimation.rows import leave_out
-from imulab.procedures.thermal.rest import stretches_at_rest, wandering
-from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes
-from imulab.procedures.tumble.segment import find_attitudes
-from imulab.recording import Array, Recording
-from imulab.verdict import Note
+from imulab.display import Note
+from imulab.errors import DataError, OptionError
+from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
+from imulab.procedures.thermal import LEAST_SPAN, SETTLE
+from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes, find_attitudes
+from imulab.recording import Array, Recording, check_finite
+from imulab.units import parse_unit
+
+# Recordings at rest while the temperature drifts: what knocks leave of them, and how far their direction wanders.
+
+
+_FEW, _TURNED = 0.005, 0.1
+"""A recording whose outputs but for a few move by less than this share of g is one at rest."""
+_BLOCK, _SHAKEN, _OFF, _BESIDE = 0.5, 4.0, 8.0, 5
+"""A knock: blocks (s) that scatter with so many times the usual variance, or lie so many standard deviations off the
+median of those beside, so many on each side."""
+_LEAST_BLOCK, _MOSTLY = 8, 0.5
+"""Samples of a block, and share of the time that knocks leave of a recording at rest."""
+_SMOOTH = 8
+_SURE = 5.0
+"""Twice the logarithm of a likelihood ratio, which chance exceeds in 1.3 % of ramps."""
+_RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e4, 81)])
+
+
+def stretches_at_rest(outputs: Array, time: Array) -> NDArray[np.int64] | None:
+    """Return the stretches of a unit that rests throughout, rows (first, last + 1); None where it is turned.
+
+    Knocks lie between them; a change of its direction does not end one.
+    """
+    still = _between_knocks(outputs, time)
+    ends = np.quantile(outputs[still], [_FEW, 1 - _FEW], axis=0)
+    if np.ptp(ends, axis=0).max() > _TURNED * np.linalg.norm(ends.mean(axis=0)):
+        return None
+    return np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
+
+
+def _between_knocks(outputs: Array, time: Array) -> NDArray[np.bool_]:
+    """Return which samples lie in no knock, nor beside one, shape (n,); all, where little would be left."""
+    every = np.ones(len(time), dtype=np.bool_)
+    size = max(_LEAST_BLOCK, round(_BLOCK * (len(time) - 1) / (time[-1] - time[0])))
+    count = len(time) // size
+    if count < 4 * _BESIDE:
+        return every
+    blocks = outputs[: count * size].reshape(count, size, 3)
+    mean, scatter = blocks.mean(axis=1), blocks.var(axis=1)
+    padded = np.pad(mean, ((_BESIDE, _BESIDE), (0, 0)), "reflect")
+    beside = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
+    off = np.abs(mean - np.median(beside, axis=-1))
+    usual = np.maximum(np.median(scatter, axis=0), np.finfo(float).tiny)
+    far = _OFF * np.maximum(MAD_TO_SIGMA * np.median(off, axis=0), np.sqrt(usual / size))
+    bad = ((scatter / usual).mean(axis=1) > _SHAKEN) | (off > far).any(axis=1)
+    bad = np.convolve(bad, np.ones(3), "same") > 0.5
+    still = np.append(np.repeat(~bad, size), np.full(len(time) - count * size, not bad[-1]))
+    return still if still.mean() > _MOSTLY else every
+
+
+def wandering(direction: Array, temperature: Array, time: Array) -> float:
+    """Return the variance per second of the random walk of a direction, rad^2/s, 0 where none is significant.
+
+    Parameters
+    ----------
+    direction
+        Mean outputs of holds that were not moved between, in units of their length, shape (n, 3).
+    temperature, time
+        Of each hold, shape (n,).
+    """
+    count = len(direction)
+    if count < 2 * _SMOOTH:
+        return 0.0
+    up = direction.mean(axis=0)
+    across = np.linalg.svd(up[None])[2][1:]
+    place = (temperature - temperature.mean()) / max(float(np.ptp(temperature)), 1e-9)
+    smooth = np.polynomial.legendre.legvander(2 * place, _SMOOTH)
+    free = np.linalg.svd(smooth, full_matrices=True)[0][:, _SMOOTH + 1 :]
+    begun = time - time.min()
+    sizes, modes = np.linalg.eigh(free.T @ np.minimum(begun[:, None], begun) @ free)
+    squares = ((modes.T @ free.T @ direction @ across.T) ** 2).sum(axis=1)
+    # Variances c (1 + r s) of two components each: c has its most likely value at every ratio r.
+    unit = float(np.median(sizes))
+    relative = 1 + _RATIOS[:, None] * np.maximum(sizes, 0.0) / unit
+    level = (squares / relative).mean(axis=1) / 2
+    likelihood = -2 * (len(sizes) * np.log(level) + np.log(relative).sum(axis=1))
+    best = int(np.argmax(likelihood))
+    if likelihood[best] - likelihood[0] < _SURE:
+        return 0.0
+    return float(level[best] * _RATIOS[best] / unit)
+
+
+# Recordings to holds: mean outputs at a known temperature, and which of them lie in one direction.
+
 
 _CUT = 1.0  # K
 _BATCHES = 10
@@ -289,3 +378,249 @@ def sides(holds: Holds) -> Array:
         found.append(_SIDES.get(said, 0.0))
     which: Array = np.array(found)[holds.recording]
     return which
+
+
+# Are these recordings of one unit over temperature? One clear sentence for each way in which they may not be.
+
+
+_KELVIN = 150.0  # degC; no unit is calibrated above it, and every kelvin above -120 degC is
+_JUMP, _QUICK = 5.0, 2.0  # K; s
+_COLDEST = -120.0  # degC
+_STUCK, _SHORT, _READINGS, _STEPS = 200, 20.0, 20, 1.5
+"""A reading that stays for so many samples, so many times as long as nearly all others, of which there are so many, and
+that changes by so many steps otherwise."""
+_LATER = (1.5, 1.25)
+"""How many times as long as the one before the last step to a reading takes, and the one before it, if it settles."""
+_SHARED, _DISTINCT = 0.3, 0.9
+"""Share of rows that are in another recording, too, which is one by chance where rows hardly repeat in either."""
+_MIX = np.uint64(0x9E3779B97F4A7C15)
+
+
+def prepared(
+    recordings: Sequence[Recording], column: str | None, settle: float | None, *, span: float = LEAST_SPAN
+) -> list[Recording]:
+    """Return recordings with a column temperature that spans `span` K, without what lies inside the settling time.
+
+    Raises
+    ------
+    DataError
+        They are of two units, of two sensors' temperatures, one is there twice, or their temperature cannot be.
+    OptionError
+        The settling time is less than 0.
+    """
+    given = [_with_temperature(recording, column) for recording in recordings]
+    _check_together(given)
+    for recording in given:
+        _check_temperature(recording)
+    given = _with_constant_named(given)
+    low = min(float(recording.si("temperature").min()) for recording in given)
+    high = max(float(recording.si("temperature").max()) for recording in given)
+    if high - low < span:
+        where = given[0].name if len(given) == 1 else f"{given[0].name} and {len(given) - 1} more"
+        raise DataError(
+            f"{where}: column temperature: spans {high - low:.1f} K ({low:.1f} to {high:.1f} degC); expected at least "
+            f"{span:g} K: imulab tumble fit calibrates at one temperature"
+        )
+    return [_settled(recording, settle) for recording in given]
+
+
+def _with_temperature(recording: Recording, column: str | None) -> Recording:
+    """Return the recording with the chosen column as its temperature."""
+    candidates = [
+        name
+        for name, unit in recording.units.items()
+        if name.startswith("temperature") and parse_unit(unit).quantity == "temperature"
+    ]
+    if column is not None:
+        recording.column(column)
+        if column not in candidates:
+            raise DataError(
+                f"{recording.name}: column {column}: expected a temperature, found {recording.units[column]}"
+            )
+        return recording.with_columns(
+            {"temperature": recording.column(column)}, {"temperature": recording.units[column]}
+        )
+    if len(candidates) > 1:
+        raise DataError(
+            f"{recording.name}: {len(candidates)} columns of temperature: {' '.join(candidates)}; expected one, that "
+            "of the unit's own sensor: choose it with --temperature-column"
+        )
+    if candidates:
+        return _called(recording, candidates[0])
+    raise DataError(
+        f"{recording.name}: no column temperature; found {' '.join(recording.columns)}: expected what the unit's own "
+        "thermometer says (--temperature-column NAME where it is called otherwise)"
+    )
+
+
+def _called(recording: Recording, column: str) -> Recording:
+    return recording.with_columns({"temperature": recording.column(column)}, {"temperature": recording.units[column]})
+
+
+def _check_together(recordings: Sequence[Recording]) -> None:
+    first = recordings[0]
+    seen: list[tuple[str, NDArray[np.uint64]]] = []
+    for recording in recordings:
+        for key in ("serial", "element"):
+            mine, its = first.metadata.get(key), recording.metadata.get(key)
+            if mine and its and mine != its:
+                raise DataError(
+                    f"{recording.name}: {key} {its}, but {first.name} is of {key} {mine}; expected recordings of "
+                    "one unit"
+                )
+        unit, other = first.triad_unit("accel"), recording.triad_unit("accel")
+        if unit != other:
+            raise DataError(
+                f"{recording.name}: columns accel_x accel_y accel_z are in {other}, but in {unit} in {first.name}; "
+                "expected one unit"
+            )
+        own = np.sort(_marks(recording))
+        for before, marks in seen:
+            if np.array_equal(own, marks):
+                raise DataError(f"{recording.name}: the same recording as {before}, which would count twice")
+            shared = _share(own, marks)
+            if shared > _SHARED and min(len(np.unique(each)) / len(each) for each in (own, marks)) > _DISTINCT:
+                raise DataError(
+                    f"{recording.name}: {100 * shared:.0f} % of its rows are in {before}, too, and would count twice; "
+                    "expected recordings of their own"
+                )
+        seen.append((recording.name, own))
+
+
+def _share(own: NDArray[np.uint64], other: NDArray[np.uint64]) -> float:
+    """Return the share of rows that are in another recording, from a few thousand of them, both in order."""
+    if not (len(own) and len(other)):
+        return 0.0
+    few = own[:: max(1, len(own) // 4000)]
+    return float((other[np.searchsorted(other, few).clip(max=len(other) - 1)] == few).mean())
+
+
+def _marks(recording: Recording) -> NDArray[np.uint64]:
+    """Return a number for each row of outputs, shape (n,), the same for the same row alone."""
+    found = np.zeros(len(recording), dtype=np.uint64)
+    for name in triad("accel"):
+        bits = np.ascontiguousarray(recording.column(name), dtype=np.float64).view(np.uint64)
+        found = (found ^ bits ^ (bits >> np.uint64(29))) * _MIX
+        found ^= found >> np.uint64(32)
+    return found
+
+
+def _check_temperature(recording: Recording) -> None:
+    check_finite(recording, ["temperature"])
+    values, time = recording.si("temperature"), recording.time
+    if not values.size:
+        raise DataError(f"{recording.name}: no samples")
+    if values.min() > _KELVIN:
+        raise DataError(
+            f"{recording.name}: column temperature: {values.min():.1f} to {values.max():.1f} degC cannot be; are these "
+            "kelvins? expected a title such as 'temperature [K]'"
+        )
+    if values.min() < _COLDEST:
+        raise DataError(
+            f"{recording.name}: column temperature: {values.min():.1f} degC cannot be; expected {_COLDEST:g} to "
+            f"{_KELVIN:g} degC"
+        )
+    if time is not None:
+        _check_stuck(recording, values)
+    if time is not None and values.size > 1:
+        jump = np.abs(np.diff(values))
+        index = int(np.argmax(jump))
+        if jump[index] > _JUMP and time[index + 1] - time[index] < _QUICK:
+            raise DataError(
+                f"{recording.name}: {recording.place(index + 1)}, column temperature: jumps from {values[index]:.1f} "
+                f"to {values[index + 1]:.1f} degC in {time[index + 1] - time[index]:.2g} s; expected a "
+                "thermometer of the unit, which follows within minutes"
+            )
+
+
+def _check_stuck(recording: Recording, values: Array) -> None:
+    """Refuse a thermometer that stops: one reading for long, where others change every few samples."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
+    runs, changes = np.diff(edges), np.abs(np.diff(values[edges[:-1]]))
+    longest = int(np.argmax(runs))
+    # A reading whose steps are larger than its noise goes from one to the next, and rests at one where nothing warms.
+    if not changes.size or np.median(changes) < _STEPS * changes.min():
+        return
+    if len(runs) < _READINGS or runs[longest] < max(_STUCK, _SHORT * np.quantile(np.delete(runs, longest), 0.95)):
+        return
+    first, last = int(edges[longest]), int(edges[longest + 1]) - 1
+    if _settles(values[:first], values[first]):
+        return
+    raise DataError(
+        f"{recording.name}: {recording.place(first)} to {recording.place(last)}, column temperature: stuck at "
+        f"{values[first]:.6g} degC over {runs[longest]} samples, where others change every few; expected a thermometer "
+        "that goes on: choose the part before it (--window)"
+    )
+
+
+def _settles(before: Array, value: float) -> bool:
+    """Return whether readings came to rest at a value step by step, each step later than the one before it.
+
+    An exponential approach takes at least 1.71 and 1.41 times as long for its last step and the one before as for that
+    before these; a thermometer that stops while it drifts took as long for each.
+    """
+    away = np.round(np.abs(before - value), 6)
+    levels = np.unique(away[away > 0])[: len(_LATER) + 2]
+    if len(levels) < len(_LATER) + 2:
+        return False
+    left = np.array([int(np.flatnonzero(away >= level)[-1]) for level in levels])
+    steps = -np.diff(left)
+    return bool(np.all(steps[:-1] > np.array(_LATER) * steps[1:]))
+
+
+def _with_constant_named(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the same, with a note on each that has one temperature throughout while that of others changes."""
+    counts = [
+        0 if recording.time is None else len(np.unique(recording.column("temperature"))) for recording in recordings
+    ]
+    if max(counts) < _READINGS:
+        return list(recordings)
+    note = "column temperature: the same value in every row, while it changes in other recordings: a thermometer stuck?"
+    return [
+        replace(recording, notes=(*recording.notes, f"{recording.name}: {note}")) if count == 1 else recording
+        for recording, count in zip(recordings, counts, strict=True)
+    ]
+
+
+def _settled(recording: Recording, settle: float | None) -> Recording:
+    """Return what lies after the settling time: by default where the head says that time counts from power-on."""
+    time = recording.time
+    if settle is not None and not settle >= 0:
+        raise OptionError(f"settle {settle:g} s: expected 0 s or more")
+    if settle is None:
+        settle = SETTLE if "power_on_temperature" in recording.metadata else 0.0
+    if time is None or not settle:
+        return recording
+    kept = time >= settle
+    if np.count_nonzero(kept) < 2:
+        raise DataError(
+            f"{recording.name}: ends {time[-1]:.0f} s after power-on, inside the settling time of {settle:g} s; "
+            "expected a longer recording, or another --settle"
+        )
+    return replace(
+        recording,
+        columns={name: values[kept] for name, values in recording.columns.items()},
+        first_row=recording.first_row + int(np.argmax(kept)),
+    )
+
+
+def check_holds(holds: Holds, gravity: float, nominal: float | None) -> None:
+    """Check that the holds can be those of accelerometers under `gravity`, m/s^2, `nominal` m/s^2 per output.
+
+    Raises
+    ------
+    DataError
+        The magnitudes are nowhere near it, or an axis is dead.
+    """
+    if nominal is not None:
+        length = np.linalg.norm(holds.mean, axis=1) * nominal
+        far = np.flatnonzero((length < gravity / 2) | (length > 2 * gravity))
+        if far.size:
+            raise DataError(
+                f"{holds.label(int(far[0]))}: columns accel_x accel_y accel_z: the specific force at rest is "
+                f"{length[far[0]]:.4g} m/s^2, expected {gravity:.4g} m/s^2: is the unit wrong?"
+            )
+    span = np.ptp(holds.mean, axis=0)
+    if span.min() <= 0:
+        name = triad("accel")[int(np.argmin(span))]
+        raise DataError(f"{holds.recordings[0].name}: column {name}: the same output in every hold: a dead axis")

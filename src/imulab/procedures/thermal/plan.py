@@ -1,25 +1,565 @@
-"""How many soaks at which temperatures, and which attitudes in each: what a time in the chamber gives."""
+"""Which soaks and attitudes a test over temperature needs, what it will give, and the plan as its user has it.
+
+The information of an attitude is the gradient of ``|f|`` for a nominal sensor, whose nine parameters are polynomials of
+the temperature. The offsets of the biases in each power cycle are unknowns beside them, known to a standard deviation
+tau; everything is in units of the noise of ``|f|`` in one attitude. Attitudes are exchanged one by one (Fedorov 1972)
+for those that lower the mean variance of the corrected force over temperature and direction most.
+
+As `imulab.procedures.thermal.gyro` fits them: the laws of the biases, the g-sensitivities and offsets of each power
+cycle, from means at rest whose noise is that of the angle random walk and of the Earth's rate, whose vertical part the
+g-sensitivities take up.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import legendre
 
+from imulab.display import Shown
 from imulab.errors import ObservabilityError, OptionError
-from imulab.procedures.thermal.choices import APART, DEGREES, LEAST_SPAN, degrees_of, further_of
-from imulab.procedures.thermal.design import Design, exchange, nodes, way
-from imulab.procedures.thermal.gyroplan import noise_and_scatter, plan_gyroscopes
-from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.planned import PlannedSoak, ThermalPlan, Tried
-from imulab.procedures.tumble.plan import shortest_path, sphere_candidates
-from imulab.procedures.tumble.planning import Known, candidates_of, noise_of
-from imulab.quantities import in_si, temperature_list
+from imulab.files import write_page
+from imulab.procedures.thermal import APART, DEGREES, FOLLOWED, LEAST_SPAN, TURNED, degrees_of, further_of
+from imulab.procedures.thermal.degrees import spoken_degrees
+from imulab.procedures.thermal.gyro import VERTICAL, new_in_each
+from imulab.procedures.thermal.model import SHARES, Laws, forces
+from imulab.procedures.tumble.plan import (
+    Known,
+    attitude_picture,
+    candidates_of,
+    noise_of,
+    roll_pitch,
+    shortest_path,
+    sphere_candidates,
+)
+from imulab.quantities import RANDOM_WALK, in_si, of_units, temperature_list
 from imulab.reading import Data
-from imulab.recording import Array
-from imulab.units import STANDARD_GRAVITY
+from imulab.recording import Array, Recording
+from imulab.report import render_plan
+from imulab.report.plots import Plot
+from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis
+from imulab.units import STANDARD_GRAVITY, from_si
+from imulab.writers import write_csv
+
+# Which temperatures and attitudes show the laws best: the search behind a plan.
+
+
+_PLACES = 41
+_SWEEPS = 3
+_CLOSEST = np.cos(np.radians(3.0))
+"""Two attitudes of a soak closer than this are one attitude."""
+_RIDGE = 1e-6
+"""Information that keeps the matrix regular while the attitudes of a start determine too little."""
+_UNDETERMINED = 1e4
+
+
+def nodes(count: int) -> Array:
+    """Return -1, the extrema of the Legendre polynomial of degree `count` - 1, and 1, shape (count,)."""
+    polynomial = np.eye(count)[-1]
+    inner = np.sort(legendre.legroots(legendre.legder(polynomial)).real)
+    return np.concatenate([[-1.0], inner, [1.0]])
+
+
+def way(count: int, soaks: int) -> list[int]:
+    """Return the order of soaks at `count` temperatures: up through all, then back and forth through what is left.
+
+    The way back takes inner temperatures first, spread over the range: they are what can be reached from either side.
+    """
+    found, last = list(range(min(count, soaks))), count - 1
+    while len(found) < soaks:
+        left = soaks - len(found)
+        if left > count - 2:
+            leg = list(range(1, count))
+        else:
+            leg = np.round(np.linspace(1, count - 2, left) if left > 1 else [(count - 1) / 2]).astype(int).tolist()
+        found += [last - k if found[-1] == last else k for k in leg]
+    return found
+
+
+@dataclass(frozen=True)
+class Design:
+    """Soaks at temperatures (degC), a power cycle each; tau and the variance of an attitude in units of its noise."""
+
+    laws: Laws
+    temperatures: Array
+    tau: float
+    variance: float = 1.0
+
+    @cached_property
+    def carried(self) -> Array:
+        """Derivatives of the nine parameters in each soak by coefficients and offsets, shape (K, 9, c + 3 K)."""
+        design, count = self.laws.design(self.temperatures), len(self.temperatures)
+        found = np.zeros((count, 9, self.laws.size + 3 * count))
+        found[:, :, : self.laws.size] = design
+        for k in range(count):
+            at = self.laws.size + 3 * k
+            found[k, :3, at : at + 3] = self.tau * np.eye(3)
+        return found
+
+    @cached_property
+    def places(self) -> Array:
+        """Temperatures at which the variance counts, degC."""
+        return np.linspace(self.laws.low, self.laws.high, _PLACES)
+
+    @cached_property
+    def weights(self) -> Array:
+        """Mean variance of a component of the corrected force at each place, as matrices (places, c, c).
+
+        Over all directions: that of the bias, and a third of those of scale factor and misalignment.
+        """
+        design = self.laws.design(self.places)
+        found: Array = np.einsum("p,tpa,tpb->tab", SHARES, design, design)
+        return found
+
+    @cached_property
+    def weight(self) -> Array:
+        """Mean of `weights`."""
+        found: Array = self.weights.mean(axis=0)
+        return found
+
+    def covariance(self, sets: Sequence[Array]) -> Array:
+        """Covariance of coefficients and offsets with these attitudes, in units of the noise of an attitude squared."""
+        information = np.diag(np.append(np.full(self.laws.size, _RIDGE), np.ones(3 * len(self.temperatures))))
+        for own, directions in zip(self.carried, sets, strict=True):
+            rows = gradients(directions) @ own
+            information += rows.T @ rows / self.variance
+        return np.asarray(np.linalg.inv(information), dtype=np.float64)
+
+    def cost(self, covariance: Array) -> float:
+        """Mean variance of a component of the corrected force; infinite where attitudes do not determine the laws."""
+        own = covariance[: self.laws.size, : self.laws.size]
+        return np.inf if np.diag(own).max() > _UNDETERMINED * (1 + self.tau**2) else float(np.trace(self.weight @ own))
+
+    def deviations(self, covariance: Array) -> Array:
+        """Standard deviation of a component of the corrected force at each place, its mean over directions."""
+        own = covariance[: self.laws.size, : self.laws.size]
+        found: Array = np.sqrt(np.einsum("tab,ba->t", self.weights, own))
+        return found
+
+
+def gradients(directions: Array) -> Array:
+    """Return the derivatives of ``|f|`` / g by the nine parameters of a nominal sensor, shape (n, 9)."""
+    nominal = np.tile(np.repeat([0.0, 1.0, 0.0], 3), (len(directions), 1))
+    force, change = forces(nominal, directions)
+    found: Array = np.einsum("ni,nij->nj", force, change)
+    return found
+
+
+def exchange(design: Design, points: Array, counts: Sequence[int], seed: int) -> tuple[list[Array], Array]:
+    """Choose attitudes of each soak among `points`, shape (m, 3), and return them with the covariance they give."""
+    rng = np.random.default_rng(seed)
+    rows = gradients(points)
+    products = (rows[:, :, None] * rows[:, None, :]).reshape(len(points), 81)
+    chosen = [rng.choice(len(points), count, replace=False) for count in counts]
+    covariance = design.covariance([points[own] for own in chosen])
+    for _ in range(_SWEEPS):
+        moved = False
+        for soak, own in enumerate(chosen):
+            carried = design.carried[soak] / np.sqrt(design.variance)
+            taken = (points @ points[own].T > _CLOSEST).sum(axis=1)
+            for place in range(len(own)):
+                old = int(own[place])
+                covariance = _added(covariance, rows[old] @ carried, -1.0)
+                taken -= points @ points[old] > _CLOSEST
+                seen = carried @ covariance
+                known = seen[:, : design.laws.size]
+                drop = products @ (known @ design.weight @ known.T).ravel()
+                gain = drop / (1 + products @ (seen @ carried.T).ravel())
+                gain[taken > 0] = -np.inf
+                best = int(np.argmax(gain))
+                best = best if gain[best] > gain[old] * (1 + 1e-9) else old
+                moved |= best != old
+                own[place] = best
+                covariance = _added(covariance, rows[best] @ carried, 1.0)
+                taken += points @ points[best] > _CLOSEST
+        if not moved:
+            break
+    sets = [points[own] for own in chosen]
+    return sets, design.covariance(sets)
+
+
+def _added(covariance: Array, row: Array, sign: float) -> Array:
+    """Return the covariance with one row of information more, or less."""
+    carried = covariance @ row
+    found: Array = covariance - np.outer(carried, carried) / (sign + row @ carried)
+    return found
+
+
+# What a schedule over temperature gives of the gyroscopes: rates at rest, and the turns that scale factors take.
+
+
+NOISE, TURN_ON_SCATTER = "0.3 deg/sqrt(h)", "0.01 deg/s"
+
+
+@dataclass(frozen=True)
+class GyroPlan:
+    """What a plan over temperature will give of the gyroscopes.
+
+    Attributes
+    ----------
+    deviation
+        Standard deviation of a component of the corrected rate at rest at the plan's temperatures, root mean square
+        over attitudes, rad/s, shape (m,).
+    noise
+        Angle random walk, rad/sqrt(s).
+    turn_on_scatter
+        Of the biases from one power cycle to the next, rad/s.
+    turns, turned_at
+        Turns between attitudes that tell scale factors, and at how many temperatures: of soaks of nine attitudes or
+        more.
+    needed
+        Time in which each soak has nine attitudes, s.
+    """
+
+    deviation: Array
+    noise: float
+    turn_on_scatter: float
+    turns: int
+    turned_at: int
+    needed: float
+
+    @property
+    def mean(self) -> float:
+        """Root of the mean square of `deviation`, rad/s."""
+        return float(np.sqrt(np.mean(self.deviation**2)))
+
+    def said(self, temperature: Array) -> str:
+        """Return what the plan predicts in sentences; `temperature` as of the plan, degC."""
+        worst = int(np.argmax(self.deviation))
+        known = f"{hourly(self.mean)} deg/h, {hourly(self.deviation[worst])} deg/h where they are worst"
+        walk = f"{self.noise / RANDOM_WALK['deg/sqrt(h)']:.3g} deg/sqrt(h)"
+        return (
+            f"The gyroscopes' laws will give a component of the rate at rest to {known}, at "
+            f"{temperature[worst]:.0f} degC, by an angle random walk of {walk}, {hourly(self.turn_on_scatter)} deg/h "
+            f"of turn-on scatter and the Earth's rate from unknown directions. {self._turned()}"
+        )
+
+    def _turned(self) -> str:
+        if not self.turns:
+            return (
+                f"No soak has the {TURNED} attitudes whose turns tell scale factors: these soaks with as many take "
+                f"{self.needed / 3600:.3g} h."
+            )
+        follow = "and how they follow it" if self.turned_at >= FOLLOWED else "taken as constant"
+        at = "temperature" if self.turned_at == 1 else "temperatures"
+        return f"{self.turns} turns at {self.turned_at} {at} will tell scale factors, {follow}."
+
+
+def hourly(rate: float) -> str:
+    """Return a rate in deg/h, as text."""
+    return f"{from_si(float(rate), 'deg/h'):.3g}"
+
+
+def noise_and_scatter(
+    noise: float | str | None, turn_on_scatter: float | str | None, *, asked: bool
+) -> tuple[float, float] | None:
+    """Return the angle random walk, rad/sqrt(s), and the scatter of biases between power cycles, rad/s.
+
+    None where gyroscopes are not `asked` for.
+
+    Raises
+    ------
+    OptionError
+        One is out of range, or given where they are not asked for.
+    """
+    if not asked:
+        for name, value in (("gyro_noise", noise), ("gyro_turn_on_scatter", turn_on_scatter)):
+            if value is not None:
+                raise OptionError(f"{name}: no gyroscopes are planned; expected --with gyro beside it")
+        return None
+    noise = NOISE if noise is None else noise
+    turn_on_scatter = TURN_ON_SCATTER if turn_on_scatter is None else turn_on_scatter
+    walk = of_units(noise, "gyro_noise", RANDOM_WALK)
+    tau = in_si(turn_on_scatter, "gyro_turn_on_scatter", "rate", "deg/s")
+    if not 0 < walk < 1:
+        raise OptionError(f"gyro_noise {noise!r}: expected more than 0, less than 1 rad/sqrt(s)")
+    if not 0 <= tau < 1:
+        raise OptionError(f"gyro_turn_on_scatter {turn_on_scatter!r}: expected 0 or more, less than 1 rad/s")
+    return walk, tau
+
+
+def plan_gyroscopes(
+    laws: Laws, places: Array, soaks: Sequence[tuple[float, Array]], times: tuple[float, float], walk: float, tau: float
+) -> GyroPlan:
+    """Predict what soaks give of gyroscopes.
+
+    Parameters
+    ----------
+    laws
+        Of the accelerometers, whose degree of the bias the gyroscopes' have too.
+    places
+        Temperatures at which to predict, degC, shape (m,).
+    soaks
+        Temperature, degC, and upward directions, (n, 3), of each.
+    times
+        Of a soak, and of an attitude, all of which counts as rest, s.
+    walk, tau
+        As of `noise_and_scatter`.
+    """
+    size, walked = laws.degrees[0] + 1, walk**2 / times[1] * np.eye(3)
+    information = np.zeros((3 * (size + 3), 3 * (size + 3)))
+    for temperature, up in soaks:
+        law = np.tile(laws.design(np.array([temperature]))[0, 0, :size], (len(up), 1))
+        rows = np.einsum("nc,ij->nijc", np.hstack([law, up]), np.eye(3)).reshape(len(up), 3, -1)
+        own = new_in_each(up, None)
+        weight = np.linalg.inv(walked + own @ np.swapaxes(own, 1, 2))
+        common = np.einsum("nij,njc->ic", weight, rows)  # by an offset of the power cycle
+        share = tau**2 * np.linalg.inv(np.eye(3) + tau**2 * weight.sum(axis=0))
+        information += np.einsum("nia,nij,njb->ab", rows, weight, rows) - common.T @ share @ common
+    blocks = np.linalg.inv(information).reshape(3, size + 3, 3, size + 3)
+    covariance = np.einsum("iaib->ab", blocks) / 3
+    functions = laws.design(places)[:, 0, :size]
+    at_rest = np.einsum("ma,ab,mb->m", functions, covariance[:size, :size], functions)
+    # Each of the three g-sensitivities along its own axis holds the vertical part of the Earth's rate.
+    felt = (np.trace(covariance[size:, size:]) + VERTICAL**2) / 3
+    counts = [len(up) for _, up in soaks]
+    enough = [(temperature, count) for (temperature, _), count in zip(soaks, counts, strict=True) if count >= TURNED]
+    return GyroPlan(
+        deviation=np.sqrt(at_rest + felt),
+        noise=walk,
+        turn_on_scatter=tau,
+        turns=sum(count - 1 for _, count in enough),
+        turned_at=len({temperature for temperature, _ in enough}),
+        needed=len(soaks) * (times[0] + TURNED * times[1]),
+    )
+
+
+# A plan over temperature as its user has it: what it predicts, its CSV to measure by, its sheet, its figure.
+
+
+_ROWS = 9
+_RATE = "#7a4f9a"
+
+
+@dataclass(frozen=True)
+class PlannedSoak:
+    """One power cycle at one temperature.
+
+    Attributes
+    ----------
+    temperature
+        degC.
+    warming
+        Whether it is reached from below.
+    directions
+        Upward directions in the body frame, in the order that turns least, shape (n, 3).
+    start, duration
+        Of soak and attitudes, s.
+    """
+
+    temperature: float
+    warming: bool
+    directions: Array
+    start: float
+    duration: float
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A number of soaks that the time allows, attitudes in each, and sd of the corrected force, m/s^2."""
+
+    soaks: int
+    attitudes: int
+    mean: float
+    worst: float
+
+
+@dataclass(frozen=True, repr=False)
+class ThermalPlan(Shown):
+    """Soaks and attitudes of a calibration over temperature, and what they will give.
+
+    Attributes
+    ----------
+    soaks
+        In their order.
+    degrees
+        Of bias, scale factor and misalignment.
+    temperature, deviation
+        Temperatures over the range, degC, and the standard deviation of a component of the corrected force there, root
+        mean square over directions, m/s^2, shape (m,).
+    mean
+        Root of the mean of its square, m/s^2.
+    noise
+        Of ``|f|`` in one attitude, m/s^2.
+    noise_from
+        What said so, in brackets; empty where it was given as a number.
+    turn_on_scatter
+        Of the biases from one power cycle to the next, m/s^2.
+    time
+        That was available, s.
+    tried
+        The numbers of soaks that were compared.
+    gyro
+        What is predicted of the gyroscopes, None unless it was asked for.
+    """
+
+    soaks: tuple[PlannedSoak, ...]
+    degrees: tuple[int, int, int]
+    temperature: Array
+    deviation: Array
+    mean: float
+    noise: float
+    noise_from: str
+    turn_on_scatter: float
+    time: float
+    tried: tuple[Tried, ...]
+    gyro: GyroPlan | None = None
+
+    @property
+    def duration(self) -> float:
+        """Of all soaks and attitudes, s."""
+        return self.soaks[-1].start + self.soaks[-1].duration
+
+    @property
+    def lead(self) -> str:
+        """What the plan is and predicts."""
+        counts = [len(soak.directions) for soak in self.soaks]
+        each = f"{counts[0]}" if min(counts) == max(counts) else f"{min(counts)} or {max(counts)}"
+        again = len(self.soaks) - len({soak.temperature for soak in self.soaks})
+        places = len(self.soaks) - again
+        spoken = spoken_degrees(self.degrees)
+        back = f" ({again} of them back at one)" if again else ""
+        low, high = self.temperature[[0, -1]]
+        worst = int(np.argmax(self.deviation))
+        free = 3 * (len(self.soaks) - self.degrees[0] - 1)  # beside laws of the biases
+        return (
+            f"{len(self.soaks)} soaks, a power cycle each, at {places} temperatures{back}, {each} attitudes in each "
+            f"({sum(counts)} in all), {_hours(self.duration)} of {_hours(self.time)}. For degrees {spoken}, a "
+            f"noise of {_ug(self.noise)} ug in |f| per attitude{self.noise_from} and {_ug(self.turn_on_scatter)} ug of "
+            f"turn-on scatter the laws will give a component of the force to {_ug(self.mean)} ug (standard deviation, "
+            f"mean over {low:g} to {high:g} degC), {_ug(self.deviation[worst])} ug where they are worst, at "
+            f"{self.temperature[worst]:.0f} degC; the turn-on offset of each later power cycle comes on top. "
+            f"{free} independent offsets will tell the turn-on scatter."
+            + ("" if self.gyro is None else f" {self.gyro.said(self.temperature)}")
+        )
+
+    @property
+    def predicted(self) -> list[tuple[str, str, str]]:
+        """Standard deviation of the corrected force, and rate, at temperatures over the range: name, text and unit."""
+        places = np.linspace(0, len(self.temperature) - 1, _ROWS).round().astype(int).tolist()
+        at = [f"at {self.temperature[k]:.0f} degC" for k in places]
+        found = [(f"corrected force {one}", _ug(self.deviation[k]), "ug") for one, k in zip(at, places, strict=True)]
+        if self.gyro is not None:
+            rates = self.gyro.deviation[places].tolist()
+            found += [(f"corrected rate {one}", hourly(u), "deg/h") for one, u in zip(at, rates, strict=True)]
+        return found
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return the plan in a few sentences, and the schedule."""
+        rows = [
+            [str(k), f"{soak.temperature:.1f}", _side(soak), str(len(soak.directions)), _hours(soak.start),
+             _hours(soak.start + soak.duration)]
+            for k, soak in enumerate(self.soaks, 1)
+        ]  # fmt: skip
+        return self.lead, ["soak", "degC", "reached by", "attitudes", "from, h:min", "to, h:min"], rows
+
+    def compared(self) -> tuple[list[str], list[list[str]]]:
+        """Return the numbers of soaks that were compared, as titles and rows."""
+        rows = [[str(each.soaks), str(each.attitudes), _ug(each.mean), _ug(each.worst)] for each in self.tried]
+        return ["soaks", "attitudes in each", "mean sd, ug", "worst sd, ug"], rows
+
+    def save(self, path: str | Path) -> None:
+        """Write the attitudes as CSV: soak, set point, side, start, number, upward direction, roll and pitch.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written.
+        """
+        write_csv(self.recording(), path)
+
+    def recording(self) -> Recording:
+        """Return the same as a table."""
+        counts = [len(soak.directions) for soak in self.soaks]
+        up = np.vstack([soak.directions for soak in self.soaks])
+
+        def each(values: list[float]) -> Array:
+            return np.repeat(np.array(values, dtype=np.float64), counts)
+
+        columns = {
+            "soak": each([float(k) for k in range(1, len(counts) + 1)]),
+            "set_point": each([round(soak.temperature, 1) for soak in self.soaks]),
+            "warming": each([float(soak.warming) for soak in self.soaks]),
+            "start": each([round(soak.start / 60, 3) for soak in self.soaks]),
+            "number": np.concatenate([np.arange(1.0, n + 1) for n in counts]),
+            **{f"up_{name}": np.round(up[:, i], 6) + 0.0 for i, name in enumerate("xyz")},
+        }
+        angles = np.round(np.degrees(roll_pitch(up)), 3) + 0.0
+        columns |= {"roll": angles[:, 0], "pitch": angles[:, 1]}
+        units = dict.fromkeys(columns, "1") | {"set_point": "degC", "start": "min", "roll": "deg", "pitch": "deg"}
+        degrees = ",".join(map(str, self.degrees))
+        return Recording(columns=columns, units=units, metadata={"degrees": degrees}, name="thermal plan")
+
+    def sheet(self) -> str:
+        """Return the sheet to print, a picture for each attitude, as HTML text."""
+        pictures: list[dict[str, Any]] = []
+        for number, soak in enumerate(self.soaks, 1):
+            heading = f"Soak {number}: {soak.temperature:.1f} degC, reached by {_side(soak)}, {_hours(soak.start)}"
+            for index, up in enumerate(soak.directions):
+                roll, pitch = np.degrees(roll_pitch(up[None]))[0]
+                pictures.append(
+                    {
+                        "heading": "" if index else heading,
+                        "number": f"{number}.{index + 1}",
+                        "picture": attitude_picture(up),
+                        "facing": "",
+                        "up": "(" + ", ".join(f"{value:+.2f}" for value in up) + ")",
+                        "roll": f"{roll:.1f}",
+                        "pitch": f"{pitch:.1f}",
+                    }
+                )
+        return render_plan("Thermal plan", self.lead, pictures, self.predicted)
+
+    def report(self, path: str | Path) -> None:
+        """Write the sheet to print as an HTML file; errors as for `save`."""
+        write_page(path, self.sheet())
+
+    def plot(self) -> Plot:
+        """Return the standard deviation of the corrected force, and rate, over temperature, and where soaks are."""
+        at = np.array([soak.temperature for soak in self.soaks])
+        traces: list[dict[str, Any]] = [
+            {"type": "scatter", "mode": "lines", "name": "predicted", "x": np.round(self.temperature, 3).tolist(),
+             "y": [float(_ug(value)) for value in self.deviation], "line": {"color": GOOD, "width": 2}},
+            {"type": "scatter", "mode": "markers", "name": "soaks", "x": np.round(at, 2).tolist(),
+             "y": [float(_ug(value)) for value in np.interp(at, self.temperature, self.deviation)],
+             "marker": {"color": BAD, "size": 8}},
+        ]  # fmt: skip
+        layout = {
+            "xaxis": figure_axis("temperature, degC"),
+            "yaxis": figure_axis("sd of the corrected force, ug", rangemode="tozero"),
+            "legend": LEGEND,
+        }
+        if self.gyro is not None:
+            traces[0]["name"] = "force"
+            own = [float(hourly(value)) for value in self.gyro.deviation]
+            line = {"color": _RATE, "width": 2, "dash": "dash"}
+            traces.insert(1, {**traces[0], "name": "rate at rest", "y": own, "yaxis": "y2", "line": line})
+            right = figure_axis("sd of the rate at rest, deg/h", rangemode="tozero", overlaying="y", side="right")
+            layout |= {"yaxis2": {**right, "showgrid": False}, "margin": {"r": 75}}
+        caption = "Of a component, root mean square over directions, without the turn-on offset of the day."
+        return Plot(Figure("What the laws will give", caption, traces, layout, message=self.lead), "Thermal plan")
+
+
+def _side(soak: PlannedSoak) -> str:
+    return "warming" if soak.warming else "cooling"
+
+
+def _ug(value: float) -> str:
+    return f"{from_si(float(value), 'ug'):.3g}"
+
+
+def _hours(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    return f"{minutes // 60}:{minutes % 60:02d} h"
+
+
+# How many soaks at which temperatures, and which attitudes in each: what a time in the chamber gives.
+
 
 _FEWEST, _MOST, _SOAKS = 3, 40, 24
 """Attitudes of a soak; soaks."""

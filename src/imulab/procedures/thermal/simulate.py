@@ -13,12 +13,12 @@ from typing import overload
 
 import numpy as np
 
-from imulab.atomic_write import write_text
+from imulab.display import Shown
 from imulab.errors import OptionError, listed
-from imulab.procedures.thermal.choices import LAWS, TEMPERATURES
+from imulab.files import write_text
+from imulab.procedures.thermal import LAWS, TEMPERATURES
 from imulab.quantities import in_si, temperature_list, whole
 from imulab.recording import Array, Recording
-from imulab.shown import Shown
 from imulab.units import STANDARD_GRAVITY
 from imulab.writers import write_csv
 

@@ -1,14 +1,36 @@
-"""Attitudes: what segmentation hands to a tumble fit."""
+"""Static attitudes: from continuous recordings, tables, files and arrays; clipped samples, and the samples of holds.
+
+Source: batch means: Fishman, Grouping observations in digital simulation, Management Science 24 (1978) 510.
+
+The recording is cut into short blocks whose means and scatters are formed once; windows of a second or so slide over
+the blocks. A window is quiet where its variance stays below a threshold relative to the quietest stretch. The
+threshold is swept, and the one is kept whose attitudes predict each other best: the outputs of a triad at rest lie on
+an ellipsoid, whose leave-one-out error needs no gravity, no model order and no iteration.
+
+Source: Tedaldi, Pretto, Menegatti, ICRA 2014 (threshold sweep).
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from imulab.recording import Array, Recording
+import imulab.procedures.tumble._segment as _segment
+from imulab.columns import triad
+from imulab.errors import DataError, OptionError, SegmentError, UnitError
+from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
+from imulab.procedures.result import as_recording
+from imulab.reading import Data, Reading, Sampling
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.units import conversion_factor
+
+# Attitudes: what segmentation hands to a tumble fit.
+
 
 POOL_DEGREES = 10.0
 """Weight, in degrees of freedom, of the noise pooled over all attitudes against an attitude's own."""
@@ -171,3 +193,634 @@ class Attitudes:
             motion=None if self.motion is None else self.motion[kept],
             numbers=kept if self.numbers is None else self.numbers[kept],
         )
+
+
+# A table of attitudes: a recording without time, each of whose rows is an attitude at rest.
+
+
+_LONG_TABLE = 1000
+_NO_TIME = (
+    "no time column: each of the {} rows was taken as an attitude at rest; is this a recording with "
+    "motion? Then it needs a column time, or a layout with sample_rate"
+)
+
+
+def attitude_table(
+    recording: Recording, sensor: str, names: list[str], unit: str, temperature: float | None
+) -> Attitudes:
+    """Return the rows of a table as attitudes; a row that repeats an earlier one exactly is not measured again."""
+    mean, covariance = recording.triad(sensor), stated_covariance(recording, names, unit)
+    kept = np.sort(np.unique(mean, axis=0, return_index=True)[1])
+    row = (kept + recording.first_row).astype(np.float64)
+    notes = [_NO_TIME.format(len(recording))] if len(recording) > _LONG_TABLE else []
+    if len(kept) < len(mean):
+        again = int(np.setdiff1d(np.arange(len(mean)), kept)[0])
+        first = int(np.argmax((mean == mean[again]).all(axis=1)))
+        notes.append(
+            f"{len(mean) - len(kept)} of {len(mean)} rows are duplicates of earlier ones, such as "
+            f"{recording.place(again)} of {recording.place(first)}: they were left out, being no measurements"
+        )
+    return Attitudes(
+        mean=mean[kept],
+        covariance=None if covariance is None else covariance[kept],
+        samples=np.ones(len(kept), dtype=np.int64),
+        start=row,
+        stop=row.copy(),
+        unit=unit,
+        recording=recording,
+        temperature=temperature,
+        notes=tuple(notes),
+    )
+
+
+def stated_covariance(recording: Recording, names: list[str], unit: str) -> Array | None:
+    """Covariances from the ``std_*`` columns of a table, in the unit of the means, or None."""
+    long, short = [f"std_{name}" for name in names], [f"std_{name[-1]}" for name in names]
+    stated = short if any(name in recording for name in short) else long
+    if not any(name in recording for name in stated):
+        return None
+    check_finite(recording, stated)
+    try:
+        factors = [conversion_factor(recording.units[name], unit) for name in stated]
+    except UnitError as error:
+        raise UnitError(f"{recording.name}: columns {' '.join(stated)}: {error}") from None
+    std = np.column_stack([recording.column(name) for name in stated]) * factors
+    if not (std > 0).all():
+        row, axis = np.argwhere(std <= 0)[0]
+        raise SegmentError(
+            f"{recording.name}: {recording.place(row)}, column {stated[axis]}: "
+            f"expected a positive standard deviation, found {std[row, axis]:g}"
+        )
+    covariance = np.zeros((len(std), 3, 3))
+    covariance[:, range(3), range(3)] = std**2
+    return covariance
+
+
+# Clipped samples: a flat top where an axis reached the end of its range.
+
+
+_FEWEST_SAMPLES = 5
+_FEWEST_ROWS = 4
+_USUAL_TIES = 3.0
+"""A flat top is held by this many times more samples than values otherwise share (coarse counts share many)."""
+
+
+def check_clipping(recording: Recording, names: list[str], pieces: NDArray[np.int64]) -> None:
+    """Check that no axis is clipped in a stretch at rest.
+
+    The extreme value of an axis is suspect where far more samples hold it exactly than values usually share.
+
+    Parameters
+    ----------
+    recording, names
+        The columns to look at.
+    pieces
+        Stretches at rest as rows (first sample, last sample + 1, attitude).
+
+    Raises
+    ------
+    DataError
+        The message names column and row.
+    """
+    for column in names:
+        values = recording.column(column)
+        smallest, largest = values.min(), values.max()
+        if smallest == largest:
+            continue  # not clipped but dead, which is for the procedure to say
+        for extreme, side in ((largest, "largest"), (smallest, "smallest")):
+            ties = values == extreme
+            if np.count_nonzero(ties) < _FEWEST_SAMPLES:
+                continue
+            shares, held = [], []
+            for start, stop, _ in pieces:
+                count = int(np.count_nonzero(ties[start:stop]))
+                if count >= _FEWEST_SAMPLES:
+                    held.append((count / (stop - start), start + int(np.argmax(ties[start:stop]))))
+                else:
+                    shares.append(_largest_share(values[start:stop]))
+            usual = median(np.array(shares)) if shares else 0.0
+            if held and max(held)[0] > _USUAL_TIES * usual:
+                share, first = max(held)
+                raise DataError(
+                    f"{recording.name}: {recording.place(first)}, column {column}: clipped: {100 * share:.0f} % of the "
+                    f"samples of an attitude at rest have exactly the {side} value {extreme:.9g} "
+                    f"{recording.units[column]}; expected a range that holds 1 g with its noise"
+                )
+
+
+def check_clipped_rows(recording: Recording, names: list[str]) -> None:
+    """Check the rows of a table of attitudes for a value at the end of the range that many of them hold exactly.
+
+    Raises
+    ------
+    DataError
+        The message names column and row.
+    """
+    for column in names:
+        values = recording.column(column)
+        if values.min() == values.max():
+            continue
+        for extreme, side in ((values.max(), "largest"), (values.min(), "smallest")):
+            rows = np.flatnonzero(values == extreme)
+            others = np.unique(values[values != extreme], return_counts=True)[1]
+            if len(rows) >= _FEWEST_ROWS and len(rows) > _USUAL_TIES * others.max():
+                raise DataError(
+                    f"{recording.name}: {recording.place(int(rows[0]))}, column {column}: clipped: "
+                    f"{len(rows)} attitudes have exactly the {side} value {extreme:.9g} {recording.units[column]}"
+                )
+
+
+def _largest_share(values: Array) -> float:
+    """Share of the most frequent value among (at most 1000) samples."""
+    few = values[:1000]
+    return float(np.unique(few, return_counts=True)[1].max() / len(few))
+
+
+# The samples of the holds: the covariance of each mean, and how the attitudes moved while they were held.
+
+
+SMALLEST_BLOCK = 4
+"""Samples of a block whose scatter is told."""
+_TREMOR_SECONDS = 0.125
+"""A period of a hand's tremor: the magnitudes of shorter blocks rectify it, longer ones hide the motion of the hand."""
+_BATCHES = 10
+"""Batches per attitude: few, so that they are long against the correlation of the noise, but enough to tell it."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """The samples of all holds, one after the other, in blocks as long as a hand's tremor.
+
+    `start` and `stop` are the stretches in blocks, `attitude` says whose each is; `centre` is an attitude's mean.
+    """
+
+    samples: tuple[Array, Array, Array]
+    mean: Array
+    scatter: Array
+    length: int
+    start: NDArray[np.int64]
+    stop: NDArray[np.int64]
+    attitude: NDArray[np.int64]
+    centre: Array
+
+    @classmethod
+    def of(cls, recording: Recording, names: list[str], stretches: NDArray[np.int64], step: float) -> Held:
+        """Return the samples of the `stretches`, rows (first, last + 1, attitude), which are `step` apart, s."""
+        begin, end, attitude = np.ascontiguousarray(stretches.T)
+        usual = math.ceil(_TREMOR_SECONDS / step - 0.01)
+        length = min(max(SMALLEST_BLOCK, usual), int((end - begin).min()) // 2)
+        size = (end - begin) // length
+        index = np.concatenate([np.arange(a, a + n * length) for a, n in zip(begin, size, strict=True)])
+        x, y, z = (np.ascontiguousarray(recording.column(name)[index], dtype=np.float64) for name in names)
+        stop = np.cumsum(size)
+        mean, scatter, unused = np.empty((stop[-1], 3)), np.empty((stop[-1], 3)), np.empty(stop[-1])
+        _segment.blocks(x, y, z, x, length, mean, scatter, unused)
+        first = np.unique(attitude, return_index=True)[1]
+        total = np.add.reduceat(size, first)[:, None]
+        centre = np.add.reduceat(mean, (stop - size)[first]) / total
+        return cls((x, y, z), mean, scatter, length, stop - size, stop, attitude, centre)
+
+
+def _statistics(held: Held) -> tuple[Array, Array, Array]:
+    """Return `Motion.moments` of each attitude, their degrees of freedom, and the share of a batch in all."""
+    count = len(held.centre)
+    size = held.stop - held.start
+    total = np.bincount(held.attitude, size, count)
+    per_batch = max(1, min(int(median(total)) // _BATCHES, int(size.min()) // 2))
+    first = np.empty(int((size // per_batch).sum()), dtype=np.int64)
+    number = np.empty(count, dtype=np.int64)
+    scatter: Array = np.empty((count, 9, 9))
+    _segment.batches(
+        held.mean, held.start, held.stop, held.attitude, held.centre, per_batch,
+        first, np.empty((len(first), 9)), number, scatter,
+    )  # fmt: skip
+    freedom, share = number.astype(np.float64) - 1, np.full(count, float(per_batch)) / total
+    moments: Array = scatter * (share / np.maximum(freedom, 1))[:, None, None]
+    return moments, freedom, share
+
+
+def _pooled(covariance: Array, freedom: Array, share: Array) -> Array:
+    """Covariance of each mean, shrunk towards the noise common to all: a few batches alone make poor weights."""
+    scatter = covariance / share[:, None, None]
+    level = np.trace(scatter, axis1=1, axis2=2)
+    usual = level <= 3 * median(level)
+    pooled = np.einsum("n,nij->ij", freedom[usual], scatter[usual]) / max(float(freedom[usual].sum()), 1.0)
+    own = freedom[:, None, None]
+    shrunk: Array = (own * scatter + POOL_DEGREES * pooled) / (own + POOL_DEGREES)
+    return shrunk * share[:, None, None]
+
+
+def _motion(held: Held, moments: Array, freedom: Array, share: Array) -> Motion:
+    """How the attitudes moved: ``D = cov(x_k) - C_w / B + [mean(e e') - C_w / 2B] / 12``, B samples in a block."""
+    count, size = len(held.centre), held.stop - held.start
+    sums = np.empty((3, count, 3, 3))
+    _segment.motion(
+        *held.samples, held.length, held.mean, held.start, held.stop, held.attitude, held.centre, *sums
+    )  # fmt: skip
+    terms = size * held.length - 1, size, np.maximum(size - 2, 0)
+    numbers = np.array([np.bincount(held.attitude, each, count) for each in terms])
+    difference, spread, slope = sums / np.maximum(numbers, 1)[:, :, None, None]
+    white = difference / (2 * held.length)
+    pooled = medians(white, 0)
+    each = np.repeat(held.attitude, size)
+    within: Array = np.column_stack([np.bincount(each, held.scatter[:, axis], count) for axis in range(3)])
+    within = within * held.length / (held.length - 1) / np.bincount(each, minlength=count)[:, None]
+    return Motion(
+        lengthening=white * (1 + 1 / 24) - spread - slope / 12,
+        moments=moments,
+        usual=(pooled + (1e-3 * np.trace(pooled) + np.finfo(float).tiny) * np.eye(3)) * share[:, None, None],
+        freedom=freedom,
+        shake=np.maximum(within - held.length * np.einsum("nii->ni", white), 0.0),
+    )
+
+
+def covariance_and_motion(
+    held: Held, recording: Recording, names: list[str], resolution: Array
+) -> tuple[Array, Motion | None]:
+    """Return the covariance of each mean, with that of rounding, and the motion in the attitudes."""
+    moments, freedom, share = _statistics(held)
+    noise = np.sqrt(medians(held.scatter, 0))
+    if (noise < resolution / 2).any():
+        resolution = resolutions(recording, names)
+    # Noise below half a step of the output does not average its rounding away.
+    rounding = np.where(noise < resolution / 2, resolution**2 / 12, 0.0)
+    covariance = _pooled(moments[:, :3, :3], freedom, share)
+    for matrices in (moments, covariance):
+        matrices[:, range(3), range(3)] += rounding
+    return covariance, _motion(held, moments, freedom, share)
+
+
+def resolutions(recording: Recording, names: list[str], part: int | None = None) -> Array:
+    """Smallest step between the values of each channel, shape (3,), or within the first `part` samples of each.
+
+    0 for a channel of one value, but infinite for a part of one.
+    """
+    found = np.full(len(names), 0.0 if part is None else np.inf)
+    for axis, name in enumerate(names):
+        samples = recording.column(name)
+        values = distinct(samples[:: max(1, len(samples) // 100_000)][:part])
+        if len(values) > 1:
+            found[axis] = np.diff(values).min()
+    return found
+
+
+# A continuous recording to static attitudes.
+
+
+_BLOCK_SECONDS = 0.1
+_GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
+"""A step in time that is longer than both is a gap; no window reaches across it."""
+_SLOW = 5.0
+_MUCH_LOST = 0.05
+_THRESHOLDS = np.geomspace(1.5, 400.0, 18)
+_DRIFT, _AS_GOOD = 1.0, 1.1
+"""K by which the temperature moves where the ellipsoid moves with it, and the share of the least error that then tells
+thresholds apart no more."""
+_SAME_ATTITUDE = 2e-3
+"""Pieces of one hold whose means differ by less than this fraction of g (rad) are one attitude: averaging them
+shortens the vector by less than 0.5 ug."""
+_TRACE_POINTS = 2000
+_A_PART = 2000
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Means and mean squared scatters of consecutive blocks of `length` samples, shape (n, 3)."""
+
+    mean: Array
+    scatter: Array
+    length: int
+    duration: float
+    broken: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """Static stretches in blocks, half-open, the attitude that each belongs to, and the attitudes' means (n, 3)."""
+
+    start: NDArray[np.int64]
+    stop: NDArray[np.int64]
+    attitude: NDArray[np.int64]
+    mean: Array
+
+
+def find_attitudes(
+    data: Data,
+    *,
+    sensor: str = "accel",
+    window: float = 1.0,
+    settling: float = 0.3,
+    shortest: float = 1.0,
+    **reading: Unpack[Sampling],
+) -> Attitudes:
+    """Find the static attitudes of a tumble recording, with the covariance of each mean.
+
+    A recording without a time column is a table of attitudes, a row each; it is taken as it is, with the
+    covariances that its ``std_<sensor>_<axis>`` columns state.
+
+    Parameters
+    ----------
+    data
+        A file, recording, data frame or arrays with columns ``<sensor>_x``, ``_y``, ``_z``, and ``time`` unless it is a
+        table; or the triad alone, shape (n, 3).
+    sensor
+        Stem of the triad's columns.
+    window
+        Length of the window whose variance decides on rest, s.
+    settling
+        Discarded at both ends of each static stretch, s.
+    shortest
+        Shortest static stretch to use after that, s.
+    reading
+        How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
+        `element`.
+
+    Returns
+    -------
+    Attitudes
+        Means in the unit of the columns.
+
+    Raises
+    ------
+    DataError
+        A sample is not finite or clipped, time does not rise.
+    SegmentError
+        No static stretch was found.
+    UnitError
+        The three columns have different units, or none.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.find_attitudes(il.simulate_tumble(attitudes=24).triad("accel"), rate=100.0, unit="m/s^2")
+    Attitudes(24 of arrays, in m/s^2)
+    """
+    for name, value in (("window", window), ("settling", settling), ("shortest", shortest)):
+        if value < 0:
+            raise OptionError(f"{name} {value:g} s: expected 0 or more")
+    recording = as_recording(data, reading, find_attitudes, lambda samples: {sensor: samples})
+    unit = recording.triad_unit(sensor)
+    names = triad(sensor)
+    if not len(recording):
+        raise SegmentError(f"{recording.name}: no samples")
+    check_finite(recording, names)
+    temperature = recording.mean_temperature()
+    if "time" not in recording:
+        check_clipped_rows(recording, names)
+        found = attitude_table(recording, sensor, names, unit, temperature)
+        return replace(found, notes=(*_corrected_notes(recording), *found.notes))
+    time = check_time(recording)
+    left_out = leave_out(recording, names)
+    given, recording = recording, left_out.recording
+    blocks = _form_blocks(recording, names, time, window)
+    width = _window_width(blocks, recording, time, window)
+    variance = _window_variance(blocks, width)
+    quiet, resolution = _quietest(variance, recording, names)
+    pieces, threshold = _sweep(variance, quiet, blocks, width, settling, shortest, _drifts(recording))
+    trace = _trace(variance, time, blocks, width, threshold, quiet)
+    if not pieces.start.size:
+        raise SegmentError(f"{recording.name}: no static attitude found: {trace.describe()}")
+    stretches = np.column_stack([pieces.start * blocks.length, pieces.stop * blocks.length, pieces.attitude])
+    for a, b, _ in stretches.tolist():
+        left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
+    check_clipping(recording, names, stretches)
+    held = Held.of(recording, names, stretches, blocks.duration / blocks.length)
+    covariance, motion = covariance_and_motion(held, recording, names, resolution)
+    first = np.unique(pieces.attitude, return_index=True)[1]
+    return Attitudes(
+        mean=pieces.mean,
+        covariance=covariance,
+        samples=np.bincount(pieces.attitude, pieces.stop - pieces.start).astype(np.int64) * blocks.length,
+        start=time[stretches[first, 0]],
+        stop=time[stretches[np.append(first[1:], len(stretches)) - 1, 1] - 1],
+        unit=unit,
+        recording=given,
+        temperature=temperature,
+        trace=trace,
+        pieces=stretches,
+        swing=np.ptp(blocks.mean, axis=0),
+        motion=motion,
+        notes=(
+            *_corrected_notes(recording),
+            *left_out.notes(_at_rest(stretches, len(time))),
+            *_notes(blocks, variance),
+        ),
+    )
+
+
+def _quietest(variance: Array, recording: Recording, names: list[str]) -> tuple[float, Array]:
+    """Return the variance of the quietest windows, no smaller than that of rounding, and the step of each output."""
+    finite = variance[np.isfinite(variance) & (variance > 0)]
+    quietest = quantile(finite, 0.05) if finite.size else 0.0
+    # No step within a part is smaller than the smallest of all, which costs a sort: often too small to matter already.
+    resolution = resolutions(recording, names, _A_PART)
+    if float((resolution**2).sum()) / 12 > quietest:
+        resolution = resolutions(recording, names)
+    return max(quietest, float((resolution**2).sum()) / 12), resolution
+
+
+def _at_rest(stretches: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+    """Return which samples belong to an attitude, shape (count,)."""
+    rest = np.zeros(count, dtype=np.bool_)
+    for start, stop, _ in stretches.tolist():
+        rest[start:stop] = True
+    return rest
+
+
+def _corrected_notes(recording: Recording) -> tuple[str, ...]:
+    return tuple(
+        f"the recording was corrected by {entry.rpartition(' sha256:')[0]}: what is found is what that left; expected "
+        "the recording as it was measured"
+        for entry in recording.corrected_by
+    )
+
+
+def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
+    """What is odd about the clock of the recording."""
+    rate = blocks.length / blocks.duration
+    lost = 1 - float(np.isfinite(variance).mean())
+    notes = []
+    if rate < _SLOW:
+        notes.append(f"about {rate:.3g} samples per second: is the unit of time right?")
+    if lost > _MUCH_LOST:
+        notes.append(f"gaps in time: {100 * lost:.0f} % of the windows reach across one and were not used")
+    return tuple(notes)
+
+
+def _form_blocks(recording: Recording, names: list[str], time: Array, window: float) -> _Blocks:
+    steps = np.diff(time)
+    # The mean, not the median: stamps come in bursts, rates change, samples get lost; long pauses are left out.
+    usual = steps[steps <= quantile(steps, 0.99)] if steps.size else np.ones(1)
+    step = float(usual.mean())
+    seconds = min(_BLOCK_SECONDS, window / 3, len(time) * step)  # no block is longer than the recording
+    length = max(SMALLEST_BLOCK, round(seconds / step))
+    count = len(time) // length
+    mean, scatter, longest = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    x, y, z = (np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)
+    _segment.blocks(x, y, z, np.ascontiguousarray(time), length, mean, scatter, longest)
+    return _Blocks(mean, scatter, length, length * step, longest > max(_GAP_SECONDS, _GAP_STEPS * step))
+
+
+def _window_width(blocks: _Blocks, recording: Recording, time: Array, window: float) -> int:
+    """Return the length of the window in blocks; refuse a recording of less than two."""
+    width = max(3, round(window / blocks.duration))
+    if len(blocks.mean) < 2 * width:
+        raise SegmentError(
+            f"{recording.name}: {len(recording)} samples over {time[-1] - time[0]:.3g} s are too few to find static "
+            f"attitudes with a window of {window:g} s"
+        )
+    return width
+
+
+def _window_variance(blocks: _Blocks, width: int) -> Array:
+    """Variance of each window of `width` blocks, summed over the axes; infinite across a gap in time."""
+    variance = np.empty(len(blocks.mean) - width + 1)
+    _segment.windows(blocks.mean, blocks.scatter, blocks.broken, width, variance)
+    return variance
+
+
+def _sweep(
+    variance: Array, quiet: float, blocks: _Blocks, width: int, settling: float, shortest: float, drifting: bool
+) -> tuple[_Pieces, float]:
+    """Return the attitudes that predict each other best, and the threshold of the variance that they lie below."""
+    whole = len(blocks.mean) * blocks.duration
+    trim = int(np.ceil(min(settling, whole) / blocks.duration))
+    fewest = max(2, int(np.ceil(min(shortest, 2 * whole) / blocks.duration)))
+    candidates = _candidates(variance, quiet, blocks, width, trim, fewest)
+    best = _choose(candidates, drifting=drifting)
+    return candidates[best], _THRESHOLDS[best] * quiet
+
+
+def _candidates(variance: Array, quiet: float, blocks: _Blocks, width: int, trim: int, fewest: int) -> list[_Pieces]:
+    """Return the attitudes under each threshold; the same object where two thresholds find the same stretches.
+
+    Those are neighbours: what is quiet under one threshold is so under the next.
+    """
+    candidates: list[_Pieces] = []
+    start, stop = np.empty((2, len(variance)), dtype=np.int64)
+    before = None
+    for limit in (_THRESHOLDS * quiet).tolist():
+        count = _segment.stretches(variance, limit, width, trim, fewest, start, stop)
+        found = start[:count].tobytes(), stop[:count].tobytes()
+        candidates.append(
+            candidates[-1] if found == before else _merge(start[:count].copy(), stop[:count].copy(), blocks)
+        )
+        before = found
+    return candidates
+
+
+def _merge(start: NDArray[np.int64], stop: NDArray[np.int64], blocks: _Blocks) -> _Pieces:
+    """Number the attitudes: neighbouring stretches with the same mean are one attitude that was interrupted."""
+    attitude, mean = np.empty(len(start), dtype=np.int64), np.empty((len(start), 3))
+    count = _segment.attitudes(blocks.mean, start, stop, _SAME_ATTITUDE, attitude, mean)
+    return _Pieces(start, stop, attitude, mean[:count])
+
+
+def _drifts(recording: Recording) -> bool:
+    """Return whether the temperature moves so much that the outputs at rest lie on no one ellipsoid."""
+    if "temperature" not in recording:
+        return False
+    read = recording.column("temperature")
+    read = read[np.isfinite(read)]
+    return bool(read.size) and quantile(read, 0.95) - quantile(read, 0.05) > _DRIFT
+
+
+def _choose(candidates: list[_Pieces], *, drifting: bool = False) -> int:
+    """Index of the threshold whose attitudes predict each other best, among those that find enough.
+
+    An ellipsoid ``x' Q x + 2 q' x = 1`` is linear in its nine coefficients, so that the error of each attitude
+    predicted from all others follows from the hat matrix, ``r / (1 - h)``; half of it is the relative error of the
+    radius. Where the temperature drifts, so does the ellipsoid, which is most of every error: of the thresholds that
+    are as good, the one is taken whose neighbours change the time at rest least.
+    """
+    counts = np.array([len(pieces.mean) for pieces in candidates])
+    enough = min(int(counts.max()), max(14, int(np.ceil(0.75 * median(counts[counts > 0])))) if counts.any() else 0)
+    known: dict[int, float] = {}
+    errors = []
+    for pieces, count in zip(candidates, counts, strict=True):
+        if id(pieces) not in known:
+            usable = count >= max(enough, 1)
+            known[id(pieces)] = _segment.ellipsoid_error(pieces.mean) if usable else np.inf
+        errors.append(known[id(pieces)])
+    if np.isfinite(errors).any() and drifting:
+        rest = np.log([max(int((pieces.stop - pieces.start).sum()), 1) for pieces in candidates])
+        good = np.array(errors) <= _AS_GOOD * np.min(errors)
+        return int(np.argmin(np.where(good, np.abs(np.gradient(rest)), np.inf)))
+    if np.isfinite(errors).any():
+        return int(np.argmin(errors))
+    return int(np.argmax(counts))
+
+
+def _trace(variance: Array, time: Array, blocks: _Blocks, width: int, threshold: float, quiet: float) -> Trace:
+    """Decimate the variance trace for the record: the largest value of each group of windows."""
+    group = max(1, -(-len(variance) // _TRACE_POINTS))
+    usable = variance[: len(variance) // group * group].reshape(-1, group)
+    largest = np.where(np.isfinite(usable), usable, 0.0).max(axis=1)
+    middle = (np.arange(len(largest)) * group * blocks.length + width * blocks.length // 2).clip(max=len(time) - 1)
+    return Trace(time=time[middle], variance=largest, threshold=float(threshold), quiet=quiet)
+
+
+# Attitudes from what people have: a file, a recording, a data frame, arrays, or means with their covariances.
+
+
+TumbleData: TypeAlias = Attitudes | Data
+_SYMMETRIC = 1e-9
+
+
+def as_attitudes(
+    data: TumbleData,
+    reading: Mapping[str, Any] | Reading | Sampling,
+    function: Callable[..., Any],
+    covariance: ArrayLike | None = None,
+) -> Attitudes:
+    """Return data as static attitudes.
+
+    Parameters
+    ----------
+    data
+        Attitudes; or data, in which they are found; without a time each row is one.
+    reading
+        How data are to be understood.
+    function
+        What was called with them, for messages.
+    covariance
+        Of the means, in the squared unit of the outputs, shape (3, 3) for all or (n, 3, 3), where rows are attitudes.
+
+    Raises
+    ------
+    DataError
+        The covariances are none, or of something else; and what `as_recording` and `find_attitudes` raise.
+    OptionError
+        They are given twice, or for a recording with time, which says itself what they are.
+    """
+    called = function.__name__
+    if isinstance(data, Attitudes):
+        for key, value in reading.items():
+            if value is not None:
+                raise OptionError(f"{called}: {key} does not go with attitudes, which were found already")
+        found = data
+    else:
+        found = find_attitudes(as_recording(data, reading, function))
+    if covariance is None:
+        return found
+    if found.covariance is not None:
+        why = "std_* columns state it" if found.trace is None else "the recording itself says how certain they are"
+        raise OptionError(f"{called}: covariance: {why}; expected means of attitudes without")
+    return replace(found, covariance=_checked(covariance, len(found), called))
+
+
+def _checked(covariance: ArrayLike, count: int, called: str) -> Array:
+    """Return covariances of shape (n, 3, 3)."""
+    try:
+        given = np.asarray(covariance, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DataError(f"{called}: covariance: expected numbers") from None
+    if given.shape not in ((3, 3), (count, 3, 3)):
+        raise DataError(f"{called}: covariance: expected the shape (3, 3) or ({count}, 3, 3), found {given.shape}")
+    matrices = np.array(np.broadcast_to(given, (count, 3, 3)))
+    largest = np.abs(matrices).max(axis=(1, 2), initial=0.0)[:, None, None]
+    if not np.isfinite(matrices).all() or (np.abs(matrices - matrices.swapaxes(1, 2)) > _SYMMETRIC * largest).any():
+        raise DataError(f"{called}: covariance: expected symmetric matrices of finite numbers")
+    if (np.linalg.eigvalsh(matrices) <= 0).any():
+        raise DataError(f"{called}: covariance: expected positive definite matrices")
+    return matrices

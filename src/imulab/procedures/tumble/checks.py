@@ -6,11 +6,11 @@ import numpy as np
 
 from imulab.columns import triad
 from imulab.errors import DataError, RecordError
-from imulab.estimation.ranked import median
+from imulab.estimation.rows import median
+from imulab.procedures.tumble import HIGHEST_ORDER
 from imulab.procedures.tumble.attitudes import Attitudes, Motion
-from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.model import GAUGE, parameter_names
-from imulab.procedures.tumble.sections import data_of, model_of
+from imulab.procedures.tumble.schema import data_of, model_of
 from imulab.procedures.tumble.solve import Solution
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration

@@ -1,22 +1,54 @@
-"""A tumble record as the tables that the C core runs, and the vectors by which an exported unit tests itself."""
+"""A tumble record as the tables that the C core runs and as matrices for other programs.
+
+Recordings corrected by it.
+
+The linear part of a model with nonlinearity is not the best linear model: where the attitudes hardly separate scale
+factor and k3, the one has taken what the other has given. A target that holds no k3 needs the scale factor without it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from imulab.device.golden import VECTORS
-from imulab.device.gyroscopes import gyro_powers, gyro_table, polynomial
-from imulab.device.tables import DeviceTable, Field, field_of, nonzero, values_of, whole
-from imulab.device.unit import DeviceUnit
-from imulab.errors import RecordError
-from imulab.procedures.tumble.choices import HIGHEST_ORDER
-from imulab.procedures.tumble.sections import model_of
-from imulab.recording import Array
-from imulab.records.calibration import Calibration
-from imulab.records.triads import CROSS_TERMS
-from imulab.units import STANDARD_GRAVITY
+from imulab.columns import triad
+from imulab.device.tables import (
+    DeviceTable,
+    Field,
+    field_of,
+    gyro_powers,
+    gyro_table,
+    nonzero,
+    polynomial,
+    values_of,
+    whole,
+)
+from imulab.device.unit import VECTORS, DeviceUnit
+from imulab.errors import DataError, RecordError, UnitError
+from imulab.estimation.least_squares import covariance, least_squares, leverage, observability, plausible_excess
+from imulab.procedures.tumble import HIGHEST_ORDER
+from imulab.procedures.tumble.model import AXES, gravity_slope, norm_and_jacobian, parameter_names
+from imulab.procedures.tumble.schema import data_of, fit_of, model_of
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.triads import (
+    CROSS_TERMS,
+    Accelerometers,
+    Gyroscopes,
+    LinearFit,
+    Magnetometers,
+    Triads,
+    output_to_si,
+    text_in_g,
+)
+from imulab.report.traces import plain_number
+from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
+
+# A tumble record as the tables that the C core runs, and the vectors by which an exported unit tests itself.
+
 
 _AXES = "xyz"
 _CROSSED = 256
@@ -131,3 +163,326 @@ def golden_magnetometers(table: DeviceTable, rng: np.random.Generator) -> dict[s
     output[1, 0] = np.nan
     field, _ = DeviceUnit.of(table).mag(list(output.T))
     return {"": VECTORS, "scale": size, "output": output, "field": np.column_stack(field)}
+
+
+# A tumble record applied: raw triads to specific force and body rate, by the C core.
+
+
+_FAR = 2.0
+_ACCEL = triad("accel")
+_GYRO = triad("gyro")
+_MAG = triad("mag")
+
+
+def apply_tumble(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+    """Return the recording with accel_* as specific force, m/s^2, in the body frame of the record's gauge.
+
+    NaN stays in what it touches; an output that lies beyond a turning point of the polynomial becomes NaN.
+
+    Raises
+    ------
+    UnitError
+        The columns' unit cannot be converted to the record's.
+    DataError
+        The recording has no accelerometer triad.
+    """
+    force, _ = unit.tumble(_outputs(recording, "accel", str(columns["output_unit"])))
+    return recording.with_columns(dict(zip(_ACCEL, force, strict=True)), dict.fromkeys(_ACCEL, "m/s^2"))
+
+
+def apply_gyro(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+    """Return the recording with gyro_* as body rate, in their unit if that is one of rate, else in rad/s.
+
+    accel_* are the specific force (already corrected), which the g-sensitivity needs.
+
+    Raises
+    ------
+    UnitError
+        The columns' unit cannot be converted to the record's.
+    DataError
+        The recording lacks a gyroscope, or the accelerometers that the record's g-sensitivity needs.
+    """
+    outputs = _outputs(recording, "gyro", str(columns["output_unit"]))
+    kept = parse_unit(recording.triad_unit("gyro"))
+    kept_unit = kept.symbol if kept.quantity == "rate" else "rad/s"
+    force = None
+    if any(name in recording for name in _ACCEL):
+        force = [to_si(recording.column(name), recording.units[name]) for name in _ACCEL]
+    elif np.isnan(unit.gyro([np.zeros(1)] * 3, None)[0][0][0]):
+        raise DataError(
+            f"{recording.name}: the record corrects the gyroscopes' g-sensitivity, which needs accel_x, accel_y and "
+            f"accel_z; found {' '.join(recording.columns)}"
+        )
+    rate, _ = unit.gyro(outputs, force)
+    return recording.with_columns(
+        {name: from_si(values, kept_unit) for name, values in zip(_GYRO, rate, strict=True)},
+        dict.fromkeys(_GYRO, kept_unit),
+    )
+
+
+def apply_mag(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+    """Return the recording with mag_* as the field in the body frame: uT, or parts of the local field (unit 1).
+
+    Raises
+    ------
+    UnitError
+        The columns' unit cannot be converted to the record's.
+    DataError
+        The recording has no magnetometer triad.
+    """
+    field, _ = unit.mag(_outputs(recording, "mag", str(columns["output_unit"])))
+    known = "uT" if columns["field_unit"] == "T" else "1"
+    return recording.with_columns(
+        {name: from_si(values, known) for name, values in zip(_MAG, field, strict=True)}, dict.fromkeys(_MAG, known)
+    )
+
+
+def _outputs(recording: Recording, sensor: str, needed: str) -> list[Array]:
+    """Columns of a triad in the unit of the outputs that the record calibrates."""
+    factor = output_factor(recording.name, sensor, recording.triad_unit(sensor), needed)
+    columns = [recording.column(f"{sensor}_{axis}") for axis in AXES]
+    return columns if factor == 1.0 else [column * factor for column in columns]
+
+
+def output_factor(name: str, sensor: str, unit: str, needed: str) -> float:
+    """Return the factor from a triad's unit to the unit of the outputs that a record calibrates.
+
+    Raises
+    ------
+    UnitError
+        There is none; the message names the recording and both units.
+    """
+    try:
+        return conversion_factor(unit, needed)
+    except UnitError:
+        raise UnitError(
+            f"{name}: columns {' '.join(f'{sensor}_{axis}' for axis in AXES)} are in {unit}, "
+            f"but the record calibrates outputs in {needed}"
+        ) from None
+
+
+def specific_force(record: Calibration, output: Array) -> Array:
+    """Return the specific force, m/s^2, for outputs in the record's unit; both of shape (n, 3).
+
+    Raises
+    ------
+    RecordError
+        The record lacks a parameter, or has one that cannot be.
+    """
+    force, _ = DeviceUnit.of(tables_of(record)[0]).tumble(list(output.T))
+    return np.column_stack(force)
+
+
+def field_in_body(record: Calibration, output: Array) -> Array:
+    """Return the field in the body frame, T or parts of the local one, for outputs in the record's unit, (n, 3) each.
+
+    Raises
+    ------
+    RecordError
+        The record lacks a parameter, or has one that cannot be.
+    """
+    (table,) = (table for table in tables_of(record) if table.kind == "mag")
+    field, _ = DeviceUnit.of(table).mag(list(output.T))
+    return np.column_stack(field)
+
+
+def beyond_test(record: Calibration, recording: Recording) -> tuple[int, float]:
+    """Return how many samples lie far beyond the 1 g that the record was made at, and the largest, m/s^2.
+
+    Counted only where the record has nonlinearity, which gravity has shown within 1 g and nowhere else.
+    """
+    model = model_of(record)
+    if model.order <= 1 and not model.cross:
+        return 0, 0.0
+    scale = np.array([record.value(f"scale_factor_{axis}") for axis in AXES])
+    bias = np.array([record.value(f"bias_{axis}") for axis in AXES])
+    factor = conversion_factor(recording.triad_unit("accel"), model.output_unit)
+    reading = np.abs(recording.triad("accel") * factor / scale - bias)
+    largest = np.where(np.isfinite(reading), reading, 0.0).max(axis=1, initial=0.0)
+    return int(np.count_nonzero(largest > _FAR * STANDARD_GRAVITY)), float(largest.max(initial=0.0))
+
+
+def beyond_message(record: Calibration, count: int, largest: float) -> str:
+    """Say that so many samples, the largest in m/s^2, lie beyond what shows the nonlinearity."""
+    most = f"{from_si(largest, 'g'):.1f} g"
+    return f"{count} samples beyond 2 g (up to {most}): the record's nonlinearity was measured within 1 g"
+
+
+# A record at a smaller model: fitted anew to the attitudes that the record holds.
+
+
+_LINEAR = 1
+_WEIGHED = 3  # passes until weights and excess agree
+_KEPT = 0.5  # attitudes that count for less than half were set aside by the record's own fit
+
+
+def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | None:
+    """Return a record of order 1, with bias and scale factor (and misalignment) fitted to the record's attitudes.
+
+    Minimises ``sum w (|f| - g - l)^2``, l the lengthening of |f| by noise and motion that the record states, over the
+    parameters that are left; w holds the scatter about the smaller model, so that the uncertainties do too.
+
+    Parameters
+    ----------
+    record
+        Of a tumble test.
+    misalignment
+        Whether the smaller model has misalignment; it is 0 otherwise.
+
+    Returns
+    -------
+    Calibration or None
+        The record with other parameters, covariance and rms; None where it holds no attitudes, or too few to see them.
+    """
+    held = data_of(record).attitudes
+    free = np.arange(9 if misalignment else 6)
+    if held is None:
+        return None
+    gravity = model_of(record).gravity
+    kept = np.array(held.down_weight) >= _KEPT
+    n, g = int(kept.sum()), float(gravity.value)
+    if n <= len(free):
+        return None
+    names = parameter_names(_LINEAR)
+    nominal = np.array([record.value(name) for name in names[3:6]])
+    reading = (np.array(held.mean)[kept] / (nominal * g))[None]
+    lengthening = np.array(held.lengthening or np.zeros(len(kept)))[kept] / g
+    stated = held.standard_uncertainty
+    own: Array = np.ones((1, n)) if stated is None else (np.array(stated)[kept] / g)[None] ** 2
+
+    def model(parameters: Array) -> tuple[Array, Array]:
+        theta = np.zeros((1, 9))
+        theta[0, free] = parameters
+        norm, jacobian = norm_and_jacobian(theta, reading, _LINEAR)[:2]
+        return norm[0] - 1 - lengthening, jacobian[0][:, free]
+
+    start: Array = np.concatenate([[record.value(name) / g for name in names[:3]], np.ones(3), np.zeros(3)])[free]
+    variance: Array = own
+    for _ in range(_WEIGHED):
+        fit = least_squares(model, start, 1 / variance[0])
+        start = fit.parameters[0]
+        if stated is not None:
+            spare = 1 - leverage(fit.jacobian, 1 / variance)
+            variance = own + plausible_excess(fit.residuals, own, spare)[0][:, None]
+    square = float((fit.residuals**2 / variance).sum()) / (n - len(free))
+    # Where nothing was stated of the noise, the residuals tell it.
+    factor = square if stated is None else 1.0
+    seen = observability(fit.jacobian[0], 1 / (variance[0] * max(factor, np.finfo(float).tiny)))
+    if seen.rank < len(free) or not fit.converged[0]:
+        return None
+    theta = np.zeros(9)
+    theta[free] = start
+    zero, relative = theta[:3], theta[3:6]
+    values = np.concatenate([g * zero / relative, nominal * relative, theta[6:]])
+    slope = np.diag(np.concatenate([g / relative, nominal, np.ones(3)]))
+    slope[range(3), range(3, 6)] = -g * zero / relative**2
+    shared = float(gravity.standard_uncertainty or 0.0) / g * gravity_slope(values, _LINEAR)
+    whole = slope[:, free] @ (covariance(fit.jacobian, 1 / variance)[0] * factor) @ slope[:, free].T
+    whole += np.outer(shared, shared)
+    fitted = {
+        name: replace(record.parameters[name], value=float(value), standard_uncertainty=float(np.sqrt(spread)))
+        if name in record.parameters
+        else Parameter(float(value), float(np.sqrt(spread)), "rad")
+        for name, value, spread in zip(names, values, np.diag(whole), strict=True)
+    }
+    gyro = {name: parameter for name, parameter in record.parameters.items() if name.startswith("gyro_")}
+    return replace(
+        record,
+        parameters=fitted | gyro,
+        covariance=Covariance(tuple(names), tuple(map(tuple, whole.tolist()))),
+        model={key: value for key, value in record.model.items() if key != "cross"} | {"order": _LINEAR},
+        fit={"attitudes": n, "rms": {"value": g * float(np.sqrt(np.mean(fit.residuals**2))), "unit": "m/s^2"}},
+    )
+
+
+# The triads of a tumble record as matrices, whole and without nonlinearity, for the files of other programs.
+
+
+def triads_of(record: Calibration) -> Triads:
+    """Return the triads of a record.
+
+    Raises
+    ------
+    RecordError
+        It lacks a parameter.
+    """
+    return Triads(_accelerometers(record), _gyroscopes(record), _magnetometers(record))
+
+
+def linear_fit(record: Calibration, *, misalignment: bool) -> LinearFit:
+    """Return the accelerometers fitted anew to the record's attitudes, without nonlinearity (and misalignment)."""
+    held = data_of(record).attitudes
+    refitted = refit_linear(record, misalignment=misalignment)
+    if refitted is None:
+        why = (
+            f"the record's {len(held.mean)} attitudes are too few, or not the ones, to fit them to anew"
+            if held is not None
+            else "the record holds no attitudes to fit them to anew"
+        )
+        return LinearFit(None, f"are those of the whole model: {why}")
+    uncertain = {name: p.standard_uncertainty or 0.0 for name, p in refitted.parameters.items()}
+    bias = max(uncertain[f"bias_{axis}"] for axis in _AXES)
+    scale = max(uncertain[f"scale_factor_{axis}"] / refitted.value(f"scale_factor_{axis}") for axis in _AXES)
+    return LinearFit(
+        _accelerometers(refitted),
+        f"were fitted anew to the record's {fit_of(refitted).attitudes} attitudes, without what is left out: "
+        f"|f| - g there is {text_in_g(fit_of(refitted).rms.value)} rms, {text_in_g(fit_of(record).rms.value)} by "
+        f"the whole model; standard uncertainties up to {text_in_g(bias)} and {plain_number(1e6 * scale, 3)} ppm",
+    )
+
+
+def _accelerometers(record: Calibration) -> Accelerometers:
+    model = model_of(record)
+    factor, kept = output_to_si(model.output_unit, "m/s^2")
+    matrix = np.eye(3)
+    for i, j in ((1, 0), (2, 0), (2, 1)):
+        matrix[i, j] = record.value(f"misalignment_{_AXES[i]}{_AXES[j]}")
+    terms = [[record.value(f"k{power}_{axis}") for axis in _AXES] for power in range(2, model.order + 1)]
+    return Accelerometers(
+        scale=np.array([record.value(f"scale_factor_{axis}") for axis in _AXES]) * factor,
+        matrix=matrix,
+        bias=np.array([record.value(f"bias_{axis}") for axis in _AXES]),
+        nonlinearity=np.array(terms).reshape(-1, 3),
+        cross=np.array([record.value(n) for n in CROSS_TERMS]) if CROSS_TERMS[0] in record.parameters else np.zeros(3),
+        unit=kept,
+    )
+
+
+def _gyroscopes(record: Calibration) -> Gyroscopes | None:
+    if "gyro_output_unit" not in record.model:
+        return None
+    factor, kept = output_to_si(model_of(record).gyro_output_unit, "rad/s")
+    matrix, sensitivity = np.eye(3), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            pair = _AXES[i] + _AXES[j]
+            if i != j:
+                matrix[i, j] = record.value(f"gyro_misalignment_{pair}")
+            if "gyro_g_sensitivity_xx" in record.parameters:
+                sensitivity[i, j] = record.value(f"gyro_g_sensitivity_{pair}")
+    return Gyroscopes(
+        scale=np.array([record.value(f"gyro_scale_factor_{axis}") for axis in _AXES]) * factor,
+        matrix=matrix,
+        sensitivity=sensitivity,
+        bias=np.array([record.value(f"gyro_bias_{axis}") for axis in _AXES]),
+        unit=kept,
+        nonlinearity=gyro_powers(record),
+    )
+
+
+def _magnetometers(record: Calibration) -> Magnetometers | None:
+    if "mag_output_unit" not in record.model:
+        return None
+    model = model_of(record)
+    matrix = np.eye(3)
+    for i, j in ((i, j) for i in range(3) for j in range(3) if i != j):
+        matrix[i, j] = record.value(f"mag_misalignment_{_AXES[i]}{_AXES[j]}")
+    return Magnetometers(
+        scale=np.array([record.value(f"mag_scale_factor_{axis}") for axis in _AXES]),
+        matrix=matrix,
+        bias=np.array([record.value(f"mag_bias_{axis}") for axis in _AXES]),
+        quadratic=np.array([record.value(f"mag_k2_{axis}") if model.mag_order == 2 else 0.0 for axis in _AXES]),
+        axes=mag_axes(model.mag_axes),
+        unit=model.mag_output_unit,
+        field=model.field.value if model.field is not None and model.field.unit == "T" else None,
+    )

@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from imulab.estimation.ranked import median, rms
-from imulab.procedures.tumble.engineering import micro_g, small_g
+from imulab.estimation.rows import median, quantile, rms
 from imulab.procedures.tumble.mag.figures import mag_facts, mag_figures, mag_headline
 from imulab.procedures.tumble.model import AXES
-from imulab.procedures.tumble.sections import (
+from imulab.procedures.tumble.record import engineering_rows, micro_g, propagated_rows, small_g
+from imulab.procedures.tumble.schema import (
     HeldAttitudes,
+    Prior,
     Trace,
+    Trials,
     TurnAside,
     Turns,
     attitudes_of,
@@ -21,13 +23,301 @@ from imulab.procedures.tumble.sections import (
     gyro_of,
     model_of,
 )
-from imulab.procedures.tumble.sphere import sphere_figure
-from imulab.procedures.tumble.tables import orders_table, parameters_table, propagated_table, shares_table
+from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.bulk import bulk, edge_marks, edge_note
-from imulab.report.elements import ALARM, BAD, GOOD, LEGEND, QUIET, Exhibits, Figure, ReportTable, plain_number
-from imulab.report.traces import axis, correlation_map, log_axis, scatter, strongest_pair
+from imulab.report.traces import (
+    ALARM,
+    BAD,
+    GOOD,
+    INK,
+    LEGEND,
+    QUIET,
+    Exhibits,
+    Figure,
+    ReportTable,
+    bulk,
+    correlation_map,
+    edge_marks,
+    edge_note,
+    figure_axis,
+    format_uncertain,
+    log_axis,
+    plain_number,
+    scatter,
+    strongest_pair,
+)
 from imulab.units import from_si
+
+# The attitudes of a tumble test on two equal-area maps of the sphere.
+
+
+def sphere_figure(record: Calibration) -> Figure:
+    """Return the attitudes as points on the hemispheres around +z and −z, coloured by their residual."""
+    data = attitudes_of(record)
+    force = np.array(data.force)
+    u = force / np.linalg.norm(force, axis=1, keepdims=True)
+    residual = np.array([float(from_si(value, "ug")) for value in data.residual])
+    weight = np.array(data.down_weight)
+    limit = quantile(np.abs(residual[weight >= ALARM]), 0.95) if (weight >= ALARM).any() else 1.0
+    up = u[:, 2] >= 0
+    traces: list[dict[str, Any]] = []
+    for upper, axes in ((True, ("x", "y")), (False, ("x2", "y2"))):
+        traces += _graticule(axes)
+        chosen = up if upper else ~up
+        labels = [label for label, c in zip(data.label, chosen.tolist(), strict=True) if c]
+        traces.append(_hemisphere(u[chosen], residual[chosen], labels, limit, axes, upper=upper))
+    hidden = {"visible": False, "range": [-1.25, 1.25], "fixedrange": True}
+    return Figure(
+        title="Attitudes on the sphere",
+        caption="Direction of the specific force (up) in the body frame, equal-area maps: left the "
+        "hemisphere around +z, right that around −z. Large empty regions are what the calibration has not seen.",
+        traces=traces,
+        layout={
+            "margin": {"l": 10, "r": 10, "t": 20, "b": 10},
+            "xaxis": {**hidden, "domain": [0, 0.47]},
+            "yaxis": {**hidden, "scaleanchor": "x"},
+            "xaxis2": {**hidden, "domain": [0.5, 0.97]},
+            "yaxis2": {**hidden, "scaleanchor": "x2", "anchor": "x2"},
+            "annotations": [
+                note
+                for axes, side in ((("x", "y"), "+z"), (("x2", "y2"), "−z"))
+                for note in (
+                    _label(axes, 1.15, 0, "+x"),
+                    _label(axes, -1.15, 0, "−x"),
+                    _label(axes, 0, 1.12, "+y"),
+                    _label(axes, 0, -1.12, "−y"),
+                    _label(axes, 0, 0, side),
+                )
+            ],
+        },
+        height=420,
+    )
+
+
+def _hemisphere(
+    up: Array, residual: Array, labels: list[str], limit: float, axes: tuple[str, str], *, upper: bool
+) -> dict[str, Any]:
+    """Return the attitudes of one hemisphere as points, coloured by residual from -limit to limit, µg."""
+    x, y = _equal_area(up, upper)
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "x": x.tolist(),
+        "y": y.tolist(),
+        "xaxis": axes[0],
+        "yaxis": axes[1],
+        "showlegend": False,
+        "marker": {
+            "size": 12,
+            "color": residual.tolist(),
+            "cmin": -limit,
+            "cmax": limit,
+            "colorscale": [[0, GOOD], [0.5, "#f4efe6"], [1, BAD]],
+            "line": {"color": INK, "width": 1},
+            "showscale": upper,
+            "colorbar": {"title": {"text": "|f| − g, µg"}, "thickness": 12},
+        },
+        "text": labels,
+        "customdata": up.round(3).tolist(),
+        "hovertemplate": "%{text}<br>up (%{customdata[0]}, %{customdata[1]}, %{customdata[2]})<extra></extra>",
+    }
+
+
+def _equal_area(u: Array, upper: bool) -> tuple[Array, Array]:
+    """Lambert's azimuthal equal-area map of a hemisphere onto the unit disc."""
+    z = u[:, 2] if upper else -u[:, 2]
+    radius = np.sqrt(np.maximum(1 - z, 0.0))
+    ring = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-12)
+    return radius * u[:, 0] / ring, radius * u[:, 1] / ring
+
+
+def _graticule(axes: tuple[str, str]) -> list[dict[str, Any]]:
+    angle = np.linspace(0, 2 * np.pi, 121)
+    circles = [np.sqrt(1 - np.cos(np.radians(t))) for t in (30, 60, 90)]
+    return [
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": (r * np.cos(angle)).round(4).tolist(),
+            "y": (r * np.sin(angle)).round(4).tolist(),
+            "xaxis": axes[0],
+            "yaxis": axes[1],
+            "hoverinfo": "skip",
+            "line": {"color": INK if r == circles[-1] else "#d5dbdf", "width": 1},
+            "showlegend": False,
+        }
+        for r in circles
+    ]
+
+
+def _label(axes: tuple[str, str], x: float, y: float, text: str) -> dict[str, Any]:
+    return {
+        "xref": axes[0],
+        "yref": axes[1],
+        "x": x,
+        "y": y,
+        "text": text,
+        "showarrow": False,
+        "font": {"color": QUIET if (x, y) == (0, 0) else INK},
+    }
+
+
+# The tables of a tumble record, from the record alone.
+
+
+_AGREE = 10.0
+"""Per cent by which the widths of two kinds of intervals may differ before it matters."""
+
+
+def _basis(record: Calibration) -> str:
+    """Say what the uncertainties rest on."""
+    fit = fit_of(record)
+    freedom = fit.freedom
+    if fit.noise != "known" and freedom is None:
+        return "As many parameters as attitudes: nothing tells the noise, and no uncertainty is stated."
+    if fit.noise != "known":
+        return f"Noise estimated from the residuals; Student's t with {freedom:.0f} degrees of freedom."
+    if not fit.excess.value or freedom is None:
+        return "Noise known from the attitudes' own scatter; normal quantiles."
+    return (
+        f"Noise known from the attitudes' own scatter, with {small_g(fit.excess.value)} more for each "
+        f"attitude, as its residual makes plausible; Student's t with {freedom:.0f} effective degrees of freedom."
+    )
+
+
+def parameters_table(record: Calibration) -> ReportTable:
+    """Return the parameters with their uncertainties."""
+    fit, model = fit_of(record), model_of(record)
+    factors = {False: fit.coverage_factor_95, True: None if fit.gyro is None else fit.gyro.coverage_factor_95}
+    rows = []
+    for row in engineering_rows(record):
+        factor = factors[row.name.startswith("gyro_")]
+        value, uncertainty = row.text()
+        interval = "not stated"
+        if row.interval is not None and row.standard_uncertainty is not None:
+            interval = " to ".join(format_uncertain(end, row.standard_uncertainty)[0] for end in row.interval)
+        elif row.standard_uncertainty is not None and factor is not None:
+            half = factor * row.standard_uncertainty
+            interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
+        order_known = "–" if row.given_order is None else format_uncertain(row.value, row.given_order)[1]
+        given = [] if fit.blend is None else [order_known]
+        rows.append([row.name, value, uncertainty, *given, interval, row.unit])
+    basis = _basis(record)
+    if fit.blend is not None:
+        basis += (
+            f" The standard uncertainty holds whatever the order is, up to {fit.blend.highest_order}; beside it what "
+            f"it would be if order {model.order} were known to be right."
+        )
+    turned = ""
+    if fit.gyro is not None:
+        turned = (
+            f" Gyroscopes: M = S (T ω + b + G f), Student's t with {fit.gyro.degrees_of_freedom} degrees of freedom."
+        )
+    if fit.mag is not None:
+        turned += (
+            f" Magnetometers: the law of the accelerometers with the field m for f, T with six misalignments, outputs "
+            f"renamed {model.mag_axes}; Student's t."
+        )
+    return ReportTable(
+        title="Parameters",
+        caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {model.gauge}.{turned}",
+        columns=[
+            "parameter",
+            "value",
+            "standard uncertainty",
+            *([] if fit.blend is None else [f"if order {model.order} is right"]),
+            "95 % interval",
+            "unit",
+        ],
+        rows=rows,
+    )
+
+
+def propagated_table(record: Calibration, trials: Trials) -> ReportTable:
+    """Return the intervals by propagation of distributions beside the linear ones."""
+    rows = propagated_rows(record, trials)
+    failed = f", {trials.failed} more did not converge" if trials.failed else ""
+    return ReportTable(
+        title="Monte Carlo",
+        message=_agreement(rows),
+        caption=f"95 % intervals of {trials.trials} trials (JCGM 101{failed}) beside the linear ones. A ratio far "
+        "from 1 means that the model is not linear over its own uncertainty: trust the trials then.",
+        columns=["parameter", "linear", "Monte Carlo", "ratio of widths", "unit"],
+        rows=rows,
+    )
+
+
+def _agreement(rows: list[list[str]]) -> str:
+    """Say within what the linear and the Monte Carlo intervals agree."""
+    if not rows:
+        return ""
+    name, *_, ratio, _ = max(rows, key=lambda row: abs(float(row[3]) - 1))
+    percent = 100 * abs(float(ratio) - 1)
+    apart = f"{plain_number(percent, 2)} % ({name})"
+    if percent <= _AGREE:
+        return f"The linear and the Monte Carlo intervals agree: their widths within {apart}."
+    return (
+        f"The linear and the Monte Carlo intervals differ: their widths by up to {apart}. Use the "
+        "Monte Carlo intervals."
+    )
+
+
+def shares_table(prior: Prior) -> ReportTable:
+    """Return what each parameter owes to the prior."""
+    rows = [[name, f"{100 * share:.0f} %", f"{100 * (1 - share):.0f} %"] for name, share in prior.shares.items()]
+    return ReportTable(
+        title="Prior and data",
+        caption=f"Where the knowledge of each parameter comes from: the prior (a record of {prior.created}) or "
+        "these attitudes; variance now over that of the prior with what it aged since.",
+        columns=["parameter", "from the prior", "from the data"],
+        rows=rows,
+    )
+
+
+def orders_table(record: Calibration) -> ReportTable:
+    """Return what the choice of the order rests on."""
+    fit, chosen = fit_of(record), model_of(record).order
+    rows, highlight = [], None
+    for index, row in enumerate(fit.orders):
+        if row.order == chosen:
+            highlight = index
+        rows.append(
+            [
+                str(row.order),
+                str(row.parameters),
+                plain_number(micro_g(row.rms), 4),
+                plain_number(micro_g(row.leave_one_out), 4) if row.leave_one_out is not None else "–",
+                f"{row.f_probability:.2g}" if row.f_probability is not None else "–",
+                f"{row.bic:.1f}" if row.bic is not None else "–",
+                plain_number(micro_g(row.largest_uncertainty), 3) if row.largest_uncertainty is not None else "–",
+                plain_number(row.condition_number, 3),
+                "yes" if row.observable else f"no, rank {row.rank} of {row.parameters}",
+            ]
+        )
+    huber = " Rms of all attitudes, a down-weighted one by its weight." if fit.loss == "huber" else ""
+    return ReportTable(
+        title="Choice of the order",
+        caption="A higher order fits closer (rms) whether it is right or not. It is taken only if it also predicts "
+        "attitudes it has not seen better (leave-one-out), by more than the error of that comparison, if the F-test "
+        "finds the gain significant, and if the attitudes can observe it: nowhere on the sphere may the predicted "
+        f"uncertainty of |f| exceed 4 times the scatter at order 1.{huber}",
+        columns=[
+            "order",
+            "parameters",
+            "rms, µg",
+            "leave-one-out, µg",
+            "F-test p",
+            "BIC",
+            "largest u(|f|), µg",
+            "condition",
+            "observable",
+        ],
+        rows=rows,
+        highlight=highlight,
+    )
+
+
+# The figures and tables of a tumble record, from the record alone.
 
 
 def exhibits(record: Calibration) -> Exhibits:
@@ -132,11 +422,11 @@ def _residuals(record: Calibration) -> Figure:
             *marks,
         ],
         layout={
-            "xaxis": axis(
+            "xaxis": figure_axis(
                 "attitude", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6], anchor="y"
             ),
-            "yaxis": axis("after, µg", domain=[0, 0.6]) | scale,
-            "yaxis2": axis("before, mg", domain=[0.68, 1]),
+            "yaxis": figure_axis("after, µg", domain=[0, 0.6]) | scale,
+            "yaxis2": figure_axis("before, mg", domain=[0.68, 1]),
             "showlegend": False,
         },
         height=460,
@@ -186,7 +476,7 @@ def _trace(trace: Trace, data: HeldAttitudes) -> Figure:
             ),
         ],
         layout={
-            "xaxis": axis("time, s"),
+            "xaxis": figure_axis("time, s"),
             "yaxis": log_axis("standard deviation, mg"),
             "legend": LEGEND,
             "shapes": [
@@ -242,8 +532,8 @@ def _turns(data: Turns, aside: list[TurnAside]) -> Figure:
             *marks,
         ],
         layout={
-            "xaxis": axis("turn", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6]),
-            "yaxis": axis("residual angle, deg", **({} if beyond is None else {"range": [0, beyond.high]})),
+            "xaxis": figure_axis("turn", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6]),
+            "yaxis": figure_axis("residual angle, deg", **({} if beyond is None else {"range": [0, beyond.high]})),
             "showlegend": False,
         },
         height=320,

@@ -8,27 +8,26 @@ from typing import Unpack
 
 from numpy.typing import ArrayLike
 
-from imulab.earth import at_latitude
 from imulab.errors import OptionError
 from imulab.estimation.least_squares import Observability
-from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Record, as_record
-from imulab.procedures.result import Result
-from imulab.procedures.tumble import texts
-from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.gravity import Gravity, at_latitude, at_place, local_gravity
+from imulab.procedures import tumble
+from imulab.procedures.result import Record, Result, as_record
+from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.checks import check_attitudes
-from imulab.procedures.tumble.estimate import estimate_triad, nominal_scaling
-from imulab.procedures.tumble.findings import Estimate
-from imulab.procedures.tumble.given import TumbleData, as_attitudes
-from imulab.procedures.tumble.linearised import SOURCE_THRESHOLD, Threshold
-from imulab.procedures.tumble.mag.stated import Place, stated_place
+from imulab.procedures.tumble.estimate import (
+    check_options,
+    estimate_triad,
+    further_triads,
+    nominal_scaling,
+    with_assumed_alignment,
+)
+from imulab.procedures.tumble.mag.solve import Place, stated_place
 from imulab.procedures.tumble.model import parameter_count
-from imulab.procedures.tumble.montecarlo import MonteCarlo, propagate
-from imulab.procedures.tumble.options import check_options, further_triads
-from imulab.procedures.tumble.order_zero import with_assumed_alignment
 from imulab.procedures.tumble.orders import OrderRow
-from imulab.procedures.tumble.record import make_record
-from imulab.procedures.tumble.sections import model_of
+from imulab.procedures.tumble.record import Estimate, make_record
+from imulab.procedures.tumble.schema import model_of
+from imulab.procedures.tumble.solve import SOURCE_THRESHOLD, MonteCarlo, Threshold, propagate
 from imulab.quantities import in_si, whole
 from imulab.reading import Reading
 from imulab.recording import Array
@@ -184,10 +183,10 @@ def fit_tumble(
     >>> [nine.parameters[name].unit for name in ("bias_x", "gyro_bias_x", "mag_bias_x")]
     ['m/s^2', 'rad/s', 'T']
     """
-    order = texts.order(order, "order") if isinstance(order, str) else order
-    nonlinearity = texts.nonlinearity(nonlinearity, "nonlinearity") if isinstance(nonlinearity, str) else nonlinearity
-    ageing = texts.ageing(ageing, "ageing") if isinstance(ageing, str) else ageing
-    threshold = texts.threshold(threshold, "threshold") if isinstance(threshold, str) else threshold
+    order = tumble.order(order, "order") if isinstance(order, str) else order
+    nonlinearity = tumble.nonlinearity(nonlinearity, "nonlinearity") if isinstance(nonlinearity, str) else nonlinearity
+    ageing = tumble.ageing(ageing, "ageing") if isinstance(ageing, str) else ageing
+    threshold = tumble.threshold(threshold, "threshold") if isinstance(threshold, str) else threshold
     monte_carlo = None if monte_carlo is None else whole(monte_carlo, "monte_carlo")
     further = further_triads(with_, "with_")
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
@@ -241,11 +240,10 @@ def _with_further(
             attitudes, accel=record, gravity=gravity, loss=loss, field=field, hemisphere=place.hemisphere, dip=place.dip
         ).calibration
     if "gyro" in further:
-        from imulab.procedures.tumble.gyro import fit_gyro
-        from imulab.procedures.tumble.gyrorecord import with_gyro
+        from imulab.procedures.tumble.gyro.fit import fit_gyro_triad, with_gyro
 
         recording = attitudes.recording
-        found = fit_gyro(record, attitudes, recording, earth=at_latitude(latitude))
+        found = fit_gyro_triad(record, attitudes, recording, earth=at_latitude(latitude))
         record = with_gyro(record, found, recording, recording)
     return record
 
@@ -271,7 +269,7 @@ def prior_record(record: Calibration, attitudes: Attitudes) -> Calibration:
     """Return a record as a prior of these attitudes: one over temperature at theirs; errors as for `at_temperature`."""
     if record.procedure != "thermal":
         return record
-    from imulab.procedures.thermal.prior import at_temperature
+    from imulab.procedures.thermal.device import at_temperature
 
     return at_temperature(record, attitudes.temperature, attitudes.recording.name)
 

@@ -20,7 +20,7 @@ import numpy as np
 
 import imulab.procedures.tumble._model as _model
 from imulab.estimation.least_squares import Fit, least_squares
-from imulab.estimation.ranked import medians
+from imulab.estimation.rows import medians
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Motion
 from imulab.recording import Array
 from imulab.records.triads import CROSS_TERMS

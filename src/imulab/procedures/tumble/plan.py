@@ -1,4 +1,4 @@
-"""Which attitudes to measure: D- or A-optimal sets for a tumble test, and what they will give.
+"""Which attitudes to measure: D- or A-optimal sets for a tumble test, what they will give, and the plan on disk.
 
 What the user may choose from (the sphere, a fixture's steps, a list), what is chosen (optimal.py), what it predicts for
 every parameter, and the order of the attitudes that turns least.
@@ -6,18 +6,45 @@ every parameter, and the order of the attitudes that turns least.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from itertools import product
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from imulab.errors import ObservabilityError, OptionError, listed
+from imulab.columns import triad
+from imulab.display import Shown
+from imulab.errors import DataError, ImulabError, ObservabilityError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.least_squares import observability
-from imulab.procedures.tumble.advice import sphere_points
-from imulab.procedures.tumble.choices import CRITERIA, HIGHEST_ORDER
+from imulab.files import write_page
+from imulab.procedures.registry import load
+from imulab.procedures.result import as_recording
+from imulab.procedures.tumble import CRITERIA, HIGHEST_ORDER, STARTS
+from imulab.procedures.tumble.attitudes import find_attitudes
+from imulab.procedures.tumble.estimate import check_method
+from imulab.procedures.tumble.fit import fit_tumble
+from imulab.procedures.tumble.mag.heading import Headings, plan_headings
+from imulab.procedures.tumble.mag.solve import world_axes
 from imulab.procedures.tumble.model import parameter_count, parameter_names
-from imulab.procedures.tumble.optimal import CLOSEST, Search, information_rows, inverse, optimal_set
-from imulab.recording import Array
+from imulab.procedures.tumble.record import freedom_finding, predicted_rows
+from imulab.procedures.tumble.schema import attitudes_of, data_of, fit_of, model_of
+from imulab.procedures.tumble.solve import CLOSEST, Search, information_rows, inverse, optimal_set, sphere_points
+from imulab.quantities import in_si, quantity, whole
+from imulab.reading import Data
+from imulab.recording import Array, Recording, check_finite
+from imulab.records import is_json
+from imulab.records.calibration import Calibration
+from imulab.report import render_plan
+from imulab.report.plots import Plot
+from imulab.report.traces import GOOD, Figure, figure_axis
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+from imulab.writers import write_csv
+
+# Which attitudes to measure: D- or A-optimal sets for a tumble test, and what they will give.
+
 
 MOST_ATTITUDES = 300
 _CANDIDATES = 900
@@ -60,7 +87,7 @@ class Plan:
         return dict(zip(parameter_names(self.order), sigma.tolist(), strict=True))
 
 
-def plan_tumble(
+def plan_attitudes(
     *,
     attitudes: int,
     order: int = 3,
@@ -240,3 +267,498 @@ def shortest_path(directions: Array) -> Array:
                     path[i + 1 : j + 1] = path[i + 1 : j + 1][::-1]
                     improved = True
     return directions[path]
+
+
+# A plan on disk: CSV to measure by and to plan on from, and a printable sheet with a picture of each attitude.
+
+
+_SIZE = 62.0
+_LARGEST_LETTER, _SMALLEST_LETTER = 13.0, 6.5
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float) * [1.0, 0.7, 0.35]
+_FACES = (
+    (0, (4, 5, 7, 6), "+x"), (0, (0, 1, 3, 2), "−x"), (1, (2, 3, 7, 6), "+y"),
+    (1, (0, 1, 5, 4), "−y"), (2, (1, 3, 7, 5), "+z"), (2, (0, 2, 6, 4), "−z"),
+)  # fmt: skip
+_SHADES = ("#c8553d", "#1f6f8b", "#d9c27a")
+_LETTERS = ("#ffffff", "#ffffff", "#22303a")
+
+
+def plan_recording(plan: Plan, north: Array | None = None) -> Recording:
+    """Return a plan as a table: number, upward direction in the body frame (and that of north), roll and pitch."""
+    angles = roll_pitch(plan.directions)
+    columns = {"number": np.arange(1.0, len(plan.directions) + 1)}
+    columns |= {f"up_{axis}": np.round(plan.directions[:, i], 6) + 0.0 for i, axis in enumerate("xyz")}
+    if north is not None:
+        columns |= {f"north_{axis}": np.round(north[:, i], 6) + 0.0 for i, axis in enumerate("xyz")}
+    columns |= {name: np.round(np.degrees(angles[:, i]), 3) + 0.0 for i, name in enumerate(("roll", "pitch"))}
+    units = {name: "deg" if name in ("roll", "pitch") else "1" for name in columns}
+    return Recording(columns=columns, units=units, metadata={"order": str(plan.order)}, name="plan")
+
+
+def directions_of(recording: Recording) -> Array | None:
+    """Return the upward directions of a plan or a list of attitudes, shape (n, 3); None where it has none.
+
+    Raises
+    ------
+    DataError
+        A direction has no length or is not finite.
+    UnitError
+        Roll or pitch is no angle.
+    """
+    if all(name in recording for name in triad("up")):
+        check_finite(recording, triad("up"))
+        up = recording.triad("up")
+    elif "roll" in recording and "pitch" in recording:
+        for name in ("roll", "pitch"):
+            if parse_unit(recording.units[name]).quantity != "angle":
+                raise UnitError(
+                    f"{recording.name}: column {name}: expected an angle, as in {name} [deg]; found the unit "
+                    f"{recording.units[name]}"
+                )
+        check_finite(recording, ["roll", "pitch"])
+        roll, pitch = recording.si("roll"), recording.si("pitch")
+        up = np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
+    else:
+        return None
+    return _directions(up, recording)
+
+
+def norths_of(recording: Recording) -> Array | None:
+    """Return the directions of north of a plan with headings, shape (n, 3), level; None where it has none.
+
+    Raises
+    ------
+    DataError
+        A direction has no level part or is not finite.
+    """
+    if not all(name in recording for name in (*triad("up"), *triad("north"))):
+        return None
+    check_finite(recording, triad("north"))
+    up, north = _directions(recording.triad("up"), recording), recording.triad("north")
+    return _directions(north - np.einsum("ni,ni->n", up, north)[:, None] * up, recording)
+
+
+def _directions(vectors: Array, recording: Recording) -> Array:
+    length = np.linalg.norm(vectors, axis=1)
+    bad = ~(length > 0.1)
+    if bad.any():
+        index = int(np.argmax(bad))
+        raise DataError(f"{recording.name}: {recording.place(index)}: expected a direction, found one without length")
+    directions: Array = vectors / length[:, None]
+    return directions
+
+
+def attitude_picture(up: Array, north: Array | None = None) -> str:
+    """Return an SVG of the unit as a box in one attitude, seen slightly from above, axes lettered.
+
+    With the direction of north in the body frame the box faces as it is to lie, beside an arrow to the north.
+    """
+    level = _to_level(up) if north is None else np.array([np.cross(north, up), north, up])
+    turned = _CORNERS @ level.T
+    view = turned @ _camera().T
+    points = view[:, :2] * [_SIZE * 0.5, -_SIZE * 0.5] + _SIZE
+    normals = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
+    facing = (normals @ level.T @ _camera().T)[:, 2]
+    shapes = [] if north is None else [_arrow()]
+    for (axis, corners, text), toward in zip(_FACES, facing, strict=True):
+        if toward <= 0.02:
+            continue
+        outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in points[list(corners)])
+        middle = points[list(corners)].mean(axis=0)
+        shapes.append(
+            f'<polygon points="{outline}" fill="{_SHADES[axis]}" fill-opacity="{0.45 + 0.5 * toward:.2f}" '
+            'stroke="#22303a"/>'
+        )
+        size = min(_LARGEST_LETTER, 0.7 * _narrowest(points[list(corners)]))
+        if size >= _SMALLEST_LETTER:
+            shapes.append(
+                f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="{size:.1f}" text-anchor="middle" '
+                f'dominant-baseline="central" fill="{_LETTERS[axis]}">{text}</text>'
+            )
+    side = 2 * _SIZE
+    return f'<svg viewBox="0 0 {side:.0f} {side:.0f}" width="150" height="150" role="img">{"".join(shapes)}</svg>'
+
+
+def _arrow() -> str:
+    """An arrow on the floor, from the lower left to where north is, which is away from the viewer and to the right."""
+    tip = _camera()[:2, 1] * [_SIZE * 0.35, -_SIZE * 0.35]
+    start = np.array([8.0, 2 * _SIZE - 6.0])
+    end = start + tip
+    along = tip / np.hypot(*tip)
+    across = np.array([-along[1], along[0]])
+    head = " ".join(f"{x:.1f},{y:.1f}" for x, y in (end, end - 6 * along + 3 * across, end - 6 * along - 3 * across))
+    x, y = end + 7 * along
+    return (
+        f'<path d="M{start[0]:.1f} {start[1]:.1f}L{end[0]:.1f} {end[1]:.1f}" stroke="#22303a"/>'
+        f'<polygon points="{head}" fill="#22303a"/>'
+        f'<text x="{x:.1f}" y="{y:.1f}" font-size="10" text-anchor="middle" dominant-baseline="central" '
+        'fill="#22303a">N</text>'
+    )
+
+
+def _narrowest(outline: Array) -> float:
+    """Distance between the nearer pair of sides of a parallelogram, shape (4, 2)."""
+    one, two = outline[1] - outline[0], outline[3] - outline[0]
+    area = abs(float(one[0] * two[1] - one[1] * two[0]))
+    return area / max(float(np.linalg.norm(one)), float(np.linalg.norm(two)))
+
+
+def _to_level(up: Array) -> Array:
+    """Rotation that turns the body so that `up` points up, by the shortest way."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine, cosine = float(np.linalg.norm(axis)), float(up[2])
+    if sine < 1e-9:
+        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
+    x, y, z = axis / sine
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation: Array = np.eye(3) + sine * cross + (1 - cosine) * cross @ cross
+    return rotation
+
+
+def _camera() -> Array:
+    """Rows: right, up and toward the viewer, who looks down by 25 deg from the front left."""
+    a, e = np.radians(-55.0), np.radians(25.0)
+    toward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    return np.array([right, np.cross(toward, right), toward])
+
+
+# A plan as its user has it: what it predicts, its CSV to measure by, its sheet to print, its figure.
+
+
+@dataclass(frozen=True, repr=False)
+class TumblePlan(Shown, Plan):
+    """Attitudes to measure, in the order that turns least, and what they will give.
+
+    Attributes
+    ----------
+    criterion
+        By which they were chosen.
+    noise
+        Of |f| in one attitude, in units of g.
+    noise_from
+        What said so, in brackets; empty where it was given as a number.
+    distinct_verticals
+        Whether no two attitudes have the same of x, y and z vertical.
+    headings
+        Which way each attitude faces, for a magnetometer; None where that was not asked for.
+    """
+
+    criterion: str
+    noise: float
+    noise_from: str
+    distinct_verticals: bool
+    headings: Headings | None = None
+
+    @property
+    def finding(self) -> str | None:
+        """What too few attitudes leave open; None where they are enough."""
+        return freedom_finding(len(self.directions) + self.already, len(self.covariance), self.order)
+
+    @property
+    def lead(self) -> str:
+        """What the plan is and predicts, and why it differs from what was asked for."""
+        noise = f"{from_si(self.noise * STANDARD_GRAVITY, 'ug'):.4g} µg"
+        there = f" with the {self.already} already there" if self.already else ""
+        lead = (
+            f"{len(self.directions)} attitudes{there} for order {self.order}, criterion {self.criterion}: condition "
+            f"number {self.condition_number:.1f}, {np.degrees(turning(self.directions)):.0f} deg of turning. Predicted "
+            f"for a noise of {noise} in |f| per attitude{self.noise_from} and a nominal sensor."
+        )
+        if self.order == 3:
+            lead += " Order 3 because attitudes for a lower one cannot show what that would leave in the scale factors."
+        if self.again:
+            pairs = ", ".join(f"{one} and {other}" for one, other in self.again)
+            lead += (
+                f" Put down twice: {pairs}. No more candidates lie 3 deg apart; the second time, after the others, "
+                "lowers the noise and shows what drifts, but no new direction."
+            )
+        if self.distinct_verticals:
+            lead += " Of the new attitudes no two have the same of x, y and z vertical, nor one that had it before."
+        if self.finding is not None:
+            lead += f" Too few to check the order: {self.finding}."
+        return lead if self.headings is None else lead + self.headings.lead
+
+    @property
+    def predicted(self) -> list[tuple[str, str, str]]:
+        """Predicted uncertainties as people read them: name, text and unit."""
+        rows = predicted_rows(self.uncertainties(self.noise))
+        return rows if self.headings is None else rows + self.headings.rows()
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return the plan in a few sentences, and the predicted uncertainties."""
+        return self.lead, ["parameter", "predicted u", "unit"], [list(row) for row in self.predicted]
+
+    def save(self, path: str | Path) -> None:
+        """Write the attitudes as CSV: number, upward direction in the body frame (and that of north), roll and pitch.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written.
+        """
+        write_csv(self.recording(), path)
+
+    def recording(self) -> Recording:
+        """Return the same as a table."""
+        return plan_recording(self, None if self.headings is None else self.headings.north)
+
+    def sheet(self) -> str:
+        """Return the sheet to print, a picture for each attitude, as HTML text."""
+        return render_plan("Tumble plan", self.lead, self._pictures(), self.predicted)
+
+    def report(self, path: str | Path) -> None:
+        """Write the sheet to print as an HTML file; errors as for `save`."""
+        write_page(path, self.sheet())
+
+    def plot(self) -> Plot:
+        """Return roll and pitch of the attitudes, numbered in their order."""
+        roll, pitch = np.degrees(roll_pitch(self.directions)).T.tolist()
+        numbers = [str(number) for number in range(1, len(roll) + 1)]
+        sides = [("top center", "bottom center")[k % 2] for k in range(len(roll))]
+        trace = {
+            "type": "scatter", "mode": "lines+markers+text", "x": roll, "y": pitch, "text": numbers,
+            "textposition": sides, "line": {"color": GOOD, "width": 1}, "marker": {"color": GOOD, "size": 8},
+        }  # fmt: skip
+        layout = {
+            "xaxis": figure_axis("roll, deg", dtick=90, range=[-195, 195]),
+            "yaxis": figure_axis("pitch, deg", dtick=45, range=[-110, 110]),
+        }
+        return Plot(Figure("Attitudes to measure", self.lead, [trace], layout), "Tumble plan")
+
+    def _pictures(self) -> list[dict[str, str]]:
+        angles = np.degrees(roll_pitch(self.directions))
+        pictures = []
+        for index, (up, (roll, pitch)) in enumerate(zip(self.directions, angles, strict=True)):
+            north = None if self.headings is None else self.headings.north[index]
+            pictures.append(
+                {
+                    "number": str(index + 1),
+                    "picture": attitude_picture(up, north),
+                    "facing": "" if self.headings is None else self.headings.facing(index),
+                    "up": "(" + ", ".join(f"{value:+.2f}" for value in up) + ")",
+                    "roll": f"{roll:.1f}",
+                    "pitch": f"{pitch:.1f}",
+                }
+            )
+        return pictures
+
+
+# A plan from what people have: noise, candidates and earlier attitudes as numbers, texts, files, records or arrays.
+
+
+Known: TypeAlias = Calibration | Data
+
+
+def plan_tumble(
+    attitudes: int | str,
+    *,
+    noise: float | Known | None = None,
+    order: int | str = 3,
+    criterion: str = "A",
+    from_: Data = "sphere",
+    add: Known | Plan | None = None,
+    method: str = "norm",
+    distinct_verticals: bool | None = None,
+    with_: str | None = None,
+) -> TumblePlan:
+    """Choose the attitudes to measure, and predict the uncertainty of every parameter.
+
+    Criterion A minimises the sum of the parameters' variances (in units of g), D the volume of their confidence region.
+    Of sets whose sums are within 1 % of the least, A takes that whose worst axes have the least sum. Where fewer
+    candidates lie 3 deg apart than attitudes are asked for, some are put down again, those first that gain most.
+
+    Parameters
+    ----------
+    attitudes
+        Number of attitudes to choose.
+    noise
+        Of ``|f|`` in one attitude: m/s^2, or a text such as ``"20ug"``; or the recording or record, or its file, that
+        has it.
+    order
+        Order of the model, 0 to 5; attitudes for order 3 show what an order 2 would silently leave in scale factors.
+    criterion
+        ``"A"`` or ``"D"``.
+    from_
+        Where attitudes may lie: ``sphere``, ``fixture:15`` or ``head:15`` (steps in deg), a file that lists them, or
+        upward directions in the body frame, shape (m, 3).
+    add
+        Attitudes already there: a plan, a record or a recording, or its file; or upward directions, shape (k, 3).
+    method
+        Of the fit that they are for: ``norm`` or ``linearised``.
+    distinct_verticals
+        Whether x, y and z are each vertical, up or down, in one attitude at most, as the source of method linearised
+        has it; as `method` demands if not given.
+    with_
+        ``"mag"``: each attitude gets a heading too, in quarter turns, for the magnetometers beside the accelerometers;
+        of `add` the headings of a plan with headings, or of a record with magnetometers, count.
+
+    Raises
+    ------
+    OptionError
+        An option cannot be; too few or too many attitudes, too few candidates or none far enough apart.
+    ObservabilityError
+        No choice among the candidates determines the model, or no headings the magnetometers.
+    RecordError, ReadError, DataError
+        A record or recording cannot be read, or does not say what it is asked.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> plan = il.plan_tumble(18, noise="20ug", order=2, from_="fixture:45")
+    >>> len(plan.directions), round(plan.condition_number, 1)
+    (18, 5.8)
+    >>> plan.save("plan.csv")
+    >>> plan.report("plan.html")
+    >>> il.plan_tumble(16, noise="20ug", order=1, with_="mag").headings.facing(0)
+    '+y to the east'
+    """
+    number = whole(order, "order")
+    check_method(method, number)
+    if with_ not in (None, "mag"):
+        raise OptionError(f"with_ {with_!r}: expected mag: only magnetometers ask for headings")
+    sigma, source = noise_of(noise)
+    distinct = method == "linearised" if distinct_verticals is None else distinct_verticals
+    found = plan_attitudes(
+        order=number,
+        attitudes=whole(attitudes, "attitudes"),
+        criterion=criterion,
+        candidates=candidates_of(from_),
+        already=None if add is None else _measured_directions(add),
+        source=from_ if isinstance(from_, str) else "from_",
+        distinct_verticals=distinct,
+    )
+    headings = None
+    if with_ is not None:
+        headings = plan_headings(found.directions, before=None if add is None else _measured_headings(add))
+    return TumblePlan(
+        **vars(found), criterion=criterion, noise=sigma, noise_from=source, distinct_verticals=distinct,
+        headings=headings,
+    )  # fmt: skip
+
+
+def _record(data: object) -> Calibration | None:
+    """Return a tumble record, given or named; None for what is none."""
+    name = os.fspath(data) if isinstance(data, str | PathLike) else "the record"
+    if isinstance(data, str | PathLike) and is_json(name):
+        data = load(name)
+    if not isinstance(data, Calibration):
+        return None
+    if data.procedure != "tumble":
+        raise RecordError(f"{name}: a {data.procedure} record holds no attitudes; expected a tumble record")
+    return data
+
+
+def noise_of(given: Any) -> tuple[float, str]:
+    """Noise of |f| in one attitude, g: a quantity, or what the attitudes of a recording or record have; and whose."""
+    if given is None:
+        raise OptionError(
+            "noise: expected the noise of |f| in one attitude, such as 20ug, or a recording or record that has it"
+        )
+    if isinstance(given, float | int) or (isinstance(given, str) and not Path(given).is_file()):
+        sigma = from_si(in_si(given, "noise", "acceleration", "ug"), "g")
+        if not sigma > 0:
+            raise OptionError(f"noise {given!r}: expected more than 0")
+        return sigma, ""
+    record = _record(given)
+    if record is not None:
+        whose = os.fspath(given) if isinstance(given, str | PathLike) else "the record"
+        return _noise_of(record), f" (that of {whose})"
+    found = find_attitudes(as_recording(given, {}, plan_tumble, name="noise"))
+    whose = f" (that of {os.fspath(given) if isinstance(given, str | PathLike) else found.recording.name})"
+    if found.covariance is None:
+        name = found.recording.name
+        raise OptionError(f"{name}: a table without std_* columns does not say what noise its attitudes have")
+    try:
+        return _noise_of(fit_tumble(found).calibration), whose
+    except ImulabError:  # too few for a fit: any direction and length are good enough for a noise
+        up = found.mean / np.linalg.norm(found.mean, axis=1, keepdims=True)
+        variance = np.einsum("ni,nij,nj->n", up, found.covariance, up) / (found.mean**2).sum(axis=1)
+        return float(np.sqrt(np.median(variance))), whose
+
+
+def _noise_of(record: Calibration) -> float:
+    """Noise of |f| in the usual attitude of a record, with what they scatter beyond their own, g."""
+    stated, fit, g = attitudes_of(record).standard_uncertainty, fit_of(record), model_of(record).gravity.value
+    if stated:
+        return float(np.hypot(np.median(stated), fit.excess.value)) / g
+    reduced = fit.reduced_chi_square
+    if not reduced:
+        raise RecordError("noise: the record's attitudes do not say what noise they have; expected a value, as 20ug")
+    return float(np.sqrt(reduced)) / g
+
+
+def candidates_of(given: Any) -> Array | None:
+    """Return the upward directions among which a plan chooses, as ``--from`` names them; None for the whole sphere."""
+    if isinstance(given, str):
+        if given == STARTS[0]:
+            return None
+        kind, colon, step = given.partition(":")
+        if colon and kind in ("fixture", "head"):
+            angle = quantity(step, f"from_ {kind}", "angle", "deg")
+            return fixture_candidates(angle) if kind == "fixture" else head_candidates(angle)
+        if colon and not Path(given).exists():
+            raise OptionError(f"from_ {given!r}: expected {', '.join(STARTS)} (steps in deg) or a file of directions")
+    if isinstance(given, np.ndarray | list | tuple):
+        return _unit_vectors(given, "from_")
+    recording = as_recording(given, {}, plan_tumble, name="from_")
+    found = directions_of(recording)
+    if found is None:
+        raise OptionError(f"{recording.name}: expected columns up_x up_y up_z, or roll [deg] and pitch [deg]")
+    return found
+
+
+def _unit_vectors(given: object, name: str) -> Array:
+    """Return directions as unit vectors, shape (n, 3)."""
+    try:
+        found = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    length = np.linalg.norm(found, axis=-1, keepdims=True)
+    if found.ndim != 2 or found.shape[1] != 3 or not (np.isfinite(length) & (length > 0)).all():
+        raise OptionError(f"{name}: expected upward directions, shape (n, 3), found the shape {found.shape}")
+    units: Array = found / length
+    return units
+
+
+def _measured_directions(given: Any) -> Array:
+    """Upward directions of a plan, of a record's attitudes, or of a recording's under an order-1 fit."""
+    if isinstance(given, Plan):
+        return given.directions
+    if isinstance(given, np.ndarray | list | tuple):
+        return _unit_vectors(given, "add")
+    record = _record(given)
+    if record is not None:
+        held = attitudes_of(record)
+        force = np.array(held.force)[np.array(held.down_weight) > 0]
+    else:
+        recording = as_recording(given, {}, plan_tumble, name="add")
+        listed = directions_of(recording)
+        if listed is not None:
+            return listed
+        found = find_attitudes(recording)
+        # The directions need no better than a percent, and too few attitudes for a fit are no reason to refuse.
+        try:
+            force = np.array(attitudes_of(fit_tumble(found, order=1).calibration).force)
+        except ImulabError:
+            force = found.mean
+    directions: Array = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return directions
+
+
+def _measured_headings(given: Any) -> tuple[Array, Array] | None:
+    """Upward directions and those of north of a plan with headings or a record with magnetometers; None of others."""
+    if isinstance(given, TumblePlan):
+        return None if given.headings is None else (given.directions, given.headings.north)
+    if isinstance(given, Plan | np.ndarray | list | tuple):
+        return None
+    record = _record(given)
+    if record is None:
+        recording = as_recording(given, {}, plan_tumble, name="add")
+        up, north = directions_of(recording), norths_of(recording)
+        return None if up is None or north is None else (up, north)
+    held = data_of(record).mag
+    if held is None:
+        return None
+    axes = world_axes(np.array(held.field)[held.used], np.array(held.force)[held.used])
+    return axes[:, 2], axes[:, 1]

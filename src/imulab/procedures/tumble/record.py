@@ -1,46 +1,236 @@
-"""The calibration record of a tumble test: parameters in SI, and what its figures need."""
+"""The calibration record of a tumble test.
+
+Parameters in SI and in the units that people read, and what a fit notes besides its values.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from imulab.display import Note
+from imulab.errors import first_of
 from imulab.estimation.least_squares import Observability, chi_square_probability, coverage_factor, leverage
 from imulab.gravity import Gravity, gravity_findings
+from imulab.procedures.procedure import Row
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import shake_warnings
-from imulab.procedures.tumble.findings import (
-    FEW_DEGREES,
-    Estimate,
-    aside_warnings,
-    assumption_notes,
-    freedom_finding,
-    size_warnings,
-    uncertainty_entries,
-    vertical_warnings,
-)
 from imulab.procedures.tumble.model import (
     AXES,
     GAUGE,
+    MISALIGNMENTS,
     gravity_slope,
+    parameter_count,
     parameter_names,
     parameter_units,
     powers_of_gravity,
 )
-from imulab.procedures.tumble.montecarlo import MonteCarlo
-from imulab.procedures.tumble.orders import OrderRow
-from imulab.procedures.tumble.patterns import direction_findings, time_findings
-from imulab.procedures.tumble.sections import model_of
-from imulab.procedures.tumble.solve import Problem, Solution, data_freedom, forces
+from imulab.procedures.tumble.orders import (
+    FREEDOM,
+    HIGHEST_TESTED,
+    Aside,
+    Blended,
+    OrderRow,
+    direction_findings,
+    time_findings,
+)
+from imulab.procedures.tumble.schema import Trials, data_of, fit_of, model_of
+from imulab.procedures.tumble.solve import CLOSEST, MonteCarlo, Problem, Solution, data_freedom, forces, near_vertical
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.comparison import Change
+from imulab.report.traces import format_uncertain, plain_number
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+# What a fit found besides its values: attitudes set aside, and what its uncertainties hold for.
+
+
+_SELDOM_MISSED = 6
+"""Degrees of freedom at the highest order tested from which a knock is seldom missed."""
+_NEGLIGIBLE = 0.01
+FEW_DEGREES, _ENOUGH_DEGREES = 5, 9
+_WORST_SCALE = 0.1
+_WORST_MISALIGNMENT = 0.1
+_MOST_NAMED = 8
+
+
+@dataclass(frozen=True)
+class Found:
+    """All attitudes that were found, those set aside included, under the solution for the others."""
+
+    attitudes: Attitudes
+    problem: Problem
+    solution: Solution
+    aside: Aside
+
+
+@dataclass(frozen=True)
+class Stated:
+    """Covariance in units of g and its degrees of freedom (None: noise known), as stated, and if the order is right."""
+
+    covariance: Array
+    freedom: float | None
+    given_order: Array | None = None
+    freedom_given_order: float | None = None
+    blended: Blended | None = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the attitudes that were not set aside say of the unit, in units of g.
+
+    `with_gravity` says that the covariance holds gravity's own uncertainty already; `prior` is the record's entry on an
+    earlier record, and `notes` are findings about that.
+    """
+
+    attitudes: Attitudes
+    problem: Problem
+    solution: Solution
+    given_order: Stated | None
+    stated: Stated | None
+    found: Found
+    observability: Observability
+    orders: tuple[OrderRow, ...]
+    with_gravity: bool = False
+    prior: Mapping[str, Any] | None = None
+    notes: Sequence[str] = ()
+
+
+def uncertainty_entries(stated: Stated | None) -> dict[str, Any]:
+    """Return the record's entries on the stated uncertainty."""
+    entries: dict[str, Any] = {
+        "effective_degrees_of_freedom": None if stated is None else stated.freedom,
+        "coverage_factor_95": None if stated is None else coverage_factor(stated.freedom),
+    }
+    if stated is None or stated.blended is None:
+        return entries
+    if stated.given_order is not None:
+        entries["coverage_factor_95_given_order"] = coverage_factor(stated.freedom_given_order)
+    noise = {str(order): share for order, share in stated.blended.noise.items()}
+    return entries | {"blend": {"highest_order": stated.blended.order, "noise_share": noise}}
+
+
+def aside_of(record: Calibration, attitudes: Attitudes) -> NDArray[np.bool_]:
+    """Return which of the attitudes a record set aside, if it was made from these, shape (n,)."""
+    found = np.zeros(len(attitudes), dtype=np.bool_)
+    held = data_of(record).attitudes
+    if held is not None and np.array_equal(held.mean, attitudes.mean):
+        found[[number - 1 for number in fit_of(record).set_aside]] = True
+    return found
+
+
+def aside_warnings(found: Found, options: Mapping[str, Any]) -> list[str]:
+    """Name the attitudes that were set aside, or say why a knocked one may not have been."""
+    if options["loss"] != "auto":
+        return []
+    if options["method"] != "norm":
+        return [Note("method linearised keeps every attitude: only method norm sets knocked ones aside")]
+    if options.get("cross"):
+        return [
+            Note(
+                "with cross terms every attitude is kept: a knocked one is not looked for (fit without --cross to see)"
+            )
+        ]
+    aside = found.aside
+    named = [
+        f"{found.attitudes.label(index)} set aside: {1e3 * found.solution.residuals[0, index]:+.3f} mg "
+        f"({abs(deviations):.0f} standard uncertainties) from what the others give, as if it had been knocked or had "
+        "not settled; --loss square keeps it"
+        for index, deviations in zip(aside.index, aside.deviations, strict=True)
+    ]
+    n = len(found.attitudes)
+    lowest, highest = (options["order"],) * 2 if isinstance(options["order"], int) else (1, HIGHEST_TESTED)
+    enough = parameter_count(lowest) + 1 + FREEDOM[found.problem.covariance is not None]
+    if n < enough:
+        named.append(Note(f"{n} attitudes are too few to tell a knocked one from the others: {enough} or more can"))
+    elif n - parameter_count(highest) < _SELDOM_MISSED:
+        named.append(
+            Note(
+                f"a knocked attitude among only {n} may stay unseen: of those that are off by more than 8 standard "
+                "uncertainties 18 attitudes show 60 to 97 %, 24 show 97 % or more"
+            )
+        )
+    return named
+
+
+def freedom_finding(attitudes: int, size: int, order: int) -> str | None:
+    """Say that so many attitudes are few for the parameters of an order, where they are."""
+    freedom = attitudes - size
+    if freedom >= FEW_DEGREES:
+        return None
+    return (
+        f"only {freedom} degree{'' if freedom == 1 else 's'} of freedom: {attitudes} attitudes hardly check whether "
+        f"order {order} is enough, and the uncertainties hold only if it is; {size + _ENOUGH_DEGREES} or more would "
+        "tell"
+    )
+
+
+def vertical_warnings(found: Found, method: str) -> list[str]:
+    """Name the axes that are vertical, up or down, in more than one attitude, which the linearised's source forbids."""
+    if method != "linearised":
+        return []
+    vertical = near_vertical(forces(found.problem, found.solution)[0], CLOSEST)
+    warnings = []
+    for axis, column in zip(AXES, vertical.T, strict=True):
+        which = np.flatnonzero(column).tolist()
+        if len(which) > 1:
+            named = first_of([found.attitudes.label(index) for index in which], _MOST_NAMED)
+            warnings.append(
+                f"axis {axis} is vertical within {np.degrees(CLOSEST):.0f} deg in {len(which)} attitudes ("
+                f"{named}): the source of method linearised has no axis vertical in two; "
+                "tumble plan --method linearised chooses attitudes without such"
+            )
+    return warnings
+
+
+def size_warnings(attitudes: Attitudes, solution: Solution) -> list[str]:
+    """Errors that no accelerometer in physical units has: more likely the columns are not what they are said to be."""
+    theta, found = solution.theta[0], []
+    if parse_unit(attitudes.unit).quantity == "acceleration":
+        found += [
+            f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?"
+            for axis, value in zip(AXES, theta[3:6], strict=True)
+            if abs(value - 1) > _WORST_SCALE
+        ]
+    found += [
+        f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?"
+        for pair, value in zip(MISALIGNMENTS, theta[6:9], strict=False)  # order 0 has none
+        if abs(value) > _WORST_MISALIGNMENT
+    ]
+    return found
+
+
+def assumption_notes(stated: Stated | None) -> list[str]:
+    """Say which nonlinearity the attitudes do not show, and what it would move."""
+    if stated is None or stated.blended is None:
+        return []
+    notes: list[str] = []
+    for order, (bias, scale) in stated.blended.assumed.items():
+        unit = f"µg/g{'⁰¹²³'[order]}"
+        moved = [
+            f"{value:.2g} {of}"
+            for value, of in ((bias, "µg of bias"), (scale, "ppm of scale factor"))
+            if value > _NEGLIGIBLE
+        ]
+        notes.append(
+            Note(
+                f"these attitudes do not show k{order}: the uncertainties assume k{order} = 0; 1 {unit} of it moves up "
+                f"to {' and '.join(moved)} (tumble plan --order 3 chooses attitudes that show it)"
+            )
+        )
+    return notes
+
+
+# The calibration record of a tumble test: parameters in SI, and what its figures need.
+
 
 _STANDS_OUT = 5.0
 _TOO_GOOD = 1e-3
-_MOST_NAMED = 8
 _DOWN_WEIGHTED = 0.5
 _NOT_BY_CHANCE = 0.01
 _HIGH_CONDITION = 300.0
@@ -398,3 +588,177 @@ def _outliers(problem: Problem, solution: Solution) -> dict[int, float]:
     standard = standard / np.maximum(others, least)
     limit = max(_STANDS_OUT, coverage_factor(freedom - 1, 1 - 1e-3 / n))
     return {i: float(standard[i]) for i in np.flatnonzero(standard > limit).tolist()}
+
+
+# The parameters of a tumble record in the units that people read: mg, ppm, mrad, µg/g².
+
+
+_OFF_NOMINAL = "ppm off nominal"
+"""A scale factor whose nominal value is known is read as its difference from it."""
+
+
+@dataclass(frozen=True)
+class EngineeringRow(Row):
+    """One parameter as people read it.
+
+    `given_order` is the standard uncertainty if the order chosen from the data is right, None where none was chosen.
+    `interval` is the 95 % interval where the parameter has one of its own.
+    """
+
+    given_order: float | None = None
+    interval: tuple[float, float] | None = None
+
+    def text(self) -> tuple[str, str]:
+        """Return value and uncertainty as text."""
+        return format_uncertain(self.value, self.standard_uncertainty)
+
+
+def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
+    """Return the factor and the unit in which the change of a parameter is read."""
+    output = model_of(record).output_unit
+    factor, _, unit = _converted(change.name, change.unit, output, parse_unit(output).quantity == "acceleration")
+    return factor, "ppm" if unit == _OFF_NOMINAL else unit
+
+
+def same_meaning(name: str, first: Calibration, second: Calibration) -> bool:
+    """Return whether a parameter means the same in both records: magnetometers' outputs may be renamed otherwise."""
+    if name == "dip":
+        return False  # of the place, not of the unit
+    return not name.startswith("mag_") or first.model.get("mag_axes") == second.model.get("mag_axes")
+
+
+def propagated_rows(record: Calibration, trials: Trials) -> list[list[str]]:
+    """Return the Monte Carlo intervals beside the linear ones: name, both, ratio of their widths, unit."""
+    fit, output = fit_of(record), model_of(record).output_unit
+    physical = parse_unit(output).quantity == "acceleration"
+    coverage = fit.coverage_factor_95_given_order or fit.coverage_factor_95 or 0.0
+    rows = []
+    for name, found in trials.parameters.items():
+        parameter = record.parameter(name)
+        factor, offset, unit = _converted(name, parameter.unit, output, physical)
+        u = parameter.standard_uncertainty_given_order or parameter.standard_uncertainty or 0.0
+        linear = [parameter.value - coverage * u, parameter.value + coverage * u]
+        texts = [
+            " to ".join(format_uncertain(end * factor + offset, u * abs(factor))[0] for end in ends)
+            for ends in (linear, found.interval_95)
+        ]
+        width = linear[1] - linear[0]
+        ratio = (found.interval_95[1] - found.interval_95[0]) / width if width else math.nan
+        rows.append([name, *texts, f"{ratio:.3f}", unit])
+    return rows
+
+
+def predicted_rows(uncertainties: dict[str, float]) -> list[tuple[str, str, str]]:
+    """Return predicted uncertainties (units of g) as name, text and engineering unit."""
+    rows = []
+    for name, value in uncertainties.items():
+        stem = name.rpartition("_")[0]
+        factor, unit = {"bias": (1e6, "µg"), "scale_factor": (1e6, "ppm"), "misalignment": (1e6, "µrad")}.get(
+            stem, (1e6, f"µg/g{'⁰¹²³⁴⁵'[int(stem[1:])] if stem[1:].isdigit() else ''}")
+        )
+        rows.append((name, plain_number(value * factor, 3), unit))
+    return rows
+
+
+def engineering_rows(record: Calibration) -> list[EngineeringRow]:
+    """Return the parameters in engineering units, the outputs at zero specific force included for counts and volts."""
+    rows = []
+    output = model_of(record).output_unit
+    physical = parse_unit(output).quantity == "acceleration"
+    zeros = {} if physical else zero_outputs(record)
+    for name, parameter in record.parameters.items():
+        stem, _, axis = name.rpartition("_")
+        factor, offset, unit = _converted(name, parameter.unit, output, physical)
+        rows.append(
+            EngineeringRow(
+                name,
+                parameter.value * factor + offset,
+                _scaled(parameter.standard_uncertainty, factor),
+                unit,
+                _scaled(parameter.standard_uncertainty_given_order, factor),
+                _interval(parameter.interval_95, factor, offset),
+            )
+        )
+        if stem == "bias" and axis == "z":
+            rows += [
+                EngineeringRow(f"zero_output_{a}", z.value, z.standard_uncertainty, output) for a, z in zeros.items()
+            ]
+    return rows
+
+
+def _interval(ends: tuple[float, float] | None, factor: float, offset: float) -> tuple[float, float] | None:
+    if ends is None:
+        return None
+    low, high = sorted(end * factor + offset for end in ends)
+    return low, high
+
+
+def _scaled(uncertainty: float | None, factor: float) -> float | None:
+    return None if uncertainty is None else uncertainty * abs(factor)
+
+
+def _converted(name: str, unit: str, output: str, physical: bool) -> tuple[float, float, str]:
+    """Factor, offset and unit that turn a parameter of either triad into engineering units."""
+    stem = name.rpartition("_")[0]
+    if stem.startswith("mag_") or name == "dip":
+        return _of_field(stem or name, unit)
+    if not stem.startswith("gyro_"):
+        return _engineering(stem, output, physical)
+    if stem == "gyro_bias":
+        return from_si(1.0, "deg/s"), 0.0, "deg/s"
+    if stem == "gyro_scale_factor":
+        sensed = unit.removesuffix("/(rad/s)")
+        if parse_unit(sensed).quantity == "rate":
+            return 1e6 / from_si(1.0, sensed), -1e6, _OFF_NOMINAL
+        return 1.0, 0.0, unit
+    if stem == "gyro_misalignment":
+        return 1e3, 0.0, "mrad"
+    if stem == "gyro_g_sensitivity":
+        return from_si(STANDARD_GRAVITY, "deg/h"), 0.0, "deg/h/g"
+    return (1e6, 0.0, "ppm") if unit == "1" else (1.0, 0.0, unit)  # of a rate table
+
+
+def _of_field(stem: str, unit: str) -> tuple[float, float, str]:
+    """Factor, offset and unit of a magnetometers' parameter, or of the dip."""
+    if stem in ("dip", "mag_misalignment"):
+        return (from_si(1.0, "deg"), 0.0, "deg") if stem == "dip" else (1e3, 0.0, "mrad")
+    if stem == "mag_bias":
+        return (1e6, 0.0, "uT") if unit == "T" else (1.0, 0.0, "of the field")
+    if stem == "mag_scale_factor" and unit.endswith("/T"):
+        sensed = unit.removesuffix("/T")
+        if parse_unit(sensed).quantity == "magnetic field":
+            return 1e6 / from_si(1.0, sensed), -1e6, _OFF_NOMINAL
+        return 1e-6, 0.0, f"{sensed}/uT"
+    return 1.0, 0.0, unit
+
+
+def _engineering(stem: str, output: str, physical: bool) -> tuple[float, float, str]:
+    """Factor, offset and unit that turn an SI parameter into engineering units."""
+    if stem == "bias":
+        return from_si(1.0, "mg"), 0.0, "mg"
+    if stem == "scale_factor":
+        if physical:
+            return 1e6 / from_si(1.0, output), -1e6, _OFF_NOMINAL
+        return 1.0, 0.0, f"{output}/(m/s²)"
+    if stem == "misalignment":
+        return 1e3, 0.0, "mrad"
+    power = int(stem[1:] or "2")  # a cross term is k_xy: of the second degree, as k2
+    superscript = "⁰¹²³⁴⁵"[power]
+    return 1e6 * STANDARD_GRAVITY ** (power - 1), 0.0, f"µg/g{superscript}"
+
+
+def small_g(value: float) -> str:
+    """Return an acceleration in µg or mg, three significant digits."""
+    micro = micro_g(value)
+    return (
+        f"{micro:.3g} µg"
+        if abs(micro) < 999.5
+        else f"{micro / 1e3:.4g} mg"
+        if abs(micro) < 1e6
+        else f"{micro / 1e6:.3g} g"
+    )
+
+
+def micro_g(value: float) -> float:
+    """Return an acceleration in µg."""
+    return float(from_si(value, "ug"))

@@ -1,26 +1,38 @@
-"""The default estimator of a tumble test, for batches of problems in units of g.
+"""The estimators of a tumble test.
+
+Least squares in units of g, the published first-order iteration, propagation of distributions, and which attitudes
+determine the parameters best.
 
 `solve_norm` minimises ``sum_p w_p (|f(M_p)| - 1)^2`` with the model inverted exactly; the published first-order
 iteration (linearised.py) returns the same `Solution`.
 
 Noise-length term: second-order expansion of |f + e|.
+
+Source: the method's patent, its equation (4) with the products paired as docs/tumble_method.md says.
+
+The information of an attitude is the gradient of |f| for a nominal sensor, a function of its upward direction alone.
+Attitudes are exchanged one by one for the best of a list of candidates (Fedorov 1972; Atkinson, Donev and Tobias,
+Optimum Experimental Designs, 2007, ch. 12) from several starts, and on the free sphere then moved to where they are
+best. Many sets come within 1 % of the least sum of variances; the one whose worst axis is known best is taken,
+because a triad is as good as its worst axis.
+
+Each trial draws the attitudes' outputs about what was measured and runs the estimator again; thousands of trials are
+one batch of the solver. Where the noise was estimated, each trial scales it by ``sqrt(nu / chi2_nu)``, which makes the
+parameters' distribution a Student t with nu degrees of freedom (JCGM 101, 6.4.9).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.least_squares import (
-    Fit,
-    huber_weights,
-    leverage,
-    plausible_excess,
-    robust_scale,
-)
+from imulab.errors import DataError, OptionError
+from imulab.estimation.least_squares import Fit, huber_weights, leverage, plausible_excess, robust_scale
 from imulab.procedures.tumble.attitudes import Motion
 from imulab.procedures.tumble.model import (
     fit_lengths,
@@ -30,6 +42,10 @@ from imulab.procedures.tumble.model import (
     parameter_count,
 )
 from imulab.recording import Array
+from imulab.units import from_si
+
+# The default estimator of a tumble test, for batches of problems in units of g.
+
 
 REWEIGHTING_PASSES = {False: 4, True: 30}
 WEIGHTS_AT_REST = 1e-4
@@ -310,3 +326,470 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
         solution.theta, problem.reading, solution.weights, solution.lengthening, problem.order,
         tolerance=_REFIT_TOLERANCE, most=_REFIT_STEPS,
     )  # fmt: skip
+
+
+# The published first-order iteration of a tumble test (method ``linearised``), and the source's rules for it.
+
+
+_PASSES = 50
+_DIVERGED = 0.98
+"""A relative change of scale, or of bias in g, after which the linear step cannot be meant."""
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """Changes from one pass to the next below which the iteration rests: relative, in g, and in rad."""
+
+    scale_factor: float
+    bias: float
+    misalignment: float
+
+    def in_si(self, gravity: float) -> list[float]:
+        """Return the three in SI: 1, m/s^2 and rad."""
+        return [self.scale_factor, self.bias * gravity, self.misalignment]
+
+    def describe(self) -> str:
+        """Return the three as a person reads them."""
+        angle = from_si(self.misalignment, "arcsec")
+        return f"{1e6 * self.scale_factor:.3g} ppm, {1e6 * self.bias:.3g} ug, {angle:.3g} arcsec"
+
+
+SOURCE_THRESHOLD = Threshold(5e-6, 2e-6, 3 / 3600 * np.pi / 180)
+
+
+def solve_linearised(problem: Problem, name: str, threshold: Threshold = SOURCE_THRESHOLD) -> Solution:
+    """Run the published first-order iteration for a batch of one; weights and excess variance as for `solve_norm`.
+
+    ``sum_i sum_j d_ji a_i^(j+1) + m_1 a_x a_y + m_2 a_y a_z + m_3 a_z a_x = (|B|^2 - 1) / 2``, solved by linear least
+    squares until every change is below the threshold. The misalignments m_1, m_2, m_3 are the model's m_yx, m_zy, m_zx.
+
+    Raises
+    ------
+    DataError
+        The iteration does not converge, or ends where the model cannot be inverted.
+    """
+    lengthening, own = magnitude_noise(problem, start_parameters(problem.order))
+    theta, passes = _linearised_iteration(problem, lengthening[0], own[0], name, threshold)
+    solution = _evaluated(problem, theta, passes, name)
+    if problem.covariance is None:
+        return solution
+    for _ in range(REWEIGHTING_PASSES[False]):
+        before = solution.excess
+        spare = 1 - leverage(solution.jacobian, solution.weights)
+        excess, freedom = plausible_excess(solution.residuals, solution.own_variance, spare)
+        variance = solution.own_variance[0] + excess
+        theta, passes = _linearised_iteration(problem, solution.lengthening[0], variance, name, threshold)
+        solution = _evaluated(problem, theta, passes, name)
+        total = solution.own_variance + excess[:, None]
+        solution = replace(solution, variance=total, excess=np.sqrt(excess), freedom=freedom)
+        if np.abs(solution.excess - before).max() <= WEIGHTS_AT_REST * solution.excess.max():
+            break
+    return solution
+
+
+def _linearised_iteration(
+    problem: Problem, lengthening: Array, variance: Array, name: str, threshold: Threshold
+) -> tuple[Array, int]:
+    """Repeat the linear step until it rests; return theta, shape (1, p), and the number of passes."""
+    order = problem.order
+    root = 1 / np.sqrt(variance)
+    reading = problem.reading[0]
+    bias, scale, misalignment = np.zeros(3), np.ones(3), np.zeros(3)
+    for number in range(1, _PASSES + 1):
+        a = reading / scale - bias
+        x = a[:, 0]
+        y = a[:, 1] - misalignment[0] * x
+        z = a[:, 2] - misalignment[1] * x - misalignment[2] * y
+        products = np.column_stack([a[:, 0] * a[:, 1], a[:, 2] * a[:, 0], a[:, 1] * a[:, 2]])
+        design = np.column_stack([*(a ** (j + 1) for j in range(order + 1)), products])
+        right = (x * x + y * y + z * z - 1) / 2 - lengthening
+        solution = np.linalg.lstsq(design * root[:, None], right * root, rcond=None)[0]
+        change = solution[: 3 * (order + 1)].reshape(order + 1, 3)
+        bias = bias + change[0]
+        scale = scale * (1 + change[1])
+        misalignment = misalignment + solution[3 * (order + 1) :]
+        if not (np.abs(change[:2]).max() < _DIVERGED and np.isfinite(solution).all()):
+            break
+        moved = Threshold(*(float(np.abs(part).max()) for part in (change[1], change[0], solution[3 * (order + 1) :])))
+        if (
+            moved.scale_factor < threshold.scale_factor
+            and moved.bias < threshold.bias
+            and (moved.misalignment < threshold.misalignment)
+        ):
+            theta = np.concatenate([scale * bias, scale, misalignment, change[2:].ravel()])[None]
+            return theta, number
+    else:
+        raise DataError(
+            f"{name}: method linearised is not at rest after {_PASSES} passes: the last one changed parameters by "
+            f"{moved.describe()}, the threshold is {threshold.describe()}; use a larger threshold or method norm"
+        )
+    raise DataError(
+        f"{name}: method linearised does not converge on these attitudes (after {number} passes); use --method norm"
+    )
+
+
+def _evaluated(problem: Problem, theta: Array, iterations: int, name: str) -> Solution:
+    """Wrap parameters of the linearised iteration as a solution."""
+    norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, problem.order)
+    if not np.isfinite(norm).all():
+        raise DataError(
+            f"{name}: method linearised ends at a nonlinearity under which no specific force leads to some of these "
+            "attitudes; use --method norm"
+        )
+    lengthening, own = magnitude_noise(problem, theta, jacobian)
+    n = norm.shape[1]
+    return Solution(
+        theta=theta,
+        residuals=norm - 1 - lengthening,
+        deviations=norm - 1 - (lengthening if problem.motion is not None else 0.0),
+        lengthening=lengthening,
+        jacobian=jacobian,
+        variance=own,
+        own_variance=own,
+        down_weights=np.ones((1, n)),
+        scale=np.ones(1),
+        excess=np.zeros(1),
+        freedom=np.full(1, np.inf),
+        iterations=np.array([iterations]),
+        converged=np.array([True]),
+    )
+
+
+# The search behind a plan: sets of attitudes that are D- or A-optimal for a tumble test.
+
+
+CLOSEST = np.radians(3.0)
+"""Two attitudes closer than this are the same attitude: the same axis vertical."""
+_KEPT_CLEAR = 2 * CLOSEST
+"""What a plan with distinct verticals keeps from a vertical axis, so that an attitude put down 3 deg off does too."""
+_STARTS = 12
+_ENOUGH = 600  # attitudes over all starts: with many attitudes the first start is as good as the best
+_SWEEPS = 40
+_POLISH_RADII = np.repeat(np.radians([8.0, 3.0, 1.0]), 4)
+_CAP = 48
+_BALANCED = 3
+"""So many of the best starts are polished and balanced."""
+_BALANCE_ROUNDS = 6
+_BALANCE_RADII = np.repeat(np.radians([3.0, 1.0]), 3)
+_AS_GOOD = 1.01
+"""Sums of variances within this factor of the least are taken for equal."""
+_RIDGE = 1e-9
+"""Information that keeps the matrix regular while attitudes are still missing."""
+_UNDETERMINED = 1e6
+_QUICK_ROUNDS = 2
+_QUICK_RADII = np.radians([8.0, 3.0, 3.0, 1.0])
+
+
+def information_rows(directions: Array, order: int) -> Array:
+    """Return the gradient of |f| with respect to the scaled parameters of a nominal sensor, shape (n, p)."""
+    rows: Array = norm_and_jacobian(start_parameters(order), directions[None], order)[1][0]
+    return rows
+
+
+def near_vertical(directions: Array, angle: float) -> NDArray[np.bool_]:
+    """Return which of x, y and z is vertical within `angle`, up or down, at each upward direction, shape (n, 3)."""
+    vertical: NDArray[np.bool_] = np.abs(directions) > np.cos(angle) * np.linalg.norm(directions, axis=1, keepdims=True)
+    return vertical
+
+
+def inverse(information: Array) -> Array:
+    """Return the covariance that belongs to an information matrix."""
+    return np.asarray(np.linalg.inv(information), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a set of attitudes is for.
+
+    Attributes
+    ----------
+    order
+        Order of the model.
+    criterion
+        ``"A"``, least sum of variances, or ``"D"``, least volume of the confidence region.
+    before
+        Upward directions already measured, shape (k, 3).
+    distinct_verticals
+        Whether x, y and z are each to be vertical, up or down, in one attitude at most.
+    """
+
+    order: int
+    criterion: str
+    before: Array
+    distinct_verticals: bool = False
+
+    @cached_property
+    def base(self) -> Array:
+        """Information of the attitudes already measured."""
+        fixed = information_rows(self.before, self.order)
+        information: Array = fixed.T @ fixed + _RIDGE * np.eye(parameter_count(self.order))
+        return information
+
+    def covariance(self, directions: Array) -> Array:
+        """Covariance of the parameters with these attitudes added, per variance of |f| / g."""
+        rows = information_rows(directions, self.order)
+        return inverse(self.base + rows.T @ rows)
+
+    def gain(self, rows: Array, kept: Array, weight: Array | float = 1.0) -> Array:
+        """What adding each row to those kept improves.
+
+        By A the drop of the sum of weight times variance, by D the growth of the determinant.
+        """
+        carried = rows @ inverse(self.base + kept.T @ kept)
+        variance: Array = 1 + np.einsum("ij,ij->i", carried, rows)
+        if self.criterion == "D":
+            return variance
+        gain: Array = (carried**2 * weight).sum(axis=1) / variance
+        return gain
+
+    def taken(self, points: Array, others: Array) -> NDArray[np.bool_]:
+        """Points that would repeat an attitude: it measures nothing new that a longer hold would not."""
+        near = np.vstack([others, self.before])
+        repeated: NDArray[np.bool_] = (points @ near.T).max(axis=1, initial=-1.0) > np.cos(CLOSEST)
+        if self.distinct_verticals:
+            used = near_vertical(near, _KEPT_CLEAR).any(axis=0)
+            repeated |= (near_vertical(points, _KEPT_CLEAR) & used).any(axis=1)
+        return repeated
+
+
+def optimal_set(search: Search, points: Array, count: int, seed: int, *, free: bool) -> Array | None:
+    """Choose `count` of the candidate `points`, shape (m, 3), and move them from there if `free`.
+
+    Returns the directions, shape (count, 3), or None where no choice determines the model.
+    """
+    rng = np.random.default_rng(seed)
+    rows = information_rows(points, search.order)
+    starts = [_exchange(search, points, rows, count, rng) for _ in range(max(2, min(_STARTS, _ENOUGH // count)))]
+    starts.sort(key=lambda directions: _cost(search.covariance(directions), search.criterion))
+    if not np.isfinite(_cost(search.covariance(starts[0]), search.criterion)):
+        return None
+    if not free:
+        return _most_alike(search, starts)
+    polished = [_polish(search, directions, rng, _POLISH_RADII) for directions in starts[:_BALANCED]]
+    if search.criterion == "D":
+        return _most_alike(search, polished)
+    return _most_alike(search, polished + [each for one in polished for each in _balance(search, one, rng)])
+
+
+def quick_set(
+    search: Search, points: Array, count: int, seed: int, *, weight: Array | float = 1.0, move: bool = True
+) -> Array | None:
+    """Choose as `optimal_set` does, but from one start: within hundredths of a second, for who waits for the answer.
+
+    The sum of weight times variance is made least. Returns the directions, shape (count, 3), or None where this choice
+    does not determine the model.
+    """
+    rng = np.random.default_rng(seed)
+    chosen = _exchange(search, points, information_rows(points, search.order), count, rng, weight)
+    if np.diag(search.covariance(chosen)).max() > _UNDETERMINED:
+        return None
+    if not move:
+        return chosen
+    for _ in range(_QUICK_ROUNDS):
+        variance = np.diag(search.covariance(chosen)).reshape(-1, 3)
+        weight = weight * (variance / variance.mean(axis=1, keepdims=True)).ravel() ** 2
+        chosen = _polish(search, chosen, rng, _QUICK_RADII, weight)
+    return chosen
+
+
+def _exchange(
+    search: Search, points: Array, rows: Array, count: int, rng: np.random.Generator, weight: Array | float = 1.0
+) -> Array:
+    """Exchange attitudes from a random start until no exchange helps."""
+    chosen = rng.choice(len(rows), count, replace=False)
+    for _ in range(_SWEEPS):
+        moved = False
+        for place in range(count):
+            others = np.delete(chosen, place)
+            gain = search.gain(rows, rows[others], weight)
+            gain[search.taken(points, points[others])] = -np.inf
+            best = int(np.argmax(gain))
+            if gain[best] > gain[chosen[place]] * (1 + 1e-9) or gain[chosen[place]] == -np.inf:
+                chosen[place], moved = best, True
+        if not moved:
+            break
+    directions: Array = points[chosen]
+    return directions
+
+
+def _polish(
+    search: Search, directions: Array, rng: np.random.Generator, radii: Array, weight: Array | float = 1.0
+) -> Array:
+    """Move each attitude within shrinking caps to where it gives most."""
+    best = directions.copy()
+    for radius in radii:
+        for place in range(len(best)):
+            others = np.delete(best, place, axis=0)
+            cap = best[place] + radius * rng.uniform(-1, 1, (_CAP, 3))
+            cap = np.vstack([best[place], cap / np.linalg.norm(cap, axis=1, keepdims=True)])
+            gain = search.gain(information_rows(cap, search.order), information_rows(others, search.order), weight)
+            gain[1:][search.taken(cap[1:], others)] = -np.inf
+            best[place] = cap[int(np.argmax(gain))]
+    return best
+
+
+def _balance(search: Search, directions: Array, rng: np.random.Generator) -> list[Array]:
+    """Sets made from one by weighting up, again and again, the variances of axes that are worse than the others."""
+    sets = [directions]
+    weight: Array = np.ones(parameter_count(search.order))
+    for _ in range(_BALANCE_ROUNDS):
+        variance = np.diag(search.covariance(sets[-1])).reshape(-1, 3)
+        weight = weight * (variance / variance.mean(axis=1, keepdims=True)).ravel() ** 2
+        sets.append(_polish(search, sets[-1], rng, _BALANCE_RADII, weight))
+    return sets[1:]
+
+
+def _most_alike(search: Search, sets: list[Array]) -> Array:
+    """The set with the least cost; by A the one of the least worst axes among those as good as it."""
+    cost = [_cost(search.covariance(directions), search.criterion) for directions in sets]
+    if search.criterion == "D":
+        return sets[int(np.argmin(cost))]
+    good = [directions for directions, each in zip(sets, cost, strict=True) if each <= _AS_GOOD * min(cost)]
+    return min(good, key=lambda directions: _worst_axes(search.covariance(directions)))
+
+
+def _worst_axes(covariance: Array) -> float:
+    """Sum over bias, scale factor, misalignment, k2 ... of the variance of the worst of its three."""
+    return float(np.diag(covariance).reshape(-1, 3).max(axis=1).sum())
+
+
+def _cost(covariance: Array, criterion: str) -> float:
+    if criterion == "D":
+        return float(np.linalg.slogdet(covariance)[1])
+    return float(np.trace(covariance))
+
+
+# Which further attitudes would tell apart what these cannot.
+
+
+_CANDIDATES = 400
+
+
+def sphere_points(count: int) -> Array:
+    """Return directions spread evenly over the sphere (Fibonacci lattice), shape (count, 3)."""
+    index = np.arange(count) + 0.5
+    height = 1 - 2 * index / count
+    angle = np.pi * (1 + np.sqrt(5)) * index
+    ring = np.sqrt(1 - height**2)
+    points: Array = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), height])
+    return points
+
+
+def helpful_attitudes(order: int, solution: Solution, count: int) -> str:
+    """Name the upward directions (body axes) that add most to what the attitudes determine.
+
+    Each is the candidate with the largest variance of |f| under the information so far, a step of the exchange on the
+    D-criterion (Fedorov 1972).
+    """
+    candidates = sphere_points(_CANDIDATES)
+    present = solution.jacobian[0]
+    cross = present.shape[1] > parameter_count(order)
+    rows = norm_and_jacobian(start_parameters(order, cross=cross), candidates[None], order)[1][0]
+    information = present.T @ present + 1e-6 * np.eye(present.shape[1])
+    chosen = []
+    for _ in range(count):
+        gain = np.einsum("ij,jk,ik->i", rows, np.linalg.inv(information), rows)
+        best = int(np.argmax(gain))
+        information = information + np.outer(rows[best], rows[best])
+        chosen.append("(" + ", ".join(f"{value:+.2f}" for value in candidates[best]) + ")")
+    return " and ".join(chosen)
+
+
+# Uncertainty of a tumble fit by propagation of distributions (JCGM 101, GUM Supplement 1).
+
+
+_AT_ONCE = 2000
+FEWEST_TRIALS, MOST_TRIALS = 1000, 10_000_000
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Trials of a fit.
+
+    Attributes
+    ----------
+    theta
+        Scaled parameters of every trial that converged, shape (trials, p).
+    failed
+        Number of trials that did not converge.
+    """
+
+    theta: Array
+    failed: int
+
+
+def check_trials(trials: int) -> None:
+    """Check the number of trials.
+
+    Raises
+    ------
+    OptionError
+        Too few or too many.
+    """
+    if not FEWEST_TRIALS <= trials <= MOST_TRIALS:
+        raise OptionError(f"monte-carlo {trials}: expected {FEWEST_TRIALS} to {MOST_TRIALS} trials")
+
+
+def propagate(
+    problem: Problem,
+    solution: Solution,
+    *,
+    trials: int,
+    freedom: float | None,
+    seed: int = 1,
+    progress: Callable[[int], None] = lambda _: None,
+) -> MonteCarlo:
+    """Draw the attitudes' outputs and fit them again, `trials` times.
+
+    Parameters
+    ----------
+    problem, solution
+        What was fitted, a batch of one.
+    trials
+        1000 to 10,000,000.
+    freedom
+        Degrees of freedom of the noise where it was estimated, else None.
+    seed
+        Of the random numbers.
+    progress
+        Called with the number of trials done so far.
+
+    Raises
+    ------
+    OptionError
+        Too few or too many trials.
+    """
+    check_trials(trials)
+    rng = np.random.default_rng(seed)
+    problem = problem.held_still(solution)
+    covariance = _noise(problem, solution)
+    root = np.linalg.cholesky(covariance)
+    n = problem.reading.shape[1]
+    found, failed, done = [], 0, 0
+    while done < trials:
+        count = min(_AT_ONCE, trials - done)
+        factor = np.ones(count) if freedom is None else np.sqrt(freedom / rng.chisquare(freedom, count))
+        noise = np.einsum("nij,bnj->bni", root, rng.standard_normal((count, n, 3))) * factor[:, None, None]
+        known = None if problem.covariance is None else covariance[None]
+        batch = replace(problem, reading=problem.reading + noise, covariance=known, excess=False)
+        fit = solve_norm(batch, np.repeat(solution.theta, count, axis=0))
+        found.append(fit.theta[fit.converged])
+        failed += int(count - np.count_nonzero(fit.converged))
+        done += count
+        progress(done)
+    return MonteCarlo(np.vstack(found), failed)
+
+
+def _noise(problem: Problem, solution: Solution) -> Array:
+    """Covariance of each attitude's output to draw from, shape (n, 3, 3): as known with its excess, or as estimated."""
+    n, size = problem.reading.shape[1], solution.theta.shape[1]
+    identity = np.eye(3)
+    if problem.covariance is not None:
+        # Along the vertical, where it is seen, an isotropic excess has the variance that was found.
+        known: Array = problem.covariance[0] * solution.scale[0] ** 2 + solution.excess[0] ** 2 * identity
+        return known
+    if problem.robust:
+        variance = float(solution.scale[0] ** 2)
+    else:
+        variance = float((solution.residuals[0] ** 2).sum()) / max(n - size, 1)
+    return np.broadcast_to(variance * identity, (n, 3, 3)).copy()

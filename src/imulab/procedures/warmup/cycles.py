@@ -1,4 +1,4 @@
-"""Recordings to power cycles: the samples averaged over bins of one second, block by block.
+"""Recordings to power cycles on common bins of time, side by side, each referenced to its own settled mean.
 
 A bin keeps the mean of the data and, for the basis functions, two instants with weights that have the same first three
 moments as the times of its samples (a Gauss rule): averages of cubics over a bin are then exact, those of smooth
@@ -8,23 +8,30 @@ functions good to fourth order, and 60,000 samples cost no more than 600.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, UnitError
-from imulab.power_on import (
+from imulab.recording import (
     LATEST_START,
+    Array,
+    Recording,
+    Source,
     check_clock,
+    check_finite,
     check_start,
+    check_time,
     first_reading,
     head_temperature,
     power_on_temperature,
 )
-from imulab.recording import Array, Recording, Source, check_finite, check_time
 from imulab.units import conversion_factor, parse_unit, si_unit
+
+# Recordings to power cycles: the samples averaged over bins of one second, block by block.
+
 
 BIN = 1.0
 """Width of a bin, s."""
@@ -398,3 +405,390 @@ def with_axes(cycle: Cycle, wanted: tuple[str, ...]) -> Cycle:
         units=tuple(cycle.units[i] for i in index),
         file_units=tuple(cycle.file_units[i] for i in index),
     )
+
+
+# Power cycles side by side: each referenced to its own settled mean, on common bins of time, by temperature.
+
+
+SETTLED = 30.0
+"""A settled part shorter than this does not make a reference, s."""
+_WIDTH, _GROWTH = 2.0, 0.15
+"""Bins are two seconds wide at first, later this share of the time since power-on: few, so that noise weighs little."""
+_MOVED = 9.0
+_MOVED_RANGE = 0.02
+_APART, _APART_RANGE = 10.0, 0.1
+_QUIET = 60  # s
+_FEWEST = 10
+_NEARLY = 1e-9
+
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Curves:
+    """The cycles of a test on common bins of time before T_M.
+
+    Attributes
+    ----------
+    cycles
+        The power cycles, c of them.
+    temperatures
+        Calibration temperatures, shape (k,), degC.
+    group
+        Index of each cycle's calibration temperature, shape (c,).
+    power_on
+        Measured power-on temperatures, shape (c,), degC.
+    unit
+        Index of each cycle's unit, shape (c,).
+    settling_time
+        T_M, s.
+    edges
+        Of the bins, shape (b + 1,), s.
+    nodes, shares
+        Two instants of each bin and their weights, shapes (c, b, 2).
+    seconds
+        How much of each bin has samples, shape (c, b); the weights of a fit.
+    mean
+        Referenced to the cycle's settled mean, shape (c, b, axes), SI or count or V.
+    noise
+        Variance of the mean over one second, white noise alone, shape (axes,).
+    reference, reference_seconds
+        Settled mean, shape (c, axes), and how long it was averaged, shape (c,).
+    drift, drift_uncertainty
+        Change of the settled part from its start to its end, and standard uncertainty, shapes (c, axes).
+    end
+        Where each cycle ends (or the unit begins to move for good), s, shape (c,).
+    moved
+        Seconds left out because the unit moved, and when that began, shape (c, 2).
+    halved
+        Whether the settled part is the cycle's second half, shape (c,).
+    """
+
+    cycles: tuple[Cycle, ...]
+    temperatures: Array
+    group: Index
+    power_on: Array
+    unit: Index
+    settling_time: float
+    edges: Array
+    nodes: Array
+    shares: Array
+    seconds: Array
+    mean: Array
+    noise: Array
+    reference: Array
+    reference_seconds: Array
+    drift: Array
+    drift_uncertainty: Array
+    end: Array
+    moved: Array
+    halved: NDArray[np.bool_]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Columns, in order."""
+        return self.cycles[0].axes
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each axis."""
+        return self.cycles[0].units
+
+    def kinds(self) -> dict[str, list[int]]:
+        """Return the indices of the axes of each kind: gyro, accel."""
+        return {
+            kind: found
+            for kind in ("gyro", "accel")
+            if (found := [i for i, axis in enumerate(self.axes) if axis.startswith(kind)])
+        }
+
+    def expected_noise(self) -> Array:
+        """Return the mean square that white noise alone leaves in each cycle's curve, shape (c, axes)."""
+        used = (self.seconds > 0).sum(axis=1)
+        share = used / np.maximum(self.seconds.sum(axis=1), 1e-300) + 1 / self.reference_seconds
+        return np.asarray(share[:, None] * self.noise)
+
+    def group_means(self) -> tuple[Array, Array]:
+        """Return the mean curve at each calibration temperature, shape (k, b, axes), and its seconds, (k, b)."""
+        member = (self.group[None, :] == np.arange(len(self.temperatures))[:, None]).astype(np.float64)
+        seconds = member @ self.seconds
+        total = np.einsum("kc,cb,cba->kba", member, self.seconds, self.mean)
+        return total / np.maximum(seconds, 1e-300)[:, :, None], seconds
+
+
+def assign_temperatures(cycles: Sequence[Cycle], temperatures: Array, tolerance: float) -> Index:
+    """Return the index of each cycle's calibration temperature.
+
+    Raises
+    ------
+    DataError
+        A cycle fits none, or a calibration temperature has no cycle.
+    """
+    known = " ".join(f"{t:g}" for t in temperatures)
+    power_on = np.array([cycle.temperature for cycle in cycles])
+    apart = np.abs(power_on[:, None] - temperatures)
+    group = apart.argmin(axis=1)
+    for cycle, distance in zip(cycles, apart.min(axis=1), strict=True):
+        if distance > tolerance + _NEARLY:
+            raise DataError(
+                f"{cycle.name}: power-on temperature {cycle.temperature:g} degC fits no calibration temperature within "
+                f"{tolerance:g} K; expected one of {known} (--temperatures names others)"
+            )
+    missing = [f"{temperatures[k]:g}" for k in range(len(temperatures)) if k not in group]
+    if missing:
+        raise DataError(
+            f"no power cycle at {' '.join(missing)} degC among {len(cycles)} files: every interval needs cycles at its "
+            "two end points (--temperatures names those that were measured)"
+        )
+    return np.asarray(group, dtype=np.intp)
+
+
+def make_curves(
+    cycles: Sequence[Cycle],
+    temperatures: Array,
+    *,
+    tolerance: float,
+    settling_time: float | None,
+    limit: dict[str, float],
+) -> tuple[Curves, bool]:
+    """Put power cycles side by side; choose T_M where it is not given.
+
+    Parameters
+    ----------
+    cycles
+        With the same axes and units.
+    temperatures
+        Calibration temperatures, degC, ascending.
+    tolerance
+        How far a power-on temperature may lie from its calibration temperature, K.
+    settling_time
+        T_M, s, or None.
+    limit
+        Kind (gyro, accel) to the |Z| below which a curve counts as settled: a share of the largest if negative.
+
+    Returns
+    -------
+    Curves, and whether every curve was seen to settle.
+
+    Raises
+    ------
+    DataError
+        A cycle fits no temperature, is too short, or moved most of the time.
+    """
+    group = assign_temperatures(cycles, temperatures, tolerance)
+    still = [_still(cycle, level) for cycle, level in zip(cycles, quiet_levels(cycles), strict=True)]
+    end = np.array([bins.stop[-1] for bins, _ in still])
+    settled = True
+    serials = [cycle.serial or "" for cycle in cycles]
+    unit = np.array([sorted(set(serials)).index(serial) for serial in serials])
+    if settling_time is None:  # the longest over temperatures and units
+        _, each = np.unique(unit * len(temperatures) + group, return_inverse=True)
+        settling_time, settled = _choose_settling_time(cycles, [bins for bins, _ in still], each, end, limit)
+    _check_early(cycles, [bins for bins, _ in still], settling_time)
+    noise = _white_noise([bins for bins, _ in still])
+    edges = bin_edges(settling_time)
+    c, b, a = len(cycles), len(edges) - 1, len(cycles[0].axes)
+    nodes, shares = np.zeros((c, b, 2)), np.full((c, b, 2), 0.5)
+    nodes[:] = (0.5 * (edges[1:] + edges[:-1]))[:, None]
+    seconds, mean = np.zeros((c, b)), np.zeros((c, b, a))
+    reference, reference_seconds = np.zeros((c, a)), np.zeros(c)
+    drift, uncertain = np.zeros((c, a)), np.zeros((c, a))
+    halved = end < settling_time + SETTLED - _NEARLY
+    for i, (bins, _) in enumerate(still):
+        late = bins.where(bins.start >= (end[i] / 2 if halved[i] else settling_time) - _NEARLY)
+        reference[i], reference_seconds[i], drift[i], uncertain[i] = _settled(late, bins, noise)
+        wide = merge(bins, edges)
+        where = np.searchsorted(edges, wide.start + _NEARLY, side="right") - 1
+        nodes[i, where], shares[i, where] = wide.nodes, wide.shares
+        seconds[i, where] = wide.count / np.median(bins.count)
+        mean[i, where] = wide.mean - reference[i]
+    curves = Curves(
+        cycles=tuple(cycles),
+        temperatures=temperatures,
+        group=group,
+        power_on=np.array([cycle.temperature for cycle in cycles]),
+        unit=unit,
+        settling_time=settling_time,
+        edges=edges,
+        nodes=nodes,
+        shares=shares,
+        seconds=seconds,
+        mean=mean,
+        noise=noise,
+        reference=reference,
+        reference_seconds=reference_seconds,
+        drift=drift,
+        drift_uncertainty=uncertain,
+        end=end,
+        moved=np.array([moved for _, moved in still]),
+        halved=halved,
+    )
+    return curves, settled
+
+
+def _check_early(cycles: Sequence[Cycle], still: Sequence[Bins], settling_time: float) -> None:
+    """Refuse a cycle that has hardly a sample of the warm-up."""
+    for cycle, bins in zip(cycles, still, strict=True):
+        early = int((bins.stop <= settling_time + _NEARLY).sum())
+        if early < _FEWEST:
+            raise DataError(
+                f"{cycle.name}: {early} s of samples before T_M = {settling_time:g} s: expected {_FEWEST} s or more"
+            )
+
+
+def bin_edges(stop: float) -> Array:
+    """Return edges from 0 to `stop`, whole seconds: two apart at first, later 15 % of the time."""
+    edges = [0.0]
+    while edges[-1] < stop:
+        edges.append(edges[-1] + max(_WIDTH, round(_GROWTH * edges[-1])))
+    edges[-1] = stop
+    if len(edges) > 2 and edges[-1] - edges[-2] < 0.5 * (edges[-2] - edges[-3]):
+        del edges[-2]
+    return np.array(edges)
+
+
+def quiet_levels(cycles: Sequence[Cycle]) -> list[Array]:
+    """Return the variance within a bin at rest, shape (axes,) for each cycle.
+
+    Of each cycle the quietest minute (a vehicle may fly for most of its log); if the cycles of the same sample rate
+    are mostly quieter than that, theirs (a cycle may move throughout).
+    """
+    own = np.array([_quietest(cycle.bins.variance) for cycle in cycles])
+    rate = np.array([np.median(cycle.bins.count) for cycle in cycles])
+    levels = []
+    for level, mine in zip(own, rate, strict=True):
+        usual = np.median(own[np.abs(rate / mine - 1) < 0.1], axis=0)
+        levels.append(np.where(usual > 0, np.minimum(level, usual), level))
+    return levels
+
+
+def _quietest(variance: Array) -> Array:
+    """Least median over any minute, or over any quarter of what is shorter than four."""
+    width = max(min(_QUIET, len(variance) // 4), 1)
+    windows = np.lib.stride_tricks.sliding_window_view(variance, width, axis=0)[:: max(width // 6, 1)]
+    return np.asarray(np.median(windows, axis=-1).min(axis=0))
+
+
+def _still(cycle: Cycle, quiet: Array) -> tuple[Bins, tuple[float, float]]:
+    """Return the bins in which the unit stood still; seconds left out, and when it first moved.
+
+    A bin counts as moved when its variance is far above `quiet` and above what the warm-up curve itself makes of it, or
+    when its mean stands apart from those around it, as a knock that fills a bin leaves it.
+    """
+    bins = cycle.bins
+    slope = np.gradient(bins.mean, axis=0) if len(bins) > 1 else 0.0
+    excess = bins.variance - np.square(slope) / 12
+    noise = _MOVED * (1 + 10 / bins.count[:, None]) * quiet
+    away = np.square(bins.mean - _running_medians(bins.mean))
+    # Its own noise from neighbouring bins: within a bin of a few samples the variance says little.
+    steps = np.diff(bins.mean, axis=0)
+    usual = np.median(np.abs(steps - np.median(steps, axis=0)), axis=0) if len(steps) else np.inf
+    alone = _APART**2 * np.maximum(quiet / bins.count[:, None], (1.05 * usual) ** 2)
+    moved = np.zeros(len(bins), dtype=np.bool_)
+    while not moved.all():
+        # The curve's range is that of the bins at rest: in motion it would hide the motion.
+        spread = np.subtract(*np.quantile(bins.mean[~moved], [0.95, 0.05], axis=0))
+        found = (excess > noise + (_MOVED_RANGE * spread) ** 2).any(axis=1) & (bins.count > 2)
+        found |= (away > alone + (_APART_RANGE * spread) ** 2).any(axis=1)
+        if not (found & ~moved).any():
+            break
+        moved |= found
+    if not moved.any():
+        return bins, (0.0, 0.0)
+    near = np.convolve(moved, [1, 1, 1], mode="same") > 0
+    began = float(bins.start[np.argmax(near)])
+    if (~near).sum() < 2 * _FEWEST:
+        raise DataError(f"{cycle.name}: the unit moved from {began:g} s on: {int((~near).sum())} s at rest are too few")
+    return bins.where(~near), (float(near.sum()), began)
+
+
+def _running_medians(values: Array) -> Array:
+    """Median of each row and the three on either side, which two bad ones do not move."""
+    if len(values) <= 3:
+        return np.asarray(np.median(values, axis=0, keepdims=True))
+    padded = np.pad(values, ((3, 3), (0, 0)), mode="reflect", reflect_type="odd")
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 7, axis=0), axis=-1))
+
+
+def _white_noise(still: Sequence[Bins]) -> Array:
+    """Variance of the mean over one second, from differences of neighbouring bins, shape (axes,)."""
+    total, number = np.zeros(still[0].mean.shape[1]), 0
+    for bins in still:
+        neighbours = (np.diff(bins.start) < 1.5) & (bins.start[1:] > bins.stop[-1] / 4)
+        steps = np.diff(bins.mean, axis=0)[neighbours]
+        if len(steps) > 1:
+            # Second differences: the curve's own slope is no noise.
+            bends = np.diff(steps, axis=0)
+            total += (bends**2).sum(axis=0) / 6
+            number += len(bends)
+    return total / max(number, 1)
+
+
+def _settled(late: Bins, bins: Bins, noise: Array) -> tuple[Array, float, Array, Array]:
+    """Mean of the settled part, its seconds, its change from start to end with standard uncertainty."""
+    weight = late.count / late.count.sum()
+    mean = weight @ late.mean
+    seconds = float(late.count.sum() / np.median(bins.count))
+    time = (late.shares * late.nodes).sum(axis=1)
+    time = time - weight @ time
+    spread = float(weight @ time**2)
+    if spread <= 0:
+        return mean, seconds, np.zeros_like(mean), np.zeros_like(mean)
+    length = float(late.stop[-1] - late.start[0])
+    slope = (weight * time) @ (late.mean - mean) / spread
+    return mean, seconds, slope * length, np.sqrt(noise / (seconds * spread)) * length
+
+
+def _choose_settling_time(
+    cycles: Sequence[Cycle], still: Sequence[Bins], group: Index, end: Array, limit: dict[str, float]
+) -> tuple[float, bool]:
+    """Return the first time after which every mean curve stays below its limit, rounded up to 10 s, and whether any is.
+
+    There is a curve for each group: a temperature of a unit. They are referenced to what follows that time, so that it
+    is found by iteration from three quarters of the shortest cycle.
+    """
+    shortest = float(np.floor(end.min()))
+    latest = 10.0 * np.floor((shortest - SETTLED) / 10)
+    if latest < 2 * _FEWEST:
+        raise DataError(
+            f"{cycles[int(end.argmin())].name}: ends {shortest:g} s after power-on: too short to find the settling "
+            "time; record until the output has settled, or give --settling-time"
+        )
+    edges = bin_edges(shortest)
+    noise = _white_noise(still)
+    wide = [merge(bins, edges) for bins in still]
+    count = int(group.max()) + 1
+    axes = cycles[0].axes
+    total, weight = np.zeros((count, len(edges) - 1, len(axes))), np.zeros((count, len(edges) - 1, 1))
+    for bins, k in zip(wide, group, strict=True):
+        where = np.searchsorted(edges, bins.start + _NEARLY, side="right") - 1
+        share = (bins.count / np.median(bins.count / (bins.stop - bins.start)))[:, None]
+        settled = bins.where(bins.start >= 0.75 * shortest)
+        level = np.average(settled.mean, axis=0, weights=settled.count) if len(settled) else bins.mean[-1]
+        total[k, where] += share * (bins.mean - level)
+        weight[k, where] += share
+    curve = total / np.maximum(weight, 1e-300)
+    margin = 2 * np.sqrt(noise / np.maximum(weight, 1.0))
+    chosen = 0.75 * shortest
+    found = True
+    for _ in range(5):
+        late = edges[:-1] >= min(chosen, latest) - _NEARLY
+        z = curve - (curve[:, late] * weight[:, late]).sum(axis=1, keepdims=True) / weight[:, late].sum(
+            axis=1, keepdims=True
+        )
+        z = np.where(weight > 0, z, 0.0)
+        over = np.zeros(len(edges) - 1, dtype=np.bool_)
+        for kind, given in limit.items():
+            index = [i for i, axis in enumerate(axes) if axis.startswith(kind)]
+            if index:
+                threshold = given if given > 0 else -given * np.abs(z[:, :, index]).max()
+                over |= (np.abs(z[:, :, index]) - margin[:, :, index] > threshold).any(axis=(0, 2))
+        above = edges[1:][over & (edges[:-1] < latest)]
+        first = 10.0 * np.ceil((above[-1] if above.size else edges[1]) / 10)
+        first = max(first, 3.0 * _FEWEST)
+        found = first < latest and not (over & (edges[:-1] >= latest)).any()
+        first = min(first, latest)
+        if abs(first - chosen) < 1:
+            break
+        chosen = first
+    return float(min(chosen, latest)), found

@@ -1,24 +1,30 @@
-"""A warm-up table as the C core runs it, and the vectors by which an exported unit tests itself."""
+"""A warm-up table as the C core runs it, its vectors for an exported unit, and its curve subtracted from recordings."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.device.tables import DeviceTable, Field, field_of, whole
 from imulab.device.unit import DeviceUnit
-from imulab.errors import RecordError
-from imulab.procedures.warmup.choices import EXITS, MODELS
+from imulab.display import Note
+from imulab.errors import DataError, RecordError, UnitError
+from imulab.procedures.warmup import EXITS, MODELS
 from imulab.procedures.warmup.model import record_table
-from imulab.recording import Array
+from imulab.recording import LATEST_START, Array, Recording, check_clock, check_start, check_time, power_on_temperature
 from imulab.records.calibration import Calibration
+from imulab.units import conversion_factor
+
+# A warm-up table as the C core runs it, and the vectors by which an exported unit tests itself.
+
 
 _COLDEST, _HOTTEST, _HAIR = -273.15, 1000.0, 1e-3
 """How far a table is held beyond its edges, degC, and how soon its slope ends there, K."""
-_TICK = 0.01  # s
+_GOLDEN_STEP = 0.01  # s
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
@@ -115,12 +121,12 @@ def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     knots, axes = field_of(table, "temperature"), int(field_of(table, "axes"))
     between = knots[:-1] + np.diff(knots) * rng.uniform(0.1, 0.9, len(knots) - 1)
     starts = np.concatenate([knots, between, [knots[0] - 1, knots[-1] + 1, np.nan]])
-    end = float(field_of(table, "settling_time") + field_of(table, "taper_time")) * 1.1 / _TICK
+    end = float(field_of(table, "settling_time") + field_of(table, "taper_time")) * 1.1 / _GOLDEN_STEP
     ticks = np.unique(np.concatenate([[0, 1], np.linspace(0, end, 30)])).astype(np.uint32)
     unit = DeviceUnit.of(table)
     bias = np.empty((len(starts), len(ticks), axes))
     for place, start in zip(bias, starts, strict=True):
-        left, _ = unit.warmup(float(start), _TICK, ticks, [np.zeros(len(ticks))] * axes)
+        left, _ = unit.warmup(float(start), _GOLDEN_STEP, ticks, [np.zeros(len(ticks))] * axes)
         place[:] = -np.column_stack([column for column in left if column is not None])
     # The size of the numbers that a polynomial adds up, not of a sum that may be near zero.
     sizes = np.abs(field_of(table, "coefficient")).sum(axis=2).max(axis=0)
@@ -128,8 +134,136 @@ def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
         "starts": len(starts),
         "ticks": ticks,
         "TICKS": len(ticks),
-        "tick": _TICK,
+        "tick": _GOLDEN_STEP,
         "temperature": starts,
         "scale": np.where(sizes > 0, sizes, 1.0),
         "bias": bias + 0.0,
     }
+
+
+# A warm-up record applied by the C core: the table's curve is subtracted while the unit warms up.
+
+
+_TICK, _LONG, _LONG_TICK = 1e-6, 2000.0, 1e-4  # s: the core counts time in ticks, 2^32 of them
+_LAST_TICK = 2**32 - 1
+_PIECE = 32768  # samples at a time: their ticks stay in the cache
+
+
+def apply_warmup(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+    """Return the recording with ``output - Z(t; T)`` in those axes of the record that it has, their units kept.
+
+    `t` is the column time, counted from power-on; `T` is ``power_on_temperature`` of the head of the file. Without it,
+    or outside the table, the recording passes unchanged (`unchanged` says why).
+
+    Raises
+    ------
+    UnitError
+        A column's unit cannot be converted to the record's.
+    DataError
+        The recording lacks time or every axis of the record; its time does not count from power-on, does not rise or is
+        of another unit.
+    """
+    factors, there = [], present_axes(columns, recording)
+    for axis, made_in in zip(columns["axes"], columns["units"], strict=True):
+        if axis not in there:
+            factors.append(1.0)
+            continue
+        try:
+            factors.append(conversion_factor(made_in, recording.units[axis]))
+        except UnitError:
+            raise UnitError(
+                f"{recording.name}: column {axis} is in {recording.units[axis]}, but the record corrects {made_in}"
+            ) from None
+    time = recording.time
+    if time is None:
+        raise DataError(f"{recording.name}: no column time; a warm-up record needs the time since power-on")
+    time = _checked(recording, columns.get("latest_start", LATEST_START))
+    temperature = power_on_temperature(recording)
+    if temperature is None or unchanged(columns, recording) is not None:
+        return recording
+    tick = _TICK if columns["end"] < _LONG else _LONG_TICK
+    given = [recording.columns[axis] if axis in there else None for axis in columns["axes"]]
+    corrected = [None if column is None else np.empty(len(recording)) for column in given]
+    buffer = np.empty(min(_PIECE, len(recording)))
+    for start in range(0, len(recording), _PIECE):
+        piece = slice(start, start + _PIECE)
+        ticks = _ticks(time[piece], tick, buffer)
+        into = _parts(corrected, piece)
+        _, active = unit.warmup(temperature, tick, ticks, _parts(given, piece), factors=factors, into=into)
+        if not active:
+            return recording
+    found = zip(columns["axes"], corrected, strict=True)
+    return recording.with_columns({axis: column for axis, column in found if column is not None}, {})
+
+
+def present_axes(columns: Mapping[str, Any], recording: Recording) -> list[str]:
+    """Return the axes of a table that a recording has.
+
+    Raises
+    ------
+    DataError
+        It has none of them.
+    """
+    there = [axis for axis in columns["axes"] if axis in recording]
+    if not there:
+        recording.column(columns["axes"][0])  # says what was expected and what was found
+    return there
+
+
+def _parts(columns: Sequence[Array | None], piece: slice) -> list[Array | None]:
+    return [None if column is None else column[piece] for column in columns]
+
+
+def _checked(recording: Recording, latest: float) -> Array:
+    """Return the column time, s, once it is sure that it counts from power-on; a later block has no start."""
+    time = check_time(recording)
+    if time.size and recording.first_row == 1:
+        check_start(recording, float(time[0]), latest)
+        check_clock(recording, time)
+    return time
+
+
+def _ticks(time: Array, tick: float, buffer: Array) -> NDArray[np.uint32]:
+    """Return times in whole ticks; `buffer` has room for them."""
+    count = np.divide(time, tick, out=buffer[: len(time)])
+    np.rint(count, out=count)
+    return np.clip(count, 0, _LAST_TICK, out=count).astype(np.uint32)
+
+
+def unchanged(columns: Mapping[str, Any], recording: Recording) -> str | None:
+    """Return why the table of a record or blob leaves a recording unchanged, in one line, or None.
+
+    `columns` are those of its section in the C core: range of temperatures, degC, and when the correction ends, s.
+    """
+    low, high = columns["range"]
+    temperature = power_on_temperature(recording)
+    if temperature is None:
+        return (
+            f"{recording.name}: no power_on_temperature in the head of the file: nothing corrected; "
+            "expected a line such as '# power_on_temperature: 21.5'"
+        )
+    if not low <= temperature <= high:
+        return (
+            f"{recording.name}: power-on temperature {temperature:g} degC is not within the table, "
+            f"{low:g} to {high:g} degC: nothing corrected"
+            + ("" if np.isnan(temperature) else " (warmup fit --beyond hold: a table that goes on as at its edges)")
+        )
+    time = recording.time
+    ends = columns["end"] if columns.get("exit", "hold") != "hold" else np.inf
+    if recording.first_row == 1 and time is not None and time.size and time[0] >= ends:
+        return (
+            f"{recording.name}: starts {time[0]:.6g} s after power-on, where the correction has ended "
+            f"({ends:g} s): nothing corrected"
+        )
+    return None
+
+
+def remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
+    """Return what a user should know about correcting a recording: why it stays as it is, or which axes it lacks."""
+    if message := unchanged(columns, recording):
+        return [message]
+    there = [axis for axis in columns["axes"] if axis in recording]
+    absent = [axis for axis in columns["axes"] if axis not in there]
+    if not there or not absent:
+        return []
+    return [Note(f"{recording.name}: no {' '.join(absent)} in it: {' '.join(there)} alone are corrected for warm-up")]

@@ -6,34 +6,261 @@ from typing import Any
 
 import numpy as np
 
-from imulab.procedures.warmup.engineering import engineering_unit
-from imulab.procedures.warmup.grid import axis_style, grid, temperature_colour, temperature_mark
+from imulab.estimation.rows import rms
 from imulab.procedures.warmup.model import WarmupTable, evaluate, record_table
-from imulab.procedures.warmup.sections import Cycle, Fit, Warmup, drawn_of
-from imulab.procedures.warmup.tables import (
-    axes_by_kind,
-    largest_text,
-    models_table,
-    rms_of,
-    rms_text,
-    tests_table,
-    units_table,
-)
+from imulab.procedures.warmup.schema import Cycle, Fit, Warmup, drawn_of, engineering_unit
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.elements import (
+from imulab.report.traces import (
     BAD,
     GOOD,
     INK,
     LEGEND,
     QUIET,
+    SYMBOLS,
     Exhibits,
     Figure,
     ReportTable,
+    figure_axis,
     format_uncertain,
     plain_number,
+    rounded,
+    scatter,
 )
-from imulab.report.traces import rounded, scatter
+
+# A row of plots that share their axes, coloured by temperature.
+
+
+_ACROSS = 3
+_DECADES = [1, 10, 100, 1000]
+_SCALE = ("#2c4fa3", "#3d8fc4", "#58b5a6", "#a3bf58", "#e0a83c", "#d5663a", "#a8322f")
+"""Cold to warm; distinct in lightness too."""
+
+
+def axis_style(title: str, **more: Any) -> dict[str, Any]:
+    """Return a Plotly axis in the style of the reports."""
+    return figure_axis("", **more) | {"title": {"text": title, "standoff": 12}}
+
+
+def temperature_colour(temperature: float, temperatures: Array) -> str:
+    """Return the colour of a temperature between the coldest and the warmest, as #rrggbb."""
+    low, high = float(temperatures[0]), float(temperatures[-1])
+    position = float(np.clip((temperature - low) / max(high - low, 1e-9), 0, 1)) * (len(_SCALE) - 1)
+    first = min(int(position), len(_SCALE) - 2)
+    share = position - first
+    ends = [np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) for colour in _SCALE[first : first + 2]]
+    mixed = np.rint((1 - share) * ends[0] + share * ends[1]).astype(int)
+    return "#" + "".join(f"{value:02x}" for value in mixed)
+
+
+def temperature_mark(temperature: float, temperatures: Array) -> str:
+    """Return the mark of the calibration temperature that is nearest."""
+    return SYMBOLS[int(np.argmin(np.abs(temperatures - temperature))) % len(SYMBOLS)]
+
+
+def _temperature_key(temperatures: Array) -> list[dict[str, Any]]:
+    """Return a trace without points for each temperature, for the key."""
+    return [
+        {
+            "type": "scatter",
+            "mode": "lines+markers",
+            "x": [None],
+            "y": [None],
+            "name": f"{at:g} °C",
+            "line": {"color": temperature_colour(at, temperatures), "width": 3},
+            "marker": {"symbol": temperature_mark(at, temperatures), "size": 7},
+        }
+        for at in temperatures.tolist()
+    ]
+
+
+def grid(
+    *,
+    title: str,
+    caption: str,
+    names: list[str],
+    cells: list[list[dict[str, Any]]],
+    y_title: str,
+    temperatures: Array,
+    log_time: bool = False,
+) -> Figure:
+    """Lay out one plot per name, at most three across, with a common key of temperatures below the title.
+
+    On a logarithm of time bins that widen with time lie evenly.
+    """
+    across = min(len(names), _ACROSS)
+    down = -(-len(names) // across)
+    gap_x, gap_y = 0.06, 0.16 / down
+    width, height = (1 - gap_x * (across - 1)) / across, (1 - gap_y * (down - 1)) / down
+    layout: dict[str, Any] = {
+        "showlegend": True,
+        "legend": {"orientation": "h", "x": 0, "y": 1 + 0.09 / down, "yanchor": "bottom", "itemsizing": "constant"},
+        "annotations": [],
+    }
+    traces = _temperature_key(temperatures)
+    for number, (name, cell) in enumerate(zip(names, cells, strict=True)):
+        row, column = divmod(number, across)
+        suffix = "" if number == 0 else str(number + 1)
+        left, top = column * (width + gap_x), 1 - row * (height + gap_y)
+        here = {"type": "scatter", "showlegend": False, "xaxis": f"x{suffix}", "yaxis": f"y{suffix}"}
+        traces += [{**here, **trace} for trace in cell]
+        bottom = row == down - 1
+        scale = {"type": "log", "tickvals": _DECADES} if log_time else {"rangemode": "tozero"}
+        layout[f"xaxis{suffix}"] = axis_style(
+            "s after power-on" if bottom else "", domain=[left, left + width], anchor=f"y{suffix}", **scale
+        )
+        layout[f"yaxis{suffix}"] = axis_style(
+            y_title if column == 0 else "",
+            domain=[top - height, top],
+            anchor=f"x{suffix}",
+            showticklabels=column == 0,
+            ticks="outside" if column == 0 else "",
+            tickcolor="#ffffff",
+            **({} if number == 0 else {"matches": "y"}),
+        )
+        layout["annotations"].append(
+            {
+                "text": f"<b>{name}</b>",
+                "xref": "paper",
+                "yref": "paper",
+                "x": left,
+                "y": top,
+                "xanchor": "left",
+                "yanchor": "bottom",
+                "showarrow": False,
+            }
+        )
+    return Figure(title=title, caption=caption, traces=traces, layout=layout, height=120 + 280 * down)
+
+
+# The tables of a warm-up record, and its numbers as text.
+
+
+_LOST = "in noise"
+
+
+def models_table(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> ReportTable:
+    """Return the models that were compared, over the axes of one kind."""
+    label, factor = engineering_unit(table.units[index[0]])
+    rows, highlight = [], None
+    fit = drawn.fit
+    for number, row in enumerate(fit.models):
+        if row.chosen:
+            highlight = number
+        scales = ", ".join(plain_number(value, 3) for value in row.scales) or "–"
+        none = row.model == "none"
+        rows.append(
+            [
+                row.model,
+                rms_text(row.training, index, factor),
+                "–" if none else rms_text(row.left_cycle, index, factor),
+                rms_text(row.left_temperature, index, factor),
+                "–" if none else largest_text(row.edge_jump, index, factor),
+                "–" if none else largest_text(row.exit_jump, index, factor),
+                scales,
+            ]
+        )
+    floor = rms_text(fit.repeatability.cycle, index, factor, f" {label}")
+    what = "unit" if drawn.model.pool == "type" else "cycle"
+    return ReportTable(
+        title=f"Models compared, {kind}, {label}",
+        caption="Root mean square over all axes and the time t after power-on up to T_M, from which the unit is "
+        "settled and nothing is subtracted; white noise taken off. Z is what the table subtracts. Columns: the cycles "
+        f"fitted, of each {what} left out, of each temperature left out (its neighbours are then twice as far as in "
+        "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops at "
+        f"once. No table can beat the repeatability of cycles, {floor}.",
+        columns=["model", "at tests", f"{what} left out", "temp. left out", "edge jump", "|Z(T_M)|", "tau, s"],
+        rows=rows,
+        highlight=highlight,
+    )
+
+
+def units_table(fit: Fit, table: WarmupTable, kinds: dict[str, list[int]], units: list[float | None]) -> ReportTable:
+    """Return whether one table for the type is enough, axis by axis."""
+    found = fit.repeatability
+    rows = []
+    for index in kinds.values():
+        for i in index:
+            label, factor = engineering_unit(table.units[i])
+            unit, cycle, uncertainty = units[i], found.cycle[i], found.standard_uncertainty[i]
+            verdict = "–"
+            if unit is not None and cycle is not None and uncertainty is not None:
+                verdict = "each unit" if unit > cycle + 2 * uncertainty else "one per type"
+            shown = [rms_text(values, [i], factor) for values in (units, found.cycle)]
+            rows.append([table.axes[i], *shown, verdict, label])
+    return ReportTable(
+        title=f"Spread between {fit.units} units",
+        caption="Root mean square deviation of a unit's curve from that of the type, beside that of a cycle from its "
+        "unit. Where units differ clearly more than their cycles do (by two standard uncertainties of the latter), a "
+        "table for each unit would gain; otherwise one per type is enough.",
+        columns=["axis", "between units", "between cycles", "table for", "unit"],
+        rows=rows,
+    )
+
+
+def tests_table(drawn: Warmup, table: WarmupTable) -> ReportTable:
+    """Return what each calibration temperature showed, over the axes of the first kind."""
+    label, factor = engineering_unit(table.units[0])
+    head = next(iter(axes_by_kind(table).values()))
+    chosen = drawn.fit.row()
+    rows = []
+    for k, at in enumerate(drawn.data.knots):
+        members = [cycle for cycle in drawn.data.cycles if cycle.calibration_temperature == at]
+        power_on = [cycle.power_on_temperature for cycle in members]
+        drift = [None if (moved := cycle.settled_drift[i]) is None else abs(moved) for cycle in members for i in head]
+        rows.append(
+            [
+                f"{at:g}",
+                str(len(members)),
+                f"{min(power_on):.2f} to {max(power_on):.2f}",
+                rms_text(drawn.fit.repeatability.by_temperature[k], head, factor),
+                rms_text(chosen.by_temperature[k], head, factor),
+                rms_text(chosen.left_by_temperature[k], head, factor),
+                largest_text(drift, list(range(len(drift))), factor),
+                f"{min(cycle.end for cycle in members):g}",
+            ]
+        )
+    return ReportTable(
+        title=f"The test, by temperature ({label})",
+        caption="Repeatability, what is left, and what is left where this temperature was kept out of the fit; largest "
+        "change of the settled part from T_M to its end; end of the shortest cycle.",
+        columns=["degC", "cycles", "power-on, degC", "repeatability", "left", "left out", "settled drift", "end, s"],
+        rows=rows,
+    )
+
+
+def axes_by_kind(table: WarmupTable) -> dict[str, list[int]]:
+    """Return the numbers of the gyroscopes' axes, and of the accelerometers'."""
+    found: dict[str, list[int]] = {}
+    for i, axis in enumerate(table.axes):
+        found.setdefault("gyroscopes" if axis.startswith("gyro") else "accelerometers", []).append(i)
+    return found
+
+
+def rms_of(values: list[float | None] | None, index: list[int]) -> float:
+    """Return the root mean square of the values of some axes, nan where one is not known."""
+    chosen = [values[i] for i in index] if values else [None]
+    if any(value is None for value in chosen):
+        return float("nan")
+    return rms(np.array(chosen, dtype=np.float64))
+
+
+def rms_text(values: list[float | None] | None, index: list[int], factor: float, unit: str = "") -> str:
+    """Return the root mean square of some axes as text; what is not above the white noise has no number."""
+    value = rms_of(values, index) * factor
+    if np.isnan(value):
+        return "–"
+    return f"{plain_number(value, 2)}{unit}" if value > 0 else _LOST
+
+
+def largest_text(values: list[float | None], index: list[int], factor: float) -> str:
+    """Return the largest of the values of some axes as text."""
+    known = [value for i in index if (value := values[i]) is not None]
+    return plain_number(max(known) * factor, 2) if known else "–"
+
+
+# The figures and tables of a warm-up record, from the record alone.
+
 
 _POINTS = 121
 _INSTANTS = (0.0, 30.0, 100.0, 200.0)

@@ -9,16 +9,16 @@ from typing import Annotated, Any, Unpack
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
-from imulab.procedures.inputs import as_blocks
-from imulab.procedures.options import names_of_columns
-from imulab.procedures.result import Result
-from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS, settling_size
-from imulab.procedures.warmup.curves import Curves, make_curves
-from imulab.procedures.warmup.cycles import Cycle, common_axes, find_power_cycle, with_axes
-from imulab.procedures.warmup.judge import (
+from imulab.procedures.procedure import names_of_columns
+from imulab.procedures.result import Result, as_blocks
+from imulab.procedures.warmup import BEYOND, EXITS, MODELS, POOLS, settling_size
+from imulab.procedures.warmup.cycles import Curves, Cycle, common_axes, find_power_cycle, make_curves, with_axes
+from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable, coefficient_covariance, statistics
+from imulab.procedures.warmup.quality import (
     CANDIDATES,
     Judged,
     Repeatability,
+    after_of,
     choose,
     cycle_weights,
     judge,
@@ -26,10 +26,7 @@ from imulab.procedures.warmup.judge import (
     repeatability,
     worst_between,
 )
-from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable
-from imulab.procedures.warmup.quality import after_of
 from imulab.procedures.warmup.record import make_record
-from imulab.procedures.warmup.solve import coefficient_covariance, statistics
 from imulab.quantities import in_si, number, temperature_list
 from imulab.reading import Data, Reading
 from imulab.recording import Array

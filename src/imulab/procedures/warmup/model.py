@@ -1,9 +1,14 @@
-"""The warm-up table: what is subtracted from an output, as a function of time and temperature at power-on.
+"""The warm-up table, what is subtracted over time and temperature at power-on, and its coefficients from curves.
+
+Linear least squares, and a search for the shared time scales.
 
 ``Z(t; T) = sum_k c_k(T) b_k(t)`` for ``t < T_M``. The basis is 1, u, u^2, u^3 with ``u = t / T_M`` (models
 ``interval-cubic`` and ``knot-cubic``) or ``u = ln(1 + t / tau0) / ln(1 + T_M / tau0)`` (``knot-log-cubic``), or
 ``exp(-t / tau_j)`` (``exponential``). The coefficients are constant in half-open intervals of power-on temperature, or
 interpolated between knots: linearly, or for exponentials by cubic Hermite polynomials.
+
+All that the fits need of a cycle is its normal matrix, its moments and its sum of squares, so that leaving cycles or
+temperatures out costs no further pass over the data.
 """
 
 from __future__ import annotations
@@ -13,12 +18,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.errors import RecordError, UnitError
-from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS
+from imulab.procedures.warmup import BEYOND, EXITS, MODELS
+from imulab.procedures.warmup.cycles import Curves, Index
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, parse_unit
+
+# The warm-up table: what is subtracted from an output, as a function of time and temperature at power-on.
+
 
 MOST_CONSTANTS = 3
 """Time constants of an exponential that the unit has room for."""
@@ -283,3 +293,367 @@ def record_table(record: Calibration) -> WarmupTable:
     if "table" not in record.sections:
         raise RecordError("the warm-up record lacks its table")
     return table_from(record.sections["table"])
+
+
+# Curves to coefficients: linear least squares per interval or knot, a search for the shared time scales.
+
+
+Mask = NDArray[np.bool_]
+
+_START = {1: (20.0,), 2: (0.1, 0.4), 3: (0.06, 0.2, 0.6)}
+_CLOSEST = 1.6
+"""Neighbouring time constants differ by this factor at least: closer ones cannot be told apart."""
+SCALE_LIMIT = 3.0
+"""Longest time scale that is sought, in units of T_M."""
+_PASSES = 3
+_WORST_CONDITION = 1e8
+_SHRINK = 2.0
+"""Degrees of freedom with which the scatter of all temperatures counts at each one."""
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Sums over the bins of each cycle for one basis.
+
+    Attributes
+    ----------
+    normal
+        ``sum w b b'``, shape (c, p, p).
+    moment
+        ``sum w b y``, shape (c, p, axes).
+    square
+        ``sum w y^2``, shape (c, axes).
+    weight
+        ``sum w``, shape (c,).
+    total
+        ``sum w b``, shape (c, p).
+    """
+
+    normal: Array
+    moment: Array
+    square: Array
+    weight: Array
+    total: Array
+
+    def mean_square(self, coefficients: Array) -> Array:
+        """Return the mean squared residual of each cycle for its coefficients (c, axes, p): shape (c, axes)."""
+        cross = np.einsum("cap,cpa->ca", coefficients, self.moment)
+        own = np.einsum("cap,cpq,caq->ca", coefficients, self.normal, coefficients)
+        found: Array = np.maximum(self.square - 2 * cross + own, 0.0) / self.weight[:, None]
+        return found
+
+
+def statistics(curves: Curves, model: str, scales: Sequence[float]) -> Statistics:
+    """Return the sums of all cycles for the basis of a model."""
+    values = basis(model, curves.nodes, curves.settling_time, scales)
+    average = np.einsum("cbn,cbnp->cbp", curves.shares, values)
+    weighted = average * curves.seconds[:, :, None]
+    return Statistics(
+        normal=np.einsum("cbp,cbq->cpq", weighted, average),
+        moment=np.einsum("cbp,cba->cpa", weighted, curves.mean),
+        square=np.einsum("cb,cba->ca", curves.seconds, curves.mean**2),
+        weight=curves.seconds.sum(axis=1),
+        total=weighted.sum(axis=1),
+    )
+
+
+def hats(curves: Curves, knots: Index) -> Array:
+    """Return the weights of linear interpolation between some of the temperatures, shape (c, knots).
+
+    A power-on temperature beyond the outer knots counts as the outer knot.
+    """
+    at = curves.temperatures[knots]
+    inside = np.clip(curves.power_on, at[0], at[-1])
+    return np.stack([np.interp(inside, at, unit) for unit in np.eye(len(at))], axis=1)
+
+
+def membership(curves: Curves, knots: Index) -> Array:
+    """Return which cycles serve which interval: those of its two end points, shape (c, knots - 1)."""
+    position = np.searchsorted(knots, curves.group)
+    interval = np.arange(len(knots) - 1)
+    serves = (position[:, None] == interval) | (position[:, None] == interval + 1)
+    return np.asarray(serves, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class CurveSolution:
+    """A fitted table, and what its uncertainty needs.
+
+    Attributes
+    ----------
+    table
+        With the exit rule of the source.
+    scales
+        tau0, or the time constants.
+    weights
+        Weight of each cycle, shape (c,).
+    """
+
+    table: WarmupTable
+    scales: tuple[float, ...]
+    weights: Array
+
+
+def solve(
+    curves: Curves, model: str, scales: Sequence[float], sums: Statistics, weights: Array, knots: Index | None = None
+) -> CurveSolution:
+    """Fit a table to the cycles with positive weight, on all calibration temperatures or on some.
+
+    Parameters
+    ----------
+    curves
+        The cycles.
+    model, scales
+        What to fit.
+    sums
+        Of that model and those scales.
+    weights
+        Of the cycles, shape (c,).
+    knots
+        Indices of the temperatures that the table keeps; each needs a cycle.
+    """
+    kept = np.arange(len(curves.temperatures)) if knots is None else knots
+    used = weights * np.isin(curves.group, kept)
+    slopes = None
+    if model == "interval-cubic":
+        c = _intervals(sums, membership(curves, kept) * used[:, None])
+    elif model == "exponential":
+        c, slopes = _amplitudes(curves, sums, used, kept, scales)
+    else:
+        c = _knots(sums, hats(curves, kept), used)
+    table = WarmupTable(
+        model=model,
+        temperatures=curves.temperatures[kept],
+        axes=curves.axes,
+        units=curves.units,
+        coefficients=c,
+        settling_time=curves.settling_time,
+        time_scale=float(scales[0]) if model == "knot-log-cubic" else None,
+        time_constants=tuple(map(float, scales)) if model == "exponential" else (),
+        slopes=slopes,
+    )
+    return CurveSolution(table, tuple(map(float, scales)), used)
+
+
+def _intervals(sums: Statistics, share: Array) -> Array:
+    normal = np.einsum("cr,cpq->rpq", share, sums.normal)
+    moment = np.einsum("cr,cpa->rpa", share, sums.moment)
+    return np.linalg.solve(normal, moment).transpose(0, 2, 1)
+
+
+def _knots(sums: Statistics, hat: Array, used: Array) -> Array:
+    normal = knot_normal(sums, hat, used)
+    moment = np.einsum("c,ck,cpa->kpa", used, hat, sums.moment)
+    k, p, a = moment.shape
+    found: Array = np.linalg.solve(normal, moment.reshape(k * p, a)).reshape(k, p, a).transpose(0, 2, 1)
+    return found
+
+
+def knot_normal(sums: Statistics, hat: Array, used: Array) -> Array:
+    """Return the normal matrix of all knots' coefficients, shape (k p, k p)."""
+    size = hat.shape[1] * sums.normal.shape[1]
+    found: Array = np.einsum("c,cj,ck,cpq->jpkq", used, hat, hat, sums.normal, optimize=True).reshape(size, size)
+    return found
+
+
+def _amplitudes(
+    curves: Curves, sums: Statistics, used: Array, kept: Index, constants: Sequence[float]
+) -> tuple[Array, Array]:
+    """Amplitudes and slopes at the knots; each cycle is carried from its own temperature to its knot by the slopes."""
+    member = (curves.group[:, None] == kept).astype(np.float64) * used[:, None]
+    normal = np.einsum("ck,cpq->kpq", member, sums.normal)
+    at = curves.temperatures[kept]
+    position = np.minimum(np.searchsorted(kept, curves.group), len(kept) - 1)
+    apart = np.where(used > 0, curves.power_on - at[position], 0.0)
+    moment = sums.moment
+    for _ in range(_PASSES):
+        amplitude = np.linalg.solve(normal, np.einsum("ck,cpa->kpa", member, moment)).transpose(0, 2, 1)
+        slopes = amplitude_slopes(at, amplitude, constants)
+        shift = apart[:, None, None] * slopes[position]
+        moment = sums.moment - np.einsum("cpq,caq->cpa", sums.normal, shift)
+    return amplitude, slopes
+
+
+def amplitude_slopes(knots: Array, amplitudes: Array, constants: Sequence[float]) -> Array:
+    """Return the derivatives by temperature, 1/K, of amplitudes (k, axes, p) at knots (k,), degC, shape (k, axes, p).
+
+    Those of the monotone piecewise cubics (Fritsch and Butland) through the values that the curve itself takes at the p
+    time constants. Neighbouring amplitudes err in opposite ways and their errors nearly cancel in the curve; monotone
+    cubics through each amplitude alone are not linear in it and would undo that between the knots.
+    """
+    values = np.ascontiguousarray(amplitudes, dtype=np.float64)
+    at = np.asarray(constants, dtype=np.float64)
+    curve = np.exp(-at[:, None] / at)
+    if not np.linalg.cond(curve) < _WORST_CONDITION:  # constants that coincide, in a table edited by hand
+        return _pchip_slopes(knots, values)
+    slopes = np.linalg.solve(curve, _pchip_slopes(knots, values @ curve.T).swapaxes(1, 2))
+    return np.asarray(slopes.swapaxes(1, 2), dtype=np.float64)
+
+
+def _pchip_slopes(knots: Array, values: Array) -> Array:
+    if len(knots) == 2:
+        secant = (values[1] - values[0]) / (knots[1] - knots[0])
+        return np.stack([secant, secant])
+    from scipy.interpolate import PchipInterpolator
+
+    slopes: Array = PchipInterpolator(knots, values, axis=0).derivative()(knots)
+    return slopes
+
+
+def find_scales(
+    curves: Curves, model: str, count: int, weights: Array, start: Sequence[float] | None = None
+) -> tuple[float, ...]:
+    """Return tau0, or the shared time constants, that leave least of all mean curves.
+
+    Each temperature and axis has its own coefficients; axes count by their size and noise. Nelder-Mead in the
+    logarithms, over 2 or 3 numbers at most.
+    """
+    from scipy.optimize import minimize
+
+    member = (curves.group[:, None] == np.arange(len(curves.temperatures))).astype(np.float64) * weights[:, None]
+    member = member[:, member.any(axis=0)]
+    size = (weights @ statistics(curves, "knot-cubic", ()).square) / max(
+        float(weights @ curves.seconds.sum(axis=1)), 1e-9
+    )
+    scale = curves.noise / 100 + 1e-4 * size
+    scale = np.where(scale > 0, scale, 1.0)
+    end = curves.settling_time
+    low, high = np.log(0.5), np.log(SCALE_LIMIT * end)
+
+    def cost(logs: Array) -> float:
+        logs = np.sort(logs)
+        outside = np.maximum(low - logs, 0).sum() + np.maximum(logs - high, 0).sum()
+        outside += np.maximum(np.log(_CLOSEST) - np.diff(logs), 0).sum()
+        if outside > 0:
+            return 1e300 * (1 + float(outside))
+        sums = statistics(curves, model, np.exp(logs).tolist())
+        normal = np.einsum("ck,cpq->kpq", member, sums.normal)
+        moment = np.einsum("ck,cpa->kpa", member, sums.moment)
+        try:
+            best = np.linalg.solve(normal, moment)
+        except np.linalg.LinAlgError:
+            return 1e300
+        left = np.einsum("ck,ca->a", member, sums.square) - np.einsum("kpa,kpa->a", best, moment)
+        return float((left / scale).sum())
+
+    if start is None:
+        first = np.log(np.array(_START[count]) * (1.0 if model == "knot-log-cubic" else end))
+        step, tolerance = 0.4, 1e-3
+    else:
+        first, step, tolerance = np.log(np.array(start)), 0.1, 3e-3
+    simplex = np.vstack([first, first + step * np.eye(count)])
+    found = minimize(
+        cost,
+        first,
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": tolerance, "fatol": 1e-9 * abs(cost(first)), "maxiter": 200},
+    )
+    return tuple(np.exp(np.sort(found.x)).tolist())
+
+
+def coefficients_of(curves: Curves, table: WarmupTable) -> Array:
+    """Return the coefficients that the unit would use in each cycle, shape (c, axes, p).
+
+    A power-on temperature beyond the table (a recording at -41 for a table from -40) counts as its end.
+    """
+    inside = np.clip(curves.power_on, table.temperatures[0], table.temperatures[-1])
+    rows = [table.coefficients_at(float(temperature)) for temperature in inside]
+    return np.stack([row for row in rows if row is not None])
+
+
+def fitted_noise(curves: Curves, solution: CurveSolution, sums: Statistics) -> Array:
+    """Return the mean square that white noise leaves in the cycles of a fit, shape (c, axes).
+
+    Less than in cycles that the fit has not seen, since the fit follows some of the noise: with y = X theta for a cycle
+    of b bins, N = X' W X, B = N + X' W 1 1' W X / s for a reference of s seconds, M = sum w N and Q = sum w^2 B,
+    ``b + T / s - 2 w tr(B M^-1) + tr(N M^-1 Q M^-1)`` per T seconds. Amplitudes carried along slopes count as fixed.
+    """
+    w, kept = solution.weights, np.arange(len(curves.temperatures))
+    both = sums.normal + sums.total[:, :, None] * sums.total[:, None, :] / curves.reference_seconds[:, None, None]
+    if solution.table.model == "interval-cubic":
+        edges = curves.temperatures
+        row = np.clip(np.searchsorted(edges, curves.power_on, side="right") - 1, 0, len(edges) - 2)
+        share, taken = membership(curves, kept), np.zeros(len(w))
+        for r in range(len(edges) - 1):
+            taken[row == r] = _taken(sums.normal, both, np.ones((len(w), 1)), w * share[:, r])[row == r]
+    elif solution.table.model == "exponential":
+        taken = _taken(sums.normal, both, (curves.group[:, None] == kept).astype(np.float64), w)
+    else:
+        taken = _taken(sums.normal, both, hats(curves, kept), w)
+    share = np.maximum((curves.seconds > 0).sum(axis=1) + sums.weight / curves.reference_seconds - taken, 0.0)
+    return np.asarray((share / sums.weight)[:, None] * curves.noise)
+
+
+def _taken(normal: Array, both: Array, hat: Array, weights: Array) -> Array:
+    """What a fit takes of the noise in each cycle, shape (c,): of variances of one second's mean."""
+    size = hat.shape[1] * normal.shape[1]
+    spread = np.einsum("cj,ck->cjk", hat, hat)
+    own = np.einsum("cjk,cpq->cjpkq", spread, normal).reshape(-1, size, size)
+    noisy = np.einsum("cjk,cpq->cjpkq", spread, both).reshape(-1, size, size)
+    inverse = np.linalg.inv(np.einsum("c,cxy->xy", weights, own))
+    seen = inverse @ np.einsum("c,cxy->xy", weights**2, noisy) @ inverse
+    found: Array = 2 * weights * np.einsum("cxy,yx->c", noisy, inverse) - np.einsum("cxy,yx->c", own, seen)
+    return found
+
+
+def scatter(curves: Curves, sums: Statistics, cluster: Index) -> tuple[Array, Array, float]:
+    """Return the covariance of a cluster's coefficients by temperature, the pooled one, and its degrees of freedom.
+
+    Shapes (k, axes, p, p) and (axes, p, p).
+
+    A cluster is a cycle, or where units are pooled all cycles of one unit at one temperature. Few clusters make a poor
+    estimate: each temperature's own is averaged with the pooled one, which counts as two degrees of freedom.
+    """
+    groups = len(curves.temperatures)
+    owners = np.unique(cluster)
+    own = np.array([np.linalg.solve(*_sum(sums, cluster == o)) for o in owners])  # (o, p, axes)
+    place = np.array([curves.group[cluster == o][0] for o in owners])
+    p, a = own.shape[1:]
+    total, freedom = np.zeros((groups, a, p, p)), np.zeros(groups)
+    for k in range(groups):
+        rows = own[place == k]
+        deviation = rows - rows.mean(axis=0) if len(rows) else rows
+        total[k] = np.einsum("opa,oqa->apq", deviation, deviation)
+        freedom[k] = max(len(rows) - 1, 0)
+    if freedom.sum() == 0:
+        return np.full((groups, a, p, p), np.nan), np.full((a, p, p), np.nan), 0.0
+    pooled = total.sum(axis=0) / freedom.sum()
+    each = (total + _SHRINK * pooled) / (freedom + _SHRINK)[:, None, None, None]
+    return each, pooled, float(freedom.sum())
+
+
+def _sum(sums: Statistics, chosen: Mask) -> tuple[Array, Array]:
+    return sums.normal[chosen].sum(axis=0), sums.moment[chosen].sum(axis=0)
+
+
+def coefficient_covariance(curves: Curves, solution: CurveSolution, sums: Statistics, cluster: Index) -> Array | None:
+    """Return the covariance of each interval's or knot's coefficients, shape (r, axes, p, p), from repeatability.
+
+    ``V = G [sum_c (h h') x (N S N)] G'`` with G the inverse normal matrix, N a cluster's own and S the covariance of
+    its coefficients about those of its temperature. None where no temperature has two clusters.
+    """
+    each, _, freedom = scatter(curves, sums, cluster)
+    if freedom == 0:
+        return None
+    owners = np.unique(cluster)
+    w = solution.weights
+    normal = np.array([np.einsum("c,cpq->pq", w * (cluster == o), sums.normal) for o in owners])
+    place = np.array([curves.group[cluster == o][0] for o in owners])
+    middle = np.einsum("opq,oaqr,ors->oaps", normal, each[place], normal)
+    kept = np.arange(len(curves.temperatures))
+    model = solution.table.model
+    if model in ("interval-cubic", "exponential"):
+        if model == "interval-cubic":
+            share = membership(curves, kept)
+        else:
+            share = (curves.group[:, None] == kept).astype(np.float64)
+        share = np.array([share[cluster == o][0] for o in owners])
+        inverse = np.linalg.inv(np.einsum("or,opq->rpq", share, normal))
+        return np.asarray(np.einsum("rpq,or,oaqs,rst->rapt", inverse, share, middle, inverse, optimize=True))
+    hat = hats(curves, kept)
+    hat = np.array([np.average(hat[cluster == o], axis=0, weights=w[cluster == o]) for o in owners])
+    k, p, a = hat.shape[1], normal.shape[1], middle.shape[1]
+    whole = np.einsum("oj,ok,opq->jpkq", hat, hat, normal, optimize=True).reshape(k * p, k * p)
+    inverse = np.linalg.inv(whole).reshape(k, p, k * p)
+    inner = np.einsum("oj,ok,oaps->ajpks", hat, hat, middle, optimize=True).reshape(a, k * p, k * p)
+    return np.asarray(np.einsum("kpx,axy,kqy->kapq", inverse, inner, inverse, optimize=True))

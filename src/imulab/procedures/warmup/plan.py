@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from imulab.display import Shown
 from imulab.errors import OptionError
-from imulab.procedures.warmup.choices import TEMPERATURES
+from imulab.procedures.warmup import TEMPERATURES
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, temperature_list, whole
 from imulab.recording import Recording
-from imulab.report.elements import GOOD, LEGEND, QUIET, Figure
 from imulab.report.plots import Plot
-from imulab.shown import Shown
+from imulab.report.traces import GOOD, LEGEND, QUIET, Figure
 from imulab.writers import write_csv
 
 WIDEST = 20.0

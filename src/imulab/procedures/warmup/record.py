@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from imulab.procedures.warmup.curves import Curves
-from imulab.procedures.warmup.judge import Judged, Repeatability, Worst
+from imulab.procedures.warmup.cycles import Curves
 from imulab.procedures.warmup.model import WarmupTable, evaluate, exit_jump
-from imulab.procedures.warmup.quality import after_of, expectations, quality_warnings
+from imulab.procedures.warmup.quality import Judged, Repeatability, Worst, after_of, expectations, quality_warnings
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 

@@ -14,11 +14,11 @@ from typing import overload
 
 import numpy as np
 
+from imulab.display import Shown
 from imulab.errors import OptionError, listed
-from imulab.procedures.warmup.choices import LAWS, TEMPERATURES
+from imulab.procedures.warmup import LAWS, TEMPERATURES
 from imulab.quantities import in_si, temperature_list, whole
 from imulab.recording import Array, Recording
-from imulab.shown import Shown
 from imulab.units import STANDARD_GRAVITY
 from imulab.writers import write_csv
 

@@ -13,16 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from imulab.atomic_write import write_text
-from imulab.device.blob import is_blob
+from imulab.device.unit import is_blob
+from imulab.display import Shown
 from imulab.errors import OptionError, ReadError, RecordError, UnitError, listed
-from imulab.procedures.inputs import Record, as_record
-from imulab.procedures.warmup.choices import MODELS
-from imulab.procedures.warmup.model import WarmupTable, check_table, record_table
-from imulab.procedures.warmup.solve import amplitude_slopes
+from imulab.files import write_text
+from imulab.procedures.result import Record, as_record
+from imulab.procedures.warmup import MODELS
+from imulab.procedures.warmup.model import WarmupTable, amplitude_slopes, check_table, record_table
+from imulab.records import is_json
 from imulab.records.calibration import Calibration, Covariance, Parameter
-from imulab.records.recognition import is_json
-from imulab.shown import Shown
 from imulab.units import conversion_factor, si_unit
 
 _CUBIC = ("interval-cubic", "knot-cubic")

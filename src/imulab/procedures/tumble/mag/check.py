@@ -17,12 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.estimation.special import fdtrc
-from imulab.procedures.tumble.apply import field_in_body, output_factor, specific_force
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.mag.field import outputs_of
+from imulab.procedures.tumble.device import field_in_body, output_factor, specific_force
 from imulab.procedures.tumble.mag.heading import Law, law_of
-from imulab.procedures.tumble.mag.model import dips
-from imulab.procedures.tumble.sections import fit_of, model_of
+from imulab.procedures.tumble.mag.model import dips, outputs_of
+from imulab.procedures.tumble.schema import fit_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 

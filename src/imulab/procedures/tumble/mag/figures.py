@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from imulab.estimation.ranked import rms
+from imulab.estimation.rows import rms
 from imulab.procedures.tumble.mag.heading import law_of
-from imulab.procedures.tumble.sections import Fields, MagFit, data_of, fit_of, model_of
+from imulab.procedures.tumble.schema import Fields, MagFit, data_of, fit_of, model_of
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Figure, plain_number
-from imulab.report.traces import axis, rounded, scatter
+from imulab.report.traces import BAD, GOOD, INK, LEGEND, QUIET, Figure, figure_axis, plain_number, rounded, scatter
 
 _LABEL = "%{text}<extra></extra>"
 _PLANES = (("x", "y"), ("y", "z"), ("z", "x"))
@@ -71,11 +70,11 @@ def _residuals(record: Calibration, data: Fields) -> Figure:
                     hovertemplate="%{text}<br>%{y:+.2f} deg<extra></extra>", name="dip"),
         ],
         layout={
-            "xaxis": axis(
+            "xaxis": figure_axis(
                 "attitude", dtick=max(1, round(len(data.number) / 20)), anchor="y", range=[0.4, max(data.number) + 0.6]
             ),
-            "yaxis": axis("dip, deg", domain=[0, 0.46], zeroline=True),
-            "yaxis2": axis("|m|, %", domain=[0.54, 1], zeroline=True),
+            "yaxis": figure_axis("dip, deg", domain=[0, 0.46], zeroline=True),
+            "yaxis2": figure_axis("|m|, %", domain=[0.54, 1], zeroline=True),
             "showlegend": False,
         },
         height=460,
@@ -107,8 +106,10 @@ def _sphere(record: Calibration, data: Fields) -> Figure:
                     marker={"color": GOOD, "size": 7}, text=data.label, hovertemplate=_LABEL, **axes),
         ]  # fmt: skip
         span = [0.345 * place, 0.345 * place + 0.31]
-        layout[f"xaxis{number}"] = axis(first, domain=span, range=[-reach, reach], anchor=f"y{number}")
-        layout[f"yaxis{number}"] = axis(second, range=[-reach, reach], anchor=f"x{number}", scaleanchor=f"x{number}")
+        layout[f"xaxis{number}"] = figure_axis(first, domain=span, range=[-reach, reach], anchor=f"y{number}")
+        layout[f"yaxis{number}"] = figure_axis(
+            second, range=[-reach, reach], anchor=f"x{number}", scaleanchor=f"x{number}"
+        )
     offset = float(np.linalg.norm([record.value(f"mag_bias_{a}") for a in "xyz"]) / length)
     return Figure(
         title="The field before and after",
@@ -145,8 +146,10 @@ def _headings(record: Calibration, data: Fields) -> Figure:
                     marker={"color": GOOD, "size": 8}, **shared),
         ],
         layout={
-            "xaxis": axis("attitude", dtick=max(1, round(len(data.number) / 20)), range=[0.4, max(data.number) + 0.6]),
-            "yaxis": axis("u(heading), deg", rangemode="tozero"),
+            "xaxis": figure_axis(
+                "attitude", dtick=max(1, round(len(data.number) / 20)), range=[0.4, max(data.number) + 0.6]
+            ),
+            "yaxis": figure_axis("u(heading), deg", rangemode="tozero"),
             "legend": LEGEND,
         },
         height=330,

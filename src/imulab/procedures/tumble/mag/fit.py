@@ -1,32 +1,364 @@
-"""The magnetometer triad from what people have: data to a record of the accelerometers and magnetometers together."""
+"""The magnetometer triad from what people have: data to a record of accelerometers and magnetometers together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
+from numpy.typing import NDArray
 
+from imulab.display import UNJUDGED, Bad, Note
 from imulab.errors import DataError, OptionError, listed, quoted
-from imulab.estimation.least_squares import f_test
+from imulab.estimation.least_squares import coverage_factor, f_test
+from imulab.estimation.rows import rms
 from imulab.gravity import Gravity, at_place
-from imulab.procedures.inputs import Record, as_record
-from imulab.procedures.result import Result
-from imulab.procedures.tumble.choices import LOSSES, MAG_ORDERS
-from imulab.procedures.tumble.given import TumbleData, as_attitudes
-from imulab.procedures.tumble.gyrorecord import with_gyro_of
-from imulab.procedures.tumble.mag.field import FEWEST
-from imulab.procedures.tumble.mag.judge import FALSE_ALARM, Disturbed, Seen, leave_one_out, most_disturbed, seen
-from imulab.procedures.tumble.mag.prepare import check_seen, prepare
-from imulab.procedures.tumble.mag.record import with_mag
-from imulab.procedures.tumble.mag.scaling import Ready
-from imulab.procedures.tumble.mag.solve import Joint, solve
-from imulab.procedures.tumble.mag.stated import Place, stated_place
-from imulab.procedures.tumble.options import check_field
+from imulab.procedures.result import Record, Result, as_record
+from imulab.procedures.tumble import LOSSES, MAG_ORDERS
+from imulab.procedures.tumble.attitudes import TumbleData, as_attitudes
+from imulab.procedures.tumble.estimate import check_field
+from imulab.procedures.tumble.gyro.fit import with_gyro_of
+from imulab.procedures.tumble.mag.model import FEWEST, FieldMeans, mag_names, most_at_an_extreme
+from imulab.procedures.tumble.mag.prepare import (
+    FALSE_ALARM,
+    Disturbed,
+    Seen,
+    check_seen,
+    heading_uncertainty,
+    leave_one_out,
+    likeliest_step,
+    most_disturbed,
+    prepare,
+    seen,
+)
+from imulab.procedures.tumble.mag.solve import Joint, Place, Ready, solve, stated_place
+from imulab.procedures.tumble.model import gravity_slope, parameter_names, parameter_units
+from imulab.procedures.tumble.record import make_record, si_parameters
 from imulab.quantities import in_si
 from imulab.reading import Reading
-from imulab.records.calibration import Calibration
+from imulab.recording import Array
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.units import parse_unit
+
+# A tumble record with the magnetometer triad added, both triads as their joint fit found them.
+
+
+_AXES = "xyz"
+_FEW = 16
+_MOVED = 3.0
+"""Standard uncertainties of an accelerometer parameter beyond which the joint fit moves it too far."""
+_ONE_WAY = 6.0
+"""Condition number from which turning the heading would halve the uncertainty, or better."""
+_LARGE_RMS, _LARGE_DIP = 0.02, np.radians(1.0)
+"""Scatter of |m| and dip that steady attitudes in one field do not have; the worst of real ones: 0.5 %, 0.3 deg."""
+_HOPELESS = 5.0  # times that
+_STEPS_BY_CHANCE = 0.01
+_OF_NORMAL = 1.96
+_POINTING = np.radians(3.0)
+_OF_THE_EARTH = 22e-6, 67e-6  # T
+_BUILDING = 1.4
+"""Factor by which iron in a building may raise or lower the field."""
+
+
+def with_mag(
+    ready: Ready, joint: Joint, seen: Seen, aside: Sequence[Disturbed], options: Mapping[str, Any]
+) -> Calibration:
+    """Return the record of both triads: parameters, covariance, and residuals of |m| and dip of each attitude."""
+    accel = make_record(
+        ready.estimate, ready.gravity, ready.scaling,
+        {"order": ready.order, "method": "norm", "loss": ready.loss, "gravity": ready.gravity.value},
+    )  # fmt: skip
+    known = _covariance(ready, joint)
+    heading = heading_uncertainty(joint, known)
+    names, values, matrix, units = _values(ready, joint, known)
+    parameters = _parameters(names, values, matrix, units, joint.freedom[: len(names)])
+    own = accel.parameters
+    moved = {
+        name: (parameters[name].value - own[name].value) / u
+        for name in parameter_names(ready.estimate.problem.order)
+        if (u := own[name].standard_uncertainty)
+    }
+    kept = {
+        name: replace(parameters[name], standard_uncertainty_given_order=of_own.standard_uncertainty_given_order)
+        for name, of_own in own.items()
+    }
+    return replace(
+        accel,
+        parameters=kept | {name: parameters[name] for name in mag_names(joint.pair.mag_order)},
+        covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
+        model={**accel.model, **_model(ready, joint)},
+        fit={
+            **accel.fit,
+            "mag": _fit(ready, joint, seen, aside, moved, heading) | _of_one_sample(ready, parameters),
+        },
+        options={
+            **accel.options,
+            **{f"mag_{name}" if name == "loss" else name: value for name, value in options.items()},
+        },
+        data={**accel.data, "mag": _data(ready, joint, aside)},
+        warnings=(
+            *accel.warnings,
+            *ready.means.notes,
+            *ready.notes,
+            *_warnings(ready, joint, seen, aside, moved, options, heading[0]),
+            *_stated_dip(parameters["dip"], options.get("dip")),
+        ),
+        verdict=UNJUDGED,
+    )
+
+
+def _covariance(ready: Ready, joint: Joint) -> Array:
+    """Covariance of the scaled parameters, the accelerometers' whatever their order is, shape (p, p)."""
+    covariance = joint.covariance.copy()
+    covariance[joint.pair.layout.of_accel, joint.pair.layout.of_accel] += _whatever_the_order(ready)
+    return covariance
+
+
+def _values(ready: Ready, joint: Joint, known: Array) -> tuple[list[str], Array, Array, list[str]]:
+    """Names, values, covariance and units of all parameters, the magnetometers' first."""
+    layout, order = joint.pair.layout, ready.estimate.problem.order
+    g = ready.gravity.value
+    of_mag, mag_slope = ready.mag.in_si(joint.theta[: layout.mag])
+    of_accel, accel_slope = si_parameters(joint.theta[layout.of_accel], ready.scaling, g, order)
+    size = layout.mag + 1 + layout.accel
+    slope = np.eye(size)
+    slope[: layout.mag, : layout.mag] = mag_slope
+    slope[layout.of_accel, layout.of_accel] = accel_slope
+    matrix = slope @ known[:size, :size] @ slope.T
+    shared = np.zeros(size)
+    shared[layout.of_accel] = ready.gravity.standard_uncertainty / g * gravity_slope(of_accel, order)
+    unit = "1" if ready.mag.field is None else "T"
+    output = ready.means.unit
+    per = output if unit == "1" else f"{output}/T"
+    names = [*mag_names(joint.pair.mag_order), *parameter_names(order)]
+    units = [unit] * 3 + [per] * 3 + ["rad"] * 6 + ["1" if unit == "1" else "1/T"] * (layout.mag - 12) + ["rad"]
+    units += parameter_units(order, ready.estimate.attitudes.unit)
+    values = np.concatenate([of_mag, [joint.theta[layout.dip_at]], of_accel])
+    return names, values, matrix + np.outer(shared, shared), units
+
+
+def _whatever_the_order(ready: Ready) -> Array:
+    """What the accelerometers' covariance gains where their order was chosen from the data, shape (p, p)."""
+    stated = ready.estimate.stated
+    size = ready.estimate.solution.theta.shape[1]
+    if stated is None or stated.given_order is None:
+        return np.zeros((size, size))
+    values, vectors = np.linalg.eigh(stated.covariance - stated.given_order)
+    gained: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return gained
+
+
+def _parameters(
+    names: list[str], values: Array, matrix: Array, units: list[str], freedom: Array
+) -> dict[str, Parameter]:
+    """Parameters with intervals of Student's t, of the degrees of freedom that each variance has."""
+    found = {}
+    for name, value, u, unit, nu in zip(
+        names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, freedom.tolist(), strict=True
+    ):
+        half = coverage_factor(nu if np.isfinite(nu) else None) * u
+        found[name] = Parameter(value, u, unit, interval_95=(value - half, value + half))
+    return found
+
+
+def _model(ready: Ready, joint: Joint) -> dict[str, Any]:
+    """Law of the magnetometers, and which output became which axis."""
+    axes = " ".join(
+        f"{'+' if row[output] > 0 else '-'}{'xyz'[output]}"
+        for row, output in zip(ready.mag.axes, np.abs(ready.mag.axes).argmax(axis=1).tolist(), strict=True)
+    )
+    field = ready.mag.field
+    return {
+        "mag_order": joint.pair.mag_order,
+        "mag_output_unit": ready.means.unit,
+        "mag_axes": axes,
+        "field": {"value": 1.0, "unit": "1"} if field is None else {"value": field, "unit": "T"},
+    }
+
+
+def _fit(
+    ready: Ready,
+    joint: Joint,
+    seen: Seen,
+    aside: Sequence[Disturbed],
+    moved: Mapping[str, float],
+    heading: tuple[float, float],
+) -> dict[str, Any]:
+    predicted, residuals = leave_one_out(joint), joint.found.residuals
+    return {
+        "attitudes": len(residuals),
+        "magnitude": {"rms": rms(residuals[:, 1]), "leave_one_out": predicted.rms(1)},
+        "dip": {"rms": rms(residuals[:, 2]), "leave_one_out": predicted.rms(2)},
+        "noise": "estimated from the residuals" if joint.pair.noise is None else "known",
+        "sigma_magnitude": float(joint.sigma[0]),
+        "sigma_dip": {"value": float(joint.sigma[1]), "unit": "rad"},
+        **({} if joint.pair.held is None else {"sigma_direction": {"value": float(joint.sigma[2]), "unit": "rad"}}),
+        "condition_number": seen.condition,
+        "set_aside": [int(ready.kept[one.index]) + 1 for one in aside],
+        "heading": {
+            "standard_uncertainty": {"value": heading[0], "unit": "rad"},
+            "of_one_reading": {"value": heading[1], "unit": "rad"},
+        },
+        "moved": dict(moved),
+    }
+
+
+def _of_one_sample(ready: Ready, parameters: Mapping[str, Parameter]) -> dict[str, Any]:
+    """Noise of one axis of one sample of the recording, m/s^2 and parts of the field; nothing of a table of means."""
+    if ready.means.of_one_sample is None:
+        return {}
+    of_accel, of_mag = ready.means.of_one_sample
+    scale = float(np.median([abs(parameters[f"scale_factor_{axis}"].value) for axis in "xyz"]))
+    sizes = {
+        "accel": {"value": of_accel / scale, "unit": "m/s^2"},
+        "mag": {"value": of_mag / ready.mag.size, "unit": "1"},
+    }
+    return {"of_one_sample": sizes}
+
+
+def _data(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> dict[str, Any]:
+    """Of each attitude that was used: its number, mean output, field in the body frame (of length 1), residuals."""
+    used = ready.pair.mag
+    layout = joint.pair.layout
+    every = ready.pair if layout.mag == ready.pair.layout.mag else replace(ready.pair, mag_order=joint.pair.mag_order)
+    found = every.evaluate(joint.theta)
+    return {
+        "number": (ready.kept + 1).tolist(),
+        "label": [ready.estimate.attitudes.label(i) for i in range(len(used))],
+        "mean": ready.means.mean[ready.kept].tolist(),
+        "field": found.field.vector.tolist(),
+        "force": found.force.vector.tolist(),
+        "magnitude": found.residuals[:, 1].tolist(),
+        "dip": found.residuals[:, 2].tolist(),
+        "used": np.isin(np.arange(len(used)), [one.index for one in aside], invert=True).tolist(),
+    }
+
+
+def _scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> list[str]:
+    """Say if |m| or dip scatter so much that the triads do not belong together, or the field was not steady."""
+    magnitude, dip = rms(joint.found.residuals[:, 1]), rms(joint.found.residuals[:, 2])
+    worst = max(magnitude / _LARGE_RMS, dip / _LARGE_DIP)
+    if worst <= 1:
+        return []
+    kind = Bad if worst > _HOPELESS else str
+    count, axis, value = most_at_an_extreme(means.mean[used])
+    clipped = f", is mag_{_AXES[axis]} saturated at {value:.4g} {means.unit} ({count} attitudes)" if count > 2 else ""
+    return [
+        kind(
+            f"mag: |m| scatters by {100 * magnitude:.2g} % of the field, the dip by {np.degrees(dip):.2g} deg: were "
+            f"both triads in the same attitudes, by one clock, and was no iron near that moved{clipped}?"
+        )
+    ]
+
+
+def _step(joint: Joint, labels: Sequence[str]) -> list[str]:
+    """Say if |m| and dip are others from some attitude on."""
+    step = likeliest_step(joint)
+    if step is None or step.probability > _STEPS_BY_CHANCE:
+        return []
+    return [
+        f"mag: from {labels[step.first]} on |m| is {100 * abs(step.magnitude):.2g} % "
+        f"{'higher' if step.magnitude > 0 else 'lower'} and the dip {np.degrees(abs(step.dip)):.2g} deg "
+        f"{'higher' if step.dip > 0 else 'lower'} than before (p {step.probability:.1g}): was iron, such as a phone, "
+        "near in a part of the attitudes, or did the place change?"
+    ]
+
+
+def _stated_dip(found: Parameter, stated: Sequence[float] | None) -> list[str]:
+    """Say if the dip is off what was stated, beyond the uncertainty of both."""
+    if stated is None:
+        return []
+    off, sigma = found.value - stated[0], float(np.hypot(found.standard_uncertainty or 0.0, stated[1]))
+    if abs(off) <= _OF_NORMAL * sigma:
+        return []
+    return [
+        f"mag: the dip of {np.degrees(found.value):.2f} deg is {np.degrees(abs(off)):.2g} deg "
+        f"{'more' if off > 0 else 'less'} than the {np.degrees(stated[0]):.2f} deg stated, {abs(off) / sigma:.1f} "
+        "standard uncertainties: is iron near, or is the stated dip of another place?"
+    ]
+
+
+def _note_set_aside(label: str, one: Disturbed) -> str:
+    return (
+        f"mag: {label} set aside: |m| {100 * abs(one.magnitude):.2g} % "
+        f"{'high' if one.magnitude > 0 else 'low'}, dip {np.degrees(abs(one.dip)):.2g} deg "
+        f"{'high' if one.dip > 0 else 'low'} against the others (p {one.probability:.1g}): iron or a vehicle near?"
+    )
+
+
+def _warnings(
+    ready: Ready,
+    joint: Joint,
+    seen: Seen,
+    aside: Sequence[Disturbed],
+    moved: Mapping[str, float],
+    options: Mapping[str, Any],
+    heading: float,
+) -> list[str]:
+    attitudes = ready.estimate.attitudes
+    found = [_note_set_aside(attitudes.label(one.index), one) for one in aside]
+    n = len(joint.pair.mag)
+    if n < _FEW:
+        found.append(f"mag: {n} attitudes leave little to tell the noise from; {_FEW} or more are asked for")
+    if not joint.converged:
+        found.append(
+            "mag: the fit of both triads did not come to rest: more attitudes, at several headings, would help"
+        )
+    if seen.condition > _ONE_WAY:
+        left = np.delete(ready.kept, [one.index for one in aside])
+        which = " ".join(str(int(left[i]) + 1) for i in sorted(seen.heading))
+        found.append(
+            f"mag: the attitudes face nearly one way (condition {seen.condition:.0f}): heading is known to "
+            f"{np.degrees(heading):.2g} deg only; attitudes {which} once more, facing a quarter turn away, would help "
+            "most"
+        )
+    far = {name: value for name, value in moved.items() if abs(value) > _MOVED}
+    if far:
+        name, value = max(far.items(), key=lambda item: abs(item[1]))
+        found.append(
+            f"mag: the dip moves the accelerometers' {name} by {abs(value):.1f} standard uncertainties: field and "
+            "gravity contradict each other; was iron near, or did the unit move?"
+        )
+    left = np.delete(ready.kept, [one.index for one in aside])
+    labels = [attitudes.label(int(np.searchsorted(ready.kept, i))) for i in left]
+    found += [*_scatter(joint, ready.means, left), *_step(joint, labels)]
+    if joint.pair.held is not None and joint.sigma[2] > _POINTING:
+        found.append(
+            f"mag: the attitudes of --same-direction scatter by {np.degrees(joint.sigma[2]):.2g} deg about their "
+            "directions: does one axis of the body point the same way in them?"
+        )
+    if "hemisphere" not in options:
+        dip = float(np.degrees(joint.theta[joint.pair.layout.dip_at]))
+        where, other = ("northern", "southern") if dip > 0 else ("southern", "northern")
+        found.append(
+            Note(
+                f"mag: the dip of {dip:+.1f} deg is one of the {where} hemisphere; if this is the {other}, a "
+                "magnetometer axis is reversed, two are exchanged, or the accelerometers read minus the specific force "
+                "(--hemisphere checks it)"
+            )
+        )
+    if ready.mag.field is None and parse_unit(ready.means.unit).quantity == "magnetic field":
+        found.append(_unstated(ready.mag.size * parse_unit(ready.means.unit).factor, ready.means.unit))
+    return found
+
+
+def _unstated(field: float, unit: str) -> str:
+    """Say that |m| is none of the Earth's [T], or else that the field's magnitude was not stated."""
+    low, high = _OF_THE_EARTH
+    if not low / _BUILDING < field < high * _BUILDING:
+        return (
+            f"mag: |m| is {1e6 * field:.3g} uT in the unit {unit}, but the Earth's field has {1e6 * low:.0f} to "
+            f"{1e6 * high:.0f} uT: state the unit that the outputs have, or the field by --field"
+        )
+    return Note(
+        "mag: the field's magnitude was not stated: the field is in units of the local one; give --field, such "
+        f"as --field {1e6 * field:.3g}uT, for uT"
+    )
+
+
+# The magnetometer triad from what people have: data to a record of the accelerometers and magnetometers together.
+
 
 _STEEPEST = np.radians(87.0)
 _OFF = np.radians(0.5)
@@ -199,13 +531,13 @@ def _solved(ready: Ready, loss: str, mag_order: str) -> tuple[Joint, tuple[Distu
     robust = loss == "huber"
     joint, aside = solve(ready.pair, ready.start, robust=robust), tuple[Disturbed, ...]()
     if loss == "auto":
-        joint, aside = _set_aside(joint, ready)
+        joint, aside = _leave_out_disturbed(joint, ready)
     if mag_order != "1":
         joint = _order_two(joint, mag_order, robust=robust)
     return joint, aside
 
 
-def _set_aside(joint: Joint, ready: Ready) -> tuple[Joint, tuple[Disturbed, ...]]:
+def _leave_out_disturbed(joint: Joint, ready: Ready) -> tuple[Joint, tuple[Disturbed, ...]]:
     """Leave out the attitude that fits the others worst, and solve again, as long as one is disturbed."""
     aside: list[Disturbed] = []
     left = np.arange(len(ready.pair.mag))

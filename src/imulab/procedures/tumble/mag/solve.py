@@ -1,4 +1,15 @@
-"""One fit of both triads: every attitude's |f|, |m| and dip, each with its variance.
+"""One fit of both triads.
+
+How outputs are scaled, where the fit starts, what is known of the field, and attitudes that point the same way.
+
+The magnitude gives hard iron h and ``U'U``, linear in the ten coefficients of an ellipsoid. With u = U (M - h) and the
+direction e of gravity the constant dip is ``e' R u + sin(dip) = 0``, linear in the ten numbers R, sin(dip): their
+direction is the least singular vector of the rows ``[e_i u_j, 1]``.
+
+Source: Papafotis and Sotiriadis, IEEE Sensors J. 19 (2019) 8241 (ellipsoid, then alignment).
+
+The rows of C are east, north and up in body components: ``up = e``, ``east = u x e / |u x e|``, ``north = up x east``.
+A body axis x that keeps its direction d in the world leaves ``C x - d``, of which the two parts across d are taken.
 
 ``min sum_p r_p' V_p^-1 r_p`` over both triads and the dip. An accelerometer error is common to all dips, which is why
 the accelerometers are fitted anew, from where their own fit ended. Noise that is not known is estimated by restricted
@@ -15,15 +26,308 @@ Sources: Patterson and Thompson, Biometrika 58 (1971) 545 (REML); Satterthwaite,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import permutations, product
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.errors import OptionError, quoted
 from imulab.estimation.least_squares import chi_square_probability
-from imulab.procedures.tumble.mag.model import Invariants, Layout, invariants
-from imulab.procedures.tumble.mag.pointing import Held, with_held
+from imulab.gravity import Gravity
+from imulab.procedures import tumble
+from imulab.procedures.tumble import HEMISPHERES
+from imulab.procedures.tumble.mag.model import MAGNETOMETERS, FieldMeans, Invariants, Layout, invariants
+from imulab.procedures.tumble.record import Estimate, Scaling
+from imulab.quantities import in_si
 from imulab.recording import Array
+
+# What is known of the field at the place of a test, before there is data: its hemisphere and its dip.
+
+
+_EQUATOR = math.radians(20.0)
+"""The magnetic equator lies within 16 deg of the geographic one."""
+_SURE = 4.0
+"""Standard uncertainties of a stated dip from which its sign is one of the hemisphere."""
+
+Dip = float | str | tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Place:
+    """The hemisphere, ``north`` or ``south``, and the dip with its standard uncertainty, rad; None where unknown."""
+
+    hemisphere: str | None = None
+    dip: tuple[float, float] | None = None
+
+
+def hemisphere_at(latitude: float | str | None) -> str | None:
+    """Return the magnetic hemisphere at a latitude, rad or a text; None near the equator, and where none is given."""
+    angle = 0.0 if latitude is None else in_si(latitude, "latitude", "angle", "deg")
+    return None if abs(angle) < _EQUATOR else "north" if angle > 0 else "south"
+
+
+def stated_place(hemisphere: str | None, latitude: float | str | None, dip: Dip | None) -> Place:
+    """Return what is stated of the field at a place.
+
+    Raises
+    ------
+    OptionError
+        There is no such hemisphere or dip, or they contradict one another.
+    """
+    if hemisphere is not None and hemisphere not in HEMISPHERES:
+        raise OptionError(f"hemisphere {quoted(hemisphere)}: expected north or south")
+    known = None if dip is None else stated_dip(dip)
+    sides = {"hemisphere": hemisphere, "latitude": hemisphere_at(latitude)}
+    if known is not None and abs(known[0]) > _SURE * known[1]:
+        sides["dip"] = "north" if known[0] > 0 else "south"
+    given = {name: side for name, side in sides.items() if side is not None}
+    first = next(iter(given), "")
+    for name, side in given.items():
+        if side != given[first]:
+            raise OptionError(
+                f"{name} of the {side}ern hemisphere, {first} of the {given[first]}ern: expected both of one; the dip "
+                "is positive where the field points down, in the north"
+            )
+    return Place(given.get(first), known)
+
+
+def stated_dip(dip: Dip) -> tuple[float, float]:
+    """Return a dip and its standard uncertainty, rad; that of a model of the field where none is given.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    if isinstance(dip, str):
+        return tumble.dip(dip, "dip")
+    value, uncertainty = dip if isinstance(dip, tuple) and len(dip) == 2 else (dip, tumble.OF_FIELD_MODELS)
+    if not all(isinstance(part, Real) and not isinstance(part, bool) for part in (value, uncertainty)):
+        raise OptionError(f"dip {quoted(dip)}: expected rad, rad with a standard uncertainty, or a text '67 deg+-0.2'")
+    return tumble.check_dip(float(value), float(uncertainty), "dip")
+
+
+# Where the joint fit of both triads starts: an ellipsoid for the magnetometers, and the rotation that keeps the
+# dip.
+
+
+@dataclass(frozen=True)
+class Start:
+    """``m = W (M - h)`` in units of the field, shapes (3, 3) and (3,), and the dip, rad."""
+
+    matrix: Array
+    hard_iron: Array
+    dip: float
+
+
+def find_start(mag: Array, direction: Array) -> Start:
+    """Return where to start from.
+
+    Parameters
+    ----------
+    mag
+        Outputs, of any scale, shape (n, 3).
+    direction
+        Unit vectors of the specific force in the body frame, shape (n, 3).
+    """
+    centre, size = mag.mean(axis=0), float(np.linalg.norm(mag.std(axis=0)))
+    scaled = (mag - centre) / size
+    shape = _ellipsoid(scaled)
+    if shape is None:
+        shape = _sphere(scaled)
+        rotation, sine = _best_permutation_of_axes((scaled - shape[1]) @ shape[0].T, direction)
+    else:
+        rotation, sine = _alignment((scaled - shape[1]) @ shape[0].T, direction)
+    upper, hard_iron = shape
+    dip = float(np.arcsin(np.clip(sine, -0.999, 0.999)))
+    return Start(rotation @ upper / size, centre + size * hard_iron, dip)
+
+
+def _ellipsoid(points: Array) -> tuple[Array, Array] | None:
+    """Return U and h of ``|U (x - h)| = 1``, by algebraic least squares; None where the surface is no ellipsoid."""
+    x, y, z = points.T
+    design = np.column_stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z])
+    if np.linalg.matrix_rank(design) < design.shape[1]:
+        return None
+    a = np.linalg.lstsq(design, np.ones(len(points)), rcond=None)[0]
+    form = np.array([[a[0], a[3], a[4]], [a[3], a[1], a[5]], [a[4], a[5], a[2]]])
+    sign = 1.0 if np.trace(form) > 0 else -1.0
+    if np.linalg.eigvalsh(sign * form).min() <= 0:
+        return None
+    h = -np.linalg.solve(form, a[6:])
+    level = 1 + h @ form @ h
+    if level * sign <= 0:
+        return None
+    return np.linalg.cholesky(form / level).T, h
+
+
+def _sphere(points: Array) -> tuple[Array, Array]:
+    """Return U and h of the sphere ``|x - h| = r`` through the points, by algebraic least squares."""
+    design = np.column_stack([2 * points, np.ones(len(points))])
+    found = np.linalg.lstsq(design, (points**2).sum(axis=1), rcond=None)[0]
+    radius = np.sqrt(max(found[3] + found[:3] @ found[:3], 1e-12))
+    return np.eye(3) / radius, found[:3]
+
+
+def _alignment(field: Array, direction: Array) -> tuple[Array, float]:
+    """Return the rotation and the sine of the dip that make ``e' R u + sin(dip)`` least; R is right-handed."""
+    rows = np.column_stack([(direction[:, :, None] * field[:, None, :]).reshape(len(field), 9), np.ones(len(field))])
+    found = np.linalg.svd(rows, full_matrices=False)[2][-1]
+    matrix = found[:9].reshape(3, 3)
+    if np.linalg.det(matrix) < 0:
+        matrix, found = -matrix, -found
+    left, _, right = np.linalg.svd(matrix)
+    rotation: Array = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return rotation, float(-np.mean(np.einsum("ni,ij,nj->n", direction, rotation, field)))
+
+
+def _best_permutation_of_axes(field: Array, direction: Array) -> tuple[Array, float]:
+    """Return, of the 24 rotations that carry axes into axes, the one under which the dip varies least."""
+    candidates = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        rotation = np.diag(signs)[:, order]
+        if np.linalg.det(rotation) > 0:
+            cosine = np.einsum("ni,ij,nj->n", direction, rotation, field)
+            candidates.append((float(cosine.var()), rotation, float(-cosine.mean())))
+    _, rotation, sine = min(candidates, key=lambda candidate: candidate[0])
+    return rotation, sine
+
+
+def axes_of(matrix: Array) -> Array:
+    """Return the signed permutation P, shape (3, 3), that names outputs: ``sum |(D P')_ii| / |row i|`` is largest.
+
+    Parameters
+    ----------
+    matrix
+        D, field in the body frame to output, shape (3, 3).
+    """
+    rows = matrix / np.linalg.norm(matrix, axis=1)[:, None]
+    best = max(permutations(range(3)), key=lambda order: float(np.abs(rows[list(order), range(3)]).sum()))
+    named: Array = np.zeros((3, 3))
+    for axis, output in enumerate(best):
+        named[axis, output] = np.sign(rows[output, axis])
+    return named
+
+
+# Attitudes in which one axis of the body points the same way: what they say of heading beyond magnitude and dip.
+
+
+@dataclass(frozen=True)
+class Held:
+    """Groups of attitudes that point one way, relative to where the axis and the directions were at the start.
+
+    Attributes
+    ----------
+    group
+        Number of the group that each attitude is in, -1 for none, shape (n,).
+    axis, axis_across
+        The body axis at the start, shape (3,), and two directions across it, shape (2, 3).
+    across
+        Two directions across the direction of each group in the world, shape (groups, 2, 3).
+    """
+
+    group: Array
+    axis: Array
+    axis_across: Array
+    across: Array
+
+    @property
+    def size(self) -> int:
+        """Number of parameters: two of the axis, two of each group."""
+        return 2 + 2 * len(self.across)
+
+    def only(self, kept: NDArray[np.intp]) -> Held:
+        """Return what is held of some of the attitudes."""
+        return replace(self, group=self.group[kept])
+
+
+def find_held(field: Array, force: Array, groups: Sequence[Sequence[int]]) -> tuple[Held, Array]:
+    """Return the groups, relative to the axis that keeps its directions best, and the start of their parameters.
+
+    Parameters
+    ----------
+    field, force
+        m and f of each attitude, shape (n, 3).
+    groups
+        Numbers of the attitudes of each group, from 0.
+    """
+    axes = world_axes(field, force)
+    number = np.full(len(field), -1)
+    scatter = np.zeros((3, 3))
+    for index, group in enumerate(groups):
+        number[list(group)] = index
+        off = axes[list(group)] - axes[list(group)].mean(axis=0)
+        scatter += np.einsum("nij,nik->jk", off, off)
+    axis = np.linalg.eigh(scatter)[1][:, 0]
+    means = [axes[list(group)].mean(axis=0) @ axis for group in groups]
+    across = np.array([_across(mean / np.linalg.norm(mean)) for mean in means])
+    start = np.concatenate([np.zeros(2), *(b @ mean for b, mean in zip(across, means, strict=True))])
+    return Held(number, axis, _across(axis), across), start
+
+
+def world_axes(field: Array, force: Array) -> Array:
+    """Return C, rows east, north and up in body components, shape (n, 3, 3)."""
+    up = force / np.linalg.norm(force, axis=1)[:, None]
+    east = np.cross(field, up)
+    east /= np.linalg.norm(east, axis=1)[:, None]
+    return np.stack([east, np.cross(up, east), up], axis=1)
+
+
+def with_held(found: Invariants, theta: Array, layout: Layout, held: Held) -> Invariants:
+    """Return the invariants with two more residuals of each attitude, ``B (C x - d)``; nil outside of the groups."""
+    own = theta[layout.of_directions]
+    longer = held.axis + own[:2] @ held.axis_across
+    length = np.linalg.norm(longer)
+    x = longer / length
+    by_own = (held.axis_across - np.outer(held.axis_across @ x, x)) / length  # dx by its two parameters, (2, 3)
+    axes = world_axes(found.field.vector, found.force.vector)
+    turned = _change(found, axes, x, layout)
+    member = held.group >= 0
+    across = np.where(member[:, None, None], held.across[held.group], 0.0)
+    residuals = np.einsum("nki,nij,j->nk", across, axes, x)
+    slope = np.einsum("nki,nip->nkp", across, turned)
+    first = layout.of_directions.start
+    slope[:, :, first : first + 2] = np.einsum("nki,nij,lj->nkl", across, axes, by_own)
+    for index in range(len(held.across)):
+        inside = held.group == index
+        at = first + 2 + 2 * index
+        residuals[inside] -= own[2 + 2 * index : 4 + 2 * index]
+        slope[inside, :, at : at + 2] = -np.eye(2)
+    return replace(
+        found,
+        residuals=np.hstack([found.residuals, residuals]),
+        by_parameters=np.concatenate([found.by_parameters, slope], axis=1),
+    )
+
+
+def _change(found: Invariants, axes: Array, x: Array, layout: Layout) -> Array:
+    """Return how ``C x`` changes with the triads' parameters, shape (n, 3, p)."""
+    n = len(axes)
+    du, de = np.zeros((n, 3, layout.size)), np.zeros((n, 3, layout.size))
+    du[:, :, : layout.mag] = found.field.by_parameters
+    de[:, :, layout.of_accel] = found.force.by_parameters / np.linalg.norm(found.force.vector, axis=1)[:, None, None]
+    east, _, up = axes.transpose(1, 0, 2)
+    de -= up[:, :, None] * np.einsum("ni,nip->np", up, de)[:, None, :]
+    cross = np.cross(found.field.vector, up)
+    length = np.linalg.norm(cross, axis=1)[:, None, None]
+    da = (np.cross(du, up[:, :, None], axis=1) + np.cross(found.field.vector[:, :, None], de, axis=1)) / length
+    d_east = da - east[:, :, None] * np.einsum("ni,nip->np", east, da)[:, None, :]
+    d_north = np.cross(de, east[:, :, None], axis=1) + np.cross(up[:, :, None], d_east, axis=1)
+    return np.stack([np.einsum("i,nip->np", x, part) for part in (d_east, d_north, de)], axis=1)
+
+
+def _across(direction: Array) -> Array:
+    """Return two unit vectors across a unit vector and each other, shape (2, 3)."""
+    basis: Array = np.linalg.svd(direction[None])[2][1:]
+    return basis
+
+
+# One fit of both triads: every attitude's |f|, |m| and dip, each with its variance.
+
 
 _STEPS = 60
 _TOLERANCE = 1e-11
@@ -355,3 +659,101 @@ def _uncertainty(pair: Pair, found: Invariants, information: Array, extra: Array
     with np.errstate(divide="ignore"):
         freedom = np.diag(covariance) ** 2 / np.einsum("kp,kl,lp->p", by_block, spread, by_block)
     return covariance, freedom
+
+
+# How the magnetometers' outputs are scaled for the fit, and what is ready for it.
+
+
+@dataclass(frozen=True)
+class MagScaling:
+    """Outputs are renamed by a signed permutation, less a zero, over a size: those of a field of length 1.
+
+    Attributes
+    ----------
+    axes
+        Row k names the output that becomes axis k, shape (3, 3).
+    zero
+        In renamed outputs, shape (3,).
+    size
+        Output per unit of the field.
+    field
+        Magnitude of the field, T; None where it is the unit.
+    """
+
+    axes: Array
+    zero: Array
+    size: float
+    field: float | None
+
+    def outputs(self, mean: Array) -> Array:
+        """Return outputs, shape (n, 3), scaled."""
+        scaled: Array = (mean @ self.axes.T - self.zero) / self.size
+        return scaled
+
+    def covariance(self, matrices: Array) -> Array:
+        """Return covariances of outputs, shape (n, 3, 3), scaled."""
+        scaled: Array = self.axes @ matrices @ self.axes.T / self.size**2
+        return scaled
+
+    def in_si(self, theta: Array) -> tuple[Array, Array]:
+        """Return the parameters as they stand in a record, shape (p,), and their derivatives by theta, (p, p).
+
+        ``S = size s / F``, ``b = (zero + size z) / S``, ``k2 = theta / F``; misalignments are the same.
+        """
+        unit = 1.0 if self.field is None else self.field
+        scale = self.size * theta[3:6] / unit
+        bias = (self.zero + self.size * theta[:3]) / scale
+        values = np.concatenate([bias, scale, theta[6:12], theta[12:] / unit])
+        slope = np.diag(
+            np.concatenate(
+                [self.size / scale, np.full(3, self.size / unit), np.ones(6), np.ones(len(theta[12:])) / unit]
+            )
+        )
+        slope[range(3), range(3, 6)] = -bias / theta[3:6]
+        return values, slope
+
+
+def nominal_mag(start: Start, magnitude: float | None) -> tuple[MagScaling, Array]:
+    """Return the scaling of outputs, and the magnetometers' parameters where the fit starts, order 1, shape (12,)."""
+    turned: Array = np.asarray(np.linalg.inv(start.matrix), dtype=np.float64)
+    axes = axes_of(turned)
+    renamed = axes @ turned
+    size = float(np.abs(np.diag(renamed)).mean())
+    scale = np.diag(renamed) / size
+    off = (renamed / np.diag(renamed)[:, None])[tuple(np.transpose(MAGNETOMETERS))]
+    return MagScaling(axes, axes @ start.hard_iron, size, magnitude), np.concatenate([np.zeros(3), scale, off])
+
+
+@dataclass(frozen=True)
+class Ready:
+    """Both triads before the joint fit.
+
+    Attributes
+    ----------
+    estimate, scaling, gravity
+        The accelerometers by themselves, how they are scaled, and local gravity.
+    means
+        The magnetometers' outputs in all attitudes.
+    kept
+        Which of these are used, from 0.
+    mag
+        How the magnetometers are scaled.
+    pair, start
+        What is fitted, and from where.
+    order, loss
+        As asked for the accelerometers by themselves.
+    notes
+        What a user should know already.
+    """
+
+    estimate: Estimate
+    scaling: Scaling
+    gravity: Gravity
+    means: FieldMeans
+    kept: NDArray[np.intp]
+    mag: MagScaling
+    pair: Pair
+    start: Array
+    order: int | str
+    loss: str
+    notes: list[str] = field(default_factory=list)

@@ -1,5 +1,0 @@
-"""The methods by which the C core fuses an array."""
-
-STARTS = ("first", "zero")
-"""Biases to start from: those of the first samples, or none."""
-METHODS = ("mean", "support", "least-squares", "feedback", "robust", "covariance", "kalman")

@@ -1,0 +1,239 @@
+"""Files: written whole or not at all, and TOML read entry by entry, each refused with its place where it cannot be."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import stat
+import tempfile
+import threading
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from imulab.errors import OptionError, ReadError, UnitError, file_name, listed, quoted
+from imulab.units import Unit, parse_scale_factor, parse_unit
+
+# Writing files whole or not at all.
+
+
+_UMASK = threading.Lock()
+
+
+def real_path(path: str | Path) -> Path:
+    """Return the absolute path of the file that a name leads to, through links.
+
+    Raises
+    ------
+    OptionError
+        The links go round in a circle.
+    """
+    found = Path(os.path.realpath(file_name(path)))
+    if found.is_symlink():
+        raise OptionError(f"{path}: cannot be written: too many levels of symbolic links")
+    return found
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a new file beside `path` that takes its place when the block ends well, and vanishes otherwise.
+
+    Raises
+    ------
+    OptionError
+        The file cannot be written there.
+    """
+    target = real_path(path)  # through a link to the file that it names
+    if target.is_dir():
+        raise OptionError(f"{path}: expected the name of a file to write, found a folder")
+    if target.exists() and not target.is_file():  # a device or a pipe is written to, not replaced
+        try:
+            with target.open("wb") as stream:
+                yield stream
+        except BrokenPipeError:  # its reader has had enough, which is no failure
+            raise
+        except OSError as error:
+            raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
+        return
+    try:
+        descriptor, name = tempfile.mkstemp(prefix=".imulab.", suffix=".part", dir=target.parent)
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
+    part = Path(name)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.chmod(0o666 & ~_umask())
+        part.replace(target)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def check_no_paper(path: str | Path) -> None:
+    """Check that no file is asked for that promises a picture or a printed page.
+
+    Raises
+    ------
+    OptionError
+        It is.
+    """
+    if Path(path).suffix.lower() in (".pdf", ".png", ".svg", ".docx"):
+        raise OptionError(f"{path}: no such file is written; reports are HTML (.html), which any browser prints")
+
+
+def write_page(path: str | Path, page: str) -> None:
+    """Write an HTML page; errors as for `write_text` and `check_no_paper`."""
+    check_no_paper(path)
+    write_text(path, page)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file whole or not at all, UTF-8."""
+    with replacing(path) as stream:
+        stream.write(text.encode("utf-8"))
+
+
+def _umask() -> int:
+    with _UMASK:  # there is no way to look without setting it: one thread at a time, and never wider meanwhile
+        mask = os.umask(0o077)
+        os.umask(mask)
+    return mask
+
+
+# TOML files: layouts, manifests of tests, limits, the project file.
+
+
+_LARGEST = 1_000_000
+_MOST_DOTS = 50  # the time that a key takes grows with the square of its dots
+_NUMBER = re.compile(r"(?<![\w.])\d++\.\d++(?:[eE][-+]?\d++)?(?![\w.])")
+_DOT = re.compile(r"(?<!\.)\.(?!\.)")
+_WIDEST = 1 << 63
+
+
+def load_toml(path: str | Path, name: str, what: str) -> dict[str, Any]:
+    """Return the table of a TOML file; messages call the file `name`, and `what` is the kind that it should be.
+
+    Raises
+    ------
+    ReadError
+        There is no such file, it is no regular file or too large, it cannot be read, or it is not TOML.
+    """
+    text = _text(Path(path), name, what)
+    for number, line in enumerate(text.split("\n"), start=1):
+        if line.count(".") > _MOST_DOTS and len(_DOT.findall(_NUMBER.sub("", line))) > _MOST_DOTS:
+            raise ReadError(
+                f"{name}: line {number}: more than {_MOST_DOTS} dots in a line of the {what} file; expected keys of a "
+                "few words"
+            )
+    wide = ReadError(f"{name}: the {what} file holds a whole number of more than 64 bits, which TOML does not have")
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ReadError(f"{name}: the {what} file is not TOML: {error}") from None
+    except ValueError:  # Python reads no whole numbers of thousands of digits
+        raise wide from None
+    except RecursionError:
+        raise ReadError(f"{name}: the {what} file nests its tables or lists hundreds of levels deep") from None
+    if _has_wide(table):
+        raise wide
+    return table
+
+
+def _text(path: Path, name: str, what: str) -> str:
+    """Return the text of a regular file of no more than the largest size."""
+    try:
+        mode = path.stat().st_mode  # before it is opened: opening a pipe waits for a writer
+        if stat.S_ISDIR(mode):
+            raise ReadError(f"{name}: expected a {what} file, found a folder")
+        if not stat.S_ISREG(mode):
+            raise ReadError(f"{name}: expected a {what} file, found a device or a pipe")
+        with path.open("rb") as stream:
+            data = stream.read(_LARGEST + 1)
+    except FileNotFoundError:
+        if os.path.lexists(path):
+            raise ReadError(f"{name}: expected a {what} file, found a link to a file that is not there") from None
+        raise ReadError(f"{name}: no such {what} file") from None
+    except OSError as error:
+        raise ReadError(f"{name}: expected a {what} file, which cannot be read: {error.strerror}") from None
+    if len(data) > _LARGEST:
+        raise ReadError(f"{name}: expected a {what} file of at most 1 MB")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ReadError(f"{name}: line {line}: expected a {what} file of UTF-8 text, as TOML is") from None
+
+
+def _has_wide(value: Any) -> bool:
+    """Return whether a whole number of more than 64 bits is among TOML's values."""
+    if isinstance(value, dict):
+        return any(map(_has_wide, value.values()))
+    if isinstance(value, list):
+        return any(map(_has_wide, value))
+    return isinstance(value, int) and not -_WIDEST <= value < _WIDEST
+
+
+# Entries of TOML files: keys, numbers, units and scale factors, each refused with its place where it cannot be.
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleFactor:
+    """Output per unit of what is measured: its value, and the units of both."""
+
+    value: float
+    output: Unit
+    measured: Unit
+
+
+def scale_factor_of(entry: Any, place: str, example: str) -> ScaleFactor:
+    """Return a scale factor ``{ value = 0.02, unit = "V/(deg/s)" }``; `example` is how the whole line is written."""
+    value, unit = value_and_unit(entry, place, example)
+    if value == 0:
+        raise ReadError(f"{place}: expected a value other than 0")
+    try:
+        output, measured = parse_scale_factor(unit)
+    except UnitError as error:
+        raise UnitError(f"{place}: {error}") from None
+    return ScaleFactor(value, output, measured)
+
+
+def value_and_unit(entry: Any, place: str, example: str) -> tuple[float, str]:
+    """Return both of ``{ value = 2.5, unit = "V" }``; `example` is how the whole line is written."""
+    if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
+        raise ReadError(f"{place}: expected {example}, found {quoted(entry)}")
+    return number_of(entry["value"], place), str(entry["unit"])
+
+
+def check_keys(table: Mapping[str, Any], keys: tuple[str, ...], place: str) -> None:
+    """Refuse a key that is none of `keys`: a misspelt one must not pass."""
+    for key in table:
+        if key not in keys:
+            raise ReadError(f"{place}: unknown key {quoted(key)}; known keys: {listed(keys, key)}")
+
+
+def number_of(value: Any, place: str) -> float:
+    """Return a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ReadError(f"{place}: expected a number, found {quoted(value)}")
+    return float(value)
+
+
+def unit_of(text: Any, kind: str, place: str) -> str:
+    """Return the symbol of a unit of one kind."""
+    try:
+        unit = parse_unit(str(text))
+    except UnitError as error:
+        raise UnitError(f"{place}: {error}") from None
+    if unit.quantity != kind:
+        raise UnitError(f"{place}: expected a unit of {kind}, found {quoted(text)} ({unit.quantity})")
+    return unit.symbol

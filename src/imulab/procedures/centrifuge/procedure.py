@@ -1,0 +1,135 @@
+"""The centrifuge test in the registry: its options, its fit from files, and what its record gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from imulab.errors import ReadError
+from imulab.procedures.centrifuge import CURVES, METHODS
+from imulab.procedures.procedure import LAYOUT, Files, Procedure, Section, Task, choice, read_options, source_of
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from imulab.device.tables import DeviceTable, Fusion
+    from imulab.device.unit import DeviceUnit
+    from imulab.recording import Recording, Source
+    from imulab.records.calibration import Calibration
+    from imulab.report.traces import Exhibits
+
+
+# A centrifuge test from its manifest, which names the recordings.
+
+
+def _fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.procedures.centrifuge.fit import fit_centrifuge
+    from imulab.procedures.centrifuge.manifest import load_manifest
+
+    (manifest,) = files
+    test = load_manifest(access.path(manifest), manifest)
+    names = {run.file: access.beside(manifest, run.file) for run in test.runs}
+    for index, run in enumerate(test.runs):  # a missing file is refused before hours of data are read
+        if not access.path(names[run.file]).is_file():
+            raise ReadError(f"{test.place(index)}: no such file")
+
+    def sources() -> list[Source]:
+        named = [(manifest, manifest), *names.items()]
+        return [source for called, name in named if (source := source_of(access, name, called)) is not None]
+
+    return fit_centrifuge(
+        test,
+        lambda run: access.blocks(names[run.file], values["layout"], window=run.window),
+        method=values["method"],
+        curve=values["curve"],
+        sources=sources,
+        progress=progress,
+    ).calibration
+
+
+OPTIONS = (
+    choice("method", "least-squares, or fourier (the source's whole-period sums).", METHODS, "least-squares"),
+    choice("curve", "Terms of K(a).", ("auto", *CURVES), "auto"),
+    LAYOUT,
+)
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    return read_options(OPTIONS, texts, label)
+
+
+TASK = Task(
+    files="the manifest of one test",
+    count=(1, 1),
+    options=OPTIONS,
+    values=_values,
+    fit=_fit,
+)
+
+
+# The g-sensitive drift of a flexible gyro, which changes with g, as the registry knows it.
+
+
+class CentrifugeSection(Section):
+    """Drift by the curve K(a) and the specific force."""
+
+    kind = "centrifuge"
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.procedures.centrifuge.device import golden
+
+        return golden(table, random)
+
+    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+        from imulab.procedures.centrifuge.device import apply_centrifuge
+
+        return apply_centrifuge(unit, columns, recording)
+
+
+class CentrifugeProcedure(Procedure):
+    """The g-sensitive drift of a flexible gyro, which changes with g."""
+
+    name = "centrifuge"
+    command = "centrifuge"
+    title = "Centrifuge test"
+    line_title = "Centrifuge"
+    elsewhere = "{target} has no parameter for drift that depends on acceleration"
+    task = TASK
+    sections = (CentrifugeSection(),)
+
+    def check(self, record: Calibration) -> None:
+        from imulab.procedures.centrifuge.schema import check
+
+        check(record)
+
+    def exhibits(self, record: Calibration) -> Exhibits:
+        from imulab.procedures.centrifuge.figures import exhibits
+
+        return exhibits(record)
+
+    def summary(self, record: Calibration) -> tuple[list[str], list[list[str]]]:
+        from imulab.procedures.centrifuge.figures import summary
+
+        return summary(record)
+
+    def same_meaning(self, name: str, first: Calibration, second: Calibration) -> bool:
+        from imulab.procedures.centrifuge.schema import same_meaning
+
+        return same_meaning(name, first, second)
+
+    def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
+        from imulab.procedures.centrifuge.device import tables_of
+
+        return tables_of(record)
+
+    def beyond(self, record: Calibration, recording: Recording) -> tuple[int, float]:
+        from imulab.procedures.centrifuge.device import beyond_levels
+
+        return beyond_levels(record, recording)
+
+    def beyond_message(self, record: Calibration, count: int, largest: float) -> str:
+        from imulab.procedures.centrifuge.device import beyond_message
+
+        return beyond_message(record, count, largest)

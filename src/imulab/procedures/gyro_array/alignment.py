@@ -1,0 +1,345 @@
+"""Biases and noise of an array at rest, alignment of an array's elements against their consensus.
+
+Elements that answer late.
+
+All readings are one motion seen n times. The largest eigenvectors of their covariance, whitened by the noise at rest,
+span what the elements sense of it (maximum likelihood of the factor model); the frame within is fixed by a convention.
+
+An element whose readings come later by tau than the others' reads ``A w(t - tau) = A w - tau A dw/dt + ...``: what the
+consensus leaves of it goes with the derivative of the consensus. The regression on that gives tau to a fraction of a
+sample, and is repeated on readings moved by it (cubic splines) until it stands still.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import ObservabilityError
+from imulab.estimation.column_noise import ColumnNoise, columns_noise
+from imulab.estimation.noise_coefficients import AllanCurve
+from imulab.procedures.gyro_array.elements import Elements
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.records.mean_noise import mean_uncertainties
+
+# Biases and noise of an array at rest, and how uncertain the biases are.
+
+
+_CANDIDATES = ("N", "NK", "NB", "NG", "NBK")
+"""Models of the noise: a stretch at rest is too short to tell more."""
+
+
+@dataclass(frozen=True)
+class AtRest:
+    """What the recording at rest says: biases, their uncertainties, curves and noise per axis and element; rad/s."""
+
+    bias: Array
+    curves: tuple[tuple[AllanCurve, ...], ...]
+    noise: tuple[tuple[ColumnNoise, ...], ...]
+    white: Array
+    uncertainty: Array
+    duration: float
+    rate: float
+
+
+def at_rest(
+    readings: Array, rate: float, elements: Elements, record: Calibration | None, head: Mapping[str, str]
+) -> tuple[AtRest, list[str]]:
+    """Return what readings at rest say, shape (m, axes, n), rad/s, at a rate, Hz, and what there is to say of `record`.
+
+    Raises
+    ------
+    RecordError
+        The noise record is none, or lacks an element.
+    """
+    n, duration = elements.count, len(readings) / rate
+    columns = [readings[:, a, i] for a in range(len(elements.axes)) for i in range(n)]
+    each = columns_noise(columns, rate, candidates=_CANDIDATES)
+    notes: list[str] = []
+    if record is None:
+        spread = np.array([one.mean_uncertainty(duration) for one in each])
+    else:
+        names = [name for row in elements.names for name in row]
+        spread, notes = mean_uncertainties(record, names, duration, "rad/s", head)
+    noise = tuple(tuple(each[k : k + n]) for k in range(0, len(each), n))
+    curves = tuple(tuple(one.curve for one in row) for row in noise)
+    white = np.array([[curve.deviation[0] for curve in row] for row in curves])
+    spread = spread.reshape(len(elements.axes), n)
+    return AtRest(readings.mean(axis=0), curves, noise, white, spread, duration, rate), notes
+
+
+def unseen(noises: Mapping[str, ColumnNoise], rest: AtRest) -> list[str]:
+    """Return by how much noise that is slower than a stretch shows could raise the uncertainties of the biases."""
+    most = max((each.unseen(rest.duration) for each in noises.values()), default=1.0)
+    if most == 1:
+        return []
+    largest = math.degrees(float(rest.uncertainty.max())) * 3600
+    return [
+        f"the uncertainties of the biases, up to {largest:.3g} deg/h, hold the noise that {rest.duration:.4g} s show; "
+        f"slower noise, which so short a stretch cannot show, could make them up to {most:.2g} times as large "
+        "(--noise RECORD: the noise of a longer log)"
+    ]
+
+
+# Alignment of an array's elements against their consensus, from a recording in motion.
+
+
+_BLOCKS = 20
+_WORST = 0.05
+_VISIBLE = 25.0  # variance of the motion over that of the noise, in the direction where it is least
+_NEAR_PERMUTATION = 0.35  # rad
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What each element senses of the array's rate, ``z_i = A_i w + b_i``.
+
+    Attributes
+    ----------
+    sensing, standard_uncertainty
+        A_i and its standard uncertainty, shape (n, axes, axes).
+    residual
+        Rms of what the consensus leaves of each element, rad/s, shape (n, axes).
+    gauge
+        The convention that fixes the frame.
+    latency, latency_uncertainty
+        By how much each element's readings come later than the median's (than the truth), s, shape (n,), or None.
+    """
+
+    sensing: Array
+    standard_uncertainty: Array
+    residual: Array
+    gauge: str
+    latency: Array | None = None
+    latency_uncertainty: Array | None = None
+
+
+def align(readings: Array, white: Array, truth: Array | None = None, *, strict: bool = True) -> Alignment:
+    """Estimate what each element senses of the array's rate.
+
+    Without `truth`, element 1 in its nominal orientation gives the directions and the mean over all elements of
+    ``P_i' A_i`` is the unit matrix, P_i the nominal orientation of element i (a signed permutation where it is near
+    one). With `truth`, A_i is the regression on it. Uncertainties: jackknife over 20 stretches of the recording.
+
+    Parameters
+    ----------
+    readings
+        In motion, shape (m, axes, n), rad/s; their means are taken off.
+    white
+        Standard deviation of a sample at rest, shape (axes, n).
+    truth
+        True rate, shape (m, axes), or None.
+    strict
+        Whether to refuse what is not fixed to 5 %.
+
+    Raises
+    ------
+    ObservabilityError
+        The motion does not excite every axis.
+    """
+    m, axes, n = readings.shape
+    stacked = np.moveaxis(readings, 2, 1).reshape(m, n * axes)  # element by element
+    # Biases may have changed since the array was at rest: what does not vary says nothing here.
+    stacked = stacked - stacked.mean(axis=0)
+    truth = None if truth is None else truth - truth.mean(axis=0)
+    sigma = white.T.reshape(n * axes)
+    edges = np.linspace(0, m, min(_BLOCKS, m // 4) + 1).astype(int)
+    moments = [_moments(stacked[a:b], truth if truth is None else truth[a:b]) for a, b in pairwise(edges)]
+    total = sum(moments[1:], start=moments[0].copy())
+    sensing = _solve(total, sigma, axes, n, known=truth is not None)
+    without = np.array([_solve(total - part, sigma, axes, n, known=truth is not None) for part in moments])
+    blocks = len(moments)
+    uncertainty = np.sqrt((blocks - 1) / blocks * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
+    size = n * axes
+    weakest = np.linalg.eigvalsh(total[:size, :size] / np.outer(sigma, sigma))[-axes] / m
+    if strict and (not np.isfinite(uncertainty).all() or uncertainty.max() > _WORST or weakest < _VISIBLE):
+        # Its own first element is nearest to the frame: the axis about which it moves least against its noise.
+        worst = int(np.argmin(readings[:, :, 0].std(axis=0) / white[:, 0]))
+        axis = f" about {'xyz'[worst]}" if axes == 3 else ""
+        raise ObservabilityError(
+            f"the motion does not fix the elements' scale factors and alignment{axis} to {100 * _WORST:.0f} %; "
+            "expected a recording that turns fast, both ways, about every axis"
+        )
+    full = sensing.reshape(n * axes, axes)
+    weight = full / sigma[:, None] ** 2
+    consensus = np.linalg.solve(full.T @ weight, weight.T @ stacked.T)
+    residual = (stacked - consensus.T @ full.T).std(axis=0).reshape(n, axes)
+    gauge = "truth_rate" if truth is not None else "mean over the elements of P_i' A_i = 1, directions of element 1"
+    return Alignment(sensing, uncertainty, residual, gauge)
+
+
+def _moments(stacked: Array, truth: Array | None) -> Array:
+    """Second moments of readings, with those of the truth appended where there is one."""
+    columns = stacked if truth is None else np.hstack([stacked, truth])
+    moments: Array = columns.T @ columns
+    return moments
+
+
+def _solve(moments: Array, sigma: Array, axes: int, n: int, *, known: bool) -> Array:
+    """Return A_i, shape (n, axes, axes)."""
+    size = n * axes
+    if known:
+        inner = moments[size:, size:]
+        if np.linalg.cond(inner) > 1e12:
+            return np.full((n, axes, axes), np.nan)
+        regression = np.linalg.solve(inner, moments[size:, :size]).T
+        return np.asarray(regression, dtype=np.float64).reshape(n, axes, axes)
+    scaled = moments / np.outer(sigma, sigma)
+    loading = np.linalg.eigh(scaled)[1][:, -axes:] * sigma[:, None]
+    parts: Array = loading.reshape(n, axes, axes)
+    if np.linalg.cond(parts[0]) > 1e6:
+        return np.full((n, axes, axes), np.nan)
+    relative = _product(parts, np.linalg.inv(parts[0]))
+    nominal = np.array([nominal_orientation(part) for part in relative])
+    mean = np.einsum("iba,ibc->ac", nominal, relative) / n
+    return _product(relative, np.linalg.inv(mean))
+
+
+def _product(a: Array, b: Array) -> Array:
+    product: Array = np.einsum("iab,bc->iac", a, b)
+    return product
+
+
+def nominal_orientation(matrix: Array) -> Array:
+    """Return the signed permutation near a matrix, or the rotation nearest to it, shape (axes, axes)."""
+    u, _, vt = np.linalg.svd(matrix)
+    rotation: Array = u @ vt
+    permutation = np.zeros_like(matrix)
+    rows = np.arange(len(matrix))
+    columns = np.argmax(np.abs(rotation), axis=1)
+    permutation[rows, columns] = np.sign(rotation[rows, columns])
+    near = np.abs(rotation - permutation).max() < _NEAR_PERMUTATION and len(set(columns.tolist())) == len(rows)
+    return permutation if near else rotation
+
+
+# Elements of an array that answer late, and their alignment in spite of it.
+
+
+_STEPS = 8
+_CLEAR = 4.0
+_HARMLESS = 1e-4  # s; 5 ppm of scale factor in motion at 5 Hz
+_SETTLED = 0.02  # standard uncertainties
+_GAP = 1.5
+_BESIDE = 4  # samples beside a gap that a spline does not follow
+_FEWEST = 100
+_LONGEST = 0.1  # s, of a step
+
+
+def align_in_time(time: Array, readings: Array, white: Array, truth: Array | None = None) -> Alignment:
+    """Align elements as `align` does, after those that are late were moved by their latency.
+
+    Where no latency is clear (four standard uncertainties) and above 0.1 ms, the readings are taken as they are.
+
+    Parameters
+    ----------
+    time
+        s, shape (m,).
+    readings, white, truth
+        As for `align`.
+
+    Raises
+    ------
+    ObservabilityError
+        The motion does not excite every axis.
+    """
+    count = readings.shape[2]
+    delay, u = np.zeros(count), np.full(count, np.inf)
+    moved, fine = readings, np.ones(len(time), dtype=np.bool_)
+    # Late elements alone can make an alignment uncertain: only the last one must be good enough.
+    found = align(readings, white, truth, strict=False)
+    for _ in range(_STEPS):
+        if fine.sum() < _FEWEST or not np.isfinite(found.sensing).all():
+            break
+        step, u = _regressed(time[fine], moved[fine], white, found, None if truth is None else truth[fine])
+        if truth is None:
+            step = step - np.median(step)
+        delay = delay + np.clip(step, -_LONGEST, _LONGEST)
+        if moved is readings and not _is_late(delay, u).any():
+            break
+        moved, fine = _without_delays(time, readings, delay)
+        found = align(moved[fine], white, None if truth is None else truth[fine], strict=False)
+        if np.abs(step).max() < _SETTLED * u.min():
+            break
+    known = bool(np.isfinite(u).all() and np.isfinite(delay).all())
+    if not known or not _is_late(delay, u).any() or fine.sum() < _FEWEST:
+        found = align(readings, white, truth)
+    else:
+        found = align(moved[fine], white, None if truth is None else truth[fine])
+    return replace(found, latency=delay, latency_uncertainty=u) if known else found
+
+
+def _is_late(delay: Array, u: Array) -> NDArray[np.bool_]:
+    """Which latencies are clear, and not too small to matter."""
+    found: NDArray[np.bool_] = np.abs(delay) > np.maximum(_CLEAR * u, _HARMLESS)
+    return found
+
+
+def latency_notes(found: Alignment, names: Sequence[str]) -> list[str]:
+    """Say which elements are late, under these names."""
+    if found.latency is None or found.latency_uncertainty is None:
+        return []
+    late = np.flatnonzero(_is_late(found.latency, found.latency_uncertainty)).tolist()
+    if not late:
+        return []
+    listed = ", ".join(
+        f"{names[i]} by {1e3 * found.latency[i]:+.3g} ms (u {1e3 * found.latency_uncertainty[i]:.1g} ms)" for i in late
+    )
+    than = "the truth" if found.gauge == "truth_rate" else "the array's median"
+    return [
+        f"readings come later than {than}: {listed}; scale factors and alignment are of readings moved by as much, but "
+        "array fuse does not move them: give such an element a column time_i of its own, or mend the logger"
+    ]
+
+
+def _regressed(
+    time: Array, readings: Array, white: Array, found: Alignment, truth: Array | None
+) -> tuple[Array, Array]:
+    """Latency that is left of each element, s, and its standard uncertainty by jackknife over 20 stretches."""
+    weight = found.sensing / white.T[:, :, None] ** 2
+    centred = readings - readings.mean(axis=0)
+    if truth is None:
+        normal = np.einsum("iab,iac->bc", found.sensing, weight)
+        rate = np.linalg.solve(normal, np.einsum("iab,mai->bm", weight, centred)).T
+    else:
+        rate = truth - truth.mean(axis=0)
+    change = np.einsum("iab,mb->mai", found.sensing, np.gradient(rate, time, axis=0))
+    left = centred - np.einsum("iab,mb->mai", found.sensing, rate)
+    gap = np.diff(time) > _GAP * np.median(np.diff(time))
+    change[np.append(gap, False) | np.insert(gap, 0, False)] = 0.0
+    inverse = 1 / white**2
+    across = -np.einsum("mai,mai,ai->mi", left, change, inverse)
+    along = np.einsum("mai,mai,ai->mi", change, change, inverse)
+    edges = np.linspace(0, len(time), _BLOCKS + 1).astype(int)
+    parts = np.array([[across[a:b].sum(axis=0), along[a:b].sum(axis=0)] for a, b in pairwise(edges)])
+    total = parts.sum(axis=0)
+
+    def delays(sums: Array) -> Array:
+        value = sums[..., 0, :] / np.maximum(sums[..., 1, :], 1e-300)
+        return value if truth is not None else value - np.median(value, axis=-1, keepdims=True)
+
+    without = delays(total - parts)
+    spread = np.sqrt((_BLOCKS - 1) / _BLOCKS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
+    # The element that is the median has none of its own: it is known as well as the others.
+    return delays(total), np.maximum(spread, np.median(spread))
+
+
+def _without_delays(time: Array, readings: Array, delay: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return readings earlier by each element's delay, and which rows are interpolated, not made up, (m,)."""
+    from scipy.interpolate import CubicSpline
+
+    moved = np.empty_like(readings)
+    for i, late in enumerate(delay.tolist()):
+        moved[:, :, i] = CubicSpline(time, readings[:, :, i])(time + late) if late else readings[:, :, i]
+    usual = float(np.median(np.diff(time)))
+    reach = float(np.abs(delay).max())
+    fine = (time >= time[0] + reach) & (time <= time[-1] - reach)
+    width = int(reach / usual) + _BESIDE
+    for k in np.flatnonzero(np.diff(time) > _GAP * usual).tolist():
+        fine[max(k - width, 0) : k + width + 1] = False
+    return moved, fine

@@ -1,0 +1,942 @@
+"""The elements of a gyro array.
+
+Which columns they are, their clocks, where they are at rest, and which of them fail.
+
+One axis: columns ``gyro_1 .. gyro_n``. Three axes: ``gyro_x_1 .. gyro_z_n``. ``z_i = A_i w + b_i``: reading z of
+element i, body rate w, bias b; the record holds ``M_i = A_i^-1`` so that ``w = M_i (z_i - b_i)``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from imulab.display import Bad, Note
+from imulab.errors import DataError, RecordError, UnitError
+from imulab.estimation.noise_coefficients import resolution
+from imulab.estimation.sampling import usual_step
+from imulab.procedures.gyro_array.schema import array_of
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.records.calibration import Calibration
+from imulab.units import conversion_factor, from_si, parse_unit
+
+# What a gyro array is: which columns of a recording are its elements, and what a record says of them.
+
+
+FEWEST_ROBUST = 3
+SOURCE_RATES = (50.0, 200.0)
+"""Sampling rates for which the source states its recursion, Hz."""
+MOST_ELEMENTS = 64
+_ELEMENT = re.compile(r"gyro_(?:([xyz])_)?([1-9][0-9]*)")
+_MISNUMBERED = re.compile(r"gyro_(?:[xyz]_)?0[0-9]*")
+
+
+@dataclass(frozen=True)
+class Elements:
+    """The elements of an array in a recording.
+
+    Attributes
+    ----------
+    names
+        Column names, axis by axis, each of n elements.
+    units
+        Unit of each axis.
+    axes
+        ``("",)`` for one axis, ``("x", "y", "z")`` for three.
+    """
+
+    names: tuple[tuple[str, ...], ...]
+    units: tuple[str, ...]
+    axes: tuple[str, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of elements on each axis."""
+        return len(self.names[0])
+
+    def rate_names(self) -> list[str]:
+        """Return the names of the fused columns: ``rate``, or ``rate_x rate_y rate_z``."""
+        return [f"rate_{axis}" if axis else "rate" for axis in self.axes]
+
+    def readings(self, recording: Recording) -> Array:
+        """Return the readings as logged, shape (m, axes, n), C-contiguous."""
+        out = np.empty((len(recording), len(self.axes), self.count))
+        for a, row in enumerate(self.names):
+            for i, name in enumerate(row):
+                out[:, a, i] = recording.columns[name]
+        return out
+
+    def truth(self, recording: Recording) -> Array | None:
+        """Return the columns ``truth_rate`` (or ``truth_rate_x`` ..) in the unit of the readings, shape (m, axes).
+
+        Raises
+        ------
+        DataError
+            There is a truth for some axes only.
+        UnitError
+            The truth has a unit that cannot be converted to the readings'.
+        """
+        names = [f"truth_{name}" for name in self.rate_names()]
+        there = [name for name in names if name in recording]
+        if not there:
+            return None
+        if len(there) < len(names):
+            missing = next(name for name in names if name not in there)
+            raise DataError(f"{recording.name}: column {there[0]} without {missing}; expected {' '.join(names)}")
+        columns = []
+        for name, unit in zip(names, self.units, strict=True):
+            try:
+                factor = conversion_factor(recording.units[name], unit)
+            except UnitError as error:
+                raise UnitError(f"{recording.name}: column {name}: {error}") from None
+            columns.append(recording.columns[name] * factor)
+        return np.column_stack(columns)
+
+
+def find_elements(recording: Recording) -> Elements:
+    """Find the elements of a recording by their column names.
+
+    Raises
+    ------
+    DataError
+        There are none, numbers are missing or do not begin with 1, or the axes have different numbers of elements.
+    UnitError
+        The elements of an axis have different units.
+    """
+    found: dict[str, dict[int, str]] = {}
+    for name in recording.columns:
+        match = _ELEMENT.fullmatch(name)
+        if match:
+            found.setdefault(match[1] or "", {})[int(match[2])] = name
+        elif _MISNUMBERED.fullmatch(name):
+            raise DataError(f"{recording.name}: column {name}: expected elements numbered 1 2 3 ..")
+    if not found:
+        raise DataError(
+            f"{recording.name}: no columns gyro_1 gyro_2 .. (one axis) or gyro_x_1 .. gyro_z_n (three); "
+            f"found {' '.join(recording.columns)}"
+        )
+    if "" in found and len(found) > 1:
+        raise DataError(f"{recording.name}: both {found[''][min(found[''])]} and columns by axis; expected one form")
+    axes = ("",) if "" in found else ("x", "y", "z")
+    stem = {axis: f"gyro_{axis}_" if axis else "gyro_" for axis in axes}
+    count = max(max(numbers) for numbers in found.values())
+    if count > MOST_ELEMENTS:
+        raise DataError(f"{recording.name}: {count} elements; expected {MOST_ELEMENTS} at most")
+    for axis in axes:
+        for number in range(1, count + 1):
+            if number not in found.get(axis, {}):
+                raise DataError(
+                    f"{recording.name}: no column {stem[axis]}{number}; expected {count} elements on each axis, "
+                    "numbered from 1"
+                )
+    names = tuple(tuple(found[axis][i] for i in range(1, count + 1)) for axis in axes)
+    units = []
+    for row in names:
+        of_column = {name: parse_unit(recording.units[name]).symbol for name in row}
+        if len(set(of_column.values())) > 1:
+            listed = ", ".join(f"{name} [{unit}]" for name, unit in of_column.items())
+            raise UnitError(f"{recording.name}: the elements of an axis must share one unit, found {listed}")
+        units.append(of_column[row[0]])
+    return Elements(names, tuple(units), axes)
+
+
+@dataclass(frozen=True)
+class ArrayCalibration:
+    """What a record says of an array, in the unit of the readings.
+
+    Attributes
+    ----------
+    bias
+        Plain means at rest, the common part included, shape (axes, n).
+    matrices
+        Shape (n, axes, axes), or None where no moving recording was calibrated from.
+    weights
+        Fixed weights ``C^-1 1 / (1' C^-1 1)``, shape (axes, n).
+    white, walk
+        Angle random walk, unit s^1/2 (`ArrayRecord.white_noise`), and rate random walk, unit s^-1/2, 0 where it is not
+        determined, shape (axes, n).
+    """
+
+    bias: Array
+    matrices: Array | None
+    weights: Array
+    white: Array
+    walk: Array
+
+
+def feedback_notes(count: int, rate: float) -> list[str]:
+    """Return what to know of the method `feedback` for so many gyros on each axis and this sampling rate, Hz."""
+    found: list[str] = []
+    if count < FEWEST_ROBUST:
+        found.append(
+            Note(
+                f"method feedback with {count} gyro{'s' * (count > 1)} on each axis: with fewer than {FEWEST_ROBUST} "
+                "no gyro stands out from the others, so that the weights mean little"
+            )
+        )
+    low, high = SOURCE_RATES
+    if not 0.99 * low <= rate <= 1.01 * high:
+        found.append(
+            Note(
+                f"method feedback at {rate:.6g} Hz: its source states it for {low:g} to {high:g} Hz, and its memory "
+                "counts samples"
+            )
+        )
+    return found
+
+
+def check_calibration(record: Calibration, name: str = "the record") -> None:
+    """Check that a record, of this file name, is that of an array calibration.
+
+    Raises
+    ------
+    RecordError
+        It is of another procedure, or of a comparison.
+    """
+    if record.procedure != "gyro_array" or record.model.get("kind") != "calibration":
+        what = record.model.get("kind", record.procedure) if record.procedure == "gyro_array" else record.procedure
+        raise RecordError(f"{name}: expected the record of an array calibration, found one of a {what}")
+
+
+def array_calibration(record: Calibration, elements: Elements, recording: str = "recording") -> ArrayCalibration:
+    """Return what a record says of the elements of a recording of this name.
+
+    Raises
+    ------
+    RecordError
+        The record is of another procedure, or of another number of elements or axes.
+    UnitError
+        The readings are not rates.
+    """
+    check_calibration(record)
+    held = array_of(record)
+    listed, axes = held.elements, len(held.model.axes)
+    if len(listed) != elements.count or axes != len(elements.axes):
+        raise RecordError(
+            f"{recording}: {elements.count} gyros on {count_of_axes(len(elements.axes))}; "
+            f"the record of the calibration holds {len(listed)} on {count_of_axes(axes)}"
+        )
+    for row, unit in zip(elements.names, elements.units, strict=True):
+        if parse_unit(unit).quantity != "rate":
+            raise UnitError(f"{recording}: column {row[0]} is in {unit}; the record of the calibration is in rad/s")
+
+    def of(values: Array) -> Array:
+        return np.array([from_si(row, unit) for row, unit in zip(values, elements.units, strict=True)])
+
+    matrices = None
+    if held.model.aligned:
+        matrices = np.array([element.alignment for element in listed])
+        size = np.array([conversion_factor("rad/s", unit) for unit in elements.units])
+        matrices *= size[:, None] / size[None, :]
+    return ArrayCalibration(
+        bias=of(np.array([element.bias.values for element in listed]).T),
+        matrices=matrices,
+        weights=np.array(held.correlation.weights),
+        white=of(held.white_noise),
+        walk=of(np.nan_to_num(np.array([element.rate_random_walk.values for element in listed]).T)),
+    )
+
+
+def count_of_axes(count: int) -> str:
+    """Return ``1 axis`` or ``3 axes``, for messages."""
+    return "1 axis" if count == 1 else f"{count} axes"
+
+
+def fixed_weights(covariance: Array) -> tuple[Array, float]:
+    """Return the weights ``C^-1 1 / (1' C^-1 1)`` and the limit ``(1' C^-1 1)^-1/2`` of a covariance, shape (n, n).
+
+    Source: Vaccaro and Zaki, Sensors 17 (2017).
+    """
+    ones = np.ones(len(covariance))
+    raw = np.linalg.solve(covariance, ones)
+    return raw / raw.sum(), float(raw.sum() ** -0.5)
+
+
+def unit_of_angle(unit: str) -> tuple[str, float]:
+    """Return the unit of angles for a unit of rates, and the factor from that rate times s to it."""
+    known = parse_unit(unit).symbol
+    return {"deg/s": ("deg", 1.0), "rad/s": ("rad", 1.0), "deg/h": ("deg", 1 / 3600)}.get(known, (f"{known} s", 1.0))
+
+
+# Elements on clocks of their own, brought to one; gaps in time.
+
+
+_GAP = 1.5
+_MOST_OFFSET = 0.5
+_TO_ESTIMATE = 16
+_MOST_NAMED = 3
+
+
+@dataclass
+class Clock:
+    """Watches time over the blocks of a recording: the sampling rate of its beginning, gaps, and order."""
+
+    nominal: float | None = None
+    steps: list[float] = field(default_factory=list)
+    last: float | None = None
+    count: int = 0
+    total: float = 0.0
+    gaps: list[str] = field(default_factory=list)
+
+    def watch(self, block: Recording) -> None:
+        """Check a block's time against what came before, and note its gaps.
+
+        Raises
+        ------
+        DataError
+            There is no time column, or time stands still or runs backwards.
+        """
+        if "time" not in block:
+            raise DataError(f"{block.name}: no column time; found {' '.join(block.columns)}")
+        time = check_time(block)
+        if not len(time):
+            return
+        if self.last is not None and not time[0] > self.last:
+            raise DataError(
+                f"{block.name}: {block.place(0)}, column time: time runs backwards: expected more than "
+                f"{self.last:.15g} s, found {time[0]:.15g} s"
+            )
+        known = time if self.last is None else np.concatenate([[self.last], time])
+        step = np.diff(known)
+        if len(self.steps) < _TO_ESTIMATE:
+            self.steps += step[: _TO_ESTIMATE - len(self.steps)].tolist()
+        if self.steps:
+            longest = usual_step(np.array(self.steps))[1] if self.nominal is None else _GAP / self.nominal
+            wide = np.flatnonzero(step > longest)
+            for index in wide.tolist():
+                self.count += 1
+                self.total += float(step[index])
+                if len(self.gaps) < _MOST_NAMED:
+                    row = index + (0 if self.last is not None else 1)
+                    self.gaps.append(
+                        f"a gap of {step[index]:.6g} s before {block.place(row)} at {known[index + 1]:.6g} s"
+                    )
+        self.last = float(time[-1])
+
+    @property
+    def rate(self) -> float:
+        """Sampling rate, Hz: as given, or from the first steps of time; 100 while there are none."""
+        if self.nominal is not None:
+            return self.nominal
+        return 1 / usual_step(np.array(self.steps))[0] if self.steps else 100.0
+
+    @property
+    def settled(self) -> bool:
+        """Whether further blocks can no longer change `rate`."""
+        return self.nominal is not None or len(self.steps) >= _TO_ESTIMATE
+
+    def lines(self, name: str) -> list[str]:
+        """Return what there is to say of gaps."""
+        found = [f"{name}: {gap}" for gap in self.gaps]
+        if self.count > len(self.gaps):
+            found.append(
+                f"{name}: {self.count - len(self.gaps)} more gaps; {self.total:.6g} s in all {self.count} together"
+            )
+        return found
+
+
+def own_clocks(recording: Recording) -> dict[int, str]:
+    """Return the columns ``time_1 .. time_n`` in which elements have clocks of their own."""
+    found = {}
+    for name in recording.columns:
+        number = name.removeprefix("time_")
+        if number != name and number.isdecimal():
+            found[int(number)] = name
+    return found
+
+
+def to_one_clock(blocks: Iterable[Recording]) -> Iterator[Recording]:
+    """Interpolate elements with clocks of their own (columns ``time_i``) to the column ``time``, block by block.
+
+    Linear between an element's samples. Rows before an element's first sample or after its last are dropped.
+
+    Raises
+    ------
+    DataError
+        A clock stands still or runs backwards, or is more than half a second away from ``time``.
+    """
+    held: Recording | None = None
+    until = -np.inf  # time of the last row given out
+    for block in blocks:
+        clocks = own_clocks(block)
+        if not clocks:
+            yield block
+            continue
+        if "time" not in block:
+            raise DataError(f"{block.name}: columns time_1 .. but no column time; expected the clock to interpolate to")
+        joined = block if held is None else _join(held, block)
+        time, own = check_time(joined), _own_times(joined, clocks)
+        start, stop = max(t[0] for t in own.values()), min(t[-1] for t in own.values())
+        ready = np.flatnonzero((time > until) & (time >= start) & (time <= stop))
+        if ready.size:
+            until = float(time[ready[-1]])
+            yield _interpolated(joined, time[ready], own, clocks, ready)
+        keep = min(int(np.searchsorted(t, until, side="right")) - 1 for t in (*own.values(), time))
+        held = _rows(joined, np.arange(max(keep, 0), len(time)))
+
+
+def on_one_clock(recording: Recording) -> Recording:
+    """Return a whole recording with its elements interpolated to the column ``time``; errors as for `to_one_clock`.
+
+    Raises
+    ------
+    DataError
+        The clocks have no time in common.
+    """
+    for block in to_one_clock([recording]):
+        return block
+    raise DataError(f"{recording.name}: the clocks of the elements have no time in common with column time")
+
+
+def _join(first: Recording, second: Recording) -> Recording:
+    columns = {name: np.concatenate([values, second.columns[name]]) for name, values in first.columns.items()}
+    return replace(first, columns=columns)
+
+
+def _own_times(recording: Recording, clocks: dict[int, str]) -> dict[int, Array]:
+    own: dict[int, Array] = {}
+    time = recording.si("time")
+    for number, name in clocks.items():
+        check_finite(recording, [name])
+        own[number] = recording.si(name)
+        step = np.diff(own[number])
+        if step.size and step.min() <= 0:
+            place = recording.place(int(np.argmax(step <= 0)) + 1)
+            raise DataError(f"{recording.name}: {place}, column {name}: the clock runs backwards or stands still")
+        apart = np.abs(own[number] - time)
+        if apart.max() > _MOST_OFFSET:
+            index = int(np.argmax(apart))
+            raise DataError(
+                f"{recording.name}: {recording.place(index)}, column {name}: the clocks disagree: "
+                f"{own[number][index]:.9g} s where time is {time[index]:.9g} s; expected less than {_MOST_OFFSET} s "
+                "apart"
+            )
+    return own
+
+
+def _interpolated(
+    block: Recording, time: Array, own: dict[int, Array], clocks: dict[int, str], ready: np.ndarray
+) -> Recording:
+    columns = {name: values[ready] for name, values in block.columns.items() if name not in clocks.values()}
+    for name in columns:
+        stem, _, number = name.rpartition("_")
+        if stem.startswith("gyro") and number.isdecimal() and int(number) in own:
+            columns[name] = np.interp(time, own[int(number)], block.columns[name])
+    units = {name: block.units[name] for name in columns}
+    return replace(block, columns=columns, units=units, first_row=block.first_row + int(ready[0]))
+
+
+def _rows(block: Recording, index: np.ndarray) -> Recording:
+    columns = {name: values[index] for name, values in block.columns.items()}
+    return replace(block, columns=columns, first_row=block.first_row + (int(index[0]) if index.size else 0))
+
+
+# What happened to each gyro while an array was fused.
+
+
+NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, HELD, ALONE = (1 << bit for bit in range(8))
+"""Flags of a gyro in a sample, as the C core sets them."""
+_KINDS = (
+    (NON_FINITE, "non-finite"),
+    (STUCK, "stuck"),
+    (HELD, "held (end of its range?)"),
+    (JUMPED, "jumped"),
+    (EXCLUDED, "excluded"),
+)
+
+
+@dataclass
+class Event:
+    """How often a gyro was in one state, and when first: sample count, time, s."""
+
+    samples: int
+    first: float
+
+
+@dataclass
+class Health:
+    """Counts the flags of each gyro over the blocks of a recording."""
+
+    names: Sequence[Sequence[str]]
+    total: int = 0
+    lost: int = 0
+    few: int = 0
+    events: dict[tuple[int, int, str], Event] = field(default_factory=dict)
+
+    def watch(self, time: np.ndarray, flags: np.ndarray | None, rate: np.ndarray) -> list[tuple[int, int, str]]:
+        """Count the flags (m, axes, n) of a block; return what is new: axis, element and kind."""
+        self.total += len(time)
+        self.lost += int(np.isnan(rate).any(axis=1).sum())
+        new: list[tuple[int, int, str]] = []
+        if flags is None or not flags.any():
+            return new
+        self.few += int((flags & ALONE).any(axis=(1, 2)).sum()) - int(np.isnan(rate).any(axis=1).sum())
+        any_flag = np.bitwise_or.reduce(flags, axis=0)
+        for a, i in zip(*np.nonzero(any_flag), strict=True):
+            for bit, kind in _KINDS:
+                if not any_flag[a, i] & bit:
+                    continue
+                held = (flags[:, a, i] & bit) > 0
+                key = (int(a), int(i), kind)
+                event = self.events.get(key)
+                if event is None:
+                    self.events[key] = Event(int(held.sum()), float(time[int(np.argmax(held))]))
+                    new.append(key)
+                else:
+                    event.samples += int(held.sum())
+        return new
+
+    def first(self, key: tuple[int, int, str]) -> str:
+        """Return a line on the first time that a gyro was in a state."""
+        axis, element, kind = key
+        return f"{self.names[axis][element]}: {kind} at {self.events[key].first:.6g} s"
+
+    def stuck(self) -> set[str]:
+        """Return the columns of the gyros that were stuck at any time."""
+        return {self.names[a][i] for a, i, kind in self.events if kind == "stuck"}
+
+    def lines(self) -> list[str]:
+        """Return one line per gyro that was excluded, stuck, jumped or non-finite, and one where all were lost."""
+        found = []
+        gyros = sorted({(a, i) for a, i, _ in self.events})
+        for a, i in gyros:
+            parts = [
+                f"{kind} {_samples(event.samples)} from {event.first:.6g} s"
+                for _, kind in _KINDS
+                if (event := self.events.get((a, i, kind))) is not None
+            ]
+            found.append(f"{self.names[a][i]}: {'; '.join(parts)} (of {_samples(self.total)})")
+        if self.few > 0:
+            found.append(
+                f"fewer than three gyros left in {_samples(self.few)}: nothing to compare with, equal weights there"
+            )
+        if self.lost:
+            found.append(f"no gyro left in {_samples(self.lost)}: the output is nan there")
+        return found
+
+
+def _samples(count: int) -> str:
+    return f"{count} sample{'' if count == 1 else 's'}"
+
+
+# What readings say of an array before any alignment: dead gyros, mixed units, elements mounted otherwise.
+
+
+_FEWEST = 100  # samples
+_EVERY_ROW, _THINNED = 20_000, 16
+_FOLLOWS = 0.81
+"""Share of a gyro's variance that the first element must explain: a correlation of 0.9."""
+_ONE_AXIS = 0.8  # of what is explained
+_APART = 20.0
+_WITHIN = 8.0
+_FACTORS = {
+    180 / math.pi: "rad/s labelled deg/s, or the other way round",
+    3600.0: "deg/h labelled deg/s, or the other way round",
+    3600 * 180 / math.pi: "rad/s labelled deg/h, or the other way round",
+    1000.0: "thousandths, or the other way round",
+}
+_NEAR = 1.6
+_UNTURNED = "array calibrate --moving finds it, and --calibration puts it right"
+
+Map = tuple[tuple[int, int] | None, ...]
+"""For each axis of an element the axis of the reference that it reads and the sign, or None where nothing tells."""
+
+
+@dataclass
+class Checks:
+    """Watches the readings of an array, block by block."""
+
+    names: Sequence[Sequence[str]]
+    seen: int = 0
+    count: int = 0
+    moments: list[Array] = field(default_factory=list)
+    pivot: Array | None = None
+    last: Array | None = None
+    first: Array | None = None
+    still: np.ndarray | None = None
+    twins: list[tuple[int, int]] | None = None
+
+    def watch(self, readings: Array) -> None:
+        """Add readings, shape (m, axes, n); rows with a reading that is not finite do not count for the moments.
+
+        The moments are of every row of the first 20,000, and of every 16th after them.
+        """
+        rows, axes, n = readings.shape
+        if not rows:
+            return
+        flat = readings.reshape(rows, axes * n)
+        self._watch_still(flat)
+        self._watch_twins(flat, n)
+        number = np.arange(self.seen, self.seen + rows)
+        chosen = np.flatnonzero((number < _EVERY_ROW) | (number % _THINNED == 0))
+        self.seen += rows
+        if not chosen.size:
+            self.last = flat[-1]
+            return
+        before = flat[np.maximum(chosen - 1, 0)]
+        if chosen[0] == 0:
+            before[0] = np.nan if self.last is None else self.last
+        self.last = flat[-1]
+        part = flat[chosen]
+        fine = np.isfinite(part).all(axis=1)
+        part = part[fine]
+        step = part - before[fine]
+        if not len(part):
+            return
+        if self.pivot is None:
+            self.pivot = part[0]  # moments about it: a constant has none, to the last bit
+        part = part - self.pivot
+        step[~np.isfinite(step).all(axis=1)] = 0.0
+        found = [
+            part.sum(axis=0).reshape(axes, n),
+            np.einsum("mk,mk->k", part, part).reshape(axes, n),
+            (part.T @ part[:, ::n]).reshape(axes, n, axes),
+            np.einsum("mk,mk->k", step, step).reshape(axes, n),
+        ]
+        self.moments = [a + b for a, b in zip(self.moments, found, strict=True)] if self.moments else found
+        self.count += len(part)
+
+    def _watch_still(self, flat: Array) -> None:
+        """Keep the gyros that have read one number so far."""
+        if self.still is None or self.first is None:
+            self.still, self.first = np.ones(flat.shape[1], dtype=bool), np.full(flat.shape[1], np.nan)
+        for k in np.flatnonzero(self.still).tolist():
+            column = flat[np.isfinite(flat[:, k]), k]
+            if len(column):
+                self.first[k] = column[0] if np.isnan(self.first[k]) else self.first[k]
+                self.still[k] = bool((column == self.first[k]).all())
+
+    def _watch_twins(self, flat: Array, n: int) -> None:
+        """Keep the pairs of an axis that have read the same so far, by their places among the columns."""
+        if self.twins is None:
+            self.twins = [(i, j) for i in range(flat.shape[1]) for j in range(i + 1, (i // n + 1) * n)]
+        self.twins = [
+            (i, j)
+            for i, j in self.twins
+            if np.array_equal(flat[:1, i], flat[:1, j], equal_nan=True)
+            and np.array_equal(flat[:, i], flat[:, j], equal_nan=True)
+        ]
+
+    def lines(self, *, turned: bool = True, known: Collection[str] = ()) -> list[str]:
+        """Return what there is to say; of `turned` elements only if asked, and not of dead gyros `known` already."""
+        found = self.dead(known) + self.doubled() + self.units()
+        if turned:
+            found += [f"{line}: mounted the other way round? {_UNTURNED}" for line in self.turned()]
+        return found
+
+    def dead(self, known: Collection[str] = ()) -> list[str]:
+        """Return a line on gyros whose readings never change, and one on axes without any that do."""
+        if self.still is None or self.first is None or self.seen < _FEWEST:
+            return []
+        still = (self.still & np.isfinite(self.first)).reshape(len(self.names), -1)
+        found: list[str] = []
+        for row, dead in zip(self.names, still, strict=True):
+            named = [name for name, gone in zip(row, dead, strict=True) if gone]
+            if len(named) == len(row):
+                found.append(
+                    Bad(f"{_listed(named)}: no reading ever changes: all gyros are dead, and so is the result")
+                )
+            elif set(named) - set(known):
+                found.append(f"{' '.join(n for n in named if n not in known)}: no reading ever changes: a dead gyro")
+        return found
+
+    def doubled(self) -> list[str]:
+        """Return a line on gyros that read the same throughout: one that was logged twice counts twice."""
+        if self.still is None or self.first is None or self.seen < _FEWEST:
+            return []
+        flat = [name for row in self.names for name in row]
+        live = ~self.still
+        return [
+            Bad(f"{flat[i]} and {flat[j]} read the same throughout: one gyro, logged twice? It counts as two")
+            for i, j in self.twins or []
+            if live[i]
+        ]
+
+    def units(self) -> list[str]:
+        """Return a line where the readings of an axis fall into two groups of very different size."""
+        if self.count < _FEWEST:
+            return []
+        spread, explained = self._spread()
+        found: list[str] = []
+        for a, row in enumerate(self.names):
+            if len(row) < 2:
+                continue
+            moves = bool(np.median(explained[a]) > _FOLLOWS)
+            size = spread[a] if moves else np.sqrt(self.moments[3][a] / self.count)
+            alive = np.flatnonzero(size > 0)
+            order = alive[np.argsort(size[alive])]
+            ordered = np.log(size[order])
+            if len(order) < 2:
+                continue
+            cut = int(np.argmax(np.diff(ordered))) + 1
+            low, high = ordered[:cut], ordered[cut:]
+            if high[0] - low[-1] < math.log(_APART) or max(np.ptp(low), np.ptp(high)) > math.log(_WITHIN):
+                continue
+            ratio = math.exp(float(high.mean() - low.mean()))
+            likely = [text for factor, text in _FACTORS.items() if 1 / _NEAR < ratio / factor < _NEAR]
+            smaller, larger = (" ".join(row[i] for i in sorted(part.tolist())) for part in (order[:cut], order[cut:]))
+            what = "readings" if moves else "noise"
+            kind = Bad if moves or min(cut, len(order) - cut) > 1 else str
+            found.append(
+                kind(
+                    f"the {what} of {larger} is {ratio:.3g} times as large as that of {smaller}: another unit"
+                    f"{f' ({likely[0]})' if likely else ''} or another kind of gyro? Unlike units must not be fused"
+                )
+            )
+        return found
+
+    def turned(self) -> list[str]:
+        """Return a line for each way in which elements are mounted unlike the others, or wired."""
+        maps = self.maps()
+        if not maps:
+            return []
+        axes = len(self.names)
+        plain: Map = tuple((a, 1) for a in range(axes))
+        votes = Counter(found for found in maps if None not in found)
+        usual = max(votes, key=lambda found: (votes[found], found == plain), default=plain)
+        back = {found: (a, found[1]) for a, found in enumerate(usual) if found is not None}
+        origin = {axis: (a, sign) for (axis, sign), (a, _) in back.items()}
+        told: dict[Map, list[int]] = {}
+        for i, found in enumerate(maps):
+            seen: Map = tuple(None if one is None else (origin[one[0]][0], one[1] * origin[one[0]][1]) for one in found)
+            if any(one is not None and one != plain[a] for a, one in enumerate(seen)):
+                told.setdefault(seen, []).append(i)
+        others = "first gyro of the axis" if usual == plain else "other gyros of the axis"
+        lines = []
+        for seen, elements in told.items():
+            if axes == 1:
+                verb = "turns" if len(elements) == 1 else "turn"
+                lines.append(f"{' '.join(self.names[0][i] for i in elements)} {verb} against the {others}")
+                continue
+            numbers = " ".join(str(i + 1) for i in elements)
+            reads = ", ".join(
+                f"{'xyz'[a]} reads {'+' if one[1] > 0 else '-'}{'xyz'[one[0]]}"
+                for a, one in enumerate(seen)
+                if one is not None and one != plain[a]
+            )
+            against = "the first" if usual == plain else "most elements"
+            lines.append(
+                f"element{'s' * (len(elements) > 1)} {numbers} ({self.names[0][elements[0]]} ..): {reads} of {against}"
+                f"{_mirrored(seen)}"
+            )
+        return lines
+
+    def maps(self) -> list[Map]:
+        """Return for each element which axis of the first it reads on each of its own, where motion tells."""
+        if self.count < _FEWEST or not np.isfinite(self.moments[1]).all():
+            return []
+        axes, n = self.moments[0].shape
+        own, cross = self._covariance()
+        inner = own[:, 0]
+        weights = np.linalg.lstsq(_regular(cross[:, 0]), np.moveaxis(cross, 2, 0).reshape(axes, -1), rcond=None)[0]
+        weights = np.moveaxis(weights.reshape(axes, axes, n), 0, 2)
+        explained = np.einsum("aib,aib->ai", weights, cross)
+        shares = weights**2 * inner
+        found: list[Map] = []
+        for i in range(n):
+            row: list[tuple[int, int] | None] = []
+            for a in range(axes):
+                axis = int(np.argmax(shares[a, i]))
+                sure = (
+                    own[a, i] > 0
+                    and explained[a, i] > _FOLLOWS * own[a, i]
+                    and shares[a, i, axis] > _ONE_AXIS * shares[a, i].sum()
+                )
+                row.append((axis, 1 if weights[a, i, axis] > 0 else -1) if sure else None)
+            read = [one[0] for one in row if one is not None]
+            found.append(tuple(row) if len(set(read)) == len(read) else (None,) * axes)
+        return found
+
+    def _covariance(self) -> tuple[Array, Array]:
+        """Variance of each gyro, shape (axes, n), and covariance with the axes of element 1, (axes, n, axes)."""
+        mean, square, product = (moment / self.count for moment in self.moments[:3])
+        own = np.maximum(square - mean * mean, 0.0)
+        return own, product - mean[:, :, None] * mean[None, None, :, 0]
+
+    def _spread(self) -> tuple[Array, Array]:
+        """Standard deviation of each gyro, (axes, n), and share of the others that goes with an axis of element 1."""
+        own, cross = self._covariance()
+        both = own[:, :, None] * own[None, None, :, 0]
+        share = np.where(both > 0, cross**2 / np.where(both > 0, both, 1.0), 0.0).max(axis=2)
+        return np.sqrt(own), share[:, 1:]
+
+
+def _regular(matrix: Array) -> Array:
+    return matrix + 1e-9 * max(float(np.trace(matrix)), 1e-300) * np.eye(len(matrix))
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+
+
+def _mirrored(seen: Map) -> str:
+    """Say that a known map is left-handed."""
+    if any(one is None for one in seen):
+        return ""
+    matrix = np.zeros((len(seen), len(seen)))
+    for a, one in enumerate(seen):
+        if one is not None:
+            matrix[a, one[0]] = one[1]
+    return (
+        " (left-handed, which no mounting does: columns interchanged or reversed)" if np.linalg.det(matrix) < 0 else ""
+    )
+
+
+# Where an array is at rest: judged element by element, and by what all elements do together, however mounted.
+
+
+_WINDOW = 1.0  # s
+_FEWEST_WINDOWS = 12
+_SMALLEST_WINDOW = 8
+_QUIETEST = 0.1
+_QUIET_FACTOR = 3.0
+_STEP_NOISE = 0.29
+"""Standard deviation that rounding brings at least, in steps of the output."""
+_DRIFT = math.radians(1.0)
+"""How far the zero of a gyro at rest may wander within one recording, rad/s."""
+_SHORTEST = 5  # windows
+_TOGETHER = 10.0
+_ALIKE = 1.25
+_STEADY, _STEADY_SPREAD = math.radians(5.0), 0.1
+_LARGEST_ZERO = math.radians(100.0)
+_MOST_SAMPLES = 20_000
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A stretch at rest: first sample, last + 1, and what moved first outside of it ("" where it is everything)."""
+
+    start: int
+    stop: int
+    moved: str = ""
+
+
+def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name: str) -> Rest:
+    """Find the longest stretch in which an array is at rest.
+
+    A window of a second is quiet where the standard deviation of every gyro is at most 3 times that of its own quietest
+    windows (a tenth of all; rounding counts), and its mean within 1 deg/s of the median of the quiet ones. Then the
+    whole stretch is at rest unless its elements go together (`together`), or read a rate that no zero has.
+
+    Parameters
+    ----------
+    readings
+        Shape (m, axes, n), rad/s.
+    rate
+        Sampling rate, Hz.
+    names
+        Columns by axis and element, for messages.
+    name
+        The recording's name, for messages.
+
+    Raises
+    ------
+    DataError
+        No stretch of five windows is quiet, or the quiet one moves.
+    """
+    count, axes, n = readings.shape
+    size = max(_SMALLEST_WINDOW, min(round(_WINDOW * rate), count // _FEWEST_WINDOWS))
+    windows = readings[: count // size * size].reshape(-1, size, axes, n)
+    spread, mean = windows.std(axis=1), windows.mean(axis=1)
+    usual = np.quantile(spread, _QUIETEST, axis=0)
+    steps = np.array([[resolution(readings[:, a, i]) for i in range(n)] for a in range(axes)])
+    usual = np.maximum(usual, _STEP_NOISE * steps)
+    loud = spread > _QUIET_FACTOR * usual
+    calm = ~loud.any(axis=(1, 2))
+    centre = np.median(mean[calm] if calm.any() else mean, axis=0)
+    away = np.abs(mean - centre) > np.maximum(_DRIFT, _SHORTEST * usual / math.sqrt(size))
+    restless = loud | away
+    edges = np.diff(np.concatenate([[0], (~restless.any(axis=(1, 2))).astype(int), [0]]))
+    runs = np.flatnonzero(edges).reshape(-1, 2)
+    first, last = runs[int(np.argmax(runs[:, 1] - runs[:, 0]))].tolist() if len(runs) else (0, 0)
+    if last - first < _SHORTEST:
+        moves, ratio = common_motion(mean - mean.mean(axis=0), usual / math.sqrt(size))
+        if ratio > _TOGETHER:
+            raise DataError(_motion_message(name, moves, ratio))
+        raise DataError(
+            f"{name}: no stretch of {_SHORTEST * size / rate:.3g} s at rest: "
+            f"{_restless_message(restless, spread, mean - centre, names, size / rate)}; expected a recording at rest"
+        )
+    start, stop = first * size, count if last == len(windows) else last * size
+    _refuse_motion(readings[start:stop], mean[first:last], usual, size, names, name)
+    if (start, stop) == (0, count):
+        return Rest(0, count)
+    return Rest(start, stop, _restless_message(restless, spread, mean - centre, names, size / rate))
+
+
+def common_motion(off: Array, noise: Array) -> tuple[float, float]:
+    """Return how far the elements of an array go together, rms, and its ratio to what each does on its own.
+
+    The largest eigenvectors of the covariance, as many as there are axes, whitened by `noise`, hold what all elements
+    see of one motion, in whichever orientation and sense. A ratio that a quarter of the elements falls short of does
+    not count; neither does what elements share in unlike sizes, as they share a temperature.
+
+    Parameters
+    ----------
+    off
+        Readings or their means less their mean over time, shape (m, axes, n).
+    noise
+        Their standard deviation at rest, shape (axes, n).
+    """
+    count, axes, n = off.shape
+    scale = np.maximum(noise, 1e-300).reshape(-1)
+    flat = off.reshape(count, -1) / scale
+    _, vectors = np.linalg.eigh(flat.T @ flat)
+    shared = vectors[:, -axes:]
+    common = flat @ shared @ shared.T
+    seen = np.sqrt(np.mean(((common * scale).reshape(count, axes, n)) ** 2, axis=0).sum(axis=0) / axes)
+    apart = np.sqrt(np.mean((((flat - common) * scale).reshape(count, axes, n)) ** 2, axis=0).sum(axis=0) / axes)
+    low, high = np.quantile(seen, [0.25, 0.75])
+    if high > _ALIKE * low:
+        return float(np.median(seen)), 0.0
+    ratio = np.sort(seen / np.maximum(apart, 1e-300))[(n - 1) // 4]
+    return float(np.median(seen)), float(ratio)
+
+
+def _refuse_motion(
+    readings: Array, mean: Array, usual: Array, size: int, names: Sequence[Sequence[str]], name: str
+) -> None:
+    """Refuse a quiet stretch whose elements go together, or that turns steadily."""
+    slow = common_motion(mean - mean.mean(axis=0), usual / math.sqrt(size))
+    part = readings[: min(len(readings), _MOST_SAMPLES) // size * size]
+    blocks = part.reshape(-1, size, *part.shape[1:])
+    fast = common_motion((blocks - blocks.mean(axis=1, keepdims=True)).reshape(part.shape), usual)
+    moves, ratio = max(slow, fast, key=lambda found: found[1])
+    if ratio > _TOGETHER:
+        raise DataError(_motion_message(name, moves, ratio))
+    steady = readings.mean(axis=0)
+    rates = np.sqrt((steady**2).sum(axis=0))
+    low, middle, high = np.quantile(rates, [0.0, 0.5, 1.0])
+    if len(rates) > 2 and middle > _STEADY and high - low < _STEADY_SPREAD * middle:
+        raise DataError(
+            f"{name}: all elements read {math.degrees(middle):.3g} deg/s: the array turns steadily; expected a "
+            "recording at rest"
+        )
+    worst = np.unravel_index(int(np.argmax(np.abs(steady))), steady.shape)
+    if abs(steady[worst]) > _LARGEST_ZERO:
+        raise DataError(
+            f"{name}: column {names[int(worst[0])][int(worst[1])]}: {math.degrees(steady[worst]):.4g} deg/s on "
+            f"average, which is no zero (is the unit right?); expected less than {math.degrees(_LARGEST_ZERO):.0f} "
+            "deg/s at rest"
+        )
+
+
+def _motion_message(name: str, moves: float, ratio: float) -> str:
+    return (
+        f"{name}: the array moves: its elements go together by {math.degrees(moves):.3g} deg/s, {ratio:.0f} times what "
+        "they differ; expected a recording at rest"
+    )
+
+
+def _restless_message(
+    restless: np.ndarray, spread: Array, off: Array, names: Sequence[Sequence[str]], step: float
+) -> str:
+    """Name the gyro that moves most, its rate, and when, s from the beginning."""
+    reach = np.where(restless, np.hypot(spread, off), 0.0)
+    k, a, i = (int(index) for index in np.unravel_index(int(np.argmax(reach)), reach.shape))
+    return f"{names[a][i]} moves by {math.degrees(reach[k, a, i]):.3g} deg/s {k * step:.3g} s after the beginning"

@@ -1,0 +1,141 @@
+"""The gyro array in the registry: its options, its fit from files, and what its record gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from imulab.device import METHODS
+from imulab.errors import OptionError
+from imulab.procedures.procedure import (
+    READING,
+    Files,
+    Option,
+    Procedure,
+    Section,
+    Task,
+    file_option,
+    measure,
+    part_of,
+    read_options,
+    text_option,
+)
+from imulab.quantities import span
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from imulab.device.tables import DeviceTable, Fusion
+    from imulab.records.calibration import Calibration
+    from imulab.report.traces import Exhibits
+
+
+# A gyro array from a recording at rest and, if there is one, a recording in motion.
+
+
+def _fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.procedures.gyro_array.fit import calibrate_array
+
+    part = values["part"]
+    still = access.recording(files[0], values["layout"], **{**part, "window": values["interval"] or part["window"]})
+    moving = access.recording(files[1], values["layout"], **{**part, "window": None}) if len(files) > 1 else None
+    noise = None if values["noise"] is None else access.record(values["noise"])
+    return calibrate_array(
+        still, moving, averaging_time=values["averaging"], fusion=values["fusion"], noise=noise
+    ).calibration
+
+
+METHOD = text_option(
+    "method", "Method that fuse and export take from the record; robust if not given.", shows="METHOD", choices=METHODS
+)
+MEMORY = text_option(
+    "memory",
+    "Its memory: growing, growing:COUNT, or a gain between 0 and 1.",
+    shows="growing|growing:N|GAIN",
+    choices=("growing",),
+)
+OPTIONS = (
+    Option("interval", "The same as window, by its older name.", span, shows="FROM:TO"),
+    measure("averaging", "Averaging time of the covariance matrix, s.", "time", "s", "1 s", shows="TIME"),
+    METHOD,
+    MEMORY,
+    file_option("noise", "Noise record of the same gyros, for the uncertainties of the biases.", "RECORD"),
+    *READING,
+)
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.procedures.gyro_array.fuse import fusion_text
+
+    values = read_options(OPTIONS, texts, label)
+    if values["interval"] is not None and values["window"]:
+        names = label.format("interval"), label.format("window")
+        raise OptionError(f"{names[0]} together with {names[1]}: expected one of them, they say the same")
+    by = (values["method"], values["memory"])
+    fusion = None if by == (None, None) else fusion_text(*by, label)
+    return {**values, "fusion": fusion, "part": part_of(values)}
+
+
+TASK = Task(
+    files="STILL, or STILL;MOVING",
+    count=(1, 2),
+    options=OPTIONS,
+    values=_values,
+    fit=_fit,
+)
+
+
+# The array of gyroscopes that are fused into one rate, as the registry knows it.
+
+
+class ArraySection(Section):
+    """Biases, alignment and noise of the gyroscopes of an array, and how they are fused."""
+
+    kind = "array"
+    corrects = False
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.procedures.gyro_array.device import golden
+
+        return golden(table, random)
+
+
+class GyroArrayProcedure(Procedure):
+    """The array of gyroscopes that are fused into one rate."""
+
+    name = "gyro_array"
+    command = "array"
+    title = "Gyro array"
+    line_title = "Gyro array"
+    not_applied = "'imulab array fuse --calibration' takes it"
+    elsewhere = "{target} fuses no array of gyroscopes"
+    fuses = True
+    task = TASK
+    sections = (ArraySection(),)
+
+    def check(self, record: Calibration) -> None:
+        from imulab.procedures.gyro_array.schema import check
+
+        check(record)
+
+    def exhibits(self, record: Calibration) -> Exhibits:
+        from imulab.procedures.gyro_array.figures import exhibits
+
+        return exhibits(record)
+
+    def summary(self, record: Calibration) -> tuple[list[str], list[list[str]]]:
+        from imulab.procedures.gyro_array.figures import summary
+
+        return summary(record)
+
+    def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
+        from imulab.procedures.gyro_array.device import tables_of
+
+        return tables_of(record, fusion)
+
+    def fusion(self, record: Calibration, method: str | None, memory: str | None) -> Fusion:
+        from imulab.procedures.gyro_array.fuse import fusion_of_record
+
+        return fusion_of_record(record, method, memory)

@@ -1,0 +1,128 @@
+"""The noise of a unit in the registry: its options, its fit from files, and what its record gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from imulab.procedures.noise import COVARIATES, HORIZON, NO_COVARIATE, SAY_STEPS, STEPS, check_terms
+from imulab.procedures.procedure import (
+    ELEMENT,
+    READING,
+    Files,
+    Option,
+    Procedure,
+    Task,
+    choice,
+    measure,
+    names_of_columns,
+    part_of,
+    read_options,
+    source_of,
+)
+
+if TYPE_CHECKING:
+    from imulab.device.tables import DeviceTable, Fusion
+    from imulab.estimation.noise.rest import Rest
+    from imulab.procedures.procedure import Row
+    from imulab.recording import Recording
+    from imulab.records.calibration import Calibration
+    from imulab.records.comparison import Change
+    from imulab.report.traces import Exhibits
+
+
+# The noise of a unit, from logs at rest.
+
+
+def _fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.procedures.noise.fit import chosen_columns, fit_recordings, read_log
+
+    def read(name: str) -> Recording | Rest:
+        part = {"layout": values["layout"], **values["part"]}
+        return read_log(
+            None if name == "-" else access.path(name),
+            lambda: (access.blocks(name, **part), None),
+            lambda: access.recording(name, **part),
+            lambda first: chosen_columns(first, values["columns"]),
+        )
+
+    recordings = map(read, files)
+    sources = (source for name in files if (source := source_of(access, name)) is not None)
+    fit = {name: values[name] for name in ("terms", "horizon", "band", "regress", "columns", "steps")}
+    return fit_recordings(recordings, sources=sources, **fit).calibration
+
+
+OPTIONS = (
+    Option("terms", "Noises: auto, or letters of N B K G Q.", check_terms, "auto", "auto|NBK", ("auto",)),
+    measure(
+        "horizon",
+        f"Time that a filter predicts without aiding; {HORIZON:g} s if not given, or the length of a shorter log.",
+        "time",
+        "s",
+        shows="TIME",
+    ),
+    measure("band", "Highest frequency to use, Hz; found from the spectrum if not given.", "frequency", "Hz"),
+    choice("regress", "Take out what follows it.", (NO_COVARIATE, *COVARIATES), NO_COVARIATE),
+    Option("columns", "Columns to fit; all sensors if not given.", names_of_columns, shows="A,A,..."),
+    choice("steps", "Changes of level: say them, or remove them too.", STEPS, SAY_STEPS),
+    *READING,
+    ELEMENT,
+)
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.procedures.noise import check_options
+
+    values = read_options(OPTIONS, texts, label)
+    check_options(values["terms"], values["horizon"], values["band"], values["regress"], values["steps"], label)
+    return {**values, "part": part_of(values)}
+
+
+TASK = Task(files="its logs at rest", count=(1, None), options=OPTIONS, values=_values, fit=_fit)
+
+
+# The stochastic model of sensors at rest, as the registry knows it.
+
+
+class NoiseProcedure(Procedure):
+    """The stochastic model of sensors at rest."""
+
+    name = "noise"
+    command = "noise"
+    title = "Noise at rest"
+    line_title = "Noise"
+    not_applied = "it says how large the noise is, which no correction takes away; 'imulab export --noise' takes it"
+    elsewhere = "it holds no calibration; 'imulab noise fit --for' prints what filters want of it"
+    task = TASK
+
+    def check(self, record: Calibration) -> None:
+        from imulab.procedures.noise.schema import check
+
+        check(record)
+
+    def exhibits(self, record: Calibration) -> Exhibits:
+        from imulab.procedures.noise.figures import exhibits
+
+        return exhibits(record)
+
+    def rows(self, record: Calibration) -> Sequence[Row]:
+        from imulab.procedures.noise.schema import rows
+
+        return rows(record)
+
+    def change_unit(self, change: Change, record: Calibration) -> tuple[float, str]:
+        from imulab.procedures.noise.schema import change_unit
+
+        return change_unit(change, record)
+
+    def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
+        from imulab.procedures.noise.fit import no_tables
+
+        return no_tables(record)
+
+    def noise(self, record: Calibration) -> Mapping[str, Any]:
+        from imulab.procedures.noise.wants import for_export
+
+        return for_export(record)

@@ -1,0 +1,446 @@
+"""What a noise record holds, with types, and the units and coefficients in which people read and write noise."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, TypeAlias
+
+import numpy as np
+
+from imulab.errors import OptionError, RecordError, UnitError
+from imulab.estimation.noise.terms import NAMES, SIGMA, TIME
+from imulab.procedures.procedure import Row
+from imulab.quantities import in_si, split_quantity
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.records.comparison import Change
+from imulab.records.sections import Above0, Length, Part, Positive, Quantity, Size, part
+from imulab.records.sections import read as read_section
+from imulab.report.noise_figures import shown_unit
+from imulab.units import parse_unit, si_unit
+
+# What code reads of a noise record, with types.
+
+
+class Model(Part):
+    """``model``."""
+
+    terms: dict[str, str]
+    horizon: Above0
+
+
+class ForFilter(Part):
+    """One of ``fit.filter_white`` and ``fit.filter_walk``."""
+
+    value: Size
+    unit: str
+    interval_95: Annotated[list[Size], 2]
+
+
+class Values(Part):
+    """Several values with their unit."""
+
+    value: list[float]
+    unit: str
+
+
+class Bias(Part):
+    """One of ``fit.bias_uncertainty``."""
+
+    time: Values
+    standard_uncertainty: Values
+
+
+class Candidate(Part):
+    """One of ``fit.columns.NAME.candidates``."""
+
+    model: str
+    deviance: float
+    weight: Size
+    values: Annotated[list[Size], 8]
+
+
+class Line(Part):
+    """A line of the spectrum."""
+
+    frequency: Above0
+    amplitude: Length
+
+
+class Step(Part):
+    """A change of level."""
+
+    time: Length
+    size: Quantity
+
+
+class TestOfFit(Part):
+    """The test of fit."""
+
+    statistic: float
+    degrees_of_freedom: int
+    probability: Size
+
+
+class Drift(Part):
+    """How a column follows time or temperature."""
+
+    follows: str
+    slope: Quantity
+    significant: bool
+    removed: bool
+
+
+class Column(Part):
+    """One of ``fit.columns``."""
+
+    unit: str
+    interval: Above0
+    length: Above0
+    samples: int
+    spikes: int
+    lines: list[Line]
+    steps: list[Step]
+    full_band: bool
+    ripple: Size
+    shortest_time: Above0
+    test: TestOfFit
+    chosen: str
+    candidates: list[Candidate]
+    drifts: list[Drift]
+
+    @property
+    def values(self) -> list[float]:
+        """The parameters of the chosen candidate."""
+        return next(each.values for each in self.candidates if each.model == self.chosen)
+
+
+class Fit(Part):
+    """``fit``."""
+
+    horizon: Above0
+    sample_rate: Above0
+    length: Above0
+    logs: int
+    band: dict[str, Above0]
+    test: dict[str, Size]
+    filter_white: dict[str, ForFilter]
+    filter_walk: dict[str, ForFilter]
+    bias_uncertainty: dict[str, Bias]
+    columns: dict[str, Column]
+
+
+class Binned(Part):
+    """One of ``data.columns.NAME.spectra``."""
+
+    interval: Positive
+    count: int
+    first: Annotated[list[int], "bins"]
+    last: Annotated[list[int], "bins"]
+    power: Annotated[list[Size], "bins"]
+    freedom: Annotated[list[Size], "bins"]
+    counted: Annotated[list[Size], "bins"]
+    variance: Annotated[list[Positive], "bins"]
+
+
+class Allan(Part):
+    """``data.columns.NAME.allan``."""
+
+    tau: Annotated[list[Positive], "times"]
+    measured: Annotated[list[Size], "times"]
+    fitted: Annotated[list[Size], "times"]
+    low: Annotated[list[Size], "times"]
+    high: Annotated[list[Size], "times"]
+
+
+class Noise(Part):
+    """A noise record, its ``data`` apart, whose columns differ in length."""
+
+    model: Model
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What the figures of a column are drawn from."""
+
+    spectra: list[Binned]
+    allan: Allan
+
+
+def check(record: Calibration) -> None:
+    """Check the sections of a record as it is read from its file; raises RecordError."""
+    for name in part(record, Noise).fit.columns:
+        drawn_of(record, name)
+
+
+def fit_of(record: Calibration) -> Fit:
+    """Return the section ``fit``; a part that is wrong raises RecordError, one that is missing when it is read."""
+    return part(record, Fit, "fit")
+
+
+def drawn_of(record: Calibration, column: str) -> Drawn:
+    """Return what the figures of a column are drawn from.
+
+    Raises
+    ------
+    RecordError
+        The record lacks it, or its lists do not fit each other.
+    """
+    where = f"data.columns.{column}"
+    columns = record.data.get("columns")
+    held = columns.get(column) if isinstance(columns, Mapping) else None
+    if not isinstance(held, Mapping) or not isinstance(held.get("spectra"), Sequence) or not held["spectra"]:
+        raise RecordError(f"the record lacks {where}.spectra")
+    spectra = [read_section(Binned, each, f"{where}.spectra[{k}]") for k, each in enumerate(held["spectra"])]
+    for k, each in enumerate(spectra):
+        edges = list(zip(each.first, each.last, strict=True))
+        if any(not 1 <= low <= high < each.count for low, high in edges):
+            raise RecordError(f"{where}.spectra[{k}]: expected bins from 1 to {each.count - 1}")
+    return Drawn(spectra, read_section(Allan, held.get("allan"), f"{where}.allan"))
+
+
+# Noise coefficients as people write them: 0.3 deg/sqrt(h), 100 ug/sqrt(Hz), 5 deg/h, and so on.
+
+
+Markov: TypeAlias = str | tuple[float | str, float | str]
+"""Standard deviation and correlation time of a Gauss-Markov term: ``"20 deg/h:300 s"``, or the two of them."""
+EXAMPLES = {
+    "white": "0.3 deg/sqrt(h)",
+    "flicker": "5 deg/h",
+    "walk": "3 deg/h/sqrt(h)",
+    "quantisation": "1 arcsec",
+    "gm": "20 deg/h:300 s",
+}
+_LEVELS = ("rate", "acceleration", "output", "number")
+_INTEGRALS = {"m/s": ("m/s^2", 1.0), "mm/s": ("m/s^2", 1e-3)}
+_HOUR = math.sqrt(3600.0)
+# What follows the unit of a level, or of its integral, and the factor that it makes.
+_OF_LEVEL = {
+    "white": {"/sqrt(Hz)": 1.0},
+    "walk": {"/s/sqrt(Hz)": 1.0, "/sqrt(h)": 1 / _HOUR, "/sqrt(s)": 1.0},
+    "flicker": {"": 1.0},
+}
+_OF_INTEGRAL = {"white": {"/sqrt(h)": 1 / _HOUR, "/sqrt(s)": 1.0}, "quantisation": {"": 1.0}}
+_SPELLINGS = (
+    (re.compile(r"√\(?(Hz|hr?|s)\)?"), r"sqrt(\1)"),
+    (re.compile(r"sqrt\(hr\)"), "sqrt(h)"),
+    (re.compile(r"^(rad|deg)/s(?:\^2|²)/sqrt\(Hz\)$"), r"\1/s/s/sqrt(Hz)"),
+    (re.compile(r"^m/s(?:\^3|³)/sqrt\(Hz\)$"), "m/s^2/s/sqrt(Hz)"),
+)
+
+
+@dataclass(frozen=True)
+class GivenTerms:
+    """Noise that was given by its coefficients: SI, shape (8,) in the order of `NAMES`, and the unit of its level."""
+
+    values: Array
+    unit: str
+
+
+def given_terms(
+    unit: str,
+    *,
+    white: float | str | None,
+    flicker: float | str | None,
+    walk: float | str | None,
+    quantisation: float | str | None,
+    gm: Markov | Sequence[Markov] | None,
+) -> GivenTerms:
+    """Return noise given by coefficients; numbers are in SI, texts have units.
+
+    Parameters
+    ----------
+    unit
+        SI unit of the level where no text has one.
+    white, flicker, walk, quantisation
+        N, B, K, Q.
+    gm
+        One or two Gauss-Markov terms.
+
+    Raises
+    ------
+    OptionError
+        A coefficient cannot be read, is not above 0, or is of another kind of sensor; or there is none.
+    """
+    values = np.zeros(len(NAMES))
+    given: dict[str, float | str | None] = {
+        "white": white, "flicker": flicker, "walk": walk, "quantisation": quantisation,
+    }  # fmt: skip
+    levels: dict[str, str] = {}
+    for name, value in given.items():
+        if value is not None:
+            values[NAMES.index(name)], level = coefficient(value, name, name)
+            levels |= {} if level is None else {name: level}
+    for k, (sigma, time) in enumerate(_pairs(gm)):
+        values[SIGMA[k]], level = coefficient(sigma, "gm", "flicker")
+        values[TIME[k]] = in_si(time, "gm", "time", "s")
+        levels |= {} if level is None else {"gm": level}
+        if not 0 < values[TIME[k]] < math.inf:
+            raise OptionError(f"gm {time}: expected a correlation time above 0")
+    found = next(iter(levels.values()), unit)
+    for name, level in levels.items():
+        if level != found:
+            raise OptionError(f"{name}: noise of an output in {level}; expected that of one in {found}")
+    if not values.any():
+        options = " ".join(f"--{name}" for name in EXAMPLES)
+        raise OptionError(f'no noise is given: expected one of {options}, such as --white "{EXAMPLES["white"]}"')
+    return GivenTerms(values, found)
+
+
+def coefficient(value: float | str, option: str, term: str) -> tuple[float, str | None]:
+    """Return a coefficient in SI, and the SI unit of the level that it belongs to, None for a bare number.
+
+    Raises
+    ------
+    OptionError
+        It is none; the message gives an example.
+    """
+    unit: str | None = None
+    if isinstance(value, str):
+        number, text = split_quantity(value, option, EXAMPLES[term])
+        factor = 1.0
+        if text:
+            factor, unit = _unit(text, term, f"{option} {value!r}")
+        size = number * factor
+    else:
+        size = in_si(value, option, "", EXAMPLES[term])
+    if not 0 < size < math.inf:
+        raise OptionError(f"{option} {value}: expected more than 0")
+    return size, unit
+
+
+def _unit(text: str, term: str, called: str) -> tuple[float, str]:
+    """Factor to SI of a coefficient's unit, and the SI unit of the level."""
+    for pattern, instead in _SPELLINGS:
+        text = pattern.sub(instead, text)
+    for endings, read in ((_OF_LEVEL, _level), (_OF_INTEGRAL, _integral)):
+        for ending, factor in endings.get(term, {}).items():
+            if text.endswith(ending) and (found := read(text[: len(text) - len(ending)])):
+                return factor * found[0], found[1]
+    raise OptionError(f"{called}: expected a number with a unit such as {EXAMPLES[term]}")
+
+
+def _level(text: str) -> tuple[float, str] | None:
+    try:
+        unit = parse_unit(text)
+    except UnitError:
+        return None
+    return (unit.factor, si_unit(text)) if unit.quantity in _LEVELS else None
+
+
+def _integral(text: str) -> tuple[float, str] | None:
+    if text in _INTEGRALS:
+        level, factor = _INTEGRALS[text]
+        return factor, level
+    if text.endswith(" s") and (found := _level(text[:-2])):
+        return found
+    try:
+        unit = parse_unit(text)
+    except UnitError:
+        return None
+    return (unit.factor, "rad/s") if unit.quantity == "angle" else None
+
+
+def _pairs(gm: Markov | Sequence[Markov] | None) -> list[tuple[float | str, float | str]]:
+    alone = isinstance(gm, str) or (isinstance(gm, tuple) and len(gm) == 2 and not any(map(_is_pair, gm)))
+    several: Sequence[object] = [gm] if alone else list(gm or ())
+    pairs = []
+    for each in several:
+        parts = each.split(":") if isinstance(each, str) else each
+        if not isinstance(parts, list | tuple) or len(parts) != 2:
+            raise OptionError(f"gm {each!r}: expected standard deviation and time, such as {EXAMPLES['gm']}")
+        pairs.append((parts[0], parts[1]))
+    if len(pairs) > len(SIGMA):
+        raise OptionError(f"gm: expected at most {len(SIGMA)} Gauss-Markov terms, found {len(pairs)}")
+    return pairs
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, tuple | list) or (isinstance(value, str) and ":" in value)
+
+
+def by_name(values: Array) -> Mapping[str, float]:
+    """Return the terms that there are, SI, by the names of `NAMES`."""
+    return {name: float(value) for name, value in zip(NAMES, values, strict=True) if value}
+
+
+# The units in which people read noise: angle random walk in deg/sqrt(h), bias instability in deg/h, and so on.
+
+
+_ALLAN = {
+    "white": "angle_random_walk",
+    "flicker": "bias_instability",
+    "walk": "rate_random_walk",
+    "quantisation": "quantisation",
+}
+_LONGEST_FIRST = sorted([*NAMES, "ramp"], key=len, reverse=True)
+
+
+def shown(term: str, unit: str) -> tuple[float, str]:
+    """Return the factor from SI, and the unit, of a term of a column in `unit`; ``bias`` is a level of it."""
+    if term.endswith("_time"):
+        return 1.0, "s"
+    if term == "ramp":
+        level, name = shown("bias", unit)
+        return 3600.0 * level, f"{name}/h"
+    name, factor = shown_unit(unit, _ALLAN.get(term, "bias_instability"))
+    return factor, name
+
+
+def density(unit: str) -> tuple[float, str]:
+    """Return the factor from SI, and the unit, of a noise density as data sheets have it."""
+    if unit == "rad/s":
+        return 180 / math.pi, "deg/s/√Hz"
+    return (1e6 / 9.80665, "µg/√Hz") if unit == "m/s^2" else (1.0, f"{unit}/√Hz")
+
+
+def label(term: str, unit: str) -> str:
+    """Return what people call a term of a column in `unit`."""
+    accel = unit == "m/s^2"
+    names = {
+        "white": "velocity random walk" if accel else "angle random walk",
+        "flicker": "bias instability (1/f noise)",
+        "walk": "acceleration random walk" if accel else "rate random walk",
+        "quantisation": "quantisation",
+        "ramp": "ramp",
+        "gm1_sigma": "Gauss-Markov noise",
+        "gm1_time": "its correlation time",
+        "gm2_sigma": "second Gauss-Markov noise",
+        "gm2_time": "its correlation time",
+    }
+    return names[term]
+
+
+def split(name: str) -> tuple[str, str]:
+    """Return column and term of a parameter's name."""
+    for term in _LONGEST_FIRST:
+        if name.endswith(f"_{term}"):
+            return name[: -len(term) - 1], term
+    return name, ""
+
+
+def base_unit(record: Calibration, column: str) -> str:
+    """Return the SI unit of a column of a record."""
+    unit = record.parameter(f"{column}_white").unit
+    return unit.removesuffix("/sqrt(Hz)")
+
+
+def rows(record: Calibration) -> Sequence[Row]:
+    """Return the parameters of a record in the units in which people read them."""
+    found = []
+    for name, p in record.parameters.items():
+        column, term = split(name)
+        factor, unit = shown(term, base_unit(record, column)) if term else (1.0, p.unit)
+        u = p.standard_uncertainty
+        found.append(Row(name, p.value * factor, None if u is None else u * factor, unit))
+    return found
+
+
+def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
+    """Return the factor from SI and the unit in which people read the change of a parameter."""
+    column, term = split(change.name)
+    return shown(term, base_unit(record, column)) if term else (1.0, change.unit)

@@ -1,0 +1,171 @@
+"""The rate test in the registry: its options, its fit from files, and what its record gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from imulab.errors import OptionError
+from imulab.gravity import checked_latitude
+from imulab.procedures.procedure import (
+    ELEMENT,
+    READING,
+    Files,
+    Option,
+    Procedure,
+    Section,
+    Task,
+    choice,
+    file_option,
+    measure,
+    part_of,
+    read_options,
+    source_of,
+)
+from imulab.procedures.rate import MOUNTINGS, ORDERS, part_of_one, rates_of
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from imulab.device.tables import DeviceTable, Fusion
+    from imulab.device.unit import DeviceUnit
+    from imulab.procedures.procedure import Row
+    from imulab.recording import Recording
+    from imulab.records.calibration import Calibration
+    from imulab.records.comparison import Change
+    from imulab.report.traces import Exhibits
+
+
+# A rate test from its manifest, which names the recordings, or from one recording.
+
+
+OPTIONS = (
+    Option("rates", "Of the table, deg/s, in any order; for one recording without a column table_rate.", rates_of,
+           None, "R,R,..."),
+    choice("axis", "Body axis along the table axis, about which positive rates turn; for one recording.", MOUNTINGS,
+           "+z"),
+    choice("order", "Highest power of the rate in the model.", ORDERS, "auto"),
+    measure("latitude", "Of the place, deg, for the Earth's rate.", "angle", "deg", shows="DEG"),
+    Option("table_uncertainty", "Standard uncertainty that all rates have in common, such as 20ppm.",
+           part_of_one, None, "FRACTION"),
+    file_option("accel", "Tumble record of the unit, whose accelerometers tell the table axis.", "RECORD"),
+    file_option("prior", "Earlier record of the same gyroscopes, as prior knowledge.", "RECORD"),
+    *READING,
+    ELEMENT,
+)  # fmt: skip
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    return read_options(OPTIONS, texts, label)
+
+
+def _fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.procedures.rate.fit import fit_rate, fit_test
+    from imulab.procedures.rate.schema import load_test, refuse_folder
+
+    (name,) = files
+    part = part_of(values)
+    accel, prior = (None if values[key] is None else access.record(values[key]) for key in ("accel", "prior"))
+    if not name.lower().endswith(".toml"):
+        refuse_folder(access.path(name), name)
+        recording = access.recording(name, values["layout"], **part)
+        chosen = {key: values[key] for key in ("rates", "axis", "order", "latitude", "table_uncertainty")}
+        return fit_rate(recording, accel=accel, prior=prior, **chosen).calibration
+    if values["rates"] is not None or values["axis"] != "+z":
+        raise OptionError(
+            f"{name}: a manifest says the rates and axes of its runs; expected neither --rates nor --axis"
+        )
+    test = load_test(access.path(name), name)
+    if values["latitude"] is not None:
+        test = replace(test, latitude=checked_latitude(values["latitude"]))
+    if values["table_uncertainty"] is not None:
+        test = replace(test, relative_uncertainty=values["table_uncertainty"])
+    recordings = [access.recording(access.beside(name, run.file), values["layout"], **part) for run in test.runs]
+    record = fit_test(test, recordings, str(values["order"]), accel, prior).calibration
+    own = source_of(access, name)
+    return record if own is None else replace(record, sources=(own, *record.sources))
+
+
+TASK = Task(
+    files="the manifest of one test, or one recording",
+    count=(1, 1),
+    options=OPTIONS,
+    values=_values,
+    fit=_fit,
+)
+
+
+# The test of gyroscopes at known rates or by whole turns, as the registry knows it.
+
+
+class RateSection(Section):
+    """Bias, scale factor, misalignment and nonlinearity of gyroscopes."""
+
+    kind = "gyro"
+    triad = "gyro"
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.device.unit import golden_gyroscopes
+
+        return golden_gyroscopes(table, random)
+
+    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+        from imulab.procedures.rate.device import apply_rate
+
+        return apply_rate(unit, columns, recording)
+
+
+class RateProcedure(Procedure):
+    """The test of gyroscopes at known rates or by whole turns."""
+
+    name = "rate"
+    command = "rate"
+    title = "Gyroscopes at known rates"
+    line_title = "Rate"
+    elsewhere = "{target} wants accelerometers too, and a rate record holds gyroscopes alone"
+    joins = True
+    task = TASK
+    sections = (RateSection(),)
+
+    def check(self, record: Calibration) -> None:
+        from imulab.procedures.rate.schema import check
+
+        check(record)
+
+    def exhibits(self, record: Calibration) -> Exhibits:
+        from imulab.procedures.rate.figures import exhibits
+
+        return exhibits(record)
+
+    def joined(self, record: Calibration) -> Exhibits:
+        from imulab.procedures.rate.figures import exhibits_of_joined
+
+        return exhibits_of_joined(record)
+
+    def rows(self, record: Calibration) -> Sequence[Row]:
+        from imulab.procedures.rate.schema import rows
+
+        return rows(record)
+
+    def change_unit(self, change: Change, record: Calibration) -> tuple[float, str]:
+        from imulab.procedures.rate.schema import change_unit
+
+        return change_unit(change, record)
+
+    def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
+        from imulab.procedures.rate.device import tables_of
+
+        return tables_of(record)
+
+    def beyond(self, record: Calibration, recording: Recording) -> tuple[int, float]:
+        from imulab.device.tables import beyond_rates
+
+        return beyond_rates(record, recording)
+
+    def beyond_message(self, record: Calibration, count: int, largest: float) -> str:
+        from imulab.device.tables import beyond_message
+
+        return beyond_message(record, count, largest)

@@ -1,0 +1,471 @@
+"""What a rate test and its record hold.
+
+The manifest, the record's sections with types, and the units in which people read them.
+
+TOML; the keys are those of docs/rate.md. An unknown key is refused by name, so that a misspelt one does not pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+
+from imulab.errors import ReadError, RecordError, file_name, quoted
+from imulab.files import check_keys, load_toml, number_of, unit_of, value_and_unit
+from imulab.procedures.procedure import Row
+from imulab.procedures.rate import AXES, MOUNTINGS
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.records.comparison import Change
+from imulab.records.sections import Part, Quantity, Size, part
+from imulab.report.traces import ReportTable, format_uncertain
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit, to_si
+
+# What code reads of a rate record, with types.
+
+
+T = TypeVar("T")
+PerDwell = Annotated[list[T], "dwells"]
+PerTurn = Annotated[list[T], "turns"]
+
+
+class Model(Part):
+    """``model``."""
+
+    gyro_order: int
+    gyro_output_unit: str
+    axes: str
+    from_: str
+    largest_rate: Quantity
+
+
+class OfModel(Part):
+    """The part of a record that one of steps and one of turns share."""
+
+    model: Model
+
+
+class OfAxis(Part):
+    """One of ``fit.axes``."""
+
+    probability: Size
+    by_noise: Size
+    loop: Size | None
+    fitted_loop: float | None
+    fitted_loop_uncertainty: Size | None
+    repeatability: Size | None
+    repeatability_by_noise: Size | None
+    order: int
+    by_polynomial: Size
+    scatter: Size
+
+
+class Swept(Part):
+    """One of ``fit.sweeps``; s and Hz."""
+
+    file: str
+    axis: str
+    frequency: Size | None
+    delay: float
+    delay_uncertainty: Size
+    bandwidth: Size | None
+    bandwidth_uncertainty: Size | None
+    bandwidth_beyond: Size | None
+
+
+class OfPrior(Part):
+    """One parameter of ``fit.prior``: what the prior says of it, and the test without that."""
+
+    prior: Quantity
+    test: Quantity
+
+
+class Prior(Part):
+    """``fit.prior``."""
+
+    probability: Size | None
+    parameters: dict[str, OfPrior]
+
+
+class Fit(Part):
+    """``fit``."""
+
+    runs: int
+    dwells: int
+    rates_from: str
+    between_runs: Size
+    table_uncertainty: Size | None
+    rate_uncertainty: Quantity
+    mounting_uncertainty: Size | None
+    axes: dict[str, OfAxis]
+    sweeps: list[Swept]
+    prior: Prior
+
+
+class Seen(Part):
+    """``data.dwells``: of each its gyroscope, rate, rad/s, and what is left of the line, a fraction of the largest."""
+
+    axis: PerDwell[str]
+    rate: PerDwell[float]
+    residual: PerDwell[float]
+    standard_uncertainty: PerDwell[float]
+    direction: PerDwell[Literal["rising", "falling", "turning"]]
+
+
+class Data(Part):
+    """``data``."""
+
+    dwells: Seen
+
+
+class TurnsFit(Part):
+    """``fit`` of turns."""
+
+    turns: int
+    fence: Quantity
+    clock: Size | None
+    prior: Prior
+
+
+class Turned(Part):
+    """``data.turns``; angles in rad."""
+
+    axis: PerTurn[str]
+    start: PerTurn[float]
+    stop: PerTurn[float]
+    count: PerTurn[float]
+    angle: PerTurn[float]
+    residual: PerTurn[float]
+    standard_uncertainty: PerTurn[float]
+
+
+class TurnsData(Part):
+    """``data`` of turns."""
+
+    turns: Turned
+
+
+class Turns(Part):
+    """A record of turns."""
+
+    model: Model
+    fit: TurnsFit
+    data: TurnsData
+
+
+class Rate(Part):
+    """A rate record."""
+
+    model: Model
+    fit: Fit
+    data: Data
+
+
+def check(record: Calibration) -> None:
+    """Check the sections of a record as it is read from its file; raises RecordError."""
+    if record.model.get("from") == "turns":
+        part(record, Turns)
+    else:
+        part(record, Rate)
+    axes = model_of(record).axes
+    if not axes or any(axis not in AXES for axis in axes) or len(set(axes)) < len(axes):
+        raise RecordError(f"model.axes: expected axes such as xyz, found {axes!r}")
+
+
+def model_of(record: Calibration) -> Model:
+    """Return the model of a record of steps or of turns; errors as for `rate_of`."""
+    return part(record, OfModel).model
+
+
+def rate_of(record: Calibration) -> Rate:
+    """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
+    return part(record, Rate)
+
+
+def turns_of(record: Calibration) -> Turns:
+    """Return the sections of a record of turns; errors as for `rate_of`."""
+    return part(record, Turns)
+
+
+# The units in which people read a rate record: deg/h, ppm and mrad.
+
+
+_FIGURES = ("gyro_nonlinearity", "gyro_asymmetry", "gyro_hysteresis")
+
+
+def shown(name: str, unit: str) -> tuple[float, float, str]:
+    """Return the factor and offset from SI and the unit in which a parameter is read."""
+    if name.startswith("gyro_bias"):
+        return from_si(1.0, "deg/h"), 0.0, "deg/h"
+    if name.startswith("gyro_delay"):
+        return 1e3, 0.0, "ms"
+    if name.startswith("gyro_threshold"):
+        return from_si(1.0, "deg/s"), 0.0, "deg/s"
+    if name.startswith("gyro_g_sensitivity"):
+        return from_si(STANDARD_GRAVITY, "deg/h"), 0.0, "deg/h/g"
+    if name.startswith("gyro_misalignment"):
+        return 1e3, 0.0, "mrad"
+    if name.startswith(_FIGURES):
+        return 1e6, 0.0, "ppm"
+    if name.startswith("gyro_scale_factor_slope"):
+        return 1e6, 0.0, "ppm/K"
+    if name.startswith("gyro_scale_factor"):
+        nominal = parse_unit(unit.removesuffix("/(rad/s)"))
+        if nominal.quantity == "rate":
+            return 1e6 * nominal.factor, -1e6, "ppm off nominal"
+    return 1.0, 0.0, unit
+
+
+def rows(record: Calibration) -> list[Row]:
+    """Return the parameters in the units in which people read them."""
+    found = []
+    for name, p in record.parameters.items():
+        factor, offset, unit = shown(name, p.unit)
+        u = p.standard_uncertainty
+        found.append(Row(name, p.value * factor + offset, None if u is None else u * factor, unit))
+    return found
+
+
+def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
+    """Return the factor from SI and the unit in which the change of a parameter is read."""
+    factor, offset, unit = shown(change.name, change.unit)
+    return factor, "ppm" if offset else unit
+
+
+def prior_table(prior: Prior, record: Calibration) -> ReportTable:
+    """Return what the prior, the test without it, and both as one fit say of each parameter."""
+    found = []
+    for name, of in prior.parameters.items():
+        factor, offset, unit = shown(name, of.test.unit)
+        texts: list[str] = []
+        for one in (of.prior, of.test, record.parameter(name)):
+            u = one.standard_uncertainty
+            texts.append(" ± ".join(format_uncertain(one.value * factor + offset, None if u is None else u * factor)))
+        found.append([name, *texts, unit])
+    chance = "" if prior.probability is None else f" Probability of such differences: {prior.probability:.2g}."
+    return ReportTable(
+        "The earlier record and this test",
+        "Each alone, and both as one fit, the result, ± standard uncertainties. What all rates of one table, or "
+        f"one clock, have in common does not fall with a second test.{chance}",
+        ["parameter", "earlier", "this test", "both", "unit"],
+        found,
+    )
+
+
+# The manifest of a rate test: which file was recorded with which body axis along the table's, at which rates.
+
+
+_KEYS = ("rates", "mounting", "latitude", "sensor", "run")
+_RATES = 'rates = { unit = "deg/s", relative_standard_uncertainty = 1e-4 }'
+_FILL_IN = {
+    "relative_uncertainty": "# rates.relative_standard_uncertainty = 1e-4  # fill in: of the table, common to all "
+    "rates, such as 1e-5 to 1e-4",
+    "mounting_uncertainty": '# mounting = { standard_uncertainty = 0.3, unit = "mrad" }  # fill in: of the table axis '
+    "across each face, such as 0.1 to 1 mrad; not used with --accel",
+    "latitude": '# latitude = { value = 48.1, unit = "deg" }  # fill in: else the Earth\'s rate stays in the bias',
+}
+_MOUNTING = 'mounting = { standard_uncertainty = 0.3, unit = "mrad" }'
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording: the body axis along the table's (``+z``), the rates of the table, rad/s, None if recorded.
+
+    And whether the rate changes all the time, which is found out where it is not said.
+    """
+
+    file: str
+    mounting: str
+    rates: tuple[float, ...] | None = None
+    sweep: bool = False
+
+    @property
+    def axis(self) -> int:
+        """Number of the body axis along the table's."""
+        return AXES.index(self.mounting[1])
+
+    @property
+    def sign(self) -> int:
+        """1 where that axis points up, -1 where it points down."""
+        return 1 if self.mounting[0] == "+" else -1
+
+
+@dataclass(frozen=True)
+class RateTest:
+    """A rate test as it was run.
+
+    Attributes
+    ----------
+    runs
+        A recording each.
+    relative_uncertainty
+        Standard uncertainty that all rates have in common, a fraction; None where the manifest does not say.
+    rate_uncertainty
+        Of each commanded rate, the same at every visit, rad/s.
+    proportional_uncertainty
+        Likewise, and beside it, a fraction of that rate.
+    mounting_uncertainty
+        Of the table axis across each face, rad; None where the manifest does not say.
+    latitude
+        rad; None where the manifest does not say.
+    """
+
+    runs: tuple[Run, ...]
+    relative_uncertainty: float | None = None
+    rate_uncertainty: float = 0.0
+    mounting_uncertainty: float | None = None
+    latitude: float | None = None
+    sensor: Mapping[str, str] = field(default_factory=dict)
+    name: str = "test"
+    proportional_uncertainty: float = 0.0
+
+    def spread_of(self, rate: Array) -> Array:
+        """Return the standard uncertainty of commanded rates beside what all have in common, rad/s, shape (n,).
+
+        A table that stands still has none.
+        """
+        return np.where(rate == 0, 0.0, np.hypot(self.rate_uncertainty, self.proportional_uncertainty * rate))
+
+    def place(self, index: int) -> str:
+        """Return how messages name run `index`, counted from 0."""
+        run = self.runs[index]
+        return f"{run.file} ({run.mounting} along the table axis)"
+
+
+def load_test(path: str | Path, name: str | None = None) -> RateTest:
+    """Read a manifest; `name` is what messages call it.
+
+    Raises
+    ------
+    ReadError
+        The file is missing, is not TOML, or has a key or value that a manifest cannot have.
+    UnitError
+        A unit is unknown or of another quantity.
+    """
+    name = name or str(file_name(path))
+    table = load_toml(path, name, "manifest")
+    check_keys(table, _KEYS, name)
+    rates = table.get("rates", {"unit": "deg/s"})
+    if not isinstance(rates, dict) or "unit" not in rates:
+        raise ReadError(f"{name}: rates: expected {_RATES}, found {quoted(rates)}")
+    sizes = ("relative_standard_uncertainty", "standard_uncertainty", "proportional_standard_uncertainty")
+    check_keys(rates, ("unit", *sizes), f"{name}: rates")
+    unit = unit_of(rates["unit"], "rate", f"{name}: rates")
+    relative, each, part = (None if key not in rates else _size(rates[key], f"{name}: rates: {key}") for key in sizes)
+    entries = table.get("run")
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise ReadError(f"{name}: run: expected tables [[run]], one for each file")
+    sensor = table.get("sensor", {})
+    if not isinstance(sensor, dict) or not all(isinstance(value, str | int | float) for value in sensor.values()):
+        raise ReadError(f'{name}: sensor: expected texts such as serial = "SN42"')
+    return RateTest(
+        runs=tuple(_run(entry, f"{name}: run {number}", unit) for number, entry in enumerate(entries, 1)),
+        relative_uncertainty=relative,
+        rate_uncertainty=to_si(each or 0.0, unit),
+        mounting_uncertainty=_mounting(table.get("mounting"), f"{name}: mounting"),
+        latitude=_latitude(table.get("latitude"), f"{name}: latitude"),
+        sensor={key: str(value) for key, value in sensor.items()},
+        name=name,
+        proportional_uncertainty=part or 0.0,
+    )
+
+
+def refuse_folder(path: Path, name: str) -> None:
+    """Refuse a folder that holds a manifest, which says what its recordings are.
+
+    Raises
+    ------
+    ReadError
+        See above; the message names the manifest.
+    """
+    found = sorted(path.glob("*.toml")) if path.is_dir() else []
+    if found:
+        raise ReadError(
+            f"{name}: expected a manifest or one recording, found a folder; name its manifest: "
+            f"{' or '.join(str(Path(name) / one.name) for one in found)}"
+        )
+
+
+def _size(value: Any, place: str) -> float:
+    found = number_of(value, place)
+    if found < 0:
+        raise ReadError(f"{place}: expected 0 or more, found {value!r}")
+    return found
+
+
+def _mounting(entry: Any, place: str) -> float | None:
+    if entry is None:
+        return None
+    if not isinstance(entry, dict) or set(entry) != {"standard_uncertainty", "unit"}:
+        raise ReadError(f"{place}: expected {_MOUNTING}, found {quoted(entry)}")
+    unit = unit_of(entry["unit"], "angle", place)
+    return to_si(_size(entry["standard_uncertainty"], place), unit)
+
+
+def _latitude(entry: Any, place: str) -> float | None:
+    if entry is None:
+        return None
+    value, unit = value_and_unit(entry, place, 'latitude = { value = 48.1, unit = "deg" }')
+    found = to_si(value, unit_of(unit, "angle", place))
+    if abs(found) > math.pi / 2:
+        raise ReadError(f"{place}: expected -90 to 90 deg, found {value:g} {unit}")
+    return found
+
+
+def _run(entry: Mapping[str, Any], place: str, unit: str) -> Run:
+    file, mounting, rates = entry.get("file"), entry.get("mounting"), entry.get("rates")
+    if not isinstance(file, str) or not file:
+        raise ReadError(f'{place}: expected file = "NAME.csv", found {quoted(file)}')
+    check_keys(entry, ("file", "mounting", "rates", "sweep"), f"{place} ({file})")
+    if mounting not in MOUNTINGS:
+        raise ReadError(f"{place} ({file}): mounting: expected one of {' '.join(MOUNTINGS)}, found {quoted(mounting)}")
+    sweep = entry.get("sweep", False)
+    if not isinstance(sweep, bool) or (sweep and rates is not None):
+        raise ReadError(
+            f"{place} ({file}): sweep: expected true or false, and no rates beside true, found {quoted(sweep)}"
+        )
+    if rates is None:
+        return Run(file, str(mounting), sweep=sweep)
+    if not isinstance(rates, list) or len(set(map(str, rates))) < 2:
+        raise ReadError(f"{place} ({file}): rates: expected a list of two rates or more, found {quoted(rates)}")
+    numbers = tuple(to_si(number_of(rate, f"{place} ({file}): rates"), unit) for rate in rates)
+    return Run(file, str(mounting), numbers)
+
+
+def manifest_text(test: RateTest, comments: Sequence[str] = (), to_fill_in: bool = False) -> str:
+    """Return the manifest of a test as TOML, rates in deg/s, under lines of comment.
+
+    What the test does not state is left out, or `to_fill_in` behind a ``#``, with a usual size.
+    """
+    parts = ['unit = "deg/s"']
+    if test.relative_uncertainty is not None:
+        parts.append(f"relative_standard_uncertainty = {test.relative_uncertainty!r}")
+    if test.rate_uncertainty:
+        parts.append(f"standard_uncertainty = {from_si(test.rate_uncertainty, 'deg/s'):.9g}")
+    if test.proportional_uncertainty:
+        parts.append(f"proportional_standard_uncertainty = {test.proportional_uncertainty!r}")
+    # a key a line, since TOML lets no inline table go over several, and one can be filled in alone
+    lines = [*(f"# {comment}" for comment in comments), *(f"rates.{part}" for part in parts)]
+    if to_fill_in and test.relative_uncertainty is None:
+        lines.append(_FILL_IN["relative_uncertainty"])
+    if test.mounting_uncertainty is not None:
+        lines.append(f'mounting = {{ standard_uncertainty = {1e3 * test.mounting_uncertainty:.9g}, unit = "mrad" }}')
+    elif to_fill_in:
+        lines.append(_FILL_IN["mounting_uncertainty"])
+    if test.latitude is not None:
+        lines.append(f'latitude = {{ value = {from_si(test.latitude, "deg"):.9g}, unit = "deg" }}')
+    elif to_fill_in:
+        lines.append(_FILL_IN["latitude"])
+    for run in test.runs:
+        lines += ["", "[[run]]", f'file = "{run.file}"', f'mounting = "{run.mounting}"']
+        if run.rates is not None:
+            listed_rates = ", ".join(f"{from_si(rate, 'deg/s'):.9g}" for rate in run.rates)
+            lines.append(f"rates = [{listed_rates}]")
+        if run.sweep:
+            lines.append("sweep = true")
+    return "\n".join(lines) + "\n"

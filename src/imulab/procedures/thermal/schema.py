@@ -1,0 +1,299 @@
+"""What a thermal record holds, with types, and the units in which people read it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeVar
+
+from imulab.errors import RecordError
+from imulab.procedures.procedure import Row
+from imulab.procedures.thermal.model import Laws
+from imulab.records.calibration import Calibration
+from imulab.records.comparison import Change
+from imulab.records.sections import Length, Part, Positive, Quantity, Size, part
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+# What code reads of a thermal record, with types.
+
+
+T = TypeVar("T")
+PerHold = Annotated[list[T], "holds"]
+PerGyroHold = Annotated[list[T], "holds of gyroscopes"]
+PerCalibration = Annotated[list[T], "calibrations"]
+Three = Annotated[list[T], 3]
+Nine = Annotated[list[T], 9]
+
+
+class Gravity(Part):
+    """``model.gravity``."""
+
+    value: Positive
+    unit: str
+
+
+class Kinds(Part):
+    """``model.degrees``: of the laws of each kind of parameter."""
+
+    bias: int
+    scale_factor: int
+    misalignment: int
+
+    @property
+    def each(self) -> tuple[int, int, int]:
+        """In the order of the kinds."""
+        return self.bias, self.scale_factor, self.misalignment
+
+
+class GyroDegrees(Part):
+    """``model.gyro.degrees``."""
+
+    bias: int
+    scale_factor: int
+
+
+class GyroModel(Part):
+    """``model.gyro``: the unit of the gyroscopes' outputs, the degrees of their laws, and what else was fitted.
+
+    The knots of their biases are in degC, None where these are polynomials.
+    """
+
+    output_unit: str
+    degrees: GyroDegrees
+    g_sensitivity: bool
+    scale: Literal["nominal", "turns"]
+    knots: list[float] | None = None
+
+
+class Model(Part):
+    """``model``; the range of temperature and the knots of the bias in degC, None where it is a polynomial."""
+
+    order: int
+    degrees: Kinds
+    range: Annotated[list[float], 2]
+    reference_temperature: Quantity
+    gravity: Gravity
+    output_unit: str
+    knots: list[float] | None = None
+    gyro: GyroModel | None = None
+
+    @property
+    def laws(self) -> Laws:
+        """The laws of the accelerometers."""
+        return Laws(self.range[0], self.range[1], self.degrees.each, tuple(self.knots or ()))
+
+    @property
+    def gyro_laws(self) -> Laws:
+        """The laws of the gyroscopes' biases and scale factors."""
+        assert self.gyro is not None
+        degrees = self.gyro.degrees.bias, self.gyro.degrees.scale_factor, 0
+        return Laws(self.range[0], self.range[1], degrees, tuple(self.gyro.knots or ()))
+
+
+class LeftOut(Part):
+    """One row of ``fit.left_out_temperature``: degC, and rms in m/s^2."""
+
+    temperature: float
+    holds: int
+    rms: Size
+    chi_square: Size
+
+
+class Degrees(Part):
+    """One row of ``fit.degrees``."""
+
+    degrees: Three[int]
+    left_out: Size | None
+    probability: float | None
+    chosen: bool
+    knots: int = 0
+
+
+class TurnOn(Part):
+    """``fit.between_recordings``: what biases and scale factors move by from one power cycle to the next.
+
+    `from_` says how that is known: ``recordings``, ``argument``, ``unknown``, or ``polynomials``, an upper bound.
+
+    `resolution` is the standard uncertainty of one such offset; None in records that do not say it.
+    """
+
+    bias: Length
+    scale_factor: Length
+    rank: int
+    from_: str
+    resolution: Length | None = None
+
+
+class Tested(Quantity):
+    """``fit.lag`` in s, ``fit.loop_x`` ...: a value, its probability if there were none, whether the laws hold it."""
+
+    probability: float
+    fitted: bool
+
+
+class GyroTurnOn(Part):
+    """``fit.gyro.between_recordings``: what biases move by from one power cycle to the next, known as in `TurnOn`."""
+
+    bias: Length
+    rank: int
+    from_: str
+    resolution: Length | None = None
+
+
+class GyroTurns(Part):
+    """``fit.gyro.turns``: of how many recordings, what they miss the direction of gravity by (rms), how they agree."""
+
+    recordings: int
+    turns: int
+    rms: Length
+    chi_square: Size
+    degrees_of_freedom: int
+
+
+class GyroFit(Part):
+    """``fit.gyro``; rms in rad/s, as those of temperatures left out."""
+
+    holds: int
+    rms: Length
+    excess: Length
+    between_recordings: GyroTurnOn
+    left_out_temperature: list[LeftOut]
+    g_sensitivity_probability: float | None = None
+    latitude: float | None = None
+    turns: GyroTurns | None = None
+    lag: Tested | None = None
+    loop_x: Tested | None = None
+    loop_y: Tested | None = None
+    loop_z: Tested | None = None
+
+
+class Fit(Part):
+    """``fit``."""
+
+    recordings: int
+    holds: int
+    temperatures: int
+    rms: Length
+    excess: Length
+    between_recordings: TurnOn
+    left_out_temperature: list[LeftOut]
+    degrees: list[Degrees]
+    lag: Tested | None = None
+    loop_x: Tested | None = None
+    loop_y: Tested | None = None
+    loop_z: Tested | None = None
+    gyro: GyroFit | None = None
+
+
+class Held(Part):
+    """``data.holds``: of each its recording, temperature, degC, its change, K/s, and what is left of |f| - g."""
+
+    recording: PerHold[str]
+    temperature: PerHold[float]
+    rate: PerHold[float]
+    residual: PerHold[float]
+    standard_uncertainty: PerHold[float]
+
+
+class GyroHeld(Part):
+    """``data.gyro``: of each hold its temperature, degC, its change, K/s, and what is left of the rates, rad/s."""
+
+    recording: PerGyroHold[str]
+    temperature: PerGyroHold[float]
+    rate: PerGyroHold[float]
+    residual: PerGyroHold[Three[float]]
+
+
+class Own(Part):
+    """``data.calibrations``: the nine parameters that each steady recording gives alone, SI, at its temperature, degC.
+
+    In the order of bias, scale factor and misalignment, as in the record's parameters.
+    """
+
+    recording: PerCalibration[str]
+    temperature: PerCalibration[float]
+    values: PerCalibration[Nine[float]]
+    standard_uncertainty: PerCalibration[Nine[float]]
+
+
+class Data(Part):
+    """``data``."""
+
+    holds: Held
+    calibrations: Own | None = None
+    gyro: GyroHeld | None = None
+
+
+class Thermal(Part):
+    """A thermal record."""
+
+    model: Model
+    fit: Fit
+    data: Data
+
+
+def check(record: Calibration) -> None:
+    """Check the sections of a record as it is read from its file; raises RecordError."""
+    found = part(record, Thermal)
+    low, high = found.model.range
+    if not low < high:
+        raise RecordError(f"model.range: expected two temperatures in rising order, found {low:g} and {high:g}")
+    _check_knots(found.model, found.model, "model")
+    if found.model.gyro is not None:
+        _check_knots(found.model, found.model.gyro, "model.gyro")
+
+
+def _check_knots(model: Model, own: Model | GyroModel, where: str) -> None:
+    """Check the knots of the biases of a triad, if they have any."""
+    (low, high), knots = model.range, own.knots
+    if knots is None:
+        return
+    if not (len(knots) > 2 and [low, high] == [knots[0], knots[-1]] and sorted(set(knots)) == knots):
+        raise RecordError(
+            f"{where}.knots: expected three temperatures or more in rising order, from {low:g} to {high:g}, the ends "
+            f"of the range; found {' '.join(f'{knot:g}' for knot in knots)}"
+        )
+    if own.degrees.bias != 3:
+        raise RecordError(f"{where}.degrees.bias: expected 3 of a spline, found {own.degrees.bias}")
+
+
+def thermal_of(record: Calibration) -> Thermal:
+    """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
+    return part(record, Thermal)
+
+
+# The units in which people read a thermal record: mg, ppm, mrad, and what each changes by in a kelvin.
+
+
+def shown(name: str, unit: str) -> tuple[float, float, str]:
+    """Return the factor and offset from SI and the unit in which a coefficient is read."""
+    kelvin = unit[unit.index("/K") :] if "/K" in unit else ""
+    if name.startswith("bias"):
+        return (1e6 if kelvin else 1e3) / STANDARD_GRAVITY, 0.0, ("µg" if kelvin else "mg") + kelvin
+    if name.startswith("gyro_bias"):
+        return from_si(1.0, "deg/h" if kelvin else "deg/s"), 0.0, ("deg/h" if kelvin else "deg/s") + kelvin
+    if name.startswith(("scale_factor", "gyro_scale_factor")):
+        of = "/(rad/s)" if name.startswith("gyro") else "/(m/s^2)"
+        nominal = parse_unit(unit.removesuffix(kelvin).removesuffix(of))
+        if nominal.quantity in ("acceleration", "rate"):
+            own = 1e6 * nominal.factor
+            return (own, 0.0, "ppm" + kelvin) if kelvin else (own, -1e6, "ppm off nominal")
+    if name.startswith("gyro_g_sensitivity"):
+        return from_si(1.0, "deg/h") * STANDARD_GRAVITY, 0.0, "deg/h/g"
+    if name.startswith(("misalignment", "gyro_misalignment")):
+        return (1e6 if kelvin else 1e3), 0.0, ("µrad" if kelvin else "mrad") + kelvin
+    return 1.0, 0.0, unit
+
+
+def rows(record: Calibration) -> list[Row]:
+    """Return the coefficients in the units in which people read them."""
+    found = []
+    for name, p in record.parameters.items():
+        factor, offset, unit = shown(name, p.unit)
+        u = p.standard_uncertainty
+        found.append(Row(name, p.value * factor + offset, None if u is None else u * factor, unit))
+    return found
+
+
+def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
+    """Return the factor from SI and the unit in which the change of a coefficient is read."""
+    factor, offset, unit = shown(change.name, change.unit)
+    return factor, "ppm" if offset else unit

@@ -1,0 +1,556 @@
+"""Fresh attitudes against a record, to test whether it still holds, and how that is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab._version import VERSION
+from imulab.columns import triad
+from imulab.display import Bad, Note, verdict_of
+from imulab.errors import OptionError, RecordError
+from imulab.estimation.least_squares import chi_square_probability
+from imulab.estimation.rows import median
+from imulab.gravity import Gravity, at_place, local_gravity
+from imulab.procedures.result import Drawn, Record, as_record
+from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
+from imulab.procedures.tumble.checks import check_fresh, made_from
+from imulab.procedures.tumble.device import output_factor
+from imulab.procedures.tumble.mag.check import FEWEST, MagCheck, check_mag
+from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
+from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED, contradiction, known_of
+from imulab.procedures.tumble.prior import scatter as prior_scatter
+from imulab.procedures.tumble.record import Scaling, micro_g, scaled_parameters, small_g
+from imulab.procedures.tumble.schema import attitudes_of, fit_of, model_of
+from imulab.quantities import in_si
+from imulab.reading import Reading
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.report import render_page
+from imulab.report.traces import (
+    BAD,
+    GOOD,
+    QUIET,
+    Exhibits,
+    Figure,
+    ReportTable,
+    bulk,
+    edge_marks,
+    edge_note,
+    figure_axis,
+    format_uncertain,
+    rounded,
+    scatter,
+)
+
+# Fresh attitudes against a record, to test whether it still holds.
+
+
+@dataclass(frozen=True, repr=False)
+class Check(Drawn):
+    """How well a record still holds.
+
+    Attributes
+    ----------
+    residuals
+        ``|f| - g`` of each attitude under the record, m/s^2, shape (n,).
+    standard_uncertainty
+        Of each, from the record's covariance and the attitude's noise, m/s^2, shape (n,); None where the record states
+        no uncertainties.
+    chi_square
+        ``r' (J V J' + C)^-1 r``, with as many degrees of freedom as attitudes; None likewise.
+    probability
+        Of so large a value, did the record hold; None likewise.
+    gravity
+        That was used.
+    limit
+        Largest ``| |f| - g |`` that passes, m/s^2; None: the test alone decides.
+    notes
+        What a user must know of the test, a sentence each.
+    attitudes
+        That were tested.
+    mag
+        The same of the magnetometers; None where the record or the recording has none.
+    """
+
+    residuals: Array
+    standard_uncertainty: Array | None
+    chi_square: float | None
+    probability: float | None
+    gravity: Gravity
+    limit: float | None
+    notes: tuple[str, ...]
+    attitudes: Attitudes
+    mag: MagCheck | None = None
+
+    subject: ClassVar[str] = "Tumble check"
+
+    def exhibits(self) -> Exhibits:
+        """Return what its report shows."""
+        return exhibits_of_check(self, self.attitudes)
+
+    def __repr__(self) -> str:
+        p = "" if self.probability is None else f", p = {self.probability:.2g}"
+        worst = small_g(abs(float(self.residuals[self.worst])))
+        return (
+            f"Check({'pass' if self.passed else 'fail'}{p}, {len(self.residuals)} attitudes, the farthest off is "
+            f"number {self.worst + 1} by {worst})"
+        )
+
+    @property
+    def passed(self) -> bool:
+        """Whether the tests find no contradiction at 5 %, and every attitude is within the limit, if there is one."""
+        within = self.limit is None or bool((np.abs(self.residuals) <= self.limit).all())
+        return within and self.accelerometers_agree and self.magnetometers_agree
+
+    @property
+    def false_alarm(self) -> float:
+        """Probability below which a test fails: 5 % shared by those that are made."""
+        return FALSE_ALARM if self.mag is None or self.probability is None else FALSE_ALARM / 2
+
+    @property
+    def accelerometers_agree(self) -> bool:
+        """Whether |f| = g holds under the record."""
+        return self.probability is None or self.probability >= self.false_alarm
+
+    @property
+    def magnetometers_agree(self) -> bool:
+        """Whether |m| and dip stay the same under the record; so where there are none."""
+        return self.mag is None or self.mag.probability >= self.false_alarm
+
+    @property
+    def worst(self) -> int:
+        """Index of the attitude that is farthest off."""
+        return int(np.argmax(np.abs(self.residuals)))
+
+
+def check_tumble(
+    record: Record,
+    data: TumbleData,
+    *,
+    limit: float | str | None = None,
+    gravity: float | str | Gravity | None = None,
+    latitude: float | str | None = None,
+    height: float | str | None = None,
+    **reading: Unpack[Reading],
+) -> Check:
+    """Test whether fresh attitudes contradict an existing record, without refitting.
+
+    ``r' (J V J' + C)^-1 r`` against chi-square, with r the residuals ``|f| - g`` under the record, J their derivatives
+    by its parameters, V its covariance and C the attitudes' noise. Of magnetometers, where record and attitudes have
+    them, ``|m|`` and dip are tested likewise, but for what all have in common: the attitudes may be of another place. A
+    record that holds fails once in twenty tests.
+
+    Parameters
+    ----------
+    record
+        Of procedure tumble, or its file.
+    data
+        A file, recording, data frame, arrays or attitudes, as for `fit_tumble`. Where nothing is known of their noise,
+        that of the record's own attitudes counts.
+    limit
+        Largest ``| |f| - g |`` that passes, m/s^2 or a text such as ``"2 mg"``, beside the test.
+    gravity
+        Where the attitudes were measured, as for `fit_tumble`; else that of the recording's head, or of the record.
+    latitude, height
+        Instead of gravity, as for `fit_tumble`.
+    reading
+        How arrays and files are to be understood, as for `fit_tumble`.
+
+    Raises
+    ------
+    RecordError
+        The record is of another procedure, has cross terms, or states no uncertainties and there is no limit.
+    UnitError
+        The attitudes' unit cannot be converted to the record's.
+    OptionError
+        The limit is not above 0, or gravity cannot be.
+    DataError
+        The magnitudes are nowhere near gravity.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> first = il.simulate_tumble(gravity=9.81)
+    >>> truth = {key[6:]: float(text) for key, text in first.metadata.items() if key.startswith("truth_")}
+    >>> second = il.simulate_tumble(gravity=9.81, truth=truth, seed=2)
+    >>> il.check_tumble(il.fit_tumble(first, gravity=9.81).calibration, second, gravity=9.81).passed
+    True
+    """
+    record = as_record(record, "check_tumble")
+    limit = None if limit is None else in_si(limit, "limit", "acceleration", "mg")
+    attitudes = as_attitudes(data, reading, check_tumble)
+    if record.procedure != "tumble":
+        raise RecordError(f"a {record.procedure} record cannot be checked by attitudes; expected a tumble record")
+    if model_of(record).cross:
+        raise RecordError("a record with cross terms cannot be checked; expected one without, of the same attitudes")
+    if limit is not None and not limit > 0:
+        raise OptionError(f"limit {limit:g} m/s^2: expected more than 0")
+    if limit is None and not record.covariance.names:
+        raise RecordError("the record states no uncertainties to test against; expected a fixed limit (--limit 1mg)")
+    local = _gravity(record, at_place(gravity, latitude, height), attitudes)
+    attitudes = _in_unit_of(record, attitudes)
+    g, order = local.value, model_of(record).order
+    scale = g * np.array([record.value(f"scale_factor_{axis}") for axis in "xyz"])
+    scaling = Scaling(np.zeros(3), np.abs(scale))
+    theta = scaled_parameters(np.array([record.value(name) for name in parameter_names(order)]), scaling, g)
+    norm, jacobian, _, _ = norm_and_jacobian(theta[None], (attitudes.mean / scaling.scale)[None], order)
+    covariance, of_noise = _noise(record, attitudes, scaling)
+    motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
+    lengthening, own = length_noise(theta[None], jacobian, covariance[None], motion)
+    seen, rows = (norm - 1 - lengthening)[0], jacobian[0]
+    residuals = g * (norm[0] - 1 if motion is None else seen)
+    check_fresh(residuals, g, attitudes.recording.name)
+    notes = [*([local.note] if local.note else []), *of_noise]
+    if made_from(record, attitudes.recording):
+        notes.append("the record was made from this recording, which therefore says nothing of whether it still holds")
+    if not record.covariance.names:
+        return Check(residuals, None, None, None, local, limit, tuple(notes), attitudes)
+    mag = _mag(record, attitudes, notes)
+    own_variance = np.maximum(own[0] + _excess(record, g), 1e-24)  # data without noise leave rounding
+    more = prior_scatter(rows, seen, own_variance)
+    if more > 0:
+        notes.append(
+            f"the attitudes scatter by {1e6 * np.sqrt(more):.3g} µg beyond their noise, which no change of the record "
+            "explains and the test allows for: holds that were disturbed, or a model of too low an order"
+        )
+    known = known_of(record, scaling, local, attitudes.unit)
+    common = 0.0 if known.shared else (local.standard_uncertainty / g) ** 2
+    noise = np.diag(own_variance + more) + common
+    value, probability = contradiction(seen, rows, known.covariance, noise)
+    freedom = _freedom(record)
+    if freedom is not None:
+        from imulab.estimation.special import fdtrc
+
+        probability = float(fdtrc(len(seen), freedom, value / len(seen)))
+    total = g * np.sqrt(np.diag(rows @ known.covariance @ rows.T + noise))
+    return Check(residuals, total, value, probability, local, limit, tuple(notes), attitudes, mag)
+
+
+def _mag(record: Calibration, attitudes: Attitudes, notes: list[str]) -> MagCheck | None:
+    """Test the magnetometers where there are any; a note says why not where only the record has them."""
+    if fit_of(record).mag is None:
+        return None
+    name = attitudes.recording.name
+    if not all(column in attitudes.recording for column in triad("mag")):
+        notes.append(Note(f"{name}: no magnetometers in it: the record's accelerometers alone are tested"))
+    elif len(attitudes) < FEWEST:
+        notes.append(Note(f"{name}: {len(attitudes)} attitudes; magnetometers are tested by {FEWEST} or more"))
+    else:
+        return check_mag(record, attitudes)
+    return None
+
+
+def _gravity(record: Calibration, given: float | str | Gravity | None, attitudes: Attitudes) -> Gravity:
+    """What was given, else the head's, else that of the record."""
+    if given is None and "gravity" not in attitudes.recording.metadata:
+        stated = model_of(record).gravity
+        value, uncertainty = float(stated.value), float(stated.standard_uncertainty or 0.0)
+        sentence = f"gravity {value:.6g} m/s^2 was taken from the record, as if measured at the same place"
+        return Gravity(value, stated.from_, uncertainty, Note(sentence))
+    return local_gravity(given, attitudes.recording)
+
+
+def _in_unit_of(record: Calibration, attitudes: Attitudes) -> Attitudes:
+    unit = model_of(record).output_unit
+    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, unit)
+    return replace(
+        attitudes,
+        mean=attitudes.mean * factor,
+        covariance=None if attitudes.covariance is None else attitudes.covariance * factor**2,
+        motion=None if attitudes.motion is None else attitudes.motion.scaled(np.full(3, 1 / factor)),
+        unit=unit,
+    )
+
+
+def _noise(record: Calibration, attitudes: Attitudes, scaling: Scaling) -> tuple[Array, list[str]]:
+    """Covariance of the attitudes, g^2, shape (n, 3, 3), and a note on where it is from."""
+    if attitudes.covariance is not None:
+        return attitudes.covariance / (scaling.scale[:, None] * scaling.scale), []
+    g, chi_square = model_of(record).gravity.value, fit_of(record).reduced_chi_square
+    stated = attitudes_of(record).standard_uncertainty
+    sigma = median(np.array(stated)) if stated else float(np.sqrt(chi_square)) if chi_square else 0.0
+    note = Note(
+        f"nothing is known of the noise of these attitudes: the {1e6 * sigma / g:.3g} µg of those that the record was "
+        "made from were used; a recording, or std_* columns, would say"
+    )
+    return np.broadcast_to((sigma / g) ** 2 * np.eye(3), (len(attitudes), 3, 3)), [note]
+
+
+def _excess(record: Calibration, g: float) -> float:
+    """Variance of the record's own attitudes beyond their noise, if that was seen: fresh ones will have it too."""
+    fit = fit_of(record)
+    freedom, reduced = fit.degrees_of_freedom, fit.reduced_chi_square
+    if fit.noise != "known" or not reduced or freedom < 1:
+        return 0.0
+    if chi_square_probability(reduced * freedom, freedom) > SCATTERED:
+        return 0.0
+    return (fit.excess.value / g) ** 2
+
+
+def _freedom(record: Calibration) -> float | None:
+    """Degrees of freedom where the record's uncertainties rest on a scatter of few residuals; None: noise was known."""
+    fit = fit_of(record)
+    return None if fit.noise == "known" else float(fit.degrees_of_freedom)
+
+
+# The report of a test of a record by fresh attitudes: verdict, and each residual beside its uncertainty.
+
+
+_BEYOND = 2.0
+"""Standard uncertainties beyond which a residual is marked."""
+_BEYOND_BOTH = float(np.sqrt(2 * np.log(20.0)))
+"""The same of two at once, which one in twenty exceeds by chance."""
+
+
+def meaning(check: Check) -> str:
+    """Return what the test says, in words."""
+    if check.passed:
+        return "the attitudes agree with the record"
+    if _limit_alone(check):
+        return "no change of the unit is shown, but an attitude is beyond the limit"
+    if check.accelerometers_agree:
+        return "hard or soft iron has changed since the record was made, or iron was near"
+    return "the unit has changed since the record was made, or gravity, unit or attitudes are not as assumed"
+
+
+def next_step(check: Check, record: str, file: str) -> list[str]:
+    """Return what to do or to know where the test failed."""
+    if check.passed:
+        return []
+    if _limit_alone(check):
+        return ["the limit is smaller than the uncertainty of the attitudes can tell"]
+    if check.accelerometers_agree:
+        return [
+            "measure again away from iron, or 'imulab tumble mag FILE -o NEW.json' with 16 or more attitudes for a "
+            "record that follows the change"
+        ]
+    return [
+        f"measure again, or 'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the "
+        "change"
+    ]
+
+
+def measured(check: Check, attitudes: Attitudes) -> str:
+    """Return p and the largest residual."""
+    n = len(attitudes)
+    test = "not tested, the record states no uncertainties"
+    if check.probability is not None:
+        p = f"p = {check.probability:.2g}" if check.probability else "p below 1e-300"
+        test = f"{p} (chi-square {check.chi_square:.3g} of {n})"
+    limit = "" if check.limit is None else f", limit {small_g(check.limit)}"
+    return (
+        f"{test}, {n} attitudes, largest |f| - g {small_g(check.residuals[check.worst])} "
+        f"({attitudes.label(check.worst)}){limit}"
+    )
+
+
+def of_magnetometers(check: Check, attitudes: Attitudes, unit: str) -> list[str]:
+    """Return what the test of the magnetometers says; `unit` is that of the record's biases."""
+    mag = check.mag
+    if mag is None:
+        return []
+    p = f"p = {mag.probability:.2g}" if mag.probability else "p below 1e-300"
+    worst = mag.worst
+    lines = [
+        f"magnetometers: |m| and dip {'stay the same' if check.magnetometers_agree else 'do not stay the same'}, {p}, "
+        f"farthest off |m| {100 * mag.magnitude[worst]:+.2g} %, dip {np.degrees(mag.dip[worst]):+.2g} deg "
+        f"({attitudes.label(worst)})",
+        f"field against that of the record: |m| {format_both(100 * mag.common[0], 100 * mag.common_uncertainty[0])} %, "
+        f"dip {format_both(*np.degrees([mag.common[1], mag.common_uncertainty[1]]).tolist())} deg (not tested: of the "
+        "place)",
+    ]
+    if not check.magnetometers_agree and mag.explained >= check.false_alarm:
+        of = "uT" if unit == "T" else "of the field"
+        shown = ", ".join(f"{1e6 * v:+.2f}" if unit == "T" else f"{v:+.4f}" for v in mag.hard_iron.tolist())
+        lines.append(f"a hard iron that changed by ({shown}) {of} explains it (p = {mag.explained:.2g})")
+    return lines
+
+
+def format_both(value: float, uncertainty: float) -> str:
+    """Return ``+0.12 ± 0.05``."""
+    return " ± ".join(format_uncertain(value, uncertainty))
+
+
+def _limit_alone(check: Check) -> bool:
+    return check.probability is not None and check.accelerometers_agree and check.magnetometers_agree
+
+
+def check_page(
+    check: Check, attitudes: Attitudes, held: Calibration, *, record: str, file: str, warnings: Sequence[str]
+) -> str:
+    """Return the report; `warnings` are those of the command."""
+    failed = [] if check.passed else [Bad(meaning(check)), *next_step(check, record, file)]
+    return render_page(
+        f"Tumble check: {'pass' if check.passed else 'fail'}",
+        held.sensor.get("serial", "unit without serial number"),
+        exhibits_of_check(check, attitudes),
+        verdict=verdict_of([*failed, *warnings]),
+        notes=[note for note in warnings if isinstance(note, Note)],
+        provenance=[
+            ("record", f"{record}, created {held.created}"),
+            ("file", file),
+            ("gravity", f"{check.gravity.value:.9g} m/s^2"),
+            ("software", f"imulab {VERSION}"),
+        ],
+    )
+
+
+def exhibits_of_check(check: Check, attitudes: Attitudes) -> Exhibits:
+    """Return what the report shows."""
+    facts = [("attitudes", str(len(attitudes))), ("largest |f| − g", small_g(check.residuals[check.worst]))]
+    if check.probability is not None:
+        facts.insert(0, ("p, if nothing changed", f"{check.probability:.2g}" if check.probability else "below 1e-300"))
+    if check.limit is not None:
+        facts.append(("limit", small_g(check.limit)))
+    return Exhibits(
+        f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}; {measured(check, attitudes)}.",
+        facts,
+        [_figure(check, attitudes), *_mag_figures(check, attitudes), _table(check, attitudes)],
+    )
+
+
+def _beyond(check: Check) -> NDArray[np.bool_]:
+    """Return which attitudes are beyond the limit, or beyond twice their uncertainty."""
+    size = np.abs(check.residuals)
+    beyond = np.zeros(len(size), dtype=bool)
+    if check.limit is not None:
+        beyond |= size > check.limit
+    if check.standard_uncertainty is not None:
+        beyond |= size > _BEYOND * check.standard_uncertainty
+    return beyond
+
+
+def _figure(check: Check, attitudes: Attitudes) -> Figure:
+    number = list(range(1, len(attitudes) + 1))
+    residual = np.array([micro_g(value) for value in check.residuals.tolist()])
+    beyond = _beyond(check)
+    trace = _points(attitudes, residual, beyond)
+    room, bars = 0.0, " The record states no uncertainties."
+    if check.standard_uncertainty is not None:
+        half = [_BEYOND * micro_g(value) for value in check.standard_uncertainty.tolist()]
+        trace["error_y"] = {"type": "data", "array": half, "color": QUIET, "thickness": 1, "width": 3}
+        room = float(np.median(half))
+        bars = (
+            " Bars: twice the standard uncertainty, from record and attitude; one in twenty lies farther off by chance."
+        )
+    far = bulk(residual, room=room)
+    marks = [] if far is None else edge_marks(far, residual, number, [small_g(v) for v in check.residuals.tolist()])
+    limit = [] if check.limit is None else [-micro_g(check.limit), micro_g(check.limit)]
+    count = int(beyond.sum())
+    return Figure(
+        title="Residual |f| − g of each fresh attitude under the record",
+        message=f"{count} of {len(number)} attitudes {'lies' if count == 1 else 'lie'} beyond "
+        f"{'the limit or ' if limit else ''}twice the standard uncertainty.",
+        caption=f"f is the specific force by the record, g local gravity.{bars}"
+        f"{' Dashed: the limit.' if limit else ''} Red diamonds lie beyond."
+        + edge_note(0 if far is None else int(far.beyond.sum())),
+        traces=[trace, *marks],
+        layout={
+            "xaxis": {
+                "title": {"text": "attitude"},
+                "dtick": max(1, round(len(number) / 20)),
+                "range": [0.4, len(number) + 0.6],
+                "gridcolor": "#e6eaed",
+                "zeroline": False,
+            },
+            "yaxis": {
+                "title": {"text": "|f| − g, µg"},
+                "gridcolor": "#e6eaed",
+                "zerolinecolor": QUIET,
+                **({} if far is None else {"range": [far.low, far.high]}),
+            },
+            "showlegend": False,
+            "shapes": [
+                {
+                    "type": "line",
+                    "xref": "paper",
+                    "x0": 0,
+                    "x1": 1,
+                    "y0": end,
+                    "y1": end,
+                    "line": {"color": BAD, "dash": "dash", "width": 1.5},
+                }
+                for end in limit
+            ],
+        },
+    )
+
+
+def _points(attitudes: Attitudes, residual: Array, beyond: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return the residual of each attitude, µg, as a point, marked where it is beyond."""
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "x": list(range(1, len(attitudes) + 1)),
+        "y": residual.tolist(),
+        "marker": {
+            "size": 9,
+            "color": [BAD if mark else GOOD for mark in beyond.tolist()],
+            "symbol": ["diamond" if mark else "circle" for mark in beyond.tolist()],
+        },
+        "text": [attitudes.label(i) for i in range(len(attitudes))],
+        "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
+    }
+
+
+def _mag_figures(check: Check, attitudes: Attitudes) -> list[Figure]:
+    """Return |m| and dip of each fresh attitude, less what all have in common."""
+    mag = check.mag
+    if mag is None:
+        return []
+    number = list(range(1, len(attitudes) + 1))
+    far = np.hypot(mag.magnitude / mag.magnitude_uncertainty, mag.dip / mag.dip_uncertainty) > _BEYOND_BOTH
+    marker = {
+        "size": 8, "color": [BAD if mark else GOOD for mark in far.tolist()],
+        "symbol": ["diamond" if mark else "circle" for mark in far.tolist()],
+    }  # fmt: skip
+    texts, traces = [attitudes.label(i) for i in range(len(attitudes))], []
+    for values, sigma, unit, place in (
+        (100 * mag.magnitude, 100 * mag.magnitude_uncertainty, "%", "y2"),
+        (np.degrees(mag.dip), np.degrees(mag.dip_uncertainty), "deg", "y"),
+    ):
+        bars = {"type": "data", "array": rounded(2 * sigma), "color": QUIET, "thickness": 1, "width": 3}
+        traces.append(
+            scatter(number, rounded(values), "markers", marker=marker, error_y=bars, text=texts, yaxis=place,
+                    hovertemplate=f"%{{text}}<br>%{{y:+.2f}} {unit}<extra></extra>")
+        )  # fmt: skip
+    return [
+        Figure(
+            title="Magnitude and dip of the field in each fresh attitude under the record",
+            message=f"{int(far.sum())} of {len(number)} attitudes {'lies' if far.sum() == 1 else 'lie'} beyond what "
+            "one in twenty does by chance.",
+            caption="|m| and dip less what all attitudes have in common, which is of the place. Bars: twice the "
+            "standard uncertainty, from the record and the scatter of its attitudes.",
+            traces=traces,
+            layout={
+                "xaxis": figure_axis("attitude", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6]),
+                "yaxis": figure_axis("dip, deg", domain=[0, 0.46], zeroline=True),
+                "yaxis2": figure_axis("|m|, %", domain=[0.54, 1], zeroline=True),
+                "showlegend": False,
+            },
+            height=460,
+        )
+    ]
+
+
+def _table(check: Check, attitudes: Attitudes) -> ReportTable:
+    rows = []
+    beyond = _beyond(check)
+    for i, value in enumerate(check.residuals.tolist()):
+        u, ratio = "not stated", "–"
+        if check.standard_uncertainty is not None:
+            own = float(check.standard_uncertainty[i])
+            u, ratio = small_g(own), f"{value / own:+.1f}"
+        rows.append([attitudes.label(i), small_g(value), u, ratio, "beyond" if beyond[i] else ""])
+    return ReportTable(
+        "Attitudes",
+        "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all attitudes "
+        f"together, with what their errors share; it fails where p is below {100 * check.false_alarm:g} %.",
+        ["attitude", "|f| − g", "u", "(|f| − g) / u", "remark"],
+        rows,
+    )

@@ -1,0 +1,655 @@
+"""The gyroscope triad on top of calibrated accelerometers, from data to a record of both triads.
+
+M = S (T w + b + G f),  T with unit diagonal and six free off-diagonals
+
+w is the body rate and f the specific force in the accelerometers' frame, G the sensitivity to acceleration. Between two
+attitudes the turn that the gyroscopes see must carry the first direction of gravity into the second; the sum of the
+squared angles by which it misses is minimised over S and T (and b, if asked). At rest M = S (b + G f): b and G come
+from there.
+
+Source: Tedaldi, Pretto, Menegatti, ICRA 2014, section IV; the change of a turn with the rate: Bortz, IEEE Trans. AES-7
+(1971) 61; acceleration-sensitive drift: IEEE Std 528.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Any, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.columns import triad
+from imulab.display import UNJUDGED, Bad, Note
+from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
+from imulab.estimation.least_squares import Observability, coverage_factor, observability
+from imulab.estimation.rows import LeftOut, leave_out
+from imulab.gravity import EARTH, EarthRate, at_latitude
+from imulab.procedures.result import Record, Result, as_record, as_recording
+from imulab.procedures.tumble import CLOCKS, SENSITIVITIES
+from imulab.procedures.tumble.attitudes import Attitudes, find_attitudes
+from imulab.procedures.tumble.device import output_factor, specific_force
+from imulab.procedures.tumble.gyro.rest import clock_notes, direction_covariance, find_holds
+from imulab.procedures.tumble.gyro.solve import (
+    CRYSTAL,
+    Case,
+    Clock,
+    Nonlinearity,
+    Solved,
+    clock_of_scale,
+    compare_clocks,
+    counted,
+    evened,
+    solve_turns,
+    test_linearity,
+    turn_covariance,
+)
+from imulab.procedures.tumble.gyro.turns import COLUMNS, ROWS, shared_covariance
+from imulab.procedures.tumble.record import aside_of
+from imulab.procedures.tumble.schema import fit_of, model_of
+from imulab.quantities import in_si
+from imulab.reading import Data, Reading
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.mean_noise import mean_uncertainties
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+# The gyroscope triad on top of calibrated accelerometers.
+
+
+PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
+_EVENER = 0.9
+_FOREIGN, _TOUCHED = 5.0, 1e-3 * STANDARD_GRAVITY
+
+
+@dataclass(frozen=True)
+class GyroFit:
+    """A gyroscope triad; arrays of shape (3,) or (3, 3), SI except for the output.
+
+    Attributes
+    ----------
+    scale_factor
+        Output per rad/s.
+    misalignment
+        T.
+    bias
+        rad/s.
+    sensitivity
+        G, rad/s per m/s^2; None where it was not fitted.
+    covariance
+        Of scale factors, the six misalignments and the biases, shape (12, 12).
+    sensitivity_covariance
+        Of the sensitivities row by row, shape (9, 9).
+    residuals
+        Angle by which each turn misses, rad, shape (m,).
+    start, stop
+        Time of each turn, s, shape (m,).
+    unit
+        Of the outputs.
+    fit_bias
+        Whether the biases were fitted to the turns instead of taken from rest.
+    observability
+        Of the parameters that were fitted to the turns.
+    clock
+        What the time is known by that the scale factors are referred to.
+    nonlinearity
+        Of the scale factors over the rate.
+    aside
+        Start, stop, s, and miss, rad, of turns that stand out and were set aside, shape (k, 3).
+    notes
+        What a user should know, a sentence each.
+    earth
+        The Earth's rate whose vertical part was taken off; None where the latitude is not known.
+    """
+
+    scale_factor: Array
+    misalignment: Array
+    bias: Array
+    sensitivity: Array | None
+    covariance: Array
+    sensitivity_covariance: Array | None
+    residuals: Array
+    start: Array
+    stop: Array
+    unit: str
+    fit_bias: bool
+    observability: Observability
+    clock: Clock
+    nonlinearity: Nonlinearity | None
+    aside: Array
+    notes: tuple[str, ...] = ()
+    earth: EarthRate | None = None
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared angles, rad^2."""
+        return float(np.sum(self.residuals**2))
+
+
+def fit_gyro_triad(
+    record: Calibration,
+    attitudes: Attitudes,
+    recording: Recording,
+    *,
+    fit_bias: bool = False,
+    sensitivity: str = "auto",
+    clock: float = CRYSTAL,
+    clock_of: str = "gyro",
+    noise: Calibration | None = None,
+    earth: EarthRate | None = None,
+) -> GyroFit:
+    """Calibrate a gyroscope triad from the turns between static attitudes.
+
+    The options and what is raised are those of `imulab.fit_gyro`; `attitudes` are of the accelerometers' recording, and
+    `recording`, which may be the same, has ``time`` and ``gyro_x``, ``_y``, ``_z`` on the same clock.
+    """
+    _check_request(record, attitudes, sensitivity, clock, clock_of)
+    unit = recording.triad_unit("gyro")
+    check_finite(recording, triad("gyro"))
+    left_out = leave_out(recording, triad("gyro"))
+    time, output = check_time(recording), left_out.recording.triad("gyro")
+    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, model_of(record).output_unit)
+    means = attitudes.mean * factor
+    own = attitudes.recording.si("time")
+    moving = leave_out(attitudes.recording, triad("accel")).recording
+    own_force = specific_force(record, moving.triad("accel") * factor)
+    force, knocked = specific_force(record, means), aside_of(record, attitudes)
+    case = Case(recording.name, attitudes, force, own, own_force, output, unit, fit_bias, knocked)
+    case, found = _begun(case, time, sensitivity, earth)
+    time, found, said = _with_even_stamps(case, time, sensitivity, found)
+    apart = attitudes.recording is not recording
+    comparison = compare_clocks(own, own_force, time, found.rate(output), found.segments, search=apart)
+    if clock_of == "accel":
+        if comparison is None:
+            raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
+        time = comparison.on_other(time)
+        found = solve_turns(case, time, sensitivity)
+    said_of_noise: list[str] = []
+    if noise is not None:
+        found, said_of_noise = _with_noise(found, noise, attitudes, recording)
+    known = clock_of_scale(comparison, clock, clock_of, counted=counted(check_time(recording)))
+    notes = [
+        *(f"gyro: {note}" for note in left_out.notes(_at_rest(attitudes, time, left_out))),
+        *said,
+        *said_of_noise,
+        *found.notes,
+        *_record_notes(record, attitudes, case.force),
+        *known.notes(apart=apart),
+    ]
+    if apart and clock_of == "gyro":
+        notes += clock_notes(find_holds(attitudes, time, output, recording.name), attitudes, time)
+    segments, residual, jacobian = found.segments, found.residual, found.jacobian
+    miss, size = np.linalg.norm(residual.reshape(-1, 3), axis=1), found.theta.size
+    # Each turn fixes two angles: how far about its own direction it went, gravity cannot see.
+    freedom = max(2 * len(miss) - size, 1)
+    seen = _observability_of_turns(found, freedom, recording.name)
+    directions = direction_covariance(record, attitudes, means, case.force)
+    zero = None if fit_bias else found.rest.zero_uncertainty
+    shared = shared_covariance(segments, found.scale, found.theta, directions, zero)
+    matrix, variance = turn_covariance(found, shared, freedom)
+    linearity = test_linearity(segments, found.scale, found.theta, jacobian, residual, shared, variance)
+    if linearity is not None:
+        notes += linearity.notes()
+    return _on_earth(_result(found, matrix, miss, unit, fit_bias, seen, known, linearity, tuple(notes)), case, earth)
+
+
+def _on_earth(fit: GyroFit, case: Case, earth: EarthRate | None) -> GyroFit:
+    """Return the fit with the Earth's rate; where nobody knows its vertical part v, T v / g is in all sensitivities.
+
+    The variance of v is EARTH^2 / 3 then, the mean over all directions of the Earth's axis.
+    """
+    if earth is not None or fit.sensitivity_covariance is None:
+        return replace(fit, earth=earth)
+    gravity = np.linalg.norm(case.force, axis=1).mean()
+    common = EARTH / np.sqrt(3) / gravity * fit.misalignment.ravel()
+    return replace(fit, sensitivity_covariance=fit.sensitivity_covariance + np.outer(common, common))
+
+
+def _begun(case: Case, time: Array, sensitivity: str, earth: EarthRate | None) -> tuple[Case, Solved]:
+    """Return the case, with what is known of the Earth's rate, as output, or how large it may be, and the solution."""
+    found = solve_turns(case, time, sensitivity)
+    up = case.force / np.linalg.norm(case.force, axis=1, keepdims=True)
+    if earth is not None:
+        case = replace(case, earth=found.output_of(earth.vertical * up))
+    elif sensitivity == "auto" and found.rest.slope is not None:
+        case = replace(case, vertical=found.output_of(EARTH * up))
+    else:
+        return case, found
+    return case, solve_turns(case, time, sensitivity)
+
+
+def _check_request(record: Calibration, attitudes: Attitudes, sensitivity: str, clock: float, clock_of: str) -> None:
+    """Refuse a record, attitudes or options that no gyroscopes can be fitted with."""
+    if record.procedure != "tumble":
+        raise RecordError(f"a {record.procedure} record holds no accelerometers; expected a tumble record")
+    if sensitivity not in SENSITIVITIES:
+        raise OptionError(f"g_sensitivity {sensitivity!r}: expected one of {listed(SENSITIVITIES, sensitivity)}")
+    if clock_of not in CLOCKS:
+        raise OptionError(f"clock_of {clock_of!r}: expected one of {listed(CLOCKS, clock_of)}")
+    if not 0 <= clock < 1:
+        raise OptionError(f"clock {clock:g}: expected the relative uncertainty of a clock's rate, such as 50 ppm")
+    if attitudes.trace is None:
+        raise SegmentError(f"{attitudes.recording.name}: a table of attitudes has no turns between them")
+
+
+def _at_rest(attitudes: Attitudes, time: Array, left_out: LeftOut) -> NDArray[np.bool_]:
+    """Return which samples belong to an attitude, shape (n,); refuse one of which too many are left out."""
+    rest = np.zeros(len(time), dtype=np.bool_)
+    for a, b in np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop])).tolist():
+        left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
+        rest[a:b] = True
+    return rest
+
+
+def _with_noise(
+    found: Solved, noise: Calibration, attitudes: Attitudes, recording: Recording
+) -> tuple[Solved, list[str]]:
+    """The zero with the uncertainty that a noise record tells of the time at rest, where the holds scatter by less."""
+    unit = recording.triad_unit("gyro")
+    rate = parse_unit(unit).quantity == "rate"
+    duration = float((attitudes.stop - attitudes.start).sum())
+    u, said = mean_uncertainties(noise, triad("gyro"), duration, "rad/s" if rate else unit, recording.metadata)
+    least = from_si(u, unit) if rate else u
+    rest = replace(found.rest, zero_uncertainty=np.maximum(found.rest.zero_uncertainty, least))
+    return replace(found, rest=rest), said
+
+
+def _with_even_stamps(case: Case, time: Array, sensitivity: str, found: Solved) -> tuple[Array, Solved, list[Note]]:
+    """Return time, solution and a note with evened time stamps, where the turns miss clearly less with them."""
+    even = evened(time)
+    if even is not None:
+        # Only the turns can tell stamps that jitter from samples that do.
+        other = solve_turns(case, even[0], sensitivity)
+        if other.typical_miss < _EVENER * found.typical_miss:
+            said = Note(
+                f"gyro: the time stamps jitter by {1e3 * even[1]:.2g} ms rms: replaced by even ones, with which "
+                f"the turns miss by {np.degrees(other.typical_miss):.2g} deg instead of "
+                f"{np.degrees(found.typical_miss):.2g} deg (median)"
+            )
+            return even[0], other, [said]
+    return time, found, []
+
+
+def _observability_of_turns(found: Solved, freedom: int, name: str) -> Observability:
+    """Return what the turns determine; refuse those that cannot separate the parameters or do not converge."""
+    residual, size, turns = found.residual, found.theta.size, len(found.residual) // 3
+    seen = observability(found.jacobian, np.full(len(residual), freedom / max(float(residual @ residual), 1e-30)))
+    if seen.rank < size:
+        confused = " ".join(seen.confused(gyro_names()[:size]))
+        raise ObservabilityError(f"{name}: {turns} turns cannot separate {confused}")
+    if not found.converged:
+        raise DataError(
+            f"{name}: the fit of the gyroscopes does not converge on these {turns} turns "
+            f"(condition number {seen.condition:.0f}); use more turns, about more directions"
+        )
+    return seen
+
+
+def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
+    """Say if the accelerometers' record is hardly of this unit."""
+    mine, its = record.sensor.get("serial"), attitudes.recording.metadata.get("serial")
+    found = [f"gyro: the record is of {mine}, the recording of {its}"] if mine and its and mine != its else []
+    length = np.linalg.norm(force, axis=1)
+    scatter, usual = float(length.std()), fit_of(record).rms.value
+    if scatter > _FOREIGN * usual + _TOUCHED:
+        found.append(
+            f"gyro: under the record |f| scatters by {from_si(scatter, 'mg'):.3g} mg from attitude to attitude, by "
+            f"{from_si(usual, 'mg'):.3g} mg when it was made: is it of this unit?"
+        )
+    return found
+
+
+def gyro_names() -> list[str]:
+    """Return the names of the parameters in the order of the covariance."""
+    return [
+        *(f"gyro_scale_factor_{axis}" for axis in "xyz"),
+        *(f"gyro_misalignment_{pair}" for pair in PAIRS),
+        *(f"gyro_bias_{axis}" for axis in "xyz"),
+    ]
+
+
+def _result(
+    found: Solved,
+    matrix: Array,
+    miss: Array,
+    unit: str,
+    fit_bias: bool,
+    seen: Observability,
+    clock: Clock,
+    linearity: Nonlinearity | None,
+    notes: tuple[str, ...],
+) -> GyroFit:
+    """Turn scaled parameters into the triad."""
+    theta, scale, rest = found.theta, found.scale, found.rest
+    scale_factor = scale * (1 + theta[:3])
+    misalignment = np.eye(3)
+    misalignment[ROWS, COLUMNS] = theta[3:9]
+    moved = theta[9:12] if fit_bias else np.zeros(3)
+    bias = (rest.zero + scale * moved) / scale_factor
+    everything = np.zeros((12, 12))
+    everything[: len(matrix), : len(matrix)] = matrix
+    if not fit_bias:
+        everything[range(9, 12), range(9, 12)] = (rest.zero_uncertainty / scale) ** 2
+    derivative = np.diag(np.concatenate([scale, np.ones(6), scale / scale_factor]))
+    derivative[range(9, 12), range(3)] = -bias * scale / scale_factor
+    # A clock that is fast makes all scale factors too large by as much, and what is divided by them too small.
+    common = clock.uncertainty * np.concatenate([scale_factor, np.zeros(6), -bias])
+    return GyroFit(
+        scale_factor=scale_factor,
+        misalignment=misalignment,
+        bias=bias,
+        sensitivity=None if rest.slope is None else rest.slope / scale_factor[:, None],
+        covariance=derivative @ everything @ derivative.T + np.outer(common, common),
+        sensitivity_covariance=(
+            None
+            if rest.slope_uncertainty is None
+            else np.diag((rest.slope_uncertainty / scale_factor[:, None]).ravel() ** 2)
+        ),
+        residuals=miss,
+        start=found.segments.start,
+        stop=found.segments.stop,
+        unit=unit,
+        fit_bias=fit_bias,
+        observability=seen,
+        clock=clock,
+        nonlinearity=linearity,
+        aside=found.aside,
+        notes=notes,
+    )
+
+
+# A tumble record with the gyroscope triad added.
+
+
+_AXES = ("x", "y", "z")
+_WORST_SCALE = 0.1
+_USUAL = (
+    (np.degrees(1), "are the rates in deg/s?"),
+    (np.radians(1), "are the rates in rad/s?"),
+    (2.0, "is the sample rate twice what the time stamps say?"),
+    (0.5, "is the sample rate half what the time stamps say?"),
+)
+"""Factors by which scale factors are off, and what makes them so."""
+_ALIKE = 5.7  # Student's t of three at 1 %, over root 3
+_CLEAR = 4.0
+_SMALLEST_ALIKE = 0.05  # %
+_LARGE_MISS = 2.0  # deg
+
+
+def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerometers: Recording) -> Calibration:
+    """Return the record with parameters, covariance and residuals of the gyroscope triad; an earlier one is replaced.
+
+    Both triads are in the frame that the accelerometers define.
+    """
+    kept = {name: p for name, p in record.parameters.items() if not name.startswith("gyro_")}
+    names = [name for name in record.covariance.names if not name.startswith("gyro_")]
+    index = [record.covariance.names.index(name) for name in names]
+    block = record.covariance.array()[np.ix_(index, index)]
+    sources = {source.file: source for source in record.sources}
+    sources |= {r.source.file: r.source for r in (accelerometers, recording) if r.source is not None}
+    turns = len(fit.residuals)
+    freedom = 2 * turns - (12 if fit.fit_bias else 9)
+    # The gyroscopes' covariance holds what the accelerometers' adds; the covariance between the two is not kept.
+    joined = _diagonal_blocks(block, _covariance(fit))
+    return replace(
+        record,
+        parameters=kept | _parameters(fit),
+        covariance=Covariance((*names, *_covariance_names(fit)), tuple(map(tuple, joined.tolist()))),
+        model={**record.model, "gyro_output_unit": fit.unit},
+        sources=tuple(sources.values()),
+        fit={
+            **record.fit,
+            "gyro": {
+                "turns": turns,
+                "cost": {"value": fit.cost, "unit": "rad^2"},
+                "rms": {"value": float(np.sqrt(fit.cost / turns)), "unit": "rad"},
+                "degrees_of_freedom": freedom,
+                "coverage_factor_95": coverage_factor(float(freedom)) if freedom > 0 else None,
+                "condition_number": fit.observability.condition,
+                "bias": "fitted to the turns" if fit.fit_bias else "from the outputs at rest",
+                "g_sensitivity": "none" if fit.sensitivity is None else "from the outputs at rest",
+                "latitude": None if fit.earth is None else fit.earth.latitude,
+                "clock": _clock(fit.clock),
+                "nonlinearity": _nonlinearity(fit.nonlinearity),
+                "set_aside": [
+                    {"start": start, "stop": stop, "miss": {"value": miss, "unit": "rad"}}
+                    for start, stop, miss in fit.aside.tolist()
+                ],
+            },
+        },
+        data={
+            **record.data,
+            "gyro": {"start": fit.start.tolist(), "stop": fit.stop.tolist(), "residual": fit.residuals.tolist()},
+        },
+        warnings=(*(w for w in record.warnings if not w.startswith("gyro")), *_warnings(fit)),
+        verdict=UNJUDGED,
+    )
+
+
+def with_gyro_of(record: Calibration, known: Calibration) -> Calibration:
+    """Return the record with the gyroscope triad of another record of the same unit, if that has one."""
+    if "gyro_output_unit" not in known.model:
+        return record
+    names = [name for name in known.covariance.names if name.startswith("gyro_")]
+    joined = _diagonal_blocks(record.covariance.array(), known.covariance.block(names))
+    sources = {source.file: source for source in (*known.sources, *record.sources)}
+    return replace(
+        record,
+        parameters={
+            **record.parameters,
+            **{name: p for name, p in known.parameters.items() if name.startswith("gyro_")},
+        },
+        covariance=Covariance((*record.covariance.names, *names), tuple(map(tuple, joined.tolist()))),
+        model={**record.model, "gyro_output_unit": known.model["gyro_output_unit"]},
+        sources=tuple(sources.values()),
+        fit={**record.fit, **{key: part for key, part in known.fit.items() if key == "gyro"}},
+        data={**record.data, **{key: part for key, part in known.data.items() if key == "gyro"}},
+        warnings=(*record.warnings, *(w for w in known.warnings if w.startswith("gyro"))),
+        verdict=UNJUDGED,
+    )
+
+
+def _parameters(fit: GyroFit) -> dict[str, Parameter]:
+    sigma = np.sqrt(np.diag(fit.covariance))
+    found = {f"gyro_bias_{a}": Parameter(float(fit.bias[i]), float(sigma[9 + i]), "rad/s") for i, a in enumerate(_AXES)}
+    found |= {
+        f"gyro_scale_factor_{a}": Parameter(float(fit.scale_factor[i]), float(sigma[i]), f"{fit.unit}/(rad/s)")
+        for i, a in enumerate(_AXES)
+    }
+    found |= {
+        f"gyro_misalignment_{p}": Parameter(
+            float(fit.misalignment[_AXES.index(p[0]), _AXES.index(p[1])]), float(sigma[3 + k]), "rad"
+        )
+        for k, p in enumerate(PAIRS)
+    }
+    if fit.sensitivity is not None and fit.sensitivity_covariance is not None:
+        own = np.sqrt(np.diag(fit.sensitivity_covariance)).reshape(3, 3)
+        found |= {
+            f"gyro_g_sensitivity_{a}{b}": Parameter(float(fit.sensitivity[i, j]), float(own[i, j]), "rad/s/(m/s^2)")
+            for i, a in enumerate(_AXES)
+            for j, b in enumerate(_AXES)
+        }
+    return found
+
+
+def _covariance_names(fit: GyroFit) -> list[str]:
+    sensitivities = [] if fit.sensitivity is None else [f"gyro_g_sensitivity_{a}{b}" for a in _AXES for b in _AXES]
+    return gyro_names() + sensitivities
+
+
+def _covariance(fit: GyroFit) -> Array:
+    """Covariance of all gyroscope parameters; the sensitivities, from rest, are taken as independent of the others."""
+    if fit.sensitivity_covariance is None:
+        return fit.covariance
+    return _diagonal_blocks(fit.covariance, fit.sensitivity_covariance)
+
+
+def _diagonal_blocks(first: Array, second: Array) -> Array:
+    n, m = len(first), len(second)
+    joined = np.zeros((n + m, n + m))
+    joined[:n, :n], joined[n:, n:] = first, second
+    return joined
+
+
+def _clock(clock: Clock) -> dict[str, Any]:
+    """What the record says of the clock: relative uncertainty, whose it is, and how the two differ."""
+    found: dict[str, Any] = {"of": clock.of, "standard_uncertainty": clock.uncertainty}
+    other = clock.comparison
+    if other is not None:
+        found["accel_clock_rate"] = {"value": other.rate, "standard_uncertainty": other.rate_uncertainty, "unit": "1"}
+        found["latency"] = {"value": -other.delay, "standard_uncertainty": other.delay_uncertainty, "unit": "s"}
+    return found
+
+
+def _nonlinearity(found: Nonlinearity | None) -> dict[str, Any] | None:
+    """What the record says of scale factors that change with the rate: test, sizes, and the rates seen."""
+    if found is None:
+        return None
+    return {
+        "probability": found.probability,
+        "odd": _with_uncertainty(found.odd, found.odd_uncertainty),
+        "even": _with_uncertainty(found.even, found.even_uncertainty),
+        "largest_rate": {"value": found.largest.tolist(), "unit": "rad/s"},
+    }
+
+
+def _with_uncertainty(value: Array, uncertainty: Array) -> dict[str, Any]:
+    return {"value": value.tolist(), "standard_uncertainty": uncertainty.tolist(), "unit": "1"}
+
+
+def _off_nominal(fit: GyroFit) -> list[str]:
+    """Say if the scale factors are far from the stated unit, or all three by the same."""
+    known = parse_unit(fit.unit)
+    if known.quantity != "rate":
+        return []
+    ratio = fit.scale_factor * known.factor
+    error = 100 * (ratio - 1)
+    listed = " ".join(f"{value:+.3g}" for value in error.tolist())
+    if np.abs(error).max() > 100 * _WORST_SCALE:
+        middle = float(np.exp(np.mean(np.log(np.abs(ratio)))))
+        guess = next((f": {says}" for of, says in _USUAL if abs(middle / of - 1) < _WORST_SCALE), "")
+        return [
+            Bad(
+                f"gyro: the scale factors are off by {listed} % (x y z){guess or ': is the unit right?'}; check the "
+                f"unit ({fit.unit}) and the sample rate of the recording"
+            )
+        ]
+    mean, spread = float(error.mean()), float(error.std(ddof=1))
+    own = 100 * float(np.sqrt(np.diag(fit.covariance)[:3]).max() / fit.scale_factor.mean())
+    if abs(mean) > max(_ALIKE * spread, _CLEAR * own, _SMALLEST_ALIKE):
+        return [
+            f"gyro: the scale factors are off by {listed} % (x y z), all by the same: a sample rate or a clock that is "
+            "off by as much does that; compare the time stamps with a clock"
+        ]
+    return []
+
+
+def _warnings(fit: GyroFit) -> list[str]:
+    found = [*fit.notes, *([] if fit.earth is None else [fit.earth.note()])]
+    found += _off_nominal(fit)
+    if fit.clock.counted and fit.clock.of == "gyro" and fit.clock.assumed == CRYSTAL:
+        found.append(
+            Note(
+                "gyro: the time stamps are counted in even steps: the scale factors are true to the "
+                f"{1e6 * CRYSTAL:.0f} ppm of a crystal only if a crystal sets the sample rate; a sensor's own "
+                "oscillator is off by up to some percent: state it, such as --clock 10000ppm for 1 %"
+            )
+        )
+    rms = float(np.degrees(np.sqrt(np.mean(fit.residuals**2))))
+    if rms > _LARGE_MISS:
+        found.append(f"gyro: the turns miss the change of gravity's direction by {rms:.2g} deg rms")
+    return found
+
+
+# The gyroscope triad from what people have: data to a record of both triads.
+
+
+@dataclass(frozen=True, repr=False)
+class BothTriads(Result):
+    """Result of `fit_gyro`: the record of both triads, and what was found of the gyroscopes."""
+
+    calibration: Calibration
+    gyro: GyroFit
+
+
+def fit_gyro(
+    accel: Record,
+    data: Data,
+    *,
+    accel_data: Data | None = None,
+    fit_bias: bool = False,
+    g_sensitivity: str = "auto",
+    clock: float | str = "50 ppm",
+    clock_of: str = "gyro",
+    noise: Record | None = None,
+    latitude: float | str | None = None,
+    **reading: Unpack[Reading],
+) -> BothTriads:
+    """Calibrate a gyroscope triad from the turns between static attitudes.
+
+    ``M = S (T w + b + G f)``: between two attitudes the turn that the gyroscopes see must carry the first direction of
+    gravity into the second (Tedaldi, Pretto, Menegatti, ICRA 2014); at rest ``M = S (b + G f)``.
+
+    Parameters
+    ----------
+    accel
+        Tumble record of the accelerometers, or its file.
+    data
+        A file, recording, data frame or arrays by name with time and both triads, or the gyroscopes alone.
+    accel_data
+        The same of the accelerometers, on the same clock, where they are not in `data`.
+    fit_bias
+        Fit the biases to the turns too, instead of taking them from the outputs at rest.
+    g_sensitivity
+        Whether the zero changes with specific force: ``yes``, ``no``, or ``auto`` where the data show it.
+    clock
+        Relative standard uncertainty of the rate of the clock: common to the three scale factors.
+    clock_of
+        Whose time counts where the two triads have clocks of their own: ``gyro`` or ``accel``.
+    noise
+        Record of `fit_noise` of the same gyroscopes, or its file: the biases are no more certain than it says of a mean
+        over the time at rest.
+    latitude
+        Of the place, rad or a text such as ``"48.1 deg"``: the vertical part of the Earth's rate is taken off the
+        outputs at rest. Without it that counts as g-sensitivity or scatter, as the level part always does.
+    reading
+        How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
+        `window`, `element`.
+
+    Raises
+    ------
+    RecordError
+        `accel` is no tumble record, or `noise` no noise record of these gyroscopes.
+    SegmentError
+        Fewer than eight turns between attitudes.
+    DataError
+        The columns are missing or not finite, or the gyroscopes do not turn as gravity does.
+    ObservabilityError
+        The turns cannot separate the parameters.
+    OptionError
+        `g_sensitivity`, `clock`, `clock_of` or `latitude` has a value that cannot be.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> recording = il.simulate_tumble(gravity=9.81)
+    >>> accelerometers = il.fit_tumble(recording, order=1, gravity=9.81).calibration
+    >>> both = il.fit_gyro(accelerometers, recording).calibration
+    >>> truth = float(recording.metadata["truth_gyro_scale_factor_x"])
+    >>> abs(both.parameters["gyro_scale_factor_x"].value / truth - 1) < 1e-3
+    True
+    """
+    known = as_record(accel, "fit_gyro: accel")
+    recording = as_recording(data, reading, fit_gyro, lambda samples: {"gyro": samples})
+    own = recording
+    if accel_data is not None:
+        named = isinstance(accel_data, str | PathLike)
+        given: dict[str, Any] = {key: reading.get(key) for key in ("layout", "element") if named}
+        own = as_recording(accel_data, given, fit_gyro, name="accel_data")
+    found = fit_gyro_triad(
+        known, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
+        clock=in_si(clock, "clock", "number", "ppm"), clock_of=clock_of,
+        noise=None if noise is None else as_record(noise, "fit_gyro: noise"), earth=at_latitude(latitude),
+    )  # fmt: skip
+    return BothTriads(with_gyro(known, found, recording, own), found)

@@ -1,0 +1,201 @@
+"""Rotations from sampled rates, and whether the accelerometer's axes belong to the gyroscope's.
+
+Source: Savage, Strapdown inertial navigation integration algorithm design, part 1, J. Guidance Control Dynamics 21
+(1998) 19: the rotation vector of a constant rate is exact; steps are composed as quaternions, in C (`_rotation`).
+
+Where a recording holds both triads, the turn that the gyroscopes see between two attitudes must carry the first
+direction of gravity into the second. Swapped or reversed axes make a left-handed or foreign frame that cannot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+import imulab.procedures.tumble._rotation as _rotation
+from imulab.columns import triad
+from imulab.errors import DataError
+from imulab.estimation.rows import median
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.recording import Array
+from imulab.units import parse_unit, to_si
+
+# Rotations from sampled rates, many segments at once.
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Turns over segments, and their sensitivity to errors of the rate.
+
+    Attributes
+    ----------
+    matrix
+        Carries fixed directions, in body components, from the start of each segment to its end, shape (m, 3, 3).
+    weighted
+        ``sum C_i' x_i dt`` for each weight x (k of them), C_i from the start to the middle of step i: an error
+        ``dw = a x`` of the rate changes a carried direction v by ``C (v x sum C_i' x_i dt a)``. Shape (m, k, 3, 3).
+    """
+
+    matrix: Array
+    weighted: Array
+
+
+def frame_rotations(rate: Array, time: Array, start: NDArray[np.int64], stop: NDArray[np.int64]) -> Array:
+    """Return the matrices that carry fixed directions, in body components, from sample `start` to sample `stop`.
+
+    ``dv/dt = -w x v``, with the rate between two samples taken as their mean.
+
+    Parameters
+    ----------
+    rate
+        Body rate w, rad/s, shape (n, 3).
+    time
+        s, shape (n,).
+    start, stop
+        First and last sample of each segment, shape (m,).
+
+    Returns
+    -------
+    Array
+        Shape (m, 3, 3).
+    """
+    angle = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
+    return _turns(angle, np.empty((len(angle), 0)), start, stop).matrix
+
+
+def composed_turns(angle: Array) -> Array:
+    """Return the matrices that carry fixed directions through the steps of each segment.
+
+    Parameters
+    ----------
+    angle
+        Rotation vector of the body in each step, rad, shape (m, n, 3); zero after a segment's end.
+
+    Returns
+    -------
+    Array
+        Shape (m, 3, 3).
+    """
+    return weighted_turns(angle, np.ones(angle.shape[:2]), np.empty((*angle.shape[:2], 0))).matrix
+
+
+def weighted_turns(rate: Array, step: Array, weights: Array) -> Turns:
+    """Compose turns with their sensitivities.
+
+    Parameters
+    ----------
+    rate
+        Mean rate of each step, rad/s, shape (m, n, 3).
+    step
+        Duration of each step, s, zero after a segment's end, shape (m, n).
+    weights
+        Shape (m, n, k).
+    """
+    segments, n = step.shape
+    start = n * np.arange(segments)
+    angle, scaled = rate * step[:, :, None], weights * step[:, :, None]
+    return _turns(angle.reshape(-1, 3), scaled.reshape(segments * n, weights.shape[2]), start, start + n)
+
+
+def _turns(angle: Array, weights: Array, start: NDArray[np.int64], stop: NDArray[np.int64]) -> Turns:
+    """Segments of one sequence of steps, shape (n, 3), with weights (n, k) that hold the durations of the steps."""
+    m, k = len(start), weights.shape[1]
+    turns = Turns(np.empty((m, 3, 3)), np.empty((m, k, 3, 3)))
+    _rotation.turns(
+        np.ascontiguousarray(angle), np.ascontiguousarray(weights),
+        np.ascontiguousarray(start, dtype=np.int64), np.ascontiguousarray(stop, dtype=np.int64),
+        turns.matrix, turns.weighted,
+    )  # fmt: skip
+    return turns
+
+
+# Do the accelerometer's axes belong to the gyroscope's? Gravity's magnitude alone cannot tell two axes apart.
+
+
+_LONGEST_TURN = 20.0  # s; beyond it the drift of a cheap gyroscope counts
+_FEWEST_TURNS = 4
+_WRONG = np.radians(15.0)
+_RIGHT = np.radians(5.0)
+
+
+def check_axes(attitudes: Attitudes, force: Array) -> None:
+    """Check that gyroscope columns, where there are any, turn with the accelerometers.
+
+    Parameters
+    ----------
+    attitudes
+        Of a continuous recording; a table is not checked.
+    force
+        Calibrated specific force in each attitude, shape (n, 3), any unit.
+
+    Raises
+    ------
+    DataError
+        The axes do not agree as they are named, but would after exchanging or reversing some.
+    """
+    recording = attitudes.recording
+    names = triad("gyro")
+    time, pieces = recording.time, attitudes.pieces
+    if time is None or pieces is None or not all(name in recording for name in names):
+        return
+    if any(parse_unit(recording.units[name]).quantity != "rate" for name in names):
+        return
+    columns = [recording.column(name) for name in names]
+    if not all(np.isfinite(column).all() for column in columns):
+        return
+    first = np.unique(pieces[:, 2], return_index=True)[1]
+    last = np.append(first[1:], len(pieces)) - 1
+    start, stop = pieces[last[:-1], 1] - 1, pieces[first[1:], 0]
+    short = time[stop] - time[start] <= _LONGEST_TURN
+    if np.count_nonzero(short) < _FEWEST_TURNS:
+        return
+    edges, samples = pieces[:, :2].ravel(), pieces[:, 1] - pieces[:, 0]
+    bias = [np.mean(np.add.reduceat(c[: edges[-1]], edges[:-1])[::2] / samples) for c in columns]
+    start, stop = start[short], stop[short]
+    # Only the samples of the turns, one turn behind the other.
+    size = stop - start + 1
+    begin = np.cumsum(size) - size
+    turning = np.arange(size.sum()) + np.repeat(start - begin, size)
+    rates = [to_si(c[turning] - b, recording.units[name]) for c, b, name in zip(columns, bias, names, strict=True)]
+    rate, when = np.column_stack(rates), time[turning]
+    start, stop = begin, begin + size - 1
+    turn = frame_rotations(rate, when, start, stop)
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    before, after = up[:-1][short], up[1:][short]
+    if not _median_miss(turn, before, after) > _WRONG:
+        return
+    mirrored = frame_rotations(-rate, when, start, stop)
+    miss = {name: _median_miss(turn, before @ m.T, after @ m.T) for name, m in _signed_permutations().items()}
+    miss |= {
+        f"{name} and the gyroscopes all reversed": _median_miss(mirrored, before @ m.T, after @ m.T)
+        for name, m in _signed_permutations().items()
+    }
+    # Reversing all three axes of gravity changes nothing: of two equals, the one with fewer reversals is meant.
+    best = min(miss, key=lambda name: (round(miss[name], 9), name.count("-")))
+    if miss[best] < _RIGHT:
+        raise DataError(
+            f"{recording.name}: columns accel_x accel_y accel_z: axes swapped or reversed: between attitudes the "
+            f"direction of gravity misses the turn of gyro_x gyro_y gyro_z by {np.degrees(miss['x y z']):.0f} deg "
+            f"(median of {np.count_nonzero(short)} turns), but by {np.degrees(miss[best]):.1f} deg with the "
+            f"accelerometer columns taken as {best}"
+        )
+
+
+def _median_miss(turn: Array, before: Array, after: Array) -> float:
+    cosine = np.einsum("mij,mj,mi->m", turn, before, after)
+    return median(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def _signed_permutations() -> dict[str, Array]:
+    """All 48 ways to name three axes: text such as ``y x -z`` to matrix."""
+    found = {}
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            text = " ".join(("" if sign > 0 else "-") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
+            found[text] = matrix
+    return found

@@ -1,0 +1,548 @@
+"""The fit of the turns.
+
+The clock of the gyroscopes, whether their scale factors change with the rate, and which turns are left out.
+
+M = S (A + b + even_i A_i^2 / w_i + odd_i A_i^3 / w_i^2),   A = T w,  w_i the largest rate of gyro i in the turns
+
+Both terms of all three gyros are tried together beside the parameters of the fit (generalised least squares, F-test).
+They are tested and said, never fitted: turns by hand seldom vary enough in rate to tell S from them.
+
+A scale factor is output per angle and time: a clock that runs fast by 1000 ppm makes all three 1000 ppm too large, and
+no turn shows it. Where the accelerometers are stamped by another clock, both see the same turns. In each of them the
+accelerometers' direction of gravity follows the one that the gyroscopes carry, with a delay; the line through the
+delays over time is the difference of the clocks. Acceleration of the unit along its path is odd about the middle of a
+turn, the speed even: it does not move the delay to first order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.display import Bad, Note
+from imulab.errors import DataError
+from imulab.estimation.least_squares import Fit, covariance, f_test, least_squares
+from imulab.estimation.rows import MAD_TO_SIGMA
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.gyro.rest import Rest, at_rest, find_holds
+from imulab.procedures.tumble.gyro.rotation import frame_rotations, weighted_turns
+from imulab.procedures.tumble.gyro.turns import COLUMNS, ROWS, Segments, carried, find_turns, model, start_scale
+from imulab.recording import Array
+from imulab.units import parse_unit, to_si
+
+# Whether the scale factors of the gyroscopes change with the rate, from what the turns miss.
+
+
+_SIGNIFICANT = 0.01
+_CLEAR_SLOPE = 3.0
+_FEWEST_LEFT = 6
+
+
+@dataclass(frozen=True)
+class Nonlinearity:
+    """Probability of the residuals if nothing changes with the rate, and what changes by how much.
+
+    Attributes
+    ----------
+    probability
+        Of so large a gain by chance (F-test).
+    odd
+        Change of the scale factor from rest to the largest rate, relative, shape (3,).
+    even
+        Half its difference between the two directions at the largest rate, relative, shape (3,).
+    odd_uncertainty, even_uncertainty
+        Their standard uncertainties, shape (3,).
+    largest
+        Largest rate about each axis in the turns, rad/s, shape (3,).
+    """
+
+    probability: float
+    odd: Array
+    even: Array
+    odd_uncertainty: Array
+    even_uncertainty: Array
+    largest: Array
+
+    def notes(self) -> list[str]:
+        """Say what changes with the rate, if it is beyond chance."""
+        if not self.probability < _SIGNIFICANT:
+            return []
+        found = []
+        for i, axis in enumerate("xyz"):
+            for what, value, u in (
+                ("from slow turns to", self.odd[i], self.odd_uncertainty[i]),
+                ("between the two directions at", 2 * self.even[i], 2 * self.even_uncertainty[i]),
+            ):
+                if abs(value) > _CLEAR_SLOPE * u:
+                    rate = np.degrees(self.largest[i])
+                    found.append(f"of {axis} by {100 * value:+.2g} % (u {100 * u:.1g} %) {what} {rate:.0f} deg/s")
+        changes = "; ".join(found) or "of which axis, they do not tell"
+        return [
+            f"gyro: what the turns miss depends on the rate (p {self.probability:.1g}): the scale factor changes "
+            f"{changes}: the record holds for turns as fast as these; measure at the rates of use, or on a rate table"
+        ]
+
+
+def test_linearity(
+    segments: Segments, scale: Array, theta: Array, jacobian: Array, residual: Array, shared: Array, variance: float
+) -> Nonlinearity | None:
+    """Test whether what the turns miss depends on the rate; None where too few turns are left to tell.
+
+    Parameters
+    ----------
+    scale, theta
+        Output per rad/s and scaled parameters of the fit.
+    jacobian, residual
+        At the solution, (3 m, p) and (3 m,).
+    shared
+        Covariance of the residuals that directions of gravity and the zero bring, (3 m, 3 m).
+    variance
+        That each has beside, rad^2.
+    """
+    m, size = len(segments.before), theta.size
+    if 2 * m < size + 6 + _FEWEST_LEFT:
+        return None
+    t = np.eye(3)
+    t[ROWS, COLUMNS] = theta[3:9]
+    inverse = np.linalg.inv(t)
+    moved = scale * theta[9:12] if size > 9 else 0.0
+    sensed = (segments.output - moved) / (scale * (1 + theta[:3]))
+    sensed = np.where(segments.step[:, :, None] > 0, sensed, 0.0)
+    largest = np.maximum(np.abs(sensed).max(axis=(0, 1)), 1e-12)
+    weights = np.concatenate([sensed**3 / largest**2, sensed**2 / largest], axis=2)
+    turned = weighted_turns(sensed @ inverse.T, segments.step, weights).weighted
+    matrix = carried(segments, scale, theta)
+    columns = [
+        np.einsum("mij,mj->mi", matrix, np.cross(segments.before, turned[:, k] @ -inverse[:, k % 3])).ravel()
+        for k in range(6)
+    ]
+    floor = max(variance, 1e-6 * float(np.trace(shared)) / m, 1e-24)
+    root = np.linalg.cholesky(shared + floor * np.eye(3 * m))
+    whole = np.linalg.solve(root, np.column_stack([jacobian, *columns, residual]))
+    design, left = whole[:, :-1], whole[:, -1]
+    length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    design = design / length
+
+    def solved(count: int) -> tuple[Array, float]:
+        answer = np.linalg.lstsq(design[:, :count], left, rcond=None)[0]
+        return answer, float(((left - design[:, :count] @ answer) ** 2).sum())
+
+    cost, (answer, larger) = solved(size)[1], solved(size + 6)
+    freedom = 2 * m - size - 6
+    spread = np.linalg.pinv(design.T @ design) * (larger / freedom)
+    u = np.sqrt(np.diag(spread)[size:]) / length[size:]
+    # The residual is carried less found direction: parameters that lower it have its sign reversed.
+    value = -answer[size:] / length[size:]
+    probability = f_test(cost, size, larger, size + 6, 2 * m)
+    return Nonlinearity(probability, value[:3], value[3:], u[:3], u[3:], largest)
+
+
+# The clock of the gyroscopes: how far it can be trusted, and what the accelerometers' clock says of it.
+
+
+CRYSTAL = 50 * 1e-6  # as '50 ppm' is read, so that the two compare equal
+"""Standard uncertainty of the rate of a clock that nothing is known of but that a crystal drives it."""
+_KNOT = 0.05  # s
+_LAGS = np.linspace(-2.0, 2.0, 21)  # s
+_STEPS = 6
+_CLEAR = 2.58
+_CLEAR_DELAY = 4.0
+_OUTLIER = 4.0 * MAD_TO_SIGMA
+_FEWEST = 6
+_LATENCY = 5e-3  # s
+_JITTER, _COUNTED = 0.02, 1e-6  # of a step
+_FEWEST_STAMPS = 100
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The accelerometers' time less the gyroscopes', ``delay + rate (t - middle)``, with standard uncertainties; s."""
+
+    delay: float
+    delay_uncertainty: float
+    rate: float
+    rate_uncertainty: float
+    middle: float
+    turns: int
+
+    def on_other(self, time: Array) -> Array:
+        """Return times of the gyroscopes' clock on that of the accelerometers."""
+        return np.asarray(time + self.delay + self.rate * (time - self.middle), dtype=np.float64)
+
+    def variance(self, clock: float) -> float:
+        """Of the difference of the rates, if each clock has this relative standard uncertainty."""
+        return 2 * clock**2 + self.rate_uncertainty**2
+
+    def clear(self, clock: float) -> bool:
+        """Whether two such clocks do not explain the difference (at 1 %)."""
+        return bool(abs(self.rate) > _CLEAR * math.sqrt(self.variance(clock)))
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What the time is known by that the scale factors are referred to.
+
+    Attributes
+    ----------
+    uncertainty, assumed
+        Relative standard uncertainty of the rate of the clock in use, and as assumed of any.
+    of
+        Whose it is.
+    comparison
+        Of the two clocks, or None.
+    counted
+        Whether the gyroscopes' time stamps are a count times a nominal step, which no clock measured.
+    """
+
+    uncertainty: float
+    assumed: float
+    of: str
+    comparison: Comparison | None
+    counted: bool = False
+
+    def notes(self, *, apart: bool) -> list[str]:
+        """Say what a user should know; `apart`: the two triads come from two recordings."""
+        found = self.comparison
+        if found is None:
+            return []
+        if self.of == "gyro" and found.clear(self.assumed):
+            return [
+                f"gyro: the accelerometers' clock runs {1e6 * found.rate:+.0f} ppm (u "
+                f"{1e6 * found.rate_uncertainty:.0f} ppm) against the gyroscopes': if the gyroscopes' is wrong, so are "
+                "all their scale factors, by as much; their uncertainty covers it. If the accelerometers' clock is the "
+                "true one, use --clock-of accel"
+            ]
+        late = -found.delay
+        if not apart and abs(late) > max(_LATENCY, _CLEAR_DELAY * found.delay_uncertainty):
+            return [
+                Note(
+                    f"gyro: its samples come {1e3 * late:+.1f} ms after the accelerometers' of the same time (u "
+                    f"{1e3 * found.delay_uncertainty:.1f} ms): harmless here, where turns go from hold to hold, not in "
+                    "a filter that uses both"
+                )
+            ]
+        return []
+
+
+def clock_of_scale(comparison: Comparison | None, clock: float, of: str, *, counted: bool) -> Clock:
+    """Return what is known of the clock that the scale factors are referred to.
+
+    Parameters
+    ----------
+    comparison
+        Of the two clocks, or None.
+    clock
+        Relative standard uncertainty of the rate of the clock that `of` names.
+    of
+        ``gyro``: the gyroscopes' own stamps count; what two such clocks leave of the difference is added to it.
+        ``accel``: they were carried over to the accelerometers' clock.
+    """
+    more = 0.0
+    if comparison is not None and of == "accel":
+        more = comparison.rate_uncertainty**2
+    elif comparison is not None:
+        more = max(comparison.rate**2 - comparison.variance(clock), 0.0)
+    return Clock((clock**2 + more) ** 0.5, clock, of, comparison, counted)
+
+
+def counted(time: Array) -> bool:
+    """Whether time stamps are a count times a step, to rounding."""
+    step = np.diff(time)
+    return bool(np.ptp(step) < _COUNTED * float(step.mean()) + 8 * np.spacing(np.abs(time).max()))
+
+
+def evened(time: Array) -> tuple[Array, float] | None:
+    """Return even time stamps in place of some that jitter, and by how much they do, rms, s; None where they do not.
+
+    Samples of a sensor that runs by itself come evenly, while a host stamps them when it gets to it. Stamps are
+    replaced by a line through them, between gaps.
+    """
+    step = np.diff(time)
+    middle = float(np.median(step))
+    gap = step > 1.5 * float(step.mean()) + 8 * MAD_TO_SIGMA * float(np.median(np.abs(step - middle)))
+    even = time.copy()
+    edges = np.concatenate([[0], np.flatnonzero(gap) + 1, [len(time)]])
+    for start, stop in pairwise(edges.tolist()):
+        if stop - start >= _FEWEST_STAMPS:
+            number = np.arange(stop - start) - (stop - start - 1) / 2
+            stamps = time[start:stop] - time[start:stop].mean()
+            even[start:stop] -= stamps - number * float(number @ stamps) / float(number @ number)
+    jitter = float(np.sqrt(np.mean((time - even) ** 2)))
+    return (even, jitter) if jitter > _JITTER * float(step.mean()) and (np.diff(even) > 0).all() else None
+
+
+def compare_clocks(
+    own: Array, force: Array, time: Array, rate: Array, segments: Segments, *, search: bool
+) -> Comparison | None:
+    """Compare the clocks of the two triads; None where fewer than six turns tell.
+
+    Parameters
+    ----------
+    own, force
+        Time of the accelerometers' samples, s, (k,), and their specific force, m/s^2, (k, 3).
+    time, rate
+        Time of the gyroscopes' samples, s, (n,), and the body rate, rad/s, (n, 3).
+    segments
+        The turns, on the gyroscopes' clock.
+    search
+        Whether delays up to two seconds are to be expected.
+    """
+    step = max(_KNOT, 2 * float(np.median(np.diff(own))))
+    knots, seen = _carried_gravity(time, rate, segments, step)
+    moved = np.gradient(seen, axis=1)
+    spacing = np.gradient(knots, axis=1)
+    speed = moved / np.where(spacing > 0, spacing, np.inf)[:, :, None]
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (force[1:] + force[:-1]) * np.diff(own)[:, None], axis=0)])
+
+    def missing(delay: Array) -> Array:
+        """Direction that the accelerometers see, later by `delay` (m,), less what the gyroscopes carry."""
+        at = knots + delay[:, None]
+        parts = [np.interp(at + step / 2, own, column) - np.interp(at - step / 2, own, column) for column in sums.T]
+        vector = np.stack(parts, axis=2)
+        length = np.linalg.norm(vector, axis=2, keepdims=True)
+        return np.asarray(vector / np.maximum(length, 1e-300) - seen, dtype=np.float64)
+
+    delay = np.zeros(len(seen))
+    if search:
+        costs = np.array([(missing(delay + lag) ** 2).sum(axis=(1, 2)) for lag in _LAGS.tolist()])
+        delay = _LAGS[np.argmin(costs, axis=0)]
+    power = (speed**2).sum(axis=(1, 2))
+    for _ in range(_STEPS):
+        delay = delay - np.clip((missing(delay) * speed).sum(axis=(1, 2)) / np.maximum(power, 1e-300), -0.3, 0.3)
+    return _line((segments.start + segments.stop) / 2, delay)
+
+
+def _carried_gravity(time: Array, rate: Array, segments: Segments, step: float) -> tuple[Array, Array]:
+    """Knots of each turn (m, k), the last one repeated, and the direction of gravity there, (m, k, 3).
+
+    By how much a turn misses at its end is spread over it in proportion to the angle turned.
+    """
+    start, stop = np.searchsorted(time, segments.start), np.searchsorted(time, segments.stop)
+    samples = max(1, round(step / float(np.median(np.diff(time[start[0] : stop[0] + 1])))))
+    count = -(-int((stop - start).max()) // samples)
+    index = np.minimum(start[:, None] + samples * np.arange(count + 1), stop[:, None])
+    m = len(start)
+    turn = frame_rotations(rate, time, index[:, :-1].ravel(), index[:, 1:].ravel()).reshape(m, count, 3, 3)
+    up = np.empty((m, count + 1, 3))
+    up[:, 0] = segments.before
+    for k in range(count):
+        up[:, k + 1] = np.einsum("mij,mj->mi", turn[:, k], up[:, k])
+    path = np.concatenate([np.zeros((m, 1)), np.cumsum(np.linalg.norm(np.diff(up, axis=1), axis=2), axis=1)], axis=1)
+    share = path / np.maximum(path[:, -1:], 1e-300)
+    return time[index], up + share[:, :, None] * (segments.after - up[:, -1])[:, None, :]
+
+
+def _line(when: Array, delay: Array) -> Comparison | None:
+    """Line through the delays, those left out that stand out from it (by the median slope of all pairs)."""
+    if len(when) < _FEWEST:
+        return None
+    i, j = np.triu_indices(len(when), 1)
+    slope = float(np.median((delay[j] - delay[i]) / (when[j] - when[i])))
+    left = delay - slope * when
+    left = left - np.median(left)
+    kept = np.abs(left) <= max(_OUTLIER * float(np.median(np.abs(left))), 1e-9)
+    n = int(kept.sum())
+    if n < _FEWEST:
+        return None
+    middle = float(when[kept].mean())
+    centred, mean = when[kept] - middle, float(delay[kept].mean())
+    spread = float((centred**2).sum())
+    rate = float((centred * delay[kept]).sum()) / spread
+    scatter = float(np.sqrt(((delay[kept] - mean - rate * centred) ** 2).sum() / (n - 2)))
+    return Comparison(mean, scatter / n**0.5, rate, scatter / spread**0.5, middle, n)
+
+
+# The fit of the turns: from which outputs at rest, and without which turns.
+
+
+_WORST_TURN = np.radians(20.0)
+_FAR = np.radians(8.0)
+_STANDS_OUT = 3.0  # medians; of 30 turns whose misses are normal, none is so far out in 94 % of tests
+_BY_CHANCE = 1e-3
+_REWEIGHTED = 6
+_MANY = 3  # one turn in so many
+
+
+@dataclass(frozen=True)
+class Case:
+    """What does not change when the time, or the choice of the sensitivity, does."""
+
+    name: str
+    attitudes: Attitudes
+    force: Array
+    own: Array
+    own_force: Array
+    output: Array
+    unit: str
+    fit_bias: bool
+    knocked: NDArray[np.bool_]
+    """Attitudes that the accelerometers' record set aside, shape (n,)."""
+    earth: Array | float = 0.0
+    """Output by what is known of the Earth's rate in each attitude, shape (n, 3)."""
+    vertical: Array | None = None
+    """Output by the Earth's whole rate along up in each, shape (n, 3), where nobody knows which part of it is there."""
+
+    def force_at(self, time: Array) -> Array:
+        """Specific force at the gyroscopes' sample times, m/s^2, shape (n, 3)."""
+        if len(self.own) == len(time) and np.array_equal(self.own, time):
+            return self.own_force
+        return np.column_stack([np.interp(time, self.own, column) for column in self.own_force.T])
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Scaled parameters (p,) that fit the turns, residuals (3 m,), Jacobian (3 m, p), and what was set aside."""
+
+    segments: Segments
+    rest: Rest
+    scale: Array
+    theta: Array
+    residual: Array
+    jacobian: Array
+    converged: bool
+    aside: Array
+    notes: tuple[str, ...]
+
+    def rate(self, output: Array) -> Array:
+        """Body rate of samples, rad/s, shape (n, 3); what acceleration adds is left in."""
+        t = np.eye(3)
+        t[ROWS, COLUMNS] = self.theta[3:9]
+        moved = self.scale * self.theta[9:12] if self.theta.size > 9 else 0.0
+        scaled = (output - self.rest.zero - moved) / (self.scale * (1 + self.theta[:3]))
+        return np.asarray(np.linalg.solve(t, scaled.T).T, dtype=np.float64)
+
+    def output_of(self, rate: Array) -> Array:
+        """Output that body rates, rad/s, shape (n, 3), add."""
+        t = np.eye(3)
+        t[ROWS, COLUMNS] = self.theta[3:9]
+        return self.scale * (1 + self.theta[:3]) * (rate @ t.T)
+
+    @property
+    def typical_miss(self) -> float:
+        """Median angle by which the turns miss, rad."""
+        return float(np.median(np.linalg.norm(self.residual.reshape(-1, 3), axis=1)))
+
+    def cost(self, attitudes: NDArray[np.intp]) -> float:
+        """Sum of squares, rad^2, over the turns that begin at some of the attitudes."""
+        chosen = np.isin(self.segments.attitude, attitudes)
+        return float((self.residual.reshape(-1, 3)[chosen] ** 2).sum())
+
+
+def solve_turns(case: Case, time: Array, sensitivity: str) -> Solved:
+    """Solve with what the outputs at rest say; a sensitivity with which the turns miss more is not taken by itself."""
+    holds = find_holds(case.attitudes, time, case.output, case.name)
+
+    def solved(wanted: str) -> Solved:
+        rest = at_rest(holds, case.output, case.force, wanted, case.earth, case.vertical)
+        moving = None if rest.slope is None else case.force_at(time)
+        segments, notes = find_turns(holds, time, case.output, case.force, rest, moving, case.name)
+        beside = case.knocked[segments.attitude] | case.knocked[segments.attitude + 1]
+        if beside.any():
+            numbers = " ".join(map(str, (np.flatnonzero(case.knocked) + 1).tolist()))
+            left_out = (
+                f"gyro: {int(beside.sum())} turns left out, beside attitudes that the record set aside ({numbers})"
+            )
+            segments, notes = segments.part(~beside), [*notes, Note(left_out)]
+        return _solve(case, segments, rest, notes)
+
+    found = solved(sensitivity)
+    if sensitivity != "auto" or found.rest.slope is None:
+        return found
+    without = solved("no")
+    both = np.intersect1d(found.segments.attitude, without.segments.attitude)
+    return found if found.cost(both) < without.cost(both) else without
+
+
+def _solve(case: Case, segments: Segments, rest: Rest, notes: list[str]) -> Solved:
+    """Fit the turns; those that stand out from all others are set aside one by one."""
+    known = parse_unit(case.unit)
+    scale = np.full(3, 1 / to_si(1.0, known.symbol)) if known.quantity == "rate" else start_scale(segments)
+    theta = np.zeros(12 if case.fit_bias else 9)
+    residual = model(segments, scale, theta, case.fit_bias)[0].reshape(-1, 3)
+    if known.quantity == "rate" and np.median(np.linalg.norm(residual, axis=1)) > _FAR:
+        scale = start_scale(segments)  # the stated unit may be wrong
+    weights: Array = np.ones(len(segments.before))
+    fit = _fitted(segments, scale, theta, weights)
+    out, missed = _outliers(segments, scale, fit)
+    kept = segments
+    if out.any():
+        kept = segments.part(~out)
+        fit = _fitted(kept, scale, fit.parameters[0], weights[~out])
+    theta, residual, jacobian = fit.parameters[0], fit.residuals[0], fit.jacobian[0]
+    miss = float(np.median(np.linalg.norm(residual.reshape(-1, 3), axis=1)))
+    if not miss < _WORST_TURN:
+        raise DataError(
+            f"{case.name}: columns gyro_x gyro_y gyro_z: the turns miss the change of gravity's direction by "
+            f"{np.degrees(miss):.0f} deg (median of {len(residual) // 3}): swapped or reversed axes, or a wrong unit?"
+        )
+    others = float(np.sqrt((residual**2).sum() / (len(residual) // 3)))
+    aside = np.column_stack([segments.start, segments.stop, missed])[out]
+    notes = notes + [
+        f"gyro: the turn at {start:.1f} to {stop:.1f} s set aside: it misses by {np.degrees(size):.3g} deg, the "
+        f"others by {np.degrees(others):.3g} deg rms: knocked, or samples lost?"
+        for start, stop, size in aside.tolist()
+    ]
+    if out.sum() * _MANY > len(out):
+        notes.append(
+            Bad(
+                f"gyro: {int(out.sum())} of {len(out)} turns stand out from the others: too many to tell which are "
+                "right; record again, without knocks and without lost samples"
+            )
+        )
+    return Solved(kept, rest, scale, theta, residual, jacobian, bool(fit.converged[0]), aside, tuple(notes))
+
+
+def _fitted(segments: Segments, scale: Array, theta: Array, weights: Array) -> Fit:
+    """Return the fit of some turns, weighted (m,), from the parameters theta."""
+    return least_squares(
+        lambda parameters: model(segments, scale, parameters, theta.size > 9),
+        theta,
+        np.repeat(weights, 3),
+        tolerance=1e-8,
+    )
+
+
+def _outliers(segments: Segments, scale: Array, fit: Fit) -> tuple[NDArray[np.bool_], Array]:
+    """Return which turns stand out (m,), and what the others' fit misses each by, rad, (m,).
+
+    Candidates are far out under a fit that bounds the pull of each turn (Cauchy's weights on the scale of the median);
+    one stands out if the fit without all candidates predicts it so badly by chance in 0.1 % of tests of all turns
+    (F-test). Where the median turn is not far below the worst, there are none.
+    """
+    m, size = len(segments.before), fit.parameters.shape[1]
+    miss = np.linalg.norm(fit.residuals[0].reshape(m, 3), axis=1)
+    nothing = np.zeros(m, dtype=np.bool_)
+    if miss.max() <= _STANDS_OUT * np.median(miss) or 2 * m < size + _FEWEST_LEFT:
+        return nothing, miss
+    for _ in range(_REWEIGHTED):
+        fit = _fitted(segments, scale, fit.parameters[0], 1 / (1 + (miss / (2 * np.median(miss))) ** 2))
+        miss = np.linalg.norm(fit.residuals[0].reshape(m, 3), axis=1)
+    out = miss > _STANDS_OUT * np.median(miss)
+    left = 2 * int((~out).sum()) - size
+    if not out.any() or left < _FEWEST_LEFT:
+        return nothing, miss
+    fit = _fitted(segments, scale, fit.parameters[0], np.where(out, 0.0, 1.0))
+    residual, rows = fit.residuals[0].reshape(m, 3), fit.jacobian[0].reshape(m, 3, size)
+    spread = rows @ covariance(fit.jacobian, np.repeat(np.where(out, 0.0, 1.0), 3)[None])[0] @ np.swapaxes(rows, 1, 2)
+    far = np.einsum("mi,mi->m", residual, np.linalg.solve(np.eye(3) + spread, residual[:, :, None])[:, :, 0])
+    cost = float((residual[~out] ** 2).sum())
+    for k in np.flatnonzero(out).tolist():
+        out[k] = m * f_test(cost + float(far[k]), size, cost, size + 2, left + size + 2) < _BY_CHANCE
+    return out, np.linalg.norm(residual, axis=1)
+
+
+def turn_covariance(found: Solved, shared: Array, freedom: int) -> tuple[Array, float]:
+    """Return the covariance of the parameters, (p, p), and the variance that each residual has of its own.
+
+    `shared`, (3 m, 3 m), is what the residuals have in common; what they scatter beyond it is taken to be alike in all.
+    """
+    residual, jacobian = found.residual, found.jacobian
+    bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]
+    pulled = jacobian.T @ shared @ jacobian
+    left = float(residual @ residual) - float(np.trace(shared)) + float(np.trace(bread @ pulled))
+    variance = max(left, 0.0) / freedom
+    return bread @ pulled @ bread + variance * bread, variance

@@ -1,0 +1,204 @@
+"""The turns between holds: which can be used, what the gyroscopes say of them, and how that moves with the parameters.
+
+Source of the change of a turn with the rate: Bortz, IEEE Trans. AES-7 (1971) 61.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.display import Note
+from imulab.errors import SegmentError
+from imulab.procedures.tumble.gyro.rest import Holds, Rest, beyond_range
+from imulab.procedures.tumble.gyro.rotation import Turns, composed_turns, weighted_turns
+from imulab.recording import Array
+
+ROWS, COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)
+_FEWEST_TURNS = 8
+_LONGEST_TURN = 60.0  # s
+_GAP_SECONDS, _GAP_STEPS, _GAP_BURSTS = 0.05, 4.5, 2.0
+_FEW_BROKEN = 0.1  # of the turns: the others are as good without them
+_COARSE = 4  # steps taken as one where a scale factor is only to be found roughly
+_START_FACTORS = np.geomspace(0.4, 1.25, 24)
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Turns as steps between samples: mean output less what acceleration adds, (m, n, 3), and durations, (m, n).
+
+    `before` and `after` are the upward directions at both ends, (m, 3), `start` and `stop` the times, s, (m,).
+    """
+
+    output: Array
+    step: Array
+    before: Array
+    after: Array
+    start: Array
+    stop: Array
+    attitude: NDArray[np.intp]
+    """Index of the attitude before each turn; the one after it is the next."""
+
+    def part(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Segments:
+        """Return some of the turns."""
+        values = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
+        return Segments(**values)
+
+
+def find_turns(
+    holds: Holds, time: Array, output: Array, force: Array, rest: Rest, moving: Array | None, name: str
+) -> tuple[Segments, list[str]]:
+    """Find the turns between holds that can be used, and say which cannot: clipped ones, and those with gaps.
+
+    Parameters
+    ----------
+    time, output
+        Of the gyroscopes, (n,) and (n, 3).
+    force
+        Specific force in the holds, m/s^2, shape (holds, 3).
+    moving
+        Specific force at the gyroscopes' samples, (n, 3), or None where acceleration does not move the zero.
+
+    Raises
+    ------
+    SegmentError
+        Fewer than eight turns can be used.
+    """
+    begin, end = holds.leave[:-1], holds.arrive[1:]
+    turns = (end > begin) & (time[end] - time[begin] <= _LONGEST_TURN)
+    clipped = _any_during(beyond_range(output), begin, end) & turns[:, None]
+    step = np.diff(time)
+    # What lies in a gap is taken as a straight line: no turn is known to a milliradian across a longer one.
+    usual = float(np.median(step)), float(np.quantile(step, 0.99))  # the second where stamps come in bursts
+    wide = step > max(_GAP_SECONDS, _GAP_STEPS * usual[0], _GAP_BURSTS * usual[1])
+    broken = _any_during(np.append(wide, False)[:, None], begin, end - 1)[:, 0] & turns
+    chosen = np.flatnonzero(turns & ~clipped.any(axis=1) & ~broken)
+    notes: list[str] = []
+
+    def times(which: NDArray[np.bool_]) -> str:
+        where = np.flatnonzero(which)
+        return " ".join(f"{t:.1f}" for t in time[begin[where[:6]]].tolist()) + (" ..." if len(where) > 6 else "")
+
+    def count(which: NDArray[np.bool_]) -> str:
+        number = int(which.sum())
+        return f"{number} turn{'' if number == 1 else 's'}"
+
+    if clipped.any():
+        axes = " ".join(f"gyro_{'xyz'[axis]}" for axis in range(3) if clipped[:, axis].any())
+        which = np.asarray(clipped.any(axis=1))
+        notes.append(
+            f"gyro: {count(which)} left out, clipped: {axes} stay at the end of their range (from {times(which)} s)"
+        )
+    if broken.any():
+        longest = float(step[wide].max())
+        said = (
+            f"gyro: {count(broken)} left out, samples are missing during them: gaps of up to {longest:.3g} s "
+            f"(turns from {times(broken)} s)"
+        )
+        notes.append(Note(said) if broken.sum() <= _FEW_BROKEN * turns.sum() else said)
+    if len(chosen) < _FEWEST_TURNS:
+        aside = f" ({int(clipped.any(axis=1).sum())} more are clipped)" if clipped.any() else ""
+        aside += f" ({int(broken.sum())} more have gaps)" if broken.any() else ""
+        raise SegmentError(f"{name}: {len(chosen)} turns between attitudes{aside}; expected at least {_FEWEST_TURNS}")
+    start, stop = begin[chosen], end[chosen]
+    index = start[:, None] + np.arange(int((stop - start).max()))
+    inside = index < stop[:, None]
+    here, there = np.where(inside, index, 0), np.where(inside, index + 1, 0)
+    mean = 0.5 * (output[here] + output[there]) - rest.zero
+    if moving is not None and rest.slope is not None:
+        mean = mean - 0.5 * (moving[here] + moving[there]) @ rest.slope.T
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    between = np.where(inside, time[there] - time[here], 0.0)
+    return Segments(mean, between, up[chosen], up[chosen + 1], time[start], time[stop], chosen), notes
+
+
+def _any_during(flags: NDArray[np.bool_], first: NDArray[np.intp], last: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Whether a flag (n, k) is up from sample `first` to sample `last`, both (m,); shape (m, k)."""
+    count = np.vstack([np.zeros((1, flags.shape[1]), dtype=np.int64), np.cumsum(flags, axis=0)])
+    result: NDArray[np.bool_] = count[np.maximum(last, first) + 1] > count[first]
+    return result
+
+
+def start_scale(segments: Segments) -> Array:
+    """Return the output per rad/s to start from, what makes the turns fit best with ideal axes, shape (3,)."""
+    angle = np.arccos(np.clip(np.einsum("mi,mi->m", segments.before, segments.after), -1, 1))
+    turned = np.linalg.norm((segments.output * segments.step[:, :, None]).sum(axis=1), axis=1)
+    # A turn goes at least as far as the direction of gravity does.
+    guess = float(np.median((turned / np.maximum(angle, 1e-3))[angle > 0.3])) if (angle > 0.3).any() else 1.0
+    few = slice(None, 40)
+    angle_steps = segments.output[few] * segments.step[few, :, None]
+    missing = -angle_steps.shape[1] % _COARSE
+    coarse = np.pad(angle_steps, ((0, 0), (0, missing), (0, 0))).reshape(len(angle_steps), -1, _COARSE, 3).sum(axis=2)
+    costs = []
+    for factor in _START_FACTORS:
+        miss = (
+            np.einsum("mij,mj->mi", composed_turns(coarse / (guess * factor)), segments.before[few])
+            - segments.after[few]
+        )
+        costs.append(float(np.median(np.linalg.norm(miss, axis=1))))
+    return np.full(3, guess * float(_START_FACTORS[int(np.argmin(costs))]))
+
+
+def shared_covariance(segments: Segments, scale: Array, theta: Array, known: Array, zero: Array | None) -> Array:
+    """Return what directions of gravity and the zero at rest bring to the residuals, rad^2, shape (3 m, 3 m).
+
+    Parameters
+    ----------
+    known
+        Covariance of the upward directions of all holds, shape (3 n, 3 n).
+    zero
+        Standard uncertainty of the output at rest, shape (3,), or None where the biases are fitted.
+    """
+    flat = by_directions(segments, scale, theta, len(known) // 3)
+    found: Array = flat @ known @ flat.T
+    if zero is not None:
+        moved = model(segments, scale, np.concatenate([theta[:9], np.zeros(3)]), fit_bias=True)[1][:, 9:]
+        moved = moved * (zero / scale)
+        found += moved @ moved.T
+    return found
+
+
+def by_directions(segments: Segments, scale: Array, theta: Array, holds: int) -> Array:
+    """Return the derivatives of the residuals by the upward directions of all holds, shape (3 m, 3 holds)."""
+    m = len(segments.before)
+    spread = np.zeros((m, 3, holds, 3))
+    spread[range(m), :, segments.attitude, :] = carried(segments, scale, theta)
+    spread[range(m), :, segments.attitude + 1, :] -= np.eye(3)
+    return spread.reshape(3 * m, -1)
+
+
+def carried(segments: Segments, scale: Array, theta: Array) -> Array:
+    """Return the matrices of the turns under given parameters, shape (m, 3, 3)."""
+    t = np.eye(3)
+    t[ROWS, COLUMNS] = theta[3:9]
+    moved = scale * theta[9:12] if theta.size > 9 else 0.0
+    rate = (segments.output - moved) / (scale * (1 + theta[:3])) @ np.linalg.inv(t).T
+    return composed_turns(rate * segments.step[:, :, None])
+
+
+def model(segments: Segments, scale: Array, theta: Array, fit_bias: bool) -> tuple[Array, Array]:
+    """Return the carried less the found direction of each turn, (3 m,), and derivatives, (3 m, p).
+
+    An error ``dw`` of the rate changes a carried direction u by ``C (u x sum C' dw dt)``; dw is linear in the scaled
+    output, the rate and a constant, so that five sums per turn hold all derivatives.
+    """
+    s = scale * (1 + theta[:3])
+    t = np.eye(3)
+    t[ROWS, COLUMNS] = theta[3:9]
+    inverse = np.linalg.inv(t)
+    scaled = (segments.output - (scale * theta[9:12] if fit_bias else 0.0)) / s
+    rate = scaled @ inverse.T
+    weights = np.concatenate([scaled, rate, np.ones((*rate.shape[:2], 1))], axis=2)
+    turns: Turns = weighted_turns(rate, segments.step, weights)
+    found = np.einsum("mij,mj->mi", turns.matrix, segments.before)
+    columns = [(k, -inverse[:, k] * (scale / s)[k]) for k in range(3)]
+    columns += [(3 + j, -inverse[:, i]) for i, j in zip(ROWS, COLUMNS, strict=True)]
+    if fit_bias:
+        columns += [(6, -inverse[:, k] * (scale / s)[k]) for k in range(3)]
+    jacobian = np.empty((len(found), 3, len(columns)))
+    for column, (which, direction) in enumerate(columns):
+        moved = np.cross(segments.before, turns.weighted[:, which] @ direction)
+        jacobian[:, :, column] = np.einsum("mij,mj->mi", turns.matrix, moved)
+    return (found - segments.after).ravel(), jacobian.reshape(-1, len(columns))

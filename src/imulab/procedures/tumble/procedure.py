@@ -1,0 +1,320 @@
+"""The tumble test in the registry: its options, its fit from files, and what its record gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from imulab.errors import DataError, RecordError
+from imulab.procedures import tumble
+from imulab.procedures.procedure import (
+    ELEMENT,
+    READING,
+    Files,
+    Option,
+    Procedure,
+    Section,
+    Task,
+    choice,
+    file_option,
+    measure,
+    part_of,
+    read_options,
+    switch,
+    text_option,
+    whole,
+)
+from imulab.procedures.tumble import FURTHER, HEMISPHERES, LOSSES, METHODS, ORDERS
+from imulab.quantities import labelled
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from imulab.device.tables import DeviceTable, Fusion
+    from imulab.device.unit import DeviceUnit
+    from imulab.procedures.procedure import Row
+    from imulab.procedures.tumble.attitudes import Attitudes
+    from imulab.recording import Recording
+    from imulab.records.calibration import Calibration
+    from imulab.records.comparison import Change
+    from imulab.records.triads import LinearFit, Triads
+    from imulab.report.traces import Exhibits
+
+
+# An accelerometer triad from one recording or table of attitudes.
+
+
+_NAMED = (
+    "order", "method", "loss", "threshold", "ageing", "nonlinearity", "cross", "monte-carlo", "with_", "field",
+    "hemisphere", "latitude", "dip",
+)  # fmt: skip
+
+
+def _fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.procedures.tumble.attitudes import find_attitudes
+    from imulab.procedures.tumble.fit import fit_tumble
+
+    recording = access.recording(files[0], values["layout"], **values["part"])
+    attitudes = find_attitudes(recording)
+    prior = None if values["prior"] is None else _prior(values["prior"], attitudes, access)
+    return fit_tumble(
+        attitudes,
+        order=values["order"],
+        gravity=values["gravity"],
+        method=values["method"],
+        loss=values["loss"],
+        nonlinearity=values["nonlinearity"],
+        prior=prior,
+        ageing=values["ageing"],
+        monte_carlo=values["monte_carlo"],
+        cross=values["cross"],
+        threshold=values["threshold"],
+        with_=values["with"],
+        field=values["field"],
+        hemisphere=values["hemisphere"],
+        dip=values["dip"],
+        latitude=values["place"],
+        progress=progress,
+    ).calibration
+
+
+def _prior(file: str, attitudes: Attitudes, access: Files) -> Calibration:
+    """Read a record that can be a prior for these attitudes."""
+    from imulab.procedures.tumble.checks import check_prior, made_from
+    from imulab.procedures.tumble.fit import prior_record
+    from imulab.procedures.tumble.schema import model_of
+
+    record, recording = access.record(file), attitudes.recording
+    try:
+        record = prior_record(record, attitudes)
+        check_prior(record)
+    except RecordError as error:
+        raise RecordError(f"{file}: {error}") from None
+    unit, needed = recording.triad_unit("accel"), model_of(record).output_unit
+    if unit != needed:
+        raise RecordError(f"{file}: the prior has outputs in {needed}, {recording.name} in {unit}")
+    if made_from(record, recording):
+        raise DataError(f"{recording.name}: the prior {file} was made from this recording, which would count twice")
+    return record
+
+
+def _further(text: str, called: str) -> tuple[str, ...]:
+    from imulab.procedures.tumble.estimate import further_triads
+
+    return further_triads(text, called)
+
+
+ORDER = Option(
+    "order",
+    "auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them.",
+    tumble.order,
+    "auto",
+    "auto|0..5|blend",
+    ORDERS,
+)
+GRAVITY = (
+    text_option("gravity", "Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head.", shows="G"),
+    text_option("latitude", "Latitude, deg, for normal gravity; with gyro for the Earth's rate.", shows="DEG"),
+    text_option("height", "Height above the ellipsoid, m.", shows="M"),
+)
+OPTIONS = (
+    ORDER,
+    choice("method", "norm: by the length of f; linearised: the source's iteration.", METHODS, "norm"),
+    choice(
+        "loss", "auto: set knocked attitudes aside and name them; square: keep all; huber: limit them.", LOSSES, "auto"
+    ),
+    Option(
+        "nonlinearity",
+        "Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known.",
+        tumble.nonlinearity,
+        shows="20ug,20ug",
+    ),
+    *GRAVITY,
+    file_option("prior", "Earlier record of this unit, or one over temperature, as prior knowledge.", "RECORD"),
+    Option(
+        "ageing",
+        "What the unit may have changed since the prior, if known.",
+        tumble.ageing,
+        shows="100ug,100ppm[,50urad]",
+    ),
+    whole("monte_carlo", "Trials of a propagation of distributions, 1000 or more."),
+    switch("cross", "Fit cross terms k_xy, k_yz, k_zx: products of two axes."),
+    Option(
+        "threshold",
+        "Changes of scale factors, biases and misalignments at which --method linearised rests; "
+        'the source\'s "5 ppm, 2 ug, 3 arcsec" if not given.',
+        tumble.threshold,
+        shows="5ppm,2ug,3arcsec",
+    ),
+    Option("with", "Further triads on the same attitudes, in one record.", _further, shows="gyro,mag", choices=FURTHER),
+    measure(
+        "field",
+        "With mag: magnitude of the local field, uT; else the field is 1.",
+        "magnetic field",
+        "uT",
+        shows="48.2uT",
+    ),
+    choice("hemisphere", "With mag: to check the sign of the dip; without it by --latitude.", HEMISPHERES),
+    Option("dip", "With mag: dip of the place, deg, to compare with the one found.", tumble.dip, shows="67.2+-0.2"),
+    *READING,
+    ELEMENT,
+)
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.gravity import at_latitude, gravity_option
+    from imulab.procedures.tumble.estimate import check_options
+    from imulab.procedures.tumble.mag.solve import stated_place
+
+    values = read_options(OPTIONS, texts, label)
+    values["ageing"], values["with"] = values["ageing"] or (), values["with"] or ()
+    with labelled(label, _NAMED):
+        check_options(
+            values["order"], values["method"], values["loss"],
+            monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
+            nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
+            further=values["with"], field=values["field"],
+            hemisphere=values["hemisphere"], dip=values["dip"],
+        )  # fmt: skip
+        if "mag" in values["with"]:
+            place = stated_place(values["hemisphere"], values["latitude"], values["dip"])
+            values["hemisphere"] = place.hemisphere
+    earth = at_latitude(values["latitude"], label.format("latitude")) if "gyro" in values["with"] else None
+    values["place"] = None if earth is None else earth.latitude
+    values["gravity"] = gravity_option(
+        values["gravity"], values["latitude"], values["height"], label, beside="gyro" in values["with"]
+    )
+    return {**values, "part": part_of(values)}
+
+
+TASK = Task(
+    files="one recording or table of attitudes",
+    count=(1, 1),
+    options=OPTIONS,
+    values=_values,
+    fit=_fit,
+)
+
+
+# The tumble test as the registry knows it.
+
+
+class AccelerometerSection(Section):
+    """Bias, scale factor, misalignment and nonlinearity of accelerometers."""
+
+    kind = "tumble"
+    triad = "accel"
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.procedures.tumble.device import golden_accelerometers
+
+        return golden_accelerometers(table, random)
+
+    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+        from imulab.procedures.tumble.device import apply_tumble
+
+        return apply_tumble(unit, columns, recording)
+
+
+class GyroscopeSection(Section):
+    """Bias, scale factor, misalignment and g-sensitivity of gyroscopes."""
+
+    kind = "gyro"
+    triad = "gyro"
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.device.unit import golden_gyroscopes
+
+        return golden_gyroscopes(table, random)
+
+    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+        from imulab.procedures.tumble.device import apply_gyro
+
+        return apply_gyro(unit, columns, recording)
+
+
+class MagnetometerSection(Section):
+    """Bias and matrix of magnetometers."""
+
+    kind = "mag"
+    triad = "mag"
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.procedures.tumble.device import golden_magnetometers
+
+        return golden_magnetometers(table, random)
+
+    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+        from imulab.procedures.tumble.device import apply_mag
+
+        return apply_mag(unit, columns, recording)
+
+
+class TumbleProcedure(Procedure):
+    """The tumble test of an accelerometer triad, with gyroscopes and magnetometers on the same attitudes."""
+
+    name = "tumble"
+    command = "tumble"
+    title = "Tumble calibration"
+    line_title = "Tumble"
+    states_triads = True
+    has_heading = True
+    task = TASK
+    sections = (AccelerometerSection(), GyroscopeSection(), MagnetometerSection())
+
+    def check(self, record: Calibration) -> None:
+        from imulab.procedures.tumble.schema import check
+
+        check(record)
+
+    def exhibits(self, record: Calibration) -> Exhibits:
+        from imulab.procedures.tumble.figures import exhibits
+
+        return exhibits(record)
+
+    def rows(self, record: Calibration) -> Sequence[Row]:
+        from imulab.procedures.tumble.record import engineering_rows
+
+        return engineering_rows(record)
+
+    def change_unit(self, change: Change, record: Calibration) -> tuple[float, str]:
+        from imulab.procedures.tumble.record import change_unit
+
+        return change_unit(change, record)
+
+    def same_meaning(self, name: str, first: Calibration, second: Calibration) -> bool:
+        from imulab.procedures.tumble.record import same_meaning
+
+        return same_meaning(name, first, second)
+
+    def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
+        from imulab.procedures.tumble.device import tables_of
+
+        return tables_of(record)
+
+    def heading(self, record: Calibration) -> Callable[[Recording], Recording]:
+        from imulab.procedures.tumble.mag.heading import heading_of
+
+        return heading_of(record)
+
+    def beyond(self, record: Calibration, recording: Recording) -> tuple[int, float]:
+        from imulab.procedures.tumble.device import beyond_test
+
+        return beyond_test(record, recording)
+
+    def beyond_message(self, record: Calibration, count: int, largest: float) -> str:
+        from imulab.procedures.tumble.device import beyond_message
+
+        return beyond_message(record, count, largest)
+
+    def triads(self, record: Calibration) -> Triads:
+        from imulab.procedures.tumble.device import triads_of
+
+        return triads_of(record)
+
+    def linear_fit(self, record: Calibration, *, misalignment: bool) -> LinearFit:
+        from imulab.procedures.tumble.device import linear_fit
+
+        return linear_fit(record, misalignment=misalignment)

@@ -1,0 +1,156 @@
+"""The warm-up in the registry: its options, its fit from files, and what its record gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from imulab.procedures.procedure import (
+    ELEMENT,
+    READING,
+    Files,
+    Option,
+    Procedure,
+    Section,
+    Task,
+    choice,
+    finite,
+    measure,
+    names_of_columns,
+    part_of,
+    read_options,
+    source_of,
+    switch,
+)
+from imulab.procedures.warmup import BEYOND, EXITS, MODELS, POOLS, TEMPERATURES, settling_size
+from imulab.quantities import temperature_list
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from imulab.device.tables import DeviceTable, Fusion
+    from imulab.device.unit import DeviceUnit
+    from imulab.procedures.warmup.cycles import Cycle
+    from imulab.recording import Recording
+    from imulab.records.calibration import Calibration
+    from imulab.report.traces import Exhibits
+
+
+# The warm-up of a unit, or of a type, from recordings of power cycles.
+
+
+def _fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.procedures.warmup.cycles import find_power_cycle
+    from imulab.procedures.warmup.fit import fit_warmup
+
+    def cycle(name: str) -> Cycle:
+        return find_power_cycle(
+            access.blocks(name, values["layout"], **values["part"]),
+            latest_start=values["latest_start"],
+            temperature_from_column=values["temperature_column"],
+            source=source_of(access, name),
+        )
+
+    return fit_warmup([cycle(name) for name in files], **values["fit"]).calibration
+
+
+OPTIONS = (
+    choice("model", "How the bias goes with time; auto compares them.", ("auto", *MODELS), "auto"),
+    Option("temperatures", "Calibration temperatures, degC, ascending.", temperature_list, TEMPERATURES, "T,T,..."),
+    finite("tolerance", "A power-on temperature within this fits, K.", "1", "K"),
+    measure("settling_time", "T_M, s; chosen from the data if not given.", "time", "s", shows="TIME"),
+    Option("settling_limit", "Settled below this: percent of the peak, or deg/h, mg ..", settling_size, "5 %", "LIMIT"),
+    choice("exit", "What the table gives from T_M on.", EXITS, "zero"),
+    measure("taper_time", "How long a taper takes, s.", "time", "s", "60 s", shows="TIME"),
+    choice("pool", "unit, or type: several units share one table.", POOLS, "unit"),
+    choice("beyond", "Beyond the outer temperatures: zero (no correction) or hold (as there).", BEYOND, "zero"),
+    Option("axes", "Columns to fit; all if not given.", names_of_columns, shows="A,A,..."),
+    measure("latest_start", "A first sample later after power-on, s, is refused.", "time", "s", "5 s", shows="TIME"),
+    switch("temperature_column", "Take a missing power-on temperature from the first row's column."),
+    *READING,
+    ELEMENT,
+)
+_OF_THE_FIT = ("model", "temperatures", "tolerance", "settling_time", "taper_time", "pool", "axes", "beyond")
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.procedures.warmup.fit import check_options
+
+    values = read_options(OPTIONS, texts, label)
+    fit = {name: values[name] for name in _OF_THE_FIT}
+    fit |= {"settling_limit": values["settling_limit"], "exit": values["exit"]}
+    check_options(**{name: value for name, value in fit.items() if name not in ("axes", "settling_limit")})
+    return {**values, "fit": fit, "part": part_of(values)}
+
+
+TASK = Task(
+    files="the recordings of its power cycles",
+    count=(1, None),
+    options=OPTIONS,
+    values=_values,
+    fit=_fit,
+)
+
+
+# The bias of the minutes after power-on, as the registry knows it.
+
+
+class WarmupSection(Section):
+    """Bias over the time since power-on, by power-on temperature."""
+
+    kind = "warmup"
+    since_power_on = True
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.procedures.warmup.device import golden
+
+        return golden(table, random)
+
+    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+        from imulab.procedures.warmup.device import apply_warmup
+
+        return apply_warmup(unit, columns, recording)
+
+    def unchanged(self, columns: Mapping[str, Any], recording: Recording) -> str | None:
+        from imulab.procedures.warmup.device import unchanged
+
+        return unchanged(columns, recording)
+
+    def remarks(self, columns: Mapping[str, Any], recording: Recording) -> list[str]:
+        from imulab.procedures.warmup.device import remarks
+
+        return remarks(columns, recording)
+
+
+class WarmupProcedure(Procedure):
+    """The bias of the minutes after power-on."""
+
+    name = "warmup"
+    command = "warmup"
+    title = "Warm-up table"
+    line_title = "Warm-up"
+    elsewhere = "{target} has no parameter that follows the time since power-on, at most some that follow temperature"
+    task = TASK
+    sections = (WarmupSection(),)
+
+    def check(self, record: Calibration) -> None:
+        from imulab.procedures.warmup.schema import check
+
+        check(record)
+
+    def exhibits(self, record: Calibration) -> Exhibits:
+        from imulab.procedures.warmup.figures import exhibits
+
+        return exhibits(record)
+
+    def summary(self, record: Calibration) -> tuple[list[str], list[list[str]]]:
+        from imulab.procedures.warmup.figures import summary
+
+        return summary(record)
+
+    def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
+        from imulab.procedures.warmup.device import tables_of
+
+        return tables_of(record)
