@@ -5,32 +5,40 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ALONE := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.alone)
+# For what runs as several programs: two at a time, if make was not told otherwise.
+BOTH = $(if $(findstring jobserver,$(MAKEFLAGS)),,-j 2)
 
-.PHONY: demo test test-all core fuzz dist wheel-names lint format bench compare footprint truth docs clean
+.PHONY: demo test test-all pytest pytest-all core fuzz dist wheel-names lint format bench compare footprint truth docs clean
 
 demo: $(ALONE)
 	$(BIN)/imulab demo demo
 
+# Everything, with fewer trials and seeds (--reduced); the core by itself beside it.
+test: $(STAMP)
+	$(MAKE) -j 2 core pytest
+
 # The tests start many processes: each would compile what it imports again where the environment forbids to keep it.
-# Three workers for two cores: a good part of the tests waits for a browser, a port or a killed process.
-test test-all: export PYTHONDONTWRITEBYTECODE =
+pytest pytest-all: export PYTHONDONTWRITEBYTECODE =
 # The matrices of the tests are small: threads of the linear algebra would only wait for each other beside three workers.
-test test-all: export OPENBLAS_NUM_THREADS = 1
+pytest pytest-all: export OPENBLAS_NUM_THREADS = 1
 
-test: core $(STAMP)
-	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow"
-	$(BIN)/python -m pytest -n 3 --dist worksteal -m slow --reduced
+# Three workers for two cores: a good part of the tests waits for a browser, a port or a killed process.
+pytest: $(STAMP)
+	$(BIN)/python -m pytest -n 3 --dist worksteal --reduced
 
-test-all: core $(STAMP)
+# Every seed and thousands of trials.
+pytest-all: $(STAMP)
 	$(BIN)/python -m pytest -n 2
+
+test-all: core pytest-all
 
 # The C core by itself: double and float, every compiler there is, with sanitizers.
 core:
-	$(MAKE) -C runtime test
+	$(MAKE) $(BOTH) -C runtime test
 
 # Long by default; FUZZ_SECONDS or FUZZ_RUNS bound it.
 fuzz:
-	$(MAKE) -C runtime fuzz FUZZ_SECONDS=$(or $(FUZZ_SECONDS),3600)
+	$(MAKE) $(BOTH) -C runtime fuzz FUZZ_SECONDS=$(or $(FUZZ_SECONDS),3600)
 
 # sdist and wheel; on Linux with the manylinux tag that the wheel earns.
 dist: $(VENV)/.release
@@ -86,14 +94,15 @@ $(STAMP) $(VENV)/.alone: pyproject.toml CMakeLists.txt $(C_SOURCES)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.$(if $(filter $(STAMP),$@),[dev])'
 	touch $@
 
+# What else these need: imulab itself is there, and is not built again.
 $(VENV)/.release: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[release]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'imulab[release]'
 	touch $@
 
 $(VENV)/.bench: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'imulab[bench]'
 	touch $@
 
 $(VENV)/.docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'imulab[docs]'
 	touch $@

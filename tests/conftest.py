@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import io
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -17,19 +18,101 @@ from unittest import mock
 import numpy as np
 import pytest
 
+import madeup
 from imulab.cli import main
+from imulab.exporters import export
 from imulab.recording import Array, Recording
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+# What the make that runs these tests was told is not meant for the makefiles of exported units.
+for flags in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL"):
+    os.environ.pop(flags, None)
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--reduced", action="store_true", help="fewer trials in the statistical tests")
+    parser.addoption("--reduced", action="store_true", help="fewer trials in the statistical tests, fewer seeds in all")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the further seeds in the reduced run."""
+    if config.getoption("--reduced"):
+        further = [item for item in items if item.get_closest_marker("further")]
+        config.hook.pytest_deselected(items=further)
+        items[:] = [item for item in items if not item.get_closest_marker("further")]
+
+
+def some_of(quick: int, values: Sequence[Any]) -> list[Any]:
+    """Values of a parameter that differ by chance alone: the first few are in every run, the others in the full one."""
+    return [*values[:quick], *(pytest.param(value, marks=pytest.mark.further) for value in values[quick:])]
 
 
 @pytest.fixture(scope="session")
 def reduced(request: pytest.FixtureRequest) -> bool:
     return bool(request.config.getoption("--reduced"))
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """A function that returns the folder of a name; the first process of the run that asks for it fills it."""
+    common = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        common = common.parent
+
+    def folder_of(name: str, fill: Callable[[Path], object]) -> Path:
+        folder, filled = common / name, common / f"{name}.filled"
+        with (common / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not filled.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                fill(folder)
+                filled.touch()
+        return folder
+
+    return folder_of
+
+
+# As the Makefile of an exported unit compiles, and every warning an error.
+WARN = ["-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror"]
+STRICT = ["-std=c99", "-ffp-contract=off", *WARN]
+
+
+@pytest.fixture(scope="session")
+def compiler() -> str:
+    path = shutil.which("cc")
+    if path is None:
+        pytest.skip("no C compiler (cc) on this machine")
+    return path
+
+
+@pytest.fixture(scope="session")
+def core(compiler: str, made_once: Callable[..., Path]) -> Path:
+    """Folder of the exported core, which is the same for every unit: its sources, double.o and float.o."""
+
+    def fill(folder: Path) -> None:
+        export("c", [madeup.tumble(1)], folder)
+        for real in ("double", "float"):
+            command = [compiler, "-O2", *STRICT, f"-DIMULAB_REAL={real}", "-c", folder / "imulab.c"]
+            subprocess.run([*command, "-o", folder / f"{real}.o"], check=True)
+
+    return made_once("core", fill)
+
+
+@pytest.fixture(scope="session")
+def self_test(compiler: str, core: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """A function that builds and runs the self-test of an exported unit, with the core that is compiled once."""
+
+    def run(folder: Path, real: str = "double") -> subprocess.CompletedProcess[str]:
+        for name in ("imulab.c", "imulab.h"):
+            assert (folder / name).read_bytes() == (core / name).read_bytes()
+        files = [core / f"{real}.o", folder / "unit.c", folder / "selftest.c"]
+        program = folder / f"selftest-{real}"
+        command = [compiler, *STRICT, f"-DIMULAB_REAL={real}", f"-I{folder}", *files, "-o", program, "-lm"]
+        subprocess.run(command, check=True)
+        return subprocess.run([program], capture_output=True, text=True, check=False)
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,9 @@ FORCE = np.array([1.0, 2.0, 5.0, 10.0, 15.0, 20.0]) * G
 
 @pytest.mark.parametrize("bend", [0.0, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("model", ["c1", "c2"])
-def test_intervals_of_a_chosen_curve_hold_the_truth_whichever_model_is_right(bend: float, model: str) -> None:
+def test_intervals_of_a_chosen_curve_hold_the_truth_whichever_model_is_right(
+    bend: float, model: str, reduced: bool
+) -> None:
     """`bend` in standard deviations of that term, at every level: never below 92 %, wider than c1+c2 by 1.5 at most."""
     sigma = 0.01 / np.sqrt(FORCE)
     covariance = np.diag(sigma**2)
@@ -32,7 +34,7 @@ def test_intervals_of_a_chosen_curve_hold_the_truth_whichever_model_is_right(ben
     powers = FORCE[:, None] ** np.arange(3)
     rng = np.random.default_rng(5)
     inside, wide = np.zeros(6), np.zeros(6)
-    trials = 600
+    trials = 200 if reduced else 600
     for _ in range(trials):
         found = fit_curve(FORCE, truth + sigma * rng.standard_normal(6), covariance)
         spread = np.sqrt(np.einsum("np,pq,nq->n", powers, found.covariance, powers))

@@ -267,12 +267,13 @@ def test_the_radius_is_common_to_all_k_and_in_no_zeta():
     assert gained == pytest.approx(1e-4 * known.value("x_K_3") * known.value("y_K_3"), rel=1e-6)
 
 
-def test_coloured_noise_is_in_the_uncertainty():
+def test_coloured_noise_is_in_the_uncertainty(reduced):
     """Gauss-Markov noise of 0.2 s: its spectrum at the line decides, not its variance."""
+    trials = 5 if reduced else 12
     coloured = Truth(AxisTruth(D_x=K, markov=5 * DEG_H, markov_time=0.2), None, FogTruth(), TILTED)
     test = levels_test(1, 4)
     deviations = []
-    for seed in range(12):
+    for seed in range(trials):
         record = il.fit_centrifuge(test, Simulation(test, coloured, 50.0, 200.0, 5.0, seed=seed)).calibration
         for n in (1, 2):
             p = record.parameters[f"x_K_{n}"]
@@ -286,12 +287,13 @@ def test_coloured_noise_is_in_the_uncertainty():
     assert 0.6 < np.std(deviations) < 1.5
 
 
-def test_magnitudes_are_corrected_for_noise():
+def test_magnitudes_are_corrected_for_noise(reduced):
     """Rice: at K a of three standard deviations the plain magnitude is 5 % too long."""
+    trials = 40 if reduced else 100
     loud = Truth(AxisTruth(D_x=K, angle_random_walk=2.2e-5), None, FogTruth(), TILTED)
     test = replace(levels_test(1), reference=G)
     plain, corrected = [], []
-    for seed in range(100):
+    for seed in range(trials):
         fit = il.fit_centrifuge(test, Simulation(test, loud, 10.0, 60.0, 2.0, seed=seed))
         corrected.append(fit.calibration.value("x_K_1") / K)
         plain.append(abs(axis_lines(fit.runs[0], "least-squares")[0][0]) / fit.runs[0].force / K)

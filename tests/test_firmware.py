@@ -9,7 +9,7 @@ import pytest
 
 import imulab as il
 import madeup
-from conftest import REPOSITORY
+from conftest import REPOSITORY, STRICT
 from imulab.cli import main
 from imulab.device import METHODS
 from imulab.device.tables import Fusion, pack
@@ -23,16 +23,6 @@ from imulab.procedures.warmup import MODELS
 G = madeup.G
 MANY = 1_000_000
 DRIVER = REPOSITORY / "tests" / "firmware" / "driver.c"
-WARN = ["-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror"]
-STRICT = ["-std=c99", "-ffp-contract=off", *WARN]
-
-
-@pytest.fixture(scope="session")
-def compiler():
-    path = shutil.which("cc")
-    if path is None:
-        pytest.skip("no C compiler (cc) on this machine")
-    return path
 
 
 @pytest.fixture(scope="session")
@@ -41,34 +31,23 @@ def records():
 
 
 @pytest.fixture(scope="session")
-def exported(tmp_path_factory, records):
-    folder = tmp_path_factory.mktemp("firmware")
-    export("c", records, folder)
-    return folder
+def exported(made_once, records):
+    return made_once("firmware", lambda folder: export("c", records, folder))
 
 
 @pytest.fixture(scope="session")
-def built(compiler, exported):
+def built(compiler, exported, made_once):
     """The exported C with a small program around it, as double and as float."""
-    programs = {}
-    for name, define in (("double", []), ("float", ["-DIMULAB_REAL=float"])):
-        # More elements than firmware has by default, so that every array that Python fuses can be fused here as well.
-        options = ["-O2", *STRICT, *define, "-DIL_ARRAY_ELEMENTS=64", f"-I{exported}"]
-        sources = [DRIVER, exported / "imulab.c", exported / "unit.c"]
-        programs[name] = exported / f"driver-{name}"
-        subprocess.run([compiler, *options, *map(str, sources), "-o", programs[name], "-lm"], check=True)
-    return programs
 
+    def fill(folder):
+        for name, define in (("double", []), ("float", ["-DIMULAB_REAL=float"])):
+            # More elements than firmware has by default: every array that Python fuses can be fused here as well.
+            options = ["-O2", *STRICT, *define, "-DIL_ARRAY_ELEMENTS=64", f"-I{exported}"]
+            sources = [DRIVER, exported / "imulab.c", exported / "unit.c"]
+            subprocess.run([compiler, *options, *sources, "-o", folder / name, "-lm"], check=True)
 
-@pytest.fixture(scope="session")
-def core_objects(compiler, exported, tmp_path_factory):
-    """The core, which is the same for every unit, compiled once for each type of numbers."""
-    folder, objects = tmp_path_factory.mktemp("core"), {}
-    for real in ("double", "float"):
-        objects[real] = folder / f"{real}.o"
-        command = [compiler, *STRICT, f"-DIMULAB_REAL={real}", "-c", exported / "imulab.c", "-o", objects[real]]
-        subprocess.run(command, check=True)
-    return objects
+    folder = made_once("drivers", fill)
+    return {name: folder / name for name in ("double", "float")}
 
 
 @pytest.fixture(scope="session")
@@ -246,24 +225,26 @@ def worst(line):
 
 @pytest.mark.parametrize("name", ["gcc", "clang"])
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_the_exported_self_test_passes(name, real, exported, compiler):
+def test_the_exported_self_test_passes(name, real, exported, tmp_path):
     if shutil.which(name) is None:
         pytest.skip(f"no {name} on this machine")
-    code, line = make_test(exported, f"CC={name}" + (" -DIMULAB_REAL=float" if real == "float" else ""))
+    folder = shutil.copytree(exported, tmp_path / "unit")
+    code, line = make_test(folder, f"CC={name}" + (" -DIMULAB_REAL=float" if real == "float" else ""))
     assert code == 0, line
     assert "pass" in line
     assert real in line
     assert worst(line) <= (0 if real == "double" else 2e-6)
 
 
-def test_the_self_test_notices_a_wrong_number(exported, tmp_path, compiler):
+def test_the_self_test_notices_a_wrong_number(exported, tmp_path, self_test):
     folder = tmp_path / "altered"
     shutil.copytree(exported, folder)
     text = (folder / "unit.c").read_text()
     gain = text.split(".gain = {R(")[1].split(")")[0]
     (folder / "unit.c").write_text(text.replace(gain, repr(float(gain) * (1 + 1e-5)), 1))
-    code, line = make_test(folder)
-    assert code != 0
+    done = self_test(folder)
+    line = done.stdout
+    assert done.returncode != 0
     assert "FAIL" in line
     assert worst(line) > 1e-6
 
@@ -277,7 +258,7 @@ def test_the_readme_speaks_of_flags_only_where_there_are_some(exported, tmp_path
 
 
 @pytest.mark.parametrize("define", [[], ["-DIMULAB_REAL=float"]])
-def test_the_code_in_the_readme_compiles_and_runs(define, exported, tmp_path, compiler):
+def test_the_code_in_the_readme_compiles_and_runs(define, exported, tmp_path, compiler, core):
     blocks = (exported / "README.md").read_text(encoding="utf-8").split("```")[1::2]
     assert [block.startswith("c\n") for block in blocks] == [True, True]
     # What the README shows is made static here: a real project has a header for it.
@@ -297,13 +278,13 @@ int main(void) {
 """
     source = tmp_path / "project.c"
     source.write_text("\n".join(['#include "unit.h"', *declared, code, steps]), encoding="utf-8")
-    files = [source, exported / "imulab.c", exported / "unit.c"]
+    files = [source, core / ("float.o" if define else "double.o"), exported / "unit.c"]
     command = [compiler, *STRICT, *define, f"-I{exported}", *files, "-o", tmp_path / "project", "-lm"]
     subprocess.run(command, check=True)
     assert subprocess.run([tmp_path / "project"], check=False).returncode == 0
 
 
-def test_the_readme_of_an_array_leads_to_what_fuse_gives(compiler, tmp_path):
+def test_the_readme_of_an_array_leads_to_what_fuse_gives(compiler, core, tmp_path):
     """In the unit and at the rate that it names; readings in rad/s, so that no conversion rounds."""
     record = il.calibrate_array(il.simulate_array(experiment="static", duration=60.0, unit="rad/s")).calibration
     flight = il.simulate_array(session=1, rate=100.0, duration=20.0, unit="rad/s")
@@ -324,7 +305,7 @@ int main(void) {
 }
 """
     (tmp_path / "project.c").write_text(f"#include <stdio.h>\n{code}{steps}", encoding="utf-8")
-    files = [tmp_path / name for name in ("project.c", "imulab.c", "unit.c")]
+    files = [tmp_path / "project.c", core / "double.o", tmp_path / "unit.c"]
     command = [compiler, "-std=c99", "-ffp-contract=off", f"-I{tmp_path}", *files, "-o", tmp_path / "project", "-lm"]
     subprocess.run(command, check=True)
     rows = np.column_stack([flight.column(f"gyro_{n}") for n in range(1, 7)])
@@ -346,17 +327,11 @@ int main(void) {
     ],
     ids=str,
 )
-def test_the_self_test_passes_with_the_method_that_was_chosen(
-    compiler, core_objects, array_recordings, exported, tmp_path, fusion, real
-):
+def test_the_self_test_passes_with_the_method_that_was_chosen(self_test, array_recordings, tmp_path, fusion, real):
     record = calibrate_array(*array_recordings, fusion=fusion).calibration
     export("c", [record], tmp_path)
     assert f".method = {METHODS.index(fusion.method)}," in (tmp_path / "unit.c").read_text(encoding="utf-8")
-    assert (tmp_path / "imulab.c").read_bytes() == (exported / "imulab.c").read_bytes()
-    files = [core_objects[real], *(tmp_path / name for name in ("unit.c", "selftest.c"))]
-    command = [compiler, *STRICT, f"-DIMULAB_REAL={real}", f"-I{tmp_path}", *files, "-o", tmp_path / "t", "-lm"]
-    subprocess.run(command, check=True)
-    done = subprocess.run([tmp_path / "t"], capture_output=True, text=True, check=False)
+    done = self_test(tmp_path, real)
     assert done.returncode == 0, done.stdout
     assert "pass" in done.stdout
 
@@ -403,7 +378,7 @@ def test_a_large_array_has_room_in_the_header():
     assert "#define IL_ARRAY_ELEMENTS 48\n" in _header([large])
 
 
-def test_the_header_compiles_as_c_plus_plus(exported, tmp_path, compiler):
+def test_the_header_compiles_as_c_plus_plus(exported, tmp_path, compiler, core):
     compile_with = shutil.which("c++")
     if compile_with is None:
         pytest.skip("no C++ compiler on this machine")
@@ -412,10 +387,8 @@ def test_the_header_compiles_as_c_plus_plus(exported, tmp_path, compiler):
         '#include "unit.h"\nint main() {\n  il_real in[3] = {0, 0, 0}, out[3];\n'
         "  return il_tumble_apply(&unit_tumble, in, out) == 0 ? 0 : 1;\n}\n"
     )
-    objects = []
-    for name in ("imulab", "unit"):
-        objects.append(tmp_path / f"{name}.o")
-        subprocess.run([compiler, "-c", exported / f"{name}.c", "-o", objects[-1]], check=True)
+    objects = [core / "double.o", tmp_path / "unit.o"]
+    subprocess.run([compiler, "-c", exported / "unit.c", "-o", objects[-1]], check=True)
     strict = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", f"-I{exported}"]
     subprocess.run([compile_with, *strict, source, *objects, "-o", tmp_path / "main", "-lm"], check=True)
     subprocess.run([tmp_path / "main"], check=True)

@@ -17,7 +17,7 @@ from fleets import children, command, make_fleet, records, wait_for, workers_of
 from imulab.fleet.run import fleet_status, run_fleet
 from imulab.fleet.store import MOST_ATTEMPTS
 
-UNITS = 120
+UNITS = 80
 
 
 @pytest.fixture(scope="module")

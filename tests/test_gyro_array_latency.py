@@ -37,10 +37,11 @@ def late_lines(record):
 
 
 @pytest.mark.parametrize("axes", [1, 3])
-def test_latency_is_found_to_a_fraction_of_a_sample_and_said(axes):
+def test_latency_is_found_to_a_fraction_of_a_sample_and_said(axes, reduced):
+    trials = 2 if reduced else 4
     late = np.array([0.010, -0.004, 0.0, 0.0, 0.0037, 0.0])
     scores = []
-    for seed in range(4):
+    for seed in range(trials):
         _, (still, moving) = recordings(seed, late, axes)
         record = il.calibrate_array(still, moving).calibration
         value, u = found_latency(record)
@@ -53,9 +54,10 @@ def test_latency_is_found_to_a_fraction_of_a_sample_and_said(axes):
     assert np.sqrt(np.mean(np.square(scores))) < 1.6
 
 
-def test_scale_factors_are_right_in_spite_of_latency():
+def test_scale_factors_are_right_in_spite_of_latency(reduced):
+    trials = 8 if reduced else 25
     inside, errors = [], []
-    for seed in range(25):
+    for seed in range(trials):
         sensing, (still, moving) = recordings(seed, [0.010, -0.020, 0.005, 0.0, 0.0, 0.0], duration=30.0)
         record = il.calibrate_array(still, moving).calibration
         true = sensing[:, 0, 0] / sensing[:, 0, 0].mean()
@@ -67,9 +69,10 @@ def test_scale_factors_are_right_in_spite_of_latency():
     assert np.sqrt(np.mean(np.square(errors))) < 4e-5  # 1,800 ppm as they come
 
 
-def test_elements_that_are_not_late_are_left_as_they_are():
+def test_elements_that_are_not_late_are_left_as_they_are(reduced):
+    trials = 4 if reduced else 12
     said = 0
-    for seed in range(12):
+    for seed in range(trials):
         _, (still, moving) = recordings(seed, np.zeros(6), duration=20.0)
         said += len(late_lines(il.calibrate_array(still, moving).calibration))
     assert said == 0

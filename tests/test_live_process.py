@@ -99,13 +99,9 @@ def saved_stamps(folder: Path) -> np.ndarray:
     return np.array([float(row.split(b",")[0]) for row in rows if row[:1].isdigit()])
 
 
-def test_killed_and_gone_on_with(tmp_path):
-    kills(tmp_path, 3, 1)
-
-
 @pytest.mark.slow
-def test_killed_twenty_times(tmp_path, reduced):
-    kills(tmp_path, 5 if reduced else 20, 2)
+def test_killed_twenty_times_and_gone_on_with(tmp_path, reduced):
+    kills(tmp_path, 4 if reduced else 20, 2)
 
 
 def rows_of(recording: il.Recording, seconds: int) -> list[str]:

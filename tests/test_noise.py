@@ -36,9 +36,10 @@ def test_dense_taus_are_24_a_decade_and_contain_those_of_allantools():
     np.testing.assert_allclose(dense.deviation, peer, rtol=1e-12)
 
 
-def test_the_deviation_of_white_noise_and_its_uncertainty():
+def test_the_deviation_of_white_noise_and_its_uncertainty(reduced):
+    trials = 150 if reduced else 300
     rng = np.random.default_rng(2)
-    curves = [allan_deviation(rng.standard_normal(4096), 1.0) for _ in range(300)]
+    curves = [allan_deviation(rng.standard_normal(4096), 1.0) for _ in range(trials)]
     variance = np.array([c.deviation**2 for c in curves])
     np.testing.assert_allclose(variance.mean(axis=0)[:8] * curves[0].tau[:8], 1.0, rtol=0.05)
     stated = np.median([c.standard_uncertainty for c in curves], axis=0)
@@ -99,11 +100,12 @@ def behind_a_filter(n: int, rate: float, corner: float, rng: np.random.Generator
 
 
 @pytest.mark.parametrize("corner", [42.0, 5.0])
-def test_a_low_pass_filter_does_not_spoil_the_coefficients(corner):
+def test_a_low_pass_filter_does_not_spoil_the_coefficients(corner, reduced):
     # From all averaging times the fit gives ARW 0 and a bias instability ten times too large, both without a doubt.
+    trials = 5 if reduced else 15
     rng = np.random.default_rng(8)
     within, u = [], []
-    for _ in range(15):
+    for _ in range(trials):
         found = coefficients(behind_a_filter(100_000, 200.0, corner, rng), 200.0)
         assert found.filtered
         for c, truth in ((found.angle_random_walk, ARW), (found.bias_instability, BI)):

@@ -100,10 +100,11 @@ def test_spikes_become_the_line_and_noise_stays():
     assert spikes_removed(np.r_[np.zeros(5000), 1.0, np.zeros(5000)])[1] == 0  # a sensor that shows no noise
 
 
-def test_spikes_and_lines_leave_the_noise_as_it_is():
+def test_spikes_and_lines_leave_the_noise_as_it_is(reduced):
     """0.1 % spikes of 20 sigma and two lines: white noise within 0.5 %, 1/f noise within 3 % of the clean record."""
+    trials = 2 if reduced else 6
     off = []
-    for seed in range(6):
+    for seed in range(trials):
         x = samples(200_000, 0.01, seed, white=0.1, flicker=0.3)
         rng, t = np.random.default_rng(100 + seed), 0.01 * np.arange(len(x))
         y = x + 0.15 * np.sin(2 * np.pi * 7.3 * t + seed) + 0.3 * np.sin(2 * np.pi * 31.017 * t)
@@ -131,10 +132,11 @@ def test_a_line_a_hundred_times_the_noise_leaves_the_noise_as_it_is():
     assert [line.amplitude for line in lines] == pytest.approx([100, 30], rel=1e-3)
 
 
-def test_what_weak_lines_leak_does_not_raise_the_white_noise():
+def test_what_weak_lines_leak_does_not_raise_the_white_noise(reduced):
     """Three of half a sigma in 40,000 samples: 0.5 % of it, where only what stands out of the bins is left out."""
+    trials = 3 if reduced else 8
     off = []
-    for seed in range(8):
+    for seed in range(trials):
         x = np.random.default_rng(seed).standard_normal(40_000)
         t = 0.01 * np.arange(len(x))
         y = x + sum(0.5 * np.sin(2 * np.pi * f * t + seed) for f in (3.1, 17.0, 33.0))
@@ -185,11 +187,12 @@ def test_the_band_ends_where_the_sensor_filters():
     assert usable_band(angle).full  # it rises, as quantisation of an angle does
 
 
-def test_behind_a_filter_a_short_log_is_fitted_below_it():
+def test_behind_a_filter_a_short_log_is_fitted_below_it(reduced):
     """400 s at 100 Hz behind 5 Hz, 1/f noise: octaves agree, at 1.6 Hz where a level log may end at twice that."""
+    trials = 8 if reduced else 24
     pole = np.exp(-2 * np.pi * 5 / 100)
     off = []
-    for seed in range(24):
+    for seed in range(trials):
         rng = np.random.default_rng([seed, 3])
         white = lfilter([1 - pole], [1, -pole], rng.standard_normal(41_000))[1000:]
         (spectrum,) = transformed(white + samples(40_000, 0.01, seed, flicker=0.056), 0.01).spectra
@@ -202,13 +205,14 @@ def test_behind_a_filter_a_short_log_is_fitted_below_it():
 
 
 @pytest.mark.parametrize(("order", "corner"), [(1, 40.0), (2, 40.0), (1, 200.0), (2, 200.0)])
-def test_the_roll_off_that_is_left_in_the_band_hardly_lowers_the_white_noise(order, corner):
+def test_the_roll_off_that_is_left_in_the_band_hardly_lowers_the_white_noise(order, corner, reduced):
     """An hour at 100 Hz, 2 % ripple: with the band up to where octaves agree, N is 1.3 and .8 % too small."""
+    trials = 5 if reduced else 12
     (empty,) = transformed(np.random.default_rng(1).standard_normal(360_000), 0.01).spectra
     f, level = cosine.frequencies(empty), fitted([empty], "N")[1][0]
     shape = (1 + 0.02 * np.sin(12 * np.log(f))) / (1 + (f / corner) ** (2 * order))
     found = []
-    for seed in range(12):
+    for seed in range(trials):
         drawn = level * shape * np.random.default_rng(seed).chisquare(empty.freedom) / empty.freedom
         spectrum = replace(empty, power=drawn)
         inside = within(spectrum, usable_band([spectrum]).highest)
@@ -261,8 +265,9 @@ def trials_of_regression(seeds):
     return np.array(found, dtype=float)
 
 
-def test_what_follows_the_temperature_is_told_from_what_wanders_alike():
-    found = trials_of_regression(range(5))
+def test_what_follows_the_temperature_is_told_from_what_wanders_alike(reduced):
+    trials = 2 if reduced else 5
+    found = trials_of_regression(range(trials))
     assert not found[:, 2].any()
     assert found[:, 3].all()
     assert np.abs(found[:, :2]).max() < 3
@@ -496,13 +501,14 @@ def best_model(spectrum):
 
 
 @pytest.mark.parametrize(("step", "least", "most"), [(60.0, 8, 10), (0.0, 0, 0)])
-def test_a_step_is_told_from_the_random_walk_that_a_model_takes_it_for(step, least, most):
+def test_a_step_is_told_from_the_random_walk_that_a_model_takes_it_for(step, least, most, reduced):
     """400 s of N and 1/f noise, drawn in time, 60 deg/h beside 6.6 deg/h: the model fitted first has a walk."""
+    trials = 4 if reduced else 10
     said = 0
-    for seed in range(10):
+    for seed in range(trials):
         rng = np.random.default_rng([seed, 3])
         x = reference.draw(rng, {"N": 0.005, "B": 10 / 3600}, 40_000, 0.01, burn=40_000)
         x[int(40_000 * rng.uniform(0.2, 0.8)) :] += step / 3600
         fit = il.fit_noise({"gyro_x": x}, rate=100.0, unit="deg/s")
         said += bool(fit.columns["gyro_x"].steps)
-    assert least <= said <= most
+    assert least * trials <= 10 * said <= most * trials

@@ -64,9 +64,10 @@ def noise_record(kind, seed=1, names=("gyro_1",), terms="auto", count=COUNT, sca
 
 
 @pytest.mark.parametrize("kind", ["white", "walk"])
-def test_a_noise_record_tells_the_uncertainty_of_a_mean(kind):
+def test_a_noise_record_tells_the_uncertainty_of_a_mean(kind, reduced):
+    trials = 3 if reduced else 8
     found = []
-    for seed in range(8):
+    for seed in range(trials):
         u, said = mean_uncertainties(noise_record(kind, seed), ["gyro_1"], MEAN * INTERVAL, "rad/s", {})
         assert not said
         found.append(float(u[0]) / true_uncertainty(kind, MEAN * INTERVAL))

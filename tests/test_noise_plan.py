@@ -64,8 +64,9 @@ def test_what_is_not_seen_has_the_limit_of_the_record_or_of_a_longer_one(record)
     assert later.limit == pytest.approx(11 * WHITE / 7200, rel=0.5)
 
 
-def test_the_record_that_was_planned_reaches_it():
+def test_the_record_that_was_planned_reaches_it(reduced):
     """Records of the planned length scatter as was wanted: 40 spectra by their likelihood, of data in time."""
+    trials = 20 if reduced else 40
     from imulab.estimation.noise.likelihood import fit, time_limits
     from imulab.estimation.noise.terms import prepare, terms
     from noise_models import empty, transformed
@@ -74,7 +75,7 @@ def test_the_record_that_was_planned_reaches_it():
     plan = il.plan_noise(white=1.0, walk=0.02, for_="walk=15%", rate=2.0)
     spectrum = empty(round(plan.needed * 2), 0.5)
     rng = np.random.default_rng(5)
-    logs = np.array([reference.draw(rng, {"N": 1.0, "K": 0.02}, spectrum.count, 0.5) for _ in range(40)])
+    logs = np.array([reference.draw(rng, {"N": 1.0, "K": 0.02}, spectrum.count, 0.5) for _ in range(trials)])
     power = transformed(logs, spectrum)
     freedom = np.broadcast_to(spectrum.freedom, power.shape)
     found = fit(prepare([spectrum]), terms("NK")[None], time_limits([spectrum]), power, freedom).values[:, 2]

@@ -209,11 +209,12 @@ def test_no_noise_has_knocks(sizes, step):
             assert not len(knocks_removed(step * np.round(x / step) if step else x)[1])
 
 
-def test_a_narrow_band_is_said_and_the_white_noise_less_certain():
+def test_a_narrow_band_is_said_and_the_white_noise_less_certain(reduced):
     """A filter of 5 Hz of first order: N is 1.4 % too small on average."""
+    trials = 6 if reduced else 12
     pole = np.exp(-2 * np.pi * 5 / 100)
     held = 0
-    for seed in range(12):
+    for seed in range(trials):
         x = lfilter([1 - pole], [1, -pole], SIGMA * np.random.default_rng(seed).standard_normal(61_000))[1000:]
         record = il.fit_noise(recording({"gyro_x": x})).calibration
         low, high = np.degrees(record.parameter("gyro_x_white").interval_95)
@@ -221,4 +222,4 @@ def test_a_narrow_band_is_said_and_the_white_noise_less_certain():
         (note,) = (line for line in record.warnings if "not level" in line)
         assert "fitted up to 1.56 Hz; from about 3.12 Hz" in note
         assert re.search(r"which may leave the white noise up to (0\.\d|[1-6]) % too small$", note)
-    assert held >= 10
+    assert held >= 10 / 12 * trials

@@ -72,9 +72,10 @@ def test_without_noise_powers_of_the_rate_are_exact():
         assert found.value(f"gyro_scale_factor_{axis}") == pytest.approx(SCALE[i], abs=2e-9)
 
 
-def test_errors_are_those_that_the_record_states():
+def test_errors_are_those_that_the_record_states(reduced):
+    trials = 3 if reduced else 8
     scores = []
-    for seed in range(8):
+    for seed in range(trials):
         made = whole(noise=2e-3, rng=np.random.default_rng(seed), hold=2.5)
         found = il.fit_rate(made).calibration
         parameters = [(found.parameters[name], truth(name)) for name in LINEAR]
@@ -152,10 +153,11 @@ def test_a_loop_does_not_lean_on_the_asymmetry():
     assert found[1] == pytest.approx(found[0], abs=1e-6)  # 3e-5 without the loop beside the slopes
 
 
-def test_hysteresis_is_seldom_found_where_there_is_none():
-    found = [il.fit_rate(il.simulate_rate(hold="2 s", seed=seed, rate="50 Hz")).calibration for seed in range(8)]
+def test_hysteresis_is_seldom_found_where_there_is_none(reduced):
+    trials = 3 if reduced else 8
+    found = [il.fit_rate(il.simulate_rate(hold="2 s", seed=seed, rate="50 Hz")).calibration for seed in range(trials)]
     axes = [axis for record in found for axis in record.fit["axes"].values()]
-    assert sum(axis["loop"] < 0.01 for axis in axes) <= 2  # 24 tests at 1 %: more than 2 happens once in 500
+    assert sum(axis["loop"] < 0.01 for axis in axes) <= trials / 4  # 24 tests at 1 %: more than 2 happens once in 500
     # The largest of 11 differences is 1.1 to 2.6 times the uncertainty of one: the fitted loop is what is judged.
     squares = [(axis["fitted_loop"] / axis["fitted_loop_uncertainty"]) ** 2 for axis in axes]
     assert 0.3 < np.mean(squares) < 2.0  # 24 scatter by 0.29 about 1
@@ -165,12 +167,13 @@ def test_hysteresis_is_seldom_found_where_there_is_none():
     assert all(changes[name].deviations is None and not changes[name].significant for name in names)
 
 
-def test_a_loop_of_ten_ppm_is_found_by_three_cycles():
+def test_a_loop_of_ten_ppm_is_found_by_three_cycles(reduced):
     """0.3 deg/sqrt(h), 8 s, three cycles: 5 standard deviations of the loop, of which 2.6 are needed."""
+    trials = 2 if reduced else 4
     how = {"noise": "0.025 deg/s", "rate": "25 Hz", "hold": "8 s", "cycles": 3, "loop": "10 ppm"}
-    found = [il.fit_rate(il.simulate_rate(seed=seed, **how)).calibration for seed in range(4)]
+    found = [il.fit_rate(il.simulate_rate(seed=seed, **how)).calibration for seed in range(trials)]
     loops = [axis["loop"] for record in found for axis in record.fit["axes"].values()]
-    assert sum(loop < 0.01 for loop in loops) >= 11  # of 12 that are found with 99.4 % each
+    assert sum(loop < 0.01 for loop in loops) >= 11 / 4 * trials  # of 12 that are found with 99.4 % each
 
 
 def test_a_record_corrects_recordings_and_goes_through_the_core(tmp_path):
@@ -530,10 +533,11 @@ def test_a_bend_beyond_the_order_that_was_asked_for_is_said():
     assert not any("beyond order" in w for w in il.fit_rate(made, order=2).calibration.warnings)
 
 
-def test_a_zero_that_walks_makes_no_loop():
+def test_a_zero_that_walks_makes_no_loop(reduced):
     """Visits of one rate scatter by more than their noise, by which the loop is judged; 1 in 4 were alarms before."""
+    trials = 8 if reduced else 24
     alarms = 0
-    for seed in range(24):
+    for seed in range(trials):
         rng = np.random.default_rng(seed)
         runs = []
         for _ in range(3):
@@ -543,4 +547,4 @@ def test_a_zero_that_walks_makes_no_loop():
         test = RateTest(tuple(Run(f"{k}.csv", "+z") for k in range(3)), relative_uncertainty=0.0)
         loop = il.fit_rate(RateRecordings(test, tuple(runs), {}), order=1).linearity["z"].loop
         alarms += loop < 0.01
-    assert alarms <= 3
+    assert alarms <= trials / 8

@@ -127,15 +127,16 @@ def test_the_table_axis_is_found_from_a_sweep_too(accel, noise):
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.2])
-def test_a_sweep_states_the_error_of_its_axis_whatever_the_noise(accel, correlation):
+def test_a_sweep_states_the_error_of_its_axis_whatever_the_noise(accel, correlation, reduced):
     """Noise of the accelerometers alone, white or correlated over 0.2 s, in which it erred by 4 times its statement."""
+    trials = 3 if reduced else 8
     names = accel.covariance.names
     zero = dataclasses.replace(accel.covariance, matrix=tuple(map(tuple, (1e-20 * np.eye(len(names))).tolist())))
     exact = dataclasses.replace(accel, covariance=zero)
     keep = np.exp(-1 / FREQUENCY / correlation) if correlation else 0.0
     lean = np.tan(np.radians(1)) * np.eye(3)[[1, 2, 0]]
     made, scores = whole(SIX[::2], tilt=2e-3, leans=lean, table=swept()), []
-    for seed in range(8):
+    for seed in range(trials):
         rng, noisy = np.random.default_rng(seed), []
         for one in made.recordings:
             own = 0.05 * lfilter([np.sqrt(1 - keep**2)], [1, -keep], rng.standard_normal((len(one) + 200, 3)), axis=0)
@@ -167,13 +168,14 @@ def test_an_axis_off_by_a_degree_takes_its_cosine_from_the_scale_factor(accel):
         assert seen.value(f"gyro_scale_factor_{axis}") == pytest.approx(SCALE[i], rel=1e-9)
 
 
-def test_six_faces_tell_bias_from_g_sensitivity():
+def test_six_faces_tell_bias_from_g_sensitivity(reduced):
+    trials = 2 if reduced else 4
     scores = []
-    for seed in range(4):
+    for seed in range(trials):
         made = whole(SIX, arm=np.zeros(3), noise=3e-4, seed=seed, accelerometers=False)
         found = il.fit_rate(made, order=1).calibration
         scores += [(p.value - TRUTH[n]) / p.standard_uncertainty for n, p in found.parameters.items() if n in TRUTH]
-    assert len(scores) == 4 * len(TRUTH)
+    assert len(scores) == trials * len(TRUTH)
     assert 0.4 < np.mean(np.square(scores)) < 1.4  # 96 of noise, 48 that hold the faces' scatter beside their own
 
 

@@ -115,10 +115,11 @@ def test_a_loop_comes_apart_from_the_delay(loop):
     assert any("(hysteresis), which no calibration removes" in w for w in found.warnings)
 
 
-def test_loop_and_delay_of_a_noisy_sweep_err_by_what_is_stated():
+def test_loop_and_delay_of_a_noisy_sweep_err_by_what_is_stated(reduced):
+    trials = 5 if reduced else 12
     clean, scores, loops = swept(loop=1e-3, duration=60.0), [], []
     still = swept(duration=60.0)
-    for seed in range(12):
+    for seed in range(trials):
         noise = 0.05 * np.random.default_rng(seed).standard_normal(len(clean))
         for made in (clean, still):
             noisy = made.with_columns({"gyro_z": made.column("gyro_z") + noise}, {"gyro_z": "deg/s"})
@@ -146,11 +147,12 @@ def wandering(count, step, white, flicker, rng):
 
 @pytest.mark.parametrize("flicker", [0.0, 0.01])
 @pytest.mark.parametrize("kind", ["sine", "chirp"])
-def test_the_bias_of_a_sweep_errs_by_what_is_stated_whatever_wanders(kind, flicker):
+def test_the_bias_of_a_sweep_errs_by_what_is_stated_whatever_wanders(kind, flicker, reduced):
     """Half the mean square by which it differs from the mean zero of the next 120 s; 100 times the variance before."""
+    trials = 14 if reduced else 40
     step, count = 0.02, 6000
     time, off, stated = np.arange(count) * step, [], []
-    for seed in range(40):
+    for seed in range(trials):
         rng = np.random.default_rng(seed)
         phase = 0.3 * time if kind == "sine" else 0.05 * time + 1.95 * time**2 / 240
         table = 100 * np.sin(2 * np.pi * phase + rng.uniform(0, 6))
@@ -165,9 +167,10 @@ def test_the_bias_of_a_sweep_errs_by_what_is_stated_whatever_wanders(kind, flick
     assert 0.3 < np.mean(off) / np.mean(stated) < 2.0
 
 
-def test_the_errors_of_a_sweep_are_those_that_the_record_states():
+def test_the_errors_of_a_sweep_are_those_that_the_record_states(reduced):
+    trials = 5 if reduced else 12
     clean, scores = swept(), []
-    for seed in range(12):
+    for seed in range(trials):
         rng = np.random.default_rng(seed)
         noisy = {n: v + 0.05 * rng.standard_normal(len(v)) for n, v in clean.columns.items() if n.startswith("gyro")}
         made = dataclasses.replace(clean, columns={**clean.columns, **noisy})
@@ -271,11 +274,12 @@ def test_what_one_rate_cannot_tell_does_not_spoil_the_scale_factor(parts, single
 
 @pytest.mark.parametrize("colour", [0.0, 0.9])
 @pytest.mark.parametrize(("frequency", "periods"), [(0.1, 4.3), (1.0, 10)])
-def test_sines_of_few_periods_state_the_error_of_their_scale_factor(frequency, periods, colour):
+def test_sines_of_few_periods_state_the_error_of_their_scale_factor(frequency, periods, colour, reduced):
     """Against white noise, and noise whose samples go with those before: stated as if white it erred by 1.3 to 2.4."""
+    trials = 16 if reduced else 60
     time = np.arange(int(100 * periods / frequency)) / 100
     scores = []
-    for seed in range(60):
+    for seed in range(trials):
         rng = np.random.default_rng(seed)
         table = 100 * np.sin(2 * np.pi * (frequency * time + rng.random()))
         noise = 0.05 * rng.standard_normal(len(time))

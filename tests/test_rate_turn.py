@@ -92,11 +92,12 @@ def test_the_uncertainty_is_that_of_the_stops(counts, ppm):
         assert 1e6 * expected == pytest.approx(ppm, abs=0.6)
 
 
-def test_intervals_hold_the_scale_factor_as_often_as_they_say():
+def test_intervals_hold_the_scale_factor_as_often_as_they_say(reduced):
+    trials = 20 if reduced else 60
     rng = np.random.default_rng(5)
     counts = [1, -1, 3, -3]
     scores = []
-    for seed in range(60):
+    for seed in range(trials):
         stops = 0.5 / np.sqrt(2) * rng.standard_normal(5)
         found = il.fit_turns(turned(counts, 1.02, stops, seed=seed, speed=360)).turns["z"]
         scores.append((found.scale - 1.02) / 1.02 / found.scale_uncertainty)
@@ -219,14 +220,15 @@ def test_stamps_in_bursts_are_evened_and_said(size):
     assert not any("bursts" in w for w in il.fit_turns(made).calibration.warnings)
 
 
-def test_stamps_in_late_bursts_err_by_a_percent_if_they_are_believed():
+def test_stamps_in_late_bursts_err_by_a_percent_if_they_are_believed(reduced):
     """Blocks of 0.2 s that come up to 50 ms late, turns of a second: slope of the angle at stops over turns."""
+    trials = 4 if reduced else 12
     counts, size, speed, believed, evened = [1, -1, 3, -3], 20, 360, [], []
     made = turned(counts, 1.02, noise=1e-3, speed=speed)
     lengths = [round(360 * abs(count) / speed * FREQUENCY) + 300 for count in counts]
     stops = 150 + np.concatenate([[0], np.cumsum(lengths)])
     count = np.arange(len(made))
-    for seed in range(12):
+    for seed in range(trials):
         late = np.random.default_rng(seed).uniform(0, 0.05, len(made) // size + 1)[count // size]
         stamps = count // size * size / FREQUENCY + count % size * 2e-4 + late
         z = made.column("gyro_z") - BIAS[2]

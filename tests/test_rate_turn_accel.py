@@ -53,9 +53,10 @@ def test_a_record_of_another_unit_is_said_to_be(accel):
         assert il.fit_turns(turns, accel=record).calibration.verdict.state == "good"
 
 
-def test_intervals_hold_the_misalignments(accel):
+def test_intervals_hold_the_misalignments(accel, reduced):
+    trials = 12 if reduced else 40
     scores = []
-    for seed in range(40):
+    for seed in range(trials):
         made = hand((1, -1, 1, -1), 2e-3, 0.03, seed, stops=0.5 / np.sqrt(2), axes=LEAN)
         found = il.fit_turns(made, accel=accel).calibration
         for i, a in enumerate("xyz"):

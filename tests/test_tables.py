@@ -296,7 +296,8 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch, truth,
 
 
 @pytest.mark.parametrize("kind", ["parquet", "h5", "mat", "mat73"])
-def test_every_cut_and_damage_is_refused_in_one_line_or_read(tmp_path, truth, layout, kind):
+def test_every_cut_and_damage_is_refused_in_one_line_or_read(tmp_path, truth, layout, kind, reduced):
+    trials = 20 if reduced else 60
     text = layout(LAYOUT.format(t="t", x="x", y="y"))
     path = tmp_path / f"a.{kind}"
     if kind == "parquet":
@@ -320,7 +321,7 @@ def test_every_cut_and_damage_is_refused_in_one_line_or_read(tmp_path, truth, la
         assert "\n" not in str(error.value)
         assert path.name in str(error.value)
     rng = np.random.default_rng(3)
-    for _ in range(60):
+    for _ in range(trials):
         data = bytearray(whole)
         for place in rng.integers(0, len(data), 8):
             data[place] = rng.integers(256)

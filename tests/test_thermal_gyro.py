@@ -1,6 +1,5 @@
 """Gyroscopes over temperature: exact data, the record at work, and what a person can get wrong."""
 
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -92,10 +91,12 @@ def test_corrected_as_by_the_model_inverted_by_hand(chamber, fitted):
         assert joined.tobytes() == found.triad("gyro").tobytes()
 
 
-def test_the_exported_unit_agrees_to_the_last_bit_and_the_blob_to_single_precision(chamber, fitted, tmp_path):
+def test_the_exported_unit_agrees_to_the_last_bit_and_the_blob_to_single_precision(
+    chamber, fitted, tmp_path, self_test
+):
     il.export("c", fitted, tmp_path / "unit")
-    run = subprocess.run(["make", "-C", str(tmp_path / "unit"), "test"], capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
+    run = self_test(tmp_path / "unit")
+    assert run.returncode == 0, run.stdout
     assert "pass, worst 0 of full scale" in run.stdout
     (file,) = il.export("blob", fitted, tmp_path)
     given = recordings(chamber[2])[1]
@@ -340,11 +341,12 @@ def at_rest(rng, gyros, temperatures, count, turn_on, noise, rate=0.0, loop=0.0)
     ("temperatures", "count", "low", "worst"),
     [((-20, 0, 25, 45, 60), 12, 0.92, 33.0), ((-20, -20, 0, 25, 25, 45, 60, 60), 8, 0.93, 28.0)],
 )
-def test_intervals_of_the_biases_hold_as_many_times_as_they_say(temperatures, count, low, worst):
+def test_intervals_of_the_biases_hold_as_many_times_as_they_say(temperatures, count, low, worst, reduced):
     """Turn-on scatter of 0.01 deg/s, 36 deg/h, which cubics through five recordings pass on to 86 %."""
+    trials = 80 if reduced else 300
     held, errors = [], []
     places = np.linspace(min(temperatures), max(temperatures), 9)
-    for trial in range(300):
+    for trial in range(trials):
         rng = np.random.default_rng([31, trial])
         gyros = reference.Gyros(rng)
         noise = np.radians(0.05) / np.sqrt(300)

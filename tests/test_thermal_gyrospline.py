@@ -1,7 +1,6 @@
 """Biases of gyroscopes by a natural cubic spline: exact data, the choice, the record, the unit, and wrong input."""
 
 import json
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -139,11 +138,11 @@ def test_scale_factors_from_turns_follow_their_own_law_beside_the_spline():
     assert np.abs(found - rates).max() < 2e-5
 
 
-def test_the_exported_unit_agrees_to_the_last_bit_and_the_blob_to_single_precision(kinked, tmp_path):
+def test_the_exported_unit_agrees_to_the_last_bit_and_the_blob_to_single_precision(kinked, tmp_path, self_test):
     _, _, made, record = kinked
     il.export("c", record, tmp_path / "unit")
-    run = subprocess.run(["make", "-C", str(tmp_path / "unit"), "test"], capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
+    run = self_test(tmp_path / "unit")
+    assert run.returncode == 0, run.stdout
     assert "pass, worst 0 of full scale" in run.stdout
     (file,) = il.export("blob", record, tmp_path)
     found, expected = (il.apply(one, made[1]).triad("gyro") for one in (file, record))

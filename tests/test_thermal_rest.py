@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from conftest import some_of
 from imulab.cli import main
 from imulab.display import Note
 from imulab.procedures.thermal.holds import find_holds, stretches_at_rest, wandering
@@ -61,7 +62,8 @@ def tumble(triad, rng, temperature, *, count=14, rate=50.0, noise=0.7e-3 * G, dr
     return time, output, np.round(warm + 0.03 * rng.standard_normal(len(time)), 2)
 
 
-def test_the_size_of_a_random_walk_is_found_and_none_where_there_is_none():
+def test_the_size_of_a_random_walk_is_found_and_none_where_there_is_none(reduced):
+    trials = 200 if reduced else 400
     rng = np.random.default_rng(1)
     temperature, time = np.linspace(-20, 60, 76), np.linspace(0, 1800, 76)
     step = time[1]
@@ -71,8 +73,8 @@ def test_the_size_of_a_random_walk_is_found_and_none_where_there_is_none():
         smooth = 0.01 * np.sin(temperature / 40.0) + 0.05
         return wandering(np.column_stack([walk[:, 0] + smooth, walk[:, 1], np.ones(76)]), temperature, time)
 
-    assert np.mean([found(0.0) > 0 for _ in range(400)]) < 0.03
-    variances = np.array([found(1e-4) for _ in range(200)])
+    assert np.mean([found(0.0) > 0 for _ in range(trials)]) < 0.03
+    variances = np.array([found(1e-4) for _ in range(trials // 2)])
     assert (variances > 0).mean() > 0.95
     assert np.sqrt(variances.mean() * step) == pytest.approx(1e-4, rel=0.1)
 
@@ -135,7 +137,7 @@ def test_rows_that_are_no_readings_are_left_out_of_the_holds():
 
 
 @pytest.mark.parametrize(("rate", "noise"), [(10.0, 0.7e-3), (10.0, 3e-3), (20.0, 0.7e-3)])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", some_of(2, range(3)))
 def test_drift_of_the_temperature_does_not_cut_holds_nor_take_turns_for_rest(rate, noise, seed):
     rng = np.random.default_rng([seed, 41])
     triad = reference.Triad(rng)

@@ -54,9 +54,10 @@ def test_loops_of_soaks_are_found_and_taken_out_of_the_laws():
     assert any("biases differ between warming and cooling" in warning for warning in record.warnings)
 
 
-def test_none_is_found_where_there_is_none():
-    records = [fitted(seed, (0.0, 0.0, 0.0)) for seed in range(20)]
-    assert sum(record.fit["loop_x"]["fitted"] for record in records) <= 2  # 1 % each
+def test_none_is_found_where_there_is_none(reduced):
+    trials = 8 if reduced else 20
+    records = [fitted(seed, (0.0, 0.0, 0.0)) for seed in range(trials)]
+    assert sum(record.fit["loop_x"]["fitted"] for record in records) <= trials / 10  # 1 % each
     standard = [record.fit[f"loop_{a}"]["value"] / record.fit[f"loop_{a}"]["standard_uncertainty"]
                 for record in records for a in "xyz"]  # fmt: skip
     assert 0.6 < np.sqrt(np.mean(np.square(standard))) < 1.4

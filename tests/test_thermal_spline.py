@@ -1,7 +1,6 @@
 """Biases by a natural cubic spline over temperature: exact data, the choice, the record, the unit, and wrong input."""
 
 import json
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -169,11 +168,11 @@ def test_corrected_as_by_the_model_inverted_by_hand(kinked):
     assert np.abs(il.apply(record, given).triad("accel") - expected).max() < 1e-12 * 20
 
 
-def test_the_exported_unit_agrees_to_the_last_bit_and_a_blob_to_single_precision(kinked, tmp_path):
+def test_the_exported_unit_agrees_to_the_last_bit_and_a_blob_to_single_precision(kinked, tmp_path, self_test):
     record = kinked[2]
     il.export("c", record, tmp_path / "unit")
-    run = subprocess.run(["make", "-C", str(tmp_path / "unit"), "test"], capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
+    run = self_test(tmp_path / "unit")
+    assert run.returncode == 0, run.stdout
     assert "pass, worst 0 of full scale" in run.stdout
     (file,) = il.export("blob", record, tmp_path)
     found, expected = (il.apply(one, wandering()).triad("accel") for one in (file, record))

@@ -36,10 +36,11 @@ def one_ramp(rng, triad):
     )  # fmt: skip
 
 
-def test_what_one_ramp_does_not_tell_costs_as_much_as_is_said():
+def test_what_one_ramp_does_not_tell_costs_as_much_as_is_said(reduced):
     """Scale factors that move by 100 ppm/K (rms): errors of biases, and what the message says they are."""
+    trials = 15 if reduced else 40
     laws, said, errors = Laws(-20.0, 60.0, (3, 0, 0)), [], []
-    for seed in range(40):
+    for seed in range(trials):
         rng = np.random.default_rng([51, seed])
         triad = reference.Triad(rng, degrees=(3, 1, 0))
         given = one_ramp(rng, triad)
@@ -62,12 +63,13 @@ def test_ramps_name_what_they_do_not_tell_and_their_verdict_is_not_good():
     assert named == {1: ["scale factor", "misalignment"], 3: ["misalignment"], 4: []}
 
 
-def test_a_lag_that_fast_ramps_do_not_tell_is_said_with_what_it_costs():
+def test_a_lag_that_fast_ramps_do_not_tell_is_said_with_what_it_costs(reduced):
     """Attitudes while 80 K pass in 13 minutes, all of them warming, and a lag of 5 s; half as fast twice less."""
+    trials = 4 if reduced else 8
     from test_thermal_lag import HALF, driven, part
 
     laws, given = Laws(-20.0, 60.0, (3, 2, 1)), []
-    for seed in range(8):
+    for seed in range(trials):
         fast, triad, _ = driven(np.random.default_rng([53, seed]), lag=5.0 * HALF / 800.0, rough=0.0)
         warming = part(fast, fast.rate > 0)
         given.append((replace(warming, rate=warming.rate * HALF / 800.0), triad))
@@ -84,7 +86,7 @@ def test_a_lag_that_fast_ramps_do_not_tell_is_said_with_what_it_costs():
         said += [float(re.search(r"errs biases by (\S+) mg", text)[1]) for text in texts]
         biases = laws.design(AT)[:, :3] @ found.coefficients
         errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))
-    assert len(said) > 4
+    assert len(said) > trials / 2
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.sqrt(np.mean(np.square(said))), rel=0.4)
 
 
@@ -128,14 +130,15 @@ def test_stated_degrees_of_the_truth_are_called_too_low_as_seldom_as_the_test_sa
     assert called <= (3 if reduced else 9)
 
 
-def test_six_attitudes_at_each_temperature_leave_no_room_to_step_down():
+def test_six_attitudes_at_each_temperature_leave_no_room_to_step_down(reduced):
     """27 unknowns and 30 attitudes: nothing can be left out, and the F-test finds nothing significant. Steps down left
     intervals of misalignments that hold in 81 % and of scale factors in 88 %, of 25 units."""
+    trials = 6 if reduced else 12
     from imulab.procedures.thermal.degrees import choose
 
     laws, held = Laws(-20.0, 60.0, (3, 2, 1)), []
     design = laws.design(AT)
-    for seed in range(12):
+    for seed in range(trials):
         rng = np.random.default_rng([61, seed])
         triad = reference.Triad(rng)
         given = problem(rng, triad, (-20, 0, 25, 45, 60), 6, turn_on=1e-4)

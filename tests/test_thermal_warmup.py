@@ -5,7 +5,6 @@ The unit of the figures is made here by hand: a rate that follows the temperatur
 """
 
 import hashlib
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -132,12 +131,12 @@ def test_a_warm_up_of_other_columns_stands_beside_the_laws(unit, tmp_path):
     assert il.export("blob", [thermal, gyros.calibration], tmp_path)
 
 
-def test_a_bundle_of_both_corrects_as_the_records_do(unit, tmp_path, monkeypatch, capsys):
+def test_a_bundle_of_both_corrects_as_the_records_do(unit, tmp_path, monkeypatch, capsys, self_test):
     _, thermal, cycles, _, after = unit
     monkeypatch.chdir(tmp_path)
     il.export("c", [thermal, after], "unit")
-    run = subprocess.run(["make", "-C", "unit", "test"], capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
+    run = self_test(tmp_path / "unit")
+    assert run.returncode == 0, run.stdout
     (blob,) = il.export("blob", [thermal, after], ".")
     expected = il.apply(after, il.apply(thermal, cycles[0]))
     assert il.apply(blob, cycles[0]).triad("accel") == pytest.approx(expected.triad("accel"), abs=4e-6 * G)

@@ -102,16 +102,17 @@ def test_a_check_without_noise_takes_that_of_the_record_and_says_so(truth):
     assert float(said.split("the ")[2].split(" µg")[0]) == pytest.approx(1e6 * 1e-3 / G, rel=0.1)
 
 
-def test_disturbed_holds_are_no_change_of_the_unit(truth):
+def test_disturbed_holds_are_no_change_of_the_unit(truth, reduced):
     """Attitudes that scatter ten times more than they say fail by that alone once in twenty."""
+    trials = 20 if reduced else 60
     failed = 0
-    for seed in range(60):
+    for seed in range(trials):
         record, _ = fitted(truth, 1, seed=2 * seed, sigma=1e-4, stated=1e-4)
         _, fresh = fitted(truth, 1, seed=2 * seed + 1, sigma=1e-3, stated=1e-4)
         check = check_tumble(record, fresh)
         failed += not check.passed
         assert any("scatter by" in note for note in check.notes)
-    assert failed <= stats.binom.ppf(0.999, 60, 0.1)
+    assert failed <= stats.binom.ppf(0.999, trials, 0.1)
 
 
 def test_a_record_without_uncertainties_needs_a_limit(imulab, tmp_path, truth):
@@ -151,16 +152,17 @@ def test_a_check_needs_the_unit_of_the_record(truth):
         check_tumble(record, counts, limit=1.0)
 
 
-def test_no_change_is_claimed_where_nothing_changed(noise_as_stated, truth):
+def test_no_change_is_claimed_where_nothing_changed(noise_as_stated, truth, reduced):
     """One false claim in twenty comparisons, and the joint probability uniform."""
+    trials = 70 if reduced else 200
     claims, probabilities = 0, []
-    for seed in range(200):
+    for seed in range(trials):
         a, _ = fitted(truth, 1, seed=2 * seed, stated=1e-3)
         b, _ = fitted(truth, 1, seed=2 * seed + 1, stated=1e-3)
         comparison = compare_records(a, b)
         claims += any(change.significant for change in comparison.changes)
         probabilities.append(comparison.probability)
-    assert claims <= stats.binom.ppf(0.999, 200, 0.05)
+    assert claims <= stats.binom.ppf(0.999, trials, 0.05)
     assert stats.kstest(probabilities, "uniform").pvalue > 1e-3
 
 

@@ -113,11 +113,12 @@ def test_linearised_equals_its_transcription():
             assert found.value(name) == pytest.approx(value, rel=1e-9, abs=1e-9 * natural(name)), name
 
 
-def test_linearised_is_biased_at_mems_size_and_norm_is_not():
+def test_linearised_is_biased_at_mems_size_and_norm_is_not(reduced):
     """Method document: k2 of 50 µg/g² is off by about 1 µg/g² at MEMS size, 0.05 µg/g² at navigation size."""
+    trials = 4 if reduced else 10
     rng = np.random.default_rng(41)
     errors = {"mems": [], "navigation": [], "norm": []}
-    for _ in range(10):
+    for _ in range(trials):
         mems = reference.random_truth(rng, 2) | {f"k2_{a}": 50e-6 / G for a in "xyz"}
         nominal = {n: (1.0 if n[0] == "s" else 0.0) for n in mems}
         # scale 1 %, bias 5 mg, misalignment 1 mrad
@@ -156,10 +157,11 @@ def test_huber_keeps_one_knocked_attitude_from_spoiling_the_rest():
 
 
 @pytest.mark.parametrize("true_order", [1, 2, 3])
-def test_auto_chooses_the_order_of_the_truth(true_order):
+def test_auto_chooses_the_order_of_the_truth(true_order, reduced):
+    trials = 8 if reduced else 20
     rng = np.random.default_rng(60 + true_order)
     right = 0
-    for _ in range(20):
+    for _ in range(trials):
         truth = reference.random_truth(rng, true_order)
         for name in truth:  # nonlinearity that 40 attitudes can see
             if name.startswith(f"k{true_order}"):
@@ -168,7 +170,7 @@ def test_auto_chooses_the_order_of_the_truth(true_order):
         result = fit(data, "auto")
         right += result.calibration.model["order"] == true_order
         assert [row.order for row in result.orders] == [1, 2, 3, 4, 5]
-    assert right >= 18  # the F-test at 5 % lets one in twenty go higher
+    assert right >= 0.9 * trials  # the F-test at 5 % lets one in twenty go higher
 
 
 def test_unknown_noise_is_estimated_and_said():

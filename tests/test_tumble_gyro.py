@@ -64,9 +64,10 @@ def test_turns_of_one_segment_equal_those_of_the_other_function():
 
 
 @pytest.mark.parametrize("fit_bias", [False, True])
-def test_the_truth_is_found_within_its_uncertainty(fit_bias):
+def test_the_truth_is_found_within_its_uncertainty(fit_bias, reduced):
+    trials = 4 if reduced else 12
     scores = []
-    for seed in range(12):
+    for seed in range(trials):
         recording = il.simulate_tumble(order=1, attitudes=24, seed=seed)
         attitudes = il.find_attitudes(recording)
         record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
@@ -108,10 +109,11 @@ def test_twists_about_the_vertical_that_only_the_gyroscopes_feel_leave_the_bias_
     assert np.sqrt(np.diag(fit.covariance)).max() < 2 * sigma.max()
 
 
-def test_the_uncertainty_of_the_accelerometers_record_is_carried_along():
+def test_the_uncertainty_of_the_accelerometers_record_is_carried_along(reduced):
     """A record from a hasty test, and turns from a careful one: the frame of the gyroscopes is no better known."""
+    trials = 8 if reduced else 20
     scores = []
-    for seed in range(20):
+    for seed in range(trials):
         truth = {f"bias_{a}": 0.1 for a in "xyz"} | {f"scale_factor_{a}": 1.0 for a in "xyz"}
         truth |= {"misalignment_yx": 0.01, "misalignment_zx": -0.02, "misalignment_zy": 0.01}
         hasty, careful = (

@@ -62,9 +62,10 @@ def test_the_clock_is_a_common_part_of_all_three_scale_factors():
     assert np.abs(scores(unit, default)).max() < 5
 
 
-def test_two_clocks_are_compared_and_their_difference_is_part_of_the_uncertainty():
+def test_two_clocks_are_compared_and_their_difference_is_part_of_the_uncertainty(reduced):
+    trials = 4 if reduced else 6
     found = []
-    for seed in range(6):
+    for seed in range(trials):
         unit, record, attitudes, recording = campaign(seed, apart=True, fast=2e-3, late=0.2)
         fit = fit_gyro_triad(record, attitudes, recording)
         other = fit.clock.comparison
@@ -100,8 +101,9 @@ def test_late_samples_of_the_gyroscopes_do_no_harm_and_are_noted():
     assert with_gyro(record, fit, recording, recording).verdict.state == record.verdict.state
 
 
-def test_scale_factors_that_change_with_the_rate_are_said_with_their_size():
-    for seed in range(4):
+def test_scale_factors_that_change_with_the_rate_are_said_with_their_size(reduced):
+    trials = 2 if reduced else 4
+    for seed in range(trials):
         _, record, attitudes, recording = campaign(seed, cubic=1e-3)  # 0.1 % at 100 deg/s
         fit = fit_gyro_triad(record, attitudes, recording)
         (note,) = [w for w in fit.notes if "depends on the rate" in w]
@@ -170,9 +172,10 @@ def test_one_attitude_cut_out_of_the_recording_leaves_the_verdict_good():
     assert fit.calibration.verdict.state == "good"
 
 
-def test_nothing_is_set_aside_without_reason():
-    aside = sum(len(fit_gyro_triad(*campaign(seed)[1:]).aside) for seed in range(20, 36))
-    assert aside <= 2  # of 16 times 23 turns
+def test_nothing_is_set_aside_without_reason(reduced):
+    trials = 8 if reduced else 16
+    aside = sum(len(fit_gyro_triad(*campaign(seed)[1:]).aside) for seed in range(20, 20 + trials))
+    assert aside <= trials / 8  # 2 of 16 times 23 turns
 
 
 def test_turns_beyond_the_range_are_left_out():
@@ -282,9 +285,10 @@ def polled(columns, accel, path):
     return {n: v[number] for n, v in columns.items()}, {n: v[number] for n, v in accel.items()}
 
 
-def test_stamps_that_jitter_are_evened_where_the_turns_say_that_the_samples_do_not():
+def test_stamps_that_jitter_are_evened_where_the_turns_say_that_the_samples_do_not(reduced):
+    trials = 3 if reduced else 8
     plain, wrong = [], []
-    for seed in range(8):
+    for seed in range(trials):
         for size in (0.004, 0.04):
             unit, record, attitudes, recording = campaign(seed, change=jittered(size))
             fit = fit_gyro_triad(record, attitudes, recording)

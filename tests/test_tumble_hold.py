@@ -80,9 +80,10 @@ def noise_of_attitudes(record):
 
 
 @pytest.mark.parametrize(("degrees", "bias"), [(0.3, 3e-6), (0.5, 5e-6), (1.0, 8e-6)])
-def test_sway_of_a_hand_neither_shortens_gravity_nor_hides_what_is_known(degrees, bias):
+def test_sway_of_a_hand_neither_shortens_gravity_nor_hides_what_is_known(degrees, bias, reduced):
+    trials = 6 if reduced else 16
     found, stated, noise, off = [], [], [], []
-    for seed in range(16):
+    for seed in range(trials):
         record = fitted(il.find_attitudes(held(seed, sway=np.radians(degrees))))
         error, u = errors(record)
         found.append(error)
@@ -95,9 +96,10 @@ def test_sway_of_a_hand_neither_shortens_gravity_nor_hides_what_is_known(degrees
     assert np.mean(noise) < (1.6 if degrees == 1.0 else 1.2)  # in units of the sensor's own noise; it was 20 to 50
 
 
-def test_a_unit_at_rest_keeps_its_noise():
+def test_a_unit_at_rest_keeps_its_noise(reduced):
+    trials = 5 if reduced else 12
     at_rest, moving = [], []
-    for seed in range(12):
+    for seed in range(trials):
         attitudes = il.find_attitudes(held(seed))
         moving.append(noise_of_attitudes(fitted(attitudes)))
         at_rest.append(noise_of_attitudes(fitted(dataclasses.replace(attitudes, motion=None))))
@@ -105,9 +107,10 @@ def test_a_unit_at_rest_keeps_its_noise():
     assert np.mean(moving) == pytest.approx(0.3e-3 / np.sqrt(530), rel=0.05)
 
 
-def test_shaking_is_not_taken_for_gravity():
+def test_shaking_is_not_taken_for_gravity(reduced):
     """Block by block the magnitude of f is taken, sample by sample it would be 200 ug too long."""
-    off = [errors(fitted(il.find_attitudes(held(seed, tremor=20 * MG))))[0][3:6].mean() for seed in range(8)]
+    trials = 4 if reduced else 8
+    off = [errors(fitted(il.find_attitudes(held(seed, tremor=20 * MG))))[0][3:6].mean() for seed in range(trials)]
     assert abs(np.mean(off)) < 8e-6 + 3 * np.std(off) / np.sqrt(len(off))
 
 

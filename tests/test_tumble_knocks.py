@@ -72,17 +72,18 @@ def test_where_nothing_stands_out_the_result_is_the_plain_one_bit_for_bit(order,
     assert default.data == square.data
 
 
-def test_knocks_are_found_and_clean_attitudes_are_left_alone():
+def test_knocks_are_found_and_clean_attitudes_are_left_alone(reduced):
+    trials = 14 if reduced else 40
     found, false = 0, 0
-    for seed in range(40):
+    for seed in range(trials):
         rng = np.random.default_rng(1000 + seed)
         which = rng.choice(24, 2, replace=False)
         knocks = [(int(i), float(rng.choice([-1, 1]) * rng.uniform(2, 30) * MG)) for i in which]
         aside = {number - 1 for number in fit(tumbled(seed, knocks=knocks)[1]).calibration.fit["set_aside"]}
         found += len(aside & set(which.tolist()))
         false += bool(fit(tumbled(seed)[1]).calibration.fit["set_aside"])
-    assert found >= 0.95 * 80
-    assert false <= 2
+    assert found >= 0.95 * 2 * trials
+    assert false <= trials / 20
 
 
 def test_many_attitudes_are_searched_without_trying_every_set():

@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,6 +27,12 @@ from reference import tumble as reference
 G = 9.80665
 
 
+@cache
+def planned(order, attitudes, criterion="A"):
+    """A plan of any attitudes, made once for all tests that look at it."""
+    return plan_attitudes(order=order, attitudes=attitudes, criterion=criterion)
+
+
 def worst(plan, stem):
     return max(value for name, value in plan.uncertainties(1.0).items() if name.startswith(stem))
 
@@ -43,7 +50,7 @@ def worst(plan, stem):
 )
 def test_plans_are_no_worse_than_the_table_of_the_method(count, order, table):
     """Worst axis per unit noise, chosen by A-optimality; the table has two digits, so half of the last is added."""
-    plan = plan_attitudes(order=order, attitudes=count)
+    plan = planned(order, count)
     for stem, value in table.items():
         assert worst(plan, stem) < value + 0.05, stem
 
@@ -51,7 +58,7 @@ def test_plans_are_no_worse_than_the_table_of_the_method(count, order, table):
 @pytest.mark.parametrize(("count", "order"), [(24, 2), (24, 4), (48, 3)])
 def test_the_axes_of_a_plan_are_alike_at_no_cost_in_the_sum(count, order):
     """x, y and z of each kind within 4 %, the sum within 1 % of the least that is found without balancing."""
-    plan = plan_attitudes(order=order, attitudes=count)
+    plan = planned(order, count)
     variance = np.diag(plan.covariance).reshape(-1, 3)
     assert np.sqrt(variance.max(axis=1) / variance.min(axis=1)).max() < 1.04
     least = {(24, 2): 8.2386, (24, 4): 191.69, (48, 3): 15.990}[count, order]  # of seeds 1 to 8
@@ -60,7 +67,7 @@ def test_the_axes_of_a_plan_are_alike_at_no_cost_in_the_sum(count, order):
 
 @pytest.mark.parametrize("criterion", ["A", "D"])
 def test_a_plan_is_better_in_its_criterion_than_random_attitudes_and_than_the_other(criterion):
-    plans = {c: plan_attitudes(order=4, attitudes=18, criterion=c) for c in "AD"}
+    plans = {c: planned(4, 18, c) for c in "AD"}
     cost = {
         "A": lambda plan: np.trace(plan.covariance),
         "D": lambda plan: np.linalg.slogdet(plan.covariance)[1],
@@ -221,20 +228,20 @@ def test_attitudes_already_there_are_taken_into_account():
 
 
 def test_roll_and_pitch_are_those_of_another_library():
-    plan = plan_attitudes(order=2, attitudes=20)
+    plan = planned(2, 24)
     for up, (roll, pitch) in zip(plan.directions, roll_pitch(plan.directions), strict=True):
         body_to_level = Rotation.from_euler("ZYX", [0.3, pitch, roll])
         np.testing.assert_allclose(body_to_level.inv().apply([0, 0, 1]), up, atol=1e-12)
 
 
 def test_the_order_turns_less_than_the_list_as_chosen():
-    plan = plan_attitudes(order=4, attitudes=48)
+    plan = planned(4, 48)
     shuffled = np.random.default_rng(1).permutation(plan.directions)
     assert turning(plan.directions) < 0.5 * turning(shuffled)
 
 
 def test_a_plan_reads_back_and_feeds_the_simulator_and_the_fit(tmp_path):
-    plan = plan_attitudes(order=2, attitudes=18)
+    plan = planned(2, 18)
     il.write_csv(plan_recording(plan), tmp_path / "plan.csv")
     read = directions_of(il.read(tmp_path / "plan.csv"))
     np.testing.assert_allclose(read, plan.directions, atol=1e-6)
@@ -265,12 +272,12 @@ def test_three_degrees_off_cost_a_tenth():
     """As the sheet says."""
     rng = np.random.default_rng(8)
     for order, count in ((1, 12), (2, 24), (4, 24)):
-        plan = plan_attitudes(order=order, attitudes=count)
-        planned, worst = np.sqrt(np.diag(plan.covariance)), []
+        plan = planned(order, count)
+        predicted, worst = np.sqrt(np.diag(plan.covariance)), []
         for _ in range(100):
             off = plan.directions + np.radians(3) / np.sqrt(2) * rng.standard_normal((count, 3))
             rows = information_rows(off / np.linalg.norm(off, axis=1, keepdims=True), order)
-            worst.append((np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) / planned).max())
+            worst.append((np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) / predicted).max())
         assert np.median(worst) < 1.1
 
 

@@ -181,11 +181,12 @@ def test_what_aged_is_weighed_by_how_probable_it_makes_the_attitudes(few):
 
 
 @pytest.mark.parametrize("moved", ["nothing", "bias", "scale_factor"])
-def test_intervals_cover_what_aged(moved):
+def test_intervals_cover_what_aged(moved, reduced):
     """12 attitudes by hand, noise 60 µg, a record of 20 µg; without ageing a changed group is hardly covered."""
+    trials = 20 if reduced else 40
     size = {"nothing": 0.0, "bias": 1.5e-4 * G, "scale_factor": 2.5e-4}[moved]
     inside = []
-    for seed in range(40):
+    for seed in range(trials):
         rng = np.random.default_rng(seed)
         truth = reference.random_truth(rng, 1)
         record = fit(attitudes_of(truth, 1, 24, 1000 + seed, 20e-6 * G))
@@ -199,7 +200,7 @@ def test_intervals_cover_what_aged(moved):
             if moved == "nothing" or name.startswith(moved)
         ]
     # The document's 92 to 96 % of a changed group, three axes of a trial taken as one and a half independent ones.
-    assert np.mean(inside) > 0.92 - 2 * np.sqrt(0.92 * 0.08 / 60)
+    assert np.mean(inside) > 0.92 - 2 * np.sqrt(0.92 * 0.08 / (1.5 * trials))
 
 
 def test_the_same_place_is_one_place_for_prior_and_attitudes():

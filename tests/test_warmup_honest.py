@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,12 @@ def cycles(shift: float = 0.0) -> list[il.Recording]:
 
 def fit(recordings: list[il.Recording] | None = None, **options: Any) -> Any:
     return fit_warmup(recordings or cycles(), **{"temperatures": AT, "settling_time": 300.0, **options})
+
+
+@cache
+def fitted(model: str, **options: str) -> Any:
+    """The record of a model, made once."""
+    return fit(model=model, **options).calibration
 
 
 @pytest.fixture(scope="module")
@@ -125,9 +132,9 @@ def test_a_recording_from_after_the_warm_up_has_nothing_to_correct(folder: Path,
 def test_beyond_hold_goes_on_as_at_the_edges_on_the_desk_and_in_the_unit(
     tmp_path: Path, model: str, temperature: float, edge: float
 ) -> None:
-    record = fit(model=model, beyond="hold").calibration
+    record = fitted(model, beyond="hold")
     start = cycle(temperature, 5)
-    z = evaluate(record_table(fit(model=model).calibration), start.columns["time"], edge)
+    z = evaluate(record_table(fitted(model)), start.columns["time"], edge)
     assert z is not None
     want = start.columns["gyro_y"] - z[1] / HOUR
     np.testing.assert_allclose(il.apply(record, start).column("gyro_y"), want, atol=1e-9)
@@ -154,7 +161,7 @@ def test_hold_survives_record_and_spreadsheet(folder: Path, capsys: Any) -> None
 def test_a_start_within_the_tolerance_of_an_outer_temperature_is_corrected_as_there(
     tmp_path: Path, model: str, temperature: float, edge: float
 ) -> None:
-    record = fit(model=model).calibration
+    record = fitted(model)
     start = cycle(temperature, 5)
     z = evaluate(record_table(record), start.columns["time"], edge)
     assert z is not None

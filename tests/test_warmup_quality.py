@@ -174,12 +174,13 @@ def test_a_cycle_that_moves_throughout_is_known_by_the_others():
 
 
 @pytest.mark.parametrize("model", ["interval-cubic", "knot-cubic", "knot-log-cubic", "exponential"])
-def test_noise_alone_leaves_nothing_at_the_tests(model):
+def test_noise_alone_leaves_nothing_at_the_tests(model, reduced):
     """A fit follows some of the noise of its own cycles: what is taken off is that much smaller."""
+    trials = 40 if reduced else 60
     scales = {"knot-log-cubic": (20.0,), "exponential": (20.0, 90.0)}.get(model, ())
     rng = np.random.default_rng(10)
     at, left, unseen = np.array([-20.0, 0, 20]), [], []
-    for _ in range(60):
+    for _ in range(trials):
         noise = {(t, c): HOUR * 100 * rng.standard_normal(900) for t in at for c in (1, 2)}
         cycles = [
             find_power_cycle(
@@ -224,10 +225,11 @@ def test_a_table_that_outlasts_its_data_says_so():
     assert any("no cycle at 0 20 degC lasts to T_M = 500 s: the table goes on from 400 s" in text for text in warnings)
 
 
-def test_repeatability_lost_in_the_noise_has_an_uncertainty():
+def test_repeatability_lost_in_the_noise_has_an_uncertainty(reduced):
+    trials = 16 if reduced else 40
     rng = np.random.default_rng(11)
     values = []
-    for _ in range(40):  # no scatter but noise: the square is as often below zero, and 95 % lie within two of it
+    for _ in range(trials):  # no scatter but noise: the square is as often below zero, and 95 % lie within two of it
         cycles = [cycle_of(flat, t, name=f"{t}{c}", rate=2) for t in (0, 20) for c in (1, 2, 3)]
         for cycle in cycles:
             cycle.columns["gyro_x"] += 1e-4 * rng.standard_normal(len(cycle))
