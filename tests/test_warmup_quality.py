@@ -174,13 +174,12 @@ def test_a_cycle_that_moves_throughout_is_known_by_the_others():
 
 
 @pytest.mark.parametrize("model", ["interval-cubic", "knot-cubic", "knot-log-cubic", "exponential"])
-def test_noise_alone_leaves_nothing_at_the_tests(model, reduced):
+def test_noise_alone_leaves_nothing_at_the_tests(model):
     """A fit follows some of the noise of its own cycles: what is taken off is that much smaller."""
-    trials = 40 if reduced else 60
     scales = {"knot-log-cubic": (20.0,), "exponential": (20.0, 90.0)}.get(model, ())
     rng = np.random.default_rng(10)
     at, left, unseen = np.array([-20.0, 0, 20]), [], []
-    for _ in range(trials):
+    for _ in range(60):
         noise = {(t, c): HOUR * 100 * rng.standard_normal(900) for t in at for c in (1, 2)}
         cycles = [
             find_power_cycle(
