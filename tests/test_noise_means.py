@@ -7,7 +7,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.errors import RecordError
 from imulab.estimation.column_noise import columns_noise
-from imulab.estimation.special import ndtr
+from imulab.estimation.distributions import normal_cdf
 from imulab.records.mean_noise import mean_uncertainties
 from reference import noise as reference
 
@@ -44,7 +44,7 @@ def ratios(kind, count, duration, trials, seed=1):
 def test_a_log_ten_times_as_long_tells_the_uncertainty_of_a_mean(kind):
     """Of a true normal error 2u cover so much, u being what each log says."""
     found = ratios(kind, COUNT, MEAN * INTERVAL, 25)
-    assert np.mean(2 * ndtr(2 * found) - 1) >= 0.9
+    assert np.mean(2 * normal_cdf(2 * found) - 1) >= 0.9
     if kind == "white":
         assert np.median(found) <= 1.05
 
@@ -52,7 +52,7 @@ def test_a_log_ten_times_as_long_tells_the_uncertainty_of_a_mean(kind):
 def test_of_white_noise_a_stretch_tells_its_own_mean():
     found = ratios("white", MEAN, MEAN * INTERVAL, 25)
     assert 0.95 <= np.median(found) <= 1.6  # 5 with the guard against noise that does not show
-    assert np.mean(2 * ndtr(2 * found) - 1) >= 0.9
+    assert np.mean(2 * normal_cdf(2 * found) - 1) >= 0.9
 
 
 def noise_record(kind, seed=1, names=("gyro_1",), terms="auto", count=COUNT, scale=1.0, **head):
@@ -71,7 +71,7 @@ def test_a_noise_record_tells_the_uncertainty_of_a_mean(kind, reduced):
         u, said = mean_uncertainties(noise_record(kind, seed), ["gyro_1"], MEAN * INTERVAL, "rad/s", {})
         assert not said
         found.append(float(u[0]) / true_uncertainty(kind, MEAN * INTERVAL))
-    assert np.mean(2 * ndtr(2 * np.array(found)) - 1) >= 0.9
+    assert np.mean(2 * normal_cdf(2 * np.array(found)) - 1) >= 0.9
     if kind == "white":
         assert np.median(found) <= 1.05
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from imulab.estimation.distributions import normal_cdf, normal_quantile
 from imulab.estimation.noise.analysis import CANDIDATES, Averaged, average, choose
 from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
 from imulab.estimation.noise.likelihood import deviance, fit, information, profile, time_limits
@@ -18,7 +19,6 @@ from imulab.estimation.noise.terms import (
     walk_square,
     white_square,
 )
-from imulab.estimation.special import ndtr, ndtri
 from noise_models import AUTO, IN_TIME, LONG, TRUTHS, drawn, empty, intervals, transformed, values
 from reference import noise as reference
 
@@ -116,7 +116,7 @@ def test_quantiles_of_a_mixture_are_those_of_its_draws():
     assert mixture.expected[0, 0] == pytest.approx(draws.mean(), rel=0.01)
     nothing = Averaged(np.array([[[0.0], [1.0]]]), np.array([[[0.0], [0.1]]]), np.array([[0.1, 0.9]]))
     assert nothing.quantile(0.025)[0, 0] == 0
-    assert nothing.quantile(0.5)[0, 0] == pytest.approx(np.exp(np.sqrt(0.1) * ndtri(0.4 / 0.9)), rel=1e-6)
+    assert nothing.quantile(0.5)[0, 0] == pytest.approx(np.exp(np.sqrt(0.1) * normal_quantile(0.4 / 0.9)), rel=1e-6)
 
 
 def test_a_filter_gets_white_noise_for_what_is_fast_to_it():
@@ -203,7 +203,7 @@ def test_chosen_terms_and_averages_over_many_records(name, expected, share, requ
     ratio = np.sqrt(
         average(choice, lambda models: bias_square(models, mean, dt)).expected / bias_square(truth, mean, dt)
     )
-    within = (2 * ndtr(2 * ratio) - 1).mean()  # the error of a mean is normal, of the true variance
+    within = (2 * normal_cdf(2 * ratio) - 1).mean()  # the error of a mean is normal, of the true variance
     print(name, "right", right, "sigma covers", cover, "bias covers", within, "median u/u_true", np.median(ratio))
     assert right >= share - 2.5 * np.sqrt(0.05 / trials)
     assert cover[0] >= 0.88

@@ -24,6 +24,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imulab.estimation.distributions import (
+    chi_square_tail,
+    chi_square_upper_quantile,
+    f_tail,
+    normal_quantile,
+    t_quantile,
+)
 from imulab.estimation.rows import MAD_TO_SIGMA, median, medians
 from imulab.recording import Array
 
@@ -293,15 +300,13 @@ def robust_scale(standardised: Array, size: int) -> Array:
 
 def f_test(cost: float, size: int, larger_cost: float, larger_size: int, count: int) -> float:
     """Return the probability of so large a gain if the larger of two nested models were no better (F-test)."""
-    from imulab.estimation.special import fdtrc
-
     if larger_size >= count:
         return 1.0
     gain = (cost - larger_cost) / (larger_size - size)
     noise = larger_cost / (count - larger_size)
     if noise <= 0:
         return 0.0 if gain > 0 else 1.0
-    return float(fdtrc(larger_size - size, count - larger_size, max(gain / noise, 0.0)))
+    return float(f_tail(max(gain / noise, 0.0), larger_size - size, count - larger_size))
 
 
 def bayesian_information(cost: float, size: int, count: int) -> float:
@@ -311,24 +316,18 @@ def bayesian_information(cost: float, size: int, count: int) -> float:
 
 def chi_square_limit(freedom: int, probability: float = 1e-2) -> float:
     """Return the value that chi-square exceeds with the given probability; infinite without degrees of freedom."""
-    from imulab.estimation.special import chdtri
-
-    return float(chdtri(freedom, probability)) if freedom > 0 else float("inf")
+    return float(chi_square_upper_quantile(probability, freedom)) if freedom > 0 else float("inf")
 
 
 def coverage_factor(freedom: float | None, probability: float = 0.95) -> float:
     """Return the two-sided coverage factor: Student's t, or the normal quantile where `freedom` is None."""
-    from imulab.estimation.special import ndtri, stdtrit
-
     tail = 0.5 + probability / 2
-    return float(ndtri(tail) if freedom is None else stdtrit(freedom, tail))
+    return float(normal_quantile(tail) if freedom is None else t_quantile(tail, freedom))
 
 
 def chi_square_probability(value: float, freedom: float) -> float:
     """Return the probability that chi-square with `freedom` degrees exceeds `value`."""
-    from imulab.estimation.special import chdtrc
-
-    return float(chdtrc(freedom, value))
+    return float(chi_square_tail(value, freedom))
 
 
 # Nested models blended: what their estimates say together, whichever of them is right.

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import ReadError, UnitError, listed, quoted
+from imulab.estimation.distributions import normal_quantile, t_cdf, t_quantile
 from imulab.files import check_keys, load_toml, number_of
 from imulab.fleet.engine import Summary
 from imulab.fleet.history import Past, sources_of
@@ -341,8 +342,6 @@ def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> Drift | N
     day, value = days[used], values[used]
     if len(day) < _FEWEST_FOR_DRIFT or np.ptp(day) < _SHORTEST_SPAN:
         return None
-    from imulab.estimation.special import stdtrit
-
     centred = day - day.mean()
     spread = float(centred @ centred)
     slope = float(centred @ value) / spread
@@ -353,7 +352,7 @@ def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> Drift | N
     return Drift(
         per_day=slope,
         standard_uncertainty=uncertainty,
-        significant=abs(slope) > uncertainty * float(stdtrit(freedom, 1 - _DRIFT_LEVEL / 2)),
+        significant=abs(slope) > uncertainty * float(t_quantile(1 - _DRIFT_LEVEL / 2, freedom)),
         start=start,
         value_at_start=float(value.mean() + slope * (start - day.mean())),
         days=float(np.ptp(day)),
@@ -402,9 +401,7 @@ def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past
 
 def change_limit(count: int) -> float:
     """Return the deviations that one in so many normal changes is beyond in one set out of a hundred."""
-    from imulab.estimation.special import ndtri
-
-    return float(-ndtri(_FALSE_ALARM / 2 / max(count, 1)))
+    return float(-normal_quantile(_FALSE_ALARM / 2 / max(count, 1)))
 
 
 def _compared(
@@ -421,10 +418,8 @@ def _compared(
     share = sum((part / u) ** 4 / freedom for part, freedom in parts)
     if share <= 0:
         return u, ratio
-    from imulab.estimation.special import ndtri, stdtr
-
-    chance = max(float(stdtr(1 / share, -abs(ratio))), 1e-300)
-    return u, math.copysign(-float(ndtri(chance)), ratio)
+    chance = max(float(t_cdf(-abs(ratio), 1 / share)), 1e-300)
+    return u, math.copysign(-float(normal_quantile(chance)), ratio)
 
 
 def _last(summary: Summary, past: Sequence[Past]) -> Past | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from imulab._version import VERSION
 from imulab.display import Note, verdict_of
+from imulab.estimation.distributions import chi_square_upper_quantile
 from imulab.recording import Array, Recording
 from imulab.report import render_page
 from imulab.report import traces as panels
@@ -166,12 +167,11 @@ def exhibits_of_noise(found: dict[str, Any], recording: Recording) -> Exhibits:
 
 def interval(column: dict[str, Any]) -> tuple[Array, Array]:
     """Return the 95 % interval of a column's Allan deviation, by chi-square with its degrees of freedom."""
-    from imulab.estimation.special import chdtri
-
     deviation, u = np.array(column["deviation"]), np.array(column["standard_uncertainty"])
     known = u > 0
     freedom = np.where(known, (deviation / np.where(known, u, 1.0)) ** 2 / 2, 1.0)
-    low, high = (deviation * np.where(known, np.sqrt(freedom / chdtri(freedom, tail)), 1.0) for tail in (0.025, 0.975))
+    limits = (chi_square_upper_quantile(tail, freedom) for tail in (0.025, 0.975))
+    low, high = (deviation * np.where(known, np.sqrt(freedom / limit), 1.0) for limit in limits)
     return low, high
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.distributions import chi_square_tail, f_quantile, f_tail, normal_cdf, normal_quantile
 from imulab.estimation.noise.analysis import CANDIDATES, choose
 from imulab.estimation.noise.likelihood import Flags, score, time_limits
 from imulab.estimation.noise.spectrum import Spectrum, frequencies
@@ -55,28 +56,22 @@ class Octaves:
     @property
     def scores(self) -> Array:
         """Of what the tolerance leaves; without one, standard normal where both are of the same noise, (..., o)."""
-        from imulab.estimation.special import fdtrc, ndtri
-
         left = self.ratio / self.allowed
-        upper = fdtrc(self.freedom[1], self.freedom[0], left)
-        lower = fdtrc(self.freedom[0], self.freedom[1], 1 / left)
+        upper = f_tail(left, self.freedom[1], self.freedom[0])
+        lower = f_tail(1 / left, self.freedom[0], self.freedom[1])
         tail = np.maximum(np.minimum(upper, lower), 1e-300)
-        return np.asarray(np.where(upper < lower, 1.0, -1.0) * -ndtri(tail))
+        return np.asarray(np.where(upper < lower, 1.0, -1.0) * -normal_quantile(tail))
 
     @property
     def probability(self) -> Array:
         """Of so large a sum of squares of the scores, if both are of the same noise, shape (...)."""
-        from imulab.estimation.special import chdtrc
-
-        return np.asarray(chdtrc(max(len(self.low), 1), np.sum(self.scores**2, axis=-1)))
+        return np.asarray(chi_square_tail(np.sum(self.scores**2, axis=-1), max(len(self.low), 1)))
 
     @property
     def interval(self) -> tuple[Array, Array]:
         """Ends of the 95 % interval of the ratio of the two powers, shapes (..., o)."""
-        from imulab.estimation.special import fdtri
-
         d1, d2 = self.freedom
-        return self.ratio / fdtri(d2, d1, 1 - _TAIL), self.ratio / fdtri(d2, d1, _TAIL)
+        return self.ratio / f_quantile(1 - _TAIL, d2, d1), self.ratio / f_quantile(_TAIL, d2, d1)
 
 
 @dataclass(frozen=True)
@@ -126,8 +121,6 @@ def agreement(
     candidates, full_band
         For the choice of the common model, as for `choose`.
     """
-    from imulab.estimation.special import chdtrc, ndtri
-
     spectra = [*first, *second]
     bins, limits = prepare(spectra), time_limits(spectra)
     own = np.arange(len(bins.freedom)) < sum(len(each.power) for each in first)
@@ -142,8 +135,8 @@ def agreement(
     eased = np.where(own, bins.power, bins.power / _allowed(spectra, held, highest))
     ratios = _likelihood_ratios(bins, own, values, limits, np.concatenate([eased[None], drawn]))
     count = int(np.count_nonzero(values > 0))
-    by_terms = chdtrc(count, count * ratios / max(float(ratios[1:].mean()), 1e-9))
-    scores = ndtri(np.clip([by_terms[1:], octaves.probability[1:]], _SMALLEST, _LARGEST))
+    by_terms = chi_square_tail(count * ratios / max(float(ratios[1:].mean()), 1e-9), count)
+    scores = normal_quantile(np.clip([by_terms[1:], octaves.probability[1:]], _SMALLEST, _LARGEST))
     together = _either(min(float(by_terms[0]), float(held.probability)), float(np.corrcoef(scores)[0, 1]))
     return Agreement(model, float(by_terms[0]), held, together)
 
@@ -154,12 +147,10 @@ def _either(least: float, correlation: float) -> float:
     ``2 p - int_c^inf phi(x) Phi((rho x - c)/sqrt(1 - rho^2)) dx``, c the score of p; with a number of independent tests
     in its place, 4 % of all pairs more were below 0.5 than should be.
     """
-    from imulab.estimation.special import ndtr, ndtri
-
     rho = min(max(correlation, 0.0), _MOST_ALIKE)
-    start = max(float(-ndtri(min(max(least, 1e-300), _LARGEST))), -_FAR)
+    start = max(float(-normal_quantile(min(max(least, 1e-300), _LARGEST))), -_FAR)
     x = np.linspace(start, start + _FAR, 2001)
-    both = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi) * ndtr((rho * x - start) / np.sqrt(1 - rho**2))
+    both = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi) * normal_cdf((rho * x - start) / np.sqrt(1 - rho**2))
     return float(np.clip(2 * least - (both.sum() - (both[0] + both[-1]) / 2) * (x[1] - x[0]), 0, 1))
 
 

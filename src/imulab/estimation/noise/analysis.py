@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.distributions import chi_square_tail, normal_cdf
 from imulab.estimation.noise.cleaning import STEP, Step, find_steps, step_coefficients
 from imulab.estimation.noise.likelihood import (
     Allowance,
@@ -196,8 +197,6 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> F
     highest
         f_max, Hz.
     """
-    from imulab.estimation.special import chdtrc
-
     interval, length = spectra[0].interval, max(each.length for each in spectra)
     lowest = max(1, int(np.ceil(_SHORTEST / highest / interval - 1e-9)))
     octaves = max(0, int(np.floor(np.log2(max(length / _LONGEST / interval / lowest, 0.5)))) + 1)
@@ -230,7 +229,7 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> F
     statistic = float(np.sum((r - basis @ step) ** 2))
     better = values.copy()
     better[present] *= np.exp(np.clip(step, -2, 2))
-    probability = float(chdtrc(freedom, statistic)) if freedom else 1.0
+    probability = float(chi_square_tail(statistic, freedom)) if freedom else 1.0
     return Fit(statistic, freedom, probability, tau, found, predicted[0], better)
 
 
@@ -405,8 +404,6 @@ class Averaged:
 
     def quantile(self, probability: float) -> Array:
         """Return what the square is below with a probability, shape (c, t); 0 where that is the share of no noise."""
-        from imulab.estimation.special import ndtr
-
         with np.errstate(divide="ignore"):
             centre = np.log(self.squares)
         width = np.sqrt(self.spread) + 1e-9
@@ -417,7 +414,7 @@ class Averaged:
         low, high = np.where(nothing, 0.0, low), np.where(nothing, 0.0, high)
         for _ in range(_HALVINGS):
             middle = (low + high) / 2
-            below = np.einsum("cm,cmt->ct", self.weights, ndtr((middle[:, None] - centre) / width))
+            below = np.einsum("cm,cmt->ct", self.weights, normal_cdf((middle[:, None] - centre) / width))
             low, high = np.where(below < probability, middle, low), np.where(below < probability, high, middle)
         return np.where(nothing, 0.0, np.exp(high))
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.distributions import chi_square_upper_quantile
 from imulab.estimation.rows import median, medians, quantile
 from imulab.recording import Array
 
@@ -138,10 +139,8 @@ def line_groups(
     tuple
         Which coefficients are no lines, shape (J,), and the lines, the largest first.
     """
-    from imulab.estimation.special import chdtri
-
-    limit = float(chdtri(averages, _FALSE_ALARM) / chdtri(averages, 0.5))
-    noise = averages / float(chdtri(averages, 0.5))  # the mean of chi-square over its median
+    limit = float(chi_square_upper_quantile(_FALSE_ALARM, averages) / chi_square_upper_quantile(0.5, averages))
+    noise = averages / float(chi_square_upper_quantile(0.5, averages))  # the mean of chi-square over its median
     fine = np.ones(len(squares), dtype=np.bool_)
     level = _levels(squares, first, last)
     out = np.flatnonzero((squares > limit * level) & (level > 0))

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.distributions import sine_integral
 from imulab.estimation.noise.spectrum import Spectrum
 from imulab.recording import Array
 
@@ -268,11 +269,9 @@ def _nodes(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[Array, Ar
 
 def _flicker_end(j: Array, sign: Array) -> Array:
     """Return ``(2/pi) [Si(pi j) - (1 - cos pi j)/(pi j)]``, what the ends of the stretch leave of 1/f noise."""
-    from imulab.estimation.special import sici
-
     x = np.pi * j
     near = np.minimum(x, 25 * np.pi)
-    exact = sici(near)[0] - (1 - np.cos(near)) / near
+    exact = sine_integral(near) - (1 - np.cos(near)) / near
     return np.asarray(np.where(x <= 24.5 * np.pi, 2 / np.pi * exact, 1 - 2 / (np.pi * x) + 4 / np.pi * sign / x**3))
 
 

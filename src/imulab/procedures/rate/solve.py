@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.distributions import normal_cdf, t_cdf
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor, f_test
 from imulab.gravity import EARTH
 from imulab.procedures.rate import AXES
@@ -574,8 +575,6 @@ def _hysteresis(
 
     `error` is what not knowing the delay of a sweep adds to a loop at rate 0, infinite where it tells no loop.
     """
-    from imulab.estimation.special import ndtr, stdtr
-
     rows = []
     for k in np.unique(key):
         pairs = []
@@ -599,14 +598,14 @@ def _hysteresis(
     slope = float(np.sum(loop * table[:, 1] / table[:, 2])) / spread
     chi_square = float(np.sum((table[:, 1] - slope * loop) ** 2 / table[:, 2]))
     t = float(abs(slope) / np.sqrt(1 / spread + table[:, 3].max()))
-    found = [2 * float(stdtr(_BY_PARTS, -t) if table[:, 3].any() else ndtr(-t))]
+    found = [2 * float(t_cdf(-t, _BY_PARTS) if table[:, 3].any() else normal_cdf(-t))]
     freedom, wide = len(rows) - 1, [1.0]
     if chi_square_probability(chi_square, freedom) < _CHANCE:  # the loop has another shape, or dwells scatter more
         wide.append(chi_square / freedom)
-        found.append(2 * float(stdtr(freedom, -t / np.sqrt(wide[-1]))))
+        found.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), freedom)))
     if beyond:
         wide.append(beyond[0] / beyond[1])
-        found.append(2 * float(stdtr(beyond[1], -t / np.sqrt(wide[-1]))))
+        found.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), beyond[1])))
     return max(found), (slope, float(np.sqrt(max(wide) / spread + table[:, 3].max()))), size
 
 

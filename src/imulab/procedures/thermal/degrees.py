@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from imulab.display import Note
 from imulab.errors import ObservabilityError
+from imulab.estimation.distributions import chi_square_tail, f_tail
 from imulab.estimation.least_squares import Observability, chi_square_probability, observability
 from imulab.procedures.thermal import APART, DEGREES, LEAST_KNOTS, STRETCHES, TURNS
 from imulab.procedures.thermal.holds import Holds
@@ -396,9 +397,7 @@ def wald(solution: Solution, weights: Array) -> float:
 
 def tail(square: float, count: int, freedom: float) -> float:
     """Return the probability of so large a mean square of `count` terms; chi-square where the freedom is infinite."""
-    from imulab.estimation.special import chdtrc, fdtrc
-
-    return float(fdtrc(count, freedom, square) if np.isfinite(freedom) else chdtrc(count, count * square))
+    return float(f_tail(square, count, freedom) if np.isfinite(freedom) else chi_square_tail(count * square, count))
 
 
 def rms_of(found: Sequence[LeftOut]) -> float | None:

@@ -13,6 +13,7 @@ from imulab._version import VERSION
 from imulab.columns import triad
 from imulab.display import Bad, Note, verdict_of
 from imulab.errors import OptionError, RecordError
+from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import median
 from imulab.gravity import Gravity, at_place, local_gravity
@@ -224,9 +225,7 @@ def check_tumble(
     value, probability = contradiction(seen, rows, known.covariance, noise)
     freedom = _freedom(record)
     if freedom is not None:
-        from imulab.estimation.special import fdtrc
-
-        probability = float(fdtrc(len(seen), freedom, value / len(seen)))
+        probability = float(f_tail(value / len(seen), len(seen), freedom))
     total = g * np.sqrt(np.diag(rows @ known.covariance @ rows.T + noise))
     return Check(residuals, total, value, probability, local, limit, tuple(notes), attitudes, mag)
 

@@ -39,6 +39,7 @@ from math import comb, lgamma, log
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.distributions import f_tail, normal_cdf, t_cdf
 from imulab.estimation.least_squares import (
     Fit,
     Observability,
@@ -547,14 +548,12 @@ def _shifts(white: _Whitened, chosen: Index) -> tuple[Array, Array, float]:
 
 def _admissible(z: Array, gain: float, rss: float, n: int, freedom: int, known: bool) -> bool:
     """Whether chance hardly gives the weakest member of a set, nor the set."""
-    from imulab.estimation.special import fdtrc, ndtr, stdtr
-
     m, least = len(z), float(np.abs(z).min())
     tests = n - m + 1
     return bool(
-        2 * tests * stdtr(freedom, -least / np.sqrt(rss / freedom)) < _CHANCE
-        and (not known or 2 * tests * ndtr(-least) < _CHANCE)
-        and comb(n, m) * fdtrc(m, freedom, gain * freedom / (m * rss)) < _CHANCE
+        2 * tests * t_cdf(-least / np.sqrt(rss / freedom), freedom) < _CHANCE
+        and (not known or 2 * tests * normal_cdf(-least) < _CHANCE)
+        and comb(n, m) * f_tail(gain * freedom / (m * rss), m, freedom) < _CHANCE
     )
 
 

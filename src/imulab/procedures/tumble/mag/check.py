@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.estimation.special import fdtrc
+from imulab.estimation.distributions import f_tail
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.device import field_in_body, output_factor, specific_force
 from imulab.procedures.tumble.mag.heading import Law, law_of
@@ -109,9 +109,9 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
     sigma = np.sqrt(np.diag(total))
     return MagCheck(
         left[:n], left[n:], sigma[:n], sigma[n:], found, np.sqrt(np.diag(of_common)),
-        float(fdtrc(2.0 * n - 2, freedom, value / (2 * n - 2))),
+        float(f_tail(value / (2 * n - 2), 2.0 * n - 2, freedom)),
         moved,
-        float(fdtrc(2.0 * n - 5, freedom, after / (2 * n - 5))),
+        float(f_tail(after / (2 * n - 5), 2.0 * n - 5, freedom)),
     )  # fmt: skip
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, quoted
+from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import chi_square_probability
-from imulab.estimation.special import fdtrc
 from imulab.gravity import Gravity, local_gravity
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_attitudes, check_prior, made_from
@@ -105,7 +105,7 @@ def most_disturbed(joint: Joint) -> Disturbed:
     d = np.einsum("ni,nij,nj->n", x, np.linalg.inv(free + 1e-12 * np.eye(2)), x)
     total, redundancy = float((x**2).sum()), float(np.einsum("nii->", free))
     rest = np.maximum(total - d, 1e-300) / max(redundancy - 2, 1e-9)
-    p = np.array([float(fdtrc(2.0, max(redundancy - 2, 1.0), value)) for value in d / 2 / rest]) * n
+    p = np.array([float(f_tail(value, 2.0, max(redundancy - 2, 1.0))) for value in d / 2 / rest]) * n
     index = int(np.argmin(p))
     error = predicted.errors[index]
     return Disturbed(index, float(min(p[index], 1.0)), float(error[1]), float(error[2]))
@@ -147,7 +147,7 @@ def likeliest_step(joint: Joint) -> Step | None:
     redundancy = max(2 * n - joint.pair.layout.mag - 1.0, 3.0)
     at = int(np.argmax(gain))
     ratio = gain[at] / 2 / (max(total - float(gain[at]), 1e-300) / (redundancy - 2))
-    p = min(float(fdtrc(2.0, redundancy - 2, ratio)) * len(splits), 1.0)
+    p = min(float(f_tail(ratio, 2.0, redundancy - 2)) * len(splits), 1.0)
     return Step(int(splits[at]), float(size[at, 0]), float(size[at, 1]), p)
 
 
