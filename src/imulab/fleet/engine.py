@@ -1,14 +1,10 @@
 """Where the work on units is done, by processes of this machine or the workers of a Dask cluster.
 
 What a worker does with one unit.
-
-Each keeps the memory of one recording for the next: glibc would give it back and have it cleared page by page, which
-took 14 % of the time of a unit of 50,000 samples (71 ms instead of 62).
 """
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import os
 import queue
@@ -19,7 +15,7 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from multiprocessing import resource_tracker
@@ -44,12 +40,6 @@ T = TypeVar("T")
 
 _LOOK = 0.2
 """Seconds between two looks of a process at whether the one that started it is still there."""
-
-_KEPT = {-3: 1 << 25, -1: 1 << 27}
-"""Bytes up to which glibc is to keep memory: M_MMAP_THRESHOLD, of which that is the most, and M_TRIM_THRESHOLD.
-
-joblib starts a process anew, with a warning, that has kept 300 MB more than at first.
-"""
 
 
 class WorkersLostError(Exception):
@@ -124,7 +114,7 @@ def _no_interrupts() -> Iterator[None]:
 
 
 def _begin(parent: int) -> None:
-    """Keep memory, and end this process soon after the one that started it, whatever that dies of."""
+    """End this process soon after the one that started it, whatever that dies of."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -132,9 +122,6 @@ def _begin(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-    with suppress(AttributeError, OSError, TypeError):  # another C library, or a system that does not give its own
-        for parameter, size in _KEPT.items():
-            ctypes.CDLL(None).mallopt(parameter, size)
 
 
 # What a worker does with one unit: nothing if its record is there, else fit and write, and say how it went.
