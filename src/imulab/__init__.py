@@ -26,7 +26,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from imulab._version import VERSION as __version__  # noqa: N811
-from imulab.display import Views, hand_down
+from imulab.views import Views, hand_down
 
 if TYPE_CHECKING:
     from imulab.errors import ImulabError as ImulabError

@@ -1,27 +1,21 @@
 r"""How results and texts show themselves.
 
-Texts of files made safe to print, results as a headline and a table, the verdict on a result, and what recordings
-and records are shown by, handed down from the rooms above them.
+Texts of files made safe to print, results as a headline and a table, and the verdict on a result.
 
 A record, a title or a comment is somebody else's text. Unicode knows more line ends than ``\n`` (U+0085, U+2028), and
 marks that reverse what is shown (Unicode TR 36, bidirectional text spoofing).
 
 A procedure writes its findings as sentences. A plain ``str`` asks a person to look; a `Bad` one forbids use as it is; a
 `Note` is worth knowing and changes nothing.
-
-A person asks a `Recording` or a `Calibration` to plot, to correct or to export; what does so knows every procedure and
-lies above them. The face of the package says where it is to be had, and the methods ask `views` for it.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from html import escape
-from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 # Texts that files bring along, made safe to print: no character that ends a line, moves the cursor or turns text.
 
@@ -178,85 +172,3 @@ def as_judged(findings: Iterable[str], verdict: Verdict) -> tuple[str, ...]:
         Bad(finding) if finding == worst else finding if finding in verdict.reasons else Note(finding)
         for finding in findings
     )
-
-
-# What recordings and records show of themselves and are used for, handed down from the rooms above them.
-
-
-class AnyPlot(Protocol):
-    """One figure, which shows itself in a notebook; `imulab.report.plots.Plot` says more."""
-
-    @property
-    def name(self) -> str:
-        """Title of the figure."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the figure as Plotly's own JSON values: ``data`` and ``layout``."""
-
-    def save(self, path: str | Path) -> None:
-        """Write the figure: ``.html`` as a page that needs no network, ``.png``, ``.svg`` and ``.pdf`` as a picture."""
-
-
-class AnyPlots(Protocol):
-    """Several figures, by number or by words of their titles; `imulab.report.plots.Plots` says more."""
-
-    def __getitem__(self, which: int | str) -> AnyPlot:
-        """Return a figure by its number, or by its title or words of it."""
-
-    def __iter__(self) -> Iterator[AnyPlot]:
-        """Yield the figures."""
-
-    def __len__(self) -> int:
-        """Return how many there are."""
-
-    @property
-    def names(self) -> list[str]:
-        """Titles of the figures."""
-
-    def save(self, path: str | Path) -> None:
-        """Write all figures as one page, ``.html``, or the only one as a picture."""
-
-
-class Views(Protocol):
-    """The functions of `imulab.procedures.views`; what is a record or a recording is seen from above alone."""
-
-    def load(self, path: Path) -> Any:
-        """Return the record in a file."""
-
-    def text(self, record: Any) -> str:
-        """Return a record in a few lines."""
-
-    def html(self, record: Any) -> str:
-        """Return a record as HTML."""
-
-    def plots(self, record: Any, name: str | int | None) -> AnyPlots | AnyPlot:
-        """Return the figures of a record's report, or the one of this name."""
-
-    def write_report(self, record: Any, path: str | Path) -> None:
-        """Write the report of a record as one HTML file."""
-
-    def apply_to(self, record: Any, data: Any, reading: Mapping[str, Any], *, again: bool, heading: bool) -> Any:
-        """Return data corrected by a record."""
-
-    def export_to(self, record: Any, target: str, folder: str | Path, **options: Any) -> list[Path]:
-        """Write a record in the form of another program."""
-
-    def recording_html(self, recording: Any) -> str:
-        """Return a recording as HTML."""
-
-    def recording_plots(self, recording: Any, name: str | int | None) -> AnyPlots | AnyPlot:
-        """Return a recording's channels over time, a figure for each sensor, or the one of this name."""
-
-
-_LOADERS: list[Callable[[], Views]] = []
-
-
-def hand_down(load: Callable[[], Views]) -> None:
-    """Say what returns the views; it is called when something is first shown, applied or exported."""
-    _LOADERS[:] = [load]
-
-
-@cache
-def views() -> Views:
-    """Return the views that were handed down."""
-    return _LOADERS[0]()

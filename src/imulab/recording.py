@@ -19,10 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from imulab.arguments import checked, described
 from imulab.columns import check_unit, element_number, expected_quantities, triad
-from imulab.display import AnyPlot, AnyPlots, has_hidden, printable, views
+from imulab.display import has_hidden, printable
 from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.units import parse_unit, to_si
+from imulab.views import AnyPlot, AnyPlots, views
 
 if TYPE_CHECKING:
     import pandas

@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from imulab.display import printable
+from imulab._version import VERSION
 
 _INTERRUPTED, _INTERRUPTED_PIPE, _TERMINATED = 130, 141, 143  # 128 + the signal, as a shell reports it
 
@@ -23,6 +23,8 @@ def main(arguments: Sequence[str] | None = None, *, project: bool = True) -> int
 
     `project` says whether a project file counts.
     """
+    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
+        return _print_version()
     # Before NumPy is loaded: the matrices here are small, and threads for them cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
@@ -34,6 +36,15 @@ def main(arguments: Sequence[str] | None = None, *, project: bool = True) -> int
         return _INTERRUPTED
     except _TerminatedError:
         return _TERMINATED
+
+
+def _print_version() -> int:
+    """Print the version before anything is imported: programs ask for it to find out whether imulab is there."""
+    try:
+        print(f"imulab {VERSION}", flush=True)
+    except OSError as error:
+        return _stop_writing(error)
+    return 0
 
 
 def _main(arguments: Sequence[str] | None) -> int:
@@ -63,15 +74,12 @@ def _main(arguments: Sequence[str] | None) -> int:
             print(error.format_message())
             return 0
         return _refuse(usage(error))
-    except (BrokenPipeError, SystemExit) as error:
-        if isinstance(error, SystemExit) and (not error.code or "_IMULAB_COMPLETE" in os.environ):
+    except SystemExit as error:
+        if not error.code or "_IMULAB_COMPLETE" in os.environ:
             return int(error.code or 0)  # a shell was told what completes a word, or how to ask
-        # The reader of the output has gone; nothing more can be said there.
-        sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
-        return _INTERRUPTED_PIPE
+        return _stop_writing(BrokenPipeError())
     except OSError as error:
-        where = error.filename or "standard output"
-        return _refuse(f"{where}: cannot be written: {error.strerror}")
+        return _stop_writing(error)
     except Exception as error:
         if os.environ.get("IMULAB_DEBUG"):
             raise
@@ -82,6 +90,14 @@ def _main(arguments: Sequence[str] | None) -> int:
         )
         return 1
     return status if isinstance(status, int) else 0
+
+
+def _stop_writing(error: OSError) -> int:
+    """Return the status of a command whose output nobody takes any more, or that cannot be written."""
+    if isinstance(error, BrokenPipeError):  # the reader has gone; nothing more can be said there
+        sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
+        return _INTERRUPTED_PIPE
+    return _refuse(f"{error.filename or 'standard output'}: cannot be written: {error.strerror}")
 
 
 def run() -> None:
@@ -129,4 +145,6 @@ def _refuse(message: str) -> int:
 
 
 def _one_line(text: str) -> str:
+    from imulab.display import printable
+
     return printable(" ".join(text.split()))

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from imulab._version import VERSION
 from imulab.arguments import checked
-from imulab.display import UNJUDGED, AnyPlot, AnyPlots, Verdict, first_hidden, has_hidden, printable, verdict_of, views
+from imulab.display import UNJUDGED, Verdict, first_hidden, has_hidden, printable, verdict_of
 from imulab.errors import RecordError
 from imulab.files import write_text
 from imulab.frames import data_frame
 from imulab.recording import Source
+from imulab.views import AnyPlot, AnyPlots, views
 
 if TYPE_CHECKING:
     from typing import Unpack
