@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -47,10 +46,10 @@ def test_a_folder_for_temporary_files_may_have_a_long_name(tmp_path):
 def test_an_interrupt_does_not_wait_for_what_is_under_work(tmp_path):
     code = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from imulab.fleet import processes\n"
+        "from imulab.fleet import engine\n"
         "import sys\n"
         "calls = [('import time, pathlib; pathlib.Path(' + repr(sys.argv[1]) + ').touch(); time.sleep(60)',)] * 8\n"
-        "list(processes.run(exec, calls, 2))\n"
+        "list(engine.run(exec, calls, 2))\n"
     )
     begun = tmp_path / "begun"
     process = subprocess.Popen([sys.executable, "-c", code, begun], stderr=subprocess.PIPE, text=True)
@@ -67,11 +66,16 @@ def test_an_interrupt_does_not_wait_for_what_is_under_work(tmp_path):
 
 @pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGKILL])
 def test_processes_end_with_the_one_that_started_them(tmp_path, kind):
-    code = "from imulab.fleet import processes\nimport time\nlist(processes.run(time.sleep, [(60,)] * 2, 2))\n"
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
-    wait_for(lambda: len(workers_of(process.pid)) == 2)
+    code = (
+        "import sys\nfrom imulab.fleet import engine\n"
+        "work = 'import pathlib, time; pathlib.Path(%r).touch(); time.sleep(60)'\n"
+        "list(engine.run(exec, [(work % path,) for path in sys.argv[1:]], 2))\n"
+    )
+    begun = [tmp_path / "one", tmp_path / "other"]
+    process = subprocess.Popen([sys.executable, "-c", code, *begun], stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: all(path.exists() for path in begun))
     workers = workers_of(process.pid)
-    time.sleep(1.0)
+    assert len(workers) == 2
     process.send_signal(kind)
     process.communicate(timeout=20)
     assert process.returncode == -kind
@@ -85,7 +89,7 @@ def test_one_call_has_a_process_of_its_own():
 
 def test_a_script_needs_no_guard(tmp_path):
     script = tmp_path / "script.py"
-    script.write_text("from imulab.fleet import processes\nprint(sorted(processes.run(pow, [(2, 3), (2, 4)], 2)))\n")
+    script.write_text("from imulab.fleet import engine\nprint(sorted(engine.run(pow, [(2, 3), (2, 4)], 2)))\n")
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
     assert (done.stdout, done.stderr) == ("[8, 16]\n", "")
 
