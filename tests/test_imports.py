@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,8 @@ KNOWN_NAMES = {
 """Modules that name the structs of the C core, quantities or options, some of which are called as procedures are."""
 
 
-def _modules() -> dict[str, ast.Module]:
+@cache
+def source_modules() -> dict[str, ast.Module]:
     found = {}
     for path in sorted((SOURCE / "imulab").rglob("*.py")):
         name = ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__")
@@ -33,25 +35,24 @@ def _modules() -> dict[str, ast.Module]:
     return found
 
 
-MODULES = _modules()
-
-
 def _imported(node: ast.AST) -> set[str]:
     """What a module imports anywhere: in functions, for type checkers and by a name in a string; C modules left out."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("imulab."):
-        return {node.value.partition(":")[0]} & MODULES.keys()
+        return {node.value.partition(":")[0]} & source_modules().keys()
     if isinstance(node, ast.Import):
-        return {each.name for each in node.names if each.name in MODULES}
+        return {each.name for each in node.names if each.name in source_modules()}
     if isinstance(node, ast.ImportFrom):
         assert not node.level, "relative imports hide from where a name comes"
         paths = {f"{node.module}.{each.name}" for each in node.names}
-        modules = paths & MODULES.keys()
-        return modules | ({node.module or ""} & MODULES.keys() if len(modules) < len(paths) else set())
+        modules = paths & source_modules().keys()
+        return modules | ({node.module or ""} & source_modules().keys() if len(modules) < len(paths) else set())
     return set().union(*map(_imported, ast.iter_child_nodes(node)))
 
 
-ARROWS = {name: _imported(tree) - {name} for name, tree in MODULES.items() if name != "imulab"}
-"""The face of the package hands names on, and is in nobody's way."""
+@cache
+def arrows() -> dict[str, set[str]]:
+    """The face of the package hands names on, and is in nobody's way."""
+    return {name: _imported(tree) - {name} for name, tree in source_modules().items() if name != "imulab"}
 
 
 def _room(name: str) -> str:
@@ -69,18 +70,18 @@ def _procedure(name: str) -> str | None:
 
 def test_the_graph_is_that_of_the_package():
     assert {"tumble", "gyro_array", "warmup", "centrifuge"} <= PROCEDURES
-    assert "imulab.procedures.rate.procedure" in ARROWS["imulab.procedures.registry"]
-    assert "imulab.procedures.tumble.fit" in ARROWS["imulab.procedures.tumble.procedure"]  # within a function
+    assert "imulab.procedures.rate.procedure" in arrows()["imulab.procedures.registry"]
+    assert "imulab.procedures.tumble.fit" in arrows()["imulab.procedures.tumble.procedure"]  # within a function
 
 
 def test_arrows_go_down_only():
-    above = {(a, b) for a in ARROWS for b in ARROWS[a] if _height(a) < _height(b)}
+    above = {(a, b) for a in arrows() for b in arrows()[a] if _height(a) < _height(b)}
     assert not above
 
 
 def test_no_circles():
     try:
-        graphlib.TopologicalSorter(ARROWS).prepare()
+        graphlib.TopologicalSorter(arrows()).prepare()
     except graphlib.CycleError as error:
         pytest.fail(f"modules import each other in a circle: {' <- '.join(error.args[1])}")
 
@@ -93,7 +94,7 @@ what laws over temperature know of such a test."""
 
 
 def test_procedures_do_not_import_each_other():
-    across = {(a, b) for a in ARROWS for b in ARROWS[a] if _procedure(a) and _procedure(b) and b not in SHARED}
+    across = {(a, b) for a in arrows() for b in arrows()[a] if _procedure(a) and _procedure(b) and b not in SHARED}
     assert not {(a, b) for a, b in across if _procedure(a) != _procedure(b)}
 
 
@@ -104,7 +105,7 @@ def test_only_the_registry_reaches_into_procedures():
         "live",
         "",
     }  # commands, simulated instruments, tumble with a person in the loop, public names
-    inside = {a for a in ARROWS for b in ARROWS[a] if _procedure(b) and not _procedure(a) and _room(a) not in free}
+    inside = {a for a in arrows() for b in arrows()[a] if _procedure(b) and not _procedure(a) and _room(a) not in free}
     assert inside == {"imulab.procedures.registry"}
 
 
@@ -123,8 +124,8 @@ def _names_procedures(tree: ast.Module) -> bool:
 
 
 def test_nobody_outside_tells_procedures_apart_by_name():
-    outside = {name for name, tree in MODULES.items() if _room(name) not in {"cli", "demo", "procedures"}}
-    assert {name for name in outside if _names_procedures(MODULES[name])} == KNOWN_NAMES
+    outside = {name for name, tree in source_modules().items() if _room(name) not in {"cli", "demo", "procedures"}}
+    assert {name for name in outside if _names_procedures(source_modules()[name])} == KNOWN_NAMES
 
 
 def _lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
@@ -139,7 +140,7 @@ def _lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 def test_no_function_is_longer_than_a_screen():
     found = {
         f"{name}.{node.name}": _lines_of(node)
-        for name, tree in MODULES.items()
+        for name, tree in source_modules().items()
         for node in ast.walk(tree)
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
     }

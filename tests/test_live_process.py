@@ -101,7 +101,7 @@ def saved_stamps(folder: Path) -> np.ndarray:
 
 @pytest.mark.slow
 def test_killed_twenty_times_and_gone_on_with(tmp_path, reduced):
-    kills(tmp_path, 4 if reduced else 20, 2)
+    kills(tmp_path, 3 if reduced else 20, 2)
 
 
 def rows_of(recording: il.Recording, seconds: int) -> list[str]:
