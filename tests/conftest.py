@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import io
 import json
 import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,14 +60,20 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
         common = common.parent
 
     def folder_of(name: str, fill: Callable[[Path], object]) -> Path:
-        folder, filled = common / name, common / f"{name}.filled"
-        with (common / f"{name}.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if not filled.exists():
-                shutil.rmtree(folder, ignore_errors=True)
-                folder.mkdir()
-                fill(folder)
-                filled.touch()
+        folder, filled, failed = (common / f"{name}{ending}" for ending in ("", ".filled", ".failed"))
+        try:
+            folder.mkdir()
+        except FileExistsError:  # somebody fills it, or has
+            while not filled.exists():
+                assert not failed.exists(), f"another process could not make {name}"
+                time.sleep(0.05)
+            return folder
+        try:
+            fill(folder)
+        except BaseException:
+            failed.touch()
+            raise
+        filled.touch()
         return folder
 
     return folder_of
