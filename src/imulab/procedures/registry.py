@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from imulab.device.unit import Blob, is_blob, load_blob
 from imulab.errors import RecordError, file_name, readable
 from imulab.procedures.centrifuge.procedure import CentrifugeProcedure
 from imulab.procedures.gyro_array.procedure import GyroArrayProcedure
@@ -24,6 +24,9 @@ from imulab.procedures.tumble.procedure import TumbleProcedure
 from imulab.procedures.warmup.procedure import WarmupProcedure
 from imulab.records.calibration import Calibration
 from imulab.records.reading import parsed
+
+if TYPE_CHECKING:
+    from imulab.device.unit import Blob
 
 # The registry: the procedures, with all that the rest of the package asks of them.
 
@@ -111,6 +114,8 @@ def loads(data: bytes, name: str) -> Calibration:
 
 def load_any(path: str | Path) -> Calibration | Blob:
     """Read a record or a blob; errors as for `load` and `load_blob`."""
+    from imulab.device.unit import is_blob, load_blob
+
     return load_blob(path) if is_blob(path) else load(path)
 
 

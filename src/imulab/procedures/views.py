@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from html import escape
 from inspect import signature
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -18,8 +18,6 @@ from imulab import report
 from imulab.display import LINES, SENTENCES, WIDTH, aligned, html_table
 from imulab.errors import OptionError, RecordError, listed
 from imulab.files import write_page
-from imulab.procedures.apply import apply
-from imulab.procedures.exporting import export as export_records
 from imulab.procedures.procedure import Row
 from imulab.procedures.registry import joined_of, procedure_of
 from imulab.procedures.registry import load as load
@@ -28,8 +26,6 @@ from imulab.reading import Reading
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change, Comparison, compared
-from imulab.report.noise_figures import channel_figures
-from imulab.report.plots import Plot, Plots
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -42,6 +38,9 @@ from imulab.report.traces import (
     plain_number,
     scatter,
 )
+
+if TYPE_CHECKING:
+    from imulab.report.plots import Plot, Plots
 
 # What a procedure shows of a record: its report, and the comparison of two records of a unit.
 
@@ -263,6 +262,8 @@ def html(record: Calibration) -> str:
 
 def plots(record: Calibration, name: str | int | None) -> Plots | Plot:
     """Return the figures of a record's report, or the one of this name."""
+    from imulab.report.plots import Plots
+
     found = Plots(exhibits_of(record).figures, _title(record))
     return found if name is None else found[name]
 
@@ -271,11 +272,15 @@ def apply_to(
     record: Calibration, data: Any, reading: Mapping[str, Any] | Reading, *, again: bool, heading: bool
 ) -> Recording:
     """Return data corrected by a record."""
+    from imulab.procedures.apply import apply
+
     return apply(record, as_recording(data, reading, Calibration.apply), again=again, heading=heading)
 
 
 def export_to(record: Calibration, target: str, folder: str | Path, **options: Any) -> list[Path]:
     """Write a record in the form of another program."""
+    from imulab.procedures.exporting import export as export_records
+
     known = [name for name in signature(export_records).parameters if name not in ("to", "records", "folder")]
     for name in options:
         if name not in known:
@@ -302,6 +307,9 @@ def recording_html(recording: Recording) -> str:
 
 def recording_plots(recording: Recording, name: str | int | None) -> Plots | Plot:
     """Return a recording's channels over time, a figure for each sensor, or the one of this name."""
+    from imulab.report.noise_figures import channel_figures
+    from imulab.report.plots import Plots
+
     found = Plots(channel_figures(recording), recording.name)
     return found if name is None else found[name]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from imulab.procedures.result import Drawn, Record, as_record
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
 from imulab.procedures.tumble.device import output_factor
-from imulab.procedures.tumble.mag.check import FEWEST, MagCheck, check_mag
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED, contradiction, known_of
 from imulab.procedures.tumble.prior import scatter as prior_scatter
@@ -47,6 +46,9 @@ from imulab.report.traces import (
     rounded,
     scatter,
 )
+
+if TYPE_CHECKING:
+    from imulab.procedures.tumble.mag.check import MagCheck
 
 # Fresh attitudes against a record, to test whether it still holds.
 
@@ -234,6 +236,8 @@ def _mag(record: Calibration, attitudes: Attitudes, notes: list[str]) -> MagChec
     """Test the magnetometers where there are any; a note says why not where only the record has them."""
     if fit_of(record).mag is None:
         return None
+    from imulab.procedures.tumble.mag.check import FEWEST, check_mag
+
     name = attitudes.recording.name
     if not all(column in attitudes.recording for column in triad("mag")):
         notes.append(Note(f"{name}: no magnetometers in it: the record's accelerometers alone are tested"))

@@ -19,7 +19,7 @@ from imulab.procedures.tumble import FROM_DATA, FURTHER, HIGHEST_ORDER, LOSSES, 
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_residuals
 from imulab.procedures.tumble.gyro.rotation import check_axes
-from imulab.procedures.tumble.model import MISALIGNMENTS, parameter_count, parameter_names
+from imulab.procedures.tumble.model import GROUPS, MISALIGNMENTS, parameter_count, parameter_names
 from imulab.procedures.tumble.orders import (
     NONE_ASIDE,
     Aside,
@@ -32,7 +32,6 @@ from imulab.procedures.tumble.orders import (
     solve_orders,
     with_known_spread,
 )
-from imulab.procedures.tumble.prior import GROUPS, entries, findings, known_of, put_together
 from imulab.procedures.tumble.record import Estimate, Found, Scaling, Stated
 from imulab.procedures.tumble.solve import (
     Problem,
@@ -230,6 +229,8 @@ def estimate_triad(
     every = _problem(attitudes, scaling, robust=loss == "huber")
     known = None
     if prior is not None:
+        from imulab.procedures.tumble.prior import entries, findings, known_of, put_together
+
         known = known_of(prior, scaling, gravity, attitudes.unit)
     aside, fitted = NONE_ASIDE, dict[int, Solution]()
     if loss == "auto" and rest is None and not cross:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from imulab.estimation.rows import median, quantile, rms
-from imulab.procedures.tumble.mag.figures import mag_facts, mag_figures, mag_headline
 from imulab.procedures.tumble.model import AXES
 from imulab.procedures.tumble.record import engineering_rows, micro_g, propagated_rows, small_g
 from imulab.procedures.tumble.schema import (
@@ -351,12 +350,16 @@ def exhibits(record: Calibration) -> Exhibits:
     if record.covariance.names:
         items.append(_correlation(record))
     if held.mag is not None:
+        from imulab.procedures.tumble.mag.figures import mag_facts, mag_figures
+
         items[1:1] = mag_figures(record)
         facts += mag_facts(record)
     aside = f"; {bad} more {'was' if bad == 1 else 'were'} {_held_back(record)}" if bad else ""
     if fit.gyro is not None:
         aside += f"; {gyro_headline(record)}"
     if fit.mag is not None:
+        from imulab.procedures.tumble.mag.figures import mag_headline
+
         aside += f"; {mag_headline(record)}"
     return Exhibits(
         headline=f"After calibration the specific force of {len(used)} attitudes has magnitude g within "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
 from numpy.typing import ArrayLike
 
@@ -22,7 +22,6 @@ from imulab.procedures.tumble.estimate import (
     nominal_scaling,
     with_assumed_alignment,
 )
-from imulab.procedures.tumble.mag.solve import Place, stated_place
 from imulab.procedures.tumble.model import parameter_count
 from imulab.procedures.tumble.orders import OrderRow
 from imulab.procedures.tumble.record import Estimate, make_record
@@ -32,6 +31,9 @@ from imulab.quantities import in_si, whole
 from imulab.reading import Reading
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+
+if TYPE_CHECKING:
+    from imulab.procedures.tumble.mag.solve import Dip, Place
 
 
 @dataclass(frozen=True, repr=False)
@@ -194,7 +196,7 @@ def fit_tumble(
         order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing, cross=cross, dip=dip,
         nonlinearity=nonlinearity, threshold=threshold, further=further, field=magnitude, hemisphere=hemisphere,
     )  # fmt: skip
-    place = stated_place(hemisphere, latitude, dip)
+    place = _stated_place(further, hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
     local = local_gravity(at_place(gravity, latitude, height, beside="gyro" in further), attitudes.recording)
     check_attitudes(attitudes, local.value)
@@ -222,6 +224,19 @@ def fit_tumble(
     )
 
 
+def _stated_place(
+    further: Sequence[str], hemisphere: str | None, latitude: float | str | None, dip: Dip | None
+) -> Place | None:
+    """Return what is stated of the field at a place; None without magnetometers, whose code is not imported then."""
+    if "mag" not in further:
+        if latitude is not None:
+            in_si(latitude, "latitude", "angle", "deg")  # a wrong text is refused before data are read
+        return None
+    from imulab.procedures.tumble.mag.solve import stated_place
+
+    return stated_place(hemisphere, latitude, dip)
+
+
 def _with_further(
     record: Calibration,
     further: Sequence[str],
@@ -229,11 +244,11 @@ def _with_further(
     gravity: Gravity,
     loss: str,
     field: float | None,
-    place: Place,
+    place: Place | None,
     latitude: float | str | None,
 ) -> Calibration:
     """Return the record with further triads, each fitted on the record of those before it."""
-    if "mag" in further:
+    if place is not None:
         from imulab.procedures.tumble.mag.fit import fit_mag
 
         record = fit_mag(

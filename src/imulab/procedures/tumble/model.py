@@ -27,6 +27,8 @@ from imulab.records.triads import CROSS_TERMS
 
 AXES = ("x", "y", "z")
 MISALIGNMENTS = ("yx", "zx", "zy")
+GROUPS = {"bias": slice(0, 3), "scale_factor": slice(3, 6), "misalignment": slice(6, 9)}
+"""What ages, and where it stands among the parameters."""
 _UNUSUAL = 3.0
 _NEXT = [1, 2, 0]
 _CROSS_PASSES = 30

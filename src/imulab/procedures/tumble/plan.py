@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -26,8 +26,6 @@ from imulab.procedures.tumble import CRITERIA, HIGHEST_ORDER, STARTS
 from imulab.procedures.tumble.attitudes import find_attitudes
 from imulab.procedures.tumble.estimate import check_method
 from imulab.procedures.tumble.fit import fit_tumble
-from imulab.procedures.tumble.mag.heading import Headings, plan_headings
-from imulab.procedures.tumble.mag.solve import world_axes
 from imulab.procedures.tumble.model import parameter_count, parameter_names
 from imulab.procedures.tumble.record import freedom_finding, predicted_rows
 from imulab.procedures.tumble.schema import attitudes_of, data_of, fit_of, model_of
@@ -38,10 +36,13 @@ from imulab.recording import Array, Recording, check_finite
 from imulab.records import is_json
 from imulab.records.calibration import Calibration
 from imulab.report import render_plan
-from imulab.report.plots import Plot
 from imulab.report.traces import GOOD, Figure, figure_axis
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 from imulab.writers import write_csv
+
+if TYPE_CHECKING:
+    from imulab.procedures.tumble.mag.heading import Headings
+    from imulab.report.plots import Plot
 
 # Which attitudes to measure: D- or A-optimal sets for a tumble test, and what they will give.
 
@@ -524,6 +525,8 @@ class TumblePlan(Shown, Plan):
             "xaxis": figure_axis("roll, deg", dtick=90, range=[-195, 195]),
             "yaxis": figure_axis("pitch, deg", dtick=45, range=[-110, 110]),
         }
+        from imulab.report.plots import Plot
+
         return Plot(Figure("Attitudes to measure", self.lead, [trace], layout), "Tumble plan")
 
     def _pictures(self) -> list[dict[str, str]]:
@@ -630,6 +633,8 @@ def plan_tumble(
     )
     headings = None
     if with_ is not None:
+        from imulab.procedures.tumble.mag.heading import plan_headings
+
         headings = plan_headings(found.directions, before=None if add is None else _measured_headings(add))
     return TumblePlan(
         **vars(found), criterion=criterion, noise=sigma, noise_from=source, distinct_verticals=distinct,
@@ -760,5 +765,7 @@ def _measured_headings(given: Any) -> tuple[Array, Array] | None:
     held = data_of(record).mag
     if held is None:
         return None
+    from imulab.procedures.tumble.mag.solve import world_axes
+
     axes = world_axes(np.array(held.field)[held.used], np.array(held.force)[held.used])
     return axes[:, 2], axes[:, 1]

@@ -20,15 +20,13 @@ from imulab.errors import RecordError
 from imulab.estimation.least_squares import chi_square_probability, plausible_excess
 from imulab.gravity import Gravity
 from imulab.procedures.tumble.checks import check_prior
-from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
+from imulab.procedures.tumble.model import GROUPS, length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.record import Scaling, scaled_parameters, si_derivative
 from imulab.procedures.tumble.schema import fit_of, model_of
 from imulab.procedures.tumble.solve import Prior, Problem, Solution
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 
-GROUPS = {"bias": slice(0, 3), "scale_factor": slice(3, 6), "misalignment": slice(6, 9)}
-"""What ages, and where it stands among the parameters."""
 _SCALE = 2.0
 _STEPS = np.geomspace(0.05, 50.0, 12)
 _PASSES = 8

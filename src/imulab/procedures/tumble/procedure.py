@@ -166,7 +166,6 @@ OPTIONS = (
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.gravity import at_latitude, gravity_option
     from imulab.procedures.tumble.estimate import check_options
-    from imulab.procedures.tumble.mag.solve import stated_place
 
     values = read_options(OPTIONS, texts, label)
     values["ageing"], values["with"] = values["ageing"] or (), values["with"] or ()
@@ -179,6 +178,8 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
             hemisphere=values["hemisphere"], dip=values["dip"],
         )  # fmt: skip
         if "mag" in values["with"]:
+            from imulab.procedures.tumble.mag.solve import stated_place
+
             place = stated_place(values["hemisphere"], values["latitude"], values["dip"])
             values["hemisphere"] = place.hemisphere
     earth = at_latitude(values["latitude"], label.format("latitude")) if "gyro" in values["with"] else None
