@@ -37,7 +37,6 @@ from imulab.procedures.tumble.solve import (
     Problem,
     Solution,
     Threshold,
-    check_trials,
     evaluate,
     forces,
     helpful_attitudes,
@@ -128,9 +127,14 @@ def check_options(
         )  # fmt: skip
     check_field(field)
     _check_of_mag("mag" in further, field=field, hemisphere=hemisphere, dip=dip)
-    if monte_carlo is None:
-        return
-    check_trials(monte_carlo)
+    if monte_carlo is not None:
+        _check_monte_carlo(monte_carlo, method, with_prior=with_prior)
+
+
+def _check_monte_carlo(trials: int, method: str, *, with_prior: bool) -> None:
+    from imulab.procedures.tumble.montecarlo import check_trials
+
+    check_trials(trials)
     if method != "norm":
         raise OptionError(f"monte-carlo needs method norm, found method {method}")
     if with_prior:

@@ -26,7 +26,7 @@ from imulab.procedures.tumble.model import parameter_count
 from imulab.procedures.tumble.orders import OrderRow
 from imulab.procedures.tumble.record import Estimate, make_record
 from imulab.procedures.tumble.schema import model_of
-from imulab.procedures.tumble.solve import SOURCE_THRESHOLD, MonteCarlo, Threshold, propagate
+from imulab.procedures.tumble.solve import SOURCE_THRESHOLD, Threshold
 from imulab.quantities import in_si, whole
 from imulab.reading import Reading
 from imulab.recording import Array
@@ -34,6 +34,7 @@ from imulab.records.calibration import Calibration
 
 if TYPE_CHECKING:
     from imulab.procedures.tumble.mag.solve import Dip, Place
+    from imulab.procedures.tumble.montecarlo import MonteCarlo
 
 
 @dataclass(frozen=True, repr=False)
@@ -276,6 +277,8 @@ def _propagated(estimate: Estimate, trials: int, progress: Callable[[int], None]
             f"{attitudes.recording.name}: monte-carlo needs more attitudes than parameters, or their noise (std_* "
             f"columns); found {len(attitudes)} attitudes for {parameter_count(order)} parameters"
         )
+    from imulab.procedures.tumble.montecarlo import propagate
+
     freedom = estimate.given_order.freedom
     return propagate(estimate.problem, estimate.solution, trials=trials, freedom=freedom, progress=progress)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,12 +40,15 @@ from imulab.procedures.tumble.orders import (
     time_findings,
 )
 from imulab.procedures.tumble.schema import Trials, data_of, fit_of, model_of
-from imulab.procedures.tumble.solve import CLOSEST, MonteCarlo, Problem, Solution, data_freedom, forces, near_vertical
+from imulab.procedures.tumble.solve import CLOSEST, Problem, Solution, data_freedom, forces, near_vertical
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import Change
 from imulab.report.traces import format_uncertain, plain_number
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+if TYPE_CHECKING:
+    from imulab.procedures.tumble.montecarlo import MonteCarlo
 
 # What a fit found besides its values: attitudes set aside, and what its uncertainties hold for.
 
