@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     import pandas
     import polars
 
-    from imulab.display import AnyPlot, AnyPlots
     from imulab.recording import Array
     from imulab.report.plots import Plot, Plots
+    from imulab.views import AnyPlot, AnyPlots
 
 
 # What every fit returns, whatever the procedure: its record, and what a person does with it next.

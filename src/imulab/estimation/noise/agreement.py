@@ -137,7 +137,9 @@ def agreement(
     count = int(np.count_nonzero(values > 0))
     by_terms = chi_square_tail(count * ratios / max(float(ratios[1:].mean()), 1e-9), count)
     scores = normal_quantile(np.clip([by_terms[1:], octaves.probability[1:]], _SMALLEST, _LARGEST))
-    together = _either(min(float(by_terms[0]), float(held.probability)), float(np.corrcoef(scores)[0, 1]))
+    together = _either(
+        min(float(by_terms[0]), float(held.probability)), float(np.atleast_2d(np.corrcoef(scores))[0, 1])
+    )
     return Agreement(model, float(by_terms[0]), held, together)
 
 
