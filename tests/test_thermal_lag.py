@@ -92,7 +92,7 @@ def found(trials, seed, **size):
 )
 def test_what_is_there_is_flagged_and_what_is_not_is_not(size, which, low, high, reduced):
     """Asked for: 1 to 3 %, 100, 56, 99, 76 %; over 300 units 1.7, 100, 85, 99 and 74 % are flagged."""
-    trials, margin = (40, 0.12) if reduced else (150, 0.0)
+    trials, margin = (25, 0.12) if reduced else (150, 0.0)
     standard, flagged, _ = found(trials, 11, **size)
     share = flagged[:, which].any(axis=1).mean()
     assert low - margin * (low < 1) <= share <= high + margin * (high < 1)

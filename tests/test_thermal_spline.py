@@ -290,7 +290,7 @@ def test_auto_on_rough_laws_and_kinks(reduced):
     The one that misses is the rough law at nine temperatures of a unit without any turn-on scatter: 1.22. A rule that
     takes the spline more readily would cost more where the law is smooth and the unit scatters.
     """
-    trials = 15 if reduced else 120
+    trials = 9 if reduced else 120
     for count, attitudes, turn_on in CASES[:1] if reduced else CASES:
         cubic, spline, auto = worst("rough", count, attitudes, trials, turn_on)
         assert auto <= (1.2 if turn_on or count < 9 else 1.3) * min(cubic, spline)
