@@ -66,6 +66,22 @@ def test_a_fit_and_noise_load_no_package_that_takes_longer_than_they_do(tmp_path
         assert done.stdout.endswith("\n0 set()\n")
 
 
+def test_a_plain_fit_imports_no_code_for_what_it_does_not_do(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    il.write_csv(il.simulate_tumble(order=1, gravity=9.81, seed=1), "tumble.csv")
+    rooms = (
+        "imulab.procedures.tumble.mag.", "imulab.procedures.tumble.montecarlo", "imulab.procedures.tumble.device",
+        "imulab.procedures.apply", "imulab.procedures.exporting", "imulab.exporters", "imulab.device.unit",
+        "imulab.report.plots", "imulab.live", "imulab.fleet", "scipy", "rich", "jinja2",
+    )  # fmt: skip
+    code = (
+        "import sys; from imulab.cli import main; main(['tumble', 'fit', 'tumble.csv', '--gravity', '9.81']); "
+        f"print([name for name in sys.modules if name.startswith({rooms})])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("\n[]\n")
+
+
 @pytest.mark.parametrize("words", [["tumble", "--help"], ["show", "--help"], ["--help"]])
 def test_a_command_built_alone_says_the_same_as_among_all(words):
     from imulab.cli.app import command

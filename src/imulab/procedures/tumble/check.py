@@ -20,10 +20,8 @@ from imulab.gravity import Gravity, at_place, local_gravity
 from imulab.procedures.result import Drawn, Record, as_record
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
-from imulab.procedures.tumble.device import output_factor
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
-from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED, contradiction, known_of
-from imulab.procedures.tumble.prior import scatter as prior_scatter
+from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED
 from imulab.procedures.tumble.record import Scaling, micro_g, scaled_parameters, small_g
 from imulab.procedures.tumble.schema import attitudes_of, fit_of, model_of
 from imulab.quantities import in_si
@@ -213,6 +211,9 @@ def check_tumble(
         notes.append("the record was made from this recording, which therefore says nothing of whether it still holds")
     if not record.covariance.names:
         return Check(residuals, None, None, None, local, limit, tuple(notes), attitudes)
+    from imulab.procedures.tumble.prior import contradiction, known_of
+    from imulab.procedures.tumble.prior import scatter as prior_scatter
+
     mag = _mag(record, attitudes, notes)
     own_variance = np.maximum(own[0] + _excess(record, g), 1e-24)  # data without noise leave rounding
     more = prior_scatter(rows, seen, own_variance)
@@ -259,6 +260,8 @@ def _gravity(record: Calibration, given: float | str | Gravity | None, attitudes
 
 
 def _in_unit_of(record: Calibration, attitudes: Attitudes) -> Attitudes:
+    from imulab.procedures.tumble.device import output_factor
+
     unit = model_of(record).output_unit
     factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, unit)
     return replace(
