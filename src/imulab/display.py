@@ -23,10 +23,18 @@ from typing import Any, Literal
 _HIDDEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
 _HIDDEN_IN_LINES = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
 
+_PLAIN = bytes([*b"\t\n\r", *range(0x20, 0x7F)])
+
 
 def has_hidden(text: str) -> bool:
     """Return whether a text holds a control or bidirectional character."""
     return _HIDDEN.search(text) is not None
+
+
+def may_hide(data: bytes) -> bool:
+    r"""Return whether the texts of a JSON file may hold a control or bidirectional character: one, or a ``\``."""
+    others = data.translate(None, _PLAIN)
+    return b"\\" in data or (bool(others) and has_hidden(others.decode("utf-8")))
 
 
 def _escape(found: re.Match[str]) -> str:

@@ -26,7 +26,7 @@ from imulab.display import first_hidden
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.recording import Array
 from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
-from imulab.records.sections import Part, Positive, Size, check_sizes, read
+from imulab.records.sections import Part, Positive, Size, check_sizes, holds, read
 from imulab.units import STANDARD_GRAVITY
 
 # Python face of the C core: tables loaded once, arrays in and out, streams that keep the core's state.
@@ -442,7 +442,7 @@ def _check_text(text: Any, kinds: list[str]) -> None:
 
 def _complete(kind: type[Part], text: Any, place: str) -> None:
     found = read(kind, text, place)
-    missing = [key for key in kind.__dataclass_fields__ if key not in vars(found)]
+    missing = [key for key in kind.__struct_fields__ if not holds(found, key)]
     if missing:
         raise RecordError(f"{place} lacks {missing[0]}")
 

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
+from msgspec import Raw
+from msgspec.json import Decoder
 from numpy.typing import NDArray
 
 from imulab._version import VERSION
@@ -39,6 +41,12 @@ if TYPE_CHECKING:
 
 
 # Plain JSON values as text: with an indent as a file, without spaces and with sorted keys to be hashed.
+
+
+_SPACES = b" \n\t\r"
+_SEAL = "content_sha256"
+_decode_object = Decoder(dict[str, Raw]).decode
+_decode_array = Decoder(list[Raw]).decode
 
 
 def json_text(content: Mapping[str, Any]) -> str:
@@ -81,6 +89,59 @@ def content_sha256(content: Mapping[str, Any]) -> str:
     plain = {key: value for key, value in content.items() if key != "content_sha256"}
     text = json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return hashlib.sha256(text.encode("utf-8")).hexdigest()
+
+
+def sealed_bytes(data: bytes) -> bytes | None:
+    """Return what `content_sha256` hashes, rearranged from the bytes of a record's file, each value as it stands there.
+
+    Writing numbers takes longer than all else of a record's reading. None where a key appears twice, or has an escape.
+
+    Raises
+    ------
+    ValueError
+        The bytes are no JSON, or no object.
+    """
+    members = _decode_object(data)
+    seal = bytes(members.pop(_SEAL, b""))
+    escapes = b"\\" in data
+    pieces: list[bytes] = []
+    if not _add_object(members, escapes, pieces):
+        return None
+    text = b"".join(pieces)
+    others = len(f',"{_SEAL}":') + len(seal.translate(None, _SPACES))
+    # a key that appears twice is in the file, but not in the text
+    return text if len(data.translate(None, _SPACES)) == len(text.translate(None, _SPACES)) + others else None
+
+
+def _add_object(members: Mapping[str, Raw], escapes: bool, pieces: list[bytes]) -> bool:
+    """Add the text of an object; return False where a key has an escape, as far as the file holds any."""
+    before = b'{"'
+    for key in sorted(members):
+        if escapes and ('"' in key or "\\" in key or not key.isprintable()):
+            return False
+        pieces += (before, key.encode(), b'":')
+        if not _add_value(bytes(members[key]), escapes, pieces):
+            return False
+        before = b',"'
+    pieces.append(b"}" if members else b"{}")
+    return True
+
+
+def _add_value(text: bytes, escapes: bool, pieces: list[bytes]) -> bool:
+    """Add the text of a value; errors as for `_add_object`."""
+    if text[:1] == b"{":
+        return _add_object(_decode_object(text), escapes, pieces)
+    if text[:1] == b"[" and b'"' in text:
+        before = b"["
+        for item in _decode_array(text):
+            pieces.append(before)
+            if not _add_value(bytes(item), escapes, pieces):
+                return False
+            before = b","
+        pieces.append(b"]")
+    else:
+        pieces.append(text if text[:1] == b'"' else text.translate(None, _SPACES))
+    return True
 
 
 # The calibration record: what a procedure found, with uncertainty, provenance and the data behind its figures.

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from dataclasses import fields, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from imulab._version import VERSION
-from imulab.display import as_judged, first_hidden
+from imulab.display import as_judged, first_hidden, may_hide
 from imulab.errors import RecordError
-from imulab.records.calibration import BLOB_MAGIC, FORMAT, SCHEMA_VERSION, Calibration, content_sha256
+from imulab.records.calibration import BLOB_MAGIC, FORMAT, SCHEMA_VERSION, Calibration, content_sha256, sealed_bytes
 from imulab.records.sections import check_sizes, read
 
 _CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
@@ -35,17 +37,7 @@ def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
             f"{name}: a blob, which holds a unit's numbers without uncertainties or history: expected the record it "
             "was made from (show, apply and array fuse take blobs)"
         )
-    try:
-        content = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
-    except (ValueError, RecursionError) as error:
-        if type(error) is ValueError and "int_max_str_digits" in str(error):
-            raise RecordError(
-                f"{name}: not a calibration record: it holds a whole number of thousands of digits"
-            ) from None
-        reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
-        if not data.lstrip().startswith(b"{"):
-            raise RecordError(f"{name}: not a calibration record: it is not JSON (a recording?)") from None
-        raise RecordError(f"{name}: not a calibration record: {reason} ({error})") from None
+    content, found = _as_sealed(data) or (_content(data, name), None)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise RecordError(f'{name}: not a calibration record: expected the key "format": "{FORMAT}"')
     version = content.get("version")
@@ -60,15 +52,44 @@ def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
     if stated is None:
         raise RecordError(f"{name}: the record has no content_sha256: it was altered after it was written")
     try:
-        found = content_sha256(content)
+        found = found or content_sha256(content)
     except ValueError as error:  # a number beyond the range of a double, or text that is no Unicode
         raise RecordError(f"{name}: the record was altered after it was written ({error})") from None
     if stated != found:
         raise RecordError(f"{name}: the record was altered after it was written (its content_sha256 does not match)")
-    return _validated(content, name), found
+    return _validated(content, name, plain=not may_hide(data)), found
 
 
-def _validated(content: dict[str, Any], name: str) -> Calibration:
+def _as_sealed(data: bytes) -> tuple[dict[str, Any], str] | None:
+    """Return the content of a record's file and its ``content_sha256`` where the file is as it was sealed, else None.
+
+    Everything else, a file that is laid out in another way included, is left to slower reading.
+    """
+    try:
+        text = sealed_bytes(data)
+        content = msgspec.json.decode(data)
+    except (ValueError, RecursionError):
+        return None
+    found = None if text is None else hashlib.sha256(text).hexdigest()
+    return (content, found) if found is not None and content.get("content_sha256") == found else None
+
+
+def _content(data: bytes, name: str) -> Any:
+    """Return the JSON value of a record's file; errors as for `parsed`."""
+    try:
+        return json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
+    except (ValueError, RecursionError) as error:
+        if type(error) is ValueError and "int_max_str_digits" in str(error):
+            raise RecordError(
+                f"{name}: not a calibration record: it holds a whole number of thousands of digits"
+            ) from None
+        reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
+        if not data.lstrip().startswith(b"{"):
+            raise RecordError(f"{name}: not a calibration record: it is not JSON (a recording?)") from None
+        raise RecordError(f"{name}: not a calibration record: {reason} ({error})") from None
+
+
+def _validated(content: dict[str, Any], name: str, *, plain: bool) -> Calibration:
     known = {f.name for f in fields(Calibration)} - {"sections"}
     sections = {key: value for key, value in content.items() if key not in known and key != "format"}
     for key in _NEEDED:
@@ -79,7 +100,7 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
         record = read(Calibration, {key: content[key] for key in known & content.keys()} | {"sections": sections})
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None
-    if place := first_hidden(content):
+    if not plain and (place := first_hidden(content)):
         raise RecordError(f"{name}: {place} holds a control or bidirectional character; expected plain text")
     if not _CREATED.fullmatch(record.created):
         raise RecordError(f"{name}: created: expected a time such as 2026-11-20T12:00:00Z, found {record.created!r}")

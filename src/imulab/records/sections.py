@@ -1,23 +1,26 @@
-"""Typed parts of a record: dataclasses that say what a procedure's code reads, and their reading from plain values.
+"""Typed parts of a record: what a procedure's code fills, writes into the record, and reads from it again.
 
 The annotation of a field says what its value must be: ``float`` (any number), ``int`` (0 or more), ``str``, ``bool``,
 ``Literal`` words, one of the kinds below, another `Part`, or ``list[X]``, ``tuple[X, ...]``, ``dict[str, X]`` and
 ``X | None`` of these. ``Annotated[list[X], 3]`` has three entries, and ``Annotated[list[X], "axes"]`` as many as every
 other list of that name in the part that is read. Keys that no field names are ignored. A field whose name is a word of
-Python ends with ``_``. Other dataclasses are made by calling them, so that a record must hold all that they need.
+Python ends with ``_``. Dataclasses are made by calling them, so that a record must hold all that they need.
+
+`entries` writes a part in the order of its fields. A field with the default None is left out of the record where it is
+None; a field with the default `null` is written as null, and may be missing in older records.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
-    ClassVar,
     Literal,
+    TypeAlias,
     TypeVar,
     dataclass_transform,
     get_args,
@@ -25,9 +28,14 @@ from typing import (
     get_type_hints,
 )
 
+import msgspec
+from msgspec import NODEFAULT
+from msgspec import field as field
+
 from imulab.errors import RecordError
 
 if TYPE_CHECKING:
+    from imulab.gravity import Gravity
     from imulab.records.calibration import Calibration
 
 LARGEST = 1e100
@@ -35,7 +43,10 @@ LARGEST = 1e100
 
 P = TypeVar("P", bound="Part")
 T = TypeVar("T")
-_Counts = dict[str, tuple[int, str]]
+Place: TypeAlias = "tuple[Place, str | int] | None"
+"""Where in a record a value stands: the place of what holds it, and its key or index there; None for the record."""
+_Counts: TypeAlias = dict[str, tuple[int, Place]]
+_Reader: TypeAlias = Callable[[Any, Place, _Counts], Any]
 
 
 @dataclass(frozen=True)
@@ -47,7 +58,7 @@ class Kind:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is float or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
 Positive = Annotated[float, Kind("a number above 0", lambda value: _is_number(value) and value > 0)]
@@ -60,36 +71,81 @@ _PLAIN = {
 }
 
 
+class _PartMeta(msgspec.StructMeta):
+    """Makes the classes of parts, which are made with keywords: msgspec does not hand that on to what is derived."""
+
+    def __new__(mcls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **config: Any) -> Any:
+        return super().__new__(mcls, name, bases, namespace, kw_only=True, **config)
+
+
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
-class Part:
-    """What code reads of one part of a record; whoever reads a field that the record lacks gets a RecordError.
+class Part(msgspec.Struct, metaclass=_PartMeta, frozen=True, dict=True):
+    """What code fills and reads of one part of a record; whoever reads a field that a record lacks gets a RecordError.
 
-    Its classes are frozen dataclasses with keywords only. A record need not hold what nobody asks it for: one that is
-    only exported needs no data for figures.
+    A record need not hold what nobody asks it for: one that is only exported needs no data for figures.
     """
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-    def __init_subclass__(cls) -> None:
-        dataclass(frozen=True, kw_only=True)(cls)
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name not in type(self).__dataclass_fields__:
+            if name not in self.__struct_fields__:
                 raise AttributeError(f"{type(self).__name__} has no field {name}")
-            raise RecordError(f"the record lacks {_at(self.__dict__['_place'], name.rstrip('_'))}")
+            raise RecordError(f"the record lacks {_text((self.__dict__['place'], name.rstrip('_')))}")
+
+
+def null() -> Any:
+    """Return the default None of a field that is written as null, and that older records lack."""
+    return field(default_factory=_none)
+
+
+def _none() -> None:
+    return None
+
+
+def holds(value: Part, name: str) -> bool:
+    """Return whether the record that a part was read from holds a field, or its default stands for it."""
+    try:
+        object.__getattribute__(value, name)
+    except AttributeError:
+        return False
+    return True
+
+
+def entries(value: Part) -> dict[str, Any]:
+    """Return a part as it stands in a record, in the order of its fields."""
+    return {
+        key: _plain(item)
+        for name, key, optional in _written(type(value))
+        if (item := getattr(value, name)) is not None or not optional
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Return what a field of a part holds as it stands in a record."""
+    if isinstance(value, Part):
+        return entries(value)
+    if type(value) is list:
+        return [_plain(item) for item in value] if value and isinstance(value[0], Part) else value
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return value
+
+
+@cache
+def _written(kind: type[Part]) -> list[tuple[str, str, bool]]:
+    """Return the name of each field, its key in a record, and whether it is left out where it is None."""
+    return [(known.name, known.name.rstrip("_"), known.default is None) for known in msgspec.structs.fields(kind)]
 
 
 class Named(dict[str, Any]):
     """Values by name; whoever asks for one that the record lacks gets a RecordError."""
 
-    def __init__(self, values: Mapping[str, Any], place: str) -> None:
+    def __init__(self, values: Mapping[str, Any], place: Place) -> None:
         super().__init__(values)
         self.place = place
 
     def __missing__(self, key: str) -> Any:
-        raise RecordError(f"the record lacks {_at(self.place, key)}")
+        raise RecordError(f"the record lacks {_text((self.place, key))}")
 
 
 class Quantity(Part):
@@ -98,6 +154,33 @@ class Quantity(Part):
     value: float
     unit: str
     standard_uncertainty: Size | None = None
+
+
+class Measured(Part):
+    """A value with its standard uncertainty and its unit."""
+
+    value: float
+    standard_uncertainty: Size | None
+    unit: str
+
+
+class StatedGravity(Part):
+    """``model.gravity``: local gravity, m/s^2, and where it is from."""
+
+    value: Positive
+    unit: str
+    standard_uncertainty: Size | None = null()
+    from_: str
+
+    @classmethod
+    def of(cls, gravity: Gravity) -> StatedGravity:
+        """Return what a record says of the gravity that it was made with."""
+        return cls(
+            value=gravity.value,
+            unit="m/s^2",
+            standard_uncertainty=gravity.standard_uncertainty,
+            from_=gravity.origin,
+        )
 
 
 class Length(Part):
@@ -131,12 +214,13 @@ def part(record: Calibration, kind: type[P], place: str = "") -> P:
 
 
 def read(kind: type[T], value: Any, place: str = "") -> T:
-    """Return plain values as a part or another dataclass; errors as for `part`."""
-    found: T = _read(value, kind, place, {})
-    return found
+    """Return plain values as a part or a dataclass; errors as for `part`."""
+    annotation: Any = kind
+    result: T = _reader(annotation)(value, (None, place) if place else None, {})
+    return result
 
 
-def check_sizes(value: Any, where: str = "") -> None:
+def check_sizes(value: Any, where: Place = None) -> None:
     """Refuse numbers that no quantity has.
 
     Raises
@@ -146,108 +230,175 @@ def check_sizes(value: Any, where: str = "") -> None:
     """
     if isinstance(value, dict):
         for key, item in value.items():
-            check_sizes(item, _at(where, key))
+            kind = type(item)
+            if not (kind is str or item is None or (kind is float and -LARGEST <= item <= LARGEST)):  # as most are
+                check_sizes(item, (where, key))
     elif isinstance(value, list):
-        if value and set(map(type, value)) <= {float, int} and min(value) >= -LARGEST and max(value) <= LARGEST:
-            return
+        try:
+            if not value or (min(value) >= -LARGEST and max(value) <= LARGEST):
+                return
+        except TypeError:  # there are texts, lists or None among them
+            pass
         for index, item in enumerate(value):
-            check_sizes(item, f"{where}[{index}]")
+            check_sizes(item, (where, index))
     elif _is_number(value) and not -LARGEST <= value <= LARGEST:
         raise _mistake(where, f"a number of at most {LARGEST:g}", value)
 
 
 @cache
-def _fields(kind: Any) -> list[tuple[str, Any, Field[Any]]]:
-    """Name and annotation of each field, and the field."""
-    hints = get_type_hints(kind, include_extras=True)
-    return [(field.name, hints[field.name], field) for field in fields(kind)]
-
-
-def _read(value: Any, kind: Any, where: str, counts: _Counts) -> Any:
-    origin, given = get_origin(kind), get_args(kind)
+def _reader(kind: Any) -> _Reader:
+    """Return the function that reads an annotation's values: from a plain value, its place, and the lists' lengths."""
+    origin, arguments = get_origin(kind), get_args(kind)
     if kind is Any:
-        return value
+        return lambda value, where, counts: value
+    if kind is float:
+        return _read_number
     if kind in _PLAIN:
-        plain = _tested(value, _PLAIN[kind], where)
-        return float(plain) if kind is float else plain
+        return _plain_reader(_PLAIN[kind])
     if origin is Literal:
-        return _tested(value, Kind(f"one of {' '.join(given)}", lambda word: word in given), where)
-    if origin is Annotated and isinstance(given[1], Kind):
-        return _tested(value, given[1], where)
+        return _plain_reader(Kind(f"one of {' '.join(arguments)}", lambda word: word in arguments))
+    if origin is Annotated and isinstance(arguments[1], Kind):
+        return _plain_reader(arguments[1])
     if origin is Annotated:
-        return _read_list(value, get_args(given[0])[0], where, counts, given[1])
+        return _list_reader(get_args(arguments[0])[0], arguments[1])
     if origin is list:
-        return _read_list(value, given[0], where, counts, None)
+        return _list_reader(arguments[0], None)
     if origin is tuple:
-        return tuple(_read_list(value, given[0], where, counts, None))
+        items = _list_reader(arguments[0], None)
+        return lambda value, where, counts: tuple(items(value, where, counts))
     if origin in (dict, Mapping):
-        held = {key: _read(item, given[1], _at(where, key), counts) for key, item in _named(value, where).items()}
-        return Named(held, where) if origin is dict else held
-    if given:  # X | None, or a list or else a plain value
-        others = [other for other in given if other is not type(None)]
-        if value is None and len(others) < len(given):
+        return _mapping_reader(_reader(arguments[1]), lacks_named=origin is dict)
+    if arguments:
+        return _union_reader(arguments)
+    return _dataclass_reader(kind) if is_dataclass(kind) else _part_reader(kind)
+
+
+def _read_number(value: Any, where: Place, counts: _Counts) -> float:
+    if type(value) is float:
+        return value
+    if not _is_number(value):
+        raise _mistake(where, _PLAIN[float].name, value)
+    return float(value)
+
+
+def _plain_reader(kind: Kind) -> _Reader:
+    fits = kind.fits
+
+    def read_plain(value: Any, where: Place, counts: _Counts) -> Any:
+        if not fits(value):
+            raise _mistake(where, kind.name, value)
+        return value
+
+    return read_plain
+
+
+def _list_reader(kind: Any, count: int | str | None) -> _Reader:
+    """Return the reader of a list of so many entries, or of as many as other lists of that name have."""
+    read_item = _reader(kind)
+
+    def read_list(value: Any, where: Place, counts: _Counts) -> list[Any]:
+        if type(value) is not list and (isinstance(value, str) or not isinstance(value, Sequence)):
+            raise _mistake(where, "a list", value)
+        if count is not None:
+            expected, same = (count, None) if isinstance(count, int) else counts.setdefault(count, (len(value), where))
+            if len(value) != expected:
+                as_there = f", as {_text(same)} has" if same is not None else ""
+                raise RecordError(f"{_text(where)}: expected {expected} entries{as_there}, found {len(value)}")
+            if not value:
+                raise _mistake(where, "1 entry or more", value)
+        if kind is float and (kinds := set(map(type, value))) <= {float, int}:
+            return list(map(float, value)) if int in kinds else list(value)
+        return [read_item(item, (where, index), counts) for index, item in enumerate(value)]
+
+    return read_list
+
+
+def _mapping_reader(read_item: _Reader, *, lacks_named: bool) -> _Reader:
+    """Return the reader of values by name; with `lacks_named`, asking for one that is missing names its place."""
+
+    def read_mapping(value: Any, where: Place, counts: _Counts) -> dict[str, Any]:
+        items = {key: read_item(item, (where, key), counts) for key, item in _named(value, where).items()}
+        return Named(items, where) if lacks_named else items
+
+    return read_mapping
+
+
+def _union_reader(members: tuple[Any, ...]) -> _Reader:
+    """Return the reader of ``X | None``, or of a list or else a plain value."""
+    others = [_reader(member) for member in members if member is not type(None)]
+    optional = len(others) < len(members)
+    read_list, read_other = others[0], others[-1]
+
+    def read_union(value: Any, where: Place, counts: _Counts) -> Any:
+        if value is None and optional:
             return None
-        return _read(value, others[-1 if len(others) > 1 and not isinstance(value, list) else 0], where, counts)
-    if issubclass(kind, Part):
-        return _read_part(_named(value, where), kind, where, counts)
-    return _made(_named(value, where), kind, where, counts)
+        return (read_list if isinstance(value, list) else read_other)(value, where, counts)
+
+    return read_union
 
 
-def _read_part(value: Mapping[str, Any], kind: Any, where: str, counts: _Counts) -> Any:
-    found = object.__new__(kind)
-    held: dict[str, Any] = {"_place": where}
-    for name, hint, known in _fields(kind):
-        key = name.rstrip("_")
-        if key in value:
-            held[name] = _read(value[key], hint, _at(where, key), counts)
-        elif known.default_factory is not MISSING:
-            held[name] = known.default_factory()
-    found.__dict__.update(held)
-    return found
+def _part_reader(kind: type[Part]) -> _Reader:
+    hints = get_type_hints(kind, include_extras=True)
+    known = [
+        (f.name, f.name.rstrip("_"), _reader(hints[f.name]), f.default is NODEFAULT and f.default_factory is NODEFAULT)
+        for f in msgspec.structs.fields(kind)
+    ]
+
+    def read_part(value: Any, where: Place, counts: _Counts) -> Any:
+        value, held, missing = _named(value, where), {}, []
+        for name, key, read_item, required in known:
+            if key in value:
+                held[name] = read_item(value[key], (where, key), counts)
+            elif required:
+                missing.append(name)
+        return _incomplete(kind, held, missing, where) if missing else kind(**held)
+
+    return read_part
 
 
-def _made(value: Mapping[str, Any], kind: Any, where: str, counts: _Counts) -> Any:
-    """A dataclass that is no `Part`, from the values of its fields."""
-    held = {}
-    for name, hint, known in _fields(kind):
-        if name in value:
-            held[name] = _read(value[name], hint, _at(where, name), counts)
-        elif known.default is MISSING and known.default_factory is MISSING:
-            raise RecordError(f"the record lacks {_at(where, name)}")
-    return kind(**held)
+def _incomplete(kind: type[Part], held: Mapping[str, Any], missing: Sequence[str], where: Place) -> Part:
+    """Return a part without the fields that the record lacks: whoever reads one of these gets an error."""
+    result = kind(**held, **dict.fromkeys(missing))
+    result.__dict__["place"] = where
+    for name in missing:
+        getattr(kind, name).__delete__(result)  # the slot is empty then, so that `Part.__getattr__` is asked
+    return result
 
 
-def _read_list(value: Any, kind: Any, where: str, counts: _Counts, count: int | str | None) -> list[Any]:
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        raise _mistake(where, "a list", value)
-    if count is not None:
-        expected, of = (count, "") if isinstance(count, int) else counts.setdefault(count, (len(value), where))
-        if len(value) != expected:
-            as_there = f", as {of} has" if of else ""
-            raise RecordError(f"{where}: expected {expected} entries{as_there}, found {len(value)}")
-        if not value:
-            raise _mistake(where, "1 entry or more", value)
-    if kind is float and set(map(type, value)) <= {float, int}:
-        return list(map(float, value))
-    return [_read(item, kind, f"{where}[{index}]", counts) for index, item in enumerate(value)]
+def _dataclass_reader(kind: Any) -> _Reader:
+    hints = get_type_hints(kind, include_extras=True)
+    known = [
+        (f.name, _reader(hints[f.name]), f.default is MISSING and f.default_factory is MISSING) for f in fields(kind)
+    ]
+
+    def read_dataclass(value: Any, where: Place, counts: _Counts) -> Any:
+        value, held = _named(value, where), {}
+        for name, read_item, required in known:
+            if name in value:
+                held[name] = read_item(value[name], (where, name), counts)
+            elif required:
+                raise RecordError(f"the record lacks {_text((where, name))}")
+        return kind(**held)
+
+    return read_dataclass
 
 
-def _tested(value: Any, kind: Kind, where: str) -> Any:
-    if not kind.fits(value):
-        raise _mistake(where, kind.name, value)
-    return value
-
-
-def _named(value: Any, where: str) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
+def _named(value: Any, where: Place) -> Mapping[str, Any]:
+    if type(value) is not dict and not isinstance(value, Mapping):
         raise _mistake(where, "named values", value)
     return value
 
 
-def _at(where: str, key: str) -> str:
-    return f"{where}.{key}" if where else key
+def _text(where: Place) -> str:
+    """Return a place as messages name it: ``fit.orders[2].rms``."""
+    if where is None:
+        return ""
+    outer, key = _text(where[0]), where[1]
+    if isinstance(key, int):
+        return f"{outer}[{key}]"
+    return f"{outer}.{key}" if outer else key
 
 
-def _mistake(where: str, expected: str, value: Any) -> RecordError:
+def _mistake(where: Place, expected: str, value: Any) -> RecordError:
     text = repr(value)
-    return RecordError(f"{where}: expected {expected}, found {text if len(text) <= 60 else text[:57] + '...'}")
+    return RecordError(f"{_text(where)}: expected {expected}, found {text if len(text) <= 60 else text[:57] + '...'}")

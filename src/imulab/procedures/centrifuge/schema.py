@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import field
 from typing import Annotated
 
 from imulab.errors import RecordError
 from imulab.records.calibration import Calibration
-from imulab.records.sections import Above0, Kind, Length, Part, Quantity, Size, part
+from imulab.records.sections import Above0, Kind, Length, Part, Quantity, Size, field, part
 
 # What code reads of a centrifuge record, with types.
 

@@ -9,7 +9,7 @@ import numpy as np
 from imulab.errors import RecordError
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.records.sections import Above0, Length, Part, Positive, Quantity, part
+from imulab.records.sections import Above0, Length, Part, Positive, Quantity, holds, part
 
 T = TypeVar("T")
 PerAxis = Annotated[list[T], "axes"]
@@ -165,7 +165,7 @@ class Health(Part):
     @property
     def known(self) -> bool:
         """Whether it holds anything."""
-        return "time" in vars(self)
+        return holds(self, "time")
 
 
 class ComparisonData(Part):
@@ -208,15 +208,16 @@ def array_of(record: Calibration) -> ArrayRecord:
         Its elements have another number of axes than it says, or noise without size.
     """
     found = part(record, ArrayRecord)
-    held = vars(found)
-    many = len(vars(held.get("model", found)).get("axes", ())) > 1
-    for number, element in enumerate(held.get("elements", ())):
-        for name, value in vars(element).items():
-            if isinstance(value, PerGyro) and isinstance(vars(value).get("value", [0] * many), list) is not many:
+    many = holds(found, "model") and holds(found.model, "axes") and len(found.model.axes) > 1
+    for number, element in enumerate(found.elements if holds(found, "elements") else ()):
+        values = {name: getattr(element, name) for name in element.__struct_fields__ if holds(element, name)}
+        for name, value in values.items():
+            if isinstance(value, PerGyro) and holds(value, "value") and isinstance(value.value, list) is not many:
                 raise RecordError(
                     f"elements[{number}].{name}.value: expected {'a list over the axes' if many else 'a number'}"
                 )
-    for axis, matrix in enumerate(vars(held.get("correlation", found)).get("covariance", ())):
+    known = holds(found, "correlation") and holds(found.correlation, "covariance")
+    for axis, matrix in enumerate(found.correlation.covariance if known else ()):
         if not all(row[i] > 0 for i, row in enumerate(matrix)):
             raise RecordError(f"correlation.covariance[{axis}]: expected variances above 0")
     return found

@@ -23,10 +23,11 @@ from imulab.errors import DataError, RecordError
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.rate import AXES, GAINS
 from imulab.procedures.rate.dwells import Dwells, recorded_rate
-from imulab.procedures.rate.schema import RateTest, shown
+from imulab.procedures.rate.schema import PriorParameter, RatePrior, RateTest, shown
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import compared
+from imulab.records.sections import Measured, entries
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
 # What accelerometers say of the table axis: its direction in the body, free of the table's level and the lever arm.
@@ -381,7 +382,7 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
             "gyro_order": _order(parameters),
             "axes": axes,
         },
-        fit={**record.fit, "prior": _beside(prior, record, common, comparison.probability)},
+        fit={**record.fit, "prior": entries(_both_alone(prior, record, common, comparison.probability))},
         sources=tuple({source.file: source for source in (*prior.sources, *record.sources)}.values()),
         warnings=(
             *record.warnings,
@@ -485,20 +486,19 @@ def _interval(source: Parameter, value: float, u: float) -> tuple[float, float] 
     return value - wide, value + wide
 
 
-def _beside(prior: Calibration, record: Calibration, names: list[str], probability: float | None) -> dict[str, Any]:
+def _both_alone(prior: Calibration, record: Calibration, names: list[str], probability: float | None) -> RatePrior:
     """Return ``fit.prior``: what each record says of the parameters of both, alone."""
-    pairs = {"prior": prior, "test": record}
-    return {
-        "probability": probability,
-        "parameters": {
-            name: {
-                key: {"value": (p := one.parameters[name]).value, "standard_uncertainty": p.standard_uncertainty,
-                      "unit": p.unit}
-                for key, one in pairs.items()
-            }
+    return RatePrior(
+        probability=probability,
+        parameters={
+            name: PriorParameter(prior=_measured(prior.parameters[name]), test=_measured(record.parameters[name]))
             for name in names
         },
-    }  # fmt: skip
+    )
+
+
+def _measured(parameter: Parameter) -> Measured:
+    return Measured(value=parameter.value, standard_uncertainty=parameter.standard_uncertainty, unit=parameter.unit)
 
 
 def _said(probability: float | None, changes: Any) -> str:

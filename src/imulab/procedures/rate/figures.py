@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from imulab.procedures.rate.record import sweep_table
-from imulab.procedures.rate.schema import OfAxis, Rate, Seen, prior_table, rate_of
+from imulab.procedures.rate.schema import AxisFit, DwellResiduals, RateRecord, prior_table, rate_of
 from imulab.procedures.rate.schema import rows as engineering_rows
 from imulab.procedures.rate.turns import turns_exhibits
 from imulab.records.calibration import Calibration
@@ -52,10 +52,10 @@ def exhibits(record: Calibration) -> Exhibits:
     ]
     items: list[Figure | ReportTable] = [
         _parameters(record),
-        *([prior_table(found.fit.prior, record)] if "prior" in record.fit else []),
+        *([] if found.fit.prior is None else [prior_table(found.fit.prior, record)]),
         *(_left(a, found.data.dwells) for a in axes),
         _of_line(record, found),
-        *([sweep_table(found.fit.sweeps)] if "sweeps" in record.fit else []),
+        *([] if found.fit.sweeps is None else [sweep_table(found.fit.sweeps)]),
         _budget(record, found),
     ]
     return Exhibits(headline, facts, items)
@@ -93,7 +93,7 @@ def _parameters(record: Calibration) -> ReportTable:
     )
 
 
-def _left(name: str, seen: Seen) -> Figure:
+def _left(name: str, seen: DwellResiduals) -> Figure:
     rate, left = (np.array(values) for values in (seen.rate, seen.residual))
     u = np.array(seen.standard_uncertainty) * _PPM
     traces: list[dict[str, Any]] = []
@@ -120,7 +120,7 @@ def _left(name: str, seen: Seen) -> Figure:
     )
 
 
-def _of_line(record: Calibration, found: Rate) -> ReportTable:
+def _of_line(record: Calibration, found: RateRecord) -> ReportTable:
     def ppm(value: float | None) -> str:
         return "–" if value is None else plain_number(value * _PPM, 3)
 
@@ -163,21 +163,21 @@ def _of_line(record: Calibration, found: Rate) -> ReportTable:
     )
 
 
-def _of_loop(record: Calibration, of: OfAxis, name: str) -> tuple[str, str]:
+def _of_loop(record: Calibration, of: AxisFit, name: str) -> tuple[str, str]:
     """Return the fitted loop and its uncertainty, ppm; records of before have none."""
     if "fitted_loop" not in record.fit["axes"][name] or of.fitted_loop is None:
         return "–", "–"
     return format_uncertain(of.fitted_loop * _PPM, (of.fitted_loop_uncertainty or 0.0) * _PPM)
 
 
-def _of_powers(record: Calibration, of: OfAxis, name: str) -> tuple[str, str]:
+def _of_powers(record: Calibration, of: AxisFit, name: str) -> tuple[str, str]:
     """Return the order of a gyroscope, and what its powers leave, ppm; records of before have but one order."""
     if "order" not in record.fit["axes"][name]:
         return str(record.model["gyro_order"]), "–"
     return str(of.order), plain_number(of.by_polynomial * _PPM, 3)
 
 
-def _budget(record: Calibration, found: Rate) -> ReportTable:
+def _budget(record: Calibration, found: RateRecord) -> ReportTable:
     common = (found.fit.table_uncertainty or 0.0) * _PPM
     rows = []
     for name in found.model.axes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -13,10 +12,20 @@ from imulab.gravity import EARTH
 from imulab.procedures.rate import AXES
 from imulab.procedures.rate.axes import BY_ACCELEROMETERS, TableAxes, faces_said, lean_said
 from imulab.procedures.rate.dwells import Dwells
-from imulab.procedures.rate.schema import RateTest, Swept
+from imulab.procedures.rate.schema import (
+    AxisFit,
+    Direction,
+    DwellResiduals,
+    RateEvidence,
+    RateModel,
+    RateSummary,
+    RateTest,
+    SweptRun,
+)
 from imulab.procedures.rate.solve import Linearity, Problem, Solution, model_parameters, temperature_slopes
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.sections import Quantity, entries
 from imulab.report.traces import ReportTable, format_uncertain, plain_number
 from imulab.units import from_si, parse_unit
 
@@ -47,23 +56,22 @@ def motion_of(dwells: Sequence[Dwells]) -> str:
     return "steps" if kinds == {True} else "sweeps" if kinds == {False} else "steps and sweeps"
 
 
-def swept(test: RateTest, dwells: Sequence[Dwells]) -> dict[str, Any]:
-    """Return ``fit.sweeps``: of each run that was one its file, and what it says; nothing where there was none."""
-    found = [
-        {
-            "file": run.file,
-            "axis": AXES[run.axis],
-            "frequency": one.sweep.frequency,
-            "delay": one.sweep.delay[0],
-            "delay_uncertainty": one.sweep.delay[1],
-            "bandwidth": None if one.sweep.bandwidth is None else one.sweep.bandwidth[0],
-            "bandwidth_uncertainty": None if one.sweep.bandwidth is None else one.sweep.bandwidth[1],
-            "bandwidth_beyond": one.sweep.beyond,
-        }
-        for run, one in zip(test.runs, dwells, strict=True)
-        if one.sweep is not None
+def swept(test: RateTest, dwells: Sequence[Dwells]) -> list[SweptRun]:
+    """Return ``fit.sweeps``: of each run that was one its file, and what it says."""
+    return [
+        SweptRun(
+            file=run.file,
+            axis=AXES[run.axis],
+            frequency=sweep.frequency,
+            delay=sweep.delay[0],
+            delay_uncertainty=sweep.delay[1],
+            bandwidth=None if sweep.bandwidth is None else sweep.bandwidth[0],
+            bandwidth_uncertainty=None if sweep.bandwidth is None else sweep.bandwidth[1],
+            bandwidth_beyond=sweep.beyond,
+        )
+        for run, reduced in zip(test.runs, dwells, strict=True)
+        if (sweep := reduced.sweep) is not None
     ]
-    return {"sweeps": found} if found else {}
 
 
 def of_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
@@ -87,7 +95,7 @@ def of_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
     return [Note(line) for line in said]
 
 
-def sweep_table(sweeps: Sequence[Swept]) -> ReportTable:
+def sweep_table(sweeps: Sequence[SweptRun]) -> ReportTable:
     """Return the table of the sweeps of a record."""
     rows = []
     for of in sweeps:
@@ -143,24 +151,23 @@ def make_record(
     heads = [recording.metadata for recording in recordings]
     sensor = {key: text for head in heads for key in ("serial", "model", "element") if (text := head.get(key))}
     temperatures = [t for recording in recordings if (t := recording.mean_temperature()) is not None]
-    model: dict[str, Any] = {
-        "gyro_order": max(solution.orders),
-        "gyro_output_unit": unit,
-        "axes": "".join(linearity),
-        "from": motion_of(dwells),
-        "frame": "the faces on which the unit was mounted" if axes is None else BY_ACCELEROMETERS,
-        "largest_rate": {"value": _largest(problem), "unit": "rad/s"},
-    }
-    if temperatures:
-        model["temperature"] = {"value": float(np.mean(temperatures)), "unit": "degC"}
+    model = RateModel(
+        gyro_order=max(solution.orders),
+        gyro_output_unit=unit,
+        axes="".join(linearity),
+        from_=motion_of(dwells),
+        frame="the faces on which the unit was mounted" if axes is None else BY_ACCELEROMETERS,
+        largest_rate=Quantity(value=_largest(problem), unit="rad/s"),
+        temperature=Quantity(value=float(np.mean(temperatures)), unit="degC") if temperatures else None,
+    )
     return Calibration(
         procedure="rate",
         parameters=parameters | figures,
         covariance=joint,
-        model=model,
-        fit=_fit(test, problem, solution, linearity, dwells) | swept(test, dwells),
+        model=entries(model),
+        fit=entries(_summary(test, problem, solution, linearity, dwells)),
         options={"order": order if order == "auto" else int(order)},
-        data={"dwells": _dwells(linearity)},
+        data=entries(RateEvidence(dwells=_dwells(linearity))),
         sensor={**sensor, **test.sensor},
         sources=tuple(recording.source for recording in recordings if recording.source is not None),
         warnings=(
@@ -217,53 +224,61 @@ def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
     return found
 
 
-def _fit(
+def _summary(
     test: RateTest,
     problem: Problem,
     solution: Solution,
     linearity: Mapping[str, Linearity],
     dwells: Sequence[Dwells],
-) -> dict[str, Any]:
-    return {
-        "runs": len(dwells),
-        "dwells": len(problem.rate),
-        "rates_from": "the table's column" if all(found.recorded for found in dwells) else "the list of rates",
-        "chi_square": solution.chi_square,
-        "degrees_of_freedom": solution.freedom,
-        "between_runs": solution.cycle,
-        "table_uncertainty": test.relative_uncertainty,
-        "rate_uncertainty": {"value": test.rate_uncertainty, "unit": "rad/s"},
-        "proportional_uncertainty": test.proportional_uncertainty,
-        "mounting_uncertainty": test.mounting_uncertainty,
-        "latitude": test.latitude,
-        "axes": {
-            axis: {
-                "probability": found.probability,
-                "by_noise": found.by_noise,
-                "loop": found.loop,
-                "fitted_loop": None if found.fitted_loop is None else found.fitted_loop[0],
-                "fitted_loop_uncertainty": None if found.fitted_loop is None else found.fitted_loop[1],
-                "repeatability": None if found.repeatability is None else found.repeatability[0],
-                "repeatability_by_noise": None if found.repeatability is None else found.repeatability[1],
-                "by_polynomial": found.by_polynomial,
-                "order": solution.orders[problem.gyros.index(AXES.index(axis))],
-                "scatter": float(solution.scatter[problem.gyros.index(AXES.index(axis))]),
-            }
-            for axis, found in linearity.items()
+) -> RateSummary:
+    """Return how the lines were fitted, and how well."""
+    return RateSummary(
+        runs=len(dwells),
+        dwells=len(problem.rate),
+        rates_from="the table's column" if all(run.recorded for run in dwells) else "the list of rates",
+        chi_square=solution.chi_square,
+        degrees_of_freedom=solution.freedom,
+        between_runs=solution.cycle,
+        table_uncertainty=test.relative_uncertainty,
+        rate_uncertainty=Quantity(value=test.rate_uncertainty, unit="rad/s"),
+        proportional_uncertainty=test.proportional_uncertainty,
+        mounting_uncertainty=test.mounting_uncertainty,
+        latitude=test.latitude,
+        axes={
+            axis: _axis_fit(line, solution, problem.gyros.index(AXES.index(axis))) for axis, line in linearity.items()
         },
-    }
+        sweeps=swept(test, dwells) or None,
+    )
 
 
-def _dwells(linearity: Mapping[str, Linearity]) -> dict[str, Any]:
+def _axis_fit(line: Linearity, solution: Solution, number: int) -> AxisFit:
+    """Return how well the line of one gyroscope fits; `number` is its place among those that were fitted."""
+    fitted_loop, repeatability = line.fitted_loop or (None, None), line.repeatability or (None, None)
+    return AxisFit(
+        probability=line.probability,
+        by_noise=line.by_noise,
+        loop=line.loop,
+        fitted_loop=fitted_loop[0],
+        fitted_loop_uncertainty=fitted_loop[1],
+        repeatability=repeatability[0],
+        repeatability_by_noise=repeatability[1],
+        by_polynomial=line.by_polynomial,
+        order=solution.orders[number],
+        scatter=float(solution.scatter[number]),
+    )
+
+
+def _dwells(linearity: Mapping[str, Linearity]) -> DwellResiduals:
     """Return each dwell about the axis of a gyroscope, as the figures draw it."""
-    words = ("falling", "turning", "rising")
-    return {
-        "axis": [axis for axis, found in linearity.items() for _ in found.rate],
-        "rate": [value for found in linearity.values() for value in found.rate.tolist()],
-        "residual": [value for found in linearity.values() for value in found.residual.tolist()],
-        "standard_uncertainty": [value for found in linearity.values() for value in found.uncertainty.tolist()],
-        "direction": [words[d + 1] for found in linearity.values() for d in found.direction.tolist()],
-    }
+    words: tuple[Direction, ...] = ("falling", "turning", "rising")
+    lines = linearity.values()
+    return DwellResiduals(
+        axis=[axis for axis, line in linearity.items() for _ in line.rate],
+        rate=[value for line in lines for value in line.rate.tolist()],
+        residual=[value for line in lines for value in line.residual.tolist()],
+        standard_uncertainty=[value for line in lines for value in line.uncertainty.tolist()],
+        direction=[words[d + 1] for line in lines for d in line.direction.tolist()],
+    )
 
 
 def _of_sensor(test: RateTest, recordings: Sequence[Recording]) -> list[str]:

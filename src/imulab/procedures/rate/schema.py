@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -22,35 +22,43 @@ from imulab.procedures.rate import AXES, MOUNTINGS
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change
-from imulab.records.sections import Part, Quantity, Size, part
+from imulab.records.sections import Measured, Part, Quantity, Size, part
 from imulab.report.traces import ReportTable, format_uncertain
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit, to_si
 
-# What code reads of a rate record, with types.
+# What a rate record holds, with types: filled by those who write it, checked as it is read.
 
 
 T = TypeVar("T")
+Direction: TypeAlias = Literal["rising", "falling", "turning"]
 PerDwell = Annotated[list[T], "dwells"]
 PerTurn = Annotated[list[T], "turns"]
 
 
-class Model(Part):
-    """``model``."""
+class TurnsModel(Part):
+    """``model`` of turns."""
 
     gyro_order: int
     gyro_output_unit: str
     axes: str
     from_: str
+
+
+class RateModel(TurnsModel):
+    """``model``."""
+
+    frame: str
     largest_rate: Quantity
+    temperature: Quantity | None = None
 
 
-class OfModel(Part):
+class ModelSection(Part):
     """The part of a record that one of steps and one of turns share."""
 
-    model: Model
+    model: RateModel
 
 
-class OfAxis(Part):
+class AxisFit(Part):
     """One of ``fit.axes``."""
 
     probability: Size
@@ -60,12 +68,12 @@ class OfAxis(Part):
     fitted_loop_uncertainty: Size | None
     repeatability: Size | None
     repeatability_by_noise: Size | None
-    order: int
     by_polynomial: Size
+    order: int
     scatter: Size
 
 
-class Swept(Part):
+class SweptRun(Part):
     """One of ``fit.sweeps``; s and Hz."""
 
     file: str
@@ -78,61 +86,65 @@ class Swept(Part):
     bandwidth_beyond: Size | None
 
 
-class OfPrior(Part):
+class PriorParameter(Part):
     """One parameter of ``fit.prior``: what the prior says of it, and the test without that."""
 
-    prior: Quantity
-    test: Quantity
+    prior: Measured
+    test: Measured
 
 
-class Prior(Part):
-    """``fit.prior``."""
+class RatePrior(Part):
+    """``fit.prior``: what each record says of the parameters of both, alone."""
 
     probability: Size | None
-    parameters: dict[str, OfPrior]
+    parameters: dict[str, PriorParameter]
 
 
-class Fit(Part):
+class RateSummary(Part):
     """``fit``."""
 
     runs: int
     dwells: int
     rates_from: str
+    chi_square: Size
+    degrees_of_freedom: float
     between_runs: Size
     table_uncertainty: Size | None
     rate_uncertainty: Quantity
+    proportional_uncertainty: Size
     mounting_uncertainty: Size | None
-    axes: dict[str, OfAxis]
-    sweeps: list[Swept]
-    prior: Prior
+    latitude: float | None
+    axes: dict[str, AxisFit]
+    sweeps: list[SweptRun] | None = None
+    prior: RatePrior | None = None
 
 
-class Seen(Part):
+class DwellResiduals(Part):
     """``data.dwells``: of each its gyroscope, rate, rad/s, and what is left of the line, a fraction of the largest."""
 
     axis: PerDwell[str]
     rate: PerDwell[float]
     residual: PerDwell[float]
     standard_uncertainty: PerDwell[float]
-    direction: PerDwell[Literal["rising", "falling", "turning"]]
+    direction: PerDwell[Direction]
 
 
-class Data(Part):
+class RateEvidence(Part):
     """``data``."""
 
-    dwells: Seen
+    dwells: DwellResiduals
 
 
-class TurnsFit(Part):
-    """``fit`` of turns."""
+class TurnsSummary(Part):
+    """``fit`` of turns; the fence in rad, the clock's relative uncertainty."""
 
     turns: int
     fence: Quantity
     clock: Size | None
-    prior: Prior
+    prior: RatePrior | None = None
 
 
-class Turned(Part):
+class WholeTurns(Part):
     """``data.turns``; angles in rad."""
 
     axis: PerTurn[str]
@@ -144,52 +156,52 @@ class Turned(Part):
     standard_uncertainty: PerTurn[float]
 
 
-class TurnsData(Part):
+class TurnsEvidence(Part):
     """``data`` of turns."""
 
-    turns: Turned
+    turns: WholeTurns
 
 
-class Turns(Part):
+class TurnsRecord(Part):
     """A record of turns."""
 
-    model: Model
-    fit: TurnsFit
-    data: TurnsData
+    model: TurnsModel
+    fit: TurnsSummary
+    data: TurnsEvidence
 
 
-class Rate(Part):
+class RateRecord(Part):
     """A rate record."""
 
-    model: Model
-    fit: Fit
-    data: Data
+    model: RateModel
+    fit: RateSummary
+    data: RateEvidence
 
 
 def check(record: Calibration) -> None:
     """Check the sections of a record as it is read from its file; raises RecordError."""
     if record.model.get("from") == "turns":
-        part(record, Turns)
+        part(record, TurnsRecord)
     else:
-        part(record, Rate)
+        part(record, RateRecord)
     axes = model_of(record).axes
     if not axes or any(axis not in AXES for axis in axes) or len(set(axes)) < len(axes):
         raise RecordError(f"model.axes: expected axes such as xyz, found {axes!r}")
 
 
-def model_of(record: Calibration) -> Model:
+def model_of(record: Calibration) -> RateModel:
     """Return the model of a record of steps or of turns; errors as for `rate_of`."""
-    return part(record, OfModel).model
+    return part(record, ModelSection).model
 
 
-def rate_of(record: Calibration) -> Rate:
+def rate_of(record: Calibration) -> RateRecord:
     """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
-    return part(record, Rate)
+    return part(record, RateRecord)
 
 
-def turns_of(record: Calibration) -> Turns:
+def turns_of(record: Calibration) -> TurnsRecord:
     """Return the sections of a record of turns; errors as for `rate_of`."""
-    return part(record, Turns)
+    return part(record, TurnsRecord)
 
 
 # The units in which people read a rate record: deg/h, ppm and mrad.
@@ -237,7 +249,7 @@ def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
     return factor, "ppm" if offset else unit
 
 
-def prior_table(prior: Prior, record: Calibration) -> ReportTable:
+def prior_table(prior: RatePrior, record: Calibration) -> ReportTable:
     """Return what the prior, the test without it, and both as one fit say of each parameter."""
     found = []
     for name, of in prior.parameters.items():

@@ -36,13 +36,14 @@ from imulab.procedures.rate.axes import (
     with_accelerometers,
     with_prior,
 )
-from imulab.procedures.rate.schema import prior_table, turns_of
+from imulab.procedures.rate.schema import TurnsEvidence, TurnsModel, TurnsSummary, WholeTurns, prior_table, turns_of
 from imulab.procedures.rate.schema import rows as engineering_rows
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.sections import Quantity, entries
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -568,24 +569,23 @@ def turns_record(
             if i != k and a.startswith("gyro_scale") and b.startswith("gyro_scale"):
                 matrix[i, k] = parameters[a].value * parameters[b].value * (clock or 0.0) ** 2
     turned = sorted((k, a, j) for a, of in found.items() for j, k in enumerate(of.motion))
+    turns = WholeTurns(
+        axis=[a for _, a, _ in turned],
+        start=[float(motions.start[k]) for k, _, _ in turned],
+        stop=[float(motions.stop[k]) for k, _, _ in turned],
+        count=[float(found[a].count[j]) for _, a, j in turned],
+        angle=[float(found[a].angle[j]) for _, a, j in turned],
+        residual=[float(found[a].residual[j]) for _, a, j in turned],
+        standard_uncertainty=[float(found[a].uncertainty[j]) for _, a, j in turned],
+    )
     return Calibration(
         procedure="rate",
         parameters=parameters,
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
-        model={"gyro_order": 1, "gyro_output_unit": unit, "axes": "".join(found), "from": "turns"},
-        fit={"turns": len(turned), "fence": {"value": fence, "unit": "rad"}, "clock": clock},
+        model=entries(TurnsModel(gyro_order=1, gyro_output_unit=unit, axes="".join(found), from_="turns")),
+        fit=entries(TurnsSummary(turns=len(turned), fence=Quantity(value=fence, unit="rad"), clock=clock)),
         options={"fence": fence},
-        data={
-            "turns": {
-                "axis": [a for _, a, _ in turned],
-                "start": [float(motions.start[k]) for k, _, _ in turned],
-                "stop": [float(motions.stop[k]) for k, _, _ in turned],
-                "count": [float(found[a].count[j]) for _, a, j in turned],
-                "angle": [float(found[a].angle[j]) for _, a, j in turned],
-                "residual": [float(found[a].residual[j]) for _, a, j in turned],
-                "standard_uncertainty": [float(found[a].uncertainty[j]) for _, a, j in turned],
-            }
-        },
+        data=entries(TurnsEvidence(turns=turns)),
         sensor={key: text for key in ("serial", "model", "element") if (text := recording.metadata.get(key))},
         sources=() if recording.source is None else (recording.source,),
         warnings=(*motions.notes, *_findings(found, clock)),
@@ -662,7 +662,7 @@ def turns_exhibits(record: Calibration) -> Exhibits:
         [
             ReportTable("Parameters", "Per clock where no uncertainty of it was stated.",
                         ["parameter", "value", "u", "unit"], rows),
-            *([prior_table(found.fit.prior, record)] if "prior" in record.fit else []),
+            *([] if found.fit.prior is None else [prior_table(found.fit.prior, record)]),
             ReportTable(
                 "Turns",
                 "Stated angle of each, and what is left of it by the scale factor of these turns.",

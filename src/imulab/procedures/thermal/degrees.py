@@ -34,6 +34,7 @@ from imulab.estimation.least_squares import Observability, chi_square_probabilit
 from imulab.procedures.thermal import APART, DEGREES, LEAST_KNOTS, STRETCHES, TURNS
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import AXES, GROUPS, Laws, cardinal_spline
+from imulab.procedures.thermal.schema import TestedEffect
 from imulab.procedures.thermal.solve import (
     Problem,
     Rows,
@@ -584,20 +585,20 @@ def findings(drift: Drift, solution: Solution, name: str) -> list[str]:
     return found
 
 
-def entries(drift: Drift, scale: float, unit: str = "m/s^2") -> dict[str, Any]:
+def drift_effects(drift: Drift, scale: float, unit: str = "m/s^2") -> dict[str, TestedEffect | None]:
     """Return ``lag``, ``loop_x`` ... of the record's fit, loops times `scale` in a unit; None where not told."""
     if drift.values is None:
         return dict.fromkeys(_NAMES)
     assert drift.covariance is not None
     size, u = np.array([1.0, scale, scale, scale]), np.sqrt(np.diag(drift.covariance))
     return {
-        name: {
-            "value": float(drift.values[k] * size[k]),
-            "standard_uncertainty": float(u[k] * size[k]),
-            "unit": unit if k else "s",
-            "probability": drift.probability[min(k, 1)],
-            "fitted": k in drift.free,
-        }
+        name: TestedEffect(
+            value=float(drift.values[k] * size[k]),
+            standard_uncertainty=float(u[k] * size[k]),
+            unit=unit if k else "s",
+            probability=drift.probability[min(k, 1)],
+            fitted=k in drift.free,
+        )
         if np.isfinite(u[k])
         else None
         for k, name in enumerate(_NAMES)

@@ -19,7 +19,7 @@ from imulab.display import Note
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.procedures.procedure import OnLine
 from imulab.procedures.thermal.model import AXES, GROUPS, MISALIGNMENTS, SENSITIVITIES, Laws
-from imulab.procedures.thermal.schema import GyroModel, Model, thermal_of
+from imulab.procedures.thermal.schema import ThermalGyroModel, ThermalModel, thermal_of
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, output_to_si
@@ -73,7 +73,7 @@ def check_scale_factors(laws: Array) -> None:
         raise RecordError("the record has a scale factor of 0 within its range of temperature")
 
 
-def _matrix(record: Calibration, gyro: GyroModel) -> Array:
+def _matrix(record: Calibration, gyro: ThermalGyroModel) -> Array:
     """Return T, the identity where turns did not tell it."""
     matrix = np.eye(3)
     if gyro.scale == "turns":
@@ -364,7 +364,7 @@ def on_line(record: Calibration) -> OnLine:
     )
 
 
-def _laws(model: Model, gyroscopes: bool) -> list[Kind]:
+def _laws(model: ThermalModel, gyroscopes: bool) -> list[Kind]:
     """Return the kinds of parameters that follow the temperature: name, axes, laws, and which of these are its own."""
     found: list[Kind] = []
     found += [(kind, axes, model.laws, group) for group, (kind, axes) in enumerate(GROUPS)]

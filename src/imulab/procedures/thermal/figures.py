@@ -11,7 +11,7 @@ import numpy as np
 from imulab.procedures.thermal.degrees import moved, spoken_degrees
 from imulab.procedures.thermal.model import AXES, GROUPS
 from imulab.procedures.thermal.record import deviation_of_force, gyro_predicted, gyro_scale_predicted, predicted
-from imulab.procedures.thermal.schema import Thermal, thermal_of
+from imulab.procedures.thermal.schema import ThermalRecord, thermal_of
 from imulab.procedures.thermal.schema import rows as engineering_rows
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -295,7 +295,7 @@ def exhibits(record: Calibration) -> Exhibits:
     return Exhibits(headline, facts, items)
 
 
-def _drift(found: Thermal) -> list[tuple[str, str]]:
+def _drift(found: ThermalRecord) -> list[tuple[str, str]]:
     """Return lag and loops as facts, where the recordings tell them."""
     fit, facts = found.fit, []
     for label, tested, factor, unit in (
@@ -313,7 +313,7 @@ def _drift(found: Thermal) -> list[tuple[str, str]]:
     return facts
 
 
-def _left(found: Thermal) -> str:
+def _left(found: ThermalRecord) -> str:
     rows = found.fit.left_out_temperature
     return f"{plain_number(max(row.rms for row in rows) * _MICRO_G, 2)} µg rms at worst" if rows else "–"
 
@@ -362,7 +362,7 @@ def _over_temperature(group: int, record: Calibration, temperature: Array) -> Fi
     return law_figure(title, name, unit, curves, alone, read=read, at_middle=at_middle)
 
 
-def _of_force(record: Calibration, found: Thermal, temperature: Any) -> Figure:
+def _of_force(record: Calibration, found: ThermalRecord, temperature: Any) -> Figure:
     laws, between = deviation_of_force(record, temperature), found.fit.between_recordings
     cycle = np.hypot(between.bias.value, found.model.gravity.value * between.scale_factor.value / np.sqrt(3))
     known = between.from_ != "unknown"
@@ -392,7 +392,7 @@ def _of_force(record: Calibration, found: Thermal, temperature: Any) -> Figure:
     )
 
 
-def _residuals(found: Thermal) -> Figure:
+def _residuals(found: ThermalRecord) -> Figure:
     held = found.data.holds
     temperature, residual, u = (np.array(each) for each in (held.temperature, held.residual, held.standard_uncertainty))
     rate = moved(np.array(held.recording), temperature, np.array(held.rate))
@@ -444,7 +444,7 @@ def _means(temperature: Array, values: Array, edges: Array, label: str, marker: 
     return scatter(rounded(at), rounded(mean, 4), "markers", name=name, marker=marker, error_y=bars)
 
 
-def _predicted(found: Thermal) -> ReportTable:
+def _predicted(found: ThermalRecord) -> ReportTable:
     rows = [
         [f"{row.temperature:.1f}", str(row.holds), plain_number(row.rms * _MICRO_G, 3), f"{row.chi_square:.2f}"]
         for row in found.fit.left_out_temperature
@@ -458,7 +458,7 @@ def _predicted(found: Thermal) -> ReportTable:
     )
 
 
-def _compared(found: Thermal) -> ReportTable:
+def _compared(found: ThermalRecord) -> ReportTable:
     rows, chosen = [], None
     for number, row in enumerate(found.fit.degrees):
         chosen = number if row.chosen else chosen

@@ -17,7 +17,7 @@ from imulab.procedures.thermal.degrees import (
     bias_shift_from_unobserved,
     clusters_of,
     disagreements,
-    entries,
+    drift_effects,
     findings,
     spoken_degrees,
 )
@@ -31,10 +31,28 @@ from imulab.procedures.thermal.gyro import (
 )
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import AXES, GROUPS, MISALIGNMENTS, SENSITIVITIES, SHARES, Laws, law_names
-from imulab.procedures.thermal.schema import thermal_of
+from imulab.procedures.thermal.schema import (
+    DegreesTried,
+    GyroDegrees,
+    GyroHoldResiduals,
+    GyroTurnOn,
+    GyroTurns,
+    HoldResiduals,
+    LawDegrees,
+    LeftOutTemperature,
+    OwnCalibrations,
+    ThermalEvidence,
+    ThermalGyroModel,
+    ThermalGyroSummary,
+    ThermalModel,
+    ThermalSummary,
+    TurnOn,
+    thermal_of,
+)
 from imulab.procedures.thermal.solve import Own, Problem, Scatter, Solution, own_calibrations, together
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.sections import Length, Quantity, StatedGravity, entries
 from imulab.units import from_si, parse_unit
 
 # The calibration record of a thermal test: coefficients in SI, and what its figures need.
@@ -79,20 +97,26 @@ def make_record(
         procedure="thermal",
         parameters=parameters,
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
-        model={
-            "order": 1,
-            "degrees": {kind: degree for (kind, _), degree in zip(GROUPS, laws.degrees, strict=True)},
-            **({"knots": list(laws.knots)} if laws.knots else {}),
-            "range": [laws.low, laws.high],
-            "reference_temperature": {"value": laws.middle, "unit": "degC"},
-            "gravity": gravity.entry(),
-            "output_unit": holds.unit,
-            "gauge": _GAUGE,
-        },
-        fit=_fit(holds, residual, found, options, g) | entries(drift, g),
+        model=entries(
+            ThermalModel(
+                order=1,
+                degrees=LawDegrees(bias=laws.degrees[0], scale_factor=laws.degrees[1], misalignment=laws.degrees[2]),
+                knots=list(laws.knots) or None,
+                range=[laws.low, laws.high],
+                reference_temperature=Quantity(value=laws.middle, unit="degC"),
+                gravity=StatedGravity.of(gravity),
+                output_unit=holds.unit,
+                gauge=_GAUGE,
+            )
+        ),
+        fit=entries(_summary(holds, residual, found, drift, options, g)),
         options=dict(options),
-        data=_data(holds, g * residual, g * uncertainty)
-        | _alone(own_calibrations(problem, solution), holds, np.append(np.full(3, g), scale / g)),
+        data=entries(
+            ThermalEvidence(
+                holds=_hold_residuals(holds, g * residual, g * uncertainty),
+                calibrations=_alone(own_calibrations(problem, solution), holds, np.append(np.full(3, g), scale / g)),
+            )
+        ),
         sensor=sensor,
         sources=sources,
         warnings=tuple(_findings(holds, problem, found, drift, gravity, options, name)),
@@ -108,66 +132,71 @@ def at_reference(laws: Laws, values: Array, covariance: Array, kind: str, unit: 
     return found
 
 
-def _fit(holds: Holds, residual: Array, found: Found, options: Mapping[str, Any], g: float) -> dict[str, Any]:
-    solution = found.solution
-    return {
-        "recordings": len(holds.recordings),
-        "holds": len(holds),
-        "temperatures": int(clusters_of(holds.temperature).max(initial=0)) + 1,
-        "rms": {"value": g * float(np.sqrt(np.mean(residual**2))), "unit": "m/s^2"},
-        "excess": {"value": g * solution.excess, "unit": "m/s^2"},
-        "chi_square": solution.chi_square,
-        "degrees_of_freedom": solution.freedom,
-        "condition_number": found.view.condition,
-        "between_recordings": _turn_on(solution, options, g),
-        "left_out_temperature": [
-            {"temperature": e.temperature, "holds": e.holds, "rms": g * e.rms, "chi_square": e.chi_square}
-            for e in found.left_out
+def _summary(
+    holds: Holds, residual: Array, found: Found, drift: Drift, options: Mapping[str, Any], g: float
+) -> ThermalSummary:
+    """Return how the laws were chosen, and how well they fit."""
+    solution, effects = found.solution, drift_effects(drift, g)
+    return ThermalSummary(
+        recordings=len(holds.recordings),
+        holds=len(holds),
+        temperatures=int(clusters_of(holds.temperature).max(initial=0)) + 1,
+        rms=Length(value=g * float(np.sqrt(np.mean(residual**2))), unit="m/s^2"),
+        excess=Length(value=g * solution.excess, unit="m/s^2"),
+        chi_square=solution.chi_square,
+        degrees_of_freedom=solution.freedom,
+        condition_number=found.view.condition,
+        between_recordings=_turn_on(solution, options, g),
+        left_out_temperature=[
+            LeftOutTemperature(
+                temperature=each.temperature, holds=each.holds, rms=g * each.rms, chi_square=each.chi_square
+            )
+            for each in found.left_out
         ],
-        "degrees": [
-            {
-                "degrees": list(step.degrees),
-                "left_out": None if step.left_out is None else g * step.left_out,
-                "probability": step.probability,
-                "chosen": step.chosen,
-                "knots": step.knots,
-            }
+        degrees=[
+            DegreesTried(
+                degrees=list(step.degrees),
+                left_out=None if step.left_out is None else g * step.left_out,
+                probability=step.probability,
+                chosen=step.chosen,
+                knots=step.knots,
+            )
             for step in found.steps
         ],
-    }
+        lag=effects["lag"],
+        loop_x=effects["loop_x"],
+        loop_y=effects["loop_y"],
+        loop_z=effects["loop_z"],
+    )
 
 
-def _data(holds: Holds, residual: Array, uncertainty: Array) -> dict[str, Any]:
+def _hold_residuals(holds: Holds, residual: Array, uncertainty: Array) -> HoldResiduals:
     """Return each hold as the figures draw it; residual and uncertainty of |f| - g in m/s^2."""
-    return {
-        "holds": {
-            "recording": [holds.recordings[k].name for k in holds.recording.tolist()],
-            "start": holds.start.tolist(),
-            "stop": holds.stop.tolist(),
-            "temperature": holds.temperature.tolist(),
-            "rate": holds.rate.tolist(),
-            "group": [None if k < 0 else k for k in holds.group.tolist()],
-            "mean": holds.mean.tolist(),
-            "residual": residual.tolist(),
-            "standard_uncertainty": uncertainty.tolist(),
-        }
-    }
+    return HoldResiduals(
+        recording=[holds.recordings[k].name for k in holds.recording.tolist()],
+        start=holds.start.tolist(),
+        stop=holds.stop.tolist(),
+        temperature=holds.temperature.tolist(),
+        rate=holds.rate.tolist(),
+        group=[None if k < 0 else k for k in holds.group.tolist()],
+        mean=holds.mean.tolist(),
+        residual=residual.tolist(),
+        standard_uncertainty=uncertainty.tolist(),
+    )
 
 
-def _alone(calibrations: list[Own], holds: Holds, factor: Array) -> dict[str, Any]:
+def _alone(calibrations: list[Own], holds: Holds, factor: Array) -> OwnCalibrations | None:
     """Return what each recording gives alone; `factor` makes biases and scale factors SI, shape (6,)."""
     if not calibrations:
-        return {}
+        return None
     each = np.append(factor, np.ones(3))
     names = ["prior" if own.recording < 0 else holds.recordings[own.recording].name for own in calibrations]
-    return {
-        "calibrations": {
-            "recording": names,
-            "temperature": [own.temperature for own in calibrations],
-            "values": [(each * own.values).tolist() for own in calibrations],
-            "standard_uncertainty": [(each * own.standard_uncertainty).tolist() for own in calibrations],
-        }
-    }
+    return OwnCalibrations(
+        recording=names,
+        temperature=[own.temperature for own in calibrations],
+        values=[(each * own.values).tolist() for own in calibrations],
+        standard_uncertainty=[(each * own.standard_uncertainty).tolist() for own in calibrations],
+    )
 
 
 def interval_of(value: float, uncertainty: float, freedom: float) -> tuple[float, float] | None:
@@ -229,16 +258,16 @@ def _residuals(problem: Problem, solution: Solution) -> tuple[Array, Array]:
     return rows.residual[used][order], np.sqrt(np.diag(rows.noise)[used][order])
 
 
-def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> dict[str, Any]:
+def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> TurnOn:
+    """Return what biases and scale factors move by between power cycles, and how that is known."""
     scatter = solution.scatter
-    known = "turn_on_scatter" in options
-    return {
-        "bias": {"value": g * float(scatter.tau[0]), "unit": "m/s^2"},
-        "scale_factor": {"value": float(scatter.tau[1]), "unit": "1"},
-        "rank": scatter.rank,
-        "resolution": {"value": g * scatter.resolution, "unit": "m/s^2"},
-        "from": "argument" if known else told_by(scatter),
-    }
+    return TurnOn(
+        bias=Length(value=g * float(scatter.tau[0]), unit="m/s^2"),
+        scale_factor=Length(value=float(scatter.tau[1]), unit="1"),
+        rank=scatter.rank,
+        resolution=Length(value=g * scatter.resolution, unit="m/s^2"),
+        from_="argument" if "turn_on_scatter" in options else told_by(scatter),
+    )
 
 
 def told_by(scatter: Scatter) -> str:
@@ -360,23 +389,25 @@ def with_gyroscopes(
     if laws.knots:
         parameters = at_reference(laws, values, covariance, "gyro_bias", "rad/s") | parameters
     joined = block_diagonal(record.covariance.array(), covariance)
-    fit = _gyro_fit(gyros, known="gyro_turn_on_scatter" in record.options)
+    summary = _gyro_summary(gyros, turned, known="gyro_turn_on_scatter" in record.options)
     return replace(
         record,
         parameters={**record.parameters, **parameters},
         covariance=Covariance((*record.covariance.names, *names), tuple(map(tuple, joined.tolist()))),
         model={
             **record.model,
-            "gyro": {
-                "output_unit": gyros.held.unit,
-                "degrees": {"bias": laws.degrees[0], "scale_factor": 0 if turned is None else turned.degree},
-                **({"knots": list(laws.knots)} if laws.knots else {}),
-                "g_sensitivity": gyros.sensitivity,
-                "scale": "nominal" if turned is None else "turns",
-            },
+            "gyro": entries(
+                ThermalGyroModel(
+                    output_unit=gyros.held.unit,
+                    degrees=GyroDegrees(bias=laws.degrees[0], scale_factor=0 if turned is None else turned.degree),
+                    knots=list(laws.knots) or None,
+                    g_sensitivity=gyros.sensitivity,
+                    scale="nominal" if turned is None else "turns",
+                )
+            ),
         },
-        fit={**record.fit, "gyro": fit if turned is None else {**fit, "turns": _turns(turned)}},
-        data={**record.data, "gyro": _gyro_data(holds, gyros)},
+        fit={**record.fit, "gyro": entries(summary)},
+        data={**record.data, "gyro": entries(_gyro_hold_residuals(holds, gyros))},
         warnings=(*record.warnings, *_gyro_findings(record, holds, gyros, turned, name)),
         verdict=UNJUDGED,
     )
@@ -406,14 +437,15 @@ def scale_to_si(turned: ScaleLaws, size: Array, output: str) -> tuple[Array, lis
     return matrix, names + list(MISALIGNMENTS), units + ["rad"] * len(MISALIGNMENTS)
 
 
-def _turns(turned: ScaleLaws) -> dict[str, Any]:
-    return {
-        "recordings": turned.recordings,
-        "turns": turned.turns,
-        "rms": {"value": turned.miss, "unit": "rad"},
-        "chi_square": turned.chi_square,
-        "degrees_of_freedom": turned.freedom,
-    }
+def _turns(turned: ScaleLaws) -> GyroTurns:
+    """Return what the turns of the recordings were, and how well they agree."""
+    return GyroTurns(
+        recordings=turned.recordings,
+        turns=turned.turns,
+        rms=Length(value=turned.miss, unit="rad"),
+        chi_square=turned.chi_square,
+        degrees_of_freedom=turned.freedom,
+    )
 
 
 def names_and_units(laws: Laws, *, sensitivity: bool) -> tuple[list[str], list[str]]:
@@ -426,38 +458,44 @@ def names_and_units(laws: Laws, *, sensitivity: bool) -> tuple[list[str], list[s
     return names, units
 
 
-def _gyro_fit(gyros: Gyroscopes, *, known: bool) -> dict[str, Any]:
-    solution = gyros.solution
-    return {
-        "holds": len(gyros.held),
-        "rms": {"value": float(np.sqrt(np.mean(solution.rows.residual**2))), "unit": "rad/s"},
-        "excess": {"value": solution.excess, "unit": "rad/s"},
-        "chi_square": solution.chi_square,
-        "degrees_of_freedom": solution.freedom,
-        "between_recordings": {
-            "bias": {"value": float(solution.scatter.tau[0]), "unit": "rad/s"},
-            "rank": solution.scatter.rank,
-            "resolution": {"value": solution.scatter.resolution, "unit": "rad/s"},
-            "from": "argument" if known else told_by(solution.scatter),
-        },
-        "g_sensitivity_probability": gyros.probability,
-        "latitude": None if gyros.held.earth is None else gyros.held.earth.latitude,
-        **entries(gyros.drift, 1.0, "rad/s"),
-        "left_out_temperature": [
-            {"temperature": e.temperature, "holds": e.holds, "rms": e.rms, "chi_square": e.chi_square}
-            for e in gyros.left_out
+def _gyro_summary(gyros: Gyroscopes, turned: ScaleLaws | None, *, known: bool) -> ThermalGyroSummary:
+    """Return how the gyroscopes' laws were fitted, and how well; `known` says that their turn-on scatter was stated."""
+    solution, effects = gyros.solution, drift_effects(gyros.drift, 1.0, "rad/s")
+    return ThermalGyroSummary(
+        holds=len(gyros.held),
+        rms=Length(value=float(np.sqrt(np.mean(solution.rows.residual**2))), unit="rad/s"),
+        excess=Length(value=solution.excess, unit="rad/s"),
+        chi_square=solution.chi_square,
+        degrees_of_freedom=solution.freedom,
+        between_recordings=GyroTurnOn(
+            bias=Length(value=float(solution.scatter.tau[0]), unit="rad/s"),
+            rank=solution.scatter.rank,
+            resolution=Length(value=solution.scatter.resolution, unit="rad/s"),
+            from_="argument" if known else told_by(solution.scatter),
+        ),
+        g_sensitivity_probability=gyros.probability,
+        latitude=None if gyros.held.earth is None else gyros.held.earth.latitude,
+        lag=effects["lag"],
+        loop_x=effects["loop_x"],
+        loop_y=effects["loop_y"],
+        loop_z=effects["loop_z"],
+        left_out_temperature=[
+            LeftOutTemperature(temperature=each.temperature, holds=each.holds, rms=each.rms, chi_square=each.chi_square)
+            for each in gyros.left_out
         ],
-    }
+        turns=None if turned is None else _turns(turned),
+    )
 
 
-def _gyro_data(holds: Holds, gyros: Gyroscopes) -> dict[str, Any]:
+def _gyro_hold_residuals(holds: Holds, gyros: Gyroscopes) -> GyroHoldResiduals:
+    """Return each hold as the figures draw it; residuals in rad/s."""
     held = gyros.held
-    return {
-        "recording": [holds.recordings[k].name for k in held.recording.tolist()],
-        "temperature": held.temperature.tolist(),
-        "rate": held.rate.tolist(),
-        "residual": gyros.solution.rows.residual.reshape(-1, 3).tolist(),
-    }
+    return GyroHoldResiduals(
+        recording=[holds.recordings[k].name for k in held.recording.tolist()],
+        temperature=held.temperature.tolist(),
+        rate=held.rate.tolist(),
+        residual=gyros.solution.rows.residual.reshape(-1, 3).tolist(),
+    )
 
 
 def _gyro_findings(

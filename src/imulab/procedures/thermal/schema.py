@@ -9,10 +9,10 @@ from imulab.procedures.procedure import Row
 from imulab.procedures.thermal.model import Laws
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change
-from imulab.records.sections import Length, Part, Positive, Quantity, Size, part
+from imulab.records.sections import Length, Measured, Part, Quantity, Size, StatedGravity, null, part
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
-# What code reads of a thermal record, with types.
+# What a thermal record holds, with types: filled by those who write it, checked as it is read.
 
 
 T = TypeVar("T")
@@ -23,14 +23,7 @@ Three = Annotated[list[T], 3]
 Nine = Annotated[list[T], 9]
 
 
-class Gravity(Part):
-    """``model.gravity``."""
-
-    value: Positive
-    unit: str
-
-
-class Kinds(Part):
+class LawDegrees(Part):
     """``model.degrees``: of the laws of each kind of parameter."""
 
     bias: int
@@ -50,7 +43,7 @@ class GyroDegrees(Part):
     scale_factor: int
 
 
-class GyroModel(Part):
+class ThermalGyroModel(Part):
     """``model.gyro``: the unit of the gyroscopes' outputs, the degrees of their laws, and what else was fitted.
 
     The knots of their biases are in degC, None where these are polynomials.
@@ -58,22 +51,23 @@ class GyroModel(Part):
 
     output_unit: str
     degrees: GyroDegrees
+    knots: list[float] | None = None
     g_sensitivity: bool
     scale: Literal["nominal", "turns"]
-    knots: list[float] | None = None
 
 
-class Model(Part):
+class ThermalModel(Part):
     """``model``; the range of temperature and the knots of the bias in degC, None where it is a polynomial."""
 
     order: int
-    degrees: Kinds
+    degrees: LawDegrees
+    knots: list[float] | None = None
     range: Annotated[list[float], 2]
     reference_temperature: Quantity
-    gravity: Gravity
+    gravity: StatedGravity
     output_unit: str
-    knots: list[float] | None = None
-    gyro: GyroModel | None = None
+    gauge: str
+    gyro: ThermalGyroModel | None = None
 
     @property
     def laws(self) -> Laws:
@@ -88,7 +82,7 @@ class Model(Part):
         return Laws(self.range[0], self.range[1], degrees, tuple(self.gyro.knots or ()))
 
 
-class LeftOut(Part):
+class LeftOutTemperature(Part):
     """One row of ``fit.left_out_temperature``: degC, and rms in m/s^2."""
 
     temperature: float
@@ -97,7 +91,7 @@ class LeftOut(Part):
     chi_square: Size
 
 
-class Degrees(Part):
+class DegreesTried(Part):
     """One row of ``fit.degrees``."""
 
     degrees: Three[int]
@@ -118,11 +112,11 @@ class TurnOn(Part):
     bias: Length
     scale_factor: Length
     rank: int
+    resolution: Length | None = null()
     from_: str
-    resolution: Length | None = None
 
 
-class Tested(Quantity):
+class TestedEffect(Measured):
     """``fit.lag`` in s, ``fit.loop_x`` ...: a value, its probability if there were none, whether the laws hold it."""
 
     probability: float
@@ -134,8 +128,8 @@ class GyroTurnOn(Part):
 
     bias: Length
     rank: int
+    resolution: Length | None = null()
     from_: str
-    resolution: Length | None = None
 
 
 class GyroTurns(Part):
@@ -148,24 +142,26 @@ class GyroTurns(Part):
     degrees_of_freedom: int
 
 
-class GyroFit(Part):
+class ThermalGyroSummary(Part):
     """``fit.gyro``; rms in rad/s, as those of temperatures left out."""
 
     holds: int
     rms: Length
     excess: Length
+    chi_square: Size
+    degrees_of_freedom: float
     between_recordings: GyroTurnOn
-    left_out_temperature: list[LeftOut]
-    g_sensitivity_probability: float | None = None
-    latitude: float | None = None
+    g_sensitivity_probability: float | None = null()
+    latitude: float | None = null()
+    lag: TestedEffect | None = null()
+    loop_x: TestedEffect | None = null()
+    loop_y: TestedEffect | None = null()
+    loop_z: TestedEffect | None = null()
+    left_out_temperature: list[LeftOutTemperature]
     turns: GyroTurns | None = None
-    lag: Tested | None = None
-    loop_x: Tested | None = None
-    loop_y: Tested | None = None
-    loop_z: Tested | None = None
 
 
-class Fit(Part):
+class ThermalSummary(Part):
     """``fit``."""
 
     recordings: int
@@ -173,27 +169,37 @@ class Fit(Part):
     temperatures: int
     rms: Length
     excess: Length
+    chi_square: Size
+    degrees_of_freedom: float
+    condition_number: float
     between_recordings: TurnOn
-    left_out_temperature: list[LeftOut]
-    degrees: list[Degrees]
-    lag: Tested | None = None
-    loop_x: Tested | None = None
-    loop_y: Tested | None = None
-    loop_z: Tested | None = None
-    gyro: GyroFit | None = None
+    left_out_temperature: list[LeftOutTemperature]
+    degrees: list[DegreesTried]
+    lag: TestedEffect | None = null()
+    loop_x: TestedEffect | None = null()
+    loop_y: TestedEffect | None = null()
+    loop_z: TestedEffect | None = null()
+    gyro: ThermalGyroSummary | None = None
 
 
-class Held(Part):
-    """``data.holds``: of each its recording, temperature, degC, its change, K/s, and what is left of |f| - g."""
+class HoldResiduals(Part):
+    """``data.holds``: of each its recording, edges, s, temperature, degC, its change, K/s, and what is left of |f| - g.
+
+    `group` numbers the rests between which the unit was not turned, None where each hold stands alone.
+    """
 
     recording: PerHold[str]
+    start: PerHold[float | None]
+    stop: PerHold[float | None]
     temperature: PerHold[float]
     rate: PerHold[float]
+    group: PerHold[int | None]
+    mean: PerHold[Three[float]]
     residual: PerHold[float]
     standard_uncertainty: PerHold[float]
 
 
-class GyroHeld(Part):
+class GyroHoldResiduals(Part):
     """``data.gyro``: of each hold its temperature, degC, its change, K/s, and what is left of the rates, rad/s."""
 
     recording: PerGyroHold[str]
@@ -202,7 +208,7 @@ class GyroHeld(Part):
     residual: PerGyroHold[Three[float]]
 
 
-class Own(Part):
+class OwnCalibrations(Part):
     """``data.calibrations``: the nine parameters that each steady recording gives alone, SI, at its temperature, degC.
 
     In the order of bias, scale factor and misalignment, as in the record's parameters.
@@ -214,25 +220,25 @@ class Own(Part):
     standard_uncertainty: PerCalibration[Nine[float]]
 
 
-class Data(Part):
+class ThermalEvidence(Part):
     """``data``."""
 
-    holds: Held
-    calibrations: Own | None = None
-    gyro: GyroHeld | None = None
+    holds: HoldResiduals
+    calibrations: OwnCalibrations | None = None
+    gyro: GyroHoldResiduals | None = None
 
 
-class Thermal(Part):
+class ThermalRecord(Part):
     """A thermal record."""
 
-    model: Model
-    fit: Fit
-    data: Data
+    model: ThermalModel
+    fit: ThermalSummary
+    data: ThermalEvidence
 
 
 def check(record: Calibration) -> None:
     """Check the sections of a record as it is read from its file; raises RecordError."""
-    found = part(record, Thermal)
+    found = part(record, ThermalRecord)
     low, high = found.model.range
     if not low < high:
         raise RecordError(f"model.range: expected two temperatures in rising order, found {low:g} and {high:g}")
@@ -241,7 +247,7 @@ def check(record: Calibration) -> None:
         _check_knots(found.model, found.model.gyro, "model.gyro")
 
 
-def _check_knots(model: Model, own: Model | GyroModel, where: str) -> None:
+def _check_knots(model: ThermalModel, own: ThermalModel | ThermalGyroModel, where: str) -> None:
     """Check the knots of the biases of a triad, if they have any."""
     (low, high), knots = model.range, own.knots
     if knots is None:
@@ -255,9 +261,9 @@ def _check_knots(model: Model, own: Model | GyroModel, where: str) -> None:
         raise RecordError(f"{where}.degrees.bias: expected 3 of a spline, found {own.degrees.bias}")
 
 
-def thermal_of(record: Calibration) -> Thermal:
+def thermal_of(record: Calibration) -> ThermalRecord:
     """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
-    return part(record, Thermal)
+    return part(record, ThermalRecord)
 
 
 # The units in which people read a thermal record: mg, ppm, mrad, and what each changes by in a kelvin.

@@ -31,7 +31,7 @@ from imulab.errors import DataError, RecordError, UnitError
 from imulab.estimation.least_squares import covariance, least_squares, leverage, observability, plausible_excess
 from imulab.procedures.tumble import HIGHEST_ORDER
 from imulab.procedures.tumble.model import AXES, gravity_slope, norm_and_jacobian, parameter_names
-from imulab.procedures.tumble.schema import data_of, fit_of, model_of
+from imulab.procedures.tumble.schema import data_of, fit_of, gyro_model_of, mag_model_of, model_of
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.triads import (
@@ -103,13 +103,13 @@ def _gyro(record: Calibration) -> tuple[DeviceTable, ...]:
     if "gyro_g_sensitivity_xx" in record.parameters:
         g = np.array([[record.value(f"gyro_g_sensitivity_{i}{j}") for j in _AXES] for i in _AXES])
     bias = np.array([record.value(f"gyro_bias_{axis}") for axis in _AXES])
-    columns = {"output_unit": model_of(record).gyro_output_unit}
+    columns = {"output_unit": gyro_model_of(record).gyro_output_unit}
     return (gyro_table(scale, bias, misalignment, gyro_powers(record), columns, sensitivity=g),)
 
 
 def _mag(record: Calibration) -> tuple[DeviceTable, ...]:
     """Magnetometers: ``m = T^-1 s`` with s of each output, whose signs and places are in ``T^-1 P``."""
-    model = model_of(record)
+    model = mag_model_of(record)
     if model.mag_order not in (1, 2):
         raise RecordError(f"the record has mag_order {model.mag_order!r}, expected 1 or 2")
     axes = mag_axes(model.mag_axes)
@@ -451,7 +451,7 @@ def _accelerometers(record: Calibration) -> Accelerometers:
 def _gyroscopes(record: Calibration) -> Gyroscopes | None:
     if "gyro_output_unit" not in record.model:
         return None
-    factor, kept = output_to_si(model_of(record).gyro_output_unit, "rad/s")
+    factor, kept = output_to_si(gyro_model_of(record).gyro_output_unit, "rad/s")
     matrix, sensitivity = np.eye(3), np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -473,7 +473,7 @@ def _gyroscopes(record: Calibration) -> Gyroscopes | None:
 def _magnetometers(record: Calibration) -> Magnetometers | None:
     if "mag_output_unit" not in record.model:
         return None
-    model = model_of(record)
+    model = mag_model_of(record)
     matrix = np.eye(3)
     for i, j in ((i, j) for i in range(3) for j in range(3) if i != j):
         matrix[i, j] = record.value(f"mag_misalignment_{_AXES[i]}{_AXES[j]}")

@@ -233,7 +233,7 @@ def estimate_triad(
     every = _problem(attitudes, scaling, robust=loss == "huber")
     known = None
     if prior is not None:
-        from imulab.procedures.tumble.prior import entries, findings, known_of, put_together
+        from imulab.procedures.tumble.prior import findings, known_of, prior_shares, put_together
 
         known = known_of(prior, scaling, gravity, attitudes.unit)
     aside, fitted = NONE_ASIDE, dict[int, Solution]()
@@ -265,7 +265,7 @@ def estimate_triad(
     return replace(
         estimate,
         with_gravity=aged.with_gravity,
-        prior=entries(prior, known, aged, scaling, gravity),
+        prior=prior_shares(prior, known, aged, scaling, gravity),
         notes=findings(prior, aged, attitudes.recording, len(kept)),
     )
 

@@ -10,16 +10,17 @@ from imulab.estimation.rows import median, quantile, rms
 from imulab.procedures.tumble.model import AXES
 from imulab.procedures.tumble.record import engineering_rows, micro_g, propagated_rows, small_g
 from imulab.procedures.tumble.schema import (
+    DeviationTrace,
     HeldAttitudes,
-    Prior,
-    Trace,
+    PriorShares,
     Trials,
     TurnAside,
-    Turns,
+    TurnResiduals,
     attitudes_of,
     data_of,
     fit_of,
     gyro_of,
+    mag_model_of,
     model_of,
 )
 from imulab.recording import Array
@@ -215,7 +216,7 @@ def parameters_table(record: Calibration) -> ReportTable:
     if fit.mag is not None:
         turned += (
             f" Magnetometers: the law of the accelerometers with the field m for f, T with six misalignments, outputs "
-            f"renamed {model.mag_axes}; Student's t."
+            f"renamed {mag_model_of(record).mag_axes}; Student's t."
         )
     return ReportTable(
         title="Parameters",
@@ -261,7 +262,7 @@ def _agreement(rows: list[list[str]]) -> str:
     )
 
 
-def shares_table(prior: Prior) -> ReportTable:
+def shares_table(prior: PriorShares) -> ReportTable:
     """Return what each parameter owes to the prior."""
     rows = [[name, f"{100 * share:.0f} %", f"{100 * (1 - share):.0f} %"] for name, share in prior.shares.items()]
     return ReportTable(
@@ -450,7 +451,7 @@ def _calibrated_points(data: HeldAttitudes, after: list[float], bars: list[float
     return trace
 
 
-def _trace(trace: Trace, data: HeldAttitudes) -> Figure:
+def _trace(trace: DeviationTrace, data: HeldAttitudes) -> Figure:
     deviation = [max(float(from_si(value, "mg")), 1e-6) for value in trace.deviation]
     stretches = data.stretches
     rest = sum(stop - start for start, stop in stretches)
@@ -501,7 +502,7 @@ def _trace(trace: Trace, data: HeldAttitudes) -> Figure:
     )
 
 
-def _turns(data: Turns, aside: list[TurnAside]) -> Figure:
+def _turns(data: TurnResiduals, aside: list[TurnAside]) -> Figure:
     turns = [(a, b, miss, GOOD) for a, b, miss in zip(data.start, data.stop, data.residual, strict=True)]
     turns += [(turn.start, turn.stop, turn.miss.value, BAD) for turn in aside]
     turns.sort(key=lambda turn: turn[0])

@@ -23,9 +23,8 @@ from imulab.procedures.tumble.estimate import (
     with_assumed_alignment,
 )
 from imulab.procedures.tumble.model import parameter_count
-from imulab.procedures.tumble.orders import OrderRow
 from imulab.procedures.tumble.record import Estimate, make_record
-from imulab.procedures.tumble.schema import model_of
+from imulab.procedures.tumble.schema import OrderRow, model_of
 from imulab.procedures.tumble.solve import SOURCE_THRESHOLD, Threshold
 from imulab.quantities import in_si, whole
 from imulab.reading import Reading

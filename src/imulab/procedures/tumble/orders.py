@@ -55,6 +55,7 @@ from imulab.estimation.least_squares import (
 from imulab.procedures.tumble import HIGHEST_ORDER
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.model import AXES, MISALIGNMENTS, fit_lengths, norm_and_jacobian, parameter_count
+from imulab.procedures.tumble.schema import OrderRow
 from imulab.procedures.tumble.solve import (
     Problem,
     Solution,
@@ -81,31 +82,6 @@ _ROUNDING = 1e-30
 """Smallest variance of |f| that is told from rounding, g^2."""
 _NOTHING_KNOWN = 1e12
 """Inverse variance where no residual tells the noise: only the geometry is judged then."""
-
-
-@dataclass(frozen=True)
-class OrderRow:
-    """One row of the table of orders; rms and leave-one-out error in m/s^2, as Huber's loss feels the residuals.
-
-    `largest_uncertainty` is the predicted standard uncertainty of |f| where on the sphere it is largest, m/s^2.
-    """
-
-    order: int
-    parameters: int
-    degrees_of_freedom: int
-    rms: float
-    leave_one_out: float | None
-    f_probability: float | None
-    bic: float | None
-    condition_number: float
-    rank: int
-    observable: bool
-    largest_uncertainty: float | None
-
-    @property
-    def scatter(self) -> float:
-        """Standard deviation of the residuals, m/s^2."""
-        return self.rms * float(np.sqrt((self.degrees_of_freedom + self.parameters) / max(self.degrees_of_freedom, 1)))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 
@@ -22,10 +21,11 @@ from imulab.gravity import Gravity
 from imulab.procedures.tumble.checks import check_prior
 from imulab.procedures.tumble.model import GROUPS, length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.record import Scaling, scaled_parameters, si_derivative
-from imulab.procedures.tumble.schema import fit_of, model_of
+from imulab.procedures.tumble.schema import PriorShares, fit_of, model_of
 from imulab.procedures.tumble.solve import Prior, Problem, Solution
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
+from imulab.records.sections import Quantity
 
 _SCALE = 2.0
 _STEPS = np.geomspace(0.05, 50.0, 12)
@@ -100,7 +100,7 @@ def known_of(record: Calibration, scaling: Scaling, gravity: Gravity, unit: str)
         raise RecordError(f"the prior has outputs in {model.output_unit}, the recording in {unit}")
     names = parameter_names(model.order)
     covariance = record.covariance.block(names)
-    common = fit_of(record).shared.get(gravity.name)
+    common = (fit_of(record).shared or {}).get(gravity.name)
     if common is not None:
         slope = np.array([common[name] for name in names])
         covariance = covariance - np.outer(slope, slope)
@@ -270,7 +270,7 @@ def _mixture(jacobian: Array, seen: Array, noise: Array, known: Array, ageing: t
     )
 
 
-def entries(record: Calibration, known: Known, aged: Aged, scaling: Scaling, gravity: Gravity) -> dict[str, Any]:
+def prior_shares(record: Calibration, known: Known, aged: Aged, scaling: Scaling, gravity: Gravity) -> PriorShares:
     """Return what a record says of its prior: what it aged, the test, and each parameter's share of the knowledge.
 
     The share is the variance now over that of the prior with what it aged, 1 where the data added nothing.
@@ -284,20 +284,20 @@ def entries(record: Calibration, known: Known, aged: Aged, scaling: Scaling, gra
         )
     )
     names = parameter_names(aged.problem.order)
-    common = fit_of(record).shared.get(gravity.name, {}) if known.shared else {}
+    common = (fit_of(record).shared or {}).get(gravity.name, {}) if known.shared else {}
     shared = np.array([common.get(name, 0.0) ** 2 for name in names])
     shares = np.minimum((np.diag(now) + shared) / (np.diag(before) + shared), 1.0)
     units = ((g, "m/s^2"), (1.0, "1"), (1.0, "rad"))
-    return {
-        "content_sha256": record.to_dict()["content_sha256"],
-        "created": record.created,
-        "probability": aged.probability,
-        "ageing": {
-            name: {"value": factor * tau, "unit": unit}
+    return PriorShares(
+        content_sha256=record.to_dict()["content_sha256"],
+        created=record.created,
+        probability=aged.probability,
+        ageing={
+            name: Quantity(value=factor * tau, unit=unit)
             for name, tau, (factor, unit) in zip(GROUPS, aged.ageing, units, strict=False)
         },
-        "shares": dict(zip(names, shares.tolist(), strict=True)),
-    }
+        shares=dict(zip(names, shares.tolist(), strict=True)),
+    )
 
 
 def findings(record: Calibration, aged: Aged, recording: Recording, count: int) -> list[str]:

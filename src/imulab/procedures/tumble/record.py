@@ -30,20 +30,27 @@ from imulab.procedures.tumble.model import (
     parameter_units,
     powers_of_gravity,
 )
-from imulab.procedures.tumble.orders import (
-    FREEDOM,
-    HIGHEST_TESTED,
-    Aside,
-    Blended,
+from imulab.procedures.tumble.orders import FREEDOM, HIGHEST_TESTED, Aside, Blended, direction_findings, time_findings
+from imulab.procedures.tumble.schema import (
+    DeviationTrace,
+    HeldAttitudes,
+    OrderBlend,
     OrderRow,
-    direction_findings,
-    time_findings,
+    PriorShares,
+    Spread,
+    Trials,
+    TumbleEvidence,
+    TumbleModel,
+    TumbleSummary,
+    data_of,
+    fit_of,
+    model_of,
 )
-from imulab.procedures.tumble.schema import Trials, data_of, fit_of, model_of
 from imulab.procedures.tumble.solve import CLOSEST, Problem, Solution, data_freedom, forces, near_vertical
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import Change
+from imulab.records.sections import Length, Quantity, StatedGravity, entries
 from imulab.report.traces import format_uncertain, plain_number
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
@@ -100,22 +107,8 @@ class Estimate:
     observability: Observability
     orders: tuple[OrderRow, ...]
     with_gravity: bool = False
-    prior: Mapping[str, Any] | None = None
+    prior: PriorShares | None = None
     notes: Sequence[str] = ()
-
-
-def uncertainty_entries(stated: Stated | None) -> dict[str, Any]:
-    """Return the record's entries on the stated uncertainty."""
-    entries: dict[str, Any] = {
-        "effective_degrees_of_freedom": None if stated is None else stated.freedom,
-        "coverage_factor_95": None if stated is None else coverage_factor(stated.freedom),
-    }
-    if stated is None or stated.blended is None:
-        return entries
-    if stated.given_order is not None:
-        entries["coverage_factor_95_given_order"] = coverage_factor(stated.freedom_given_order)
-    noise = {str(order): share for order, share in stated.blended.noise.items()}
-    return entries | {"blend": {"highest_order": stated.blended.order, "noise_share": noise}}
 
 
 def aside_of(record: Calibration, attitudes: Attitudes) -> NDArray[np.bool_]:
@@ -279,15 +272,20 @@ def make_record(
         covariance=Covariance((), ())
         if matrix is None
         else Covariance(tuple(parameters), tuple(map(tuple, matrix.tolist()))),
-        model=_model(attitudes, problem, gravity),
-        fit={
-            **_fit(estimate, options, g, chi_square, freedom),
-            **({"shared": {gravity.name: dict(zip(parameters, shared.tolist(), strict=True))}} if shared.any() else {}),
-            **_propagated(monte_carlo, scaling, gravity, problem.order),
-            **({} if estimate.prior is None else {"prior": estimate.prior}),
-        },
+        model=entries(_model(attitudes, problem, gravity)),
+        fit=entries(
+            _summary(
+                estimate,
+                options,
+                g,
+                chi_square,
+                freedom,
+                shared={gravity.name: dict(zip(parameters, shared.tolist(), strict=True))} if shared.any() else None,
+                trials=None if monte_carlo is None else _propagated(monte_carlo, scaling, gravity, problem.order),
+            )
+        ),
         options=dict(options),
-        data=_data(found.attitudes, scaling, found.problem, found.solution, g),
+        data=entries(_evidence(found.attitudes, scaling, found.problem, found.solution, g)),
         sensor={key: recording.metadata[key] for key in ("serial", "model", "element") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
         warnings=(
@@ -326,41 +324,69 @@ def _parameters(
     )
 
 
-def _model(attitudes: Attitudes, problem: Problem, gravity: Gravity) -> dict[str, Any]:
+def _model(attitudes: Attitudes, problem: Problem, gravity: Gravity) -> TumbleModel:
     """Return the law of the record, and the conditions of the test."""
-    model: dict[str, Any] = {
-        "order": problem.order,
-        "gravity": gravity.entry(),
-        "output_unit": attitudes.unit,
-        "gauge": GAUGE,
-        **({"cross": True} if problem.cross else {}),
-    }
-    if attitudes.temperature is not None:
-        model["temperature"] = {"value": attitudes.temperature, "unit": "degC"}
-    return model
+    return TumbleModel(
+        order=problem.order,
+        gravity=StatedGravity.of(gravity),
+        output_unit=attitudes.unit,
+        gauge=GAUGE,
+        cross=True if problem.cross else None,
+        temperature=None if attitudes.temperature is None else Quantity(value=attitudes.temperature, unit="degC"),
+    )
 
 
-def _fit(estimate: Estimate, options: Mapping[str, Any], g: float, chi_square: float, freedom: float) -> dict[str, Any]:
+def _summary(
+    estimate: Estimate,
+    options: Mapping[str, Any],
+    g: float,
+    chi_square: float,
+    freedom: float,
+    *,
+    shared: dict[str, dict[str, float]] | None,
+    trials: Trials | None,
+) -> TumbleSummary:
     """Return how the estimate was made, and how well it fits."""
-    problem, solution, orders = estimate.problem, estimate.solution, estimate.orders
+    problem, solution, orders, stated = estimate.problem, estimate.solution, estimate.orders, estimate.stated
     n, size = len(estimate.attitudes), solution.theta.shape[1]
-    return {
-        "method": options["method"],
-        "loss": options["loss"],
-        "attitudes": n,
-        "set_aside": [number + 1 for number in estimate.found.aside.index],
-        "rms": {"value": g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), "unit": "m/s^2"},
-        "leave_one_out": _leave_one_out(orders, problem, solution, str(options["method"]), g),
-        "degrees_of_freedom": n - size if problem.prior is None else freedom,
-        "reduced_chi_square": chi_square / freedom if freedom > 0 else None,
-        "noise": "known" if problem.covariance is not None else "estimated from the residuals",
-        "excess": {"value": g * float(solution.excess[0]), "unit": "m/s^2"},
-        **uncertainty_entries(estimate.stated),
-        "rank": estimate.observability.rank,
-        "condition_number": estimate.observability.condition,
-        "iterations": int(solution.iterations[0]),
-        "orders": [dict(vars(row)) for row in orders],
-    }
+    return TumbleSummary(
+        method=options["method"],
+        loss=options["loss"],
+        attitudes=n,
+        set_aside=[number + 1 for number in estimate.found.aside.index],
+        rms=Length(value=g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), unit="m/s^2"),
+        leave_one_out=_leave_one_out(orders, problem, solution, str(options["method"]), g),
+        degrees_of_freedom=n - size if problem.prior is None else freedom,
+        reduced_chi_square=chi_square / freedom if freedom > 0 else None,
+        noise="known" if problem.covariance is not None else "estimated from the residuals",
+        excess=Length(value=g * float(solution.excess[0]), unit="m/s^2"),
+        effective_degrees_of_freedom=None if stated is None else stated.freedom,
+        coverage_factor_95=None if stated is None else coverage_factor(stated.freedom),
+        coverage_factor_95_given_order=_coverage_factor_given_order(stated),
+        blend=_blend(stated),
+        rank=estimate.observability.rank,
+        condition_number=estimate.observability.condition,
+        iterations=int(solution.iterations[0]),
+        orders=list(orders),
+        shared=shared,
+        monte_carlo=trials,
+        prior=estimate.prior,
+    )
+
+
+def _coverage_factor_given_order(stated: Stated | None) -> float | None:
+    """Return the coverage factor if the order were known to be right, None where it was not chosen from the data."""
+    if stated is None or stated.blended is None or stated.given_order is None:
+        return None
+    return coverage_factor(stated.freedom_given_order)
+
+
+def _blend(stated: Stated | None) -> OrderBlend | None:
+    """Return up to which order the stated uncertainty holds, and the noise that each order takes."""
+    if stated is None or stated.blended is None:
+        return None
+    noise = {str(order): share for order, share in stated.blended.noise.items()}
+    return OrderBlend(highest_order=stated.blended.order, noise_share=noise)
 
 
 def zero_outputs(record: Calibration) -> dict[str, Parameter]:
@@ -377,24 +403,20 @@ def zero_outputs(record: Calibration) -> dict[str, Parameter]:
     return found
 
 
-def _propagated(trials: MonteCarlo | None, scaling: Scaling, gravity: Gravity, order: int) -> dict[str, Any]:
-    """Mean, standard deviation and 95 % interval of every parameter over the trials, in SI."""
-    if trials is None:
-        return {}
+def _propagated(trials: MonteCarlo, scaling: Scaling, gravity: Gravity, order: int) -> Trials:
+    """Return mean, standard deviation and 95 % interval of every parameter over the trials, in SI."""
     drawn = np.random.default_rng(2).standard_normal((len(trials.theta), 1))
     values = _si_values(trials.theta, scaling, gravity.value + gravity.standard_uncertainty * drawn, order)
     low, high = np.quantile(values, [0.025, 0.975], axis=0)
     columns = zip(parameter_names(order), values.mean(axis=0), values.std(axis=0, ddof=1), low, high, strict=True)
-    return {
-        "monte_carlo": {
-            "trials": len(values),
-            "failed": trials.failed,
-            "parameters": {
-                name: {"mean": float(m), "standard_deviation": float(s), "interval_95": [float(a), float(b)]}
-                for name, m, s, a, b in columns
-            },
-        }
-    }
+    return Trials(
+        trials=len(values),
+        failed=trials.failed,
+        parameters={
+            name: Spread(mean=float(m), standard_deviation=float(s), interval_95=[float(a), float(b)])
+            for name, m, s, a, b in columns
+        },
+    )
 
 
 def _si_values(theta: Array, scaling: Scaling, g: float | Array, order: int) -> Array:
@@ -438,47 +460,47 @@ def si_parameters(theta: Array, scaling: Scaling, g: float, order: int) -> tuple
 
 def _leave_one_out(
     orders: tuple[OrderRow, ...], problem: Problem, solution: Solution, method: str, g: float
-) -> dict[str, Any] | None:
+) -> Length | None:
     """Error of each attitude predicted from the others, rms: from the table of orders, or by the linear formula."""
     for row in orders:
         if row.order == problem.order and row.leave_one_out is not None and method == "norm" and not problem.cross:
-            return {"value": row.leave_one_out, "unit": "m/s^2"}
+            return Length(value=row.leave_one_out, unit="m/s^2")
     if problem.reading.shape[1] <= solution.theta.shape[1]:
         return None
     free = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-12)
     felt = solution.down_weights[0] * solution.residuals[0] / free
-    return {"value": g * float(np.sqrt(np.mean(felt**2))), "unit": "m/s^2"}
+    return Length(value=g * float(np.sqrt(np.mean(felt**2))), unit="m/s^2")
 
 
-def _data(attitudes: Attitudes, scaling: Scaling, problem: Problem, solution: Solution, g: float) -> dict[str, Any]:
+def _evidence(attitudes: Attitudes, scaling: Scaling, problem: Problem, solution: Solution, g: float) -> TumbleEvidence:
+    """Return of each attitude its mean output, force and residual, and the deviation over time."""
     known = problem.covariance is not None
     before = np.linalg.norm(problem.reading[0], axis=1) - 1
     uncertainty = np.sqrt(solution.own_variance[0]) * g
-    data: dict[str, Any] = {
-        "attitudes": {
-            "label": [attitudes.label(i) for i in range(len(attitudes))],
-            "start": attitudes.start.tolist(),
-            "stop": attitudes.stop.tolist(),
-            "samples": attitudes.samples.tolist(),
-            "mean": attitudes.mean.tolist(),
-            "covariance": None if attitudes.covariance is None else attitudes.covariance.tolist(),
-            "force": (g * forces(problem, solution)[0]).tolist(),
-            "residual": (g * solution.deviations[0]).tolist(),
-            "residual_before": (g * before).tolist(),
-            "standard_uncertainty": uncertainty.tolist() if known else None,
-            "lengthening": (g * solution.lengthening[0]).tolist(),
-            "down_weight": solution.down_weights[0].tolist(),
-        }
-    }
-    if attitudes.trace is not None:
-        trace = attitudes.trace
-        data["trace"] = {
-            "time": np.round(trace.time, 6).tolist(),
-            "deviation": (np.sqrt(trace.variance) / float(np.mean(scaling.scale)) * g).tolist(),
-            "threshold": float(np.sqrt(trace.threshold) / np.mean(scaling.scale) * g),
-            "unit": "m/s^2",
-        }
-    return data
+    held = HeldAttitudes(
+        label=[attitudes.label(i) for i in range(len(attitudes))],
+        start=attitudes.start.tolist(),
+        stop=attitudes.stop.tolist(),
+        samples=attitudes.samples.tolist(),
+        mean=attitudes.mean.tolist(),
+        covariance=None if attitudes.covariance is None else attitudes.covariance.tolist(),
+        force=(g * forces(problem, solution)[0]).tolist(),
+        residual=(g * solution.deviations[0]).tolist(),
+        residual_before=(g * before).tolist(),
+        standard_uncertainty=uncertainty.tolist() if known else None,
+        lengthening=(g * solution.lengthening[0]).tolist(),
+        down_weight=solution.down_weights[0].tolist(),
+    )
+    trace = attitudes.trace
+    if trace is None:
+        return TumbleEvidence(attitudes=held)
+    deviation = DeviationTrace(
+        time=np.round(trace.time, 6).tolist(),
+        deviation=(np.sqrt(trace.variance) / float(np.mean(scaling.scale)) * g).tolist(),
+        threshold=float(np.sqrt(trace.threshold) / np.mean(scaling.scale) * g),
+        unit="m/s^2",
+    )
+    return TumbleEvidence(attitudes=held, trace=deviation)
 
 
 def _warnings(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import field
 from typing import Annotated, TypeVar
 
 from imulab.errors import RecordError
 from imulab.records.calibration import Calibration
-from imulab.records.sections import Above0, Part, Positive, Quantity, Size, part
+from imulab.records.sections import Above0, Part, Positive, Quantity, Size, field, part
 from imulab.report.traces import plain_number
 from imulab.units import conversion_factor
 

@@ -47,12 +47,24 @@ from imulab.procedures.tumble.gyro.solve import (
 )
 from imulab.procedures.tumble.gyro.turns import COLUMNS, ROWS, shared_covariance
 from imulab.procedures.tumble.record import aside_of
-from imulab.procedures.tumble.schema import fit_of, model_of
+from imulab.procedures.tumble.schema import (
+    ClockState,
+    GyroModel,
+    GyroSummary,
+    LargestRates,
+    RateTest,
+    RateValues,
+    TurnAside,
+    TurnResiduals,
+    fit_of,
+    model_of,
+)
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.mean_noise import mean_uncertainties
+from imulab.records.sections import Length, Measured, entries
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
 # The gyroscope triad on top of calibrated accelerometers.
@@ -388,42 +400,42 @@ def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerom
     block = record.covariance.array()[np.ix_(index, index)]
     sources = {source.file: source for source in record.sources}
     sources |= {r.source.file: r.source for r in (accelerometers, recording) if r.source is not None}
-    turns = len(fit.residuals)
-    freedom = 2 * turns - (12 if fit.fit_bias else 9)
+    freedom = 2 * len(fit.residuals) - (12 if fit.fit_bias else 9)
     # The gyroscopes' covariance holds what the accelerometers' adds; the covariance between the two is not kept.
     joined = _diagonal_blocks(block, _covariance(fit))
+    residuals = TurnResiduals(start=fit.start.tolist(), stop=fit.stop.tolist(), residual=fit.residuals.tolist())
     return replace(
         record,
         parameters=kept | _parameters(fit),
         covariance=Covariance((*names, *_covariance_names(fit)), tuple(map(tuple, joined.tolist()))),
-        model={**record.model, "gyro_output_unit": fit.unit},
+        model={**record.model, **entries(GyroModel(gyro_output_unit=fit.unit))},
         sources=tuple(sources.values()),
-        fit={
-            **record.fit,
-            "gyro": {
-                "turns": turns,
-                "cost": {"value": fit.cost, "unit": "rad^2"},
-                "rms": {"value": float(np.sqrt(fit.cost / turns)), "unit": "rad"},
-                "degrees_of_freedom": freedom,
-                "coverage_factor_95": coverage_factor(float(freedom)) if freedom > 0 else None,
-                "condition_number": fit.observability.condition,
-                "bias": "fitted to the turns" if fit.fit_bias else "from the outputs at rest",
-                "g_sensitivity": "none" if fit.sensitivity is None else "from the outputs at rest",
-                "latitude": None if fit.earth is None else fit.earth.latitude,
-                "clock": _clock(fit.clock),
-                "nonlinearity": _nonlinearity(fit.nonlinearity),
-                "set_aside": [
-                    {"start": start, "stop": stop, "miss": {"value": miss, "unit": "rad"}}
-                    for start, stop, miss in fit.aside.tolist()
-                ],
-            },
-        },
-        data={
-            **record.data,
-            "gyro": {"start": fit.start.tolist(), "stop": fit.stop.tolist(), "residual": fit.residuals.tolist()},
-        },
+        fit={**record.fit, "gyro": entries(_summary(fit, freedom))},
+        data={**record.data, "gyro": entries(residuals)},
         warnings=(*(w for w in record.warnings if not w.startswith("gyro")), *_warnings(fit)),
         verdict=UNJUDGED,
+    )
+
+
+def _summary(fit: GyroFit, freedom: int) -> GyroSummary:
+    """Return how the gyroscopes were fitted, and how well."""
+    turns = len(fit.residuals)
+    return GyroSummary(
+        turns=turns,
+        cost=Length(value=fit.cost, unit="rad^2"),
+        rms=Length(value=float(np.sqrt(fit.cost / turns)), unit="rad"),
+        degrees_of_freedom=freedom,
+        coverage_factor_95=coverage_factor(float(freedom)) if freedom > 0 else None,
+        condition_number=fit.observability.condition,
+        bias="fitted to the turns" if fit.fit_bias else "from the outputs at rest",
+        g_sensitivity="none" if fit.sensitivity is None else "from the outputs at rest",
+        latitude=None if fit.earth is None else fit.earth.latitude,
+        clock=_clock(fit.clock),
+        nonlinearity=_nonlinearity(fit.nonlinearity),
+        set_aside=[
+            TurnAside(start=start, stop=stop, miss=Length(value=miss, unit="rad"))
+            for start, stop, miss in fit.aside.tolist()
+        ],
     )
 
 
@@ -492,30 +504,33 @@ def _diagonal_blocks(first: Array, second: Array) -> Array:
     return joined
 
 
-def _clock(clock: Clock) -> dict[str, Any]:
-    """What the record says of the clock: relative uncertainty, whose it is, and how the two differ."""
-    found: dict[str, Any] = {"of": clock.of, "standard_uncertainty": clock.uncertainty}
+def _clock(clock: Clock) -> ClockState:
+    """Return what the record says of the clock."""
     other = clock.comparison
-    if other is not None:
-        found["accel_clock_rate"] = {"value": other.rate, "standard_uncertainty": other.rate_uncertainty, "unit": "1"}
-        found["latency"] = {"value": -other.delay, "standard_uncertainty": other.delay_uncertainty, "unit": "s"}
-    return found
+    if other is None:
+        return ClockState(of=clock.of, standard_uncertainty=clock.uncertainty)
+    return ClockState(
+        of=clock.of,
+        standard_uncertainty=clock.uncertainty,
+        accel_clock_rate=Measured(value=other.rate, standard_uncertainty=other.rate_uncertainty, unit="1"),
+        latency=Measured(value=-other.delay, standard_uncertainty=other.delay_uncertainty, unit="s"),
+    )
 
 
-def _nonlinearity(found: Nonlinearity | None) -> dict[str, Any] | None:
-    """What the record says of scale factors that change with the rate: test, sizes, and the rates seen."""
-    if found is None:
+def _nonlinearity(test: Nonlinearity | None) -> RateTest | None:
+    """Return what the record says of scale factors that change with the rate."""
+    if test is None:
         return None
-    return {
-        "probability": found.probability,
-        "odd": _with_uncertainty(found.odd, found.odd_uncertainty),
-        "even": _with_uncertainty(found.even, found.even_uncertainty),
-        "largest_rate": {"value": found.largest.tolist(), "unit": "rad/s"},
-    }
+    return RateTest(
+        probability=test.probability,
+        odd=_with_uncertainty(test.odd, test.odd_uncertainty),
+        even=_with_uncertainty(test.even, test.even_uncertainty),
+        largest_rate=LargestRates(value=test.largest.tolist(), unit="rad/s"),
+    )
 
 
-def _with_uncertainty(value: Array, uncertainty: Array) -> dict[str, Any]:
-    return {"value": value.tolist(), "standard_uncertainty": uncertainty.tolist(), "unit": "1"}
+def _with_uncertainty(value: Array, uncertainty: Array) -> RateValues:
+    return RateValues(value=value.tolist(), standard_uncertainty=uncertainty.tolist(), unit="1")
 
 
 def _off_nominal(fit: GyroFit) -> list[str]:

@@ -21,7 +21,7 @@ from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.device import field_in_body, output_factor, specific_force
 from imulab.procedures.tumble.mag.heading import Law, law_of
 from imulab.procedures.tumble.mag.model import dips, outputs_of
-from imulab.procedures.tumble.schema import fit_of, model_of
+from imulab.procedures.tumble.schema import fit_of, mag_model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -91,7 +91,7 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
     law, fit, n = law_of(record), fit_of(record).mag, len(attitudes)
     assert fit is not None
     means = outputs_of(attitudes, np.arange(n))
-    factor = output_factor(attitudes.recording.name, "mag", means.unit, model_of(record).mag_output_unit)
+    factor = output_factor(attitudes.recording.name, "mag", means.unit, mag_model_of(record).mag_output_unit)
     field = field_in_body(record, means.mean * factor)
     force = specific_force(record, attitudes.mean)
     length, dip = float(record.model["field"]["value"]), record.value("dip")

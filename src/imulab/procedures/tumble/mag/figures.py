@@ -6,7 +6,7 @@ import numpy as np
 
 from imulab.estimation.rows import rms
 from imulab.procedures.tumble.mag.heading import law_of
-from imulab.procedures.tumble.schema import Fields, MagFit, data_of, fit_of, model_of
+from imulab.procedures.tumble.schema import MagFields, MagSummary, data_of, fit_of, mag_model_of, model_of
 from imulab.records.calibration import Calibration
 from imulab.report.traces import BAD, GOOD, INK, LEGEND, QUIET, Figure, figure_axis, plain_number, rounded, scatter
 
@@ -41,13 +41,13 @@ def mag_figures(record: Calibration) -> list[Figure]:
     return [_residuals(record, data), _sphere(record, data), _headings(record, data)]
 
 
-def _fit(record: Calibration) -> MagFit:
+def _fit(record: Calibration) -> MagSummary:
     fit = fit_of(record).mag
     assert fit is not None
     return fit
 
 
-def _residuals(record: Calibration, data: Fields) -> Figure:
+def _residuals(record: Calibration, data: MagFields) -> Figure:
     magnitude, dip = 100 * np.array(data.magnitude), np.degrees(data.dip)
     used = np.array(data.used)
     colours = [GOOD if one else BAD for one in data.used]
@@ -81,11 +81,11 @@ def _residuals(record: Calibration, data: Fields) -> Figure:
     )  # fmt: skip
 
 
-def _sphere(record: Calibration, data: Fields) -> Figure:
+def _sphere(record: Calibration, data: MagFields) -> Figure:
     """Return outputs, scaled and renamed only, and the field after calibration, in three planes."""
     from imulab.procedures.tumble.device import mag_axes
 
-    output = np.array(data.mean) @ mag_axes(model_of(record).mag_axes).T
+    output = np.array(data.mean) @ mag_axes(mag_model_of(record).mag_axes).T
     scale = abs(np.array([record.value(f"mag_scale_factor_{a}") for a in "xyz"])).mean()
     length = record.model["field"]["value"]
     before, after = output / scale / length, np.array(data.field)
@@ -123,7 +123,7 @@ def _sphere(record: Calibration, data: Fields) -> Figure:
     )
 
 
-def _headings(record: Calibration, data: Fields) -> Figure:
+def _headings(record: Calibration, data: MagFields) -> Figure:
     """Return the uncertainty of heading in each attitude, by the parameters, and that of one reading."""
     length, gravity = float(record.model["field"]["value"]), model_of(record).gravity.value
     known, reading = law_of(record).horizontal_uncertainty(

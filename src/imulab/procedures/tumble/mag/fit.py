@@ -35,10 +35,12 @@ from imulab.procedures.tumble.mag.prepare import (
 from imulab.procedures.tumble.mag.solve import Joint, Place, Ready, solve, stated_place
 from imulab.procedures.tumble.model import gravity_slope, parameter_names, parameter_units
 from imulab.procedures.tumble.record import make_record, si_parameters
+from imulab.procedures.tumble.schema import FieldAgreement, Heading, MagFields, MagModel, MagSummary, OneSample
 from imulab.quantities import in_si
 from imulab.reading import Reading
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.sections import Length, Quantity, entries
 from imulab.units import parse_unit
 
 # A tumble record with the magnetometer triad added, both triads as their joint fit found them.
@@ -87,16 +89,16 @@ def with_mag(
         accel,
         parameters=kept | {name: parameters[name] for name in mag_names(joint.pair.mag_order)},
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
-        model={**accel.model, **_model(ready, joint)},
+        model={**accel.model, **entries(_model(ready, joint))},
         fit={
             **accel.fit,
-            "mag": _fit(ready, joint, seen, aside, moved, heading) | _of_one_sample(ready, parameters),
+            "mag": entries(_summary(ready, joint, seen, aside, moved, heading, _of_one_sample(ready, parameters))),
         },
         options={
             **accel.options,
             **{f"mag_{name}" if name == "loss" else name: value for name, value in options.items()},
         },
-        data={**accel.data, "mag": _data(ready, joint, aside)},
+        data={**accel.data, "mag": entries(_fields(ready, joint, aside))},
         warnings=(
             *accel.warnings,
             *ready.means.notes,
@@ -162,77 +164,79 @@ def _parameters(
     return found
 
 
-def _model(ready: Ready, joint: Joint) -> dict[str, Any]:
-    """Law of the magnetometers, and which output became which axis."""
+def _model(ready: Ready, joint: Joint) -> MagModel:
+    """Return the law of the magnetometers, and which output became which axis."""
     axes = " ".join(
         f"{'+' if row[output] > 0 else '-'}{'xyz'[output]}"
         for row, output in zip(ready.mag.axes, np.abs(ready.mag.axes).argmax(axis=1).tolist(), strict=True)
     )
     field = ready.mag.field
-    return {
-        "mag_order": joint.pair.mag_order,
-        "mag_output_unit": ready.means.unit,
-        "mag_axes": axes,
-        "field": {"value": 1.0, "unit": "1"} if field is None else {"value": field, "unit": "T"},
-    }
+    return MagModel(
+        mag_order=joint.pair.mag_order,
+        mag_output_unit=ready.means.unit,
+        mag_axes=axes,
+        field=Quantity(value=1.0, unit="1") if field is None else Quantity(value=field, unit="T"),
+    )
 
 
-def _fit(
+def _summary(
     ready: Ready,
     joint: Joint,
     seen: Seen,
     aside: Sequence[Disturbed],
     moved: Mapping[str, float],
     heading: tuple[float, float],
-) -> dict[str, Any]:
+    one_sample: OneSample | None,
+) -> MagSummary:
+    """Return how well magnitude and dip of the field agree over the attitudes."""
     predicted, residuals = leave_one_out(joint), joint.found.residuals
-    return {
-        "attitudes": len(residuals),
-        "magnitude": {"rms": rms(residuals[:, 1]), "leave_one_out": predicted.rms(1)},
-        "dip": {"rms": rms(residuals[:, 2]), "leave_one_out": predicted.rms(2)},
-        "noise": "estimated from the residuals" if joint.pair.noise is None else "known",
-        "sigma_magnitude": float(joint.sigma[0]),
-        "sigma_dip": {"value": float(joint.sigma[1]), "unit": "rad"},
-        **({} if joint.pair.held is None else {"sigma_direction": {"value": float(joint.sigma[2]), "unit": "rad"}}),
-        "condition_number": seen.condition,
-        "set_aside": [int(ready.kept[one.index]) + 1 for one in aside],
-        "heading": {
-            "standard_uncertainty": {"value": heading[0], "unit": "rad"},
-            "of_one_reading": {"value": heading[1], "unit": "rad"},
-        },
-        "moved": dict(moved),
-    }
+    directed = joint.pair.held is not None
+    return MagSummary(
+        attitudes=len(residuals),
+        magnitude=FieldAgreement(rms=rms(residuals[:, 1]), leave_one_out=predicted.rms(1)),
+        dip=FieldAgreement(rms=rms(residuals[:, 2]), leave_one_out=predicted.rms(2)),
+        noise="estimated from the residuals" if joint.pair.noise is None else "known",
+        sigma_magnitude=float(joint.sigma[0]),
+        sigma_dip=Length(value=float(joint.sigma[1]), unit="rad"),
+        sigma_direction=Length(value=float(joint.sigma[2]), unit="rad") if directed else None,
+        condition_number=seen.condition,
+        set_aside=[int(ready.kept[disturbed.index]) + 1 for disturbed in aside],
+        heading=Heading(
+            standard_uncertainty=Length(value=heading[0], unit="rad"),
+            of_one_reading=Length(value=heading[1], unit="rad"),
+        ),
+        moved=dict(moved),
+        of_one_sample=one_sample,
+    )
 
 
-def _of_one_sample(ready: Ready, parameters: Mapping[str, Parameter]) -> dict[str, Any]:
-    """Noise of one axis of one sample of the recording, m/s^2 and parts of the field; nothing of a table of means."""
+def _of_one_sample(ready: Ready, parameters: Mapping[str, Parameter]) -> OneSample | None:
+    """Return the noise of one axis of one sample, m/s^2 and parts of the field; None of a table of means."""
     if ready.means.of_one_sample is None:
-        return {}
+        return None
     of_accel, of_mag = ready.means.of_one_sample
     scale = float(np.median([abs(parameters[f"scale_factor_{axis}"].value) for axis in "xyz"]))
-    sizes = {
-        "accel": {"value": of_accel / scale, "unit": "m/s^2"},
-        "mag": {"value": of_mag / ready.mag.size, "unit": "1"},
-    }
-    return {"of_one_sample": sizes}
+    return OneSample(
+        accel=Length(value=of_accel / scale, unit="m/s^2"), mag=Length(value=of_mag / ready.mag.size, unit="1")
+    )
 
 
-def _data(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> dict[str, Any]:
-    """Of each attitude that was used: its number, mean output, field in the body frame (of length 1), residuals."""
+def _fields(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> MagFields:
+    """Return of each attitude that was used its number, mean output, field (of length 1) and residuals."""
     used = ready.pair.mag
     layout = joint.pair.layout
     every = ready.pair if layout.mag == ready.pair.layout.mag else replace(ready.pair, mag_order=joint.pair.mag_order)
-    found = every.evaluate(joint.theta)
-    return {
-        "number": (ready.kept + 1).tolist(),
-        "label": [ready.estimate.attitudes.label(i) for i in range(len(used))],
-        "mean": ready.means.mean[ready.kept].tolist(),
-        "field": found.field.vector.tolist(),
-        "force": found.force.vector.tolist(),
-        "magnitude": found.residuals[:, 1].tolist(),
-        "dip": found.residuals[:, 2].tolist(),
-        "used": np.isin(np.arange(len(used)), [one.index for one in aside], invert=True).tolist(),
-    }
+    evaluated = every.evaluate(joint.theta)
+    return MagFields(
+        number=(ready.kept + 1).tolist(),
+        label=[ready.estimate.attitudes.label(i) for i in range(len(used))],
+        mean=ready.means.mean[ready.kept].tolist(),
+        field=evaluated.field.vector.tolist(),
+        force=evaluated.force.vector.tolist(),
+        magnitude=evaluated.residuals[:, 1].tolist(),
+        dip=evaluated.residuals[:, 2].tolist(),
+        used=np.isin(np.arange(len(used)), [disturbed.index for disturbed in aside], invert=True).tolist(),
+    )
 
 
 def _scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> list[str]:

@@ -38,7 +38,7 @@ from imulab.procedures.tumble.mag.model import (
 from imulab.procedures.tumble.mag.prepare import WORST_CONDITION
 from imulab.procedures.tumble.mag.solve import world_axes
 from imulab.procedures.tumble.model import parameter_names
-from imulab.procedures.tumble.schema import fit_of, model_of
+from imulab.procedures.tumble.schema import fit_of, mag_model_of, model_of
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.report.traces import plain_number
@@ -172,7 +172,7 @@ def law_of(record: Calibration) -> Law:
             "heading needs magnetometers, which the record does not hold; 'imulab tumble mag FILE --accel RECORD' adds "
             "them"
         )
-    of_mag, of_accel = mag_names(model.mag_order)[:-1], parameter_names(model.order)
+    of_mag, of_accel = mag_names(mag_model_of(record).mag_order)[:-1], parameter_names(model.order)
     values = np.array([record.value(name) for name in (*of_mag, *of_accel)])
     return Law(
         accel=Triad.of(values[len(of_mag) :], ACCELEROMETERS),
