@@ -8,7 +8,6 @@ import re
 import stat
 import tempfile
 import threading
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -128,6 +127,8 @@ def load_toml(path: str | Path, name: str, what: str) -> dict[str, Any]:
     ReadError
         There is no such file, it is no regular file or too large, it cannot be read, or it is not TOML.
     """
+    import tomllib  # takes 3 ms to load, and most commands meet no such file
+
     text = _text(Path(path), name, what)
     for number, line in enumerate(text.split("\n"), start=1):
         if line.count(".") > _MOST_DOTS and len(_DOT.findall(_NUMBER.sub("", line))) > _MOST_DOTS:

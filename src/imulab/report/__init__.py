@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
-from importlib.resources import files
 from typing import Any
 
 from imulab.display import SENTENCES, Verdict
@@ -115,6 +114,8 @@ def _template(name: str) -> Any:
 
 @cache
 def _file(*name: str) -> str:
+    from importlib.resources import files  # takes 2 ms to load, which a command without a report need not
+
     return files("imulab.report").joinpath(*name).read_text(encoding="utf-8")
 
 
