@@ -82,22 +82,6 @@ def test_a_plain_fit_imports_no_code_for_what_it_does_not_do(tmp_path, monkeypat
     assert done.stdout.endswith("\n[]\n")
 
 
-@pytest.mark.parametrize("words", [["tumble", "--help"], ["show", "--help"], ["--help"]])
-def test_a_command_built_alone_says_the_same_as_among_all(words):
-    from imulab.cli.app import command
-
-    def said(root):
-        shown = []
-        group = root
-        for word in words:
-            group = group.commands.get(word) if hasattr(group, "commands") and not word.startswith("-") else group
-        with group.make_context("imulab", [], resilient_parsing=True) as context:
-            shown.append(group.get_help(context))
-        return shown
-
-    assert said(command(words)) == said(command())
-
-
 def test_no_submodule_hides_a_public_function():
     """Importing a submodule puts it where its package looks names up: imulab.apply must stay the function."""
     import importlib

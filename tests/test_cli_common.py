@@ -111,12 +111,12 @@ OF_FEW_WORDS = {
 
 @pytest.mark.parametrize("path", OF_FEW_WORDS)
 def test_an_option_of_few_words_offers_them(path):
-    from imulab.cli import common
-    from imulab.cli.app import command
+    from imulab.cli.app import commands
 
-    options = {name: p for p in dict(common.commands_of(command()))[path].params for name in p.opts}
+    (command,) = (command for command in commands() if command.path == path)
+    options = {flag: option for option in command.options for flag in option.flags}
     for name in OF_FEW_WORDS[path]:
-        words = [word.value for word in options[name].shell_complete(None, "")]
+        words = options[name].words
         assert words
         assert all(words)
         assert options[name].default is None or options[name].default in words
@@ -153,13 +153,12 @@ def test_json_stays_alone_on_standard_output_when_much_is_said(imulab, recording
 
 
 def test_every_command_takes_both(capsys):
-    from imulab.cli import common
-    from imulab.cli.app import command
+    from imulab.cli.app import commands
 
-    for path, found in common.commands_of(command()):
-        options = [option for parameter in found.params for option in parameter.opts]
-        assert {"-q", "--quiet", "-v", "--verbose"} <= set(options), path
-        assert len(options) == len(set(options)), path
+    for command in commands():
+        flags = [flag for option in command.options for flag in option.flags]
+        assert {"-q", "--quiet", "-v", "--verbose"} <= set(flags), command.path
+        assert len(flags) == len(set(flags)), command.path
 
 
 class Terminal(io.StringIO):

@@ -40,14 +40,14 @@ def work(tmp_path, monkeypatch, recordings):
 
 
 def test_what_it_gives_is_as_if_typed(work, capsys):
-    (work / "imulab.files").write_text('gravity = "9.81362+-0.00002"\n')
+    (work / "imulab.toml").write_text('gravity = "9.81362+-0.00002"\n')
     assert main(["tumble", "fit", "native.csv", "--order", "1", "-o", "by_file.json"]) == 0
     err = capsys.readouterr().err
-    assert err.count("imulab.files") == 1
+    assert err.count("imulab.toml") == 1
     assert "imulab: note: --gravity 9.81362+-0.00002 from ../../imulab.toml\n" in err
     typed = ["--gravity", "9.81362+-0.00002", "--no-project"]
     assert main(["tumble", "fit", "native.csv", "--order", "1", "-o", "typed.json", *typed]) == 0
-    assert "imulab.files" not in capsys.readouterr().err
+    assert "imulab.toml" not in capsys.readouterr().err
     records = [json.loads(Path(name).read_text()) for name in ("by_file.json", "typed.json")]
     for record in records:
         del record["created"], record["content_sha256"]
@@ -57,11 +57,11 @@ def test_what_it_gives_is_as_if_typed(work, capsys):
 
 
 def test_what_is_typed_wins(work, capsys):
-    (work / "imulab.files").write_text("latitude = 48.1\nheight = 520\n")
+    (work / "imulab.toml").write_text("latitude = 48.1\nheight = 520\n")
     assert main(["tumble", "fit", "native.csv", "--order", "1", "--gravity", "9.81362", "--json"]) == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["model"]["gravity"]["value"] == 9.81362
-    assert "imulab.files" not in err
+    assert "imulab.toml" not in err
     assert main(["tumble", "fit", "native.csv", "--order", "1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["model"]["gravity"]["from"] == (
         "normal gravity at latitude 48.1 deg, height 520 m (WGS 84)"
@@ -69,7 +69,7 @@ def test_what_is_typed_wins(work, capsys):
 
 
 def test_a_layout_beside_it_is_for_files_that_need_one(work, capsys):
-    (work / "imulab.files").write_text('layout = "board.toml"\n')
+    (work / "imulab.toml").write_text('layout = "board.toml"\n')
     (work / "board.toml").write_text(LAYOUT)
     assert main(["show", "foreign.txt"]) == 0
     out, err = capsys.readouterr()
@@ -79,23 +79,23 @@ def test_a_layout_beside_it_is_for_files_that_need_one(work, capsys):
     for own in (["show", "native.csv"], ["show", "r.json"], ["apply", "r.json", "native.csv", "-o", "c.csv"]):
         capsys.readouterr()
         assert main(own) == 0
-        assert "imulab.files" not in capsys.readouterr().err
+        assert "imulab.toml" not in capsys.readouterr().err
 
 
 def test_a_layout_that_comes_along_is_meant_by_its_name_and_a_file_by_its_path(work, capsys):
     (work / "phyphox").write_text(LAYOUT)
-    (work / "imulab.files").write_text('layout = "phyphox"\n')
-    assert common.load(work / "imulab.files", "imulab.files") == {"layout": "phyphox"}
-    (work / "imulab.files").write_text('layout = "./phyphox"\n')
-    assert common.load(work / "imulab.files", "../../imulab.toml") == {"layout": "../../phyphox"}
+    (work / "imulab.toml").write_text('layout = "phyphox"\n')
+    assert common.load(work / "imulab.toml", "imulab.toml") == {"layout": "phyphox"}
+    (work / "imulab.toml").write_text('layout = "./phyphox"\n')
+    assert common.load(work / "imulab.toml", "../../imulab.toml") == {"layout": "../../phyphox"}
     (Path.cwd() / "phyphox").write_text(LAYOUT)
-    (Path.cwd() / "imulab.files").write_text('layout = "./phyphox"\n')
+    (Path.cwd() / "imulab.toml").write_text('layout = "./phyphox"\n')
     assert main(["show", "foreign.txt"]) == 0
-    assert "note: --layout ./phyphox from imulab.files" in capsys.readouterr().err
+    assert "note: --layout ./phyphox from imulab.toml" in capsys.readouterr().err
 
 
 def test_a_layout_is_left_out_for_a_stream_and_for_each_file_that_does_without(work, capsys, monkeypatch):
-    (work / "imulab.files").write_text('layout = "board.toml"\n')
+    (work / "imulab.toml").write_text('layout = "board.toml"\n')
     (work / "board.toml").write_text(LAYOUT)
     outputs = []
     for name in ("native.csv", "foreign.txt"):
@@ -125,15 +125,15 @@ def test_no_home_and_no_working_folder(work, capsys, monkeypatch):
 
 def test_it_is_found_up_to_the_root_of_the_repository_and_not_above(work, monkeypatch):
     assert common.find(Path.cwd()) is None
-    (work.parent / "imulab.files").write_text("gravity = 9.8\n")
+    (work.parent / "imulab.toml").write_text("gravity = 9.8\n")
     try:
         assert common.find(Path.cwd()) is None
     finally:
-        (work.parent / "imulab.files").unlink()
-    (work / "imulab.files").write_text("gravity = 9.8\n")
-    assert common.find(Path.cwd()) == work / "imulab.files"
-    (work / "bench" / "imulab.files").write_text("gravity = 9.81\n")
-    assert common.find(Path.cwd()) == work / "bench" / "imulab.files"
+        (work.parent / "imulab.toml").unlink()
+    (work / "imulab.toml").write_text("gravity = 9.8\n")
+    assert common.find(Path.cwd()) == work / "imulab.toml"
+    (work / "bench" / "imulab.toml").write_text("gravity = 9.81\n")
+    assert common.find(Path.cwd()) == work / "bench" / "imulab.toml"
     monkeypatch.setenv("HOME", str(work / "bench" / "monday"))
     assert common.find(Path.cwd()) is None
     monkeypatch.setenv("HOME", str(work))
@@ -143,8 +143,8 @@ def test_it_is_found_up_to_the_root_of_the_repository_and_not_above(work, monkey
 
 def test_verbose_says_which_one_was_used(work, capsys):
     assert main(["tumble", "fit", "native.csv", "--order", "1", "-v"]) == 0
-    assert "imulab: no project file imulab.files here or above\n" in capsys.readouterr().err
-    (work / "imulab.files").write_text("limit = '1 mg'\n")
+    assert "imulab: no project file imulab.toml here or above\n" in capsys.readouterr().err
+    (work / "imulab.toml").write_text("limit = '1 mg'\n")
     assert main(["tumble", "fit", "native.csv", "--order", "1", "-v"]) == 0
     assert "imulab: project file ../../imulab.toml, which says nothing for this command\n" in capsys.readouterr().err
 
@@ -175,7 +175,7 @@ def test_verbose_says_which_one_was_used(work, capsys):
     ],
 )
 def test_what_it_cannot_say_is_refused(work, capsys, content, message):
-    (work / "imulab.files").write_text(content)
+    (work / "imulab.toml").write_text(content)
     assert main(["tumble", "fit", "native.csv", "-o", "r.json"]) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -188,9 +188,9 @@ def test_what_it_cannot_say_is_refused(work, capsys, content, message):
 def test_the_example_of_the_documentation_is_one(work):
     page = (Path(__file__).resolve().parents[1] / "docs" / "index.md").read_text()
     block = page.partition("## Project file")[2].split("\n\n")[2]
-    for name in ("imulab.files", "board.toml", "limits.toml"):
+    for name in ("imulab.toml", "board.toml", "limits.toml"):
         (work / name).write_text("".join(line.removeprefix("    ") + "\n" for line in block.splitlines()))
-    assert common.load(work / "imulab.files", "../../imulab.toml") == {
+    assert common.load(work / "imulab.toml", "../../imulab.toml") == {
         "gravity": "9.81362+-0.00002",
         "layout": "../../board.toml",
         "limits": "../../limits.toml",
@@ -199,7 +199,7 @@ def test_the_example_of_the_documentation_is_one(work):
 
 
 def test_a_simulation_keeps_its_own_gravity_and_the_demonstration_is_left_alone(work, capsys):
-    (work / "imulab.files").write_text("gravity = 9.7\n")
+    (work / "imulab.toml").write_text("gravity = 9.7\n")
     assert main(["tumble", "simulate", "-o", "s.csv", "--attitudes", "6", "--hold", "1"]) == 0
     assert il.read("s.csv").metadata["gravity"].startswith("9.80665")
-    assert "imulab.files" not in capsys.readouterr().err
+    assert "imulab.toml" not in capsys.readouterr().err

@@ -1,8 +1,7 @@
-"""Every command has its function: the same options, the same defaults, the same result bit for bit."""
+"""Every command has its function, whose options it has, and gives the same result bit for bit."""
 
 import inspect
 import json
-import keyword
 import re
 import shutil
 from dataclasses import replace
@@ -11,11 +10,10 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.cli import common, main
-from imulab.cli.app import command
+from imulab.cli import main
+from imulab.cli.app import commands
 from imulab.estimation.noise_coefficients import coefficients_dict
 from imulab.procedures.noise.check import as_json
-from imulab.quantities import quantity
 from imulab.records.calibration import json_text
 
 FUNCTIONS = {
@@ -62,74 +60,13 @@ FUNCTIONS = {
 }
 WITHOUT = {"demo", "live", "open"}
 """One runs other commands, the others are a person's session at a terminal or in a browser."""
-READING = {"layout", "topic", "instance", "window", "element", "accel_layout", "unpack_limit"}
-APART = READING | {"output", "report", "json", "quiet", "verbose", "no_project"}
-OTHERWISE = {
-    "convert": {"with_"},  # join_recordings, which takes both files
-    "show": {"formats"},  # a list of the files that can be read, for people; docs/recordings.md has it too
-    "tumble gyro": {"accel_file"},  # accel_data: as FILE is data in Python, it need not be a file
-    "array calibrate": {"interval"},  # an older name of window, which is there too
-    "array compare": {"experiment", "seeds"},  # in place of a FILE: repeats the simulation of the method's source
-    "noise fit": {"for_", "rate", "step"},  # of NoiseFit.wants, which the command prints in place of the record
-}
-"""Options that functions have by another name, or in another place, and where."""
-ELSEWHERE = {"noise fit": il.NoiseFit.wants}
-COMMANDS = dict(common.commands_of(command()))
+COMMANDS = {command.path: command for command in commands()}
 G = 9.80665
 DEGREE = np.pi / 180
 
 
-def options_of(path):
-    """Names of a command's options, as keywords, and their defaults."""
-    found = {}
-    for parameter in COMMANDS[path].params:
-        if parameter.param_type_name == "option":
-            long = next(name for name in parameter.opts if name.startswith("--"))
-            name = long.lstrip("-").replace("-", "_")
-            found[name + "_" * keyword.iskeyword(name)] = parameter.default
-    return {name: default for name, default in found.items() if name not in APART}
-
-
-def plain(default):
-    """A default as what it means: a number in SI where it is one, else a text; None for what is not given."""
-    if default in (None, inspect.Parameter.empty) or isinstance(default, bool):
-        return None if default is inspect.Parameter.empty else default or None
-    if isinstance(default, tuple | list):
-        return ",".join(f"{value:g}" for value in default) or None
-    text = str(default)
-    for kind, unit in (("time", "s"), ("number", "1"), ("acceleration", "m/s^2"), ("rate", "rad/s")):
-        try:
-            return quantity(text, "", kind, unit)
-        except il.ImulabError:
-            continue
-    return text
-
-
 def test_every_command_has_a_function():
     assert {*FUNCTIONS} | WITHOUT == {*COMMANDS}
-
-
-@pytest.mark.parametrize("path", FUNCTIONS)
-def test_options_are_keywords_of_the_same_name_and_default(path):
-    keywords = inspect.signature(FUNCTIONS[path]).parameters
-    wrong = {
-        name: (default, str(keywords.get(name, "none")))
-        for name, default in options_of(path).items()
-        if name not in keywords or plain(default) != plain(keywords[name].default)
-    }
-    assert {*wrong} == OTHERWISE.get(path, set())
-    if path in ELSEWHERE:
-        assert {*wrong} == {*inspect.signature(ELSEWHERE[path]).parameters} - {"self"}
-
-
-@pytest.mark.parametrize("path", FUNCTIONS)
-def test_an_option_is_read_as_on_the_command_line_where_it_is_a_text(path):
-    """What is neither a switch nor a file: `duration=600`, ``"600 s"`` and ``"10 min"`` are the same."""
-    keywords = inspect.signature(FUNCTIONS[path]).parameters
-    for parameter in COMMANDS[path].params:
-        own = keywords.get(parameter.name)
-        if own is not None and parameter.param_type_name == "option" and not parameter.is_flag:
-            assert re.search(r"\bstr\b|Data|Record|Known|Markov|Window|Sequence\[Fault", str(own.annotation)), own
 
 
 def test_what_a_program_wants_of_a_noise_fit_is_as_on_the_command_line(folder, capsys, monkeypatch):
@@ -140,22 +77,18 @@ def test_what_a_program_wants_of_a_noise_fit_is_as_on_the_command_line(folder, c
     assert said == {key: f"{value:.4g}" for key, value in found.items()}
 
 
-def test_the_unit_of_a_bare_number_is_in_the_help():
-    """Every call ``in_si(value, "option", kind, unit)`` of a function, against the help of that option."""
-    seen, missing = 0, []
+def test_the_unit_of_a_bare_number_is_that_of_the_help():
+    """Every call ``in_si(value, "option", kind, unit)`` of a function, against what its signature says."""
+    seen, wrong = 0, []
     for path, function in FUNCTIONS.items():
-        texts = {
-            name.lstrip("-").replace("-", "_"): f"{parameter.help} {parameter.default} {parameter.metavar}"
-            for parameter in COMMANDS[path].params
-            for name in parameter.opts
-        }
+        units = {option.keyword: option.reads.unit for option in COMMANDS[path].options}
         read = re.findall(r'in_si\(\w+, "(\w+)", "\w+", "([^"]+)"\)', inspect.getsource(function))
         for name, unit in read:
-            if name in texts and unit != "1":
+            if name in units and unit != "1":
                 seen += 1
-                if not re.search(rf"(?<![\w/]){re.escape(unit)}(?![\w/])", texts[name]):
-                    missing.append((path, name, unit))
-    assert missing == []
+                if units[name] != unit:
+                    wrong.append((path, name, unit, units[name]))
+    assert wrong == []
     assert seen > 20
 
 

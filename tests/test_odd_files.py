@@ -72,14 +72,14 @@ def test_links_that_go_round_in_a_circle(imulab, tmp_path, recording, command):
 @pytest.mark.parametrize(
     "command",
     [
-        ["show", "a.csv", "--layout", "imulab.files"],
-        ["centrifuge", "reduce", "imulab.files"],
+        ["show", "a.csv", "--layout", "imulab.toml"],
+        ["centrifuge", "reduce", "imulab.toml"],
         ["tumble", "fit", "a.csv"],
     ],
 )
 def test_toml_nested_deeper_than_python_reads(imulab, tmp_path, recording, command):
-    (tmp_path / "imulab.files").write_text("a = " + "[" * 5000 + "]" * 5000)
-    refused(imulab(*command), "imulab.files: the ", "nests its tables or lists")
+    (tmp_path / "imulab.toml").write_text("a = " + "[" * 5000 + "]" * 5000)
+    refused(imulab(*command), "imulab.toml: the ", "nests its tables or lists")
 
 
 def closed(tmp_path, command, *streams):

@@ -27,8 +27,7 @@ pytest.importorskip("starlette", reason="the page needs imulab[live]")
 
 import imulab as il
 from imulab.cli import main
-from imulab.cli.app import command
-from imulab.cli.common import commands_of
+from imulab.cli.app import commands
 from imulab.errors import OptionError
 from imulab.live.page import bench as bench_module
 from imulab.live.page import server
@@ -37,8 +36,8 @@ from imulab.live.page.files import Files, checked
 from imulab.live.page.jobs import Jobs, forms
 from imulab.live.page.server import to_json
 
-COMMANDS = dict(commands_of(command()))
-FORMS = forms(COMMANDS.items())
+COMMANDS = {command.path: command for command in commands()}
+FORMS = forms(COMMANDS.values())
 HOSTILE = (
     "../../etc/passwd",
     "/etc/passwd",
@@ -67,7 +66,8 @@ def test_a_form_has_what_the_help_of_its_command_has(path, capsys):
     form = FORMS[path]
     assert " ".join(form.help.split()[:5]) in shown
     options = [field for field in form.fields if field.flag]
-    assert {each.name for each in form.fields} == {each.name for each in COMMANDS[path].params}
+    of_command = (*COMMANDS[path].arguments, *COMMANDS[path].options)
+    assert {each.name for each in form.fields} == {each.keyword for each in of_command}
     for field in options:
         assert field.flag in shown
         assert field.shows in shown
@@ -104,9 +104,9 @@ def test_no_text_of_a_form_is_a_file_without_being_called_one():
         ("tumble plan", {"attitudes": "9", "distinct_verticals": False},
          "tumble plan --attitudes 9 --repeated-verticals"),
         ("array simulate", {"fault": ["dead:1", "stuck:2", ""], "output": True},
-         "array simulate -o folder/found.csv --fault dead:1 --fault stuck:2"),
+         "array simulate --fault dead:1 --fault stuck:2 -o folder/found.csv"),
         ("noise simulate", {"gm": ["20 deg/h:300 s", " 2 deg/h:9 s"], "output": True},
-         "noise simulate -o folder/found.csv --gm '20 deg/h:300 s' --gm '2 deg/h:9 s'"),
+         "noise simulate --gm '20 deg/h:300 s' --gm '2 deg/h:9 s' -o folder/found.csv"),
         ("warmup fit", {"files": ["a.csv"], "temperatures": "-40,0"}, "warmup fit a.csv --temperatures=-40,0"),
     ],
 )  # fmt: skip
@@ -244,7 +244,7 @@ def test_a_refusal_is_said(tmp_path, monkeypatch):
 
 def test_a_module_in_the_working_folder_is_not_imported(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("numpy", "imulab", "typer"):
+    for name in ("numpy", "imulab", "rich"):
         Path(f"{name}.py").write_text("open('executed', 'w')")
     job = Jobs(lambda job: None).run("show", ["show", "--formats"], [])
     until(lambda: job.ended)

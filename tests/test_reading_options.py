@@ -7,7 +7,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.cli.app import command
+from imulab.cli.app import commands
 from imulab.errors import DataError, OptionError
 from imulab.readers import read_blocks
 from test_flight_logs import low_rate_log
@@ -21,16 +21,9 @@ LIVE = {"live"}
 """A stream is one sensor's, from now on."""
 
 
-def commands(group, path=""):
-    for name, found in group.commands.items():
-        if hasattr(found, "commands"):
-            yield from commands(found, f"{path}{name} ")
-        else:
-            yield f"{path}{name}", {parameter.name for parameter in found.params}
-
-
 def test_every_command_that_reads_a_recording_has_the_same_options():
-    reading = {path: names for path, names in commands(command()) if names & {*PART, "element"}}
+    every = {command.path: {option.name for option in command.options} for command in commands()}
+    reading = {path: names for path, names in every.items() if names & {*PART, "element"}}
     assert {"show", "convert", "apply", "allan", "tumble fit", "tumble gyro", "tumble check", "warmup fit"} <= set(
         reading
     )

@@ -1,6 +1,7 @@
 """A procedure that nobody knows but the registry goes all the way: fit, record, report, apply, show and a fleet."""
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from imulab.cli import main
 from imulab.cli.options import GivenFiles
 from imulab.device.tables import DeviceTable, Field, whole
 from imulab.device.unit import golden_gyroscopes
-from imulab.procedures.procedure import LAYOUT, Procedure, Section, Task, measure, read_options, source_of
+from imulab.options import file, measure, read_options
+from imulab.procedures.procedure import Procedure, Section, Task, source_of
 from imulab.procedures.registry import PROCEDURES, run_task
 from imulab.procedures.tumble.device import apply_gyro
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -18,8 +20,28 @@ from imulab.records.triads import Accelerometers, Triads
 from imulab.report import traces
 
 RATE = (0.01, -0.02, 0.03)
-OPTIONS = (measure("skip", "Time at the start to leave out, s.", "time", "s", "0 s"), LAYOUT)
 NAMES = tuple(f"drift_{axis}" for axis in "xyz")
+
+
+def fit_drift(
+    data,
+    *,
+    skip: Annotated[float | str, measure("time", "s")] = "0 s",
+    layout: Annotated[str | None, file("NAME|L.toml")] = None,
+):
+    """Find the drift at rest.
+
+    Parameters
+    ----------
+    skip
+        Time at the start to leave out.
+    layout
+        Columns of a foreign file.
+    """
+
+
+def _values(texts, label):
+    return read_options(DriftProcedure.task.options, texts, label)
 
 
 def _fit(files, values, access, progress):
@@ -73,7 +95,7 @@ class DriftProcedure(Procedure):
     command = "drifts"
     title = "Drift at rest"
     line_title = "Drifts"
-    task = Task("one recording", (1, 1), OPTIONS, lambda texts, label: read_options(OPTIONS, texts, label), _fit)
+    task = Task("one recording", (1, 1), lambda: fit_drift, _values, _fit)
     sections = (DriftSection(),)
 
     def check(self, record):

@@ -67,13 +67,13 @@ def test_only_files_are_layouts_and_project_files(tmp_path, monkeypatch, capsys,
     assert err.startswith("imulab: board: expected a layout file, ")
     assert found in err
     assert err.count("\n") == 1
-    (tmp_path / "board").rename("imulab.files")
+    (tmp_path / "board").rename("imulab.toml")
     if kind == "circle":
-        (tmp_path / "imulab.files").unlink()
-        odd(tmp_path / "imulab.files", kind)
+        (tmp_path / "imulab.toml").unlink()
+        odd(tmp_path / "imulab.toml", kind)
     assert main(["show", "log.txt"]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("imulab: imulab.files: expected a project file, ")
+    assert err.startswith("imulab: imulab.toml: expected a project file, ")
     assert found in err
 
 

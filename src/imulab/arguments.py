@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import inspect
 import re
 import sys
@@ -10,7 +11,7 @@ from functools import cache, wraps
 from numbers import Integral, Real
 from os import PathLike
 from types import UnionType
-from typing import Annotated, Any, ParamSpec, TypeAlias, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ForwardRef, ParamSpec, TypeAlias, TypeVar, Union, get_args, get_origin
 
 from imulab.errors import OptionError, listed, quoted
 
@@ -44,10 +45,10 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 def check(value: object, hint: Any, called: str) -> None:
     """Refuse a value of another type; `called` is how the message names it; errors as for `checked`."""
-    members = set(_members(hint))
-    if (str in members and members & {float, int}) or _fits(value, hint):
+    kinds = set(members(hint))
+    if (str in kinds and kinds & {float, int}) or _fits(value, hint):
         return
-    for each in members:
+    for each in kinds:
         if get_origin(each) is Mapping and isinstance(value, Mapping):
             for key, item in value.items():
                 check(item, get_args(each)[1], f"{called}[{key!r}]")
@@ -61,17 +62,62 @@ def check_fields(instance: Any) -> None:
         check(getattr(instance, name), hint, name)
 
 
+class Unknown:
+    """Stands for a name of an annotation that is imported for type checkers alone."""
+
+    def __class_getitem__(cls, _: Any) -> type[Unknown]:
+        return cls
+
+
+@cache
+def types_of(owner: Any) -> dict[str, Any]:
+    """Return the types of a function's parameters or a class's fields; `Unknown` for names that are not there."""
+    owner = inspect.unwrap(owner)
+    names, types = _Names(vars(sys.modules[owner.__module__])), {}
+    for name, text in inspect.get_annotations(owner).items():
+        text = text.__forward_arg__ if isinstance(text, ForwardRef) else text
+        try:
+            types[name] = eval(text, {}, names) if isinstance(text, str) else text
+        except AttributeError:  # of a module that is imported for type checkers alone
+            types[name] = Unknown
+    return types
+
+
+class _Names(dict[str, Any]):
+    """The names of a module; those of Python itself, and `Unknown`, for all others."""
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, Unknown)
+
+
 @cache
 def hints(owner: Any) -> dict[str, Any]:
     """Return the types that the annotations of a function or class name, where they are known at run time."""
-    names = vars(sys.modules[owner.__module__])
-    found: dict[str, Any] = {}
-    for name, text in inspect.get_annotations(owner).items():
-        try:
-            found[name] = eval(text, names) if isinstance(text, str) else text
-        except NameError:  # imported for type checkers alone
-            continue
-    return found
+    return {name: hint for name, hint in types_of(owner).items() if not _is_unknown(hint)}
+
+
+def _is_unknown(hint: Any) -> bool:
+    return hint is Unknown or any(map(_is_unknown, hint if isinstance(hint, list) else get_args(hint)))
+
+
+def metadata(hint: Any) -> tuple[Any, ...]:
+    """Return what ``Annotated`` says of a type, the outermost first, or of the members of a union."""
+    if get_origin(hint) is Annotated:
+        inner, *more = get_args(hint)
+        return (*reversed(more), *metadata(inner))
+    return tuple(each for member in _union(hint) for each in metadata(member))
+
+
+def members(hint: Any) -> tuple[Any, ...]:
+    """Return the types of a union, without None and without what is said of them."""
+    if get_origin(hint) is Annotated:
+        return members(get_args(hint)[0])
+    parts = _union(hint)
+    return tuple(each for part in parts for each in members(part)) if parts else (hint,) * (hint is not type(None))
+
+
+def _union(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else ()
 
 
 def described(found: object) -> str:
@@ -135,7 +181,7 @@ def _fits_list(value: Iterable[object], inner: tuple[Any, ...]) -> bool:
     """Return whether what is iterated over is a list whose items have a type, or these types one after the other."""
     if isinstance(value, str | bytes | Mapping):
         return False
-    if hasattr(value, "__array__") and not {*_members(inner[0])} <= {float, int, str}:  # samples or a data frame
+    if hasattr(value, "__array__") and not {*members(inner[0])} <= {float, int, str}:  # samples or a data frame
         return False
     if not hasattr(value, "__len__"):  # read as it is used
         return True
@@ -153,23 +199,15 @@ def _is_numeric(value: object) -> bool:
         return False
 
 
-def _members(hint: Any) -> tuple[Any, ...]:
-    """Return the types of a union, without None."""
-    if get_origin(hint) is Annotated:
-        return _members(get_args(hint)[0])
-    found = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    return tuple(each for each in found if each is not type(None))
-
-
 def _expected(hint: Any) -> str:
     """Return a type in words."""
-    for each in (hint, *_members(hint)):
-        if get_origin(each) is Annotated:
-            return str(get_args(each)[1])
-    members = _members(hint)
-    words = [_word(each) for each in members]
+    for each in metadata(hint):
+        if isinstance(each, str):
+            return each
+    kinds = members(hint)
+    words = [_word(each) for each in kinds]
     if "" in words:  # a path
-        others = [word for word, each in zip(words, members, strict=True) if word and each is not str]
+        others = [word for word, each in zip(words, kinds, strict=True) if word and each is not str]
         words = [*others, f"the name of {'its' if others else 'a'} file"]
     return " or ".join(dict.fromkeys(words))
 
@@ -180,7 +218,7 @@ def _word(hint: Any) -> str:
     if isinstance(kind, type) and issubclass(kind, PathLike):
         return ""
     if kind is tuple and inner[-1] is not Ellipsis:
-        return f"{len(inner)} {'numbers' if {float, int} & set(_members(inner[0])) else 'items'}"
+        return f"{len(inner)} {'numbers' if {float, int} & set(members(inner[0])) else 'items'}"
     if isinstance(kind, type) and issubclass(kind, Mapping):
         return "a mapping from names"
     if inner and kind is not Callable:

@@ -12,10 +12,11 @@ import math
 import numbers
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
 
 from imulab.display import Note
 from imulab.errors import OptionError, quoted
+from imulab.options import Group, text
 from imulab.quantities import in_si, quantity, with_uncertainty
 from imulab.units import STANDARD_GRAVITY, from_si
 
@@ -76,6 +77,12 @@ class Gravity:
 
 
 Given = TypeVar("Given")
+
+
+_GROUP = Group("gravity")
+LocalGravity: TypeAlias = Annotated[float | str | Gravity | None, text("G", unit="m/s^2"), _GROUP]
+Latitude: TypeAlias = Annotated[float | str | None, text("DEG", unit="deg"), _GROUP]
+Height: TypeAlias = Annotated[float | str | None, text("M", unit="m"), _GROUP]
 
 
 def local_gravity(given: float | str | Gravity | None, recording: Recording) -> Gravity:

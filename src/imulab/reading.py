@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imulab.frames import Frame
+from imulab.options import PROGRAM, READING, file, parsed, text
+from imulab.quantities import span, whole_number
 from imulab.recording import Array, Recording
 
 Data: TypeAlias = str | os.PathLike[str] | Recording | Frame | ArrayLike | Mapping[str, ArrayLike]
@@ -106,28 +108,44 @@ class Part(TypedDict, total=False):
         Unit of the sensors whose quantity it measures.
     units
         Units by sensor or column.
-    layout, topic, instance
-        As for `imulab.read`.
+    layout
+        Columns of a foreign file; see imulab show --formats.
+    topic
+        Topic of a bag or log, where there are several; with a comma, the magnetometer's beside it.
+    instance
+        Sensor of a flight log, from 0; the first if not given.
     element
-        One IMU of several, from 1.
+        One IMU of a file of several, from 1.
     """
 
-    time: ArrayLike | None
-    unit: str | None
-    units: Mapping[str, str] | None
-    layout: str | os.PathLike[str] | Layout | None
-    topic: str | None
-    instance: int | None
-    element: int | None
+    time: Annotated[ArrayLike | None, PROGRAM]
+    unit: Annotated[str | None, PROGRAM]
+    units: Annotated[Mapping[str, str] | None, PROGRAM]
+    layout: Annotated[str | os.PathLike[str] | Layout | None, file("NAME|L.toml"), READING]
+    topic: Annotated[str | None, text("TOPIC"), READING]
+    instance: Annotated[int | None, parsed(whole_number, "N"), READING]
+    element: Annotated[int | None, parsed(whole_number, "N"), READING]
 
 
 class Sampling(Part, total=False):
-    """The same, and `rate`: samples per second, Hz, of arrays without `time`."""
+    """The same, and how often arrays were sampled.
+
+    Attributes
+    ----------
+    rate
+        Samples per second, Hz, of arrays without `time`.
+    """
 
     rate: float | None
 
 
 class Reading(Sampling, total=False):
-    """The same, and which part of them: `window`, first and last time, s, as ``(10, 60)`` or ``"10:60"``."""
+    """The same, and which part of them.
 
-    window: Window | None
+    Attributes
+    ----------
+    window
+        Part to read; either side may be left out. First and last time, s, as ``(10, 60)`` or ``"10:60"``.
+    """
+
+    window: Annotated[Window | None, parsed(span, "FROM:TO", unit="s"), READING]

@@ -48,10 +48,7 @@ def _print_version() -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> int:
-    from typer.exceptions import TyperException
-
-    from imulab.cli.app import command
-    from imulab.cli.common import usage
+    from imulab.cli.app import run, typed_words
     from imulab.cli.options import explained, release
     from imulab.errors import ImulabError
 
@@ -59,25 +56,15 @@ def _main(arguments: Sequence[str] | None) -> int:
         if hasattr(stream, "reconfigure"):  # a terminal without µ gets a question mark, not a fault
             stream.reconfigure(errors="replace")
     try:
-        status = command(sys.argv[1:] if arguments is None else arguments).main(
-            args=arguments,
-            prog_name="imulab",
-            standalone_mode=False,
-            obj=main,  # `imulab demo` runs other commands
-        )
+        if arguments is None and (asked := os.environ.get("_IMULAB_COMPLETE")):
+            return _complete(asked)
+        status = run(typed_words() if arguments is None else arguments)
         sys.stdout.flush()
         release()
     except ImulabError as error:
         return _refuse(explained(str(error)))
-    except TyperException as error:
-        if type(error).__name__ == "NoArgsIsHelpError":
-            print(error.format_message())
-            return 0
-        return _refuse(usage(error))
     except SystemExit as error:
-        if not error.code or "_IMULAB_COMPLETE" in os.environ:
-            return int(error.code or 0)  # a shell was told what completes a word, or how to ask
-        return _stop_writing(BrokenPipeError())
+        return 0 if not error.code else _stop_writing(BrokenPipeError())
     except OSError as error:
         return _stop_writing(error)
     except Exception as error:
@@ -89,7 +76,18 @@ def _main(arguments: Sequence[str] | None) -> int:
             file=sys.stderr,
         )
         return 1
-    return status if isinstance(status, int) else 0
+    return status or 0
+
+
+def _complete(asked: str) -> int:
+    """Tell a shell what completes a word, or how to ask."""
+    from imulab.cli.app import ROOT_OPTIONS, find, listed_commands
+    from imulab.cli.completion import answer
+
+    text, status = answer(asked, find, listed_commands, ROOT_OPTIONS)
+    print(text)
+    sys.stdout.flush()
+    return status
 
 
 def _stop_writing(error: OSError) -> int:

@@ -1,137 +1,172 @@
-"""The tree of commands."""
+"""The commands: where each is, and how the words that were typed find it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import glob
+import os
+import sys
+from collections.abc import Iterator, Sequence
 from importlib import import_module
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Any
 
-import typer
-
+from imulab import docstrings
 from imulab._version import VERSION
-from imulab.cli.common import offer
+from imulab.cli.command import ALIKE, HELP, Command, values_of
+from imulab.errors import OptionError, listed, meant
 
-_SETTINGS: dict[str, Any] = {
-    "no_args_is_help": True,
-    "rich_markup_mode": None,
-    "context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 100},
+TITLE = "From recordings of inertial sensors to calibration records and reports."
+EXAMPLES = """
+  Examples:
+    imulab show recording.csv
+    imulab tumble fit recording.csv --gravity 9.81362 -o sn42.json --report sn42.html
+    imulab apply sn42.json flight.csv -o corrected.csv
+
+  'imulab COMMAND --help' says more; 'imulab demo' runs everything on simulated instruments."""
+ROOT_OPTIONS = (
+    ("--version", "Print the version."),
+    ("--install-completion", "Install completion for the current shell."),
+    ("--show-completion", "Show completion for the current shell, to copy it or customize the installation."),
+)
+_WHERE = {
+    **dict.fromkeys(("apply", "show", "report", "demo"), "records"),
+    **{"convert": "records", "export": "records", "allan": "noise", "live": "live", "open": "live"},
+    **{name: name for name in ("tumble", "array", "centrifuge", "warmup", "noise", "thermal", "rate", "fleet")},
 }
-_EXAMPLES = """
-\b
-Examples:
-  imulab show recording.csv
-  imulab tumble fit recording.csv --gravity 9.81362 -o sn42.json --report sn42.html
-  imulab apply sn42.json flight.csv -o corrected.csv
-\b
-'imulab COMMAND --help' says more; 'imulab demo' runs everything on simulated instruments.
-"""
-_GROUPS = {
-    "tumble": "Calibrate an accelerometer triad with gravity alone.",
-    "array": "Fuse several gyroscopes on one axis into one rate.",
-    "centrifuge": "Measure how a gyroscope's g-sensitive drift changes with g.",
-    "warmup": "Tabulate and subtract the bias after power-on.",
-    "noise": "Model the noise of sensors at rest, for filters.",
-    "thermal": "Calibrate an accelerometer triad over temperature.",
-    "rate": "Calibrate gyroscopes by a rate table or by turns.",
-    "fleet": "Calibrate many units, and watch the line.",
-}
-_SINGLE = ("convert", "export", "allan", "live", "open")
-"""Commands with a module of their own; the others that are in no group are those of records."""
-_SUMMARIES = {
-    "apply": "Correct a recording by records.",
-    "show": "Say what is in a record or recording, or what changed.",
-    "report": "Draw the report of a record.",
-    "demo": "Run all procedures on simulated instruments.",
-    "convert": "Write a recording of any kind as CSV or Parquet.",
-    "export": "Write firmware, a blob, or another program's files.",
-    "live": "Guide a test while the unit is connected.",
-    "open": "Open the workbench in the browser.",
-    "allan": "Print Allan deviation and noise coefficients.",
-    "tumble plan": "Choose the attitudes to measure.",
-    "tumble simulate": "Simulate a recording of a tumble test.",
-    "tumble fit": "Calibrate an accelerometer triad.",
-    "tumble gyro": "Calibrate the gyroscope triad on top of that.",
-    "tumble mag": "Calibrate a magnetometer triad beside it.",
-    "tumble check": "Hold fresh attitudes against a record.",
-    "array simulate": "Simulate a recording of an array.",
-    "array merge": "Join files of one gyro each to an array.",
-    "array calibrate": "Find bias, noise and alignment of every element.",
-    "array fuse": "Fuse a file or a live stream into one rate.",
-    "array compare": "Run every method over one recording.",
-    "warmup plan": "Write the chamber programme of a test.",
-    "warmup simulate": "Simulate the power cycles of a test.",
-    "warmup fit": "Fit the table of a unit to its power cycles.",
-    "warmup table": "Write the table as CSV, or a record from that CSV.",
-    "centrifuge plan": "List the runs of a test, with what they will give.",
-    "centrifuge simulate": "Simulate the runs of a test.",
-    "centrifuge reduce": "Reduce a test to K at every g and to its curve.",
-    "noise fit": "Fit a model of the noise to logs at rest.",
-    "noise plan": "Say how long to record for a wanted accuracy.",
-    "noise check": "Hold a new log against a noise record.",
-    "noise simulate": "Simulate a log at rest.",
-    "thermal simulate": "Simulate a unit at several temperatures.",
-    "thermal fit": "Fit one model to recordings at several temperatures.",
-    "rate simulate": "Simulate a unit on a rate table.",
-    "rate fit": "Calibrate gyroscopes from steps of rate.",
-    "rate turn": "Find scale factors from whole turns by hand.",
-    "fleet run": "Calibrate every unit of a manifest that has no record.",
-    "fleet status": "Say what is done, failed and missing.",
-    "fleet report": "Draw the statistics of the line.",
-}
-"""What the lists of commands say, each a line; the commands' own help says more."""
+"""The first word of a command to the module that has it."""
 
 
-def command(arguments: Sequence[str] = ()) -> Any:
-    """Return the root command; where the arguments begin with a command or a group, without the others.
+def commands(first: str = "") -> list[Command]:
+    """Return all commands, or those that begin with a word."""
+    modules = dict.fromkeys([_WHERE[first]] if first else _WHERE.values())
+    found = [command for name in modules for command in _module(name).COMMANDS]
+    return [command for command in found if not first or command.path.split()[0] == first]
 
-    Importing and building all of them takes a fifth of the time of a short command.
+
+def find(words: Sequence[str]) -> Command | str:
+    """Return the command that words begin with; of others, how much of them names a group, maybe nothing.
+
+    Raises
+    ------
+    OptionError
+        They name none.
     """
-    app = typer.Typer(
-        help="From recordings of inertial sensors to calibration records and reports.", epilog=_EXAMPLES, **_SETTINGS
-    )
-    app.callback()(_root)
-    first = arguments[0] if arguments else ""
-    known = {name for name in (*_GROUPS, *_SUMMARIES) if " " not in name}
-    wanted = {first} if first in known else known
-    for name in _GROUPS:
-        if name in wanted:
-            app.add_typer(_module(name).commands(_SETTINGS), name=name, help=_GROUPS[name])
-    if wanted - {*_GROUPS, *_SINGLE}:
-        _module("records").add_commands(app)
-    for name in _SINGLE:
-        if name in wanted:
-            app.command(name)(
-                getattr(
-                    _module(
-                        {"allan": "noise", "convert": "records", "export": "records", "open": "live"}.get(name, name)
-                    ),
-                    name,
-                )
-            )
-    root: Any = typer.main.get_command(app)
-    for path, summary in _SUMMARIES.items():
-        found = root
-        for name in path.split():
-            found = getattr(found, "commands", {}).get(name)
-        if found:
-            found.short_help = summary
-    offer(root)
-    return root
+    if not words or words[0].startswith("-") or words[0] not in _WHERE:
+        return ""
+    known = {command.path: command for command in commands(words[0])}
+    return known.get(words[0]) or known.get(" ".join(words[:2])) or words[0]
+
+
+def listed_commands(group: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the commands of a group, or the first words of all, and a line on each."""
+    if group:
+        yield from ((command.path.split()[1], command.summary) for command in commands(group))
+        return
+    for name in _WHERE:
+        first = commands(name)[0]
+        yield name, first.summary if first.path == name else docstrings.summary(_module(_WHERE[name]))
+
+
+def run(words: Sequence[str]) -> int | None:
+    """Run a command by the words that were typed; return its exit status, None for 0.
+
+    Raises
+    ------
+    OptionError
+        There is no such command, or it has no such option; and what the command raises.
+    """
+    from imulab.cli.common import run_command
+
+    words = list(words)
+    if _answered("", words):
+        return None
+    group = words.pop(0)
+    if group not in _WHERE:
+        raise _no_command(group, "")
+    found = find([group, *words])
+    if not isinstance(found, Command):
+        if _answered(group, words):
+            return None
+        found = find([group, *words])
+    if not isinstance(found, Command):
+        raise _no_command(words[0], group)
+    given = values_of(found, words[found.path.count(" ") :])
+    if given is not None:
+        return run_command(found, *given)
+    from imulab.cli.help import command_help
+
+    print(command_help(found))
+    return None
+
+
+def _names(group: str) -> list[str]:
+    return [command.path.split()[1] for command in commands(group)] if group else [*_WHERE]
+
+
+def _no_command(word: str, group: str) -> OptionError:
+    return OptionError(f"No such command '{word}'; known commands: {listed(_names(group), word)}")
+
+
+def _answered(group: str, words: list[str]) -> bool:
+    """Take the options of the root or of a group from the beginning of the words, and print what they ask for."""
+    known = {flag: lambda: print(_group_help(group)) for flag in HELP.flags} | ({} if group else _ANSWERS)
+    asked = [] if words else [*HELP.flags]
+    while words and words[0].startswith("-") and words[0] != "-":
+        word = words.pop(0)
+        if word == "--":
+            break
+        if word not in known:
+            path = f"imulab {group}".strip()
+            raise OptionError(f"No such option: {word}; see '{path} --help'{meant(known, word, ALIKE)}")
+        asked.append(word)
+    if asked:
+        known[asked[0]]()
+    elif not words:
+        raise OptionError(f"Missing command; known commands: {listed(_names(group), '')}")
+    return bool(asked)
+
+
+def _group_help(group: str) -> str:
+    from imulab.cli.help import group_help
+
+    if group:
+        text = docstrings.summary(_module(_WHERE[group]))
+        return group_help(f"imulab {group}", text, (), listed_commands(group))
+    return f"{group_help('imulab', TITLE, ROOT_OPTIONS, listed_commands())}\n{EXAMPLES}"
+
+
+def _version() -> None:
+    print(f"imulab {VERSION}")
+
+
+def _show_completion() -> None:
+    from imulab.cli import completion
+
+    print(completion.script(completion.current_shell()))
+
+
+def _install_completion() -> None:
+    from imulab.cli import completion
+
+    shell = completion.current_shell()
+    print(f"{shell} completion installed in {completion.install(shell)}")
+    print("Completion will take effect once you restart the terminal")
+
+
+_ANSWERS = dict(zip(dict(ROOT_OPTIONS), (_version, _install_completion, _show_completion), strict=True))
+
+
+def typed_words() -> list[str]:
+    """Return the words of this process; on Windows, where no shell does it, with names of files for patterns."""
+    words = sys.argv[1:]
+    if os.name != "nt":
+        return words
+    expanded: list[str] = []
+    for word in words:
+        pattern = os.path.expandvars(str(Path(word).expanduser()))
+        expanded += glob.glob(pattern, recursive=True) or [word]  # noqa: PTH207
+    return expanded
 
 
 def _module(name: str) -> Any:
     return import_module(f"imulab.cli.{name}")
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        print(f"imulab {VERSION}")
-        raise typer.Exit
-
-
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", callback=_version, is_eager=True)
-    ] = False,
-) -> None:
-    """From recordings of inertial sensors to calibration records and reports."""

@@ -1,15 +1,15 @@
-"""``imulab array``: simulate, merge, calibrate, fuse and compare."""
+"""Fuse several gyroscopes on one axis into one rate."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from json import dumps
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+import imulab as il
+from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -18,28 +18,22 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
-    one_of,
     progress_bar,
     quantity,
     reading,
     warn,
     whole_number,
     with_notes,
-    with_options,
 )
-from imulab.device import METHODS, STARTS
+from imulab.device import STARTS
 from imulab.display import aligned
 from imulab.errors import OptionError
-from imulab.procedures.gyro_array import EXPERIMENTS, FAULTS, MOUNTINGS, OF_THE_SOURCE, UNITS
-from imulab.procedures.gyro_array.compare import Comparison, ExperimentRow
-from imulab.procedures.gyro_array.elements import unit_of_angle
-from imulab.procedures.gyro_array.figures import method_texts
-from imulab.procedures.gyro_array.procedure import MEMORY, METHOD, OPTIONS
-from imulab.procedures.procedure import READING
-from imulab.report.traces import plain_number
+from imulab.options import OUTPUT
+from imulab.procedures.gyro_array import OF_THE_SOURCE
 
 if TYPE_CHECKING:
     from imulab.device.unit import Blob
+    from imulab.procedures.gyro_array.compare import Comparison, ExperimentRow
     from imulab.procedures.gyro_array.fuse import Fuser
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
@@ -56,6 +50,8 @@ _TITLE = {
 
 def describe_experiment(name: str, seeds: int, rows: list[ExperimentRow]) -> str:
     """Return the two tables of an experiment: without and with a calibrated start."""
+    from imulab.report.traces import plain_number
+
     lines = [f"{name}: 6 gyros {_TITLE[name]}; medians of {seeds} seeds"]
     for calibrated in (False, True):
         lines += ["", f"{'with' if calibrated else 'without'} a calibrated start"]
@@ -75,6 +71,10 @@ def experiment_json(name: str, seeds: int, rows: list[ExperimentRow]) -> str:
 
 def describe_comparison(found: Comparison) -> str:
     """Return a table of all seven methods for each axis."""
+    from imulab.procedures.gyro_array.elements import unit_of_angle
+    from imulab.procedures.gyro_array.figures import method_texts
+    from imulab.report.traces import plain_number
+
     model, data = found.record.model, found.record.data
     lines = [
         f"{found.elements.count} gyros on each axis, {found.record.fit['samples']} samples at "
@@ -116,129 +116,83 @@ def _gyros_of_mean(names: Sequence[str], working: Sequence[str]) -> str:
     return f"the {len(working)} that work (not {failed})" if working else "none"
 
 
-# ``imulab array``: simulate, merge, calibrate, fuse and compare.
-
-
-_METHOD = replace(METHOD, help=f"{' '.join(METHODS)}; the calibration's, or robust.")
-_MEMORY = replace(MEMORY, help="growing, growing:COUNT, or a gain between 0 and 1; the calibration's, or growing.")
-CalibrationFile = Annotated[
-    str | None, typer.Option("--calibration", metavar="RECORD", help="Record of array calibrate, taken off first.")
-]
-
-
-def commands(settings: dict[str, Any]) -> typer.Typer:
-    """Return the group of commands."""
-    group = typer.Typer(**settings)
-    for function in (simulate, merge, calibrate, fuse, compare):
-        group.command(function.__name__)(function)
-    return group
+# Fuse several gyroscopes on one axis into one rate.
 
 
 def simulate(
-    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.csv", help="Recording to write.")],
-    experiment: Annotated[str, one_of(EXPERIMENTS, "static and dynamic are the source's set-ups.")] = "dynamic",
-    elements: Annotated[str, typer.Option(help="Gyros on each axis.")] = "6",
-    axes: Annotated[str, typer.Option(help="1 or 3.")] = "1",
-    rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; that of the experiment if not given.")] = None,
-    duration: Annotated[str | None, typer.Option(help="Duration, s; that of the experiment if not given.")] = None,
-    white: Annotated[str, typer.Option(help="White noise of a sample, before a factor for each gyro.")] = "0.05 deg/s",
-    spread: Annotated[str, typer.Option(help="Range of that factor.")] = "0.6,1.6",
-    gauss_markov: Annotated[str, typer.Option(help="Standard deviation of the correlated noise.")] = "0.003 deg/s",
-    correlation_time: Annotated[str, typer.Option(help="Of the correlated noise.")] = "200 s",
-    walk: Annotated[str, typer.Option(help="Rate random walk, per square root of a second.")] = "0.0002 deg/s",
-    turn_on: Annotated[str, typer.Option(help="Standard deviation of the turn-on biases.")] = "0.02 deg/s",
-    scale_spread: Annotated[str, typer.Option(help="Standard deviation of the scale factors.")] = "0",
-    misalignment: Annotated[str, typer.Option(help="Standard deviation of the misalignments.")] = "0 deg",
-    mounting: Annotated[str, one_of(MOUNTINGS, "alternate: even elements upside down.")] = "same",
-    fault: Annotated[
-        list[str] | None,
-        one_of(FAULTS, f"{' '.join(FAULTS)}; s, deg/s.", metavar="KIND:GYRO[:START[:DURATION[:SIZE]]]"),
-    ] = None,
-    unit: Annotated[str, one_of(UNITS, "Unit of the outputs.")] = "deg/s",
-    session: Annotated[str, typer.Option(help="Another recording of the same array.")] = "0",
-    seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
+    *, output: Annotated[str, option("OUT.csv", "Recording to write.", "-o", "--output"), OUTPUT], **options: Any
 ) -> None:
-    """Simulate an array's recording, with its truth in the columns truth_rate."""
-    from imulab.procedures.gyro_array.simulate import simulate_array
+    """Simulate a recording of an array.
+
+    With its truth in the columns truth_rate.
+    """
     from imulab.writers import write_csv
 
     check_outputs([output], [])
-    recording = call(
-        simulate_array, experiment=experiment, elements=elements, axes=axes, rate=rate, duration=duration, white=white,
-        spread=spread, gauss_markov=gauss_markov, correlation_time=correlation_time, walk=walk, turn_on=turn_on,
-        scale_spread=scale_spread, misalignment=misalignment, mounting=mounting, fault=fault, unit=unit,
-        session=session, seed=seed,
-    )  # fmt: skip
+    recording = call(il.simulate_array, **options)
     write_csv(recording, output)
-    print(f"{output}: {len(recording)} samples, {elements} gyros on each axis, serial {recording.metadata['serial']}")
+    elements, serial = options["elements"], recording.metadata["serial"]
+    print(f"{output}: {len(recording)} samples, {elements} gyros on each axis, serial {serial}")
 
 
-@with_options(READING)
 def merge(
-    files: Annotated[list[str], typer.Argument(metavar="FILE FILE...", help="Recordings, a gyroscope each.")],
+    files: Annotated[list[str], Argument("FILE FILE...", "Recordings, a gyroscope each.")],
     *,
-    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Recording of the array to write.")],
-    axis: Annotated[str | None, typer.Option(metavar="x|y|z", help="Take this axis of each.")] = None,
-    column: Annotated[str | None, typer.Option(metavar="NAME", help="Take this column of each.")] = None,
-    align: Annotated[bool, typer.Option("--align", help="Move the clocks to where the motion fits the first.")] = False,
-    options: dict[str, str | None],
+    output: Annotated[str, option("OUT", "Recording of the array to write.", "-o", "--output"), OUTPUT],
+    **options: Any,
 ) -> None:
-    """Join files of one gyroscope each to the recording of an array, by time, at the times of the first file."""
+    """Join files of one gyro each to an array.
+
+    By time, at the times of the first file.
+    """
     from imulab.cli.options import note, read_recording
-    from imulab.procedures.gyro_array.public import merge_array
     from imulab.writers import check_writable, write
 
-    check_outputs([output], [*files, *([options["layout"]] if options["layout"] else [])])
     how = reading(options)
+    check_outputs([output], [*files, *([how["layout"]] if how["layout"] else [])])
     check_writable(output)
     recordings = [read_recording(file, **how) for file in files]
-    merged = call(merge_array, recordings, axis=axis, column=column, align=align)
+    merged = call(il.merge_array, recordings, **options)
     write(merged.recording, output)
     for message in merged.notes:
         note(message)
     print(f"{output}: {len(merged.recording)} samples, {len(files)} gyros")
 
 
-@with_options(OPTIONS)
 def calibrate(
-    still: Annotated[str, typer.Argument(metavar="STILL", help="Recording at rest.")],
-    options: dict[str, str | None],
-    moving: Annotated[
-        str | None, typer.Option("--moving", metavar="FILE", help="Recording in motion, for alignment and scale.")
-    ] = None,
+    still: Annotated[str, Argument("STILL", "Recording at rest.")],
+    *,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Calibrate an array's elements: bias, noise and correlation at rest; sign and scale or alignment in motion."""
+    """Find bias, noise and alignment of every element.
+
+    Bias, noise and correlation at rest; sign and scale or alignment in motion.
+    """
     from imulab.cli.show import finish
     from imulab.procedures.registry import run_task
 
+    moving = options.pop("moving")
     check_outputs([output, report], [name for name in (still, moving, options["layout"], options["noise"]) if name])
     files = [still] if moving is None else [still, moving]
     finish(run_task("array", files, options, GivenFiles()), output, report, json=json)
 
 
-@with_options((_METHOD, _MEMORY, *READING))
-def fuse(
-    file: RecordingFile,
-    options: dict[str, str | None],
-    initial_bias: Annotated[
-        str, one_of(STARTS, "Biases to start from.", "--initial-bias", metavar=f"{'|'.join(STARTS)}|RECORD")
-    ] = "first",
-    calibration: CalibrationFile = None,
-    rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; from the first samples if not given.")] = None,
-    still: Annotated[
-        str | None, typer.Option("--still", metavar="FROM:TO", help="The unit is known to be at rest then, s.")
-    ] = None,
-    output: OutputFile = None,
-) -> None:
-    """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes."""
+def fuse(file: RecordingFile, *, output: OutputFile = None, **options: Any) -> None:
+    """Fuse a file or a live stream into one rate.
+
+    CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes.
+    """
     from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, carried, fusion_text
     from imulab.quantities import interval
     from imulab.readers import read_blocks
     from imulab.writers import check_writable, write, write_csv_to
 
+    calibration, initial_bias, rate, still = (
+        options[name] for name in ("calibration", "initial_bias", "rate", "still")
+    )
     records = [name for name in (calibration, None if initial_bias in STARTS else initial_bias) if name]
     check_outputs([output], [name for name in (file, options["layout"], *records) if name])
     how = reading(options)
@@ -313,21 +267,25 @@ def _print_findings(fuser: Fuser, *, verdict: bool) -> None:
         warn(line)
 
 
-@with_options((_MEMORY, *READING))
 def compare(
-    file: Annotated[str | None, typer.Argument(metavar="FILE", help="Recording, with or without truth_rate.")] = None,
+    file: Annotated[str | None, Argument("FILE", "Recording, with or without truth_rate.")] = None,
     *,
-    calibration: CalibrationFile = None,
-    experiment: Annotated[str | None, one_of(OF_THE_SOURCE, "Run the source's set-up instead of a FILE.")] = None,
-    seeds: Annotated[str, typer.Option(help="Runs of the experiment.")] = "20",
-    options: dict[str, str | None],
+    experiment: Annotated[
+        str | None, option("|".join(OF_THE_SOURCE), "Run the source's set-up instead of a FILE.", words=OF_THE_SOURCE)
+    ] = None,
+    seeds: Annotated[str, option("N", "Runs of the experiment.")] = "20",
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Run every method over one recording, or over the source's experiments, and say what fusing buys."""
+    """Run every method over one recording.
+
+    Or over the source's experiments; says what fusing buys.
+    """
     from imulab.cli.show import write_both
 
+    calibration = options["calibration"]
     if (file is None) == (experiment is None):
         raise OptionError("array compare: expected FILE, or --experiment static|dynamic")
     check_outputs([output, report], [name for name in (file, calibration, options["layout"]) if name])
@@ -360,3 +318,18 @@ def compare(
             print(f"{what}: {name}")
     for message in comparison.warnings:
         warn(message)
+
+
+def _of_calibrate() -> list[Any]:
+    from imulab.procedures.gyro_array.procedure import Older
+
+    return [il.calibrate_array, Older]
+
+
+COMMANDS = (
+    Command("array simulate", simulate, lambda: [il.simulate_array]),
+    Command("array merge", merge, lambda: [il.merge_array], without=("element",)),
+    Command("array calibrate", calibrate, _of_calibrate, without=("element",)),
+    Command("array fuse", fuse, lambda: [il.fuse], without=("element",)),
+    Command("array compare", compare, lambda: [il.compare_methods], without=("element",)),
+)

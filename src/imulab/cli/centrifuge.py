@@ -1,11 +1,11 @@
-"""``imulab centrifuge``: plan, simulate and reduce."""
+"""Measure how a gyroscope's g-sensitive drift changes with g."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+import imulab as il
+from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -15,62 +15,31 @@ from imulab.cli.options import (
     check_outputs,
     progress_bar,
     warn,
-    with_options,
 )
 from imulab.display import aligned
 from imulab.errors import OptionError
-from imulab.procedures.centrifuge.procedure import OPTIONS
+from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
     from imulab.procedures.centrifuge.plan import Plan
 
-ManifestFile = Annotated[str, typer.Argument(metavar="MANIFEST", help="Manifest of the test, TOML.")]
-Levels = Annotated[str, typer.Option(help="Specific forces in g, with commas; the lowest is the reference.")]
-Radius = Annotated[str, typer.Option(help="Arm axis to the gyroscope's centre.")]
-NetRate = Annotated[str, typer.Option("--net-rate", help="Rate at which the gyroscope turns against the room.")]
-Cycles = Annotated[str, typer.Option(help="Number of power cycles.")]
-BothSenses = Annotated[bool, typer.Option("--both-senses", help="Every level in both senses.")]
-
-
-def commands(settings: dict[str, Any]) -> typer.Typer:
-    """Return the group of commands."""
-    group = typer.Typer(**settings)
-    group.command("plan")(plan)
-    group.command("simulate")(simulate)
-    group.command("reduce")(reduce)
-    return group
-
 
 def plan(
-    levels: Levels = "1,2,5,10,15,20,30,40",
-    radius: Radius = "2 m",
-    net_rate: NetRate = "40 deg/s",
-    duration: Annotated[str, typer.Option(help="Of each run, s, or with a unit.")] = "15 min",
-    cycles: Cycles = "2",
-    both_senses: BothSenses = False,
-    drift: Annotated[str, typer.Option("--drift", metavar="K", help="Expected drift per g.")] = "3.3 deg/h/g",
-    dtg_noise: Annotated[str, typer.Option(help="Angle random walk of the gyroscope.")] = "0.01 deg/sqrt(h)",
-    fog_noise: Annotated[str, typer.Option(help="Angle random walk of the FOG.")] = "0.005 deg/sqrt(h)",
-    uncertainty: Annotated[str, typer.Option(help="Wanted standard uncertainty of K, relative.")] = "1 %",
-    radius_uncertainty: Annotated[str, typer.Option(help="Standard uncertainty of the radius.")] = "0 m",
-    rate_uncertainty: Annotated[str, typer.Option(help="Standard uncertainty of the arm rates.")] = "0 deg/s",
+    *,
     output: Annotated[
-        str | None,
-        typer.Option("-o", "--output", metavar="PLAN.toml", help="Manifest, or .csv list of runs, to write."),
+        str | None, option("PLAN.toml", "Manifest, or .csv list of runs, to write.", "-o", "--output"), OUTPUT
     ] = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """List the runs for wanted levels, predict uncertainties, and say which are too short, too close or too noisy."""
-    from imulab.procedures.centrifuge.plan import plan_centrifuge
+    """List the runs of a test, with what they will give.
 
+    For wanted levels; predicts uncertainties, and says which runs are too short, too close or too noisy.
+    """
     check_outputs([output], [])
     if output is not None and not output.lower().endswith((".toml", ".csv")):
         raise OptionError(f"{output}: expected a name that ends in .toml (the manifest) or .csv (the list of runs)")
-    result = call(
-        plan_centrifuge, levels=levels, radius=radius, net_rate=net_rate, duration=duration, cycles=cycles,
-        both_senses=both_senses, drift=drift, dtg_noise=dtg_noise, fog_noise=fog_noise, uncertainty=uncertainty,
-        radius_uncertainty=radius_uncertainty, rate_uncertainty=rate_uncertainty,
-    )  # fmt: skip
+    result = call(il.plan_centrifuge, **options)
     if output is not None:
         result.save(output)
     head, titles, rows = result.shown()
@@ -82,41 +51,24 @@ def plan(
 
 
 def simulate(
-    context: typer.Context,
-    output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder to write manifest and runs to.")],
-    manifest: Annotated[
-        str | None, typer.Option("--plan", metavar="PLAN.toml", help="Manifest to simulate, as plan writes it.")
-    ] = None,
-    levels: Levels = "1,2,5,10,15,20",
-    radius: Radius = "2 m",
-    net_rate: NetRate = "40 deg/s",
-    cycles: Cycles = "2",
-    both_senses: BothSenses = False,
-    duration: Annotated[str, typer.Option(help="Of each run, s, or with a unit.")] = "5 min",
-    static_duration: Annotated[str, typer.Option(help="Of each static run, s, or with a unit.")] = "1 min",
-    rate: Annotated[str, typer.Option(help="Sample rate.")] = "50 Hz",
-    nonlinearity: Annotated[str, typer.Option(help="K(20 g) / K(0) - 1.")] = "1 %",
-    tilt: Annotated[str, typer.Option(help="Table axis against the arm's axis.")] = "10 arcsec",
-    no_angle: Annotated[bool, typer.Option("--no-angle", help="No table_angle column.")] = False,
-    unit: Annotated[str, typer.Option(help="Of the rates: deg/h deg/s rad/s.")] = "deg/h",
-    seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
+    typed: set[str],
+    *,
+    output: Annotated[str, option("DIR", "Folder to write manifest and runs to.", "-o", "--output"), OUTPUT],
+    **options: Any,
 ) -> None:
-    """Simulate the test of a tuned gyroscope of 3.3 deg/h/g: a manifest, a CSV file for each run, and the truth."""
+    """Simulate the runs of a test.
+
+    Of a tuned gyroscope of 3.3 deg/h/g: a manifest, a CSV file for each run, and the truth.
+    """
     from pathlib import Path
 
-    from imulab.procedures.centrifuge.simulate import simulate_centrifuge
-
+    manifest = options["plan"]
     if manifest is not None:
         for name in ("levels", "radius", "net_rate", "cycles", "both_senses"):
-            source = context.get_parameter_source(name)
-            if source is not None and source.name == "COMMANDLINE":
+            if name in typed:
                 option = f"--{name.replace('_', '-')}"
                 raise OptionError(f"{option}: --plan {manifest} says that already; expected one or the other")
-    simulation = call(
-        simulate_centrifuge, plan=manifest, levels=levels, radius=radius, net_rate=net_rate, cycles=cycles,
-        both_senses=both_senses, duration=duration, static_duration=static_duration, rate=rate,
-        nonlinearity=nonlinearity, tilt=tilt, no_angle=no_angle, unit=unit, seed=seed,
-    )  # fmt: skip
+    simulation = call(il.simulate_centrifuge, **options)
     folder = Path(output)
     check_outputs([str(folder / "manifest.toml")] if folder.is_dir() else [], [manifest] if manifest else [])
     runs = len(simulation.manifest.runs)
@@ -125,17 +77,18 @@ def simulate(
     print(f"{folder / 'manifest.toml'}: {runs} runs, truth in {folder / 'truth.json'}")
 
 
-@with_options(OPTIONS)
 def reduce(
-    manifest: ManifestFile,
-    options: dict[str, str | None],
+    manifest: Annotated[str, Argument("MANIFEST", "Manifest of the test, TOML.")],
+    *,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Reduce a centrifuge test to K and its nonlinearity at every g, and to the curve K(a) that apply subtracts.
+    """Reduce a test to K at every g and to its curve.
 
-    The recordings are read once, block by block. Prints what was found; -o writes the record, --report its figures.
+    K and its nonlinearity at every g, and the curve K(a) that apply subtracts. The recordings are read once, block
+    by block. Prints what was found; -o writes the record, --report its figures.
     """
     from pathlib import Path
 
@@ -179,3 +132,10 @@ def _plan_json(result: Plan) -> str:
             "warnings": list(result.warnings),
         }
     ).rstrip()
+
+
+COMMANDS = (
+    Command("centrifuge plan", plan, lambda: [il.plan_centrifuge]),
+    Command("centrifuge simulate", simulate, lambda: [il.simulate_centrifuge]),
+    Command("centrifuge reduce", reduce, lambda: [il.fit_centrifuge]),
+)

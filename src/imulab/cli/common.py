@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from inspect import signature
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
+from imulab.cli.command import KEYS, NAME, Command
 from imulab.cli.options import choose, note, speech, tell
-from imulab.errors import OptionError, listed, meant, quoted
+from imulab.errors import OptionError, listed, quoted
 from imulab.files import load_toml
 
-# The project file ``imulab.files``: what one would otherwise type with every command.
+# The project file ``imulab.toml``: what one would otherwise type with every command.
 
 
-NAME = "imulab.files"
 OFF = "IMULAB_NO_PROJECT"
-_GRAVITY = ("gravity", "latitude", "height")
-_PATHS = ("layout", "limits")
-KEYS = (*_GRAVITY, *_PATHS, "limit")
+_GRAVITY, _PATHS = KEYS[:3], KEYS[3:5]
 
 
 def find(folder: Path) -> Path | None:
@@ -115,11 +111,11 @@ def additions(settings: Mapping[str, str], typed: Mapping[str, object], files: S
 
 def _describes_itself(file: str) -> bool:
     """Return whether a file is a record, a blob, native CSV or a log, which need no layout."""
-    from imulab.cli.options import is_json
     from imulab.device.unit import is_blob
     from imulab.readers import is_pipe
     from imulab.readers.formats import TEXT, recognised
     from imulab.readers.text import is_native
+    from imulab.records import is_json
 
     path = Path(file)
     if path.is_dir() or is_blob(file):
@@ -139,84 +135,25 @@ def _describes_itself(file: str) -> bool:
 # What every command has: how much it says, the project file, and the size of what it unpacks.
 
 
-_ALIKE = 0.75  # --threshold is no misspelt --hold
-
-
-def offer(root: Any) -> None:
-    """Give every command the options that all have, and every option what the help shows for its value."""
-    app = typer.Typer()
-    app.command()(_common)
-    quiet, verbose, no_project, unpack_limit = typer.main.get_command(app).params[:4]
-    for path, command in commands_of(root):
-        names = {parameter.name for parameter in command.params}
-        given = sorted(names & set(KEYS))
-        command.params += [quiet, verbose, *([no_project] if given else [])]
-        command.params += [unpack_limit] if "layout" in names else []
-        files = [parameter.name for parameter in command.params if parameter.param_type_name == "argument"]
-        command.callback = partial(_run, command.callback, path, files)
-        for parameter in command.params:
-            if parameter.param_type_name == "argument":
-                parameter.display_type_rich = lambda ctx: ""  # the name says what it is
-            elif parameter.metavar is None and not parameter.is_flag:
-                parameter.metavar = _stand_in(parameter.default)
-
-
-def _stand_in(default: Any) -> str:
-    """What the help shows in the place of an option's value."""
-    if not isinstance(default, str) or not default[:1].isdigit():
-        return "VALUE"
-    return "NUMBER" if default.replace(".", "", 1).isdigit() else "QUANTITY"
-
-
-def commands_of(group: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every command below a group, with its path (``tumble fit``)."""
-    for name, command in group.commands.items():
-        if hasattr(command, "commands"):
-            yield from commands_of(command, f"{path}{name} ")
-        else:
-            yield f"{path}{name}", command
-
-
-def _common(
-    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="No progress and no notes; warnings stay.")] = False,
-    verbose: Annotated[
-        bool, typer.Option("-v", "--verbose", help="Say what was read and chosen, and how long it took.")
-    ] = False,
-    no_project: Annotated[bool, typer.Option("--no-project", help=f"Do without {NAME}.")] = False,
-    unpack_limit: Annotated[
-        str | None,
-        typer.Option("--unpack-limit", metavar="SIZE", help="How much a compressed file may unpack to, such as 20GB."),
-    ] = None,
-) -> None:
-    """Stand for the options that every command has."""
-
-
-def _run(
-    command: Callable[..., Any],
-    path: str,
-    files: list[str],
-    /,
-    *,
-    quiet: bool,
-    verbose: bool,
-    no_project: bool = False,
-    unpack_limit: str | None = None,
-    **values: Any,
-) -> Any:
-    """Run a command, with what a project file says put where nothing was typed."""
+def run_command(command: Command, values: dict[str, Any], typed: set[str]) -> int | None:
+    """Run a command, with what a project file says put where nothing was typed; return its exit status."""
+    quiet, verbose, no_project = (values.pop(name, False) for name in ("quiet", "verbose", "no_project"))
     if quiet and verbose:
         raise OptionError("--quiet together with --verbose: expected one or the other")
     choose(quiet=quiet, verbose=verbose, project=not no_project)
-    if "layout" in values:
+    if "unpack_limit" in values:
         from imulab.quantities import size
         from imulab.readers.formats import raise_limit
 
-        raise_limit(None if unpack_limit is None else size(unpack_limit, "--unpack-limit"))
-    values |= _from_project(values, files)
+        limit = values.pop("unpack_limit")
+        raise_limit(None if limit is None else size(limit, "--unpack-limit"))
+    values |= _from_project(values, [each.keyword for each in command.arguments])
+    if "typed" in signature(command.function).parameters:
+        values["typed"] = typed
     begun = perf_counter()
-    result = command(**values)
-    tell(f"{path} took {perf_counter() - begun:.2f} s")
-    return result
+    status = command.function(**values)
+    tell(f"{command.path} took {perf_counter() - begun:.2f} s")
+    return status if isinstance(status, int) else None
 
 
 def _from_project(values: dict[str, Any], files: list[str]) -> dict[str, str]:
@@ -241,20 +178,3 @@ def _from_project(values: dict[str, Any], files: list[str]) -> dict[str, str]:
 
 def _names(value: Any) -> list[str]:
     return [value] if isinstance(value, str) else list(value or [])
-
-
-def usage(error: Any) -> str:
-    """Return a mistake in the way a command was typed, as one line that says what there is instead."""
-    context = getattr(error, "ctx", None)
-    message = str(error.format_message())
-    if context is None:
-        return message
-    known = getattr(context.command, "commands", None)
-    if known and "command" in message.lower():
-        typed = message.partition("'")[2].partition("'")[0]
-        return f"{message.partition('. ')[0].rstrip('.')}; known commands: {listed(known, typed)}"
-    close = ""
-    if hasattr(error, "possibilities"):  # typer names the options that it finds like it, in its own words
-        options = [name for parameter in context.command.params for name in parameter.opts]
-        message, close = f"No such option: {error.option_name}", meant(options, error.option_name, _ALIKE)
-    return f"{message.rstrip('.')}; see '{context.command_path} --help'{close}"

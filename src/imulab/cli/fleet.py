@@ -1,4 +1,4 @@
-"""``imulab fleet``: run, status, report and simulate."""
+"""Calibrate many units, and watch the line."""
 
 from __future__ import annotations
 
@@ -7,74 +7,38 @@ import sys
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from imulab.cli.options import AsJson, call, check_outputs, one_of, progress_bar, warn
+import imulab as il
+from imulab.cli.command import Argument, Command, option
+from imulab.cli.options import AsJson, call, check_outputs, progress_bar, warn
 from imulab.display import SENTENCES
 from imulab.errors import OptionError
-from imulab.fleet import ENGINES
+from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
     from imulab.fleet.run import FleetState
 
-HistoryUrl = Annotated[
-    str | None,
-    typer.Option("--history", metavar="URL", help="SQLite or PostgreSQL, or none; a file in DIR if not given."),
-]
 _FEW = 3
 
 
-def commands(settings: dict[str, Any]) -> typer.Typer:
-    """Return the group of commands."""
-    group = typer.Typer(**settings)
-    for function in (run, status, report, simulate):
-        group.command(function.__name__)(function)
-    return group
-
-
 def run(
-    manifest: Annotated[
-        str, typer.Argument(metavar="MANIFEST", help="CSV or Parquet: serial,procedure,file and options of the fits.")
-    ],
-    output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder of the records.")],
-    engine: Annotated[str, one_of(ENGINES, "Processes of this machine, or a Dask cluster.")] = "local",
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster, as tcp://host:8786.")
-    ] = None,
-    workers: Annotated[
-        str | None, typer.Option("--workers", metavar="N", help="Processes; one for each processor if not given.")
-    ] = None,
-    history: HistoryUrl = None,
-    table: Annotated[
-        str | None,
-        typer.Option("--table", metavar="OUT", help=".csv or .parquet; parameters.csv in DIR if not given."),
-    ] = None,
+    manifest: Annotated[str, Argument("MANIFEST", "CSV or Parquet: serial,procedure,file and options of the fits.")],
+    *,
+    output: Annotated[str, option("DIR", "Folder of the records.", "-o", "--output"), OUTPUT],
     json: AsJson = False,
+    **options: Any,
 ) -> int:
-    """Calibrate every unit of a manifest that has no record yet, or one of other files or options.
+    """Calibrate every unit of a manifest that has no record.
 
-    Exit status 2 if a unit failed; all others are finished. Killed at any moment, the next run does what is missing.
+    Or one of other files or options. Exit status 2 if a unit failed; all others are finished. Killed at any moment,
+    the next run does what is missing.
     """
-    from imulab.fleet.run import run_fleet
-
     with ExitStack() as stack:
         update: list[Any] = []
 
         def started(total: int) -> None:
             update.append(stack.enter_context(progress_bar("units", total)))
 
-        state = call(
-            run_fleet,
-            manifest,
-            output,
-            engine=engine,
-            scheduler=scheduler,
-            workers=workers,
-            history=history,
-            table=table,
-            started=started,
-            progress=lambda done: update[0](done),
-        )
+        state = call(il.run_fleet, manifest, output, started=started, progress=lambda done: update[0](done), **options)
     for note in state.notes:
         warn(note)
     if json:
@@ -86,18 +50,20 @@ def run(
         print(f"{units}: {made} done{kept}, {state.count('failed')} failed, {state.seconds:.1f} s")
         if state.judged:
             print(f"verdicts: {state.judged}")
-        print("\n".join([*_failures(state), f"records: {output}", f"table: {table or f'{output}/parameters.csv'}"]))
+        print(
+            "\n".join(
+                [*_failures(state), f"records: {output}", f"table: {options['table'] or f'{output}/parameters.csv'}"]
+            )
+        )
     return _verdict(state)
 
 
-def status(
-    folder: Annotated[str, typer.Argument(metavar="DIR", help="Folder of a fleet.")],
-    json: AsJson = False,
-) -> int:
-    """Say where a fleet stands; exit status 2 if a unit failed."""
-    from imulab.fleet.run import fleet_status
+def status(folder: Annotated[str, Argument("DIR", "Folder of a fleet.")], *, json: AsJson = False) -> int:
+    """Say what is done, failed and missing.
 
-    state = fleet_status(folder)
+    Exit status 2 if a unit failed.
+    """
+    state = il.fleet_status(folder)
     if json:
         print(_as_json(state))
     else:
@@ -108,36 +74,31 @@ def status(
 
 
 def report(
-    folder: Annotated[str, typer.Argument(metavar="DIR", help="Folder of a fleet.")],
-    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.html", help="Report to write.")],
-    limits: Annotated[
-        str | None, typer.Option("--limits", metavar="L.toml", help="Limits of parameters, for Cpk.")
-    ] = None,
-    history: HistoryUrl = None,
+    folder: Annotated[str, Argument("DIR", "Folder of a fleet.")],
+    *,
+    output: Annotated[str, option("OUT.html", "Report to write.", "-o", "--output"), OUTPUT],
+    **options: Any,
 ) -> None:
-    """Draw the line's statistics: distributions, outliers, drift, Cpk, and what changed since the last calibration."""
-    from imulab.fleet.report import write_fleet_report
+    """Draw the statistics of the line.
 
-    check_outputs([output], [limits] if limits else [])
-    write_fleet_report(folder, output, limits=limits, history=history)
+    Distributions, outliers, drift, Cpk, and what changed since the last calibration.
+    """
+    check_outputs([output], [options["limits"]] if options["limits"] else [])
+    il.write_fleet_report(folder, output, **options)
     print(f"report: {output}")
 
 
 def simulate(
-    output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")],
-    units: Annotated[str, typer.Option("--units", metavar="N", help="Number of units, 8 or more.")] = "12",
-    seed: Annotated[str, typer.Option("--seed", metavar="N", help="Of the random numbers.")] = "1",
+    *, output: Annotated[str, option("DIR", "Folder to write to.", "-o", "--output"), OUTPUT], **options: Any
 ) -> None:
     """Simulate a line of accelerometers.
 
-    Recordings of two calibrations of each unit, two manifests and limits. The zero of z drifts over the units, unit 5
-    is far off, and unit 7 changes between its two calibrations.
+    Recordings of two calibrations of each unit, two manifests and limits. The zero of z drifts over the units, unit
+    5 is far off, and unit 7 changes between its two calibrations.
     """
-    from imulab.procedures.tumble.simulate import simulate_fleet
-
     if not output:
         raise OptionError("output '': expected the name of a folder to write to")
-    first, second = call(simulate_fleet, output, units=units, seed=seed)
+    first, second = call(il.simulate_fleet, output, **options)
     print(f"manifests: {first} {second}")
     print(f"limits: {first.parent / 'limits.toml'}")
 
@@ -178,3 +139,11 @@ def _as_json(state: FleetState) -> str:
         indent=1,
         ensure_ascii=False,
     )
+
+
+COMMANDS = (
+    Command("fleet run", run, lambda: [il.run_fleet]),
+    Command("fleet status", status),
+    Command("fleet report", report, lambda: [il.write_fleet_report]),
+    Command("fleet simulate", simulate, lambda: [il.simulate_fleet]),
+)

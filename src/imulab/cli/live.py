@@ -11,14 +11,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, warn, whole_number, with_options
+import imulab as il
+from imulab.cli.command import Argument, Command, option
+from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, warn, whole_number
 from imulab.errors import OptionError
-from imulab.procedures.procedure import FLAG, LAYOUT
-from imulab.procedures.tumble.procedure import GRAVITY, ORDER, TASK
+from imulab.options import FLAG, OUTPUT
 
 if TYPE_CHECKING:
     from imulab.live.page.bench import Workbench
@@ -33,14 +32,12 @@ if TYPE_CHECKING:
 
 FOLDER = "imulab-files"
 _NOT_OFFERED = ("live", "open", "demo", "fleet ")
-PagePort = Annotated[str | None, typer.Option("--port", metavar="N", help="Port of the page; a free one if not given.")]
+PagePort = Annotated[str | None, option("N", "Port of the page; a free one if not given.", "--port")]
 PageHost = Annotated[
     str | None,
-    typer.Option(
-        "--host", metavar="ADDRESS", help="Address of this machine to listen at, for others; 0.0.0.0 or ::, all."
-    ),
+    option("ADDRESS", "Address of this machine to listen at, for others; 0.0.0.0 or ::, all.", "--host"),
 ]
-NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Print the address of the page, and open no browser.")]
+NoBrowser = Annotated[bool, option("", "Print the address of the page, and open no browser.", "--no-browser")]
 
 
 def port_number(text: str | None) -> int:
@@ -85,13 +82,12 @@ def again(save: str, texts: Mapping[str, str | None], output: str | None, record
 
 def workbench(given: Sequence[str] = (), later: Sequence[str] = ()) -> tuple[Workbench, Files]:
     """Return the workbench and its files: those of its folder, those given, and those that may come later."""
-    from imulab.cli.app import command
-    from imulab.cli.common import commands_of
+    from imulab.cli.app import commands
     from imulab.live.page.bench import Workbench
     from imulab.live.page.files import Files
     from imulab.live.page.jobs import forms
 
-    offered = [(path, each) for path, each in commands_of(command()) if not path.startswith(_NOT_OFFERED)]
+    offered = [each for each in commands() if not each.path.startswith(_NOT_OFFERED)]
     files = Files(Path(FOLDER), given, later)
     return Workbench(files, forms(offered)), files
 
@@ -136,6 +132,38 @@ def on_page(
         raise part.error
 
 
+# ``imulab open``: the workbench, in the browser of this machine.
+
+
+def open(  # noqa: A001 -- the name of the command
+    files: Annotated[list[str] | None, Argument("[FILE...]", "Recordings and records to begin with.")] = None,
+    *,
+    port: PagePort = None,
+    host: PageHost = None,
+    no_browser: NoBrowser = False,
+) -> None:
+    """Open the workbench in the browser.
+
+    Drop a recording, see it, calibrate it, take record, report and firmware.
+
+    Prints one line with the address, which only this machine reaches. What is dropped or made is kept in the folder
+    imulab-files. Ctrl-C ends it.
+    """
+    from imulab.live.page import require_server
+
+    number = port_number(port)
+    require_server()
+    from imulab.live.page.server import serve
+
+    part, session = workbench(files or [])
+    session.make()
+    try:
+        serve([part], number, host=checked_host(host), browser=not no_browser)
+    finally:
+        if session.end():
+            note(f"what was dropped and made is in {FOLDER}")
+
+
 # ``imulab live``: a guided test while the unit is connected, from the plug to the record.
 
 
@@ -143,44 +171,40 @@ _WAIT = 0.05
 _EVERY = 0.1
 
 
-@with_options((ORDER, *GRAVITY, LAYOUT))
 def live(
     source: Annotated[
         str,
-        typer.Argument(
-            metavar="SOURCE",
-            help="serial:PORT[@BAUD] (serial: lists ports), udp:PORT, tcp:HOST:PORT, -, replay:FILE[@SPEED], "
+        Argument(
+            "SOURCE",
+            "serial:PORT[@BAUD] (serial: lists ports), udp:PORT, tcp:HOST:PORT, -, replay:FILE[@SPEED], "
             "simulate[:key=value,..].",
         ),
     ],
     *,
-    save: Annotated[str | None, typer.Option("--save", metavar="REC.csv", help="Recording to write.")] = None,
+    save: Annotated[str | None, option("REC.csv", "Recording to write."), OUTPUT] = None,
     output: OutputFile = None,
     report: ReportFile = None,
-    options: dict[str, str | None],
-    target: Annotated[
-        str | None,
-        typer.Option(metavar='"bias 100 ug, .."', help="Standard uncertainties at which it is enough."),
-    ] = None,
-    attitudes: Annotated[
-        str | None, typer.Option(metavar="N", help="Number of attitudes, instead of a target.")
-    ] = None,
-    page: Annotated[bool, typer.Option("--page", help="Show it in a browser on this machine.")] = False,
+    target: Annotated[str | None, option('"bias 100 ug, .."', "Standard uncertainties at which it is enough.")] = None,
+    attitudes: Annotated[str | None, option("N", "Number of attitudes, instead of a target.")] = None,
+    page: Annotated[bool, option("", "Show it in a browser on this machine."), OUTPUT] = False,
     port: PagePort = None,
     host: PageHost = None,
     no_browser: NoBrowser = False,
-    plain: Annotated[bool, typer.Option("--plain", help="A line for each event; ends when it is enough.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the file of --save.")] = False,
-    follow: Annotated[bool, typer.Option("--follow", help="The simulated unit does what the guide says.")] = False,
+    plain: Annotated[bool, option("", "A line for each event; ends when it is enough."), OUTPUT] = False,
+    resume: Annotated[bool, option("", "Go on with the file of --save."), OUTPUT] = False,
+    follow: Annotated[bool, option("", "The simulated unit does what the guide says.")] = False,
+    **options: Any,
 ) -> None:
-    """Guide a tumble test of a unit that is connected: what to do next, when a hold is accepted, when it is enough.
+    """Guide a test while the unit is connected.
 
-    The recording is written out every second; at its end the record is that of `imulab tumble fit` on it.
+    A tumble test: what to do next, when a hold is accepted, when it is enough. The recording is written out every
+    second; at its end the record is that of `imulab tumble fit` on it.
     """
     from imulab.live.guide import read_targets
     from imulab.live.runner import Runner
     from imulab.live.session import Session
     from imulab.live.sources import open_source
+    from imulab.procedures.tumble.procedure import TASK
 
     if source == "serial:":
         _list_ports()
@@ -359,32 +383,7 @@ def _drawn(runner: Runner, *, typed: bool) -> None:
                 drawn = monotonic()
 
 
-# ``imulab open``: the workbench, in the browser of this machine.
-
-
-def open(  # noqa: A001 -- the name of the command
-    files: Annotated[
-        list[str] | None, typer.Argument(metavar="[FILE...]", help="Recordings and records to begin with.")
-    ] = None,
-    port: PagePort = None,
-    host: PageHost = None,
-    no_browser: NoBrowser = False,
-) -> None:
-    """Open the workbench in the browser: drop a recording, see it, calibrate it, take record, report and firmware.
-
-    Prints one line with the address, which only this machine reaches. What is dropped or made is kept in the folder
-    imulab-files. Ctrl-C ends it.
-    """
-    from imulab.live.page import require_server
-
-    number = port_number(port)
-    require_server()
-    from imulab.live.page.server import serve
-
-    part, session = workbench(files or [])
-    session.make()
-    try:
-        serve([part], number, host=checked_host(host), browser=not no_browser)
-    finally:
-        if session.end():
-            note(f"what was dropped and made is in {FOLDER}")
+COMMANDS = (
+    Command("live", live, lambda: [il.fit_tumble], only=("order", "gravity", "latitude", "height", "layout")),
+    Command("open", open),
+)

@@ -1,14 +1,13 @@
-"""``imulab noise``: fit, plan, check, simulate; and ``imulab allan``, the noise of any recording."""
+"""Model the noise of sensors at rest, for filters."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+import imulab as il
+from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import (
-    READ,
     AsJson,
     GivenFiles,
     OutputFile,
@@ -17,18 +16,14 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
-    lists,
     note,
-    one_of,
     quantity,
     reading,
     warn,
-    with_options,
 )
 from imulab.display import printable
 from imulab.errors import OptionError, RecordError
-from imulab.estimation import TAUS
-from imulab.procedures.noise.procedure import OPTIONS
+from imulab.options import OUTPUT
 from imulab.quantities import labelled
 
 if TYPE_CHECKING:
@@ -42,16 +37,11 @@ if TYPE_CHECKING:
 # ``imulab allan``: the noise of any recording.
 
 
-@with_options(READ)
-def allan(
-    file: RecordingFile,
-    *,
-    taus: Annotated[str, one_of(TAUS, "dense: 24 a decade.")] = "octave",
-    options: dict[str, str | None],
-    report: ReportFile = None,
-    json: AsJson = False,
-) -> None:
-    """Print Allan deviation and noise coefficients of every sensor column of a recording at rest."""
+def allan(file: RecordingFile, *, report: ReportFile = None, json: AsJson = False, **options: Any) -> None:
+    """Print Allan deviation and noise coefficients.
+
+    Of every sensor column of a recording at rest.
+    """
     from imulab.estimation.column_noise import analyse
     from imulab.readers import read, read_blocks
     from imulab.recording import is_large, on_disk
@@ -60,7 +50,7 @@ def allan(
     how = reading(options)
     recording = on_disk(read_blocks(file, **how)) if is_large(file) else read(file, **how)
     with labelled("--{}", ["taus"]):
-        found = analyse(recording, taus)
+        found = analyse(recording, options["taus"])
     if report:
         from imulab.files import write_text
         from imulab.report.noise_figures import noise_page
@@ -98,56 +88,32 @@ def describe(found: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-# ``imulab noise``: fit, plan, check, simulate.
+# Model the noise of sensors at rest, for filters.
 
 
-White = Annotated[
-    str | None, typer.Option(metavar="N", help="White noise, 0.3 deg/sqrt(h) or 100 ug/sqrt(Hz); SI without a unit.")
-]
-Flicker = Annotated[str | None, typer.Option(metavar="B", help="1/f noise, such as 5 deg/h.")]
-Walk = Annotated[str | None, typer.Option(metavar="K", help="Random walk, such as 3 deg/h/sqrt(h).")]
-Quantisation = Annotated[str | None, typer.Option(metavar="Q", help="Quantisation of the angle, such as 1 arcsec.")]
-Markov = Annotated[
-    list[str] | None,
-    typer.Option(metavar="SIGMA:TIME", help="Gauss-Markov noise, such as '20 deg/h:300 s'; once or twice."),
-]
-FromRecord = Annotated[
-    str | None, typer.Option("--from", metavar="RECORD", help="In place of terms: those of a record of noise fit.")
-]
+def _programs() -> tuple[str, ...]:
+    from imulab.procedures.noise.wants import PROGRAMS
+
+    return tuple(PROGRAMS)
 
 
-def commands(settings: dict[str, Any]) -> typer.Typer:
-    """Return the group of commands."""
-    group = typer.Typer(**settings)
-    for function in (fit, plan, check, simulate):
-        group.command(function.__name__)(function)
-    return group
-
-
-@with_options(OPTIONS)
 def fit(
-    files: Annotated[list[str], typer.Argument(metavar="LOG...", help="Logs at rest of one unit.")],
-    options: dict[str, str | None],
+    files: Annotated[list[str], Argument("LOG...", "Logs at rest of one unit.")],
+    *,
     output: OutputFile = None,
     report: ReportFile = None,
-    program: Annotated[
-        str | None,
-        typer.Option(
-            "--for",
-            metavar="PROGRAM",
-            help="Print what its filter wants, key: value.",
-            autocompletion=lists("imulab.procedures.noise.wants:PROGRAMS"),
-        ),
-    ] = None,
-    rate: Annotated[str | None, typer.Option(metavar="HZ", help="--for: samples that it gets; as the logs.")] = None,
-    step: Annotated[
-        str | None, typer.Option(metavar="TIME", help="--for: between predictions; px4 10 ms, ardupilot 12 ms.")
-    ] = None,
     json: AsJson = False,
+    program: Annotated[
+        str | None, option("PROGRAM", "Print what its filter wants, key: value.", "--for", words=_programs)
+    ] = None,
+    rate: Annotated[str | None, option("HZ", "--for: samples that it gets; as the logs.")] = None,
+    step: Annotated[str | None, option("TIME", "--for: between predictions; px4 10 ms, ardupilot 12 ms.")] = None,
+    **options: Any,
 ) -> None:
-    """Fit a model of the noise to logs at rest, column by column; several logs of a unit add up.
+    """Fit a model of the noise to logs at rest.
 
-    Prints the terms with their 95 % intervals, and what a filter wants; -o writes the record, --report its figures.
+    Column by column; several logs of a unit add up. Prints the terms with their 95 % intervals, and what a filter
+    wants; -o writes the record, --report its figures.
     """
     from imulab.cli.show import finish
     from imulab.procedures.noise.wants import check_program, noise_for
@@ -170,35 +136,23 @@ def fit(
 
 
 def plan(
-    source: FromRecord = None,
-    wanted: Annotated[
-        str,
-        typer.Option("--for", metavar="10%|walk=10%,..", help="Wanted standard uncertainty, of all terms or by name."),
-    ] = "10 %",
-    white: White = None,
-    flicker: Flicker = None,
-    walk: Walk = None,
-    quantisation: Quantisation = None,
-    gm: Markov = None,
-    rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; that of the record, or 100 Hz.")] = None,
-    duration: Annotated[str | None, typer.Option(help="What a record of this length tells, s.")] = None,
-    columns: Annotated[str | None, typer.Option(metavar="A,A,...", help="Of the record.")] = None,
+    *,
     output: Annotated[
-        str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Uncertainties over the length, to write.")
+        str | None, option("PLAN.csv", "Uncertainties over the length, to write.", "-o", "--output"), OUTPUT
     ] = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Say how long to record at rest for a wanted accuracy of each noise term."""
-    from imulab.display import aligned
-    from imulab.procedures.noise.plan import plan_noise
+    """Say how long to record for a wanted accuracy.
 
-    check_outputs([output], [source] if source else [])
+    At rest, for each noise term.
+    """
+    from imulab.display import aligned
+
+    check_outputs([output], [options["from_"]] if options["from_"] else [])
     if output is not None and not output.lower().endswith(".csv"):
         raise OptionError(f"{output}: expected a name that ends in .csv")
-    result = call(
-        plan_noise, from_=source, for_=wanted, white=white, flicker=flicker, walk=walk, quantisation=quantisation,
-        gm=gm, rate=rate, duration=duration, columns=columns,
-    )  # fmt: skip
+    result = call(il.plan_noise, **options)
     if output:
         result.save(output)
     if json:
@@ -235,22 +189,18 @@ def finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-@with_options(READ)
 def check(
     record: RecordFile,
-    files: Annotated[list[str], typer.Argument(metavar="LOG...", help="Logs at rest, of the record's rate.")],
+    files: Annotated[list[str], Argument("LOG...", "Logs at rest, of the record's rate.")],
     *,
-    tolerance: Annotated[str, typer.Option(help="Change of size that is not held against the log.")] = "1 %",
-    false_alarm: Annotated[
-        str, typer.Option("--false-alarm", help="Share of logs of unchanged noise that fail.")
-    ] = "5 %",
-    options: dict[str, str | None],
     report: ReportFile = None,
     json: AsJson = False,
+    **options: Any,
 ) -> int:
-    """Test whether a new log at rest is of the noise of a record; exit status 0: pass, 1: fail.
+    """Hold a new log against a noise record.
 
-    Several logs add up. Says what differs by how much; a log that is of the same noise fails once in twenty tests.
+    Tests whether a log at rest is of the noise of the record; exit status 0: pass, 1: fail. Several logs add up.
+    Says what differs by how much; a log that is of the same noise fails once in twenty tests.
     """
     from imulab.cli.options import coloured
     from imulab.display import Note
@@ -262,6 +212,7 @@ def check(
     check_outputs([report], [name for name in (record, *files, options["layout"]) if name])
     held = load(record)
     access, how = GivenFiles(), reading(options)
+    tolerance, false_alarm = options["tolerance"], options["false_alarm"]
 
     def log(file: str, choose: Callable[[Recording], Sequence[str]]) -> Recording | Rest:
         return read_log(
@@ -294,32 +245,29 @@ def check(
 
 
 def simulate(
-    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Log to write, .csv or .parquet.")],
-    white: White = None,
-    flicker: Flicker = None,
-    walk: Walk = None,
-    quantisation: Quantisation = None,
-    gm: Markov = None,
-    source: FromRecord = None,
-    rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; that of the record, or 100 Hz.")] = None,
-    duration: Annotated[str, typer.Option(help="Of the log, s.")] = "1 h",
-    columns: Annotated[
-        str | None, typer.Option(metavar="A,A,...", help="Those of the record, or three axes of the sensor.")
-    ] = None,
-    seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
+    *,
+    output: Annotated[str, option("OUT", "Log to write, .csv or .parquet.", "-o", "--output"), OUTPUT],
+    **options: Any,
 ) -> None:
-    """Simulate a log at rest from given noise or from a record's, with its truth in the head of the file.
+    """Simulate a log at rest.
 
-    Logs of any length are written in blocks.
+    From given noise or from a record's, with its truth in the head of the file. Logs of any length are written in
+    blocks.
     """
     from imulab.procedures.noise.simulate import noise_log
     from imulab.writers import check_writable, write
 
-    check_outputs([output], [source] if source else [])
+    check_outputs([output], [options["from_"]] if options["from_"] else [])
     check_writable(output)
-    log = call(
-        noise_log, from_=source, white=white, flicker=flicker, walk=walk, quantisation=quantisation, gm=gm, rate=rate,
-        duration=duration, columns=columns, seed=seed,
-    )  # fmt: skip
+    log = call(noise_log, **options)
     write(log.blocks(), output)
     print(f"{output}: {log.count} samples of {' '.join(log.values)}, {log.count / log.rate:g} s at {log.rate:g} Hz")
+
+
+COMMANDS = (
+    Command("noise fit", fit, lambda: [il.fit_noise]),
+    Command("noise plan", plan, lambda: [il.plan_noise]),
+    Command("noise check", check, lambda: [il.check_noise]),
+    Command("allan", allan, lambda: [il.allan_deviation]),
+    Command("noise simulate", simulate, lambda: [il.simulate_noise]),
+)

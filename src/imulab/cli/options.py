@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from importlib import import_module
-from inspect import Parameter, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TextIO, TypeVar
 
-import typer
-
+from imulab.cli.command import Argument, option
 from imulab.display import Note, printable
 from imulab.errors import ImulabError, OptionError
-from imulab.procedures.procedure import ELEMENT, FLAG, READING, Option, read_options
+from imulab.options import FLAG, OUTPUT, options_of, read_options
 from imulab.quantities import labelled
 from imulab.quantities import quantity as quantity
 from imulab.quantities import whole_number as whole_number
@@ -163,85 +160,15 @@ def _warning(message: str) -> None:
     print(f"imulab: {coloured('warning', sys.stderr)}: {printable(message)}", file=sys.stderr)
 
 
-# Options on the command line, made from the one definition that manifests and functions share.
-
-
-READ = (*READING, ELEMENT)
-"""How a recording is read."""
-
-
-def reading(texts: Mapping[str, str | None]) -> dict[str, Any]:
-    """Return the options of `imulab.read`, from the texts of those that a command has."""
-    return read_options([option for option in READ if option.name in texts], texts, FLAG)
-
-
-def with_options(options: Sequence[Option]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator that puts the options in the place of a command's parameter `options`.
-
-    The command gets the texts that were given by the names of the options, None where none was.
-    """
-
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        def run(**given: Any) -> Any:
-            texts = {option.name: _text(given.pop(option.keyword)) for option in options}
-            return command(options=texts, **given)
-
-        parameters: list[Parameter] = []
-        for parameter in signature(command, eval_str=True).parameters.values():
-            parameters += map(_parameter, options) if parameter.name == "options" else [parameter]
-        parameters = [parameter.replace(kind=Parameter.KEYWORD_ONLY) for parameter in parameters]
-        run.__name__, run.__doc__ = command.__name__, command.__doc__
-        run.__signature__ = signature(command).replace(parameters=parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-        return run
-
-    return decorate
-
-
-def _parameter(option: Option) -> Parameter:
-    """An option as a parameter of a command, which typer reads."""
-    if option.switch:
-        kind: Any = Annotated[bool, typer.Option(option.flag, help=option.help)]
-        return Parameter(option.keyword, Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-    offered = _beginning(option.choices) if option.choices else None
-    info = typer.Option(option.flag, metavar=option.shows, help=option.help, autocompletion=offered)
-    return Parameter(
-        option.keyword, Parameter.KEYWORD_ONLY, default=option.default, annotation=Annotated[str | None, info]
-    )
-
-
-def one_of(choices: Iterable[str], help: str, *flags: str, metavar: str | None = None) -> Any:  # noqa: A002
-    """Return an option of few words, which its help lists and a shell completes."""
-    words = tuple(choices)
-    return typer.Option(*flags, metavar=metavar or "|".join(words), help=help, autocompletion=_beginning(words))
-
-
-def lists(where: str) -> Callable[[str], list[str]]:
-    """Return what completes a word of a list that costs an import: ``imulab.exporters:EXPORTERS``."""
-    module, _, name = where.partition(":")
-    return lambda incomplete: _beginning(getattr(import_module(module), name))(incomplete)
-
-
-def _beginning(choices: Iterable[str]) -> Callable[[str], list[str]]:
-    def words(incomplete: str) -> list[str]:
-        return [choice for choice in choices if choice.startswith(incomplete)]
-
-    return words
-
-
-def _text(value: Any) -> str | None:
-    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else value
-
-
 # What several commands take, and what they say.
 
 
 Result = TypeVar("Result")
-RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; - reads standard input.")]
-RecordFile = Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")]
-OutputFile = Annotated[str | None, typer.Option("-o", "--output", metavar="OUT", help="File to write.")]
-ReportFile = Annotated[str | None, typer.Option("--report", metavar="R.html", help="Report to write.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+RecordingFile = Annotated[str, Argument("FILE", "Recording; - reads standard input.")]
+RecordFile = Annotated[str, Argument("RECORD", "Calibration record.")]
+OutputFile = Annotated[str | None, option("OUT", "File to write.", "-o", "--output"), OUTPUT]
+ReportFile = Annotated[str | None, option("R.html", "Report to write.", "--report"), OUTPUT]
+AsJson = Annotated[bool, option("", "Print the result as JSON, and nothing else.", "--json"), OUTPUT]
 
 
 def with_notes(
@@ -276,6 +203,19 @@ def call(function: Callable[..., Result], *given: Any, **options: Any) -> Result
     """Call a public function with a command's options; a refusal names them as the command line does."""
     with labelled("--{}", options):
         return function(*given, **options)
+
+
+def how_to_read() -> Any:
+    """Return what says how a recording is read; it is not imported for lists of commands."""
+    from imulab.reading import Reading
+
+    return Reading
+
+
+def reading(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options of `imulab.read` that a command has, and take them out of its options."""
+    chosen = [option for option in options_of(how_to_read()) if option.keyword in options]
+    return read_options(chosen, {option.name: options.pop(option.keyword) for option in chosen}, FLAG)
 
 
 class GivenFiles:

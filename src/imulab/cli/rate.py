@@ -1,13 +1,12 @@
-"""``imulab rate``: plan, simulate, fit and turn."""
+"""Calibrate gyroscopes by a rate table or by turns."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+import imulab as il
+from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import (
-    READ,
     AsJson,
     GivenFiles,
     OutputFile,
@@ -17,61 +16,33 @@ from imulab.cli.options import (
     read_recording,
     reading,
     warn,
-    with_options,
 )
 from imulab.errors import OptionError
-from imulab.procedures.rate import FENCE, RATES
-from imulab.procedures.rate.procedure import OPTIONS
+from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
     from imulab.procedures.rate.plan import RatePlan, TurnPlan
 
 
-def commands(settings: dict[str, Any]) -> typer.Typer:
-    """Return the group of commands."""
-    group = typer.Typer(**settings)
-    group.command("plan")(plan)
-    group.command("simulate")(simulate)
-    group.command("fit")(fit)
-    group.command("turn")(turn)
-    return group
-
-
 def plan(
-    rates: Annotated[str, typer.Option(metavar="R,R,...", help="Sizes of the rates, deg/s.")] = RATES,
-    arw: Annotated[str | None, typer.Option(metavar="N", help="Angle random walk, deg/sqrt(h).")] = None,
-    bias_instability: Annotated[str | None, typer.Option(metavar="B", help="Bias instability, deg/h.")] = None,
-    noise: Annotated[str | None, typer.Option(metavar="RECORD", help="Both, from a record of noise fit.")] = None,
-    uncertainty: Annotated[str, typer.Option(help="Wanted of the mean of a stay, a fraction.")] = "20 ppm",
-    of: Annotated[str, typer.Option(help="Fraction of what: the largest rate (full) or each (reading).")] = "full",
-    faces: Annotated[str, typer.Option(help="Body axes up along the table axis, one after the other.")] = "+x,+y,+z",
-    cycles: Annotated[str, typer.Option(help="Runs of each face; 5 for repeatability.")] = "3",
-    order: Annotated[str, typer.Option(help="Highest power of the rate that the fit is to have.")] = "1",
-    latitude: Annotated[str | None, typer.Option(help="Of the place, deg, for the manifest.")] = None,
-    table_uncertainty: Annotated[
-        str | None, typer.Option(metavar="FRACTION", help="That all rates have in common, such as 20ppm.")
-    ] = None,
-    turn: Annotated[
-        str | None, typer.Option(metavar="FRACTION", help="Turns by hand in place of a table, such as 0.02%.")
-    ] = None,
-    fence: Annotated[str, typer.Option(help="Of those turns: of the difference of two stops, deg.")] = FENCE,
+    *,
     output: Annotated[
-        str | None, typer.Option("-o", "--output", metavar="TEST.toml", help="Manifest, or .csv list of stays.")
+        str | None, option("TEST.toml", "Manifest, or .csv list of stays.", "-o", "--output"), OUTPUT
     ] = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Say how long to stay at each rate and what the test will give, and write the manifest that rate fit takes."""
-    from imulab.display import aligned
-    from imulab.procedures.rate.plan import RatePlan, plan_rate
+    """Say how long to stay at each rate.
 
-    check_outputs([output], [noise] if noise else [])
+    And what the test will give; writes the manifest that rate fit takes.
+    """
+    from imulab.display import aligned
+    from imulab.procedures.rate.plan import RatePlan
+
+    check_outputs([output], [options["noise"]] if options["noise"] else [])
     if output is not None and not output.lower().endswith((".toml", ".csv")):
         raise OptionError(f"{output}: expected a name that ends in .toml (the manifest) or .csv (the list of stays)")
-    result = call(
-        plan_rate, rates=rates, arw=arw, bias_instability=bias_instability, noise=noise, uncertainty=uncertainty,
-        of=of, faces=faces, cycles=cycles, order=order, latitude=latitude, table_uncertainty=table_uncertainty,
-        turn=turn, fence=fence,
-    )  # fmt: skip
+    result = call(il.plan_rate, **options)
     if output is not None:
         if not isinstance(result, RatePlan):
             raise OptionError(f"{output}: turns by hand have no manifest; expected --turn without -o")
@@ -108,45 +79,29 @@ def _plan_json(result: RatePlan | TurnPlan) -> str:
 
 
 def simulate(
-    output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder for the recordings.")],
-    rates: Annotated[str, typer.Option(metavar="R,R,...", help="Sizes of the rates, deg/s.")] = RATES,
-    faces: Annotated[str, typer.Option(help="Body axes up along the table axis, one after the other.")] = "+x,+y,+z",
-    cycles: Annotated[str, typer.Option(help="Runs of each face.")] = "1",
-    hold: Annotated[str | None, typer.Option(help="Time at each rate, s; 8 s if not given.")] = None,
-    noise: Annotated[str, typer.Option(help="Standard deviation of one sample, deg/s.")] = "0.03 deg/s",
-    rate: Annotated[str, typer.Option(help="Samples per second, Hz.")] = "100 Hz",
-    bend: Annotated[str, typer.Option(help="Largest part of k3, a fraction of the largest rate.")] = "0",
-    loop: Annotated[str, typer.Option(help="Rising less falling at rate 0, a fraction of the largest rate.")] = "0",
-    latitude: Annotated[str, typer.Option(help="Of the place, deg.")] = "48 deg",
-    table: Annotated[str, typer.Option(help="Standard deviation of what all rates are off by, a fraction.")] = "0",
-    sweep: Annotated[
-        str | None, typer.Option(help="Duration of a swept sine, 0.05 to 2 Hz, in place of steps, s.")
-    ] = None,
-    lag: Annotated[str, typer.Option(help="Time constant of the gyroscopes, s.")] = "0 s",
-    seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
+    *, output: Annotated[str, option("DIR", "Folder for the recordings.", "-o", "--output"), OUTPUT], **options: Any
 ) -> None:
-    """Simulate a unit on a rate table: a file for each face and cycle, their manifest test.toml, and the truth."""
-    from imulab.procedures.rate.simulate import simulate_rate
+    """Simulate a unit on a rate table.
 
-    made = call(
-        simulate_rate, rates=rates, faces=faces, cycles=cycles, hold=hold, noise=noise, rate=rate, bend=bend, loop=loop,
-        latitude=latitude, table=table, sweep=sweep, lag=lag, seed=seed,
-    )  # fmt: skip
+    A file for each face and cycle, their manifest test.toml, and the truth.
+    """
+    made = call(il.simulate_rate, **options)
     made.save(output)
     print(f"{output}: test.toml, {len(made.recordings)} recordings, truth in truth.json")
 
 
-@with_options(OPTIONS)
 def fit(
-    file: Annotated[str, typer.Argument(metavar="TEST.toml|FILE", help="Manifest of a test, or one recording.")],
-    options: dict[str, str | None],
+    file: Annotated[str, Argument("TEST.toml|FILE", "Manifest of a test, or one recording.")],
+    *,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Calibrate gyroscopes on a rate table: bias, scale factor, misalignment, and what a line does not hold.
+    """Calibrate gyroscopes from steps of rate.
 
-    Each recording holds steps of rate in both directions; its manifest says which body axis was along the table's.
+    On a rate table: bias, scale factor, misalignment, and what a line does not hold. Each recording holds steps of
+    rate in both directions; its manifest says which body axis was along the table's.
     """
     from pathlib import Path
 
@@ -161,36 +116,31 @@ def fit(
     finish(run_task("rate", [file], options, GivenFiles()), output, report, json=json)
 
 
-@with_options(READ)
 def turn(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="Recording of whole turns, with a rest around each.")],
-    options: dict[str, str | None],
-    fence: Annotated[str, typer.Option(help="Uncertainty of the difference of two stops, deg.")] = FENCE,
-    turns: Annotated[
-        str | None, typer.Option(metavar="N,N,...", help="Number of turns of each, such as 1,5,-6; else counted.")
-    ] = None,
-    clock: Annotated[
-        str | None, typer.Option(metavar="FRACTION", help="Uncertainty of the sample rate, such as 50ppm.")
-    ] = None,
-    accel: Annotated[
-        str | None, typer.Option(metavar="RECORD", help="Tumble record, whose accelerometers tell the turns' axes.")
-    ] = None,
-    prior: Annotated[
-        str | None, typer.Option(metavar="RECORD", help="Earlier record of the same gyroscopes, as prior knowledge.")
-    ] = None,
+    file: Annotated[str, Argument("FILE", "Recording of whole turns, with a rest around each.")],
+    *,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Find the scale factors of gyroscopes from whole turns by hand against a fence, no equipment needed."""
-    from imulab.cli.show import finish
-    from imulab.procedures.rate.turns import fit_turns
+    """Find scale factors from whole turns by hand.
 
-    check_outputs([output, report], [name for name in (file, options["layout"], accel, prior) if name])
-    recording = read_recording(file, **reading(options))
-    finish(
-        call(fit_turns, recording, fence=fence, turns=turns, clock=clock, accel=accel, prior=prior).calibration,
-        output,
-        report,
-        json=json,
+    Against a fence; no equipment needed.
+    """
+    from imulab.cli.show import finish
+
+    how = reading(options)
+    check_outputs(
+        [output, report], [name for name in (file, how["layout"], options["accel"], options["prior"]) if name]
     )
+    found = call(il.fit_turns, read_recording(file, **how), **options)
+    finish(found.calibration, output, report, json=json)
+
+
+COMMANDS = (
+    Command("rate plan", plan, lambda: [il.plan_rate]),
+    Command("rate simulate", simulate, lambda: [il.simulate_rate]),
+    Command("rate fit", fit, lambda: [il.fit_rate]),
+    Command("rate turn", turn, lambda: [il.fit_turns]),
+)

@@ -8,30 +8,28 @@ from dataclasses import dataclass
 from itertools import chain
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+import imulab as il
+from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import (
-    READ,
     AsJson,
     OutputFile,
     RecordFile,
     RecordingFile,
     call,
     check_outputs,
+    how_to_read,
     is_json,
-    lists,
     naming,
     note,
-    one_of,
     quantity,
     reading,
     warn,
     with_notes,
-    with_options,
 )
 from imulab.errors import ImulabError, OptionError, RecordError
+from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
     from imulab.device.unit import Blob
@@ -42,30 +40,34 @@ if TYPE_CHECKING:
 # ``imulab convert``: any recording to native CSV or Parquet.
 
 
-@with_options(READ)
 def convert(
     file: RecordingFile,
-    options: dict[str, str | None],
-    with_files: Annotated[
+    *,
+    with_: Annotated[
         list[str] | None,
-        typer.Option(
-            "--with",
-            metavar="FILE[@LAYOUT]",
-            help="Another sensor of the same unit, on the same clock, whose columns are added; repeatable.",
+        option(
+            "FILE[@LAYOUT]",
+            "Another sensor of the same unit, on the same clock, whose columns are added; repeatable.",
+            repeated=True,
         ),
     ] = None,
     output: OutputFile = None,
+    **options: Any,
 ) -> None:
-    """Write a recording of any kind as native CSV or Parquet to OUT, or as CSV to standard output."""
+    """Write a recording of any kind as CSV or Parquet.
+
+    Native CSV or Parquet to OUT, or CSV to standard output.
+    """
     from imulab.readers import read, read_blocks
     from imulab.readers.streams import file_and_layout, join_recordings
 
-    others = [file_and_layout(text) for text in with_files or []]
+    others = [file_and_layout(text) for text in with_ or []]
     inputs = [name for pair in ((file, options["layout"]), *others) for name in pair if name]
     check_outputs([output], inputs)
-    blocks: Iterable[Recording] = read_blocks(file, **reading(options))
+    how = reading(options)
+    blocks: Iterable[Recording] = read_blocks(file, **how)
     if others:
-        first = read(file, **reading(options))
+        first = read(file, **how)
         blocks = [join_recordings(first, [read(other, layout) for other, layout in others])]
     write_out(with_notes(blocks), output)
 
@@ -88,48 +90,19 @@ def write_out(blocks: Iterable[Recording], output: str | None) -> None:
 
 
 def export(
-    records: Annotated[list[str], typer.Argument(metavar="RECORD...", help="Calibration records of one unit.")],
-    to: Annotated[
-        str,
-        typer.Option(
-            "--to",
-            metavar="TARGET",
-            help="c blob px4 ardupilot kalibr openvins ros fusion motioncal.",
-            autocompletion=lists("imulab.exporters:EXPORTERS"),
-        ),
-    ],
-    output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")],
-    lossy: Annotated[
-        bool, typer.Option("--lossy", help="Leave out what the target cannot hold, and fit the rest anew.")
-    ] = False,
-    device_id: Annotated[str, typer.Option("--device-id", metavar="N", help="PX4: number of the sensor.")] = "0",
-    noise: Annotated[
-        str | None, typer.Option("--noise", metavar="FILE", help="Noise record, or what 'allan --json' printed.")
-    ] = None,
-    method: Annotated[
-        str | None, typer.Option("--method", help="c, blob: how an array fuses; what its record carries if not given.")
-    ] = None,
-    memory: Annotated[
-        str | None, typer.Option("--memory", help="c, blob: growing, growing:COUNT, or a gain between 0 and 1.")
-    ] = None,
-    mag_mount: Annotated[
-        str,
-        one_of(
-            ("external", "internal"),
-            "px4, ardupilot: whether the magnetometers have a rotation of their own there, which holds their mounting.",
-            "--mag-mount",
-        ),
-    ] = "external",
+    records: Annotated[list[str], Argument("RECORD...", "Calibration records of one unit.")],
+    *,
+    output: Annotated[str, option("DIR", "Folder to write to.", "-o", "--output"), OUTPUT],
+    **options: Any,
 ) -> None:
-    """Write calibration records in the form of firmware, an autopilot or a toolbox."""
-    from imulab.procedures.exporting import export as write
+    """Write firmware, a blob, or another program's files.
 
+    Calibration records in the form of firmware, an autopilot or a toolbox.
+    """
     if not output:
         raise OptionError("-o '': expected a folder to write to")
-    files = call(
-        write, to=to, records=records, folder=output, lossy=lossy, device_id=device_id, noise=noise, method=method,
-        memory=memory, mag_mount=mag_mount, tell=warn,
-    )  # fmt: skip
+    to = options.pop("to")
+    files = call(il.export, to=to, records=records, folder=output, tell=warn, **options)
     for file in files:
         print(f"{to}: {file}")
 
@@ -137,34 +110,16 @@ def export(
 # Commands on records and recordings of every procedure: apply, show, report, demo.
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Add these commands to the root."""
-    for name, function in (("apply", apply), ("show", show), ("report", report), ("demo", demo)):
-        app.command(name)(function)
-
-
-@with_options(READ)
 def apply(
-    files: Annotated[list[str], typer.Argument(metavar="RECORD... FILE", help="Records, then the recording.")],
-    options: dict[str, str | None],
-    again: Annotated[bool, typer.Option("--again", help="Correct a recording that a record corrected before.")] = False,
-    latest_start: Annotated[
-        str,
-        typer.Option("--latest-start", help="Refuse a recording that starts later after power-on (warm-up)."),
-    ] = "5 s",
-    temperature_column: Annotated[
-        bool,
-        typer.Option(
-            "--temperature-column",
-            help="Take a missing power-on temperature from the first row's column temperature (warm-up).",
-        ),
-    ] = False,
-    heading: Annotated[
-        bool, typer.Option("--heading", help="Add columns of magnetic heading and dip, deg, with uncertainties.")
-    ] = False,
+    files: Annotated[list[str], Argument("RECORD... FILE", "Records, then the recording.")],
+    *,
     output: OutputFile = None,
+    **options: Any,
 ) -> None:
-    """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
+    """Correct a recording by records.
+
+    By one or more of them, in the order given; CSV or Parquet to OUT, CSV to standard output.
+    """
     from imulab.procedures.apply import apply_blocks, loaded, with_heading
     from imulab.procedures.registry import load_any
     from imulab.readers import read_blocks
@@ -183,21 +138,21 @@ def apply(
                 f"{file}: expected a recording as the last file, found a record: records go first"
             ) from None
         raise
-    chain, start = [], quantity(latest_start, "--latest-start", "time", "s")
+    chain, start = [], quantity(options["latest_start"], "--latest-start", "time", "s")
     for name, record in zip(names, records, strict=True):
         with naming(name):
             chain.append(
                 loaded(
                     record,
                     Path(name).name,
-                    again=again,
+                    again=options["again"],
                     latest_start=start,
                 )
             )
-    if heading:
+    if options["heading"]:
         chain = with_heading(chain, records)
     blocks = with_notes(read_blocks(file, **how), notes=False)
-    if temperature_column and any(part.since_power_on for ready in chain for part, _ in ready.sections):
+    if options["temperature_column"] and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)
     rows = _Rows()
     write_out(rows.counted(apply_blocks(chain, _with_warnings(records, blocks))), output)
@@ -247,17 +202,17 @@ def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording
             warn(f"{name}: {procedure.beyond_message(record, count, most)}")
 
 
-@with_options(READ)
 def show(
-    files: Annotated[
-        list[str] | None, typer.Argument(metavar="FILE [FILE]", help="Record or recording, or two records.")
-    ] = None,
+    files: Annotated[list[str] | None, Argument("FILE [FILE]", "Record or recording, or two records.")] = None,
     *,
-    options: dict[str, str | None],
-    formats: Annotated[bool, typer.Option("--formats", help="List the kinds of recording that can be read.")] = False,
+    formats: Annotated[bool, option("", "List the kinds of recording that can be read.")] = False,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Say what is in a record or a recording, or what changed between two records of one unit."""
+    """Say what is in a record or recording, or what changed.
+
+    Changes are those between two records of one unit.
+    """
     if formats:
         _show_formats(files or [], json=json)
         return
@@ -334,8 +289,7 @@ def _show_changes(first: str, second: str, *, json: bool) -> None:
 
 
 def report(
-    file: RecordFile,
-    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.html", help="Report to write.")],
+    file: RecordFile, *, output: Annotated[str, option("OUT.html", "Report to write.", "-o", "--output"), OUTPUT]
 ) -> None:
     """Draw the report of a record."""
     from imulab.procedures.registry import load
@@ -346,13 +300,24 @@ def report(
     print(f"report: {output}")
 
 
-def demo(
-    context: typer.Context,
-    folder: Annotated[str, typer.Argument(metavar="[DIR]", help="Folder to write to.")] = "demo",
-) -> None:
-    """Run the procedures on simulated rigs and write recordings, records, corrected data and reports."""
+def demo(folder: Annotated[str, Argument("[DIR]", "Folder to write to.")] = "demo") -> None:
+    """Run all procedures on simulated instruments.
+
+    Writes recordings, records, corrected data and reports.
+    """
     from functools import partial
 
+    from imulab.cli import main
     from imulab.demo import run
 
-    print(run(folder, partial(context.obj, project=False)))
+    print(run(folder, partial(main, project=False)))
+
+
+COMMANDS = (
+    Command("apply", apply, lambda: [il.apply], without=("record",)),
+    Command("show", show, lambda: [how_to_read()]),
+    Command("report", report),
+    Command("demo", demo),
+    Command("convert", convert, lambda: [how_to_read()]),
+    Command("export", export, lambda: [il.export]),
+)

@@ -1,11 +1,11 @@
-"""``imulab warmup``: plan, simulate, fit, and the table as a spreadsheet."""
+"""Tabulate and subtract the bias after power-on."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+import imulab as il
+from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -14,50 +14,29 @@ from imulab.cli.options import (
     call,
     check_outputs,
     naming,
-    one_of,
     warn,
-    with_options,
 )
 from imulab.errors import OptionError
-from imulab.procedures.warmup import LAWS, TEMPERATURES
-from imulab.procedures.warmup.procedure import OPTIONS
+from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
     from imulab.procedures.warmup.plan import WarmupPlan
 
-Temperatures = Annotated[str, typer.Option(metavar="T,T,...", help="Calibration temperatures, degC, ascending.")]
-
-
-def commands(settings: dict[str, Any]) -> typer.Typer:
-    """Return the group of commands."""
-    group = typer.Typer(**settings)
-    for function in (plan, simulate, fit, table):
-        group.command(function.__name__)(function)
-    return group
-
 
 def plan(
-    temperatures: Temperatures = TEMPERATURES,
-    cycles: Annotated[str, typer.Option(help="Power cycles at each temperature.")] = "5",
-    soak: Annotated[str, typer.Option(help="Before each power-on, unit off, s, or with a unit.")] = "60 min",
-    record: Annotated[str, typer.Option(help="Recording from power-on on, s, or with a unit.")] = "10 min",
-    ramp: Annotated[str, typer.Option(metavar="K/MIN", help="Of the chamber, K/min.")] = "2 K/min",
-    noise: Annotated[str, typer.Option(metavar="N", help="Angle random walk, deg/sqrt(h).")] = "0.3 deg/sqrt(h)",
-    repeatability: Annotated[str, typer.Option(help="Of the curve from cycle to cycle, percent.")] = "2 %",
-    output: Annotated[
-        str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Programme to write.")
-    ] = None,
+    *,
+    output: Annotated[str | None, option("PLAN.csv", "Programme to write.", "-o", "--output"), OUTPUT] = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Write the chamber programme and its duration; say which temperatures are missing."""
-    from imulab.procedures.warmup.plan import plan_warmup
+    """Write the chamber programme of a test.
+
+    With its duration; says which temperatures are missing.
+    """
     from imulab.units import from_si
 
     check_outputs([output], [])
-    result = call(
-        plan_warmup, temperatures=temperatures, cycles=cycles, soak=soak, record=record, ramp=ramp, noise=noise,
-        repeatability=repeatability,
-    )  # fmt: skip
+    result = call(il.plan_warmup, **options)
     if output:
         result.save(output)
     if json:
@@ -102,37 +81,29 @@ def _print_plan(result: WarmupPlan) -> None:
 
 
 def simulate(
-    output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder for the recordings.")],
-    temperatures: Temperatures = TEMPERATURES,
-    cycles: Annotated[str, typer.Option(help="Power cycles at each temperature.")] = "3",
-    law: Annotated[str, one_of(LAWS, "How the zeros depend on temperature.")] = "smooth",
-    duration: Annotated[str, typer.Option(help="Of each recording.")] = "600 s",
-    rate: Annotated[str, typer.Option(help="Sample rate.")] = "10 Hz",
-    units: Annotated[str, typer.Option(help="Number of units of one type.")] = "1",
-    seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
+    *, output: Annotated[str, option("DIR", "Folder for the recordings.", "-o", "--output"), OUTPUT], **options: Any
 ) -> None:
-    """Simulate the power cycles of a warm-up test, a file each, into a folder."""
-    from imulab.procedures.warmup.simulate import simulate_warmup
+    """Simulate the power cycles of a test.
 
-    made = call(
-        simulate_warmup, temperatures=temperatures, cycles=cycles, law=law, duration=duration, rate=rate, units=units,
-        seed=seed,
-    )  # fmt: skip
+    A file each, into a folder.
+    """
+    made = call(il.simulate_warmup, **options)
     made.save(output)
-    print(f"{output}: {len(made)} recordings of {made.duration:g} s, law {law}")
+    print(f"{output}: {len(made)} recordings of {made.duration:g} s, law {options['law']}")
 
 
-@with_options(OPTIONS)
 def fit(
-    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Recordings, one power cycle each.")],
-    options: dict[str, str | None],
+    files: Annotated[list[str], Argument("FILE...", "Recordings, one power cycle each.")],
+    *,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
+    **options: Any,
 ) -> None:
-    """Fit the table of a unit's warm-up to recordings of power cycles at several temperatures.
+    """Fit the table of a unit to its power cycles.
 
-    Prints the comparison of the models; -o writes the calibration record, --report its figures.
+    Recordings of power cycles at several temperatures. Prints the comparison of the models; -o writes the
+    calibration record, --report its figures.
     """
     from imulab.cli.show import finish
     from imulab.procedures.registry import run_task
@@ -142,21 +113,22 @@ def fit(
 
 
 def table(
-    file: Annotated[str, typer.Argument(metavar="RECORD|TABLE.csv", help="Record, or table to make a record of.")],
-    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Table (.csv) or record to write.")],
-    per_second: Annotated[
-        bool, typer.Option("--per-second", help="Write cubics in powers of t in s, not of t / settling time.")
-    ] = False,
+    file: Annotated[str, Argument("RECORD|TABLE.csv", "Record, or table to make a record of.")],
+    *,
+    output: Annotated[str, option("OUT", "Table (.csv) or record to write.", "-o", "--output"), OUTPUT],
+    **options: Any,
 ) -> None:
-    """Write a record's table as CSV for a spreadsheet, or make a record of such a table."""
+    """Write the table as CSV, or a record from that CSV.
+
+    The CSV is for a spreadsheet.
+    """
     from imulab.cli.options import is_json
     from imulab.device.unit import is_blob
-    from imulab.procedures.warmup.spreadsheet import warmup_table
 
     check_outputs([output], [file])
     if is_json(file) or is_blob(file):  # a blob is refused as a record, with the reason
         with naming(file):
-            sheet = call(warmup_table, file, per_second=per_second)
+            sheet = call(il.warmup_table, file, **options)
         if not output.lower().endswith(".csv"):
             raise OptionError(f"{output}: expected a name that ends in .csv")
         sheet.save(output)
@@ -164,7 +136,15 @@ def table(
         return
     if output.lower().endswith(".csv"):
         raise OptionError(f"{output}: a table makes a record; expected a name such as unit.json")
-    if per_second:
+    if options["per_second"]:
         raise OptionError(f"{file}: --per-second writes a table; how a table that is read counts, its titles say")
-    warmup_table(file).save(output)
+    il.warmup_table(file).save(output)
     print(f"record: {output}")
+
+
+COMMANDS = (
+    Command("warmup plan", plan, lambda: [il.plan_warmup]),
+    Command("warmup simulate", simulate, lambda: [il.simulate_warmup]),
+    Command("warmup fit", fit, lambda: [il.fit_warmup]),
+    Command("warmup table", table, lambda: [il.warmup_table], without=("data",)),
+)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
+from typing import Annotated
 
 from imulab.arguments import Folder
 from imulab.errors import OptionError, first_of
@@ -27,6 +28,7 @@ from imulab.fleet.statistics import (
     parameter_units,
 )
 from imulab.fleet.store import Store
+from imulab.options import file, text
 from imulab.procedures.registry import PROCEDURES
 from imulab.report import render_page
 from imulab.report.traces import Exhibits, Figure, ReportTable
@@ -40,8 +42,8 @@ def write_fleet_report(
     folder: Folder,
     output: str | PathLike[str],
     *,
-    limits: str | PathLike[str] | None = None,
-    history: str | None = None,
+    limits: Annotated[str | PathLike[str] | None, file("L.toml")] = None,
+    history: Annotated[str | None, text("URL")] = None,
 ) -> None:
     """Write the statistics of a fleet's records.
 
@@ -50,9 +52,9 @@ def write_fleet_report(
     folder, output
         Folder of the fleet, and HTML file to write.
     limits
-        TOML file of limits for Cpk; none if not given.
+        Limits of parameters, for Cpk. None if not given.
     history
-        SQLAlchemy URL, by default the SQLite file in the folder where there is one; ``none`` for none.
+        As for `run_fleet`. That in the folder where there is one, if not given.
 
     Raises
     ------

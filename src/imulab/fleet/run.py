@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
+from typing import Annotated
 
 from imulab._version import VERSION
 from imulab.arguments import Folder
 from imulab.display import SENTENCES, Shown
 from imulab.errors import OptionError, first_of
 from imulab.files import real_path, write_text
+from imulab.fleet import ENGINES
 from imulab.fleet.engine import (
     DONE,
     FAILED,
@@ -33,8 +35,9 @@ from imulab.fleet.history import History, open_history
 from imulab.fleet.manifest import FleetManifest, FleetUnit, is_url, load_fleet
 from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
+from imulab.options import choice, parsed, text
 from imulab.procedures.registry import PROCEDURES
-from imulab.quantities import whole
+from imulab.quantities import whole, whole_number
 
 _FRUITLESS = 5
 """Losses of workers in a row, without a unit done between them, before giving up."""
@@ -117,11 +120,11 @@ def run_fleet(
     manifest: str | PathLike[str] | FleetManifest,
     folder: Folder,
     *,
-    engine: str = "local",
-    scheduler: str | None = None,
-    workers: int | str | None = None,
-    history: str | None = None,
-    table: str | None = None,
+    engine: Annotated[str, choice(ENGINES)] = "local",
+    scheduler: Annotated[str | None, text("ADDRESS")] = None,
+    workers: Annotated[int | str | None, parsed(whole_number, "N")] = None,
+    history: Annotated[str | None, text("URL")] = None,
+    table: Annotated[str | None, text("OUT")] = None,
     started: Callable[[int], None] = lambda _: None,
     progress: Callable[[int], None] = lambda _: None,
 ) -> FleetState:
@@ -136,13 +139,16 @@ def run_fleet(
         CSV or Parquet, path or URL: ``serial,procedure,file`` and options of the fits; or such a one as it was read.
     folder
         Where the records go; made if it is not there.
-    engine, scheduler, workers
-        ``local`` with so many processes (all processors if not given), or ``dask``: the cluster at ``scheduler``, or
-        one started here with so many workers.
+    engine
+        Processes of this machine, or a Dask cluster.
+    scheduler
+        Scheduler of a Dask cluster, as tcp://host:8786. One is started here if not given.
+    workers
+        Processes; one for each processor if not given.
     history
-        SQLAlchemy URL; a SQLite file in the folder if not given; ``none`` for no history.
+        SQLite or PostgreSQL, or none; a file in DIR if not given. A URL of SQLAlchemy.
     table
-        Table of all parameters, .csv or .parquet; ``parameters.csv`` in the folder if not given.
+        .csv or .parquet; parameters.csv in DIR if not given. Table of all parameters.
     started, progress
         Called once with the number of units, then with the number of units that are over.
 
@@ -206,7 +212,7 @@ def read_by(fleet: FleetManifest) -> dict[str, str]:
     found = {_absolute(os.path.join(fleet.base, Path(fleet.name).name)): fleet.name}  # noqa: PTH118
     for unit in fleet.units:
         options = PROCEDURES[unit.procedure].task.options
-        paths = [unit.options[o.name] for o in options if o.names_file and o.name in unit.options]
+        paths = [unit.options[o.name] for o in options if o.reads.file and o.name in unit.options]
         for name in (*unit.files, *paths):
             if not is_url(name):
                 found[_absolute(os.path.join(fleet.base, name))] = name  # noqa: PTH118

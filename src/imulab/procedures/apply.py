@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
 from imulab.columns import KINDS, triad
 from imulab.device.tables import DeviceTable, Fusion
 from imulab.device.unit import Blob, DeviceUnit
 from imulab.display import SENTENCES, Note
 from imulab.errors import DataError, OptionError, RecordError
+from imulab.options import measure
 from imulab.procedures.correction_order import check_after, check_order, entry, thermals_of
 from imulab.procedures.procedure import Procedure, Section
 from imulab.procedures.registry import joined_of, load_any, procedure_of, section
@@ -171,7 +172,7 @@ def apply(
     data: Data,
     *,
     again: bool = False,
-    latest_start: float | str = "5 s",
+    latest_start: Annotated[float | str, measure("time", "s")] = "5 s",
     temperature_column: bool = False,
     heading: bool = False,
     **reading: Unpack[Reading],
@@ -188,15 +189,16 @@ def apply(
     data
         What is corrected: a file, recording, data frame or arrays.
     again
-        Whether to correct it though the same record corrected it before.
+        Correct a recording that a record corrected before. The same record.
     latest_start
-        A recording that starts later after power-on, s, is refused by a warm-up table.
+        Refuse a recording that starts later after power-on (warm-up). In s.
     temperature_column
-        Whether a warm-up table takes a power-on temperature that is missing from the first row's column temperature.
+        Take a missing power-on temperature from the first row's column temperature (warm-up).
     heading
-        Whether to add columns ``heading`` (of the body's x axis, clockwise from magnetic north), ``std_heading``,
-        ``dip`` and ``std_dip``, deg, of a unit at rest, with standard uncertainties by the record's covariance, the
-        scatter of its attitudes, and the acceleration that shows where ``|f|`` is off g by more than 1 %.
+        Add columns of magnetic heading and dip, deg, with uncertainties. Columns ``heading`` (of the body's x axis,
+        clockwise from magnetic north), ``std_heading``, ``dip`` and ``std_dip`` of a unit at rest, with standard
+        uncertainties by the record's covariance, the scatter of its attitudes, and the acceleration that shows where
+        ``|f|`` is off g by more than 1 %.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.

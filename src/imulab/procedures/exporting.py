@@ -7,14 +7,16 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from imulab import exporters
 from imulab.arguments import Folder
+from imulab.device import METHODS
 from imulab.device.tables import Fusion
 from imulab.display import SENTENCES
 from imulab.errors import ImulabError, OptionError, listed
 from imulab.exporters import EXPORTERS, MAG_MOUNTS, ExportOptions
+from imulab.options import choice, file, text
 from imulab.procedures.apply import tables_of
 from imulab.procedures.registry import load, procedure_of
 from imulab.procedures.result import Record, as_record
@@ -30,16 +32,16 @@ def _nothing(message: str) -> None:
 
 
 def export(
-    to: str,
+    to: Annotated[str, text("TARGET", tuple(EXPORTERS))],
     records: Record | Sequence[Record],
     folder: Folder,
     *,
     lossy: bool = False,
     device_id: int | str = 0,
-    noise: str | PathLike[str] | Mapping[str, Any] | Calibration | None = None,
-    method: str | None = None,
-    memory: str | float | None = None,
-    mag_mount: str = "external",
+    noise: Annotated[str | PathLike[str] | Mapping[str, Any] | Calibration | None, file()] = None,
+    method: Annotated[str | None, text("METHOD", METHODS)] = None,
+    memory: Annotated[str | float | None, text("growing|growing:N|GAIN", ("growing",))] = None,
+    mag_mount: Annotated[str, choice(("external", "internal"))] = "external",
     tell: Callable[[str], object] = _nothing,
 ) -> list[Path]:
     """Write records in the form of firmware, an autopilot or a toolbox.
@@ -47,7 +49,7 @@ def export(
     Parameters
     ----------
     to
-        One of ``c blob px4 ardupilot kalibr openvins ros fusion motioncal``.
+        c blob px4 ardupilot kalibr openvins ros fusion motioncal.
     records
         The unit's records, or their files; one or several.
     folder
@@ -55,14 +57,17 @@ def export(
     lossy
         Leave out what the target cannot hold, and fit the rest anew.
     device_id
-        PX4's number of the sensor.
+        PX4: number of the sensor.
     noise
-        A noise record, or what ``imulab allan --json`` printed, or the file of either, for noise keys.
-    method, memory
-        For c and blob: how an array fuses, as for `fuse`; what its record carries if not given.
+        Noise record, or what 'allan --json' printed. Or the file of either, for noise keys.
+    method
+        c, blob: how an array fuses; what its record carries if not given. As for `fuse`.
+    memory
+        c, blob: growing, growing:COUNT, or a gain between 0 and 1.
     mag_mount
-        For px4 and ardupilot: ``external`` where the autopilot turns the magnetometers by a rotation of their own,
-        which then holds their mounting exactly; ``internal`` where it does not.
+        px4, ardupilot: whether the magnetometers have a rotation of their own there, which holds their mounting.
+        ``external`` where the autopilot turns the magnetometers by a rotation of their own, which then holds their
+        mounting exactly; ``internal`` where it does not.
     tell
         Called with a sentence on each loss that was allowed, and on each record that is not good.
 

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from imulab.errors import RecordError, file_name, readable
+from imulab.options import FLAG
 from imulab.procedures.centrifuge.procedure import CentrifugeProcedure
 from imulab.procedures.gyro_array.procedure import GyroArrayProcedure
 from imulab.procedures.noise.procedure import NoiseProcedure
-from imulab.procedures.procedure import FLAG, Files, Procedure, Section
+from imulab.procedures.procedure import Files, Procedure, Section
 from imulab.procedures.rate.procedure import RateProcedure
 from imulab.procedures.thermal.procedure import ThermalProcedure
 from imulab.procedures.tumble.procedure import TumbleProcedure
@@ -139,16 +140,20 @@ def _silent(_: int) -> None:
     pass
 
 
+def _text(value: str | bool) -> str:
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else value
+
+
 def run_task(
     name: str,
     files: Sequence[str],
-    options: Mapping[str, str | None],
+    options: Mapping[str, Any],
     access: Files,
     *,
     label: str = FLAG,
     progress: Callable[[int], None] = _silent,
 ) -> Calibration:
-    """Fit one unit; `options` are texts, None where not given.
+    """Fit one unit; `options` are texts, None where not given, and of switches truth values.
 
     What is wrong of a record that an option names, ``prior: ...``, is said with the name of its file.
 
@@ -158,7 +163,8 @@ def run_task(
         What the procedure's fit, its readers and its options raise.
     """
     task = PROCEDURES[name].task
-    values = task.values({key: text for key, text in options.items() if text is not None}, label)
+    texts = {key.rstrip("_"): _text(value) for key, value in options.items() if value is not None}
+    values = task.values(texts, label)
     try:
         return task.fit(files, values, access, progress)
     except RecordError as error:

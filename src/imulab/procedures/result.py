@@ -8,15 +8,16 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, get_type_hints, overload
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imulab.arguments import check, checked, described
+from imulab.arguments import check, checked, described, types_of
 from imulab.display import Shown
 from imulab.errors import DataError, OptionError, listed
 from imulab.frames import columns_of_arrays, is_frame, unmasked
+from imulab.options import file
 from imulab.readers import read, read_blocks
 from imulab.readers.selection import Selection
 from imulab.reading import Data, Reading, Sampling, Window
@@ -130,11 +131,11 @@ class Drawn(Shown):
 # What a fit is given, as people have it: a file, a recording, a data frame, or arrays.
 
 
-Record: TypeAlias = Calibration | Result | str | os.PathLike[str]
+Record: TypeAlias = Annotated[Calibration | Result | str | os.PathLike[str], file("RECORD")]
 """A record, a fit that holds it, or its file."""
 
 
-_HINTS = get_type_hints(Reading, include_extras=True)
+_HINTS = types_of(Reading)
 _OF_ARRAYS = ("rate", "time", "unit", "units")
 _OF_FILES = ("layout", "topic", "instance")
 _PART = ("window", "element")

@@ -30,12 +30,13 @@ from imulab.errors import OptionError, quoted
 from imulab.live.page.files import Files, Opening, Openings
 from imulab.live.page.jobs import Form, Job, Jobs
 from imulab.live.page.server import Hub, Message, Part, receive_file, report_response, to_json
-from imulab.procedures.procedure import ELEMENT, READING
+from imulab.options import options_of
+from imulab.reading import Reading
 
 _WIDEST = 4000
 _LONGEST = 1 << 20
 """Bytes of a JSON object."""
-_READING = tuple(option.name for option in (*READING, ELEMENT))
+_READING = tuple(option.name for option in options_of(Reading))
 _HERE = "/api/workbench"
 _ANY = "application/octet-stream"
 _PIECE = 1 << 20

@@ -19,7 +19,8 @@ import numpy as np
 from imulab.columns import triad
 from imulab.errors import ImulabError
 from imulab.live.page.curves import Head, Writer
-from imulab.procedures.procedure import ELEMENT, READING, part_of, read_options
+from imulab.options import options_of, part_of, read_options
+from imulab.reading import Reading
 from imulab.recording import Array, Recording
 
 _EVERY = 0.15
@@ -50,7 +51,7 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
     """
     from imulab.readers import read_blocks
 
-    options = read_options((*READING, ELEMENT), reading, "--{}")
+    options = read_options(options_of(Reading), reading, "--{}")
     writer, notes, said, block = Writer(folder), dict[str, None](), 0.0, None
     for block in read_blocks(file, options["layout"], **part_of(options)):
         writer.add(block)

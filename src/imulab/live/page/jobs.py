@@ -9,23 +9,21 @@ import signal
 import subprocess
 import sys
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from pathlib import Path
 from time import time
 from typing import IO, Any
 
 from imulab.errors import OptionError, listed, quoted
+from imulab.options import Option
 
 # Forms made from the commands themselves: what the command line takes stands once, in its own definitions.
 
 
 _FILE = re.compile(r"FILE|RECORD|[A-Z]+\.[a-z]+")
-_SHARED = 8
-"""An option that so many commands have is of files and output, not of the procedure."""
 _LONGEST_TEXT = 10_000
 
 
@@ -54,8 +52,8 @@ class Field:
         Whether it takes other texts too.
     required
         Whether it must be given.
-    shared
-        Whether many commands have it.
+    group
+        Where the page lists it; empty for an argument.
     ending
         Of the name of an output; empty for a folder.
     """
@@ -69,7 +67,7 @@ class Field:
     choices: tuple[str, ...] = ()
     other: bool = True
     required: bool = False
-    shared: bool = False
+    group: str = ""
     ending: str = ""
     unflag: str = ""
 
@@ -113,55 +111,38 @@ class Form:
         return words
 
 
-def forms(commands: Iterable[tuple[str, Any]]) -> dict[str, Form]:
-    """Return the forms of commands by their paths, from paths and the definitions that typer made."""
-    known = [(path, command) for path, command in commands]
-    shared = Counter(parameter.name for _, command in known for parameter in command.params)
-    found = {}
-    for path, command in known:
-        drawn = any(parameter.name == "report" for parameter in command.params)
-        fields = tuple(_field(each, shared[each.name] >= _SHARED, drawn=drawn) for each in command.params)
-        text = " ".join((command.help or "").split())
-        found[path] = Form(path, command.short_help or text.partition(". ")[0].rstrip("."), text, fields)
-    return found
+def forms(commands: Iterable[Any]) -> dict[str, Form]:
+    """Return the forms of the commands of the command line, by their paths."""
+    return {command.path: _form(command) for command in commands}
 
 
-def _field(parameter: Any, shared: bool, *, drawn: bool) -> Field:
-    """Return a parameter as a field; `drawn` says that the command writes a report beside its output: a record."""
-    shows = parameter.metavar or ""
-    common = {"name": parameter.name, "shows": shows, "required": bool(parameter.required)}
-    if parameter.param_type_name == "argument":
-        kind = "files" if parameter.nargs == -1 else "file"
-        return Field(flag="", kind=kind, help="", default="", other=False, **common)
-    flag = next((name for name in parameter.opts if name.startswith("--")), parameter.opts[0])
-    common |= {"flag": flag, "help": parameter.help or ""}
-    if "-o" in parameter.opts or flag == "--report":
-        return Field(
-            kind="output", default="", ending=_ending(shows, drawn=drawn), **common | {"flag": _short(parameter)}
-        )
-    if parameter.is_flag:
-        if parameter.secondary_opts:
-            return Field(kind="either", default="", unflag=parameter.secondary_opts[0], shared=shared, **common)
-        return Field(kind="switch", default="", shared=shared, **common)
+def _form(command: Any) -> Form:
+    drawn = any(option.keyword == "report" for option in command.options)
+    arguments = [
+        Field(each.keyword, "", "files" if each.many else "file", each.shows, "", "", (), False, each.required)
+        for each in command.arguments
+    ]
+    options = [_field(option, drawn=drawn) for option in command.options]
+    return Form(command.path, command.summary.rstrip("."), " ".join(command.help.split()), (*arguments, *options))
+
+
+def _field(option: Option, *, drawn: bool) -> Field:
+    """Return an option as a field; `drawn` says that the command writes a report beside its output: a record."""
+    shows, text = option.shows if option.takes_value else "", f"{option.help} [{option.unit}]" * bool(option.unit)
+    field = Field(option.keyword, option.flags[-1], option.kind, shows, text or option.help, "", group=option.group)
+    field = replace(field, required=option.required)
+    if "-o" in option.flags or field.flag == "--report":
+        return replace(field, flag=option.flags[0], kind="output", ending=_ending(shows, drawn=drawn))
+    if not option.takes_value:
+        return replace(field, unflag=option.opposite)
     alternatives = [part for part in shows.split("|") if part]
     files = [part for part in alternatives if _FILE.fullmatch(part)]
-    choices = tuple(getattr(each, "value", each) for each in parameter.shell_complete(None, ""))
+    field = replace(field, default=option.default or "", choices=option.words)
     if files:
-        other = len(files) < len(alternatives)
-        return Field(
-            kind="file", default=_text(parameter.default), choices=choices, other=other, shared=shared, **common
-        )
-    if parameter.multiple and shows.startswith("FILE"):  # from a form, each in its own layout
-        return Field(kind="files", default="", other=False, shared=shared, **common)
-    closed = bool(choices) and {*alternatives} == {*choices}
-    kind = "texts" if parameter.multiple else "text"
-    return Field(
-        kind=kind, default=_text(parameter.default), choices=choices, other=not closed, shared=shared, **common
-    )
-
-
-def _short(parameter: Any) -> str:
-    return "-o" if "-o" in parameter.opts else str(parameter.opts[0])
+        return replace(field, kind="file", other=len(files) < len(alternatives))
+    if option.kind == "texts" and shows.startswith("FILE"):  # from a form, each in its own layout
+        return replace(field, kind="files", other=False)
+    return replace(field, other=not option.words or {*alternatives} != {*option.words})
 
 
 def _ending(shows: str, *, drawn: bool) -> str:
@@ -170,10 +151,6 @@ def _ending(shows: str, *, drawn: bool) -> str:
     if shows == "DIR":
         return ""
     return ".json" if drawn else ".csv"
-
-
-def _text(default: Any) -> str:
-    return "" if default is None or isinstance(default, list | tuple) else str(default)
 
 
 def _words(field: Field, value: Any, file: Callable[[str], str], output: Callable[[str, str], str]) -> list[str]:

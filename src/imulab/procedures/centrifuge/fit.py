@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from hashlib import file_digest
 from os import PathLike, fspath
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from imulab.errors import DataError, OptionError, ReadError, listed, quoted
+from imulab.options import READING, choice, file
 from imulab.procedures.centrifuge import CURVES, METHODS
 from imulab.procedures.centrifuge.levels import Levels, level_numbers, pool_levels
 from imulab.procedures.centrifuge.manifest import Manifest, Run, load_manifest
@@ -47,9 +49,9 @@ def fit_centrifuge(
     manifest: Manifest | str | PathLike[str],
     recording_of: Callable[[Run], Iterable[Recording]] | None = None,
     *,
-    method: str = "least-squares",
-    curve: str = "auto",
-    layout: str | PathLike[str] | None = None,
+    method: Annotated[str, choice(METHODS)] = "least-squares",
+    curve: Annotated[str, choice(("auto", *CURVES))] = "auto",
+    layout: Annotated[str | PathLike[str] | None, file("NAME|L.toml"), READING] = None,
     sources: Callable[[], Sequence[Source]] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> CentrifugeFit:
@@ -67,11 +69,11 @@ def fit_centrifuge(
         Gives the consecutive blocks of a run's recording, such as a simulation's; read beside the manifest's file where
         that is given.
     method
-        ``least-squares`` or ``fourier``.
+        least-squares, or fourier (the source's whole-period sums).
     curve
-        Terms of K(a): ``auto``, ``constant``, ``c1``, ``c2`` or ``c1+c2``.
+        Terms of K(a).
     layout
-        Where the columns of foreign files are.
+        Columns of foreign files; see imulab show --formats.
     sources
         Called when all is read; returns the files that the record is made from.
     progress

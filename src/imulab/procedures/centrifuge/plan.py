@@ -13,13 +13,14 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from imulab.display import Shown
 from imulab.errors import OptionError, quoted
 from imulab.files import write_text
+from imulab.options import measure, text
 from imulab.procedures.centrifuge.levels import Measured, RunLine, arm_rate_off, delays, mismatch, tilted, weighted
 from imulab.procedures.centrifuge.manifest import Manifest, make_manifest, manifest_text
 from imulab.procedures.centrifuge.run import LoadedRun
@@ -341,19 +342,19 @@ class Plan(Shown):
 
 
 def plan_centrifuge(
-    levels: Sequence[float] | str = "1,2,5,10,15,20,30,40",
+    levels: Annotated[Sequence[float] | str, text("A,A,...", unit="g")] = "1,2,5,10,15,20,30,40",
     *,
-    radius: float | str = "2 m",
-    net_rate: float | str = "40 deg/s",
-    duration: float | str = "15 min",
+    radius: Annotated[float | str, measure("length", "m")] = "2 m",
+    net_rate: Annotated[float | str, measure("rate", "deg/s")] = "40 deg/s",
+    duration: Annotated[float | str, measure("time", "s")] = "15 min",
     cycles: int | str = 2,
     both_senses: bool = False,
-    drift: float | str = "3.3 deg/h/g",
-    dtg_noise: float | str = "0.01 deg/sqrt(h)",
-    fog_noise: float | str = "0.005 deg/sqrt(h)",
-    uncertainty: float | str = "1 %",
-    radius_uncertainty: float | str = "0 m",
-    rate_uncertainty: float | str = "0 deg/s",
+    drift: Annotated[float | str, text("K", unit="deg/h/g")] = "3.3 deg/h/g",
+    dtg_noise: Annotated[float | str, text("N", unit="deg/sqrt(h)")] = "0.01 deg/sqrt(h)",
+    fog_noise: Annotated[float | str, text("N", unit="deg/sqrt(h)")] = "0.005 deg/sqrt(h)",
+    uncertainty: Annotated[float | str, text("FRACTION")] = "1 %",
+    radius_uncertainty: Annotated[float | str, measure("length", "m")] = "0 m",
+    rate_uncertainty: Annotated[float | str, measure("rate", "deg/s")] = "0 deg/s",
     static_duration: float = 300.0,
 ) -> Plan:
     """Plan a centrifuge test.
@@ -361,23 +362,32 @@ def plan_centrifuge(
     Parameters
     ----------
     levels
-        Specific forces, m/s^2, or a text of them in g, with commas; the lowest is the reference K_1.
-    radius, radius_uncertainty
-        m.
-    net_rate, rate_uncertainty
-        rad/s.
-    duration, static_duration
-        Of each loaded and static run, s.
+        Specific forces in g, with commas; the lowest is the reference. As numbers in m/s^2; the reference is that of
+        K_1.
+    radius
+        Arm axis to the gyroscope's centre. In m.
+    net_rate
+        Rate at which the gyroscope turns against the room. In rad/s.
+    duration
+        Duration of each run. In s.
     cycles
-        Power cycles.
+        Number of power cycles.
     both_senses
-        Whether each level is run in both senses.
+        Every level in both senses.
     drift
-        Expected K, rad/s/(m/s^2).
-    dtg_noise, fog_noise
-        Angle random walk, rad/sqrt(s).
+        Expected drift per g. K, rad/s/(m/s^2).
+    dtg_noise
+        Angle random walk of the gyroscope. In rad/sqrt(s).
+    fog_noise
+        Angle random walk of the FOG. In rad/sqrt(s).
     uncertainty
-        Wanted relative standard uncertainty of K at every level.
+        Wanted standard uncertainty of K, relative. At every level.
+    radius_uncertainty
+        Standard uncertainty of the radius. In m.
+    rate_uncertainty
+        Standard uncertainty of the arm rates. In rad/s.
+    static_duration
+        Duration of each static run. In s.
 
     Raises
     ------

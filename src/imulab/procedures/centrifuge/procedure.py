@@ -6,14 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import ReadError
-from imulab.procedures.centrifuge import CURVES, METHODS
-from imulab.procedures.procedure import LAYOUT, Files, Procedure, Section, Task, choice, read_options, source_of
+from imulab.options import read_options
+from imulab.procedures.procedure import Files, Procedure, Section, Task, source_of
 
 if TYPE_CHECKING:
     import numpy as np
 
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.device.unit import DeviceUnit
+    from imulab.procedures.centrifuge.fit import CentrifugeFit
     from imulab.recording import Recording, Source
     from imulab.records.calibration import Calibration
     from imulab.report.traces import Exhibits
@@ -49,21 +50,20 @@ def _fit(
     ).calibration
 
 
-OPTIONS = (
-    choice("method", "least-squares, or fourier (the source's whole-period sums).", METHODS, "least-squares"),
-    choice("curve", "Terms of K(a).", ("auto", *CURVES), "auto"),
-    LAYOUT,
-)
+def _function() -> Callable[..., CentrifugeFit]:
+    from imulab.procedures.centrifuge.fit import fit_centrifuge
+
+    return fit_centrifuge
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    return read_options(OPTIONS, texts, label)
+    return read_options(TASK.options, texts, label)
 
 
 TASK = Task(
     files="the manifest of one test",
     count=(1, 1),
-    options=OPTIONS,
+    function=_function,
     values=_values,
     fit=_fit,
 )

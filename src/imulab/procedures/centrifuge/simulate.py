@@ -14,12 +14,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from imulab.display import Shown
 from imulab.errors import OptionError, quoted
 from imulab.files import write_text
+from imulab.options import file, measure, text
 from imulab.procedures.centrifuge.lines import FEWEST_PER_PERIOD
 from imulab.procedures.centrifuge.manifest import Manifest, Run, load_manifest, make_manifest, manifest_text
 from imulab.procedures.centrifuge.plan import Plan, plan_centrifuge, read_levels
@@ -390,21 +392,21 @@ _LEVELS, _RADIUS, _NET_RATE = "1,2,5,10,15,20", "2 m", "40 deg/s"
 
 
 def simulate_centrifuge(
-    plan: Manifest | Plan | str | PathLike[str] | None = None,
+    plan: Annotated[Manifest | Plan | str | PathLike[str] | None, file("PLAN.toml")] = None,
     truth: Truth | None = None,
     *,
-    levels: Sequence[float] | str = _LEVELS,
-    radius: float | str = _RADIUS,
-    net_rate: float | str = _NET_RATE,
+    levels: Annotated[Sequence[float] | str, text("A,A,...", unit="g")] = _LEVELS,
+    radius: Annotated[float | str, measure("length", "m")] = _RADIUS,
+    net_rate: Annotated[float | str, measure("rate", "deg/s")] = _NET_RATE,
     cycles: int | str = 2,
     both_senses: bool = False,
-    duration: float | str = "5 min",
-    static_duration: float | str = "1 min",
-    rate: float | str = "50 Hz",
-    nonlinearity: float | str = "1 %",
-    tilt: float | str = "10 arcsec",
+    duration: Annotated[float | str, measure("time", "s")] = "5 min",
+    static_duration: Annotated[float | str, measure("time", "s")] = "1 min",
+    rate: Annotated[float | str, measure("frequency", "Hz")] = "50 Hz",
+    nonlinearity: Annotated[float | str, text("FRACTION")] = "1 %",
+    tilt: Annotated[float | str, measure("angle", "arcsec")] = "10 arcsec",
     no_angle: bool = False,
-    unit: str = "deg/h",
+    unit: Annotated[str, text("UNIT")] = "deg/h",
     seed: int | str = 1,
     ramp: float = 0.0,
 ) -> Simulation:
@@ -413,29 +415,32 @@ def simulate_centrifuge(
     Parameters
     ----------
     plan
-        The test: a plan, a manifest, or its file; by `levels` to `both_senses` where none is given.
+        Manifest to simulate, as plan writes it. A plan, a manifest, or its file; `levels` to `both_senses` say the test
+        where none is given.
     truth
         Everything that the test has in it; a typical gyroscope of `nonlinearity` on a rig of `tilt` if not given.
     levels
-        Specific forces, m/s^2, or a text of them in g, with commas.
+        Specific forces in g, with commas; the lowest is the reference. As numbers in m/s^2.
     radius, net_rate
-        m and rad/s, or texts with a unit.
+        As for `plan_centrifuge`.
     cycles, both_senses
-        Number of power cycles, and whether every level is run in both senses.
-    duration, static_duration
-        Of each loaded and each static run, s.
+        As for `plan_centrifuge`.
+    duration
+        Duration of each run. In s.
+    static_duration
+        Duration of each static run. In s.
     rate
-        Samples per second, Hz.
+        Sample rate. In Hz.
     nonlinearity
-        K(20 g) / K(0) - 1.
+        K(20 g) / K(0) - 1. Of a typical gyroscope.
     tilt
-        Table axis against the arm's axis, rad.
+        Table axis against the arm's axis. In rad.
     no_angle
-        Whether the column `table_angle` is left out.
+        No table_angle column.
     unit
-        Of the rates in the recordings.
+        Unit of the rates: deg/h deg/s rad/s. In the recordings.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
     ramp
         Duration of a spin-up at the start of every loaded run, s.
 

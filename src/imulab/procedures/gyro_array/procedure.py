@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
-from imulab.device import METHODS
 from imulab.errors import OptionError
-from imulab.procedures.procedure import (
-    READING,
-    Files,
-    Option,
-    Procedure,
-    Section,
-    Task,
-    file_option,
-    measure,
-    part_of,
-    read_options,
-    text_option,
-)
+from imulab.options import READING, parsed, part_of, read_options
+from imulab.procedures.procedure import Files, Procedure, Section, Task
 from imulab.quantities import span
 
 if TYPE_CHECKING:
     import numpy as np
 
     from imulab.device.tables import DeviceTable, Fusion
+    from imulab.procedures.gyro_array.fit import ArrayFit
     from imulab.records.calibration import Calibration
     from imulab.report.traces import Exhibits
 
@@ -47,29 +36,28 @@ def _fit(
     ).calibration
 
 
-METHOD = text_option(
-    "method", "Method that fuse and export take from the record; robust if not given.", shows="METHOD", choices=METHODS
-)
-MEMORY = text_option(
-    "memory",
-    "Its memory: growing, growing:COUNT, or a gain between 0 and 1.",
-    shows="growing|growing:N|GAIN",
-    choices=("growing",),
-)
-OPTIONS = (
-    Option("interval", "The same as window, by its older name.", span, shows="FROM:TO"),
-    measure("averaging", "Averaging time of the covariance matrix, s.", "time", "s", "1 s", shows="TIME"),
-    METHOD,
-    MEMORY,
-    file_option("noise", "Noise record of the same gyros, for the uncertainties of the biases.", "RECORD"),
-    *READING,
-)
+class Older(TypedDict, total=False):
+    """Older names of options.
+
+    Attributes
+    ----------
+    interval
+        The same as window, by its older name.
+    """
+
+    interval: Annotated[str | None, parsed(span, "FROM:TO", unit="s"), READING]
+
+
+def _function() -> Callable[..., ArrayFit]:
+    from imulab.procedures.gyro_array.public import calibrate_array
+
+    return calibrate_array
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.procedures.gyro_array.fuse import fusion_text
 
-    values = read_options(OPTIONS, texts, label)
+    values = read_options(TASK.options, texts, label)
     if values["interval"] is not None and values["window"]:
         names = label.format("interval"), label.format("window")
         raise OptionError(f"{names[0]} together with {names[1]}: expected one of them, they say the same")
@@ -81,9 +69,11 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
 TASK = Task(
     files="STILL, or STILL;MOVING",
     count=(1, 2),
-    options=OPTIONS,
+    function=_function,
     values=_values,
     fit=_fit,
+    without=("moving", "element"),
+    more=(Older,),
 )
 
 

@@ -9,9 +9,10 @@ from typing import Annotated, Any, Unpack, cast
 
 from numpy.typing import NDArray
 
-from imulab.device import STARTS
+from imulab.device import METHODS, STARTS
 from imulab.device.unit import Blob, is_blob, load_blob
 from imulab.errors import DataError, OptionError
+from imulab.options import PROGRAM, READING, file, measure, parsed, text
 from imulab.procedures.gyro_array import compare, fit
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.fit import ArrayFit
@@ -20,7 +21,7 @@ from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
 from imulab.procedures.gyro_array.fused import Fused
 from imulab.procedures.gyro_array.merge import Merged, merge_recordings
 from imulab.procedures.result import Record, as_record, as_recording, check_keywords
-from imulab.quantities import in_si, interval
+from imulab.quantities import in_si, interval, span
 from imulab.reading import Data, Part, Reading, Window
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
@@ -30,12 +31,12 @@ _LABEL = "array: {}"
 
 def calibrate_array(
     still: Data,
-    moving: Data | None = None,
+    moving: Annotated[Data | None, file()] = None,
     *,
-    averaging: float | str = "1 s",
-    serial: str | None = None,
-    method: str | None = None,
-    memory: str | float | None = None,
+    averaging: Annotated[float | str, measure("time", "s")] = "1 s",
+    serial: Annotated[str | None, PROGRAM] = None,
+    method: Annotated[str | None, text("METHOD", METHODS)] = None,
+    memory: Annotated[str | float | None, text("growing|growing:N|GAIN", ("growing",))] = None,
     noise: Record | None = None,
     **reading: Unpack[Reading],
 ) -> ArrayFit:
@@ -48,18 +49,22 @@ def calibrate_array(
 
     Parameters
     ----------
-    still, moving
+    still
         A file, recording, data frame or arrays with the columns gyro_1 .. (or gyro_x_1 ..) in rad/s, deg/s or deg/h; or
         the readings of n gyros, shape (m, n) or (m, n, 3).
+    moving
+        Recording in motion, for alignment and scale. As `still`.
     averaging
-        Averaging time of the covariance matrix, s.
+        Averaging time of the covariance matrix. In s.
     serial
         Of the array, for the record.
-    method, memory
-        What `fuse` and `export` take from the record; robust and growing where not given.
+    method
+        Method that fuse and export take from the record; robust if not given.
+    memory
+        Its memory: growing, growing:COUNT, or a gain between 0 and 1. Growing if not given.
     noise
-        Record of `fit_noise` of the same gyros, or its file, from a log that is longer than `still`: the uncertainties
-        of the biases are those of its model.
+        Noise record of the same gyros, for the uncertainties of the biases. Of `fit_noise`, or its file, from a log
+        that is longer than `still`: the uncertainties of the biases are those of its model.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window` (of `still` alone).
@@ -102,16 +107,16 @@ def fuse(
     data: Data,
     options: Annotated[FuseOptions | None, "keywords, as in fuse(data, method='mean')"] = None,
     *,
-    method: str | None = None,
-    memory: str | float | None = None,
-    initial_bias: Record = "first",
+    method: Annotated[str | None, text("METHOD", METHODS)] = None,
+    memory: Annotated[str | float | None, text("growing|growing:N|GAIN", ("growing",))] = None,
+    initial_bias: Annotated[Record, text("|".join((*STARTS, "RECORD")), STARTS)] = "first",
     calibration: Record | Blob | None = None,
-    rate: float | str | None = None,
+    rate: Annotated[float | str | None, measure("frequency", "Hz")] = None,
     rate_walk: float | None = None,
-    still: tuple[float, float] | str | None = None,
-    window: Window | None = None,
-    weights: bool = False,
-    flags: bool = True,
+    still: Annotated[tuple[float, float] | str | None, text("FROM:TO", unit="s")] = None,
+    window: Annotated[Window | None, parsed(span, "FROM:TO", unit="s"), READING] = None,
+    weights: Annotated[bool, PROGRAM] = False,
+    flags: Annotated[bool, PROGRAM] = True,
     **reading: Unpack[Part],
 ) -> Fused:
     """Fuse the readings of an array into one rate.
@@ -124,21 +129,23 @@ def fuse(
     options
         The keywords as one object, instead of them, for what fuses block by block.
     method
-        One of ``mean support least-squares feedback robust covariance kalman``; that of `calibration`, or robust.
+        mean support least-squares feedback robust covariance kalman; that of the calibration, or robust.
     memory
-        ``growing``, ``growing:COUNT``, or a gain between 0 and 1; that of `calibration`, or growing.
+        growing, growing:COUNT, or a gain between 0 and 1; that of the calibration, or growing.
     initial_bias
-        ``first``, ``zero``, or the record, or its file, whose biases the recursion starts from.
+        Biases to start from. ``first``, ``zero``, or the record, or its file, whose biases the recursion starts from.
     calibration
-        Record of `calibrate_array` or blob, or its file: its biases are taken off, its noise gives the weights.
+        Record of array calibrate, taken off first. Or a blob, or the file of either: its biases are taken off, its
+        noise gives the weights.
     rate
-        Samples per second, Hz, of arrays without `time`; the nominal rate of what has a time of its own.
+        Sampling rate; from the first samples if not given. In Hz, of arrays without `time`; the nominal rate of what
+        has a time of its own.
     rate_walk
         Process noise of `kalman`, rad/s/sqrt(s).
     still
-        From when to when the unit is known to be at rest, s, as ``(10, 60)`` or ``"10:60"``.
+        The unit is known to be at rest then. From when to when, s, as ``(10, 60)`` or ``"10:60"``.
     window
-        First and last time to use, s.
+        As for `fit_tumble`.
     weights, flags
         Whether to keep the weight and the state of each gyro in each sample.
     reading
@@ -181,7 +188,7 @@ def compare_methods(
     data: Data,
     *,
     calibration: Record | None = None,
-    memory: str | float | None = None,
+    memory: Annotated[str | float | None, text("growing|growing:N|GAIN", ("growing",))] = None,
     count_from: int | None = None,
     **reading: Unpack[Reading],
 ) -> Comparison:
@@ -197,9 +204,9 @@ def compare_methods(
     data
         As for `fuse`.
     calibration
-        Record of `calibrate_array`, or its file.
+        Record of array calibrate, taken off first. Or its file.
     memory
-        ``growing``, ``growing:COUNT``, or a gain between 0 and 1; that of `calibration`, or growing.
+        growing, growing:COUNT, or a gain between 0 and 1; that of the calibration, or growing.
     count_from
         Count of the first sample under growing memory; that of `memory` if not given.
     reading
@@ -231,8 +238,8 @@ def compare_methods(
 def merge_array(
     recordings: Annotated[Sequence[Data], "a list of recordings, one of each gyroscope"],
     *,
-    axis: str | None = None,
-    column: str | None = None,
+    axis: Annotated[str | None, text("x|y|z")] = None,
+    column: Annotated[str | None, text("NAME")] = None,
     align: bool = False,
     **reading: Unpack[Reading],
 ) -> Merged:
@@ -246,11 +253,11 @@ def merge_array(
     recordings
         Two or more files, recordings or data frames, on clocks that agree unless `align` is chosen.
     axis
-        ``x``, ``y`` or ``z``: take this axis of each; all three (or the only one) if not given.
+        Take this axis of each. ``x``, ``y`` or ``z``; all three (or the only one) if not given.
     column
-        Take the column of this name instead.
+        Take this column of each. In place of an axis.
     align
-        Move the clocks to where the motion fits that of the first.
+        Move the clocks to where the motion fits the first.
     reading
         How arrays and files are to be understood, as for `fuse`.
 

@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
 from imulab.errors import OptionError, listed
+from imulab.options import choice, measure, repeated, text
 from imulab.procedures.gyro_array import EXPERIMENTS, FAULTS, MOUNTINGS, UNITS
 from imulab.quantities import in_si, quantity, whole
 from imulab.recording import Array, Recording
@@ -47,24 +49,29 @@ class Fault:
     size: float = 2.0 * _DEG
 
 
+Faults: TypeAlias = Annotated[
+    Sequence[Fault | str] | None, repeated("KIND:GYRO[:START[:DURATION[:SIZE]]]", words=FAULTS)
+]
+
+
 def simulate_array(
     *,
-    experiment: str = "dynamic",
+    experiment: Annotated[str, choice(tuple(EXPERIMENTS))] = "dynamic",
     elements: int | str = 6,
     axes: int | str = 1,
-    rate: float | str | None = None,
-    duration: float | str | None = None,
-    white: float | str = "0.05 deg/s",
-    spread: tuple[float, float] | str = "0.6,1.6",
-    gauss_markov: float | str = "0.003 deg/s",
-    correlation_time: float | str = "200 s",
-    walk: float | str = "0.0002 deg/s",
-    turn_on: float | str = "0.02 deg/s",
+    rate: Annotated[float | str | None, measure("frequency", "Hz")] = None,
+    duration: Annotated[float | str | None, measure("time", "s")] = None,
+    white: Annotated[float | str, measure("rate", "deg/s")] = "0.05 deg/s",
+    spread: Annotated[tuple[float, float] | str, text("LOW,HIGH")] = "0.6,1.6",
+    gauss_markov: Annotated[float | str, measure("rate", "deg/s")] = "0.003 deg/s",
+    correlation_time: Annotated[float | str, measure("time", "s")] = "200 s",
+    walk: Annotated[float | str, measure("rate", "deg/s")] = "0.0002 deg/s",
+    turn_on: Annotated[float | str, measure("rate", "deg/s")] = "0.02 deg/s",
     scale_spread: float | str = 0,
-    misalignment: float | str = "0 deg",
-    mounting: str = "same",
-    fault: Sequence[Fault | str] | None = None,
-    unit: str = "deg/s",
+    misalignment: Annotated[float | str, measure("angle", "deg")] = "0 deg",
+    mounting: Annotated[str, choice(MOUNTINGS)] = "same",
+    fault: Faults = None,
+    unit: Annotated[str, choice(UNITS)] = "deg/s",
     session: int | str = 0,
     seed: int | str = 1,
 ) -> Recording:
@@ -75,23 +82,44 @@ def simulate_array(
 
     Parameters
     ----------
-    elements, axes
-        Gyros on each axis; 1 or 3 axes.
-    rate, duration
-        Hz and s; by default those of the experiment.
-    white, gauss_markov, correlation_time, walk, turn_on
-        Noise of each gyro: `NoiseModel`, rad/s and s.
+    experiment
+        static and dynamic are the source's set-ups.
+    elements
+        Gyros on each axis.
+    axes
+        1 or 3.
+    rate
+        Sampling rate; that of the experiment if not given. In Hz.
+    duration
+        Duration; that of the experiment if not given. In s.
+    white
+        White noise of a sample, before a factor for each gyro. In rad/s; this and the next are those of `NoiseModel`.
     spread
-        Range of the factor of each gyro's white noise.
-    scale_spread, misalignment
-        Standard deviations of the scale factors, and of the axes' misalignments, rad.
+        Range of that factor. Of the white noise of each gyro.
+    gauss_markov
+        Standard deviation of the correlated noise. In rad/s.
+    correlation_time
+        Of the correlated noise. In s.
+    walk
+        Rate random walk, per square root of a second. In rad/s.
+    turn_on
+        Standard deviation of the turn-on biases. In rad/s.
+    scale_spread
+        Standard deviation of the scale factors.
+    misalignment
+        Standard deviation of the misalignments. Of the axes, rad.
     mounting
-        ``same``, or ``alternate``: even elements measure (-y, -x, -z), or -x on a single axis.
+        alternate: even elements upside down. They measure (-y, -x, -z), or -x on a single axis.
     fault
-        Faults to put in, each a `Fault` or a text ``KIND:GYRO[:START[:DURATION[:SIZE]]]``, s and deg/s.
-    session, seed
-        Of the random numbers. Biases and scale factors depend on `seed` alone: another experiment or session with one
-        seed is another recording of one array.
+        Faults to put in: dead stuck spikes jump nan saturation; times in s, sizes in deg/s; repeatable. Each a `Fault`
+        or a text ``KIND:GYRO[:START[:DURATION[:SIZE]]]``.
+    unit
+        Unit of the outputs.
+    session
+        Another recording of the same array. Biases and scale factors depend on `seed` alone: another experiment or
+        session with one seed is another recording of one array.
+    seed
+        Seed of the random numbers.
 
     Raises
     ------

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any, ClassVar, Unpack
+from typing import Annotated, Any, ClassVar, Unpack
 
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
-from imulab.estimation import noise_coefficients
+from imulab.estimation import TAUS, noise_coefficients
 from imulab.estimation.column_noise import FEWEST, curves_and_noise, noise_columns, samples_noise
 from imulab.estimation.noise_coefficients import NoiseCoefficients, coefficients_dict
 from imulab.estimation.sampling import sampling_rate
 from imulab.frames import is_frame, unmasked
+from imulab.options import PROGRAM, READING, choice, parsed
 from imulab.procedures.result import Drawn, as_blocks, as_recording
+from imulab.quantities import span
 from imulab.reading import Data, Part, Window
 from imulab.recording import Array, Recording, check_finite, is_large, on_disk
 from imulab.report.traces import Exhibits, Figure, ReportTable, format_uncertain
@@ -78,10 +80,10 @@ class AllanCurve(Drawn, noise_coefficients.AllanCurve):
 def allan_deviation(
     data: Data,
     rate: float | None = None,
-    taus: str | Array = "octave",
+    taus: Annotated[str | Array, choice(TAUS)] = "octave",
     *,
-    column: str | None = None,
-    window: Window | None = None,
+    column: Annotated[str | None, PROGRAM] = None,
+    window: Annotated[Window | None, parsed(span, "FROM:TO", unit="s"), READING] = None,
     **reading: Unpack[Part],
 ) -> AllanCurve:
     """Compute the overlapping Allan deviation of evenly spaced samples, and noise coefficients of a sensor's column.
@@ -100,12 +102,12 @@ def allan_deviation(
     rate
         Sampling rate, Hz, of samples without a time.
     taus
-        ``octave`` (m = 1, 2, 4 ...), ``dense`` (24 a decade), or averaging times in s, shape (t,), which are rounded to
-        whole numbers of samples.
+        dense: 24 a decade. ``octave``: m = 1, 2, 4 ...; or averaging times in s, shape (t,), which are rounded to whole
+        numbers of samples.
     column
         Which column of several.
     window
-        First and last time to use, s.
+        As for `fit_tumble`.
     reading
         How arrays and files are to be understood: `time`, `unit` or `units`; `layout`, `topic`, `instance`, `element`.
 

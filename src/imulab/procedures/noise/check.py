@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any, ClassVar, TypeAlias, Unpack
+from typing import Annotated, Any, ClassVar, TypeAlias, Unpack
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from imulab.estimation.noise.rest import Rest
 from imulab.estimation.noise.spectrum import Spectrum, frequencies
 from imulab.estimation.noise.terms import NAMES, edge_as_white, prepare
 from imulab.estimation.rows import NORMAL_95
+from imulab.options import text
 from imulab.procedures.noise.fit import fit_recordings, given_log
 from imulab.procedures.noise.schema import Column, Fit, drawn_of, fit_of, label
 from imulab.procedures.result import Drawn, as_record
@@ -157,8 +158,8 @@ def check_noise(
     record: Calibration | str | PathLike[str],
     data: Data | Sequence[Data],
     *,
-    tolerance: float | str = TOLERANCE,
-    false_alarm: float | str = FALSE_ALARM,
+    tolerance: Annotated[float | str, text("FRACTION")] = TOLERANCE,
+    false_alarm: Annotated[float | str, text("FRACTION")] = FALSE_ALARM,
     **reading: Unpack[Reading],
 ) -> NoiseCheck:
     """Test whether a new log at rest is of the noise of a record, column by column.
@@ -174,8 +175,8 @@ def check_noise(
     data
         A log of the same sampling rate, or a list of logs, as for `fit_noise`.
     tolerance
-        Relative change of the size of the noise, in an octave, that is not held against the log, however long it is:
-        no sensor keeps its noise to better than about 1 %. 0: none.
+        Change of size that is not held against the log. Relative change of the size of the noise, in an octave, however
+        long the log is: no sensor keeps its noise to better than about 1 %. 0: none.
     false_alarm
         Share of logs of unchanged noise that fail; with a tolerance, at most.
     reading

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from os import PathLike
 from pathlib import Path
-from typing import Any, NoReturn, Unpack
+from typing import Annotated, Any, NoReturn, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +48,18 @@ from imulab.estimation.noise.terms import (
 )
 from imulab.estimation.rows import NORMAL_95
 from imulab.frames import is_frame
-from imulab.procedures.noise import HORIZON, NO_COVARIATE, SAY_STEPS, check_options, rejected
+from imulab.options import choice, measure, names_of_columns, parsed
+from imulab.procedures.noise import (
+    COVARIATES,
+    HORIZON,
+    NO_COVARIATE,
+    SAY_STEPS,
+    STEPS,
+    check_options,
+    check_terms,
+    rejected,
+)
 from imulab.procedures.noise.schema import density, shown
-from imulab.procedures.procedure import names_of_columns
 from imulab.procedures.result import Result, as_blocks, as_recording
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
@@ -637,12 +646,12 @@ class NoiseFit(Result):
 def fit_noise(
     data: Data | Sequence[Data],
     *,
-    terms: str = "auto",
-    horizon: float | str | None = None,
-    band: float | str | None = None,
-    regress: str | None = NO_COVARIATE,
-    columns: str | Sequence[str] | None = None,
-    steps: str | None = SAY_STEPS,
+    terms: Annotated[str, parsed(check_terms, "auto|NBK", ("auto",))] = "auto",
+    horizon: Annotated[float | str | None, measure("time", "s")] = None,
+    band: Annotated[float | str | None, measure("frequency", "Hz")] = None,
+    regress: Annotated[str | None, choice((NO_COVARIATE, *COVARIATES))] = NO_COVARIATE,
+    columns: Annotated[str | Sequence[str] | None, parsed(names_of_columns, "A,A,...")] = None,
+    steps: Annotated[str | None, choice(STEPS)] = SAY_STEPS,
     **reading: Unpack[Reading],
 ) -> NoiseFit:
     """Fit a model of the noise to every sensor column of logs at rest, by maximum likelihood of its spectrum.
@@ -657,19 +666,19 @@ def fit_noise(
         A log, or a list of logs of the same unit, whose likelihoods add up; each a file, recording, data frame or
         arrays.
     terms
-        ``auto``, or the letters of the terms: N white, B 1/f, K random walk, G Gauss-Markov (GG for two), Q
+        Noises: auto, or letters of N B K G Q. N is white, B 1/f, K random walk, G Gauss-Markov (GG for two), Q
         quantisation.
     horizon
-        Time over which a filter predicts without aiding, s: the random walk for filters is that which predicts a mean
-        over it; 10 s if not given, or the length of a shorter log.
+        Time that a filter predicts without aiding; 10 s if not given, or the length of a shorter log. In s; the random
+        walk for filters is that which predicts a mean over it.
     band
-        Highest frequency to use, Hz; up to where the spectrum is flat if not given.
+        Highest frequency to use; up to where the spectrum is flat if not given. In Hz.
     regress
-        ``time`` or ``temperature``: take out what follows it; ``no``: nothing.
+        Take out what follows it. ``no``: nothing.
     columns
-        Which columns, as a list or a text such as ``"gyro_x,gyro_y"``; all outputs of sensors if not given.
+        Columns to fit; all sensors if not given. As a list or a text such as ``"gyro_x,gyro_y"``.
     steps
-        ``remove``: take changes of level out; ``say``: only say them.
+        Changes of level: say them, or remove them too.
     reading
         How arrays and files are to be understood: `rate` and `unit`; `layout`, `window` ...
 

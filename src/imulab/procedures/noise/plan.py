@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from imulab.errors import OptionError, listed
 from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
 from imulab.estimation.noise.rest import FEWEST, SHORT
 from imulab.estimation.noise.terms import NAMES, edge_as_white
+from imulab.options import measure, repeated, text
 from imulab.procedures.noise.schema import Markov, fit_of, given_terms, label, shown
 from imulab.procedures.noise.simulate import RATE, names_given, terms_of
 from imulab.procedures.result import Record, as_record
@@ -197,15 +198,15 @@ def _row(each: PlannedTerm) -> list[str]:
 def plan_noise(
     *,
     from_: Record | None = None,
-    for_: float | str | Mapping[str, float | str] = WANTED,
-    white: float | str | None = None,
-    flicker: float | str | None = None,
-    walk: float | str | None = None,
-    quantisation: float | str | None = None,
-    gm: Markov | Sequence[Markov] | None = None,
-    rate: float | str | None = None,
-    duration: float | str | None = None,
-    columns: str | Sequence[str] | None = None,
+    for_: Annotated[float | str | Mapping[str, float | str], text("10%|walk=10%,..")] = WANTED,
+    white: Annotated[float | str | None, text("N")] = None,
+    flicker: Annotated[float | str | None, text("B")] = None,
+    walk: Annotated[float | str | None, text("K")] = None,
+    quantisation: Annotated[float | str | None, text("Q")] = None,
+    gm: Annotated[Markov | Sequence[Markov] | None, repeated("SIGMA:TIME")] = None,
+    rate: Annotated[float | str | None, measure("frequency", "Hz")] = None,
+    duration: Annotated[float | str | None, measure("time", "s")] = None,
+    columns: Annotated[str | Sequence[str] | None, text("A,A,...")] = None,
 ) -> NoisePlan:
     """Say how long to record at rest for a wanted accuracy of each noise term.
 
@@ -216,17 +217,17 @@ def plan_noise(
     Parameters
     ----------
     from_
-        A record of `fit_noise` or its file: its terms, band and rate.
+        In place of terms: those of a record of noise fit. Or its file: its terms, band and rate.
     for_
-        Wanted relative standard uncertainty, of the sizes of all terms or by name: ``"10 %"``,
+        Wanted standard uncertainty, of all terms or by name. Relative, of their sizes: ``"10 %"``,
         ``"walk=10%,gm1_time=30%"``.
     white, flicker, walk, quantisation, gm, rate
-        In place of a record: the terms, for example of a data sheet, and the sampling rate, as for `simulate_noise`.
-        A noise density of a data sheet is often one-sided: N is that over the root of 2.
+        As for `simulate_noise`. In place of a record, for example those of a data sheet. A noise density of a data
+        sheet is often one-sided: N is that over the root of 2.
     duration
-        Also of what a record of this length tells, s; if not given, that of the record, or the one that is needed.
+        What a record of this length tells. In s; if not given, that of the record, or the one that is needed.
     columns
-        Of the record.
+        Columns of the record.
 
     Raises
     ------

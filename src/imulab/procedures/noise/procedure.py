@@ -5,25 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.procedures.noise import COVARIATES, HORIZON, NO_COVARIATE, SAY_STEPS, STEPS, check_terms
-from imulab.procedures.procedure import (
-    ELEMENT,
-    READING,
-    Files,
-    Option,
-    Procedure,
-    Task,
-    choice,
-    measure,
-    names_of_columns,
-    part_of,
-    read_options,
-    source_of,
-)
+from imulab.options import part_of, read_options
+from imulab.procedures.procedure import Files, Procedure, Task, source_of
 
 if TYPE_CHECKING:
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.estimation.noise.rest import Rest
+    from imulab.procedures.noise.fit import NoiseFit
     from imulab.procedures.procedure import Row
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
@@ -54,33 +42,21 @@ def _fit(
     return fit_recordings(recordings, sources=sources, **fit).calibration
 
 
-OPTIONS = (
-    Option("terms", "Noises: auto, or letters of N B K G Q.", check_terms, "auto", "auto|NBK", ("auto",)),
-    measure(
-        "horizon",
-        f"Time that a filter predicts without aiding; {HORIZON:g} s if not given, or the length of a shorter log.",
-        "time",
-        "s",
-        shows="TIME",
-    ),
-    measure("band", "Highest frequency to use, Hz; found from the spectrum if not given.", "frequency", "Hz"),
-    choice("regress", "Take out what follows it.", (NO_COVARIATE, *COVARIATES), NO_COVARIATE),
-    Option("columns", "Columns to fit; all sensors if not given.", names_of_columns, shows="A,A,..."),
-    choice("steps", "Changes of level: say them, or remove them too.", STEPS, SAY_STEPS),
-    *READING,
-    ELEMENT,
-)
+def _function() -> Callable[..., NoiseFit]:
+    from imulab.procedures.noise.fit import fit_noise
+
+    return fit_noise
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.procedures.noise import check_options
 
-    values = read_options(OPTIONS, texts, label)
+    values = read_options(TASK.options, texts, label)
     check_options(values["terms"], values["horizon"], values["band"], values["regress"], values["steps"], label)
     return {**values, "part": part_of(values)}
 
 
-TASK = Task(files="its logs at rest", count=(1, None), options=OPTIONS, values=_values, fit=_fit)
+TASK = Task(files="its logs at rest", count=(1, None), function=_function, values=_values, fit=_fit)
 
 
 # The stochastic model of sensors at rest, as the registry knows it.

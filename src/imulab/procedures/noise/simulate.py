@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.noise.simulate import simulated
+from imulab.options import measure, repeated, text
 from imulab.procedures.noise.fit import unit_of
 from imulab.procedures.noise.schema import Markov, by_name, fit_of, given_terms
 from imulab.procedures.result import Record, as_record
@@ -139,15 +141,15 @@ def names_given(columns: str | Sequence[str] | None) -> list[str] | None:
 
 def simulate_noise(
     *,
-    white: float | str | None = None,
-    flicker: float | str | None = None,
-    walk: float | str | None = None,
-    quantisation: float | str | None = None,
-    gm: Markov | Sequence[Markov] | None = None,
+    white: Annotated[float | str | None, text("N")] = None,
+    flicker: Annotated[float | str | None, text("B")] = None,
+    walk: Annotated[float | str | None, text("K")] = None,
+    quantisation: Annotated[float | str | None, text("Q")] = None,
+    gm: Annotated[Markov | Sequence[Markov] | None, repeated("SIGMA:TIME")] = None,
     from_: Record | None = None,
-    rate: float | str | None = None,
-    duration: float | str = DURATION,
-    columns: str | Sequence[str] | None = None,
+    rate: Annotated[float | str | None, measure("frequency", "Hz")] = None,
+    duration: Annotated[float | str, measure("time", "s")] = DURATION,
+    columns: Annotated[str | Sequence[str] | None, text("A,A,...")] = None,
     seed: int | str = 1,
 ) -> Recording:
     """Simulate a log at rest of given noise about a level of 0, in the time domain.
@@ -158,25 +160,27 @@ def simulate_noise(
     Parameters
     ----------
     white
-        N, angle or velocity random walk, unit/sqrt(Hz): ``"0.3 deg/sqrt(h)"`` or ``"100 ug/sqrt(Hz)"``.
+        White noise, 0.3 deg/sqrt(h) or 100 ug/sqrt(Hz); SI without a unit. N, angle or velocity random walk,
+        unit/sqrt(Hz).
     flicker
-        B, 1/f noise, unit: ``"5 deg/h"``.
+        1/f noise, such as 5 deg/h. B, in the unit of the output.
     walk
-        K, rate or acceleration random walk, unit/sqrt(s): ``"3 deg/h/sqrt(h)"``.
+        Random walk, such as 3 deg/h/sqrt(h). K, rate or acceleration random walk, unit/sqrt(s).
     quantisation
-        Q, of the angle or velocity, unit s: ``"1 arcsec"``.
+        Quantisation of the angle, such as 1 arcsec. Q, of the angle or velocity, unit s.
     gm
-        A Gauss-Markov term or two, standard deviation and correlation time: ``"20 deg/h:300 s"``.
+        Gauss-Markov noise, such as '20 deg/h:300 s'; once or twice. Standard deviation and correlation time.
     from_
-        In place of terms: a record of `fit_noise` or its file, whose chosen models are simulated, column by column.
+        In place of terms: those of a record of noise fit. Or its file, whose chosen models are simulated, column by
+        column.
     rate
-        Hz; that of the record, or 100 Hz.
+        Sampling rate; that of the record, or 100 Hz. In Hz.
     duration
-        s.
+        Duration of the log. In s.
     columns
-        Names; those of the record, or three axes of the sensor that the terms are of.
+        Those of the record, or three axes of the sensor. That the terms are of.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
 
     Raises
     ------

@@ -6,13 +6,14 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
 from imulab.gravity import EARTH, checked_latitude
+from imulab.options import choice, measure, parsed
 from imulab.procedures.rate import AXES, MOUNTINGS, ORDERS, gyros_of, part_of_one, rates_of
 from imulab.procedures.rate.axes import (
     TableAxes,
@@ -73,11 +74,11 @@ class RateFit(Result):
 def fit_rate(
     data: Data | RateRecordings,
     *,
-    rates: str | Sequence[float] | None = None,
-    axis: str = "+z",
-    order: int | str = "auto",
-    latitude: float | str | None = None,
-    table_uncertainty: float | str | None = None,
+    rates: Annotated[str | Sequence[float] | None, parsed(rates_of, "R,R,...", unit="deg/s")] = None,
+    axis: Annotated[str, choice(MOUNTINGS)] = "+z",
+    order: Annotated[int | str, choice(ORDERS)] = "auto",
+    latitude: Annotated[float | str | None, measure("angle", "deg")] = None,
+    table_uncertainty: Annotated[float | str | None, parsed(part_of_one, "FRACTION")] = None,
     accel: Record | None = None,
     prior: Record | None = None,
     **reading: Unpack[Reading],
@@ -93,21 +94,22 @@ def fit_rate(
         A manifest (``TEST.toml``, docs/rate.md), what `simulate_rate` returns, or one recording: a file, a recording, a
         data frame or arrays with ``gyro_*``, and ``table_rate`` or ``table_angle`` where the table wrote it.
     rates
-        Of one recording without such a column: the rates of the table, rad/s, or deg/s in a text, in any order.
+        Of the table, in any order; for one recording without a column table_rate. In rad/s, or deg/s in a text.
     axis
-        Of one recording: the body axis along the table axis, about which positive rates turn.
+        Body axis along the table axis, about which positive rates turn; for one recording.
     order
-        Highest power of the rate, 1 to 5; or, of each gyroscope, as many as its dwells support.
+        Highest power of the rate in the model. 1 to 5; ``"auto"``: of each gyroscope, as many as its dwells support.
     latitude
-        For the Earth's rate, rad; without it that stays in the bias.
+        Of the place, for the Earth's rate. In rad; without it that rate stays in the bias.
     table_uncertainty
-        Standard uncertainty that all rates of the table have in common, a fraction.
+        Standard uncertainty that all rates have in common, such as 20ppm. A fraction.
     accel
-        Record of `fit_tumble` of the same unit or its file, whose ``accel_*`` are in each recording: they tell the
-        table axis in the body, and the result is a record of both triads.
+        Tumble record of the unit, whose accelerometers tell the table axis. Of `fit_tumble` of the same unit, or its
+        file, whose ``accel_*`` are in each recording: they tell the table axis in the body, and the result is a record
+        of both triads.
     prior
-        Earlier record of the same gyroscopes, or its file: both are one fit, and the record says whether they agree. A
-        thermal record is one at the mean temperature of the recordings.
+        Earlier record of the same gyroscopes, as prior knowledge. Or its file: both are one fit, and the record says
+        whether they agree. A thermal record is one at the mean temperature of the recordings.
     reading
         How data are to be understood: `rate` or `time`, `unit`; `layout`, `topic`, `instance`, `window`, `element`.
 

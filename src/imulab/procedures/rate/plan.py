@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -20,12 +20,13 @@ from imulab.display import Shown
 from imulab.errors import ObservabilityError, OptionError, RecordError, listed
 from imulab.files import write_text
 from imulab.gravity import EARTH, checked_latitude
+from imulab.options import measure, parsed, text
 from imulab.procedures.rate import FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
 from imulab.procedures.rate.schema import RateTest, Run, manifest_text
 from imulab.procedures.rate.schema import shown as as_read
 from imulab.procedures.rate.solve import Problem, model_parameters, solve
 from imulab.procedures.result import Record, as_record
-from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
+from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole, whole_number
 from imulab.recording import Array
 from imulab.report.plots import Plot
 from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis, plain_number, short_log_axis
@@ -245,20 +246,20 @@ class RatePlan(Shown):
 
 
 def plan_rate(
-    rates: Sequence[float] | str = RATES,
+    rates: Annotated[Sequence[float] | str, text("R,R,...", unit="deg/s")] = RATES,
     *,
-    arw: float | str | None = None,
-    bias_instability: float | str | None = None,
+    arw: Annotated[float | str | None, text("N", unit="deg/sqrt(h)")] = None,
+    bias_instability: Annotated[float | str | None, measure("rate", "deg/h", "B")] = None,
     noise: Record | None = None,
-    uncertainty: float | str = "20 ppm",
-    of: str = "full",
-    faces: str = "+x,+y,+z",
+    uncertainty: Annotated[float | str, text("FRACTION")] = "20 ppm",
+    of: Annotated[str, text("full|reading", ("full", "reading"))] = "full",
+    faces: Annotated[str, text("A,A,...")] = "+x,+y,+z",
     cycles: int | str = 3,
-    order: int | str = "1",
-    latitude: float | str | None = None,
-    table_uncertainty: float | str | None = None,
-    turn: float | str | None = None,
-    fence: float | str = FENCE,
+    order: Annotated[int | str, parsed(whole_number, "N")] = "1",
+    latitude: Annotated[float | str | None, measure("angle", "deg")] = None,
+    table_uncertainty: Annotated[float | str | None, text("FRACTION")] = None,
+    turn: Annotated[float | str | None, text("FRACTION")] = None,
+    fence: Annotated[float | str, measure("angle", "deg")] = FENCE,
 ) -> RatePlan | TurnPlan:
     """Plan a test on a rate table: how long to stay at each rate, and what the test will then give.
 
@@ -267,29 +268,33 @@ def plan_rate(
     Parameters
     ----------
     rates
-        Sizes of the rates, rad/s, or deg/s in a text; each is visited up and down, either way round.
-    arw, bias_instability
-        Angle random walk N, rad/sqrt(s), and bias instability B, rad/s, of the worst gyroscope.
+        Sizes of the rates. In rad/s, or deg/s in a text; each is visited up and down, either way round.
+    arw
+        Angle random walk. N of the worst gyroscope, rad/sqrt(s).
+    bias_instability
+        Bias instability. B of the worst gyroscope, rad/s.
     noise
-        In their place: a record of `fit_noise` or its file.
+        Both, from a record of noise fit. Or its file.
     uncertainty
-        Wanted of the mean of each stay, a fraction.
+        Wanted of the mean of a stay, a fraction.
     of
-        Fraction of what: the largest rate (``"full"``) or each rate (``"reading"``).
+        Fraction of what: the largest rate (full) or each (reading).
     faces
         Body axes up along the table axis, one after the other.
     cycles
-        Runs of each face; 5 for the repeatability of scale factors.
+        Runs of each face; 5 for repeatability. Of scale factors.
     order
-        Highest power of the rate that the fit is to have, 1 to 5.
+        Highest power of the rate that the fit is to have. 1 to 5.
     latitude
-        rad, for the manifest.
+        Latitude of the place, for the manifest. In rad.
     table_uncertainty
-        Standard uncertainty that all rates have in common, a fraction, for the manifest and for what is predicted.
+        Standard uncertainty that all rates have in common, such as 20ppm. A fraction, for the manifest and for what is
+        predicted.
     turn
-        In place of a table: wanted relative standard uncertainty of scale factors by whole turns by hand.
+        Turns by hand in place of a table, such as 0.02%. The wanted relative standard uncertainty of scale factors by
+        whole turns.
     fence
-        Of those turns, the standard uncertainty of the difference of two stops, rad.
+        Of those turns: uncertainty of the difference of two stops. Standard uncertainty, rad.
 
     Raises
     ------

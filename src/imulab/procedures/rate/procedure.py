@@ -8,22 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
 from imulab.gravity import checked_latitude
-from imulab.procedures.procedure import (
-    ELEMENT,
-    READING,
-    Files,
-    Option,
-    Procedure,
-    Section,
-    Task,
-    choice,
-    file_option,
-    measure,
-    part_of,
-    read_options,
-    source_of,
-)
-from imulab.procedures.rate import MOUNTINGS, ORDERS, part_of_one, rates_of
+from imulab.options import part_of, read_options
+from imulab.procedures.procedure import Files, Procedure, Section, Task, source_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,6 +17,7 @@ if TYPE_CHECKING:
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.device.unit import DeviceUnit
     from imulab.procedures.procedure import Row
+    from imulab.procedures.rate.fit import RateFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
     from imulab.records.comparison import Change
@@ -40,24 +27,14 @@ if TYPE_CHECKING:
 # A rate test from its manifest, which names the recordings, or from one recording.
 
 
-OPTIONS = (
-    Option("rates", "Of the table, deg/s, in any order; for one recording without a column table_rate.", rates_of,
-           None, "R,R,..."),
-    choice("axis", "Body axis along the table axis, about which positive rates turn; for one recording.", MOUNTINGS,
-           "+z"),
-    choice("order", "Highest power of the rate in the model.", ORDERS, "auto"),
-    measure("latitude", "Of the place, deg, for the Earth's rate.", "angle", "deg", shows="DEG"),
-    Option("table_uncertainty", "Standard uncertainty that all rates have in common, such as 20ppm.",
-           part_of_one, None, "FRACTION"),
-    file_option("accel", "Tumble record of the unit, whose accelerometers tell the table axis.", "RECORD"),
-    file_option("prior", "Earlier record of the same gyroscopes, as prior knowledge.", "RECORD"),
-    *READING,
-    ELEMENT,
-)  # fmt: skip
+def _function() -> Callable[..., RateFit]:
+    from imulab.procedures.rate.fit import fit_rate
+
+    return fit_rate
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    return read_options(OPTIONS, texts, label)
+    return read_options(TASK.options, texts, label)
 
 
 def _fit(
@@ -92,7 +69,7 @@ def _fit(
 TASK = Task(
     files="the manifest of one test, or one recording",
     count=(1, 1),
-    options=OPTIONS,
+    function=_function,
     values=_values,
     fit=_fit,
 )

@@ -9,6 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from imulab.display import Shown
 from imulab.errors import OptionError, readable
 from imulab.files import write_text
 from imulab.gravity import EARTH, checked_latitude
+from imulab.options import measure, text
 from imulab.procedures.rate import AXES, RATES, rates_of
 from imulab.procedures.rate.schema import RateTest, Run, manifest_text
 from imulab.quantities import fraction, in_si, whole
@@ -68,19 +70,19 @@ class RateRecordings(Shown):
 
 
 def simulate_rate(
-    rates: Sequence[float] | str = RATES,
+    rates: Annotated[Sequence[float] | str, text("R,R,...", unit="deg/s")] = RATES,
     *,
-    faces: str = "+x,+y,+z",
+    faces: Annotated[str, text("A,A,...")] = "+x,+y,+z",
     cycles: int | str = 1,
-    hold: float | str | None = None,
-    noise: float | str = "0.03 deg/s",
-    rate: float | str = "100 Hz",
-    bend: float | str = "0",
-    loop: float | str = "0",
-    latitude: float | str = "48 deg",
-    table: float | str = "0",
-    sweep: float | str | None = None,
-    lag: float | str = "0 s",
+    hold: Annotated[float | str | None, measure("time", "s")] = None,
+    noise: Annotated[float | str, measure("rate", "deg/s")] = "0.03 deg/s",
+    rate: Annotated[float | str, measure("frequency", "Hz")] = "100 Hz",
+    bend: Annotated[float | str, text("FRACTION")] = "0",
+    loop: Annotated[float | str, text("FRACTION")] = "0",
+    latitude: Annotated[float | str, measure("angle", "deg")] = "48 deg",
+    table: Annotated[float | str, text("FRACTION")] = "0",
+    sweep: Annotated[float | str | None, measure("time", "s")] = None,
+    lag: Annotated[float | str, measure("time", "s")] = "0 s",
     seed: int | str = 1,
 ) -> RateRecordings:
     """Simulate a unit on a rate table: up through the rates, down, and the same the other way round, for each face.
@@ -90,32 +92,32 @@ def simulate_rate(
     Parameters
     ----------
     rates
-        Sizes of the rates, rad/s, or deg/s in a text.
+        Sizes of the rates. In rad/s, or deg/s in a text.
     faces
-        Body axes that point up along the table axis, one after the other.
+        Body axes up along the table axis, one after the other.
     cycles
         Runs of each face.
     hold
-        Time at each rate, s; 8 s if not given.
+        Time at each rate; 8 s if not given. In s.
     noise
-        Standard deviation of one sample, rad/s.
+        Standard deviation of one sample. In rad/s.
     rate
-        Samples per second, Hz.
+        Samples per second. In Hz.
     bend
-        Largest contribution of k3, a fraction of the largest rate.
+        Largest part of k3, a fraction of the largest rate.
     loop
-        Rising less falling at rate zero, a fraction of the largest rate.
+        Rising less falling at rate 0, a fraction of the largest rate.
     latitude
-        rad.
+        Latitude of the place. In rad.
     table
-        Standard deviation of what all rates of the table are off by, a fraction.
+        Standard deviation of what all rates are off by, a fraction.
     sweep
-        Duration, s, of a sine of the largest rate that goes from 0.05 to 2 Hz, in place of steps; the table's rate is
-        recorded then.
+        Duration of a swept sine, 0.05 to 2 Hz, in place of steps. In s; a sine of the largest rate, and the table's
+        rate is recorded.
     lag
-        Time constant of the gyroscopes, a first-order lag, s.
+        Time constant of the gyroscopes. Of a first-order lag, s.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
 
     Raises
     ------

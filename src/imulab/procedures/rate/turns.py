@@ -16,13 +16,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
 import numpy as np
 
 from imulab.display import UNJUDGED, Bad, Note
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
+from imulab.options import measure, text
 from imulab.procedures.rate import AXES, FENCE, gyros_of, part_of_one
 from imulab.procedures.rate.axes import (
     BY_ACCELEROMETERS,
@@ -714,9 +715,9 @@ class TurnsFit(Result):
 def fit_turns(
     data: Data,
     *,
-    fence: float | str = FENCE,
-    turns: str | Sequence[int] | None = None,
-    clock: float | str | None = None,
+    fence: Annotated[float | str, measure("angle", "deg")] = FENCE,
+    turns: Annotated[str | Sequence[int] | None, text("N,N,...")] = None,
+    clock: Annotated[float | str | None, text("FRACTION")] = None,
     accel: Record | None = None,
     prior: Record | None = None,
     **reading: Unpack[Reading],
@@ -731,18 +732,19 @@ def fit_turns(
         A file, recording, data frame or arrays with ``time`` and ``gyro_x``, ``_y``, ``_z`` in a unit of rate; with
         ``accel_*`` a wrong sample rate is found from turns that change the attitude.
     fence
-        Standard uncertainty of the difference of two stops, rad.
+        Uncertainty of the difference of two stops. Standard uncertainty, rad.
     turns
-        Number of turns of each in order, ``"1,5,-6"``; counted from the gyroscopes if not given.
+        Number of turns of each, such as 1,5,-6; else counted. In order; counted from the gyroscopes.
     clock
-        Relative standard uncertainty of the sample rate; without it the scale factors are those per clock.
+        Uncertainty of the sample rate, such as 50ppm. Relative standard uncertainty; without it the scale factors are
+        those per clock.
     accel
-        Record of `fit_tumble` of the same unit or its file, for turns about x, y and z on a level table: its
-        ``accel_*`` tell the axes of the turns, and the result is a record of both triads, with misalignments.
+        Tumble record, whose accelerometers tell the turns' axes. Of `fit_tumble` of the same unit or its file, for
+        turns about x, y and z on a level table: the result is a record of both triads, with misalignments.
     prior
-        Earlier record of the same gyroscopes, of `fit_gyro` or of a rate test, or its file: both are one fit. The
-        record says whether they agree, and holds what turns do not show as the prior has it. A thermal record is one at
-        the mean temperature of the recording.
+        Earlier record of the same gyroscopes, as prior knowledge. Of `fit_gyro` or of a rate test, or its file: both
+        are one fit. The record says whether they agree, and holds what turns do not show as the prior has it. A thermal
+        record is one at the mean temperature of the recording.
     reading
         How data are to be understood: `rate` or `time`, `unit`; `layout`, `topic`, `instance`, `window`, `element`.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Unpack
+from typing import Annotated, Any, ClassVar, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,8 @@ from imulab._version import VERSION
 from imulab.columns import triad
 from imulab.display import Bad, Note, verdict_of
 from imulab.errors import DataError, OptionError, RecordError, UnitError
-from imulab.gravity import EarthRate, Gravity, at_latitude, at_place, local_gravity
+from imulab.gravity import EarthRate, Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
+from imulab.options import FURTHER_TRIADS, measure, text
 from imulab.procedures.result import Drawn, Record, as_record, as_recording
 from imulab.procedures.thermal.degrees import parted
 from imulab.procedures.thermal.figures import own_points
@@ -237,15 +238,15 @@ def check_thermal(
     record: Record,
     data: Data | Sequence[Data],
     *,
-    limit: float | str | None = None,
-    gravity: float | str | Gravity | None = None,
-    latitude: float | str | None = None,
-    height: float | str | None = None,
-    tilt: float | str = "0.2 mrad",
-    turn_on_scatter: float | str | None = None,
-    gyro_turn_on_scatter: float | str | None = None,
-    settle: float | str | None = None,
-    temperature_column: str | None = None,
+    limit: Annotated[float | str | None, measure("acceleration", "mg")] = None,
+    gravity: LocalGravity = None,
+    latitude: Latitude = None,
+    height: Height = None,
+    tilt: Annotated[float | str, measure("angle", "mrad")] = "0.2 mrad",
+    turn_on_scatter: Annotated[float | str | None, measure("acceleration", "mg", "SIZE")] = None,
+    gyro_turn_on_scatter: Annotated[float | str | None, measure("rate", "deg/s", "SIZE"), FURTHER_TRIADS] = None,
+    settle: Annotated[float | str | None, measure("time", "s")] = None,
+    temperature_column: Annotated[str | None, text("NAME")] = None,
     **reading: Unpack[Reading],
 ) -> ThermalCheck:
     """Test whether new recordings contradict a record over temperature, without refitting.
@@ -262,17 +263,22 @@ def check_thermal(
     data
         One recording or several, a power cycle each: tumbles, attitudes at any temperature, or rest ramps.
     limit
-        Largest ``| |f| - g |`` that passes, m/s^2 or a text such as ``"2 mg"``, beside the test.
-    gravity, latitude, height
-        Where they were measured, as for `fit_tumble`; else that of the first head, or of the record.
+        Largest ``| |f| - g |`` that passes, beside the test. In m/s^2, or a text such as ``"2 mg"``.
+    gravity
+        Local gravity where they were measured; else of the first head, else of the record. As for `fit_tumble`.
+    latitude, height
+        As for `fit_tumble`.
     tilt
-        Standard deviation of the direction of a hold in which the temperature drifts, rad.
+        As for `fit_thermal`.
     turn_on_scatter
-        Standard deviation of each bias from one power cycle to the next, m/s^2; that of the record if not given.
+        What biases move by from one power cycle to the next; that of the record if not given. Standard deviation of
+        each, m/s^2.
     gyro_turn_on_scatter
-        The same of the gyroscopes' biases, rad/s.
-    settle, temperature_column
-        As for `fit_thermal`; the column as in the record's fit if not given.
+        The same of the gyroscopes' biases. In rad/s.
+    settle
+        As for `fit_thermal`.
+    temperature_column
+        Column of the unit's own thermometer; as in the record's fit if not given.
     reading
         How files are to be understood, as for `fit_thermal`.
 

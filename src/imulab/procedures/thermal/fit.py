@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
 import numpy as np
 
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import Observability
-from imulab.gravity import EarthRate, Gravity, at_latitude, at_place, local_gravity
+from imulab.gravity import EarthRate, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
+from imulab.options import FURTHER_TRIADS, measure, parsed, text
 from imulab.procedures.result import Record, Result, as_record, as_recording
-from imulab.procedures.thermal import further_of, laws_of
+from imulab.procedures.thermal import degrees_text, further_of, laws_of
 from imulab.procedures.thermal.degrees import Degrees, LeftOut, Step, choose, drift_of, moving
 from imulab.procedures.thermal.gyro import (
     check_gyroscopes,
@@ -67,17 +68,17 @@ class ThermalFit(Result):
 def fit_thermal(
     data: Data | Sequence[Data],
     *,
-    degrees: str | Degrees = "auto",
-    gravity: float | str | Gravity | None = None,
-    latitude: float | str | None = None,
-    height: float | str | None = None,
+    degrees: Annotated[str | Degrees, parsed(degrees_text, "auto|B,S,M", ("auto",))] = "auto",
+    gravity: LocalGravity = None,
+    latitude: Latitude = None,
+    height: Height = None,
     prior: Record | None = None,
-    with_: str | Sequence[str] = (),
-    tilt: float | str = "0.2 mrad",
-    turn_on_scatter: float | str | None = None,
-    gyro_turn_on_scatter: float | str | None = None,
-    settle: float | str | None = None,
-    temperature_column: str | None = None,
+    with_: Annotated[str | Sequence[str], parsed(further_of, "gyro", ("gyro",)), FURTHER_TRIADS] = (),
+    tilt: Annotated[float | str, measure("angle", "mrad")] = "0.2 mrad",
+    turn_on_scatter: Annotated[float | str | None, measure("acceleration", "mg", "SIZE")] = None,
+    gyro_turn_on_scatter: Annotated[float | str | None, measure("rate", "deg/s", "SIZE"), FURTHER_TRIADS] = None,
+    settle: Annotated[float | str | None, measure("time", "s")] = None,
+    temperature_column: Annotated[str | None, text("NAME")] = None,
     **reading: Unpack[Reading],
 ) -> ThermalFit:
     """Calibrate an accelerometer triad over temperature from recordings of one unit, each a power cycle.
@@ -90,24 +91,29 @@ def fit_thermal(
     data
         One recording or several: files, recordings or data frames with columns ``accel_*`` and ``temperature``.
     degrees
-        Of bias, scale factor and misalignment, as ``"3,2,1"``; ``"spline,2,1"``: biases are natural cubic splines with
-        a knot at each temperature; ``"auto"``: from 3,2,1 down, as data allow, or the spline where it predicts as well.
+        Of the laws of bias, scale factor and misalignment, 3,2,1, or spline,2,1; auto: from there down, or a spline.
+        ``"spline,2,1"``: biases are natural cubic splines with a knot at each temperature; ``"auto"``: from 3,2,1 down,
+        as data allow, or the spline where it predicts as well.
     gravity, latitude, height
         As for `fit_tumble`.
     prior
-        A tumble record of the unit (order 1) made at a known temperature, or its file: counts as one recording.
+        Tumble record of this unit at a known temperature: counts as one recording. A record of order 1, or its file.
     with_
-        ``"gyro"``: the gyroscopes of the same recordings in the same record; their biases, at rest, over temperature.
+        Further triads of the recordings, in one record. ``"gyro"``: the gyroscopes of the same recordings; their
+        biases, at rest, over temperature.
     tilt
-        Standard deviation of the direction of a hold in which the temperature drifts, rad.
+        How far a hold tips while it warms or cools. Standard deviation of the direction of a hold in which the
+        temperature drifts, rad.
     turn_on_scatter
-        Standard deviation of each bias from one power cycle to the next, m/s^2; from the recordings if not given.
+        What biases move by from one power cycle to the next, if known. Standard deviation of each, m/s^2; from the
+        recordings if not given.
     gyro_turn_on_scatter
-        The same of the gyroscopes' biases, rad/s.
+        The same of the gyroscopes' biases, if known. Standard deviation, rad/s.
     settle
-        Left out at the start of each recording, s; if not given 300 s where its head has ``power_on_temperature``.
+        Left out at the start of a recording; 300 s where time is from power-on. In s; that is where the head has
+        ``power_on_temperature``.
     temperature_column
-        The column of the unit's own thermometer, where there are several.
+        Column of the unit's own thermometer, where there are several.
     reading
         How files are to be understood: `layout`, `topic`, `instance`, `window`, `element`.
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -24,11 +24,13 @@ from numpy.polynomial import legendre
 from imulab.display import Shown
 from imulab.errors import ObservabilityError, OptionError
 from imulab.files import write_page
+from imulab.options import FURTHER_TRIADS, measure, parsed, text
 from imulab.procedures.thermal import APART, DEGREES, FOLLOWED, LEAST_SPAN, TURNED, degrees_of, further_of
 from imulab.procedures.thermal.degrees import spoken_degrees
 from imulab.procedures.thermal.gyro import VERTICAL, new_in_each
 from imulab.procedures.thermal.model import SHARES, Laws, forces
 from imulab.procedures.tumble.plan import (
+    STARTS,
     Known,
     attitude_picture,
     candidates_of,
@@ -570,18 +572,18 @@ _ROOM = 23.0  # degC, from which the chamber starts
 
 
 def plan_thermal(
-    temperatures: Sequence[float] | str = "-20,60",
+    temperatures: Annotated[Sequence[float] | str, parsed(temperature_list, "LOW,HIGH", unit="degC")] = "-20,60",
     *,
-    time: float | str = "8 h",
-    soak: float | str = "45 min",
-    attitude: float | str = "1 min",
-    noise: float | Known = "60 ug",
-    turn_on_scatter: float | str = "0.1 mg",
-    degrees: str | tuple[int, int, int] = DEGREES,
-    from_: Data = "sphere",
-    with_: str | Sequence[str] = (),
-    gyro_noise: float | str | None = None,
-    gyro_turn_on_scatter: float | str | None = None,
+    time: Annotated[float | str, measure("time", "min")] = "8 h",
+    soak: Annotated[float | str, measure("time", "min")] = "45 min",
+    attitude: Annotated[float | str, measure("time", "min")] = "1 min",
+    noise: Annotated[float | Known, text("60ug|FILE")] = "60 ug",
+    turn_on_scatter: Annotated[float | str, measure("acceleration", "mg", "SIZE")] = "0.1 mg",
+    degrees: Annotated[str | tuple[int, int, int], text("B,S,M")] = DEGREES,
+    from_: Annotated[Data, text("sphere|FILE", STARTS)] = "sphere",
+    with_: Annotated[str | Sequence[str], text("gyro", ("gyro",)), FURTHER_TRIADS] = (),
+    gyro_noise: Annotated[float | str | None, text("N", unit="deg/sqrt(h)"), FURTHER_TRIADS] = None,
+    gyro_turn_on_scatter: Annotated[float | str | None, measure("rate", "deg/s", "SIZE"), FURTHER_TRIADS] = None,
 ) -> ThermalPlan:
     """Choose soaks and attitudes for a calibration over temperature, and predict the corrected force over the range.
 
@@ -593,25 +595,29 @@ def plan_thermal(
     Parameters
     ----------
     temperatures
-        Lowest and highest temperature, degC.
+        Lowest and highest temperature. In degC.
     time
-        In the chamber, s, all told.
-    soak, attitude
-        Until the unit has the next temperature, and for one attitude, the turn to it included, s.
+        In the chamber, all told. In s.
+    soak
+        Until the unit has the next temperature. In s.
+    attitude
+        For one attitude, the turn to it included. In s.
     noise
-        Of ``|f|`` in one attitude, m/s^2, or what has it, as for `plan_tumble`.
+        Noise of ``|f|`` in one attitude, or a recording or record that has it. In m/s^2; as for `plan_tumble`.
     turn_on_scatter
-        Standard deviation of each bias from one power cycle to the next, m/s^2.
+        What biases move by from one power cycle to the next. Standard deviation of each, m/s^2.
     degrees
-        Of the laws of bias, scale factor and misalignment that the plan is for.
+        Of bias, scale factor and misalignment. The laws that the plan is for.
     from_
-        Where attitudes may lie, as for `plan_tumble`.
+        As for `plan_tumble`.
     with_
-        ``"gyro"``: predict what the same soaks give of the gyroscopes, too.
+        gyro: say what the same soaks give of the gyroscopes, too.
     gyro_noise
-        Angle random walk of the gyroscopes, rad/sqrt(s), over all of an attitude's time; 0.3 deg/sqrt(h) if not given.
+        Angle random walk of the gyroscopes; 0.3 deg/sqrt(h) if not given. In rad/sqrt(s), over all of an attitude's
+        time.
     gyro_turn_on_scatter
-        Standard deviation of each of their biases from one power cycle to the next, rad/s; 0.01 deg/s if not given.
+        What their biases move by from one power cycle to the next; 0.01 deg/s if not given. Standard deviation of each,
+        rad/s.
 
     Raises
     ------

@@ -5,21 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.procedures.procedure import (
-    ELEMENT,
-    READING,
-    Files,
-    Option,
-    Procedure,
-    Section,
-    Task,
-    file_option,
-    measure,
-    part_of,
-    read_options,
-    text_option,
-)
-from imulab.procedures.thermal import degrees_text, further_of
+from imulab.options import part_of, read_options
+from imulab.procedures.procedure import Files, Procedure, Section, Task
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,6 +14,7 @@ if TYPE_CHECKING:
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.device.unit import DeviceUnit
     from imulab.procedures.procedure import OnLine, Row
+    from imulab.procedures.thermal.fit import ThermalFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
     from imulab.records.comparison import Change
@@ -47,43 +35,19 @@ def _fit(
     return fit_thermal(recordings, prior=prior, **values["fit"]).calibration
 
 
-GRAVITY = (
-    text_option("gravity", "Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head.", shows="G"),
-    text_option("latitude", "Latitude, deg, for normal gravity; with gyro for the Earth's rate.", shows="DEG"),
-    text_option("height", "Height above the ellipsoid, m.", shows="M"),
-)
-OPTIONS = (
-    Option(
-        "degrees",
-        "Of the laws of bias, scale factor and misalignment, 3,2,1, or spline,2,1; auto: from there down, or a spline.",
-        degrees_text,
-        "auto",
-        "auto|B,S,M",
-    ),
-    *GRAVITY,
-    file_option("prior", "Tumble record of this unit at a known temperature: counts as one recording.", "RECORD"),
-    Option("with", "Further triads of the recordings, in one record.", further_of, shows="gyro", choices=("gyro",)),
-    measure("tilt", "How far a hold tips while it warms or cools, mrad.", "angle", "mrad", "0.2 mrad"),
-    measure(
-        "turn_on_scatter", "What biases move by from one power cycle to the next, mg, if known.", "acceleration", "mg",
-        shows="SIZE",
-    ),
-    measure(
-        "gyro_turn_on_scatter", "The same of the gyroscopes' biases, deg/s, if known.", "rate", "deg/s", shows="SIZE"
-    ),
-    measure("settle", "Left out at the start of a recording, s; 300 s where time is from power-on.", "time", "s",
-            shows="TIME"),
-    text_option("temperature_column", "Column of the unit's own thermometer, where there are several.", shows="NAME"),
-    *READING,
-    ELEMENT,
-)  # fmt: skip
 _OF_THE_FIT = ("degrees", "tilt", "turn_on_scatter", "gyro_turn_on_scatter", "settle", "temperature_column")
+
+
+def _function() -> Callable[..., ThermalFit]:
+    from imulab.procedures.thermal.fit import fit_thermal
+
+    return fit_thermal
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.gravity import at_latitude, gravity_option
 
-    values = read_options(OPTIONS, texts, label)
+    values = read_options(TASK.options, texts, label)
     values["with"] = values["with"] or ()
     earth = at_latitude(values["latitude"], label.format("latitude")) if values["with"] else None
     gravity = gravity_option(values["gravity"], values["latitude"], values["height"], label, beside=earth is not None)
@@ -95,7 +59,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
 TASK = Task(
     files="the recordings of one unit at several temperatures",
     count=(1, None),
-    options=OPTIONS,
+    function=_function,
     values=_values,
     fit=_fit,
 )

@@ -9,13 +9,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import Annotated, overload
 
 import numpy as np
 
 from imulab.display import Shown
 from imulab.errors import OptionError, listed
 from imulab.files import write_text
+from imulab.options import choice, measure, parsed
 from imulab.procedures.thermal import LAWS, TEMPERATURES
 from imulab.quantities import in_si, temperature_list, whole
 from imulab.recording import Array, Recording
@@ -37,17 +38,17 @@ _HOLD, _MOVE, _THERMOMETER = 6.0, 2.0, 0.03  # s, s, K
 
 
 def simulate_thermal(
-    temperatures: Sequence[float] | str = TEMPERATURES,
+    temperatures: Annotated[Sequence[float] | str, parsed(temperature_list, "T,T,...", unit="degC")] = TEMPERATURES,
     *,
     attitudes: int | str = 12,
     ramps: int | str = 0,
-    law: str = "cubic",
-    noise: float | str = "0.7 mg",
-    turn_on: float | str = "0.1 mg",
-    duration: float | str = "30 min",
-    rate: float | str = "50 Hz",
+    law: Annotated[str, choice(LAWS)] = "cubic",
+    noise: Annotated[float | str, measure("acceleration", "m/s^2")] = "0.7 mg",
+    turn_on: Annotated[float | str, measure("acceleration", "m/s^2")] = "0.1 mg",
+    duration: Annotated[float | str, measure("time", "s")] = "30 min",
+    rate: Annotated[float | str, measure("frequency", "Hz")] = "50 Hz",
     gyro: bool = False,
-    gyro_turn_on: float | str = "0.01 deg/s",
+    gyro_turn_on: Annotated[float | str, measure("rate", "rad/s")] = "0.01 deg/s",
     seed: int | str = 1,
 ) -> ThermalRecordings:
     """Simulate the recordings of a unit over temperature, a power cycle each.
@@ -55,25 +56,28 @@ def simulate_thermal(
     Parameters
     ----------
     temperatures
-        Set points of the chamber, degC, a tumble at each.
+        Set points of the chamber, a tumble at each. In degC.
     attitudes
-        Of each tumble.
+        Static attitudes of each tumble; 0 for ramps alone.
     ramps
-        Rest ramps from the lowest to the highest temperature, with x, y, z, -x .. up in turn.
+        Rest ramps from the lowest to the highest temperature. With x, y, z, -x .. up in turn.
     law
-        ``cubic``: what the default degrees can follow; ``rough``: with bends of some 25 K on top.
+        How the biases follow the temperature. ``cubic``: what the default degrees can follow; ``rough``: with bends of
+        some 25 K on top.
     noise
-        Standard deviation of one sample, m/s^2.
+        Standard deviation of one sample. In m/s^2.
     turn_on
-        Standard deviation of each bias from one power cycle to the next, m/s^2.
-    duration, rate
-        Of each ramp, s, and samples per second of a tumble, Hz (a tenth of it in ramps).
+        Scatter of biases between power cycles. Standard deviation of each, m/s^2.
+    duration
+        Duration of a ramp. In s.
+    rate
+        Samples per second of a tumble. In Hz; a tenth of it in ramps.
     gyro
-        Whether the recordings have columns of gyroscopes too.
+        Columns of gyroscopes too.
     gyro_turn_on
-        Standard deviation of each of their biases from one power cycle to the next, rad/s.
+        Scatter of their biases between power cycles. Standard deviation of each, rad/s.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
 
     Raises
     ------

@@ -20,8 +20,6 @@ ORDERS = ("auto", *map(str, range(HIGHEST_ORDER + 1)), "blend")
 METHODS = ("norm", "linearised")
 LOSSES = ("square", "huber", "auto")
 CRITERIA = ("A", "D")
-STARTS = ("sphere", "fixture:15", "head:15")
-"""Where attitudes may lie, with steps of any number of degrees."""
 SENSITIVITIES = ("auto", "yes", "no")
 CLOCKS = ("gyro", "accel")
 MAG_ORDERS = ("1", "2", "auto")

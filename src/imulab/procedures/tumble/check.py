@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,8 @@ from imulab.errors import OptionError, RecordError
 from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import median
-from imulab.gravity import Gravity, at_place, local_gravity
+from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_place, local_gravity
+from imulab.options import measure
 from imulab.procedures.result import Drawn, Record, as_record
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
@@ -133,10 +134,10 @@ def check_tumble(
     record: Record,
     data: TumbleData,
     *,
-    limit: float | str | None = None,
-    gravity: float | str | Gravity | None = None,
-    latitude: float | str | None = None,
-    height: float | str | None = None,
+    limit: Annotated[float | str | None, measure("acceleration", "mg")] = None,
+    gravity: LocalGravity = None,
+    latitude: Latitude = None,
+    height: Height = None,
     **reading: Unpack[Reading],
 ) -> Check:
     """Test whether fresh attitudes contradict an existing record, without refitting.
@@ -154,11 +155,11 @@ def check_tumble(
         A file, recording, data frame, arrays or attitudes, as for `fit_tumble`. Where nothing is known of their noise,
         that of the record's own attitudes counts.
     limit
-        Largest ``| |f| - g |`` that passes, m/s^2 or a text such as ``"2 mg"``, beside the test.
+        Largest ``| |f| - g |`` that passes, beside the test. In m/s^2, or a text such as ``"2 mg"``.
     gravity
-        Where the attitudes were measured, as for `fit_tumble`; else that of the recording's head, or of the record.
+        Local gravity where they were measured; else of the file's head, else of the record. As for `fit_tumble`.
     latitude, height
-        Instead of gravity, as for `fit_tumble`.
+        As for `fit_tumble`.
     reading
         How arrays and files are to be understood, as for `fit_tumble`.
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Annotated, TypeAlias, Unpack
 
 from numpy.typing import ArrayLike
 
 from imulab.errors import OptionError
 from imulab.estimation.least_squares import Observability
-from imulab.gravity import Gravity, at_latitude, at_place, local_gravity
+from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
+from imulab.options import FURTHER_TRIADS, PROGRAM, choice, measure, parsed
 from imulab.procedures import tumble
 from imulab.procedures.result import Record, Result, as_record
+from imulab.procedures.tumble import FURTHER, HEMISPHERES, LOSSES, METHODS, ORDERS
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.checks import check_attitudes
 from imulab.procedures.tumble.estimate import (
@@ -70,26 +72,31 @@ class TumbleFit(Result):
     down_weights: Array
 
 
+Dip: TypeAlias = Annotated[
+    float | str | tuple[float, float] | None, parsed(tumble.dip, "67.2+-0.2", unit="deg"), FURTHER_TRIADS
+]
+
+
 def fit_tumble(
     data: TumbleData,
     *,
-    order: int | str = "auto",
-    gravity: float | str | Gravity | None = None,
-    latitude: float | str | None = None,
-    height: float | str | None = None,
-    method: str = "norm",
-    loss: str = "auto",
-    nonlinearity: tuple[float, float] | str | None = None,
+    order: Annotated[int | str, parsed(tumble.order, "auto|0..5|blend", ORDERS)] = "auto",
+    gravity: LocalGravity = None,
+    latitude: Latitude = None,
+    height: Height = None,
+    method: Annotated[str, choice(METHODS)] = "norm",
+    loss: Annotated[str, choice(LOSSES)] = "auto",
+    nonlinearity: Annotated[tuple[float, float] | str | None, parsed(tumble.nonlinearity, "20ug,20ug")] = None,
     prior: Record | None = None,
-    ageing: Sequence[float] | str = (),
+    ageing: Annotated[Sequence[float] | str, parsed(tumble.ageing, "100ug,100ppm[,50urad]")] = (),
     monte_carlo: int | str | None = None,
     cross: bool = False,
-    threshold: Sequence[float] | str | None = None,
-    with_: str | Sequence[str] = (),
-    field: float | str | None = None,
-    hemisphere: str | None = None,
-    dip: float | str | tuple[float, float] | None = None,
-    covariance: ArrayLike | None = None,
+    threshold: Annotated[Sequence[float] | str | None, parsed(tumble.threshold, "5ppm,2ug,3arcsec")] = None,
+    with_: Annotated[str | Sequence[str], parsed(further_triads, "gyro,mag", FURTHER), FURTHER_TRIADS] = (),
+    field: Annotated[float | str | None, measure("magnetic field", "uT", "48.2uT"), FURTHER_TRIADS] = None,
+    hemisphere: Annotated[str | None, choice(HEMISPHERES), FURTHER_TRIADS] = None,
+    dip: Dip = None,
+    covariance: Annotated[ArrayLike | None, PROGRAM] = None,
     progress: Callable[[int], None] = lambda _: None,
     **reading: Unpack[Reading],
 ) -> TumbleFit:
@@ -104,45 +111,54 @@ def fit_tumble(
         A file, recording, data frame or arrays with columns ``accel_x``, ``_y``, ``_z``; the triad alone, shape (n, 3);
         or attitudes from `find_attitudes`. Without a time each row is an attitude.
     order
-        1 to 5; ``"auto"``: the order that predicts best among those that the attitudes can see, with an uncertainty
-        that holds whatever the order; ``"blend"``: all of them, each as far as the data support it.
+        auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them. ``"auto"``
+        takes the order that predicts best among those that the attitudes can see, with an uncertainty that holds
+        whatever the order.
     gravity
-        Local gravity, m/s^2, or a text such as ``"9.81362+-0.00002"``, whose standard uncertainty enters that of the
-        scale factors. Without it that of the recording's head is used, or standard gravity, with a warning.
-    latitude, height
-        Instead of gravity: where that is normal gravity, as texts (``"47.4 deg"``, ``"400 m"``) or in rad and m; what a
-        place differs by is part of the uncertainty. With ``"gyro"`` the latitude is that of `fit_gyro` too, and may
-        stand beside gravity.
+        Local gravity, as 9.81362 or 9.81362+-0.00002; else of the head. The standard uncertainty of such a text enters
+        that of the scale factors; without one the recording's head has it, or it is standard gravity, with a warning.
+    latitude
+        Latitude, for normal gravity; with gyro for the Earth's rate. It stands in place of gravity, where that is
+        normal gravity, as a text (``"47.4 deg"``) or in rad; what a place differs by is part of the uncertainty. With
+        ``"gyro"`` it is that of `fit_gyro` too, and may stand beside gravity.
+    height
+        Height above the ellipsoid, beside the latitude.
     method
-        ``"norm"`` or ``"linearised"``.
+        norm: by the length of f; linearised: the published first-order iteration.
     loss
-        ``"auto"``: attitudes that no order explains are set aside and named (``"square"`` with method linearised);
-        ``"square"``: all count; ``"huber"``: the pull of single disturbed ones is limited (method norm only).
+        auto: set knocked attitudes aside and name them; square: keep all; huber: limit them. ``"auto"`` sets aside what
+        no order explains (and is ``"square"`` with method linearised); ``"huber"`` limits the pull of single disturbed
+        ones (method norm only).
     nonlinearity
-        Standard deviations of k2 and k3 about zero, in units of 1/g and 1/g^2, or as ``"20ug,20ug"``, if known; order
-        auto or blend.
+        Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known. About zero, as numbers in units of 1/g and 1/g^2, or
+        as ``"20ug,20ug"``; order auto or blend.
     prior
-        Earlier tumble record of the same unit, or its file, taken as a normal distribution of the parameters, which is
-        widened by what the attitudes say that it aged; gives the order under ``"auto"``. Needs method norm, loss square
-        and stated or measured noise. A thermal record is one at the temperature of the recording.
+        Earlier record of this unit, or one over temperature, as prior knowledge. A record or its file, taken as a
+        normal distribution of the parameters, which is widened by what the attitudes say that it aged; gives the order
+        under ``"auto"``. Needs method norm, loss square and stated or measured noise. A thermal record is one at the
+        temperature of the recording.
     ageing
-        Standard deviations of what biases (m/s^2), scale factors (1) and misalignments (rad) changed since the prior
-        was made, as many as are known, or as ``"100ug,100ppm"``; the attitudes tell the others.
+        What the unit may have changed since the prior, if known. Standard deviations of what biases (m/s^2), scale
+        factors (1) and misalignments (rad) changed, as many as are known, or as ``"100ug,100ppm"``; the attitudes tell
+        the others.
     monte_carlo
-        Number of trials of a propagation of distributions (JCGM 101), method norm only; none if not given.
+        Trials of a propagation of distributions, 1000 or more. JCGM 101, method norm only; none if not given.
     cross
-        Whether the model has cross terms k_xy, k_yz, k_zx, at an order that is given; no attitude is set aside then.
+        Fit cross terms k_xy, k_yz, k_zx: products of two axes. At an order that is given; no attitude is set aside
+        then.
     threshold
-        Changes of scale factors (1), biases (m/s^2) and misalignments (rad) from one pass to the next below which
-        method linearised rests, or as ``"5ppm,2ug,3arcsec"``; those are the source's, and stand if not given.
+        Changes of scale factors, biases and misalignments at which method linearised rests; the source's "5 ppm, 2 ug,
+        3 arcsec" if not given. From one pass to the next, as numbers in 1, m/s^2 and rad.
     with_
-        Further triads of the same attitudes, ``"gyro"``, ``"mag"`` or both, ``"gyro,mag"``: the record is that of
-        `fit_mag` and then `fit_gyro` on the record of the accelerometers. With ``"mag"`` needs method norm, order auto
-        or 1 to 5 without cross terms, and neither prior, nonlinearity nor Monte Carlo.
+        Further triads on the same attitudes, in one record. ``"gyro"``, ``"mag"`` or both, ``"gyro,mag"``: the record
+        is that of `fit_mag` and then `fit_gyro` on the record of the accelerometers. With ``"mag"`` needs method norm,
+        order auto or 1 to 5 without cross terms, and neither prior, nonlinearity nor Monte Carlo.
     field
-        Magnitude of the field, T, or a text such as ``"48.2uT"``, with ``"mag"``; without it the field is the unit.
-    hemisphere, dip
-        As for `fit_mag`, with ``"mag"``; the hemisphere also by the latitude.
+        With mag: magnitude of the local field; else the field is 1. In T, or a text such as ``"48.2uT"``.
+    hemisphere
+        With mag: to check the sign of the dip; without it by the latitude.
+    dip
+        With mag: dip of the place, to compare with the one found. As for `fit_mag`.
     covariance
         Of means of attitudes without a time, in their squared unit, shape (3, 3) or (n, 3, 3).
     progress

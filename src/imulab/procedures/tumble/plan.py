@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import numpy as np
 
@@ -20,9 +20,10 @@ from imulab.display import Shown
 from imulab.errors import DataError, ImulabError, ObservabilityError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.least_squares import observability
 from imulab.files import write_page
+from imulab.options import choice, either, file, parsed, text
 from imulab.procedures.registry import load
 from imulab.procedures.result import as_recording
-from imulab.procedures.tumble import CRITERIA, HIGHEST_ORDER, STARTS
+from imulab.procedures.tumble import CRITERIA, HIGHEST_ORDER, METHODS
 from imulab.procedures.tumble.attitudes import find_attitudes
 from imulab.procedures.tumble.estimate import check_method
 from imulab.procedures.tumble.fit import fit_tumble
@@ -30,7 +31,7 @@ from imulab.procedures.tumble.model import parameter_count, parameter_names
 from imulab.procedures.tumble.record import freedom_finding, predicted_rows
 from imulab.procedures.tumble.schema import attitudes_of, data_of, fit_of, model_of
 from imulab.procedures.tumble.solve import CLOSEST, Search, information_rows, inverse, optimal_set, sphere_points
-from imulab.quantities import in_si, quantity, whole
+from imulab.quantities import in_si, quantity, whole, whole_number
 from imulab.reading import Data
 from imulab.recording import Array, Recording, check_finite
 from imulab.records import is_json
@@ -43,6 +44,9 @@ from imulab.writers import write_csv
 if TYPE_CHECKING:
     from imulab.procedures.tumble.mag.heading import Headings
     from imulab.report.plots import Plot
+
+STARTS = ("sphere", "fixture:15", "head:15")
+"""Where attitudes may lie, with steps of any number of degrees."""
 
 # Which attitudes to measure: D- or A-optimal sets for a tumble test, and what they will give.
 
@@ -361,7 +365,7 @@ def attitude_picture(up: Array, north: Array | None = None) -> str:
     normals = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
     facing = (normals @ level.T @ _camera().T)[:, 2]
     shapes = [] if north is None else [_arrow()]
-    for (axis, corners, text), toward in zip(_FACES, facing, strict=True):
+    for (axis, corners, label), toward in zip(_FACES, facing, strict=True):
         if toward <= 0.02:
             continue
         outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in points[list(corners)])
@@ -374,7 +378,7 @@ def attitude_picture(up: Array, north: Array | None = None) -> str:
         if size >= _SMALLEST_LETTER:
             shapes.append(
                 f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="{size:.1f}" text-anchor="middle" '
-                f'dominant-baseline="central" fill="{_LETTERS[axis]}">{text}</text>'
+                f'dominant-baseline="central" fill="{_LETTERS[axis]}">{label}</text>'
             )
     side = 2 * _SIZE
     return f'<svg viewBox="0 0 {side:.0f} {side:.0f}" width="150" height="150" role="img">{"".join(shapes)}</svg>'
@@ -554,16 +558,16 @@ Known: TypeAlias = Calibration | Data
 
 
 def plan_tumble(
-    attitudes: int | str,
+    attitudes: Annotated[int | str, parsed(whole_number, "N")],
     *,
-    noise: float | Known | None = None,
+    noise: Annotated[float | Known | None, text("20ug|FILE")] = None,
     order: int | str = 3,
-    criterion: str = "A",
-    from_: Data = "sphere",
-    add: Known | Plan | None = None,
-    method: str = "norm",
-    distinct_verticals: bool | None = None,
-    with_: str | None = None,
+    criterion: Annotated[str, choice(CRITERIA)] = "A",
+    from_: Annotated[Data, text("sphere|FILE", STARTS)] = "sphere",
+    add: Annotated[Known | Plan | None, file()] = None,
+    method: Annotated[str, choice(METHODS)] = "norm",
+    distinct_verticals: Annotated[bool | None, either("repeated-verticals")] = None,
+    with_: Annotated[str | None, text("mag", ("mag",))] = None,
 ) -> TumblePlan:
     """Choose the attitudes to measure, and predict the uncertainty of every parameter.
 
@@ -576,25 +580,26 @@ def plan_tumble(
     attitudes
         Number of attitudes to choose.
     noise
-        Of ``|f|`` in one attitude: m/s^2, or a text such as ``"20ug"``; or the recording or record, or its file, that
-        has it.
+        Noise of ``|f|`` in one attitude, or a recording or record that has it. In m/s^2, or a text such as ``"20ug"``;
+        or the file of either.
     order
-        Order of the model, 0 to 5; attitudes for order 3 show what an order 2 would silently leave in scale factors.
+        Order of the model, 0 to 5; 3 shows what 2 would leave out. Attitudes for order 3 show what an order 2 would
+        silently leave in scale factors.
     criterion
-        ``"A"`` or ``"D"``.
+        A: least sum of variances; D: smallest confidence region.
     from_
-        Where attitudes may lie: ``sphere``, ``fixture:15`` or ``head:15`` (steps in deg), a file that lists them, or
-        upward directions in the body frame, shape (m, 3).
+        Where attitudes may lie: sphere, fixture:15 or head:15 (steps in deg), or a file that lists them. Or upward
+        directions in the body frame, shape (m, 3).
     add
-        Attitudes already there: a plan, a record or a recording, or its file; or upward directions, shape (k, 3).
+        Attitudes already there: a plan, a record or a recording. Or its file; or upward directions, shape (k, 3).
     method
-        Of the fit that they are for: ``norm`` or ``linearised``.
+        Method of the fit that the attitudes are for.
     distinct_verticals
-        Whether x, y and z are each vertical, up or down, in one attitude at most, as the source of method linearised
-        has it; as `method` demands if not given.
+        Whether x, y and z are each vertical in one attitude at most, as the source of method linearised demands; as the
+        method demands if not given. Up or down.
     with_
-        ``"mag"``: each attitude gets a heading too, in quarter turns, for the magnetometers beside the accelerometers;
-        of `add` the headings of a plan with headings, or of a record with magnetometers, count.
+        mag: give each attitude a heading too, for the magnetometers beside the accelerometers. In quarter turns; of
+        `add` the headings of a plan with headings, or of a record with magnetometers, count.
 
     Raises
     ------

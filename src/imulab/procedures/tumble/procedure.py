@@ -6,25 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import DataError, RecordError
-from imulab.procedures import tumble
-from imulab.procedures.procedure import (
-    ELEMENT,
-    READING,
-    Files,
-    Option,
-    Procedure,
-    Section,
-    Task,
-    choice,
-    file_option,
-    measure,
-    part_of,
-    read_options,
-    switch,
-    text_option,
-    whole,
-)
-from imulab.procedures.tumble import FURTHER, HEMISPHERES, LOSSES, METHODS, ORDERS
+from imulab.options import part_of, read_options
+from imulab.procedures.procedure import Files, Procedure, Section, Task
 from imulab.quantities import labelled
 
 if TYPE_CHECKING:
@@ -34,6 +17,7 @@ if TYPE_CHECKING:
     from imulab.device.unit import DeviceUnit
     from imulab.procedures.procedure import Row
     from imulab.procedures.tumble.attitudes import Attitudes
+    from imulab.procedures.tumble.fit import TumbleFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
     from imulab.records.comparison import Change
@@ -100,74 +84,17 @@ def _prior(file: str, attitudes: Attitudes, access: Files) -> Calibration:
     return record
 
 
-def _further(text: str, called: str) -> tuple[str, ...]:
-    from imulab.procedures.tumble.estimate import further_triads
+def _function() -> Callable[..., TumbleFit]:
+    from imulab.procedures.tumble.fit import fit_tumble
 
-    return further_triads(text, called)
-
-
-ORDER = Option(
-    "order",
-    "auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them.",
-    tumble.order,
-    "auto",
-    "auto|0..5|blend",
-    ORDERS,
-)
-GRAVITY = (
-    text_option("gravity", "Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head.", shows="G"),
-    text_option("latitude", "Latitude, deg, for normal gravity; with gyro for the Earth's rate.", shows="DEG"),
-    text_option("height", "Height above the ellipsoid, m.", shows="M"),
-)
-OPTIONS = (
-    ORDER,
-    choice("method", "norm: by the length of f; linearised: the source's iteration.", METHODS, "norm"),
-    choice(
-        "loss", "auto: set knocked attitudes aside and name them; square: keep all; huber: limit them.", LOSSES, "auto"
-    ),
-    Option(
-        "nonlinearity",
-        "Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known.",
-        tumble.nonlinearity,
-        shows="20ug,20ug",
-    ),
-    *GRAVITY,
-    file_option("prior", "Earlier record of this unit, or one over temperature, as prior knowledge.", "RECORD"),
-    Option(
-        "ageing",
-        "What the unit may have changed since the prior, if known.",
-        tumble.ageing,
-        shows="100ug,100ppm[,50urad]",
-    ),
-    whole("monte_carlo", "Trials of a propagation of distributions, 1000 or more."),
-    switch("cross", "Fit cross terms k_xy, k_yz, k_zx: products of two axes."),
-    Option(
-        "threshold",
-        "Changes of scale factors, biases and misalignments at which --method linearised rests; "
-        'the source\'s "5 ppm, 2 ug, 3 arcsec" if not given.',
-        tumble.threshold,
-        shows="5ppm,2ug,3arcsec",
-    ),
-    Option("with", "Further triads on the same attitudes, in one record.", _further, shows="gyro,mag", choices=FURTHER),
-    measure(
-        "field",
-        "With mag: magnitude of the local field, uT; else the field is 1.",
-        "magnetic field",
-        "uT",
-        shows="48.2uT",
-    ),
-    choice("hemisphere", "With mag: to check the sign of the dip; without it by --latitude.", HEMISPHERES),
-    Option("dip", "With mag: dip of the place, deg, to compare with the one found.", tumble.dip, shows="67.2+-0.2"),
-    *READING,
-    ELEMENT,
-)
+    return fit_tumble
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.gravity import at_latitude, gravity_option
     from imulab.procedures.tumble.estimate import check_options
 
-    values = read_options(OPTIONS, texts, label)
+    values = read_options(TASK.options, texts, label)
     values["ageing"], values["with"] = values["ageing"] or (), values["with"] or ()
     with labelled(label, _NAMED):
         check_options(
@@ -193,7 +120,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
 TASK = Task(
     files="one recording or table of attitudes",
     count=(1, 1),
-    options=OPTIONS,
+    function=_function,
     values=_values,
     fit=_fit,
 )

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -16,9 +17,10 @@ from imulab.arguments import Folder
 from imulab.columns import triad
 from imulab.errors import OptionError
 from imulab.files import write_text
+from imulab.options import PROGRAM, measure, parsed, text
 from imulab.procedures.tumble import HIGHEST_ORDER
 from imulab.procedures.tumble.mag.simulate import Turns, rotate, simulate_field
-from imulab.quantities import in_si, whole
+from imulab.quantities import in_si, whole, whole_number
 from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
 from imulab.writers import write_csv
@@ -50,21 +52,21 @@ class _Path:
 
 def simulate_tumble(
     *,
-    attitudes: int | str | Array = 24,
+    attitudes: Annotated[int | str | Array, parsed(whole_number, "N")] = 24,
     order: int | str = 2,
     truth: Mapping[str, float] | None = None,
-    gravity: float | str = "9.80665 m/s^2",
-    rate: float | str = "100 Hz",
-    hold: float | str = "5 s",
-    move: float | str = "2 s",
-    noise: float | str = "0.7 mg",
-    unit: str = "m/s^2",
+    gravity: Annotated[float | str, measure("acceleration", "m/s^2")] = "9.80665 m/s^2",
+    rate: Annotated[float | str, measure("frequency", "Hz")] = "100 Hz",
+    hold: Annotated[float | str, measure("time", "s")] = "5 s",
+    move: Annotated[float | str, measure("time", "s")] = "2 s",
+    noise: Annotated[float | str, measure("acceleration", "mg")] = "0.7 mg",
+    unit: Annotated[str, text("UNIT")] = "m/s^2",
     scale: float | None = None,
     knock: int | str | None = None,
     knock_shift: float = 5e-3 * STANDARD_GRAVITY,
-    gyro: bool = True,
-    field: float | str | Array | None = None,
-    dip: float | str = "67 deg",
+    gyro: Annotated[bool, PROGRAM] = True,
+    field: Annotated[float | str | Array | None, measure("magnetic field", "uT", "48uT")] = None,
+    dip: Annotated[float | str, measure("angle", "deg")] = "67 deg",
     temperature: float = 24.0,
     seed: int | str = 1,
 ) -> Recording:
@@ -76,36 +78,40 @@ def simulate_tumble(
     Parameters
     ----------
     attitudes
-        Number of attitudes, spread evenly over the sphere, or upward directions in the body frame, shape (n, 3).
+        Number of static attitudes. Spread evenly over the sphere; or upward directions in the body frame, shape (n, 3).
     order
-        Order of the nonlinearity of a random truth.
+        Order of the true nonlinearity, 1 to 5. Of a random truth.
     truth
         Parameters in SI by the names of a record; without it a random MEMS-size sensor.
     gravity
-        m/s^2.
+        Local gravity. In m/s^2.
     rate
-        Samples per second, Hz.
-    hold, move
-        Duration of each static attitude and of the motion between two, s.
+        Sample rate. In Hz.
+    hold
+        Duration of an attitude. In s.
+    move
+        Duration of the motion between two. In s.
     noise
-        Standard deviation of one sample, m/s^2.
+        Standard deviation of one sample. In m/s^2.
     unit
-        Unit of the accelerometer columns; ``count`` also rounds to whole counts.
+        Unit of the outputs: m/s^2 g mg count V. Of the accelerometers' columns; ``count`` also rounds to whole counts.
     scale
         Nominal scale factor, output per m/s^2; for acceleration units the conversion factor.
     knock
-        Number of an attitude (from 1) that is knocked half-way and keeps a shifted zero, or None.
+        Number of an attitude that is knocked. From 1; half-way through it keeps a shifted zero.
     knock_shift
         That shift, along the vertical, m/s^2.
     gyro
         Whether the recording has gyroscope columns.
-    field, dip
-        Magnitude of the magnetic field, T, and its dip, rad, for columns mag_* and truth_mag_*; or the field in the
-        body frame in the first attitude, shape (3,), which has a dip of its own. None without a field.
+    field
+        Magnitude of the magnetic field, for columns mag_*. In T, with truth_mag_*; or the field in the body frame in
+        the first attitude, shape (3,), which has a dip of its own. None without a field.
+    dip
+        Its dip, positive where it points down. In rad.
     temperature
         degC.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
 
     Raises
     ------
@@ -361,9 +367,9 @@ def simulate_fleet(folder: Folder, *, units: int | str = 12, seed: int | str = 1
     folder
         Made if it is not there.
     units
-        8 to 2000.
+        Number of units, 8 or more. At most 2000.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
 
     Raises
     ------

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Unpack
+from typing import Annotated, Any, TypeAlias, Unpack
 
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
-from imulab.procedures.procedure import names_of_columns
+from imulab.options import choice, measure, names_of_columns, parsed
 from imulab.procedures.result import Result, as_blocks
 from imulab.procedures.warmup import BEYOND, EXITS, MODELS, POOLS, settling_size
 from imulab.procedures.warmup.cycles import Curves, Cycle, common_axes, find_power_cycle, make_curves, with_axes
@@ -71,20 +71,23 @@ class WarmupFit(Result):
     curves: Curves
 
 
+Temperatures: TypeAlias = Annotated[Sequence[float] | str, parsed(temperature_list, "T,T,...", unit="degC")]
+
+
 def fit_warmup(
     cycles: Annotated[Sequence[Cycle | Data], "a list of power cycles, one for each test"],
     *,
-    model: str = "auto",
-    temperatures: Sequence[float] | str = SOURCE_TEMPERATURES,
-    tolerance: float | str = TOLERANCE,
-    settling_time: float | str | None = None,
-    settling_limit: Mapping[str, float] | str = "5 %",
-    exit: str = "zero",  # noqa: A002
-    taper_time: float | str = 60.0,
-    pool: str = "unit",
-    axes: str | Sequence[str] | None = None,
-    beyond: str = "zero",
-    latest_start: float | str = "5 s",
+    model: Annotated[str, choice(("auto", *MODELS))] = "auto",
+    temperatures: Temperatures = SOURCE_TEMPERATURES,
+    tolerance: Annotated[float | str, parsed(number, "K")] = TOLERANCE,
+    settling_time: Annotated[float | str | None, measure("time", "s")] = None,
+    settling_limit: Annotated[Mapping[str, float] | str, parsed(settling_size, "LIMIT")] = "5 %",
+    exit: Annotated[str, choice(EXITS)] = "zero",  # noqa: A002
+    taper_time: Annotated[float | str, measure("time", "s")] = "60 s",
+    pool: Annotated[str, choice(POOLS)] = "unit",
+    axes: Annotated[str | Sequence[str] | None, parsed(names_of_columns, "A,A,...")] = None,
+    beyond: Annotated[str, choice(BEYOND)] = "zero",
+    latest_start: Annotated[float | str, measure("time", "s")] = "5 s",
     temperature_column: bool = False,
     **reading: Unpack[Reading],
 ) -> WarmupFit:
@@ -98,30 +101,32 @@ def fit_warmup(
         One per power cycle: files, recordings, data frames or arrays by name, with ``power_on_temperature`` in their
         heads (``metadata=`` of `Recording.from_frame`), or what `find_power_cycle` returned.
     model
-        ``interval-cubic`` (the source's), ``knot-cubic``, ``knot-log-cubic``, ``exponential``, or ``auto``: the one
-        that best predicts cycles and temperatures left out of the fit.
+        How the bias goes with time; auto compares them. ``interval-cubic`` is the source's; ``auto`` takes the one that
+        best predicts cycles and temperatures left out of the fit.
     temperatures
-        Calibration temperatures, degC: edges of the intervals, or knots.
+        Calibration temperatures, ascending. Edges of the intervals, or knots, degC.
     tolerance
-        How far a power-on temperature may lie from one of them, K.
+        A power-on temperature within this of one of them fits, K.
     settling_time
-        T_M, s; chosen from the data if not given.
+        T_M; chosen from the data if not given. In s.
     settling_limit
-        The size of Z that counts as settled: a share of the largest, a rate or an acceleration as a text; or kind
-        (``gyro``, ``accel``) to size in SI, 5 % of the largest for one that is not named.
-    exit, taper_time
-        What the unit does from T_M on, and how long a taper takes, s.
+        Settled below this: percent of the peak, or deg/h, mg ... A share of the largest |Z|, a rate or an acceleration
+        as a text; or kind (``gyro``, ``accel``) to size in SI, 5 % of the largest for one that is not named.
+    exit
+        What the table gives from T_M on.
+    taper_time
+        How long a taper takes. In s.
     pool
-        ``unit``: all cycles are of one unit. ``type``: several units share a table, with a random effect per unit.
+        unit, or type: several units share one table. ``type`` has a random effect for each unit.
     axes
-        Columns to fit, as a list or a text such as ``"gyro_x,gyro_y"``; all gyro_* and accel_* if not given.
+        Columns to fit; all if not given. As a list or a text such as ``"gyro_x,gyro_y"``; all gyro_* and accel_*.
     beyond
-        What the unit does at power-on temperatures beyond the outer ones: ``zero``, nothing; ``hold``, as there.
+        Beyond the outer temperatures: zero (no correction) or hold (as there).
     latest_start
-        A cycle whose first sample is later after power-on, s, is refused.
+        A first sample later after power-on is refused. In s.
     temperature_column
-        Whether a power-on temperature that is missing is taken from the first reading of the column temperature. Both
-        are of cycles that `find_power_cycle` has not averaged before.
+        Take a missing power-on temperature from the first row's column. Both are of cycles that `find_power_cycle` has
+        not averaged before.
     reading
         How arrays and files are to be understood, of all cycles alike: `units`, `layout`, `window` ...
 

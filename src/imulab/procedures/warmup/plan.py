@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from imulab.display import Shown
 from imulab.errors import OptionError
+from imulab.options import measure, parsed, text
 from imulab.procedures.warmup import TEMPERATURES
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, temperature_list, whole
 from imulab.recording import Recording
@@ -129,14 +130,14 @@ class WarmupPlan(Shown):
 
 
 def plan_warmup(
-    temperatures: Sequence[float] | str = TEMPERATURES,
+    temperatures: Annotated[Sequence[float] | str, parsed(temperature_list, "T,T,...", unit="degC")] = TEMPERATURES,
     *,
     cycles: int | str = 5,
-    soak: float | str = "60 min",
-    record: float | str = "10 min",
-    ramp: float | str = "2 K/min",
-    noise: float | str = "0.3 deg/sqrt(h)",
-    repeatability: float | str = "2 %",
+    soak: Annotated[float | str, measure("time", "s")] = "60 min",
+    record: Annotated[float | str, measure("time", "s")] = "10 min",
+    ramp: Annotated[float | str, text("K/MIN", unit="K/min")] = "2 K/min",
+    noise: Annotated[float | str, text("N", unit="deg/sqrt(h)")] = "0.3 deg/sqrt(h)",
+    repeatability: Annotated[float | str, text("FRACTION", unit="%")] = "2 %",
     start: float = 23.0,
 ) -> WarmupPlan:
     """Write the chamber programme of a warm-up test.
@@ -147,19 +148,19 @@ def plan_warmup(
     Parameters
     ----------
     temperatures
-        Set points, degC, ascending.
+        Calibration temperatures, ascending. Set points of the chamber, degC.
     cycles
-        Power cycles at each.
+        Power cycles at each temperature.
     soak
-        With the unit off, until its inside has the chamber's temperature, s.
+        Before each power-on, unit off. Until its inside has the chamber's temperature, s.
     record
-        From power-on, s.
+        Recording from power-on on. In s.
     ramp
-        Of the chamber, K/s.
+        Ramp of the chamber. In K/s.
     noise
-        Angle random walk, rad/sqrt(s).
+        Angle random walk. In rad/sqrt(s).
     repeatability
-        Of the curve from cycle to cycle, a fraction of it.
+        Repeatability of the curve from cycle to cycle. A fraction of it.
     start
         Chamber temperature at the beginning, degC.
 

@@ -5,25 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.procedures.procedure import (
-    ELEMENT,
-    READING,
-    Files,
-    Option,
-    Procedure,
-    Section,
-    Task,
-    choice,
-    finite,
-    measure,
-    names_of_columns,
-    part_of,
-    read_options,
-    source_of,
-    switch,
-)
-from imulab.procedures.warmup import BEYOND, EXITS, MODELS, POOLS, TEMPERATURES, settling_size
-from imulab.quantities import temperature_list
+from imulab.options import part_of, read_options
+from imulab.procedures.procedure import Files, Procedure, Section, Task, source_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,6 +14,7 @@ if TYPE_CHECKING:
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.device.unit import DeviceUnit
     from imulab.procedures.warmup.cycles import Cycle
+    from imulab.procedures.warmup.fit import WarmupFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
     from imulab.report.traces import Exhibits
@@ -56,29 +40,19 @@ def _fit(
     return fit_warmup([cycle(name) for name in files], **values["fit"]).calibration
 
 
-OPTIONS = (
-    choice("model", "How the bias goes with time; auto compares them.", ("auto", *MODELS), "auto"),
-    Option("temperatures", "Calibration temperatures, degC, ascending.", temperature_list, TEMPERATURES, "T,T,..."),
-    finite("tolerance", "A power-on temperature within this fits, K.", "1", "K"),
-    measure("settling_time", "T_M, s; chosen from the data if not given.", "time", "s", shows="TIME"),
-    Option("settling_limit", "Settled below this: percent of the peak, or deg/h, mg ..", settling_size, "5 %", "LIMIT"),
-    choice("exit", "What the table gives from T_M on.", EXITS, "zero"),
-    measure("taper_time", "How long a taper takes, s.", "time", "s", "60 s", shows="TIME"),
-    choice("pool", "unit, or type: several units share one table.", POOLS, "unit"),
-    choice("beyond", "Beyond the outer temperatures: zero (no correction) or hold (as there).", BEYOND, "zero"),
-    Option("axes", "Columns to fit; all if not given.", names_of_columns, shows="A,A,..."),
-    measure("latest_start", "A first sample later after power-on, s, is refused.", "time", "s", "5 s", shows="TIME"),
-    switch("temperature_column", "Take a missing power-on temperature from the first row's column."),
-    *READING,
-    ELEMENT,
-)
 _OF_THE_FIT = ("model", "temperatures", "tolerance", "settling_time", "taper_time", "pool", "axes", "beyond")
+
+
+def _function() -> Callable[..., WarmupFit]:
+    from imulab.procedures.warmup.fit import fit_warmup
+
+    return fit_warmup
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.procedures.warmup.fit import check_options
 
-    values = read_options(OPTIONS, texts, label)
+    values = read_options(TASK.options, texts, label)
     fit = {name: values[name] for name in _OF_THE_FIT}
     fit |= {"settling_limit": values["settling_limit"], "exit": values["exit"]}
     check_options(**{name: value for name, value in fit.items() if name not in ("axes", "settling_limit")})
@@ -88,7 +62,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
 TASK = Task(
     files="the recordings of its power cycles",
     count=(1, None),
-    options=OPTIONS,
+    function=_function,
     values=_values,
     fit=_fit,
 )

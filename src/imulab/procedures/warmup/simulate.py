@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import overload
+from typing import Annotated, overload
 
 import numpy as np
 
 from imulab.display import Shown
 from imulab.errors import OptionError, listed
+from imulab.options import choice, measure, parsed
 from imulab.procedures.warmup import LAWS, TEMPERATURES
 from imulab.quantities import in_si, temperature_list, whole
 from imulab.recording import Array, Recording
@@ -173,12 +174,12 @@ def simulate_power_cycle(
 
 
 def simulate_warmup(
-    temperatures: Sequence[float] | str = TEMPERATURES,
+    temperatures: Annotated[Sequence[float] | str, parsed(temperature_list, "T,T,...", unit="degC")] = TEMPERATURES,
     *,
     cycles: int | str = 3,
-    law: str = "smooth",
-    duration: float | str = "600 s",
-    rate: float | str = "10 Hz",
+    law: Annotated[str, choice(LAWS)] = "smooth",
+    duration: Annotated[float | str, measure("time", "s")] = "600 s",
+    rate: Annotated[float | str, measure("frequency", "Hz")] = "10 Hz",
     units: int | str = 1,
     seed: int | str = 1,
 ) -> PowerCycles:
@@ -187,17 +188,19 @@ def simulate_warmup(
     Parameters
     ----------
     temperatures
-        Set points of the chamber, degC.
+        Calibration temperatures, ascending. Set points of the chamber, degC.
     cycles
-        Power cycles at each.
+        Power cycles at each temperature.
     law
-        How the zeros depend on temperature: ``smooth`` or ``bent``.
-    duration, rate
-        Of each recording, s, and its samples per second, Hz; or texts with a unit.
+        How the zeros depend on temperature.
+    duration
+        Duration of each recording. In s.
+    rate
+        Sample rate. In Hz.
     units
-        Number of units of one type; several differ by 5 % in their self-heating.
+        Number of units of one type. Several differ by 5 % in their self-heating.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
 
     Raises
     ------

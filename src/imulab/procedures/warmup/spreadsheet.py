@@ -75,7 +75,7 @@ def warmup_table(data: Record, *, per_second: bool = False) -> TableSheet:
     data
         A warm-up record, its file, or the CSV file of a table.
     per_second
-        Whether cubics are in powers of t in s, not of t / settling time.
+        Write cubics in powers of t in s, not of t / settling time.
 
     Raises
     ------

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from imulab.errors import DataError, ObservabilityError, OptionError, RecordErro
 from imulab.estimation.least_squares import Observability, coverage_factor, observability
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.gravity import EARTH, EarthRate, at_latitude
+from imulab.options import PROGRAM, choice, measure
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.procedures.tumble import CLOCKS, SENSITIVITIES
 from imulab.procedures.tumble.attitudes import Attitudes, find_attitudes
@@ -592,13 +593,13 @@ def fit_gyro(
     accel: Record,
     data: Data,
     *,
-    accel_data: Data | None = None,
+    accel_data: Annotated[Data | None, PROGRAM] = None,
     fit_bias: bool = False,
-    g_sensitivity: str = "auto",
-    clock: float | str = "50 ppm",
-    clock_of: str = "gyro",
+    g_sensitivity: Annotated[str, choice(SENSITIVITIES)] = "auto",
+    clock: Annotated[float | str, measure("number", "ppm")] = "50 ppm",
+    clock_of: Annotated[str, choice(CLOCKS)] = "gyro",
     noise: Record | None = None,
-    latitude: float | str | None = None,
+    latitude: Annotated[float | str | None, measure("angle", "deg", "DEG")] = None,
     **reading: Unpack[Reading],
 ) -> BothTriads:
     """Calibrate a gyroscope triad from the turns between static attitudes.
@@ -609,25 +610,25 @@ def fit_gyro(
     Parameters
     ----------
     accel
-        Tumble record of the accelerometers, or its file.
+        Tumble record of the accelerometers. Or its file.
     data
         A file, recording, data frame or arrays by name with time and both triads, or the gyroscopes alone.
     accel_data
         The same of the accelerometers, on the same clock, where they are not in `data`.
     fit_bias
-        Fit the biases to the turns too, instead of taking them from the outputs at rest.
+        Fit the biases to the turns too. Instead of taking them from the outputs at rest.
     g_sensitivity
-        Whether the zero changes with specific force: ``yes``, ``no``, or ``auto`` where the data show it.
+        Whether to fit what forces add to the rate. ``auto``: where the data show it.
     clock
-        Relative standard uncertainty of the rate of the clock: common to the three scale factors.
+        Standard uncertainty of the clock's rate, common to the three scale factors. Relative.
     clock_of
-        Whose time counts where the two triads have clocks of their own: ``gyro`` or ``accel``.
+        Whose time stamps are right where two clocks differ.
     noise
-        Record of `fit_noise` of the same gyroscopes, or its file: the biases are no more certain than it says of a mean
-        over the time at rest.
+        Noise record of the same gyroscopes, for u of their biases. Of `fit_noise`, or its file: the biases are no more
+        certain than it says of a mean over the time at rest.
     latitude
-        Of the place, rad or a text such as ``"48.1 deg"``: the vertical part of the Earth's rate is taken off the
-        outputs at rest. Without it that counts as g-sensitivity or scatter, as the level part always does.
+        Latitude, for the vertical part of the Earth's rate. In rad or a text such as ``"48.1 deg"``: that part is taken
+        off the outputs at rest. Without it that counts as g-sensitivity or scatter, as the level part always does.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.

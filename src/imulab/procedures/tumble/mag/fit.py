@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,11 @@ from imulab.display import UNJUDGED, Bad, Note
 from imulab.errors import DataError, OptionError, listed, quoted
 from imulab.estimation.least_squares import coverage_factor, f_test
 from imulab.estimation.rows import rms
-from imulab.gravity import Gravity, at_place
+from imulab.gravity import Height, Latitude, LocalGravity, at_place
+from imulab.options import choice, measure, parsed, repeated, text
+from imulab.procedures import tumble
 from imulab.procedures.result import Record, Result, as_record
-from imulab.procedures.tumble import LOSSES, MAG_ORDERS
+from imulab.procedures.tumble import HEMISPHERES, LOSSES, MAG_ORDERS
 from imulab.procedures.tumble.attitudes import TumbleData, as_attitudes
 from imulab.procedures.tumble.estimate import check_field
 from imulab.procedures.tumble.gyro.fit import with_gyro_of
@@ -408,17 +410,17 @@ def fit_mag(
     data: TumbleData,
     *,
     accel: Record | None = None,
-    same_direction: Sequence[str | Sequence[int]] = (),
-    field: float | str | None = None,
-    loss: str = "auto",
-    mag_order: int | str = 1,
-    drop: Sequence[int | str] = (),
-    hemisphere: str | None = None,
-    dip: float | str | tuple[float, float] | None = None,
-    gravity: float | str | Gravity | None = None,
-    latitude: float | str | None = None,
-    height: float | str | None = None,
-    order: int | str = "auto",
+    same_direction: Annotated[Sequence[str | Sequence[int]], repeated("A-B")] = (),
+    field: Annotated[float | str | None, measure("magnetic field", "uT", "48.2uT")] = None,
+    loss: Annotated[str, choice(LOSSES)] = "auto",
+    mag_order: Annotated[int | str, choice(MAG_ORDERS)] = 1,
+    drop: Annotated[Sequence[int | str], repeated("N")] = (),
+    hemisphere: Annotated[str | None, choice(HEMISPHERES)] = None,
+    dip: Annotated[float | str | tuple[float, float] | None, parsed(tumble.dip, "67.2+-0.2", unit="deg")] = None,
+    gravity: LocalGravity = None,
+    latitude: Latitude = None,
+    height: Height = None,
+    order: Annotated[int | str, text("auto|1..5", ("auto", "1", "2", "3", "4", "5"))] = "auto",
     **reading: Unpack[Reading],
 ) -> MagFit:
     """Calibrate a magnetometer triad, in the accelerometers' frame, from the attitudes of a tumble test.
@@ -431,29 +433,32 @@ def fit_mag(
     data
         A file, recording, data frame or arrays by name with both triads; without a time each row is an attitude.
     accel
-        Tumble record of the accelerometers, or its file: of these data it says how they were fitted; of another test it
-        is prior knowledge. Gyroscopes that it holds are kept.
+        Tumble record of the accelerometers; of another test: a prior. Or its file: of these data it says how they were
+        fitted; of another test it is prior knowledge. Gyroscopes that it holds are kept.
     same_direction
-        Groups of attitudes, numbers from 1 or texts such as ``"9-16"``, in which one axis of the body points the same
-        way.
+        Attitudes in which one axis points the same way; repeatable. Groups of attitudes, numbers from 1 or texts such
+        as ``"9-16"``, and an axis of the body.
     field
-        Magnitude of the field, T, or a text such as ``"48.2uT"``; without it the field is the unit, and biases are
-        parts of it.
+        Magnitude of the local field; without it the field is 1. In T, or a text such as ``"48.2uT"``; biases are parts
+        of the field then.
     loss
-        ``auto``: attitudes that do not fit the others are set aside and named; ``square``: all count; ``huber``: the
-        pull of single ones is limited.
+        auto: set disturbed attitudes aside and name them; square: keep all; huber: limit them. Those that do not fit
+        the others; ``huber`` limits the pull of single ones.
     mag_order
-        1, 2 (with quadratic terms), or ``auto``: 2 where it predicts better and the gain is significant.
+        2: quadratic terms too; auto: where they predict. Better, and the gain is significant.
     drop
-        Attitudes to leave out, numbers from 1.
+        Attitude to leave out; repeatable. Numbers from 1.
     hemisphere
-        ``north`` or ``south``, to check the sign of the dip; by the latitude, where that is given, beyond 20 deg.
+        To check the sign of the dip. By the latitude, where that is given, beyond 20 deg.
     dip
-        Of the place, rad, with its standard uncertainty, ``(1.17, 0.003)``, or a text, ``"67.2+-0.2 deg"``; without one
-        that of a model of the Earth's field, 0.2 deg. It is compared with the dip that is found, and not used in the
-        fit.
-    gravity, latitude, height, order
+        Dip of the place, to compare with the one found. In rad with its standard uncertainty, ``(1.17, 0.003)``, or a
+        text, ``"67.2+-0.2 deg"``; without one that of a model of the Earth's field, 0.2 deg. It is not used in the fit.
+    gravity
+        Local gravity; else of the accelerometers' record, else of the head. As for `fit_tumble`.
+    latitude, height
         As for `fit_tumble`.
+    order
+        Order of the accelerometers' model, auto or 1 to 5.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.

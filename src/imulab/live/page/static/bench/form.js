@@ -30,8 +30,8 @@ export function form(definition, { files, values = {}, run }) {
   const group = (found, title) => found.length
     ? h("details", { class: "more" }, h("summary", {}, title), h("div", { class: "fields" }, found.map(each => each.element))) : null;
   const main = fields.filter(({ of }) => !of.flag || of.required || of.kind === "output");
-  const own = fields.filter(each => !main.includes(each) && !each.of.shared);
-  const shared = fields.filter(each => each.of.shared && !main.includes(each));
+  const of = (...groups) => fields.filter(each => !main.includes(each) && groups.includes(each.of.group));
+  const own = of("model", "gravity");
   const few = own.length <= 8;
   const element = h("form", { class: "form", novalidate: true, onsubmit: event => {
     event.preventDefault();
@@ -40,7 +40,8 @@ export function form(definition, { files, values = {}, run }) {
     h("p", { class: "caption" }, definition.help),
     h("div", { class: "fields" }, main.filter(({ of }) => of.kind !== "output").map(each => each.element), few ? own.map(each => each.element) : own.slice(0, 7).map(each => each.element)),
     few ? null : group(own.slice(7), "More options"),
-    group(shared, "Reading the file, and what is said"),
+    group(of("further triads"), "Further triads"),
+    group(of("reading", "output", "all commands"), "Reading the file, and what is said"),
     h("div", { class: "fields" }, main.filter(({ of }) => of.kind === "output").map(each => each.element)),
     refused, h("p", { class: "same" }, "The command that does the same:"), line, h("p", { class: "go" }, go));
   let later = null;

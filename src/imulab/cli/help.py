@@ -1,0 +1,77 @@
+"""The help of commands, and the lists of them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterable, Sequence
+from textwrap import TextWrapper
+
+from imulab.cli.command import HELP, Command
+from imulab.options import GROUPS, Option
+
+_WIDEST, _COLUMN = 100, 30
+_KEPT = "\xa0"  # a space where no line ends
+_TITLES = {GROUPS[0]: "Options", GROUPS[-1]: "Options of all commands"}
+
+
+def command_help(command: Command) -> str:
+    """Return what ``--help`` prints of a command: usage, what it does, and its options in their groups."""
+    usage = " ".join([f"Usage: imulab {command.path} [OPTIONS]", *(each.shows for each in command.arguments)])
+    lines = [*_wrapped(usage, " " * 7, first=""), "", *_paragraphs(command.help)]
+    given = [(each.shows, f"{each.help}{' [required]' if each.required else ''}") for each in command.arguments]
+    rows = [(each.group, each.spelling, f"{each.help}{_remarks(each)}") for each in (*command.options, HELP)]
+    column = _column([term for term, _ in given] + [term for _, term, _ in rows])
+    lines += _list("Arguments", given, column)
+    for group in GROUPS:
+        lines += _list(_TITLES.get(group, group.capitalize()), [row[1:] for row in rows if row[0] == group], column)
+    return "\n".join(lines)
+
+
+def group_help(usage: str, text: str, options: Iterable[tuple[str, str]], commands: Iterable[tuple[str, str]]) -> str:
+    """Return what ``--help`` prints of a group of commands."""
+    lines = [f"Usage: {usage} [OPTIONS] COMMAND [ARGS]...", "", *_paragraphs(text)]
+    for title, rows in (("Options", [*options, (", ".join(HELP.flags), HELP.help)]), ("Commands", [*commands])):
+        lines += _list(title, rows, _column([term for term, _ in rows]))
+    return "\n".join(lines)
+
+
+def _remarks(option: Option) -> str:
+    """Return unit and default of an option, and that it is required, in brackets."""
+    default = f"default: {option.default}" if option.default is not None and option.takes_value else ""
+    remarks = filter(None, (option.unit, default, "required" * option.required))
+    return "".join(f" [{remark.replace(' ', _KEPT)}]" for remark in remarks)
+
+
+def _paragraphs(text: str) -> list[str]:
+    lines: list[str] = []
+    for paragraph in text.split("\n\n"):
+        lines += [*_wrapped(paragraph, "  "), ""]
+    return lines[:-1]
+
+
+def _column(terms: Sequence[str]) -> int:
+    """Return the width of a column that has most of these terms."""
+    widths = [len(term) + 2 for term in terms]
+    return max((width for width in widths if width <= _COLUMN), default=_COLUMN)
+
+
+def _list(title: str, rows: Sequence[tuple[str, str]], column: int) -> list[str]:
+    """Return rows of a term and what is said of it, below a title; nothing of no rows."""
+    if not rows:
+        return []
+    lines = ["", f"{title}:"]
+    for term, text in rows:
+        head = f"  {term}".ljust(column + 2)
+        beside = len(term) + 2 <= column
+        lines += [] if beside else [head]
+        lines += _wrapped(text, " " * (column + 2), first=head if beside else None) or [head.rstrip()]
+    return lines
+
+
+def _wrapped(text: str, indent: str, first: str | None = None) -> list[str]:
+    width = max(min(shutil.get_terminal_size().columns, _WIDEST) - 2, 50)
+    first = indent if first is None else first
+    text = " ".join(re.split(r"[ \n]+", text))
+    lines = TextWrapper(width, first, indent, break_on_hyphens=False, break_long_words=False).wrap(text)
+    return [line.replace(_KEPT, " ") for line in lines]

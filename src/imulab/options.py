@@ -1,0 +1,305 @@
+"""The options of commands, manifests and forms, made from the signatures of public functions, where each is said once.
+
+A signature says name, type and default, its docstring the help. `Annotated` carries what a type cannot: a unit, the
+words to choose from, how a text is read, and the group where help lists it. An option is a switch, or a keyword that a
+text can stand for, unless it is `PROGRAM`; and whatever else is annotated with one of the functions below.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib import import_module
+from os import PathLike
+from typing import Any, NamedTuple, Unpack, get_args, get_origin
+
+from imulab import arguments, docstrings
+from imulab.errors import OptionError, listed
+from imulab.quantities import number, quantity, whole_number
+
+FLAG = "--{}"
+"""How the command line calls an option in its messages."""
+GROUPS = ("model", "gravity", "further triads", "reading", "output", "all commands")
+"""In which help and forms list options."""
+_SWITCH = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
+Read = Callable[[str, str], Any]
+"""The text of an option, and how messages call it, to its value; raises OptionError."""
+
+
+class Program(NamedTuple):
+    """Marks what is for programs alone."""
+
+
+class Group(NamedTuple):
+    """The group of an option, where it is not that of the model."""
+
+    name: str
+
+
+class Reads(NamedTuple):
+    """How the text of an option is read, and what help shows for it.
+
+    `words` are offered to complete it; where there are no `other` ones, they are all that it takes. `unit` is that of a
+    bare number; `off` the option that says the opposite of a switch.
+    """
+
+    read: Read | None = None
+    shows: str = ""
+    words: Sequence[str] | Callable[[], Sequence[str]] = ()
+    other: bool = True
+    unit: str = ""
+    file: bool = False
+    repeated: bool = False
+    flags: tuple[str, ...] = ()
+    off: str = ""
+    help: str = ""
+
+
+PROGRAM = Program()
+FURTHER_TRIADS = Group("further triads")
+READING = Group("reading")
+OUTPUT = Group("output")
+COMMON = Group("all commands")
+
+
+def text(shows: str = "TEXT", words: Sequence[str] | Callable[[], Sequence[str]] = (), **more: Any) -> Reads:
+    """Return how a text is read that stays one."""
+    return Reads(None, shows, words, **more)
+
+
+def choice(words: Sequence[str], **more: Any) -> Reads:
+    """Return how one of a few words is read."""
+
+    def read(given: str, called: str) -> str:
+        if given not in words:
+            raise OptionError(f"{called} {given!r}: expected one of {listed(words, given)}")
+        return given
+
+    return Reads(read, "|".join(words), tuple(words), other=False, **more)
+
+
+def measure(kind: str, unit: str, shows: str = "", **more: Any) -> Reads:
+    """Return how a number with a unit of a kind is read; a bare number is in `unit`."""
+    return Reads(
+        lambda given, called: quantity(given, called, kind, unit), shows or kind.upper().split()[0], unit=unit, **more
+    )
+
+
+def parsed(read: Read, shows: str, words: Sequence[str] = (), **more: Any) -> Reads:
+    """Return how a text is read by a function of its own."""
+    return Reads(read, shows, tuple(words), **more)
+
+
+def file(shows: str = "FILE", **more: Any) -> Reads:
+    """Return how the name of a file is read."""
+    return Reads(None, shows, file=True, **more)
+
+
+def either(off: str, **more: Any) -> Reads:
+    """Return how a switch is read that is on, off, or neither; `off` is the option that turns it off."""
+    return Reads(off=off, **more)
+
+
+def repeated(shows: str, **more: Any) -> Reads:
+    """Return how an option is read that may be given several times."""
+    return Reads(None, shows, repeated=True, **more)
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option.
+
+    Attributes
+    ----------
+    keyword
+        Its name as a parameter in Python.
+    owner
+        The function or typed dictionary that has it, whose docstring says what it does.
+    reads
+        How its text is read, and what help shows for it.
+    default
+        Text that stands where none is given, None where that means: not used.
+    required
+        Whether it must be given.
+    kind
+        ``switch``, ``either`` (on, off or neither), ``texts`` (any number of them) or ``text``.
+    group
+        Where help lists it.
+    """
+
+    keyword: str
+    owner: Any
+    reads: Reads
+    default: str | None
+    required: bool
+    kind: str
+    group: str
+
+    @property
+    def name(self) -> str:
+        """Its name in manifests; the command line has dashes instead of underscores."""
+        return self.keyword.rstrip("_")
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """What the command line calls it, the short one first."""
+        return self.reads.flags or ("--" + self.name.replace("_", "-"),)
+
+    @property
+    def takes_value(self) -> bool:
+        """Whether a value follows it."""
+        return self.kind.startswith("text")
+
+    @property
+    def shows(self) -> str:
+        """What stands for its value in help."""
+        default = self.default or ""
+        if self.reads.shows or not default[:1].isdigit():
+            return self.reads.shows or "VALUE"
+        return "NUMBER" if default.replace(".", "", 1).isdigit() else "QUANTITY"
+
+    @property
+    def unit(self) -> str:
+        """The unit of a bare number, where the default does not show it."""
+        unit = self.reads.unit
+        return "" if (self.default or "").endswith(f" {unit}") else unit
+
+    @property
+    def spelling(self) -> str:
+        """Its names on the command line, and what stands for its value."""
+        names = ", ".join(self.flags) + (f" / {self.opposite}" if self.opposite else "")
+        return f"{names} {self.shows}" if self.takes_value else names
+
+    @property
+    def opposite(self) -> str:
+        """What the command line calls the option that turns it off; empty where there is none."""
+        return f"--{self.reads.off}" if self.reads.off else ""
+
+    @property
+    def rank(self) -> int:
+        """The place of its group among all."""
+        return GROUPS.index(self.group)
+
+    @cached_property
+    def help(self) -> str:
+        """What it does, in a sentence."""
+        text = self.reads.help or docstrings.parameters(self.owner).get(self.keyword, "")
+        if elsewhere := re.fullmatch(r"As for (\w+)\.", text):
+            function = getattr(import_module("imulab"), elsewhere[1])
+            return next(each.help for each in options_of(function) if each.keyword == self.keyword)
+        return text
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words that complete it."""
+        return tuple(self.reads.words() if callable(self.reads.words) else self.reads.words)
+
+    def value(self, given: str, called: str) -> Any:
+        """Return what a text says.
+
+        Raises
+        ------
+        OptionError
+            It is none that the option takes; the message calls the option `called`.
+        """
+        if self.kind == "switch":
+            if given.lower() not in _SWITCH:
+                raise OptionError(f"{called} {given!r}: expected yes or no")
+            return _SWITCH[given.lower()]
+        return given if self.reads.read is None else self.reads.read(given, called)
+
+
+@cache
+def options_of(owner: Any) -> tuple[Option, ...]:
+    """Return the options that the signature of a function has, or the fields of a typed dictionary."""
+    owner = inspect.unwrap(owner)
+    types = arguments.types_of(owner)
+    options: list[Option] = []
+    if not inspect.isfunction(owner):
+        return tuple(x for name, kind in types.items() if (x := _option(owner, name, kind, None)) is not None)
+    for name, parameter in inspect.signature(owner).parameters.items():
+        kind = types.get(name)
+        if parameter.kind is parameter.VAR_KEYWORD:
+            if get_origin(kind) is Unpack:
+                options += options_of(get_args(kind)[0])
+        elif parameter.kind is parameter.KEYWORD_ONLY or _reads(kind) is not None:
+            option = _option(owner, name, kind, parameter.default)
+            options += [] if option is None else [option]
+    return tuple(options)
+
+
+def _reads(kind: Any) -> Reads | None:
+    return next((each for each in arguments.metadata(kind) if isinstance(each, Reads)), None)
+
+
+def _option(owner: Any, name: str, kind: Any, default: Any) -> Option | None:
+    """Return a parameter as an option; None where it is for programs alone."""
+    said, kinds = arguments.metadata(kind), arguments.members(kind)
+    reads, switch = _reads(kind), kinds == (bool,)
+    if PROGRAM in said or (reads is None and not switch and str not in kinds):
+        return None
+    group = next((each.name for each in said if isinstance(each, Group)), GROUPS[0])
+    reads = _by_type(kinds) if reads is None else reads
+    shape = "either" if reads.off else "switch" if switch else "texts" if reads.repeated else "text"
+    return Option(name, owner, reads, _text(default), default is inspect.Parameter.empty, shape, group)
+
+
+def _by_type(kinds: Sequence[Any]) -> Reads:
+    """Return how a text is read that stands for one of these types."""
+    if kinds == (bool,):
+        return Reads(words=("yes", "no"), other=False)
+    if int in kinds:
+        return Reads(whole_number, "N")
+    if float in kinds:
+        return Reads(number, "NUMBER")
+    return file() if any(get_origin(kind) is PathLike or kind is PathLike for kind in kinds) else text()
+
+
+def _text(default: Any) -> str | None:
+    """Return the default of a signature as one types it."""
+    if default in (None, (), inspect.Parameter.empty):
+        return None
+    if isinstance(default, bool):
+        return "yes" if default else "no"
+    if isinstance(default, tuple):
+        return ",".join(f"{each:g}" for each in default)
+    return default if isinstance(default, str) else f"{default:g}"
+
+
+def read_options(options: Sequence[Option], texts: Mapping[str, str | None], label: str) -> dict[str, Any]:
+    """Return the values of all options, from the texts of those given; `label` is how messages call one (`FLAG`).
+
+    Raises
+    ------
+    OptionError
+        A text is none that its option takes.
+    """
+    values: dict[str, Any] = {}
+    for option in options:
+        given = texts.get(option.name)
+        words = option.default if given is None else given
+        called = label.format(option.name.replace("_", "-") if label.startswith("--") else option.name)
+        values[option.name] = None if words is None else option.value(words, called)
+    return values
+
+
+def names_of_columns(given: str, called: str) -> list[str]:
+    """Return ``gyro_x,gyro_y`` as names.
+
+    Raises
+    ------
+    OptionError
+        It is no such list.
+    """
+    names = [name.strip() for name in given.split(",")]
+    if not all(names) or len(set(names)) < len(names):
+        raise OptionError(f"{called} {given!r}: expected names of columns, each once, such as gyro_x,gyro_y")
+    return names
+
+
+def part_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of `imulab.read` that choose a part of a file."""
+    return {name: values[name] for name in ("topic", "instance", "window", "element") if name in values}
