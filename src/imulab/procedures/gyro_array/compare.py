@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 
 from imulab.device import METHODS
@@ -427,7 +428,9 @@ def _evaluate(
     curves: dict[str, Any] = {m: [_curve(wrong[:, a], rate) for a in axes] for m, wrong in off.items()}
     curves["single gyro"] = [_curve(error[:, a, singles[a].middle], rate) for a in axes]
     return figures, {
-        "figures": {m: f if isinstance(f, str) else [asdict(x) for x in f] for m, f in figures.items()},
+        "figures": {
+            m: f if isinstance(f, str) else [msgspec.structs.asdict(row) for row in f] for m, f in figures.items()
+        },
         "allan": curves,
         "angle": {m: [_trace(np.cumsum(np.nan_to_num(wrong[:, a])) / rate) for a in axes] for m, wrong in off.items()},
         "trace_time": _trace(recording.si("time")[part]),

@@ -34,7 +34,8 @@ from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
 if TYPE_CHECKING:
-    from imulab.procedures.tumble.mag.solve import Dip, Place
+    from imulab.procedures.tumble.mag.solve import Dip as StatedDip
+    from imulab.procedures.tumble.mag.solve import Place
     from imulab.procedures.tumble.montecarlo import MonteCarlo
 
 
@@ -241,7 +242,7 @@ def fit_tumble(
 
 
 def _stated_place(
-    further: Sequence[str], hemisphere: str | None, latitude: float | str | None, dip: Dip | None
+    further: Sequence[str], hemisphere: str | None, latitude: float | str | None, dip: StatedDip | None
 ) -> Place | None:
     """Return what is stated of the field at a place; None without magnetometers, whose code is not imported then."""
     if "mag" not in further:
