@@ -143,7 +143,7 @@ def test_a_filter_gets_white_noise_for_what_is_fast_to_it():
 @pytest.mark.parametrize("name", TRUTHS)
 def test_profiles_cover_and_estimates_reach_the_bound(name, request):
     """95 % of intervals hold the truth; the scatter is the Cramer-Rao bound's where that is below 15 %."""
-    trials = 400 if request.config.getoption("--reduced") else 5000
+    trials = 200 if request.config.getoption("--reduced") else 5000
     truth = TRUTHS[name]
     has = truth > 0
     found, lower, upper = intervals(truth, drawn(np.random.default_rng(8), LONG, truth, trials))
@@ -188,7 +188,7 @@ def test_profiles_cover_and_estimates_reach_the_bound(name, request):
     ],
 )
 def test_chosen_terms_and_averages_over_many_records(name, expected, share, request):
-    trials = 200 if request.config.getoption("--reduced") else 1000
+    trials = 100 if request.config.getoption("--reduced") else 1000
     truth, dt, length = AUTO[name], LONG.interval, LONG.length
     power = drawn(np.random.default_rng(14), LONG, truth, trials)
     choice = choose(
@@ -237,7 +237,7 @@ def test_records_drawn_in_the_time_domain_give_their_parameters_back(name):
 @pytest.mark.parametrize("name", IN_TIME)
 @pytest.mark.parametrize("horizon", [10, 100, 300])
 def test_a_filter_with_the_fitted_white_noise_and_walk_knows_its_errors(name, horizon, request):
-    logs, each = (8, 60) if request.config.getoption("--reduced") else (30, 200)
+    logs, each = (4, 60) if request.config.getoption("--reduced") else (30, 200)
     rng = np.random.default_rng(16)
     power = drawn(rng, LONG, AUTO[name], logs)
     limits = time_limits([LONG])

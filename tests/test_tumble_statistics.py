@@ -21,7 +21,7 @@ def test_errors_reach_the_bound_and_intervals_cover(order, count, known, reduced
     clean = np.array([reference.forward(G * d, truth, order) for d in directions])
     bound = np.sqrt(np.diag(reference.bound(directions, truth, order, G, np.full((count, 3), SIGMA))))
     true = np.array(list(truth.values()))
-    trials = 500 if reduced else 5000
+    trials = 250 if reduced else 5000
     errors, covered = np.empty((trials, len(true))), np.empty((trials, len(true)), dtype=bool)
     for trial in range(trials):
         noisy = clean + SIGMA * rng.standard_normal((count, 3))
