@@ -11,7 +11,7 @@ from timing import Row, exponent, seconds
 import imulab as il
 from imulab.procedures.tumble.gyro.fit import fit_gyro_triad
 from imulab.procedures.tumble.plan import plan_attitudes
-from imulab.procedures.tumble.solve import Problem, solve_norm
+from imulab.procedures.tumble.solve import TumbleProblem, solve_norm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from reference import tumble as reference
@@ -58,7 +58,7 @@ def fitting() -> list[Row]:
     ours, peer = seconds(
         lambda: il.fit_tumble(attitudes, order=1, gravity=G), lambda: plain_scipy_fit(outputs), repeats=31
     )
-    problem = Problem(outputs[None] / G, None, 1)
+    problem = TumbleProblem(outputs[None] / G, None, 1)
     bare, again = seconds(lambda: solve_norm(problem), lambda: plain_scipy_fit(outputs), repeats=31)
     return [
         ("fit of 38 attitudes, order 1, record included", f"{1e3 * ours:.1f} ms", "<= 3 ms"),
@@ -78,12 +78,12 @@ def monte_carlo() -> list[Row]:
     clean = np.array([reference.forward(G * u, truth, 4) for u in reference.random_attitudes(rng, 24)]) / G
     noisy = clean + 2e-5 * rng.standard_normal((10_000, 24, 3))
     covariance = np.broadcast_to(4e-10 * np.eye(3), (1, 24, 3, 3))
-    (batch,) = seconds(lambda: solve_norm(Problem(noisy, covariance, 4, excess=False)), repeats=3)
+    (batch,) = seconds(lambda: solve_norm(TumbleProblem(noisy, covariance, 4, excess=False)), repeats=3)
     linear = reference.random_truth(rng, 1)
     first = np.array([reference.forward(G * u, linear, 1) for u in reference.random_attitudes(rng, 24)])
     many = first + 2e-4 * rng.standard_normal((2_000, 24, 3))
     ours, loop = seconds(
-        lambda: solve_norm(Problem(many / G, None, 1)),
+        lambda: solve_norm(TumbleProblem(many / G, None, 1)),
         lambda: [plain_scipy_fit(one) for one in many[:200]],
         repeats=3,
     )

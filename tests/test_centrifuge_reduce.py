@@ -8,7 +8,7 @@ import pytest
 
 import imulab as il
 from imulab.procedures.centrifuge.levels import axis_lines
-from imulab.procedures.centrifuge.lines import Samples, compress, solve
+from imulab.procedures.centrifuge.lines import CellSamples, compress, solve
 from imulab.procedures.centrifuge.manifest import Manifest, Run, make_manifest
 from imulab.procedures.centrifuge.run import reduce_run
 from imulab.procedures.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
@@ -103,10 +103,10 @@ def test_blocks_of_any_size_give_the_same_sums():
     rng = np.random.default_rng(1)
     time = np.arange(5000) / 100
     channels = rng.standard_normal((2, 5000))
-    whole = compress([Samples(time, channels, None)], 5.0, 0.7)
+    whole = compress([CellSamples(time, channels, None)], 5.0, 0.7)
     for sizes in ([1, 2, 3, 1000, 3994], [2500, 2500], [1] * 1200 + [3800]):
         edges = np.cumsum([0, *sizes])
-        parts = [Samples(time[a:b], channels[:, a:b], None) for a, b in pairwise(edges)]
+        parts = [CellSamples(time[a:b], channels[:, a:b], None) for a, b in pairwise(edges)]
         cut = compress(parts, 5.0, 0.7)
         np.testing.assert_allclose(cut.moments, whole.moments, rtol=0, atol=1e-9)
         assert cut.samples == 5000
@@ -119,7 +119,7 @@ def test_lines_at_another_rate_than_assumed_come_out_right(shift):
     time = np.arange(90000) / 100
     rate = 2 * np.pi + shift
     channel = 3 * np.cos(rate * (time - 449.995)) + 4 * np.sin(rate * (time - 449.995)) + 100 + 0.01 * time
-    cells = compress([Samples(time, channel[None], None)], 2 * np.pi, 0.7)
+    cells = compress([CellSamples(time, channel[None], None)], 2 * np.pi, 0.7)
     line = solve(cells, shift).line(2)[0] * np.exp(1j * 2 * np.pi * 449.995)
     loss = (shift * 0.5) ** 2 / 6
     assert abs(line) == pytest.approx(5.0, rel=2e-9 + 3 * loss)
@@ -133,7 +133,7 @@ def test_a_drifting_run_with_odd_length_has_no_error_where_whole_periods_have():
     A, B, m, _ = reference.fourier(channel - 100 - 5, rate, step)
     assert m == 5
     assert abs(A + 1j * B - 1) == pytest.approx(10 / (np.pi * 5), rel=1e-2)
-    cells = compress([Samples(time, channel[None], None)], rate, 1.3)
+    cells = compress([CellSamples(time, channel[None], None)], rate, 1.3)
     assert solve(cells).line(2)[0] == pytest.approx(1.0, abs=1e-9)
 
 

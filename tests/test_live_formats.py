@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from imulab.errors import ReadError
-from imulab.live.formats import STRAIGHTENED, Stream, UnknownFormatError
+from imulab.live.formats import STRAIGHTENED, LineStream, UnknownFormatError
 from imulab.live.sources import open_source
 from imulab.readers import Layout, load_layout
 from imulab.recording import Recording
@@ -31,9 +31,9 @@ FORMATS: dict[str, Callable[[], tuple[list[bytes], dict[str, np.ndarray]]]] = {
 }
 
 
-def decoded(pieces: list[bytes], layout: Layout | None = None, step: float = 0.01) -> tuple[Stream, Recording]:
+def decoded(pieces: list[bytes], layout: Layout | None = None, step: float = 0.01) -> tuple[LineStream, Recording]:
     """Feed pieces at a steady pace, and join what comes out."""
-    stream = Stream("device", layout)
+    stream = LineStream("device", layout)
     blocks = [block for k, piece in enumerate(pieces) for block in stream.feed(piece, k * step)]
     blocks += stream.finish()
     columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
@@ -100,7 +100,7 @@ def test_garbage_between_messages_of_mavlink_loses_none():
 @pytest.mark.parametrize("version", [1, 2])
 def test_msp_is_asked_for(version):
     frames, sent = msp(version)
-    stream = Stream("serial:x", polled=True)
+    stream = LineStream("serial:x", polled=True)
     blocks, now, waiting = [], 0.0, list(frames)
     asked = []
     while waiting:
@@ -117,7 +117,7 @@ def test_msp_is_asked_for(version):
 
 def test_what_speaks_by_itself_is_not_asked():
     pieces, _ = motioncal()
-    stream = Stream("serial:x", polled=True)
+    stream = LineStream("serial:x", polled=True)
     for k, piece in enumerate(pieces):
         stream.feed(piece, 0.01 * k)
         assert not stream.to_send
@@ -165,7 +165,7 @@ def test_arrival_times_are_straightened(reduced):
     pieces, _ = motioncal(1000)
     rates = []
     for seed in range(trials):
-        stream, late = Stream("device"), np.random.default_rng(seed).exponential(0.02, 1000)
+        stream, late = LineStream("device"), np.random.default_rng(seed).exponential(0.02, 1000)
         late[500] = 0.4  # a driver that slept
         arrivals = np.maximum.accumulate(0.01 * np.arange(1000) + late)
         blocks = [b for piece, t in zip(pieces, arrivals.tolist(), strict=True) for b in stream.feed(piece, t)]
@@ -187,7 +187,7 @@ def _about_a_line(times: np.ndarray) -> float:
 
 def test_a_pause_without_stamps_is_a_gap():
     pieces, _ = motioncal(800)
-    stream = Stream("device")
+    stream = LineStream("device")
     arrivals = [0.01 * k + 3.0 * (k >= 500) for k in range(800)]
     blocks = [b for piece, t in zip(pieces, arrivals, strict=True) for b in stream.feed(piece, t)]
     time = np.concatenate([block.columns["time"] for block in blocks])
@@ -260,7 +260,7 @@ def test_a_guess_of_json_lines():
     ],
 )
 def test_what_is_no_format_is_said_in_one_line(data, said):
-    stream = Stream("serial:/dev/ttyUSB0@115200")
+    stream = LineStream("serial:/dev/ttyUSB0@115200")
     stream.feed(data[:10], 0.0)
     with pytest.raises(ReadError, match=said) as caught:
         stream.feed(data[10:], 2.1)
@@ -282,7 +282,7 @@ def test_each_over_a_pseudo_terminal(name, monkeypatch):
                     os.write(device, piece)
 
             threading.Thread(target=write, daemon=True).start()
-            stream, blocks, rows = Stream(source.name, polled=True), [], 0
+            stream, blocks, rows = LineStream(source.name, polled=True), [], 0
             end = source.now() + 8
             while rows < len(sent["accel_x"]) and source.now() < end:
                 for arrived in source.get(0.05):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imulab.live.formats import Stream
+from imulab.live.formats import LineStream
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "streams.md"
 STUB = r"""
@@ -56,7 +56,7 @@ def test_the_sketch_of_the_page_is_recognised_unaided(tmp_path):
     flags = ["-Wall", "-Werror", "-I.", "sketch.cpp", "-o", "sketch"]
     subprocess.run([compiler, *flags], cwd=tmp_path, check=True, timeout=60)
     sent = subprocess.run([tmp_path / "sketch"], capture_output=True, check=True, timeout=20).stdout
-    stream = Stream("serial:x")
+    stream = LineStream("serial:x")
     blocks = [*stream.feed(sent[:20_000], 0.0), *stream.feed(sent[20_000:], 2.5), *stream.finish()]
     assert stream.format == "titles with units"
     assert stream.counts.damaged == stream.counts.lost == 0

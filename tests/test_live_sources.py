@@ -13,14 +13,14 @@ import pytest
 
 import imulab as il
 from imulab.errors import ImulabError, OptionError, ReadError
-from imulab.live.sources import Source, open_source
+from imulab.live.sources import LiveSource, open_source
 from streams import terminal, wait_for
 
 serial = pytest.importorskip("serial", reason="pyserial is in the extra [live]")
 SENT = [f"{k},{k * k},x{k}\n".encode() for k in range(3000)]
 
 
-def everything(source: Source, size: int) -> bytes:
+def everything(source: LiveSource, size: int) -> bytes:
     found = b""
     end = source.now() + 5
     while len(found) < size and source.now() < end and not source.ended:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imulab.live.formats import Stream
+from imulab.live.formats import LineStream
 from imulab.live.session import Watch
 from imulab.live.stamps import Counts
 from imulab.recording import Recording
 
 
-def stamped(stamps: np.ndarray | list[float], unit: str = "ms", sizes: int | list[int] = 5) -> tuple[Stream, Recording]:
+def stamped(
+    stamps: np.ndarray | list[float], unit: str = "ms", sizes: int | list[int] = 5
+) -> tuple[LineStream, Recording]:
     """Samples whose accel_z is their number, with these stamps, in pieces of so many."""
-    stream = Stream("device")
+    stream = LineStream("device")
     rows = [f"{stamp:.10g},1,0,{k}\n" for k, stamp in enumerate(stamps)]
     ends = np.cumsum(sizes) if isinstance(sizes, list) else np.arange(sizes, len(rows) + sizes, sizes)
     pieces = ["".join(rows[a:b]).encode() for a, b in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)]

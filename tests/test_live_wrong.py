@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.live.formats import Stream
+from imulab.live.formats import LineStream
 from imulab.live.sources import open_source
 from imulab.readers import load_layout
 from imulab.recording import Recording
@@ -38,11 +38,11 @@ def foreign(tmp_path: Path) -> tuple[list[bytes], dict[str, np.ndarray]]:
     return pieces, {f"accel_{axis}": values[:, k] for k, axis in enumerate("xyz")}
 
 
-def heard(unit: Device, rows: int, layout: Path | None = None) -> tuple[Stream, Recording]:
+def heard(unit: Device, rows: int, layout: Path | None = None) -> tuple[LineStream, Recording]:
     """Listen at the port as a session does, until so many rows have come or nothing more does."""
     source = open_source(f"serial:{unit.port}")
     unit.begin()
-    stream, blocks = Stream(source.name, load_layout(layout) if layout else None, polled=True), []
+    stream, blocks = LineStream(source.name, load_layout(layout) if layout else None, polled=True), []
     try:
         end = source.now() + 15
         while sum(map(len, blocks)) < rows and source.now() < end:

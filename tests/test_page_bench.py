@@ -32,7 +32,7 @@ from imulab.errors import OptionError
 from imulab.live.page import bench as bench_module
 from imulab.live.page import server
 from imulab.live.page.bench import Workbench
-from imulab.live.page.files import Files, checked
+from imulab.live.page.files import FolderFiles, checked
 from imulab.live.page.jobs import Jobs, forms
 from imulab.live.page.server import to_json
 
@@ -133,7 +133,7 @@ def test_values_that_cannot_be_are_refused_by_a_sentence(values, said):
 def test_a_word_in_the_place_of_a_file_names_no_file_outside(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("secret").write_text("x")
-    files = Files(Path("session"))
+    files = FolderFiles(Path("session"))
     files.make()
 
     def made(layout: str) -> list[str]:
@@ -166,7 +166,7 @@ def test_odd_names_are_names(tmp_path, name):
 def test_a_session_lists_its_files_with_their_kinds(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     il.write_csv(il.simulate_tumble(attitudes=12, gravity=9.81), "-given.csv")
-    files = Files(Path("session"), ["-given.csv"])
+    files = FolderFiles(Path("session"), ["-given.csv"])
     files.make()
     il.fit_tumble("-given.csv", order=1, gravity=9.81).save("session/r.json")
     Path("session/r.html").write_text("x")
@@ -189,7 +189,7 @@ def test_a_session_lists_its_files_with_their_kinds(tmp_path, monkeypatch):
 
 def test_an_empty_folder_goes_with_its_session(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    files = Files(Path("session"), later=["rec.csv"])
+    files = FolderFiles(Path("session"), later=["rec.csv"])
     assert not files.end()
     files.make()
     assert Path("session").is_dir()
@@ -197,7 +197,7 @@ def test_an_empty_folder_goes_with_its_session(tmp_path, monkeypatch):
     assert not files.end()
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(OptionError, match=r"none\.csv: no such file"):
-        Files(Path("session"), ["none.csv"])
+        FolderFiles(Path("session"), ["none.csv"])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -284,7 +284,7 @@ def bench(tmp_path, monkeypatch) -> Iterator[SimpleNamespace]:
     """A workbench that runs, and a way to ask it."""
     monkeypatch.chdir(tmp_path)
     lines: queue.Queue[str] = queue.Queue()
-    part = Workbench(files := Files(Path("session")), FORMS)
+    part = Workbench(files := FolderFiles(Path("session")), FORMS)
     files.make()
     options = {"browser": False, "limit": 10**7, "tell": lines.put}
     thread = threading.Thread(target=server.serve, args=([part],), kwargs=options, daemon=True)
@@ -465,7 +465,7 @@ def test_a_manifest_that_was_dropped_names_no_file_outside_the_folder(bench, fil
 def test_a_manifest_of_the_command_line_names_files_where_they_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("m.toml").write_text(MANIFEST.format(file="/data/one.csv"))
-    files = Files(Path("session"), ["m.toml"])
+    files = FolderFiles(Path("session"), ["m.toml"])
     files.make()
     files.check_manifest("m.toml")
     Path("session/own.toml").write_text(MANIFEST.format(file="one.csv"))
@@ -546,7 +546,7 @@ def test_open_refuses_by_a_sentence(imulab, tmp_path, arguments, said):
 
 def test_a_folder_that_another_session_removed_is_made_again(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    files = Files(Path("session"))
+    files = FolderFiles(Path("session"))
     assert files.entries() == []
     assert Path(files.new("rec.csv")).parent.is_dir()
 

@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 
 from imulab.errors import OptionError
 from imulab.live.page import server
-from imulab.live.page.server import Guard, Hub, Line, Part, inside, receive_file, to_json
+from imulab.live.page.server import Guard, Hub, PagePart, TextLine, inside, receive_file, to_json
 
 LIMIT = 1000
 
@@ -35,7 +35,7 @@ def awaited(coroutine: Coroutine[Any, Any, Any]) -> Any:
         return pool.submit(asyncio.run, coroutine).result()
 
 
-class Echo(Part):
+class Echo(PagePart):
     """A part that says again what it hears, and stores what is sent to it."""
 
     name = "workbench"
@@ -286,7 +286,7 @@ def test_a_link_out_of_the_folder_leads_nowhere(tmp_path):
 
 
 def test_a_slow_page_gets_the_latest_view_and_every_word():
-    line = Line()
+    line = TextLine()
     for number in range(5):
         line.put("view", f"view {number}", latest=True)
         line.put("event", f"event {number}")

@@ -6,7 +6,7 @@ import pytest
 import imulab as il
 import madeup
 from imulab.cli import main
-from imulab.procedures.rate.solve import Problem, choose_orders
+from imulab.procedures.rate.solve import RateProblem, choose_orders
 from reference import rate as reference
 from test_rate import BIAS, SCALE, TURN, whole
 
@@ -26,7 +26,7 @@ def problem(rng, k=(), cycles=3, each=0.0, noise=NOISE):
     mean = mean + noise * rng.standard_normal(len(table))
     same = np.zeros(len(table), dtype=int)
     variance = np.full((len(table), 1), noise**2)
-    return Problem(
+    return RateProblem(
         (2,), run, same + 2, same + 1, table, table, mean[:, None], variance, np.zeros((len(run), 2)), 0 * table
     )
 

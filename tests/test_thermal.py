@@ -13,7 +13,7 @@ from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.record import predicted
 from imulab.procedures.thermal.simulate import thermal_truth
-from imulab.procedures.thermal.solve import Problem, solve
+from imulab.procedures.thermal.solve import ThermalProblem, solve
 from reference import thermal as reference
 
 G = reference.G
@@ -27,7 +27,7 @@ def problem(rng, triad, temperatures, count, noise=60e-6, turn_on=0.0, stated=No
     soaks = [reference.soak(triad, rng, t, count, noise * G, turn_on * G) for t in temperatures]
     reading = np.vstack([outputs for outputs, _ in soaks]) / G
     n = len(reading)
-    return Problem(
+    return ThermalProblem(
         reading=reading,
         covariance=np.tile(np.eye(3) * (stated or noise) ** 2, (n, 1, 1)),
         temperature=np.concatenate([at for _, at in soaks]),

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.procedures.thermal.degrees import Drift, drift_of, findings
+from imulab.procedures.thermal.degrees import LagAndLoops, drift_of, findings
 from imulab.procedures.thermal.figures import exhibits
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.record import predicted
-from imulab.procedures.thermal.solve import Problem, solve
+from imulab.procedures.thermal.solve import ThermalProblem, solve
 from imulab.recording import Recording
 from reference import thermal as reference
 
@@ -50,7 +50,7 @@ def driven(rng, lag=0.0, loop=0.0, noise=60e-6, rough=0.03):
             rng.permutation(reference.directions(rng, COUNT)), sensor(time, lag), way, place, strict=True
         )
     ]
-    problem = Problem(
+    problem = ThermalProblem(
         reading=np.array(rows) / G + noise * rng.standard_normal((COUNT, 3)),
         covariance=np.tile(np.eye(3) * max(noise, 1e-8) ** 2, (COUNT, 1, 1)),
         temperature=thermometer(time) + rough * rng.standard_normal(COUNT),
@@ -142,7 +142,7 @@ def test_without_the_way_back_lag_and_law_are_not_told_apart(which, said):
 
 def test_a_thermometer_slower_than_the_sensor_is_called_so():
     solution = solve(driven(np.random.default_rng(3))[0], LAWS)
-    said = findings(Drift(np.array([-12.0, 0, 0, 0]), np.eye(4), (1e-4, 0.5)), solution, "unit")
+    said = findings(LagAndLoops(np.array([-12.0, 0, 0, 0]), np.eye(4), (1e-4, 0.5)), solution, "unit")
     assert said[0].startswith("unit: the temperature lags the biases by 12 s (u 1 s)")
 
 

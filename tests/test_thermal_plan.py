@@ -9,7 +9,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.plan import Design, exchange, nodes, way
-from imulab.procedures.thermal.solve import Problem, solve
+from imulab.procedures.thermal.solve import ThermalProblem, solve
 from imulab.procedures.tumble.plan import sphere_candidates
 from reference import thermal as reference
 
@@ -86,7 +86,7 @@ def test_the_stated_deviation_is_that_of_simulated_tests(tau, reduced):
         offset = tau * G * rng.standard_normal((len(plan.soaks), 3))
         means = [triad.output(G * u, t, offset[k]) for u, t, k in zip(up, place, number, strict=True)]
         n = len(up)
-        problem = Problem(
+        problem = ThermalProblem(
             reading=(np.array(means) + 60e-6 * G * rng.standard_normal((n, 3))) / G,
             covariance=np.tile(np.eye(3) * 60e-6**2, (n, 1, 1)), temperature=place, rate=np.zeros(n), step=np.zeros(n),
             shared=np.ones(n, dtype=bool), recording=number, group=np.full(n, -1), tilt=2e-4, zero=np.zeros(3),

@@ -10,7 +10,7 @@ from conftest import some_of
 from imulab.cli import main
 from imulab.procedures.thermal import solve as solving
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.solve import Problem, solve
+from imulab.procedures.thermal.solve import ThermalProblem, solve
 from reference import thermal as reference
 
 G = reference.G
@@ -21,7 +21,7 @@ PER_HOLD = ("reading", "covariance", "temperature", "rate", "step", "shared", "r
 def problem(rng, triad, noise=20e-6, step=0.0):
     soaks = [reference.soak(triad, rng, t, 12, noise * G, 1e-4 * G) for t in (-20, 0, 25, 45, 60)]
     n = 60
-    return Problem(
+    return ThermalProblem(
         reading=np.vstack([outputs for outputs, _ in soaks]) / G,
         covariance=np.tile(np.eye(3) * noise**2, (n, 1, 1)),
         temperature=np.concatenate([at for _, at in soaks]),

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 import imulab as il
 from imulab.procedures.thermal.degrees import clusters_of, left_out, seen, splits
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.solve import Problem, concluded, solve
+from imulab.procedures.thermal.solve import ThermalProblem, concluded, solve
 from reference import thermal as reference
 from test_thermal import AT, LAWS, problem, truth
 
@@ -44,7 +44,7 @@ def test_each_coefficient_errs_by_what_is_stated(reduced):
         rng = np.random.default_rng([31, trial])
         triad = reference.Triad(rng)
         means = np.array([triad.output(G * u, t) for u, t in zip(up, place, strict=True)]) / G
-        given = Problem(
+        given = ThermalProblem(
             reading=means + NOISE * rng.standard_normal((n, 3)), covariance=np.tile(np.eye(3) * NOISE**2, (n, 1, 1)),
             temperature=place, rate=np.zeros(n), step=np.zeros(n), shared=np.ones(n, dtype=np.bool_),
             recording=np.repeat(np.arange(5), counts), group=np.full(n, -1), tilt=2e-4, zero=np.zeros(3),

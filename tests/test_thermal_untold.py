@@ -8,7 +8,7 @@ import pytest
 
 import imulab as il
 from imulab.estimation.least_squares import coverage_factor
-from imulab.procedures.thermal.degrees import Drift, bias_shift_from_unobserved, drift_of
+from imulab.procedures.thermal.degrees import LagAndLoops, bias_shift_from_unobserved, drift_of
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.solve import solve
 from reference import thermal as reference
@@ -45,7 +45,7 @@ def test_what_one_ramp_does_not_tell_costs_as_much_as_is_said(reduced):
         triad = reference.Triad(rng, degrees=(3, 1, 0))
         given = one_ramp(rng, triad)
         found = solve(given, laws, tau=0.0)
-        (text, *_) = bias_shift_from_unobserved(given, found, Drift(), "ramp")
+        (text, *_) = bias_shift_from_unobserved(given, found, LagAndLoops(), "ramp")
         said.append(float(re.search(r"scale factor follows .* errs biases by (\S+) mg", text)[1]))
         biases = laws.design(AT)[:, :3] @ found.coefficients
         errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))

@@ -21,7 +21,7 @@ from imulab.options import FLAG, OUTPUT
 
 if TYPE_CHECKING:
     from imulab.live.page.bench import Workbench
-    from imulab.live.page.files import Files
+    from imulab.live.page.files import FolderFiles
     from imulab.live.runner import Runner
     from imulab.reading import Layout
     from imulab.records.calibration import Calibration
@@ -80,15 +80,15 @@ def again(save: str, texts: Mapping[str, str | None], output: str | None, record
     return shlex.join(["imulab", "tumble", "fit", save, *given, *others, *(["-o", output] if output else [])])
 
 
-def workbench(given: Sequence[str] = (), later: Sequence[str] = ()) -> tuple[Workbench, Files]:
+def workbench(given: Sequence[str] = (), later: Sequence[str] = ()) -> tuple[Workbench, FolderFiles]:
     """Return the workbench and its files: those of its folder, those given, and those that may come later."""
     from imulab.cli.app import commands
     from imulab.live.page.bench import Workbench
-    from imulab.live.page.files import Files
+    from imulab.live.page.files import FolderFiles
     from imulab.live.page.jobs import forms
 
     offered = [each for each in commands() if not each.path.startswith(_NOT_OFFERED)]
-    files = Files(Path(FOLDER), given, later)
+    files = FolderFiles(Path(FOLDER), given, later)
     return Workbench(files, forms(offered)), files
 
 

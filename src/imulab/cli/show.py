@@ -18,7 +18,7 @@ from imulab.procedures.tumble.plan import TumblePlan, plan_tumble, roll_pitch
 from imulab.procedures.views import TITLES, change_rows, exhibits_of, verdict
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, json_text
-from imulab.records.comparison import Comparison
+from imulab.records.comparison import RecordComparison
 from imulab.report.traces import ReportTable
 from imulab.units import STANDARD_GRAVITY
 from imulab.writers import write_csv_to
@@ -195,7 +195,7 @@ def _joined(value: object) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def describe_changes(first: str, second: str, comparison: Comparison, record: Calibration) -> str:
+def describe_changes(first: str, second: str, comparison: RecordComparison, record: Calibration) -> str:
     """Return what changed from one record to the other, which is of the procedure and units of `record`."""
     lines = [f"{second} less {first}: {verdict(comparison)}", "", *aligned(TITLES, change_rows(comparison, record))]
     if comparison.probability is not None:

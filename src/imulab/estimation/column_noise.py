@@ -18,7 +18,7 @@ from imulab.estimation.noise.readings import doubtful_units, own_readings
 from imulab.estimation.noise.spectrum import transformed
 from imulab.estimation.noise.terms import allan_variance
 from imulab.estimation.noise_coefficients import (
-    AllanCurve,
+    DeviationCurve,
     NoiseCoefficients,
     allan_deviation,
     coefficients_dict,
@@ -48,7 +48,7 @@ _FITTED = 0.5  # averaging times that a band tells, in terms of 1/f_max
 class ColumnNoise:
     """Allan curve of a column, its noise coefficients, and the model that they are from, None where there is none."""
 
-    curve: AllanCurve
+    curve: DeviationCurve
     coefficients: NoiseCoefficients
     model: Analysis | None = None
 

@@ -31,7 +31,7 @@ _FEWEST = 3
 
 
 @dataclass(frozen=True, repr=False)
-class AllanCurve:
+class DeviationCurve:
     """Overlapping Allan deviation over averaging time.
 
     Attributes
@@ -57,7 +57,7 @@ class AllanCurve:
         )
 
 
-def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -> AllanCurve:
+def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -> DeviationCurve:
     """Compute the overlapping Allan deviation of evenly spaced samples.
 
     ``sigma^2(m / rate) = sum_k (x_{k+2m} - 2 x_{k+m} + x_k)^2 / (2 (m / rate)^2 (N - 2m))``, x the integral of the
@@ -98,7 +98,7 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
     variance = squares / (2.0 * (len(integral) - 2 * counts)) / counts.astype(np.float64) ** 2 * rate**2
     freedom = _freedom(len(integral), counts, variance)
     deviation = np.sqrt(variance)
-    return AllanCurve(counts / rate, deviation, deviation / np.sqrt(2 * freedom), freedom)
+    return DeviationCurve(counts / rate, deviation, deviation / np.sqrt(2 * freedom), freedom)
 
 
 def _averages(length: int, rate: float, taus: str | Array) -> np.ndarray:

@@ -50,7 +50,7 @@ from imulab.units import STANDARD_GRAVITY
 
 
 @dataclass(frozen=True)
-class Corrections:
+class AutopilotCorrections:
     """``(raw - offset) * scale``, m/s^2, and ``raw - rest``, rad/s, on each axis, shape (3,); rest None without gyros.
 
     With the magnetometers, None where there are none, and comments on what is left out.
@@ -66,7 +66,7 @@ class Corrections:
 
 def corrections(
     records: Sequence[Calibration], target: str, options: ExportOptions, check: Callable[[Array, Array], None]
-) -> Corrections:
+) -> AutopilotCorrections:
     """Return what an autopilot takes of the one record; `check` refuses offsets and scales that it does not take.
 
     Raises
@@ -93,7 +93,7 @@ def corrections(
     if unit.mag is not None:
         mag, left_out = symmetric(unit.mag, target, options, turned=options.mag_mount == "external")
         lost += left_out
-    return Corrections(unit, offset, scale, None if gyro is None else gyro.scale * gyro.bias, mag, lost)
+    return AutopilotCorrections(unit, offset, scale, None if gyro is None else gyro.scale * gyro.bias, mag, lost)
 
 
 # Accelerometers over temperature as autopilots hold them: a cubic of the offset in the temperature, and one scale.

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from imulab.errors import first_of
 from imulab.fleet.run import FleetState
-from imulab.fleet.statistics import FEWEST_FOR_OUTLIERS, Drift, FleetChange, ParameterStatistics, change_limit
-from imulab.fleet.table import Display, Row, display_of
+from imulab.fleet.statistics import FEWEST_FOR_OUTLIERS, FleetChange, FleetDrift, ParameterStatistics, change_limit
+from imulab.fleet.table import Display, FleetRow, display_of
 from imulab.recording import Array
 from imulab.report import traces as grid
 from imulab.report.traces import (
@@ -232,7 +232,7 @@ def verdict_table(state: FleetState) -> ReportTable | None:
     )
 
 
-def failure_table(failures: Sequence[Row]) -> ReportTable | None:
+def failure_table(failures: Sequence[FleetRow]) -> ReportTable | None:
     """List the units that failed."""
     if not failures:
         return None
@@ -409,7 +409,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, 
     )
 
 
-def _drift_line(drift: Drift, shown: Display, x: str, y: str) -> dict[str, Any]:
+def _drift_line(drift: FleetDrift, shown: Display, x: str, y: str) -> dict[str, Any]:
     """Draw the fitted drift from the first date to the last."""
     ends = np.array([drift.value_at_start, drift.value_at_start + drift.per_day * drift.days])
     colour, dash = (BAD, "dash") if drift.significant else (QUIET, "solid")

@@ -34,7 +34,7 @@ from imulab.fleet.engine import (
 from imulab.fleet.history import History, open_history
 from imulab.fleet.manifest import FleetManifest, FleetUnit, is_url, load_fleet
 from imulab.fleet.store import Store
-from imulab.fleet.table import Row, check_table, write_table
+from imulab.fleet.table import FleetRow, check_table, write_table
 from imulab.options import choice, parsed, text
 from imulab.procedures.registry import PROCEDURES
 from imulab.quantities import whole, whole_number
@@ -68,7 +68,7 @@ class FleetState(Shown):
 
     folder: str
     manifest: FleetManifest
-    rows: tuple[Row, ...]
+    rows: tuple[FleetRow, ...]
     kept: int = 0
     at_work: str | None = None
     seconds: float = 0.0
@@ -86,7 +86,7 @@ class FleetState(Shown):
         return sum(row.status == status for row in self.rows)
 
     @property
-    def doubtful(self) -> list[Row]:
+    def doubtful(self) -> list[FleetRow]:
         """The units whose record is not ``good``, the ``bad`` ones first."""
         return [row for state in ("bad", "look") for row in self.rows if row.verdict == state]
 
@@ -106,7 +106,7 @@ class FleetState(Shown):
         return ", ".join(f"{count} {state}" for state, count in found.items() if count)
 
     @property
-    def failures(self) -> tuple[Row, ...]:
+    def failures(self) -> tuple[FleetRow, ...]:
         """The units that failed."""
         return tuple(row for row in self.rows if row.status == FAILED)
 
@@ -305,16 +305,16 @@ class _Keeper:
         self._new.clear()
         self._flushed = time.monotonic()
 
-    def rows(self) -> tuple[Row, ...]:
+    def rows(self) -> tuple[FleetRow, ...]:
         """Return the state of every unit, in the order of the manifest."""
         return tuple(
-            Row(unit, DONE if outcome.status == KEPT else outcome.status, outcome.reason, outcome.summary)
+            FleetRow(unit, DONE if outcome.status == KEPT else outcome.status, outcome.reason, outcome.summary)
             for unit in self._fleet.units
             for outcome in [self._over[unit.serial]]
         )
 
 
-def _remarks_on(rows: Sequence[Row]) -> Iterator[str]:
+def _remarks_on(rows: Sequence[FleetRow]) -> Iterator[str]:
     """Say what a person must know of the records as a whole, and no record can say by itself."""
     made = [row.summary for row in rows if row.summary is not None]
     others = [summary.software for summary in made if summary.software != f"imulab {VERSION}"]
@@ -398,9 +398,9 @@ def fleet_status(folder: Folder) -> FleetState:
     return FleetState(folder, fleet, tuple(_row(store, unit) for unit in fleet.units), at_work=store.at_work())
 
 
-def _row(store: Store, unit: FleetUnit) -> Row:
+def _row(store: Store, unit: FleetUnit) -> FleetRow:
     reason = store.reason(unit.serial)
     if reason is not None:
-        return Row(unit, FAILED, reason, None)
+        return FleetRow(unit, FAILED, reason, None)
     there = store.made_for(unit)
-    return Row(unit, "missing", "", None) if there is None else Row(unit, DONE, "", summarise(*there))
+    return FleetRow(unit, "missing", "", None) if there is None else FleetRow(unit, DONE, "", summarise(*there))

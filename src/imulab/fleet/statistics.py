@@ -114,7 +114,7 @@ _ONE_SIDED_95 = 1.6448536269514722
 
 
 @dataclass(frozen=True)
-class Drift:
+class FleetDrift:
     """Straight line over the date: change per day with its standard uncertainty, and whether it is beyond chance."""
 
     per_day: float
@@ -171,7 +171,7 @@ class ParameterStatistics:
     robust_deviation: float
     z: Array
     outlier_limit: float
-    drift: Drift | None
+    drift: FleetDrift | None
     capability: Capability | None
 
     @property
@@ -334,7 +334,7 @@ def robust_deviation(values: Array, median: float) -> float:
     return _MAD_TO_SIGMA * float(np.median(distance)) or _MEAN_TO_SIGMA * float(distance.mean())
 
 
-def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> Drift | None:
+def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> FleetDrift | None:
     """Fit a straight line over the date to the units that do not stand out; None for few units or one date.
 
     ``value = a + slope (day - mean day)``; ``u(slope) = s / sqrt(sum (day - mean)^2)``, s from the residuals.
@@ -349,7 +349,7 @@ def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> Drift | N
     freedom = len(day) - 2
     uncertainty = math.sqrt(float(left @ left) / freedom / spread)
     start = float(day.min())
-    return Drift(
+    return FleetDrift(
         per_day=slope,
         standard_uncertainty=uncertainty,
         significant=abs(slope) > uncertainty * float(t_quantile(1 - _DRIFT_LEVEL / 2, freedom)),

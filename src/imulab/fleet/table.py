@@ -106,7 +106,7 @@ HEAD = (
 
 
 @dataclass(frozen=True)
-class Row:
+class FleetRow:
     """One unit: ``done``, ``failed`` or ``missing``, with its reason or the summary of its record."""
 
     unit: FleetUnit
@@ -127,7 +127,7 @@ class Row:
         return reasons[0] + more if reasons else ""
 
 
-def columns_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
+def columns_of(rows: Sequence[FleetRow]) -> dict[str, list[Any]]:
     """Return the table by columns: the head, then ``name [unit]`` and ``std_name [unit]`` of every parameter.
 
     ``reason`` is why a unit failed, or why its verdict is not good; ``warnings`` all that its record says.
@@ -175,7 +175,7 @@ def check_table(path: str) -> None:
         raise OptionError(f"{path}: cannot be written: no such folder")
 
 
-def write_table(rows: Sequence[Row], path: str | Path) -> None:
+def write_table(rows: Sequence[FleetRow], path: str | Path) -> None:
     """Write the table, CSV or Parquet by the name of the file, whole or not at all; numbers read back exactly."""
     columns = columns_of(rows)
     if Path(path).suffix.lower() == ".parquet":

@@ -192,7 +192,7 @@ class Decoder(Protocol):
         """Return the rows that are left at the end."""
 
 
-class Stream:
+class LineStream:
     """One stream: bytes and when they came to recordings of some rows each.
 
     Parameters

@@ -13,9 +13,9 @@ import numpy as np
 
 from imulab.errors import OptionError, ReadError
 from imulab.files import replacing
-from imulab.live.formats import Stream
+from imulab.live.formats import LineStream
 from imulab.live.session import Event, Session
-from imulab.live.sources import Source
+from imulab.live.sources import LiveSource
 from imulab.live.view import FurtherFits, further_of
 from imulab.readers import read_blocks
 from imulab.reading import Layout
@@ -211,9 +211,9 @@ _BEFORE, _BEHIND = 1.0, 0.6
 class Runner:
     """Brings samples from the source to the session and the recording."""
 
-    def __init__(self, source: Source, session: Session, recorder: Recorder, layout: Layout | None = None) -> None:
+    def __init__(self, source: LiveSource, session: Session, recorder: Recorder, layout: Layout | None = None) -> None:
         self.source, self.session, self.recorder = source, session, recorder
-        self._stream = Stream(source.name, layout, polled=source.polled)
+        self._stream = LineStream(source.name, layout, polled=source.polled)
         self._last_arrival = source.now()
         self._silent = False
         self._further: FurtherFits | None = None
@@ -224,7 +224,7 @@ class Runner:
 
     @classmethod
     def open(
-        cls, source: Callable[[], Source], session: Session, save: str, layout: Layout | None, *, resume: bool
+        cls, source: Callable[[], LiveSource], session: Session, save: str, layout: Layout | None, *, resume: bool
     ) -> Runner:
         """Open the recording and the source; where the source cannot be opened no empty recording stays behind."""
         recorder = Recorder(save, resume=resume)

@@ -16,7 +16,7 @@ from imulab.gravity import Gravity
 from imulab.live.guide import Attitude, Guide, Target
 from imulab.live.holds import SHORTEST, SURE, Hold, Moment, Stillness
 from imulab.live.stamps import Counts
-from imulab.live.view import FURTHER, Held, Known, View, in_words
+from imulab.live.view import FURTHER, HeldValues, KnownUnit, View, in_words
 from imulab.procedures.views import parameter_rows
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, parse_unit, to_si
@@ -209,7 +209,7 @@ class Session:
     _next: Array | None = None
     _enough: str = ""
     _aside: frozenset[int] = frozenset()
-    _further: tuple[Known, ...] = ()
+    _further: tuple[KnownUnit, ...] = ()
     _magnetometers: bool = False
 
     def feed(self, block: Recording, counts: Counts | None = None) -> list[Event]:
@@ -290,7 +290,7 @@ class Session:
         self._plan()
         return gone.start, gone.stop
 
-    def know(self, further: tuple[Known, ...], why: Sequence[str]) -> list[Event]:
+    def know(self, further: tuple[KnownUnit, ...], why: Sequence[str]) -> list[Event]:
         """Take the parameters of further triads that the recording so far gives, or why some have none."""
         self.events = []
         for name, words in FURTHER.items():
@@ -310,15 +310,15 @@ class Session:
         residuals, agree = guide.residuals()
         directions = guide.directions()
         held = tuple(
-            Held(each.number, tuple(up), None if np.isnan(off) else float(off), not good, each.seconds)
+            HeldValues(each.number, tuple(up), None if np.isnan(off) else float(off), not good, each.seconds)
             for each, up, off, good in zip(guide.kept, directions.tolist(), residuals, agree, strict=True)
         )
-        known: tuple[Known, ...] = ()
+        known: tuple[KnownUnit, ...] = ()
         if guide.fit is not None:
             rows = parameter_rows(guide.fit.calibration)
             shares = guide.parameter_shares()
             known = tuple(
-                Known(row.name, row.value, row.standard_uncertainty, row.unit, shares.get(row.name)) for row in rows
+                KnownUnit(row.name, row.value, row.standard_uncertainty, row.unit, shares.get(row.name)) for row in rows
             )
         seconds = self._time - (self._first or 0.0)
         reading = self._reading

@@ -217,7 +217,7 @@ class Arrived:
     time: float
 
 
-class Source:
+class LiveSource:
     """What all sources have.
 
     Attributes
@@ -262,7 +262,7 @@ class Source:
         """Let go of what the source holds."""
 
 
-class Threaded(Source):
+class Threaded(LiveSource):
     """A source that is read by a thread: `read` returns bytes, none for a moment without, None at the end."""
 
     def __init__(
@@ -328,7 +328,7 @@ class Threaded(Source):
         self._close()
 
 
-class Paced(Source):
+class Paced(LiveSource):
     """Blocks of samples that are made here, each at its time: `speed` times as fast as it was, 0 without waiting."""
 
     def __init__(self, name: str, blocks: Iterator[Recording], speed: float) -> None:
@@ -383,7 +383,7 @@ class Simulated(Paced):
         self.unit.turn_by_hand(direction)
 
 
-def open_source(text: str, layout: str | None = None, *, follow: bool = False) -> Source:
+def open_source(text: str, layout: str | None = None, *, follow: bool = False) -> LiveSource:
     """Open a source by what a person calls it.
 
     Parameters
@@ -408,7 +408,7 @@ def open_source(text: str, layout: str | None = None, *, follow: bool = False) -
         raise OptionError(f"--follow: expected a simulated unit (simulate), found {text!r}")
     if text == "-":
         return Threaded("standard input", lambda: os.read(0, _CHUNK) or None)
-    makers: dict[str, Callable[[str], Source]] = {"serial": _serial, "udp": _udp, "tcp": _tcp}
+    makers: dict[str, Callable[[str], LiveSource]] = {"serial": _serial, "udp": _udp, "tcp": _tcp}
     if kind in makers and rest:
         return makers[kind](rest)
     if kind == "replay" and rest:
@@ -441,7 +441,7 @@ def _pyserial() -> Any:
     return serial
 
 
-def _serial(rest: str) -> Source:
+def _serial(rest: str) -> LiveSource:
     serial = _pyserial()
     port, at, rate = rest.rpartition("@")
     if not at:
@@ -475,7 +475,7 @@ def _why_no_port(port: str, error: Exception) -> str:
     return f"cannot be opened: {_reason(error)}"
 
 
-def _udp(rest: str) -> Source:
+def _udp(rest: str) -> LiveSource:
     name = f"udp:{rest}"
     port = _port(rest, name)
     link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -502,7 +502,7 @@ def _udp(rest: str) -> Source:
     return Threaded(name, read, close=link.close)
 
 
-def _tcp(rest: str) -> Source:
+def _tcp(rest: str) -> LiveSource:
     name = f"tcp:{rest}"
     host, colon, text = rest.rpartition(":")
     if not colon or not host:
@@ -544,7 +544,7 @@ def _why_no_address(error: OSError) -> str:
     return f"cannot be opened: {_reason(error)}"
 
 
-def _replay(rest: str, layout: str | None) -> Source:
+def _replay(rest: str, layout: str | None) -> LiveSource:
     from imulab.readers import read_blocks
 
     path, at, text = rest.rpartition("@")

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Group
 from rich.text import Text
 
-from imulab.live.view import Known, View, in_words
+from imulab.live.view import KnownUnit, View, in_words
 from imulab.recording import Array
 from imulab.report.traces import format_uncertain
 from imulab.units import STANDARD_GRAVITY
@@ -113,7 +113,7 @@ def _parameters(view: View, width: int) -> list[Text]:
     """A line for each kind of parameter: its axes, the largest standard uncertainty, and what of its target that is."""
     if not view.parameters:
         return [Text("no result yet: more attitudes are needed", style="dim")] if view.attitudes else []
-    kinds: dict[str, list[Known]] = {}
+    kinds: dict[str, list[KnownUnit]] = {}
     for known in view.parameters:
         kinds.setdefault(known.name.rpartition("_")[0], []).append(known)
     rows: list[Sequence[str]] = [("", "x", "y", "z", "±", "unit", "")]

@@ -38,7 +38,7 @@ _FULL, _HALF, _LITTLE = 0.88, 0.55, 0.2
 
 
 @dataclass(frozen=True)
-class Held:
+class HeldValues:
     """An attitude: its number, upward direction of the body, ``|f| - g``, m/s^2, whether it disagrees, length, s."""
 
     number: int
@@ -49,7 +49,7 @@ class Held:
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownUnit:
     """A parameter as people read it, and its standard uncertainty over its target where it has one."""
 
     name: str
@@ -112,9 +112,9 @@ class View:
     unit: str
     temperature: float | None
     hold: float
-    attitudes: tuple[Held, ...]
+    attitudes: tuple[HeldValues, ...]
     wanted: int
-    parameters: tuple[Known, ...]
+    parameters: tuple[KnownUnit, ...]
     targets: tuple[tuple[str, float], ...]
     next: tuple[float, ...] | None
     next_words: str
@@ -137,7 +137,7 @@ def in_words(up: Array) -> str:
 
 
 @dataclass(frozen=True)
-class Reading:
+class CorrectedReading:
     """Length of the mean reading of a block, m/s^2, as it came (None for counts) and corrected; and its rate, rad/s."""
 
     raw: float | None
@@ -151,7 +151,7 @@ class Reading:
         return f"corrected |f| {self.length:.4f} m/s², {off:+.2f} mg from g{rate}"
 
 
-def corrected_reading(ready: Loaded, block: Recording, *, gyro: bool) -> Reading:
+def corrected_reading(ready: Loaded, block: Recording, *, gyro: bool) -> CorrectedReading:
     """Return the reading of a block, raw and corrected, with its rate where the record has gyroscopes.
 
     Raises
@@ -165,7 +165,7 @@ def corrected_reading(ready: Loaded, block: Recording, *, gyro: bool) -> Reading
         return float(np.linalg.norm([of.si(name).mean() for name in triad(sensor)]))
 
     raw = None if block.units["accel_x"] == "count" else length(block, "accel")
-    return Reading(raw, length(after, "accel"), length(after, "gyro") if gyro else None)
+    return CorrectedReading(raw, length(after, "accel"), length(after, "gyro") if gyro else None)
 
 
 # The further triads of a session, gyroscopes and magnetometers: fitted to the saved recording while it goes on.
@@ -175,7 +175,7 @@ _REST = 5.0
 """The next fit waits for so many times as long as the last took, so that it stays beside the session."""
 FURTHER = {"gyro": "gyroscopes", "mag": "magnetometers"}
 """The triads that are fitted on top of the accelerometers, by the first part of their columns' names."""
-Found = tuple[tuple[Known, ...], tuple[str, ...]]
+Found = tuple[tuple[KnownUnit, ...], tuple[str, ...]]
 """Parameters of the further triads, and why some have none."""
 
 
@@ -265,4 +265,4 @@ def _fit(answer: Connection, path: str, order: int | str, gravity: Gravity | Non
         answer.send(((), (str(error),)))
         return
     rows = [row for row in parameter_rows(record) if row.name.split("_")[0] in further or row.name == "dip"]
-    answer.send((tuple(Known(row.name, row.value, row.standard_uncertainty, row.unit) for row in rows), tuple(why)))
+    answer.send((tuple(KnownUnit(row.name, row.value, row.standard_uncertainty, row.unit) for row in rows), tuple(why)))

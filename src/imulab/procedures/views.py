@@ -25,7 +25,7 @@ from imulab.procedures.result import Drawn, Record, as_record, as_recording
 from imulab.reading import Reading
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
-from imulab.records.comparison import Change, Comparison, compared
+from imulab.records.comparison import Change, RecordComparison, compared
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -110,7 +110,7 @@ def write_report(record: Record, path: str | Path) -> None:
 
 
 @dataclass(frozen=True, repr=False)
-class Changes(Drawn, Comparison):
+class Changes(Drawn, RecordComparison):
     """Two records of one unit.
 
     Attributes
@@ -175,7 +175,7 @@ def compare_records(first: Record, second: Record) -> Changes:
     return Changes(**vars(compared(*pair, procedure.same_meaning)), record=one)
 
 
-def verdict(comparison: Comparison) -> str:
+def verdict(comparison: RecordComparison) -> str:
     """Return which parameters changed."""
     changed = [change.name for change in comparison.changes if change.significant]
     judged = sum(change.standard_uncertainty is not None for change in comparison.changes)
@@ -183,7 +183,7 @@ def verdict(comparison: Comparison) -> str:
     return named if changed else "no significant change"
 
 
-def change_rows(comparison: Comparison, record: Calibration) -> list[list[str]]:
+def change_rows(comparison: RecordComparison, record: Calibration) -> list[list[str]]:
     """Return each change in the units in which people read it, of records like this one."""
     rows = []
     for change in comparison.changes:
@@ -196,7 +196,7 @@ def change_rows(comparison: Comparison, record: Calibration) -> list[list[str]]:
     return rows
 
 
-def _figure(comparison: Comparison, rows: list[list[str]]) -> Figure:
+def _figure(comparison: RecordComparison, rows: list[list[str]]) -> Figure:
     judged = [(c, row) for c, row in zip(comparison.changes, rows, strict=True) if c.deviations is not None]
     marks = [change.significant for change, _ in judged]
     trace = scatter(

@@ -37,7 +37,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class RecordComparison:
     """Two records of one unit.
 
     Attributes
@@ -61,7 +61,7 @@ class Comparison:
 
 def compared(
     first: Calibration, second: Calibration, same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
-) -> Comparison:
+) -> RecordComparison:
     """Compare two records of one unit by one procedure, in units of their combined uncertainty.
 
     A change counts as significant where it exceeds what chance gives one of all the parameters in twenty comparisons
@@ -97,7 +97,7 @@ def compared(
         significant = uncertainty is not None and abs(difference) > limit * uncertainty
         changes.append(Change(name, difference, uncertainty, first.parameters[name].unit, bool(significant)))
     either = dict.fromkeys([*first.parameters, *second.parameters])
-    return Comparison(
+    return RecordComparison(
         tuple(changes),
         _joint(first, second, judged, changes),
         tuple(name for name in either if name not in shared),

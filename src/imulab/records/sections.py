@@ -50,7 +50,7 @@ _Reader: TypeAlias = Callable[[Any, Place, _Counts], Any]
 
 
 @dataclass(frozen=True)
-class Kind:
+class PlainKind:
     """A plain value: what messages call it, and its test."""
 
     name: str
@@ -61,13 +61,13 @@ def _is_number(value: Any) -> bool:
     return type(value) is float or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-Positive = Annotated[float, Kind("a number above 0", lambda value: _is_number(value) and value > 0)]
-Size = Annotated[float, Kind("a number of 0 or more", lambda value: _is_number(value) and value >= 0)]
+Positive = Annotated[float, PlainKind("a number above 0", lambda value: _is_number(value) and value > 0)]
+Size = Annotated[float, PlainKind("a number of 0 or more", lambda value: _is_number(value) and value >= 0)]
 _PLAIN = {
-    float: Kind("a number", _is_number),
-    int: Kind("a whole number of 0 or more", lambda value: type(value) is int and 0 <= value < 2**53),
-    str: Kind("a text", lambda value: isinstance(value, str)),
-    bool: Kind("true or false", lambda value: type(value) is bool),
+    float: PlainKind("a number", _is_number),
+    int: PlainKind("a whole number of 0 or more", lambda value: type(value) is int and 0 <= value < 2**53),
+    str: PlainKind("a text", lambda value: isinstance(value, str)),
+    bool: PlainKind("true or false", lambda value: type(value) is bool),
 }
 
 
@@ -256,8 +256,8 @@ def _reader(kind: Any) -> _Reader:
     if kind in _PLAIN:
         return _plain_reader(_PLAIN[kind])
     if origin is Literal:
-        return _plain_reader(Kind(f"one of {' '.join(arguments)}", lambda word: word in arguments))
-    if origin is Annotated and isinstance(arguments[1], Kind):
+        return _plain_reader(PlainKind(f"one of {' '.join(arguments)}", lambda word: word in arguments))
+    if origin is Annotated and isinstance(arguments[1], PlainKind):
         return _plain_reader(arguments[1])
     if origin is Annotated:
         return _list_reader(get_args(arguments[0])[0], arguments[1])
@@ -281,7 +281,7 @@ def _read_number(value: Any, where: Place, counts: _Counts) -> float:
     return float(value)
 
 
-def _plain_reader(kind: Kind) -> _Reader:
+def _plain_reader(kind: PlainKind) -> _Reader:
     fits = kind.fits
 
     def read_plain(value: Any, where: Place, counts: _Counts) -> Any:

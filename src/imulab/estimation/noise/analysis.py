@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.estimation.distributions import chi_square_tail, normal_cdf
-from imulab.estimation.noise.cleaning import STEP, Step, find_steps, step_coefficients
+from imulab.estimation.noise.cleaning import STEP, LevelChange, find_steps, step_coefficients
 from imulab.estimation.noise.likelihood import (
     Allowance,
     Band,
@@ -158,7 +158,7 @@ _NODES = 32
 
 
 @dataclass(frozen=True)
-class Fit:
+class MomentsFit:
     """How well a model fits.
 
     Attributes
@@ -182,7 +182,7 @@ class Fit:
     values: Array
 
 
-def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> Fit:
+def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> MomentsFit:
     """Hold the Allan variances at octaves of averaging time, 4/f_max to L/10, against a model.
 
     ``J = r' Omega^-1 r``, r the difference that is left when the parameters are fitted to it, of cube roots, which are
@@ -203,7 +203,7 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> F
     m = lowest * 2 ** np.arange(octaves)
     tau = m.astype(np.float64) * interval
     bins, present = prepare(spectra), np.flatnonzero(values > 0)
-    nothing = Fit(0.0, 0, 1.0, tau, np.empty(0), np.empty(0), values)
+    nothing = MomentsFit(0.0, 0, 1.0, tau, np.empty(0), np.empty(0), values)
     if octaves <= len(present):
         return nothing
     weight = np.concatenate([_weights(each, m) for each in spectra], axis=1)
@@ -230,7 +230,7 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> F
     better = values.copy()
     better[present] *= np.exp(np.clip(step, -2, 2))
     probability = float(chi_square_tail(statistic, freedom)) if freedom else 1.0
-    return Fit(statistic, freedom, probability, tau, found, predicted[0], better)
+    return MomentsFit(statistic, freedom, probability, tau, found, predicted[0], better)
 
 
 def allan_of_bins(records: Sequence[Sequence[Spectrum]]) -> tuple[Array, Array]:
@@ -512,7 +512,7 @@ class Analysis:
         return np.asarray(self.choice.covariance[0, self.index])
 
     @cached_property
-    def test(self) -> Fit:
+    def test(self) -> MomentsFit:
         """The test of fit of the chosen candidate."""
         return test_of_fit(self.spectra, self.values, self.band.highest)
 
@@ -532,7 +532,7 @@ class Analysis:
         """Return the variance of the coefficients in the bins of each spectrum, (b,)."""
         return _split(self.bins.variances(self.values[None])[0], self.spectra)
 
-    def steps(self, stretches: Sequence[Stretch], limit: float = STEP) -> list[tuple[Step, ...]]:
+    def steps(self, stretches: Sequence[Stretch], limit: float = STEP) -> list[tuple[LevelChange, ...]]:
         """Return the changes of level of stretches, its own or these before something was taken out, by its noise."""
         found, start = [], 0
         variances = self.variances()
@@ -624,7 +624,7 @@ def intervals_of(found: Sequence[Analysis], index: Sequence[int]) -> list[tuple[
     return [ends[k] for k in range(len(found))]
 
 
-def without_steps(stretches: Sequence[Stretch], steps: Sequence[Sequence[Step]]) -> list[Stretch]:
+def without_steps(stretches: Sequence[Stretch], steps: Sequence[Sequence[LevelChange]]) -> list[Stretch]:
     """Return stretches without the changes of level that were found in them."""
     cleaned = []
     for stretch, its in zip(stretches, steps, strict=True):

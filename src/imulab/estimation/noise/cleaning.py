@@ -41,7 +41,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Step:
+class LevelChange:
     """A change of the level: time from the start of the stretch, s, its size, and the size's standard uncertainty."""
 
     time: float
@@ -226,7 +226,9 @@ def _sine_coefficients(j: Array, place: float, count: int) -> Array:
     return np.asarray(np.stack([cosine, sine]) * np.sqrt(2 / count) / 4)
 
 
-def find_steps(slow: Array, variances: Array, count: int, interval: float, limit: float = STEP) -> tuple[Step, ...]:
+def find_steps(
+    slow: Array, variances: Array, count: int, interval: float, limit: float = STEP
+) -> tuple[LevelChange, ...]:
     """Find steps of the level, one after the other, by their size over its standard uncertainty under the noise model.
 
     A step at sample k has the coefficients ``h_j = -sqrt(2/n) sin(pi j k/n)/s_j``, s_j = 2 sin(pi j/2n); its size is
@@ -242,13 +244,13 @@ def find_steps(slow: Array, variances: Array, count: int, interval: float, limit
     limit
         Of ``|z|``.
     """
-    found: list[Step] = []
+    found: list[LevelChange] = []
     c = slow
     while len(found) < _MOST_STEPS:
         place, size, u = _largest_step(c, variances, count)
         if not abs(size) > limit * u:
             break
-        found.append(Step(place * interval, size, u))
+        found.append(LevelChange(place * interval, size, u))
         c = c - size * step_coefficients(len(c), place, count)
     return tuple(sorted(found, key=lambda step: step.time))
 

@@ -27,9 +27,9 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from imulab.errors import OptionError, quoted
-from imulab.live.page.files import Files, Opening, Openings
-from imulab.live.page.jobs import Form, Job, Jobs
-from imulab.live.page.server import Hub, Message, Part, receive_file, report_response, to_json
+from imulab.live.page.files import FolderFiles, Opening, Openings
+from imulab.live.page.jobs import Form, Jobs, PageJob
+from imulab.live.page.server import Hub, Message, PagePart, receive_file, report_response, to_json
 from imulab.options import options_of
 from imulab.reading import Reading
 
@@ -42,7 +42,7 @@ _ANY = "application/octet-stream"
 _PIECE = 1 << 20
 
 
-class Workbench(Part):
+class Workbench(PagePart):
     """The part of the page where recordings become records.
 
     Parameters
@@ -55,7 +55,7 @@ class Workbench(Part):
 
     name: ClassVar[str] = "workbench"
 
-    def __init__(self, files: Files, forms: Mapping[str, Form]) -> None:
+    def __init__(self, files: FolderFiles, forms: Mapping[str, Form]) -> None:
         super().__init__()
         self._files, self._forms = files, forms
         self._hub = Hub()
@@ -101,7 +101,7 @@ class Workbench(Part):
         number = next(self._lists)
         return {"type": "files", "number": number, "folder": str(self._files.folder), "files": self._files.entries()}
 
-    def _tell_job(self, job: Job) -> None:
+    def _tell_job(self, job: PageJob) -> None:
         self._hub.tell(_job_message(job))
         if job.ended is not None:
             self._hub.tell(self._list_message())
@@ -227,7 +227,7 @@ def _json(value: Any) -> Response:
     return Response(to_json(value), media_type="application/json")
 
 
-def _job_message(job: Job) -> Message:
+def _job_message(job: PageJob) -> Message:
     there = [path for path in job.outputs if os.path.lexists(path)] if job.ended is not None else []
     return {"type": "job", **asdict(job), "outputs": there}
 

@@ -112,7 +112,7 @@ class Writer:
 
 
 @dataclass(frozen=True)
-class View:
+class CurveView:
     """What a screen shows of a range.
 
     Attributes
@@ -135,7 +135,7 @@ class View:
     breaks: list[int]
 
 
-def view(folder: Path, head: Head, start: float | None, stop: float | None, width: int) -> View:
+def view(folder: Path, head: Head, start: float | None, stop: float | None, width: int) -> CurveView:
     """Return the curves of a range for a screen.
 
     Parameters
@@ -178,7 +178,7 @@ def view(folder: Path, head: Head, start: float | None, stop: float | None, widt
         edges = np.append(edges, last)
     at, until = place.of(edges[:-1]), place.of(edges[1:] - 1)
     wide = np.flatnonzero(at[1:] - until[:-1] > head.longest_step) + 1 if head.timed else np.empty(0, np.int64)
-    return View(edges, at, until, low, high, wide.tolist())
+    return CurveView(edges, at, until, low, high, wide.tolist())
 
 
 class _Places:

@@ -20,7 +20,7 @@ from imulab.device.unit import is_blob
 from imulab.display import has_hidden
 from imulab.errors import ImulabError, OptionError, quoted
 from imulab.files import load_toml
-from imulab.live.page.curves import Head, View, view
+from imulab.live.page.curves import CurveView, Head, view
 from imulab.live.page.server import inside
 from imulab.records import is_json
 
@@ -36,7 +36,7 @@ _KINDS = {".html": "report", ".htm": "report", ".toml": "manifest", ".zip": "oth
 
 
 @dataclass(frozen=True)
-class Entry:
+class FileEntry:
     """One file: what the command line calls it, its own name, its kind, bytes, and when it was changed, s.
 
     The kind is ``recording``, ``record``, ``report``, ``manifest``, ``folder`` or ``other``; `own` is whether
@@ -51,7 +51,7 @@ class Entry:
     own: bool = False
 
 
-class Files:
+class FolderFiles:
     """The files of a session.
 
     Parameters
@@ -98,7 +98,7 @@ class Files:
                 f"{self.folder}: cannot be made: {error.strerror}; start in a folder of your own"
             ) from None
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[FileEntry]:
         """Return the files there are now, those of the command line first, then by name."""
         there = self.folder.iterdir() if self.folder.is_dir() else ()  # another program may have removed it
         own = sorted(str(path) for path in there if _plain(path.name) and path.name[0] != ".")
@@ -173,7 +173,7 @@ class Files:
             path = checked(self.folder, f"{stem}-{number}{dot}{rest}")
         return str(path)
 
-    def _entry(self, name: str) -> Entry | None:
+    def _entry(self, name: str) -> FileEntry | None:
         path = Path(name)
         try:
             status = path.stat()
@@ -182,7 +182,7 @@ class Files:
         key = name, status.st_mtime_ns, status.st_size
         if key not in self._kinds:
             self._kinds[key] = _kind(path)
-        return Entry(name, path.name, self._kinds[key], status.st_size, status.st_mtime, self.owns(name))
+        return FileEntry(name, path.name, self._kinds[key], status.st_size, status.st_mtime, self.owns(name))
 
     def end(self) -> bool:
         """Remove the folder where nothing is in it; return whether something is."""
@@ -325,7 +325,7 @@ class Openings:
                 return found
         raise OptionError("this recording is not open any more: choose it again")
 
-    def view(self, opening: Opening, start: float | None, stop: float | None, width: int) -> View:
+    def view(self, opening: Opening, start: float | None, stop: float | None, width: int) -> CurveView:
         """Return the curves of a range; errors as for `view` of `curves`."""
         return view(opening.folder, opening.head, start, stop, width)
 

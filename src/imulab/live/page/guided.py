@@ -40,7 +40,7 @@ from starlette.routing import Route
 
 from imulab.errors import ImulabError, OptionError, quoted
 from imulab.live.formats import UnknownFormatError
-from imulab.live.page.server import Hub, Message, Part, report_response
+from imulab.live.page.server import Hub, Message, PagePart, report_response
 from imulab.live.runner import Runner
 from imulab.live.session import Event
 from imulab.live.view import View, corrected_reading, in_words
@@ -55,7 +55,7 @@ _EVENTS = 60
 _PATIENCE = 5.0
 
 
-class GuidedPart(Part):
+class GuidedPart(PagePart):
     """The guided session as a part of the page.
 
     Parameters

@@ -28,7 +28,7 @@ _LONGEST_TEXT = 10_000
 
 
 @dataclass(frozen=True)
-class Field:
+class FormField:
     """One parameter of a command.
 
     Attributes
@@ -79,7 +79,7 @@ class Form:
     path: str
     summary: str
     help: str
-    fields: tuple[Field, ...]
+    fields: tuple[FormField, ...]
 
     def words(
         self, values: Mapping[str, Any], file: Callable[[str], str], output: Callable[[str, str], str]
@@ -119,17 +119,17 @@ def forms(commands: Iterable[Any]) -> dict[str, Form]:
 def _form(command: Any) -> Form:
     drawn = any(option.keyword == "report" for option in command.options)
     arguments = [
-        Field(each.keyword, "", "files" if each.many else "file", each.shows, "", "", (), False, each.required)
+        FormField(each.keyword, "", "files" if each.many else "file", each.shows, "", "", (), False, each.required)
         for each in command.arguments
     ]
     options = [_field(option, drawn=drawn) for option in command.options]
     return Form(command.path, command.summary.rstrip("."), " ".join(command.help.split()), (*arguments, *options))
 
 
-def _field(option: Option, *, drawn: bool) -> Field:
+def _field(option: Option, *, drawn: bool) -> FormField:
     """Return an option as a field; `drawn` says that the command writes a report beside its output: a record."""
     shows, text = option.shows if option.takes_value else "", f"{option.help} [{option.unit}]" * bool(option.unit)
-    field = Field(option.keyword, option.flags[-1], option.kind, shows, text or option.help, "", group=option.group)
+    field = FormField(option.keyword, option.flags[-1], option.kind, shows, text or option.help, "", group=option.group)
     field = replace(field, required=option.required)
     if "-o" in option.flags or field.flag == "--report":
         return replace(field, flag=option.flags[0], kind="output", ending=_ending(shows, drawn=drawn))
@@ -153,7 +153,7 @@ def _ending(shows: str, *, drawn: bool) -> str:
     return ".json" if drawn else ".csv"
 
 
-def _words(field: Field, value: Any, file: Callable[[str], str], output: Callable[[str, str], str]) -> list[str]:
+def _words(field: FormField, value: Any, file: Callable[[str], str], output: Callable[[str, str], str]) -> list[str]:
     called = field.flag or field.shows or field.name
     if field.kind == "switch" or field.kind == "either":
         if not isinstance(value, bool | None):
@@ -183,7 +183,7 @@ def _words(field: Field, value: Any, file: Callable[[str], str], output: Callabl
     return [] if text == field.default else _option(field.flag, text)
 
 
-def _file_or_word(field: Field, text: str, file: Callable[[str], str]) -> str:
+def _file_or_word(field: FormField, text: str, file: Callable[[str], str]) -> str:
     """Return what the command line calls a file of the session, or a word that names no other file."""
     try:
         return file(text)
@@ -214,7 +214,7 @@ _WINDOWS = sys.platform == "win32"
 
 
 @dataclass
-class Job:
+class PageJob:
     """One command.
 
     Attributes
@@ -253,14 +253,14 @@ class Job:
 class Jobs:
     """The commands of a session; `tell` is called with every change, from other threads."""
 
-    def __init__(self, tell: Callable[[Job], object]) -> None:
-        self.jobs: dict[int, Job] = {}
+    def __init__(self, tell: Callable[[PageJob], object]) -> None:
+        self.jobs: dict[int, PageJob] = {}
         self._tell = tell
         self._processes: dict[int, subprocess.Popen[str]] = {}
         self._watches: dict[int, threading.Thread] = {}
         self._due: set[int] = set()
 
-    def run(self, path: str, words: Sequence[str], outputs: Sequence[str]) -> Job:
+    def run(self, path: str, words: Sequence[str], outputs: Sequence[str]) -> PageJob:
         """Begin to run a command in the working folder.
 
         Raises
@@ -269,7 +269,7 @@ class Jobs:
             It cannot be started.
         """
         number = len(self.jobs) + 1
-        job = Job(number, path, shlex.join(["imulab", *words]), list(words), list(outputs))
+        job = PageJob(number, path, shlex.join(["imulab", *words]), list(words), list(outputs))
         process = _started(words)
         self.jobs[number], self._processes[number] = job, process
         self._watches[number] = threading.Thread(target=self._watch, args=(job, process), daemon=True)
@@ -295,7 +295,7 @@ class Jobs:
         for number in list(self._processes):
             self.cancel(number)
 
-    def _watch(self, job: Job, process: subprocess.Popen[str]) -> None:
+    def _watch(self, job: PageJob, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
         assert process.stderr is not None
         reader = threading.Thread(target=self._listen, args=(job, process.stderr), daemon=True)
@@ -312,14 +312,14 @@ class Jobs:
         del self._processes[job.number]
         self._tell(job)
 
-    def _listen(self, job: Job, stream: IO[str]) -> None:
+    def _listen(self, job: PageJob, stream: IO[str]) -> None:
         with stream:
             for line in stream:
                 if len(job.said) < _MOST_LINES:
                     job.said.append(line.rstrip()[:_LONGEST_LINE])
                     self._soon(job)
 
-    def _soon(self, job: Job) -> None:
+    def _soon(self, job: PageJob) -> None:
         """Tell of a job in a moment, with what it says until then: many lines are not told one by one."""
         if job.number not in self._due:
             self._due.add(job.number)
@@ -327,7 +327,7 @@ class Jobs:
             timer.daemon = True
             timer.start()
 
-    def _tell_due(self, job: Job) -> None:
+    def _tell_due(self, job: PageJob) -> None:
         self._due.discard(job.number)
         if job.ended is None:
             self._tell(job)

@@ -249,7 +249,7 @@ Message = dict[str, Any]
 _MOST_WAITING = 1000
 
 
-class Part:
+class PagePart:
     """One area of the page; `guided.GuidedPart` is the guided session.
 
     Attributes
@@ -284,7 +284,7 @@ class Hub:
     """The pages that are connected, and the way to them from every thread."""
 
     def __init__(self) -> None:
-        self._lines: set[Line] = set()
+        self._lines: set[TextLine] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self.stop: Callable[[], None] = lambda: None
         """Ends the server, from every thread."""
@@ -305,11 +305,11 @@ class Hub:
         """Begin to pass messages on."""
         self._loop = loop
 
-    def join(self, line: Line) -> None:
+    def join(self, line: TextLine) -> None:
         """Connect a page."""
         self._lines.add(line)
 
-    def leave(self, line: Line) -> None:
+    def leave(self, line: TextLine) -> None:
         """Let go of a page."""
         self._lines.discard(line)
 
@@ -318,7 +318,7 @@ class Hub:
             line.put(kind, text, latest=latest)
 
 
-class Line:
+class TextLine:
     """What waits for one page: a slow one gets the latest view, and does not hold the others up."""
 
     def __init__(self) -> None:
@@ -373,7 +373,7 @@ _SOCKET_LIMIT = 1 << 16
 _GRACE = 2
 
 
-def application(token: str, parts: Sequence[Part], *, host: str = LOCAL, limit: int = UPLOAD_LIMIT) -> Starlette:
+def application(token: str, parts: Sequence[PagePart], *, host: str = LOCAL, limit: int = UPLOAD_LIMIT) -> Starlette:
     """Return the application of a page with these parts at an address; its `state` has `hub`, `token` and `once`."""
     hub, once = Hub(), new_token()
     known = {kind: take for part in parts for kind, take in part.handlers.items()}
@@ -390,7 +390,7 @@ def application(token: str, parts: Sequence[Part], *, host: str = LOCAL, limit: 
 
     async def speak(page: WebSocket) -> None:
         await page.accept()
-        line = Line()
+        line = TextLine()
         for message in (hello, *(each for part in parts for each in part.greet())):
             line.put("greeting", to_json(message))
         hub.join(line)
@@ -425,7 +425,7 @@ def application(token: str, parts: Sequence[Part], *, host: str = LOCAL, limit: 
 
 
 def serve(
-    parts: Sequence[Part],
+    parts: Sequence[PagePart],
     port: int = 0,
     *,
     host: str | None = None,
@@ -539,14 +539,14 @@ def _file(path: str) -> Any:
     return lambda request: FileResponse(path)
 
 
-async def _write(page: WebSocket, line: Line) -> None:
+async def _write(page: WebSocket, line: TextLine) -> None:
     with suppress(WebSocketDisconnect, RuntimeError):  # it has gone: the reader finds out, too
         while True:
             for text in await line.get():
                 await page.send_text(text)
 
 
-def _take(text: str, known: Mapping[str, Callable[[Message], object]], line: Line) -> None:
+def _take(text: str, known: Mapping[str, Callable[[Message], object]], line: TextLine) -> None:
     """Hand a page's message to the part that knows it."""
     try:
         message = json.loads(text)

@@ -10,13 +10,13 @@ from imulab.errors import RecordError
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.centrifuge.manifest import curve
 from imulab.procedures.centrifuge.schema import (
-    Centrifuge,
+    BudgetError,
+    CentrifugeRecord,
+    CentrifugeSummary,
     CycleRow,
-    Error,
-    Fit,
-    Level,
-    Line,
-    Run,
+    DriftLine,
+    LevelRow,
+    RunRow,
     centrifuge_of,
     force_of,
     level_of,
@@ -70,7 +70,7 @@ _BUDGET = {
 }
 
 
-def parameters_table(record: Calibration, fit: Fit) -> ReportTable:
+def parameters_table(record: Calibration, fit: CentrifugeSummary) -> ReportTable:
     """Return every parameter with its uncertainty and interval."""
     rows = []
     for name, parameter in record.parameters.items():
@@ -90,7 +90,7 @@ def parameters_table(record: Calibration, fit: Fit) -> ReportTable:
     )
 
 
-def level_table(record: Calibration, levels: list[Level], sets: list[str]) -> ReportTable:
+def level_table(record: Calibration, levels: list[LevelRow], sets: list[str]) -> ReportTable:
     """Return K and zeta at each level."""
     columns = ["level", "specific force, g", "runs"]
     for prefix in sets:
@@ -117,7 +117,7 @@ def level_table(record: Calibration, levels: list[Level], sets: list[str]) -> Re
     )
 
 
-def curve_table(fit: Fit, sets: list[str]) -> ReportTable:
+def curve_table(fit: CentrifugeSummary, sets: list[str]) -> ReportTable:
     """Return the models of the curve that were tried."""
     rows = []
     for prefix in sets:
@@ -163,7 +163,7 @@ def cycle_tables(cycles: list[CycleRow]) -> list[ReportTable]:
     ]
 
 
-def budget_table(fit: Fit) -> ReportTable:
+def budget_table(fit: CentrifugeSummary) -> ReportTable:
     """Return the error budget."""
     rows = []
     for entry in fit.error_budget:
@@ -181,7 +181,7 @@ def budget_table(fit: Fit) -> ReportTable:
     )
 
 
-def _sized(entry: Error, factor: float) -> tuple[str, str]:
+def _sized(entry: BudgetError, factor: float) -> tuple[str, str]:
     value, u = entry.value, entry.standard_uncertainty
     if value is None:
         return "–", "–" if u is None else plain_number(u * factor, 2)
@@ -202,7 +202,7 @@ def _share(value: float) -> str:
     return "< 0.0001 %" if percent < 1e-4 else f"{plain_number(percent, 2)} %"
 
 
-def run_table(runs: list[Run]) -> ReportTable:
+def run_table(runs: list[RunRow]) -> ReportTable:
     """Return what was measured in each run; a column that says the same of all runs goes to the caption."""
     axes = [axis for axis in "xy" if any(run.line(axis) is not None for run in runs)]
     origins = list(dict.fromkeys(run.table_rate_from for run in runs if run.role == "loaded"))
@@ -236,7 +236,7 @@ def run_table(runs: list[Run]) -> ReportTable:
     return ReportTable("Runs", caption, columns, rows)
 
 
-def _line(entry: Line) -> tuple[str, str]:
+def _line(entry: DriftLine) -> tuple[str, str]:
     size = from_si(float(np.hypot(entry.A, entry.B)), "deg/h")
     u = from_si(float(np.sqrt(max(np.trace(np.array(entry.covariance)), 0.0) / 2)), "deg/h")
     return format_uncertain(size, u)
@@ -536,7 +536,7 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
     return Figure("Complex drift factor of each level", caption, traces, layout, height=440)
 
 
-def _repeatability(record: Calibration, r: Centrifuge, sets: list[str]) -> Figure:
+def _repeatability(record: Calibration, r: CentrifugeRecord, sets: list[str]) -> Figure:
     """K of every run against its level's K, by power cycle."""
     traces: list[dict[str, Any]] = []
     axes = list(dict.fromkeys(p[0] for p in sets))
@@ -587,7 +587,7 @@ def _repeatability(record: Calibration, r: Centrifuge, sets: list[str]) -> Figur
     return Figure("Repeatability over power cycles", caption, traces, layout, height=400)
 
 
-def _spectra(r: Centrifuge) -> list[Figure]:
+def _spectra(r: CentrifugeRecord) -> list[Figure]:
     """Spectra of X, FOG and residual around the table rate, at the lowest, a middle and the highest level."""
     found = [spectrum for spectrum in r.data.spectra if spectrum.spin_axis == r.data.spectra[0].spin_axis]
     if not found:

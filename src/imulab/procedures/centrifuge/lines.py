@@ -52,7 +52,7 @@ _GAP = 2.5
 
 
 @dataclass(frozen=True)
-class Samples:
+class CellSamples:
     """A block of a run in SI: time (n,), channels (k, n), chi, rad, (n,), or None."""
 
     time: Array
@@ -138,7 +138,7 @@ def sampling_period(time: Array) -> float:
     return 1 / nearest if nearest and abs(step * nearest - 1) < 1e-9 else step
 
 
-def compress(blocks: Iterable[Samples], table_rate: float, net_rate: float) -> Cells | None:
+def compress(blocks: Iterable[CellSamples], table_rate: float, net_rate: float) -> Cells | None:
     """Sum a run over cells, block by block.
 
     Parameters
@@ -212,7 +212,7 @@ class _Work:
         self.table_rate, self.net_rate = table_rate, net_rate
         self.design = np.empty((COLUMNS + len(offset), 0))
 
-    def sum(self, part: Samples, number: int) -> tuple[Array, Array, Array, Array, Array, Array | None]:
+    def sum(self, part: CellSamples, number: int) -> tuple[Array, Array, Array, Array, Array, Array | None]:
         """Return centres, moments and series of `number` whole cells."""
         shaped = part.time.reshape(number, self.cell)
         centre = shaped.mean(axis=1)
@@ -228,13 +228,13 @@ class _Work:
         angle = None if part.angle is None else part.angle[::inside].copy()
         return centre, moments, time, series, part.time[::inside].copy(), angle
 
-    def sum_about(self, part: Samples, centre: float) -> Array:
+    def sum_about(self, part: CellSamples, centre: float) -> Array:
         """Return the moments of a part with time counted from `centre`."""
         design = self._fill(part, part.time - centre)
         moments: Array = design @ design.T
         return moments
 
-    def _fill(self, part: Samples, tau: Array) -> Array:
+    def _fill(self, part: CellSamples, tau: Array) -> Array:
         count = len(tau)
         if self.design.shape[1] != count:
             self.design = np.empty((len(self.design), count))
@@ -258,9 +258,9 @@ class _Work:
         return rows
 
 
-def pieces_of(blocks: Iterable[Samples]) -> Iterator[Samples]:
+def pieces_of(blocks: Iterable[CellSamples]) -> Iterator[CellSamples]:
     """Yield the blocks, the first ones joined until there is enough to find the sampling period."""
-    waiting: list[Samples] = []
+    waiting: list[CellSamples] = []
     count = 0
     enough = False
     for block in blocks:
@@ -277,26 +277,26 @@ def pieces_of(blocks: Iterable[Samples]) -> Iterator[Samples]:
         yield _joined(*waiting)
 
 
-def _none_first(pieces: Iterator[Samples]) -> Iterator[Samples | None]:
+def _none_first(pieces: Iterator[CellSamples]) -> Iterator[CellSamples | None]:
     """Yield None for what is already at hand, then the rest."""
     yield None
     yield from pieces
 
 
-def _joined(*parts: Samples) -> Samples:
+def _joined(*parts: CellSamples) -> CellSamples:
     if len(parts) == 1:
         return parts[0]
     angles = [part.angle for part in parts if part.angle is not None]
-    return Samples(
+    return CellSamples(
         np.concatenate([part.time for part in parts]),
         np.concatenate([part.channels for part in parts], axis=1),
         np.concatenate(angles) if angles else None,
     )
 
 
-def _part(samples: Samples, first: int, last: int) -> Samples:
+def _part(samples: CellSamples, first: int, last: int) -> CellSamples:
     angle = None if samples.angle is None else samples.angle[first:last]
-    return Samples(samples.time[first:last], samples.channels[:, first:last], angle)
+    return CellSamples(samples.time[first:last], samples.channels[:, first:last], angle)
 
 
 # Regression of a run's channels on its lines, from cells: at given rates, with rates refined, and its noise.
@@ -313,7 +313,7 @@ _STEPS = 30
 
 
 @dataclass(frozen=True)
-class Regression:
+class LineRegression:
     """Lines of all channels of a run.
 
     Attributes
@@ -369,7 +369,7 @@ def basis(cells: Cells, middle: float, half: float, table_shift: float, net_shif
     return P
 
 
-def solve(cells: Cells, table_shift: float = 0.0, net_shift: float = 0.0) -> Regression:
+def solve(cells: Cells, table_shift: float = 0.0, net_shift: float = 0.0) -> LineRegression:
     """Regress all channels at the cells' rates plus the given shifts."""
     middle, half = _span(cells)
     P = basis(cells, middle, half, table_shift, net_shift)
@@ -377,7 +377,7 @@ def solve(cells: Cells, table_shift: float = 0.0, net_shift: float = 0.0) -> Reg
     kept = _independent(normal)
     inverse = np.zeros((SIZE, SIZE))
     inverse[np.ix_(kept, kept)] = _inverse(normal[np.ix_(kept, kept)])
-    return Regression(inverse @ right, inverse, table_shift, net_shift, middle, half, kept)
+    return LineRegression(inverse @ right, inverse, table_shift, net_shift, middle, half, kept)
 
 
 def _span(cells: Cells) -> tuple[float, float]:
@@ -474,7 +474,7 @@ def _rate_column(cells: Cells, P: Array, beta: Array, row: int, linear: int, mid
 
 
 @dataclass(frozen=True)
-class Scatter:
+class LineScatter:
     """A line's scatter over blocks.
 
     Attributes
@@ -500,8 +500,8 @@ class Scatter:
 
 
 def scatter(
-    cells: Cells, solution: Regression, row: int = LINE, *, least: float = 0.0, blocks: int = _BLOCKS
-) -> Scatter | None:
+    cells: Cells, solution: LineRegression, row: int = LINE, *, least: float = 0.0, blocks: int = _BLOCKS
+) -> LineScatter | None:
     """Return the scatter of a line over blocks of at least `least` seconds; None with fewer than three of them.
 
     Each block has a constant of its own, and a trend where it holds two cells or more, so that slow drift does not pass
@@ -536,7 +536,7 @@ def scatter(
     if not (np.isfinite(gain).all() and gain.min() > 0):  # blocks too short to tell the line from their constant
         return None
     noise = np.einsum("m,mi,mj->ij", 1 / gain, deviation, deviation.conj()) / (2 * (count - 1))
-    return Scatter(noise, 2.0 * (count - 1), deviation, centre, gain, edges)
+    return LineScatter(noise, 2.0 * (count - 1), deviation, centre, gain, edges)
 
 
 # The source's reduction: sums over whole periods at the manifest's rate, as the run streams by.
@@ -553,7 +553,7 @@ class PeriodSums:
         self._step = 0.0
         self._time = (0.0, 0.0)
 
-    def watch(self, blocks: Iterable[Samples]) -> Iterator[Samples]:
+    def watch(self, blocks: Iterable[CellSamples]) -> Iterator[CellSamples]:
         """Pass blocks on and sum them; the first block must hold what the sampling period is found from."""
         for block in blocks:
             if not self._index:
@@ -572,7 +572,7 @@ class PeriodSums:
         span = self._time[1] - self._time[0]
         return abs(span - (self._index - 1) * self._step) < 0.5 * self._step
 
-    def _add(self, block: Samples) -> None:
+    def _add(self, block: CellSamples) -> None:
         """Sum cosine and sine times the channels and 1 from period to period."""
         count = len(block.time)
         j = np.arange(self._index, self._index + count)
@@ -762,7 +762,7 @@ class Rates:
         What a user should know.
     """
 
-    solution: Regression
+    solution: LineRegression
     table_rate: float
     table_uncertainty: float | None
     origin: str
@@ -858,7 +858,7 @@ def _mismatch(expected: float, found: float, place: str) -> DataError:
     )
 
 
-def _check_units(solution: Regression, noise: Complex, place: str) -> list[str]:
+def _check_units(solution: LineRegression, noise: Complex, place: str) -> list[str]:
     """Check Earth rate for a size that it cannot have, and the gyroscope's size and direction against the FOG's."""
     line = solution.line(ROOM)
     fog, earth = line[-1], float(abs(line[-1]))
@@ -888,14 +888,14 @@ def _check_units(solution: Regression, noise: Complex, place: str) -> list[str]:
     return warnings
 
 
-def _noise(cells: Cells, solution: Regression, row: int) -> tuple[Complex, float]:
+def _noise(cells: Cells, solution: LineRegression, row: int) -> tuple[Complex, float]:
     """Noise of a line by its scatter over blocks, or by the residuals where the run is too short, and its freedom."""
     least = 2 * np.pi / max(abs(cells.net_rate), 1e-9) if row == ROOM else 0.0
     found = scatter(cells, solution, row, least=min(least, cells.duration / 3))
     return (residual_noise(cells, solution), 1e9) if found is None else (found.noise, found.freedom)
 
 
-def residual_noise(cells: Cells, solution: Regression) -> Complex:
+def residual_noise(cells: Cells, solution: LineRegression) -> Complex:
     """Return the covariance of a sample's residuals: that of white noise, shape (k, k)."""
     columns = cells.moments.shape[1] - len(cells.offset)
     P = basis(cells, solution.middle, solution.half, solution.table_shift, solution.net_shift) @ solution.coefficients
@@ -907,7 +907,7 @@ def residual_noise(cells: Cells, solution: Regression) -> Complex:
     return noise
 
 
-def _significant(solution: Regression, row: int, channel: int, noise: Complex) -> bool:
+def _significant(solution: LineRegression, row: int, channel: int, noise: Complex) -> bool:
     size = abs(solution.line(row)[channel])
     power = 2 * solution.gain(row) * float(noise[channel, channel].real)
     return bool(size > FAINT and size**2 > _SIGNIFICANT * power)

@@ -38,7 +38,7 @@ _MISMATCH = 5e-3
 
 
 @dataclass(frozen=True)
-class Entry:
+class BudgetEntry:
     """One error.
 
     Attributes
@@ -83,7 +83,7 @@ def error_budget(
     return [asdict(_corrected_entry(entry) if entry.error in corrected else entry) for entry in entries]
 
 
-def _corrected_entry(entry: Entry) -> Entry:
+def _corrected_entry(entry: BudgetEntry) -> BudgetEntry:
     """An entry once its value is corrected: what is left is its uncertainty."""
     share = (entry.standard_uncertainty or 0.0) / max(
         np.hypot(entry.value or 0.0, entry.standard_uncertainty or 0.0), 1e-300
@@ -91,14 +91,14 @@ def _corrected_entry(entry: Entry) -> Entry:
     return replace(entry, effect=entry.effect * share, removed=entry.effect, basis=f"{entry.basis}; corrected")
 
 
-def _tilt(test: Measured) -> list[Entry]:
+def _tilt(test: Measured) -> list[BudgetEntry]:
     if not test.encoder:
         size = np.abs(test.fog / test.arm)
         variance = test.fog_variance / test.arm**2
         weight = 1 / np.maximum(variance, 1e-300)
         value, u = float((weight * size).sum() / weight.sum()), float(1 / np.sqrt(weight.sum()))
         basis = "FOG line, flexure included"
-        return [Entry("tilt", True, value, u, "rad", 0.0, test.fog_share, basis)]
+        return [BudgetEntry("tilt", True, value, u, "rad", 0.0, test.fog_share, basis)]
     parameters, covariance, _ = tilted(test)
     entries = []
     top = float(test.force.max())
@@ -111,16 +111,16 @@ def _tilt(test: Measured) -> list[Entry]:
         pair = parameters[index] + 1j * parameters[index + 1]
         u = float(np.sqrt((covariance[index, index] + covariance[index + 1, index + 1]) / 2))
         removed = abs(pair) * factor * float(np.abs(test.arm).max()) / top / test.K
-        entries.append(Entry(error, True, float(abs(pair)), u, unit, 0.0, removed, basis))
+        entries.append(BudgetEntry(error, True, float(abs(pair)), u, unit, 0.0, removed, basis))
     return entries
 
 
-def _flexure(test: Measured) -> Entry:
+def _flexure(test: Measured) -> BudgetEntry:
     """Differential flexure: what changes sign with the sense of rotation."""
     reach = float(np.abs(test.arm).max()) / test.K
     senses = np.sign(test.arm)
     if not test.encoder or len(np.unique(senses)) < 2:
-        return Entry(
+        return BudgetEntry(
             "differential flexure", False, FLEXURE, None, "rad/(m/s^2)", FLEXURE * reach, None,
             "needs both senses, encoder",
         )  # fmt: skip
@@ -133,85 +133,86 @@ def _flexure(test: Measured) -> Entry:
     found = [weighted(design, part, test.line_variance) for part in (test.line.real, test.line.imag)]
     value = abs(complex(found[0][0][-1], found[1][0][-1]))
     u = float(np.sqrt(found[0][1][-1, -1]))
-    return Entry(
+    return BudgetEntry(
         "differential flexure", True, value, u, "rad/(m/s^2)", 0.0, value * reach,
         "difference of the senses",
     )  # fmt: skip
 
 
-def _scale_mismatch(test: Measured) -> list[Entry]:
+def _scale_mismatch(test: Measured) -> list[BudgetEntry]:
     """Scale mismatch and azimuth of X against the FOG, by Earth rate."""
     found = mismatch(test)
     if found is None:
         return [
-            Entry("scale mismatch", False, _MISMATCH, None, "1", _MISMATCH * test.fog_share, None,
+            BudgetEntry("scale mismatch", False, _MISMATCH, None, "1", _MISMATCH * test.fog_share, None,
                   "needs an Earth-rate line"),
         ]  # fmt: skip
     entries = []
     for error, value, unit in (("scale mismatch", found.scale, "1"), ("FOG azimuth", found.azimuth, "rad")):
         effect = float(np.hypot(value, found.uncertainty)) * test.fog_share
         entries.append(
-            Entry(error, True, value, found.uncertainty, unit, 0.0 if test.both else effect,
+            BudgetEntry(error, True, value, found.uncertainty, unit, 0.0 if test.both else effect,
                   effect if test.both else None, "Earth-rate line"),
         )  # fmt: skip
     return entries
 
 
-def _delays(test: Measured) -> list[Entry]:
+def _delays(test: Measured) -> list[BudgetEntry]:
     """Delays of FOG and X against the encoder: by the turning of their lines with the table rate."""
     per_second = float(np.abs(test.table).max()) * test.fog_share
     found = delays(test)
     if found is None:
         basis = "needs encoder, 3 levels"
-        return [Entry("delay, FOG to X", False, _DELAY, None, "s", _DELAY * per_second, None, basis)]
+        return [BudgetEntry("delay, FOG to X", False, _DELAY, None, "s", _DELAY * per_second, None, basis)]
     effect = float(np.hypot(found.late, found.uncertainty)) * per_second
     return [
-        Entry("delay of the FOG", True, found.fog, found.fog_uncertainty, "s", effect, None,
+        BudgetEntry("delay of the FOG", True, found.fog, found.fog_uncertainty, "s", effect, None,
               "FOG phase over table rate"),
-        Entry("delay of X", True, found.own, found.own_uncertainty, "s", effect, None, "drift phase over table rate"),
+        BudgetEntry("delay of X", True, found.own, found.own_uncertainty, "s", effect, None,
+              "drift phase over table rate"),
     ]  # fmt: skip
 
 
-def _table_rate(test: Measured) -> Entry:
+def _table_rate(test: Measured) -> BudgetEntry:
     origins = {run.rates.origin for run in test.runs}
     if "manifest" in origins:
-        return Entry(
+        return BudgetEntry(
             "table rate", False, None, None, "rad/s", 0.0, None,
             "needs FOG line or encoder",
         )  # fmt: skip
     if origins == {"encoder"}:
-        return Entry("table rate", True, 0.0, 0.0, "rad/s", 0.0, None, "encoder")
+        return BudgetEntry("table rate", True, 0.0, 0.0, "rad/s", 0.0, None, "encoder")
     u = np.array([run.rates.table_uncertainty or 0.0 for run in test.runs])
     lost = (u * [run.duration for run in test.runs]) ** 2 / 24
     off = np.array([abs(run.rates.table_rate) - run.run.table_rate for run in test.runs])
     removed = (off * [run.duration for run in test.runs]) ** 2 / 24
     worst = int(np.argmax(np.abs(off)))
-    return Entry(
+    return BudgetEntry(
         "table rate", True, float(off[worst]), float(u[worst]), "rad/s", float(lost.max()),
         float(min(removed.max(), 1.0)),
         "FOG line",
     )  # fmt: skip
 
 
-def _arm_rate(test: Measured, manifest: Manifest) -> Entry:
+def _arm_rate(test: Measured, manifest: Manifest) -> BudgetEntry:
     """Arm rate, table rate plus net rate as measured, against the manifest's."""
     runs = [run for run in test.runs if run.rates.net_rate is not None and run.rates.origin != "manifest"]
     stated = manifest.rate_uncertainty / float(np.abs(test.arm).max())
     if not runs:
-        return Entry("arm rate", False, None, manifest.rate_uncertainty, "rad/s", 2 * stated, None, "manifest")
+        return BudgetEntry("arm rate", False, None, manifest.rate_uncertainty, "rad/s", 2 * stated, None, "manifest")
     off, u = np.array([arm_rate_off(run) for run in runs]).T
     arm = np.array([r.run.arm_rate for r in runs])
     worst = int(np.argmax(np.abs(off)))
     effect = 2 * float((np.hypot(off, u) / arm).max())
-    return Entry(
+    return BudgetEntry(
         "arm rate", True, float(off[worst]), float(u[worst]), "rad/s", effect, None,
         "table + net rate",
     )  # fmt: skip
 
 
-def _radius(test: Measured, manifest: Manifest) -> Entry:
+def _radius(test: Measured, manifest: Manifest) -> BudgetEntry:
     relative = manifest.radius_uncertainty / manifest.radius
-    return Entry(
+    return BudgetEntry(
         "radius",
         False,
         None,

@@ -24,11 +24,11 @@ from imulab.procedures.centrifuge.lines import (
     SECOND,
     THIRD,
     Cells,
+    CellSamples,
     Complex,
     PeriodResult,
     PeriodSums,
     Rates,
-    Samples,
     TooSlowError,
     compress,
     detrended,
@@ -64,7 +64,7 @@ class Channels:
         self._blocks, self._manifest, self._index = blocks, manifest, index
         self.names: tuple[str, ...] = ()
 
-    def __iter__(self) -> Iterator[Samples]:
+    def __iter__(self) -> Iterator[CellSamples]:
         """Yield the blocks of the run in SI, checked.
 
         Raises
@@ -85,7 +85,7 @@ class Channels:
             # What does not name the run names its file alone, as it was opened: that is in `place` already.
             raise type(error)(f"{place}: {rest if found and name.endswith(file) else error}") from None
 
-    def _samples(self) -> Iterator[Samples]:
+    def _samples(self) -> Iterator[CellSamples]:
         end = -np.inf
         for block in self._blocks:
             for name in ("time", "dtg_x", "fog"):
@@ -109,7 +109,7 @@ class Channels:
                     f"{end:.9g} s, found {time[0]:.9g} s"
                 )
             end = float(time[-1])
-            yield Samples(time, np.stack([_rate(block, name, self._manifest) for name in self.names]), angle)
+            yield CellSamples(time, np.stack([_rate(block, name, self._manifest) for name in self.names]), angle)
 
 
 def _rate(block: Recording, name: str, manifest: Manifest) -> Array:
@@ -588,7 +588,7 @@ def reduce_run(
     )
 
 
-def _cells(pieces: Iterable[Samples], run: Run, place: str) -> Cells:
+def _cells(pieces: Iterable[CellSamples], run: Run, place: str) -> Cells:
     """Return a run averaged over cells; a run that is too slow or too short is refused."""
     try:
         cells = compress(pieces, run.sense * run.table_rate, run.net_rate)

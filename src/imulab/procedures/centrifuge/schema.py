@@ -7,15 +7,15 @@ from typing import Annotated
 
 from imulab.errors import RecordError
 from imulab.records.calibration import Calibration
-from imulab.records.sections import Above0, Kind, Length, Part, Quantity, Size, field, part
+from imulab.records.sections import Above0, Length, Part, PlainKind, Quantity, Size, field, part
 
 # What code reads of a centrifuge record, with types.
 
 
-Sense = Annotated[int, Kind("1 or -1", lambda value: type(value) is int and value in (1, -1))]
+Sense = Annotated[int, PlainKind("1 or -1", lambda value: type(value) is int and value in (1, -1))]
 
 
-class Model(Part):
+class CentrifugeModel(Part):
     """``model``; the terms of the curve by axis."""
 
     radius: Quantity
@@ -26,7 +26,7 @@ class Model(Part):
     temperature: Quantity | None = None
 
 
-class Tried(Part):
+class CurveTried(Part):
     """One model of the curve that was tried."""
 
     model: str
@@ -38,10 +38,10 @@ class Tried(Part):
 class Curve(Part):
     """The models tried on one axis."""
 
-    tried: list[Tried]
+    tried: list[CurveTried]
 
 
-class Repeatability(Part):
+class LevelRepeatability(Part):
     """``fit.repeatability``."""
 
     relative_standard_deviation: Size
@@ -63,7 +63,7 @@ class CycleRow(Part):
         return {"x": self.x, "y": self.y, "x_down": self.x_down, "y_down": self.y_down}[key]
 
 
-class Error(Part):
+class BudgetError(Part):
     """One row of the error budget."""
 
     error: str
@@ -76,7 +76,7 @@ class Error(Part):
     basis: str
 
 
-class Fit(Part):
+class CentrifugeSummary(Part):
     """``fit``; factors and degrees of freedom by parameter, curves by axis."""
 
     method: str
@@ -84,12 +84,12 @@ class Fit(Part):
     coverage_factor_95: dict[str, float]
     degrees_of_freedom: dict[str, float]
     curves: dict[str, Curve]
-    repeatability: Repeatability
+    repeatability: LevelRepeatability
     power_cycles: list[CycleRow] = field(default_factory=list)
-    error_budget: list[Error]
+    error_budget: list[BudgetError]
 
 
-class Line(Part):
+class DriftLine(Part):
     """Amplitudes in and out of phase with their covariance; of a run also K, from its amplitude."""
 
     A: float
@@ -99,23 +99,23 @@ class Line(Part):
     K: Quantity | None = None
 
 
-class Level(Part):
+class LevelRow(Part):
     """One of ``levels``: its runs by their place in ``runs``, and the drift per specific force of each axis."""
 
     level: int
     specific_force: Above0
     runs: list[int]
-    x: Line | None = None
-    y: Line | None = None
-    x_down: Line | None = None
-    y_down: Line | None = None
+    x: DriftLine | None = None
+    y: DriftLine | None = None
+    x_down: DriftLine | None = None
+    y_down: DriftLine | None = None
 
-    def line(self, key: str) -> Line | None:
+    def line(self, key: str) -> DriftLine | None:
         """Return the drift of ``x``, ``y``, ``x_down`` or ``y_down``."""
         return {"x": self.x, "y": self.y, "x_down": self.x_down, "y_down": self.y_down}[key]
 
 
-class Run(Part):
+class RunRow(Part):
     """One of ``runs``; what follows `specific_force` is of loaded runs."""
 
     file: str
@@ -128,16 +128,16 @@ class Run(Part):
     table_rate_used: Quantity
     table_rate_from: str
     periods: float
-    x: Line | None = None
-    y: Line | None = None
-    fog: Line
+    x: DriftLine | None = None
+    y: DriftLine | None = None
+    fog: DriftLine
 
-    def line(self, axis: str) -> Line | None:
+    def line(self, axis: str) -> DriftLine | None:
         """Return the line of ``x`` or ``y``."""
         return {"x": self.x, "y": self.y}[axis]
 
 
-class Spectrum(Part):
+class LineSpectrum(Part):
     """One of ``data.spectra``: heights of lines over the rate, rad/s, by column."""
 
     level: int
@@ -146,25 +146,25 @@ class Spectrum(Part):
     height: dict[str, Annotated[list[float], "rates"]]
 
 
-class Data(Part):
+class CentrifugeEvidence(Part):
     """``data``."""
 
-    spectra: list[Spectrum]
+    spectra: list[LineSpectrum]
 
 
-class Centrifuge(Part):
+class CentrifugeRecord(Part):
     """A centrifuge record."""
 
-    model: Model
-    fit: Fit
-    levels: Annotated[list[Level], "levels"]
-    runs: Annotated[list[Run], "runs"]
-    data: Data
+    model: CentrifugeModel
+    fit: CentrifugeSummary
+    levels: Annotated[list[LevelRow], "levels"]
+    runs: Annotated[list[RunRow], "runs"]
+    data: CentrifugeEvidence
 
 
-def centrifuge_of(record: Calibration) -> Centrifuge:
+def centrifuge_of(record: Calibration) -> CentrifugeRecord:
     """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
-    return part(record, Centrifuge)
+    return part(record, CentrifugeRecord)
 
 
 def check(record: Calibration) -> None:
@@ -177,7 +177,7 @@ def highest_force(record: Calibration) -> float:
     return max(float(level.specific_force.value) for level in centrifuge_of(record).levels)
 
 
-def level_of(levels: list[Level], number: int) -> Level:
+def level_of(levels: list[LevelRow], number: int) -> LevelRow:
     """Return the level of this number.
 
     Raises

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from imulab.errors import ObservabilityError
 from imulab.estimation.column_noise import ColumnNoise, columns_noise
-from imulab.estimation.noise_coefficients import AllanCurve
+from imulab.estimation.noise_coefficients import DeviationCurve
 from imulab.procedures.gyro_array.elements import Elements
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -40,7 +40,7 @@ class AtRest:
     """What the recording at rest says: biases, their uncertainties, curves and noise per axis and element; rad/s."""
 
     bias: Array
-    curves: tuple[tuple[AllanCurve, ...], ...]
+    curves: tuple[tuple[DeviationCurve, ...], ...]
     noise: tuple[tuple[ColumnNoise, ...], ...]
     white: Array
     uncertainty: Array

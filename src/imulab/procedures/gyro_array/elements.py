@@ -273,7 +273,7 @@ _MOST_NAMED = 3
 
 
 @dataclass
-class Clock:
+class SampleClock:
     """Watches time over the blocks of a recording: the sampling rate of its beginning, gaps, and order."""
 
     nominal: float | None = None
@@ -451,7 +451,7 @@ _KINDS = (
 
 
 @dataclass
-class Event:
+class HealthEvent:
     """How often a gyro was in one state, and when first: sample count, time, s."""
 
     samples: int
@@ -466,7 +466,7 @@ class Health:
     total: int = 0
     lost: int = 0
     few: int = 0
-    events: dict[tuple[int, int, str], Event] = field(default_factory=dict)
+    events: dict[tuple[int, int, str], HealthEvent] = field(default_factory=dict)
 
     def watch(self, time: np.ndarray, flags: np.ndarray | None, rate: np.ndarray) -> list[tuple[int, int, str]]:
         """Count the flags (m, axes, n) of a block; return what is new: axis, element and kind."""
@@ -485,7 +485,7 @@ class Health:
                 key = (int(a), int(i), kind)
                 event = self.events.get(key)
                 if event is None:
-                    self.events[key] = Event(int(held.sum()), float(time[int(np.argmax(held))]))
+                    self.events[key] = HealthEvent(int(held.sum()), float(time[int(np.argmax(held))]))
                     new.append(key)
                 else:
                     event.samples += int(held.sum())
@@ -808,7 +808,7 @@ _MOST_SAMPLES = 20_000
 
 
 @dataclass(frozen=True)
-class Rest:
+class ArrayRest:
     """A stretch at rest: first sample, last + 1, and what moved first outside of it ("" where it is everything)."""
 
     start: int
@@ -816,7 +816,7 @@ class Rest:
     moved: str = ""
 
 
-def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name: str) -> Rest:
+def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name: str) -> ArrayRest:
     """Find the longest stretch in which an array is at rest.
 
     A window of a second is quiet where the standard deviation of every gyro is at most 3 times that of its own quietest
@@ -865,8 +865,8 @@ def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name
     start, stop = first * size, count if last == len(windows) else last * size
     _refuse_motion(readings[start:stop], mean[first:last], usual, size, names, name)
     if (start, stop) == (0, count):
-        return Rest(0, count)
-    return Rest(start, stop, _restless_message(restless, spread, mean - centre, names, size / rate))
+        return ArrayRest(0, count)
+    return ArrayRest(start, stop, _restless_message(restless, spread, mean - centre, names, size / rate))
 
 
 def common_motion(off: Array, noise: Array) -> tuple[float, float]:

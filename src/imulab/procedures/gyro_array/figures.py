@@ -10,9 +10,9 @@ import numpy as np
 from imulab.errors import RecordError
 from imulab.procedures.gyro_array.elements import JUMPED, NON_FINITE, STUCK, unit_of_angle
 from imulab.procedures.gyro_array.schema import (
-    AllanCurve,
     ArrayRecord,
     ComparisonRecord,
+    ElementCurve,
     MethodRow,
     PerGyro,
     array_of,
@@ -59,7 +59,7 @@ def curves(
 
 
 def allan_trace(
-    curve: AllanCurve, name: str, colour: str, factor: float, width: float = 1.6, *, number: int = 0
+    curve: ElementCurve, name: str, colour: str, factor: float, width: float = 1.6, *, number: int = 0
 ) -> dict[str, Any]:
     """Return a line of deviation times a factor over averaging time, s; values of 0 have no place on a log scale."""
     known = [(t, d * factor) for t, d in zip(curve.tau, curve.deviation, strict=False) if d > 0]

@@ -12,7 +12,7 @@ from imulab.device.tables import Fusion
 from imulab.display import Note
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
 from imulab.estimation.column_noise import noise_lines
-from imulab.estimation.noise_coefficients import COEFFICIENTS, AllanCurve, coefficients_dict
+from imulab.estimation.noise_coefficients import COEFFICIENTS, DeviationCurve, coefficients_dict
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.estimation.sampling import sampling_rate
 from imulab.procedures.gyro_array.alignment import Alignment, AtRest, align_in_time, at_rest, latency_notes, unseen
@@ -51,7 +51,7 @@ class ArrayFit(Result):
     """
 
     calibration: Calibration
-    curves: tuple[tuple[AllanCurve, ...], ...]
+    curves: tuple[tuple[DeviationCurve, ...], ...]
 
 
 def calibrate_array(

@@ -25,9 +25,9 @@ from imulab.procedures.gyro_array.elements import (
     FEWEST_ROBUST,
     ArrayCalibration,
     Checks,
-    Clock,
     Elements,
     Health,
+    SampleClock,
     array_calibration,
     count_of_axes,
     feedback_notes,
@@ -336,7 +336,7 @@ class Fuser:
 
     options: FuseOptions
     weights: bool = False
-    clock: Clock = field(default_factory=Clock)
+    clock: SampleClock = field(default_factory=SampleClock)
     health: Health | None = None
     tell: Callable[[str], None] = lambda _: None
     name: str = "recording"

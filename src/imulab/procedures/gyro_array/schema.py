@@ -18,7 +18,7 @@ _LEAST_WHITE = 0.05
 Square = Annotated[list[Annotated[list[float], "elements"]], "elements"]
 
 
-class Model(Part):
+class ArrayModel(Part):
     """``model``; `units`, `truth` and `calibrated` of a comparison, `aligned` and `gauge` of a calibration."""
 
     kind: str
@@ -33,7 +33,7 @@ class Model(Part):
     temperature: Quantity | None = None
 
 
-class Fit(Part):
+class ArraySummary(Part):
     """``fit``."""
 
     sample_rate: Above0
@@ -100,7 +100,7 @@ class Correlation(Part):
     limit: PerAxis[Length]
 
 
-class AllanCurve(Part):
+class ElementCurve(Part):
     """A curve of Allan deviation over averaging time, s."""
 
     tau: list[Positive]
@@ -110,14 +110,14 @@ class AllanCurve(Part):
 class CalibrationData(Part):
     """``data`` of a calibration."""
 
-    allan: PerAxis[PerElement[AllanCurve]]
+    allan: PerAxis[PerElement[ElementCurve]]
 
 
 class ArrayRecord(Part):
     """The record of a calibration."""
 
-    model: Model
-    fit: Fit
+    model: ArrayModel
+    fit: ArraySummary
     elements: PerElement[Element]
     correlation: Correlation
     data: CalibrationData
@@ -155,7 +155,7 @@ class MethodRow(Part):
     split_half: float | None = None
 
 
-class Health(Part):
+class HealthCurves(Part):
     """Weights and flags of each gyro over time, s; nothing where the method robust failed."""
 
     time: Annotated[list[float], "times"]
@@ -172,10 +172,10 @@ class ComparisonData(Part):
     """``data`` of a comparison, by method; a method that failed has the reason as text."""
 
     figures: dict[str, PerAxis[MethodRow] | str]
-    allan: dict[str, PerAxis[AllanCurve]]
+    allan: dict[str, PerAxis[ElementCurve]]
     angle: dict[str, PerAxis[Annotated[list[float], "trace"]]]
     trace_time: Annotated[list[float], "trace"]
-    health: Health
+    health: HealthCurves
     single: PerAxis[float]
     working: PerAxis[list[str]] | None = None
     readings_names: PerAxis[PerElement[str]]
@@ -184,14 +184,14 @@ class ComparisonData(Part):
 class ComparisonRecord(Part):
     """The record of a comparison."""
 
-    model: Model
-    fit: Fit
+    model: ArrayModel
+    fit: ArraySummary
     data: ComparisonData
 
 
-def model_of(record: Calibration) -> Model:
+def model_of(record: Calibration) -> ArrayModel:
     """Return the section ``model``; a part that is wrong raises RecordError, one that is missing when it is read."""
-    return part(record, Model, "model")
+    return part(record, ArrayModel, "model")
 
 
 def comparison_of(record: Calibration) -> ComparisonRecord:

@@ -25,7 +25,7 @@ from imulab.units import si_unit
 
 
 @dataclass(frozen=True, repr=False)
-class AllanCurve(Drawn, noise_coefficients.AllanCurve):
+class AllanCurve(Drawn, noise_coefficients.DeviationCurve):
     """The same of a column, in SI, or of samples of an unknown unit.
 
     Attributes
@@ -52,7 +52,7 @@ class AllanCurve(Drawn, noise_coefficients.AllanCurve):
 
     subject: ClassVar[str] = "Allan deviation"
 
-    __repr__ = noise_coefficients.AllanCurve.__repr__
+    __repr__ = noise_coefficients.DeviationCurve.__repr__
 
     def exhibits(self) -> Exhibits:
         """Return the coefficients, where there are any, the curve with its 95 % interval, and a table of it."""

@@ -22,7 +22,7 @@ from imulab.estimation.noise.terms import NAMES, edge_as_white, prepare
 from imulab.estimation.rows import NORMAL_95
 from imulab.options import text
 from imulab.procedures.noise.fit import fit_recordings, given_log
-from imulab.procedures.noise.schema import Column, Fit, drawn_of, fit_of, label
+from imulab.procedures.noise.schema import Column, NoiseSummary, drawn_of, fit_of, label
 from imulab.procedures.result import Drawn, as_record
 from imulab.quantities import fraction
 from imulab.reading import Data, Reading
@@ -254,7 +254,7 @@ def check_logs(
     return NoiseCheck(checked, share, allowed, tuple(notes), found)
 
 
-def _columns(record: Calibration, fit: Fit, recordings: Sequence[Recording]) -> tuple[list[str], list[str]]:
+def _columns(record: Calibration, fit: NoiseSummary, recordings: Sequence[Recording]) -> tuple[list[str], list[str]]:
     """The record's columns that all logs have, in its units, and what is to be said."""
     notes: list[str] = []
     names = [name for name in fit.columns if all(name in each for each in recordings)]

@@ -9,7 +9,17 @@ import numpy as np
 from imulab.estimation.noise.analysis import PER_PARAMETER
 from imulab.estimation.noise.terms import LINEAR, allan_terms, at_band_edge, terms
 from imulab.procedures.noise import rejected
-from imulab.procedures.noise.schema import Binned, Column, Fit, density, drawn_of, fit_of, label, shown, split
+from imulab.procedures.noise.schema import (
+    BinnedSpectrum,
+    Column,
+    NoiseSummary,
+    density,
+    drawn_of,
+    fit_of,
+    label,
+    shown,
+    split,
+)
 from imulab.records.calibration import Calibration
 from imulab.report import traces as panels
 from imulab.report.traces import (
@@ -53,7 +63,7 @@ def exhibits(record: Calibration) -> Exhibits:
     return Exhibits(_headline(record, fit), facts, items)
 
 
-def _largest(fit: Fit, unit: str) -> list[tuple[str, str]]:
+def _largest(fit: NoiseSummary, unit: str) -> list[tuple[str, str]]:
     """What a filter wants of the columns with a unit: the largest of them."""
     factor, shown_as = density(unit)
     its = [name for name, column in fit.columns.items() if column.unit == unit]
@@ -67,7 +77,7 @@ def _largest(fit: Fit, unit: str) -> list[tuple[str, str]]:
     ]
 
 
-def _headline(record: Calibration, fit: Fit) -> str:
+def _headline(record: Calibration, fit: NoiseSummary) -> str:
     parts = []
     for unit in dict.fromkeys(column.unit for column in fit.columns.values()):
         factor, name = shown("white", unit)
@@ -110,7 +120,7 @@ def _between(value: float, low: float, high: float) -> tuple[str, str]:
     return f"{value:.{places}f}", f"{low:.{places}f} to {high:.{places}f}"
 
 
-def _for_filters(fit: Fit) -> ReportTable:
+def _for_filters(fit: NoiseSummary) -> ReportTable:
     rows = []
     times = fit.bias_uncertainty[next(iter(fit.columns))].time.value
     for name, column in fit.columns.items():
@@ -140,7 +150,7 @@ def _for_filters(fit: Fit) -> ReportTable:
     )
 
 
-def _models(fit: Fit) -> ReportTable:
+def _models(fit: NoiseSummary) -> ReportTable:
     rows = []
     for name, column in fit.columns.items():
         price = {each.model: each.deviance + PER_PARAMETER * int(terms(each.model).sum()) for each in column.candidates}
@@ -175,7 +185,7 @@ def _models(fit: Fit) -> ReportTable:
     )
 
 
-def _curve(record: Calibration, fit: Fit, name: str) -> Figure:
+def _curve(record: Calibration, fit: NoiseSummary, name: str) -> Figure:
     column, allan = fit.columns[name], drawn_of(record, name).allan
     factor, unit = shown("bias", column.unit)
     tau, measured, fitted, low, high = (
@@ -230,7 +240,7 @@ def _parts(column: Column, tau: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(squares))
 
 
-def _ratios(record: Calibration, fit: Fit, names: Any, page: int, pages: int) -> Figure:
+def _ratios(record: Calibration, fit: NoiseSummary, names: Any, page: int, pages: int) -> Figure:
     """The spectrum over the model, by octaves."""
     layout = panels.grid()
     traces: list[dict[str, Any]] = []
@@ -272,7 +282,7 @@ def name_at(worst: tuple[float, str, float]) -> str:
     return f"{worst[1]} at {worst[2]:.3g} Hz, by {worst[0]:.1f} standard deviations"
 
 
-def octaves(spectra: list[Binned]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def octaves(spectra: list[BinnedSpectrum]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return frequency, Hz, power over model and its standard uncertainty of each octave, shapes (o,)."""
     frequency, ratio, count = (np.concatenate(each) for each in zip(*map(_bins, spectra), strict=True))
     octave = np.floor(np.log2(frequency / frequency.min()) + 1e-9).astype(int)
@@ -283,7 +293,7 @@ def octaves(spectra: list[Binned]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return centre, mean, np.sqrt(2 / total[kept])
 
 
-def _bins(spectrum: Binned) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _bins(spectrum: BinnedSpectrum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     first, last, power, freedom, variance = (
         np.array(each, dtype=np.float64)
         for each in (spectrum.first, spectrum.last, spectrum.power, spectrum.freedom, spectrum.variance)

@@ -28,7 +28,7 @@ from imulab.estimation.noise.analysis import (
     ramp_coefficients,
     without_steps,
 )
-from imulab.estimation.noise.cleaning import PERHAPS, Line, Step
+from imulab.estimation.noise.cleaning import PERHAPS, LevelChange, Line
 from imulab.estimation.noise.likelihood import Flags
 from imulab.estimation.noise.rest import Rest, at_rest, long_rest
 from imulab.estimation.noise.spectrum import Stretch
@@ -126,7 +126,7 @@ _COVARIATE_UNITS = {"time": "s", "temperature": "K"}
 
 
 @dataclass(frozen=True)
-class Drift:
+class CovariateDrift:
     """How a column follows time or temperature: slope and its uncertainty in SI, with the models without and with it.
 
     `taken` says whether the model is that of what is left.
@@ -170,8 +170,8 @@ class ColumnModel:
     spikes: int
     knocks: tuple[tuple[float, float], ...]
     lines: tuple[Line, ...]
-    steps: tuple[Step, ...]
-    drifts: tuple[Drift, ...]
+    steps: tuple[LevelChange, ...]
+    drifts: tuple[CovariateDrift, ...]
 
 
 # What a user of noise models must know, a sentence each.
@@ -269,7 +269,7 @@ def _lines(column: ColumnModel) -> str:
     return f"{many} line{'s' if many > 1 else ''} of the spectrum left out, the largest {named}"
 
 
-def _drift_sentence(drift: Drift, column: ColumnModel) -> tuple[type[str], str] | None:
+def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> tuple[type[str], str] | None:
     if not drift.found.follows:
         return None
     factor, unit = shown("bias", column.unit)
@@ -516,12 +516,12 @@ def _column_section(column: ColumnModel) -> dict[str, Any]:
     }
 
 
-def _step(step: Step, unit: str) -> dict[str, Any]:
+def _step(step: LevelChange, unit: str) -> dict[str, Any]:
     size = {**_value(step.size, unit), "standard_uncertainty": _number(step.standard_uncertainty)}
     return {"time": _value(step.time, "s"), "size": size}
 
 
-def _drift_section(drift: Drift, unit: str) -> dict[str, Any]:
+def _drift_section(drift: CovariateDrift, unit: str) -> dict[str, Any]:
     return {
         "follows": drift.covariate,
         "slope": {
@@ -848,7 +848,7 @@ def _column(
         taken, left = covariate == regress, analysis.letters
         if regression.follows or taken:
             left = analysed(regression.residual, candidates, band).letters
-        drifts.append(Drift(covariate, regression, (analysis.letters, left), taken))
+        drifts.append(CovariateDrift(covariate, regression, (analysis.letters, left), taken))
     for drift in drifts:
         if drift.taken:
             analysis = analysed(drift.found.residual, candidates, band)

@@ -25,7 +25,7 @@ from imulab.units import parse_unit, si_unit
 # What code reads of a noise record, with types.
 
 
-class Model(Part):
+class NoiseConditions(Part):
     """``model``."""
 
     terms: dict[str, str]
@@ -63,14 +63,14 @@ class Candidate(Part):
     values: Annotated[list[Size], 8]
 
 
-class Line(Part):
+class SpectralLine(Part):
     """A line of the spectrum."""
 
     frequency: Above0
     amplitude: Length
 
 
-class Step(Part):
+class LevelStep(Part):
     """A change of level."""
 
     time: Length
@@ -85,7 +85,7 @@ class TestOfFit(Part):
     probability: Size
 
 
-class Drift(Part):
+class ColumnDrift(Part):
     """How a column follows time or temperature."""
 
     follows: str
@@ -102,15 +102,15 @@ class Column(Part):
     length: Above0
     samples: int
     spikes: int
-    lines: list[Line]
-    steps: list[Step]
+    lines: list[SpectralLine]
+    steps: list[LevelStep]
     full_band: bool
     ripple: Size
     shortest_time: Above0
     test: TestOfFit
     chosen: str
     candidates: list[Candidate]
-    drifts: list[Drift]
+    drifts: list[ColumnDrift]
 
     @property
     def values(self) -> list[float]:
@@ -118,7 +118,7 @@ class Column(Part):
         return next(each.values for each in self.candidates if each.model == self.chosen)
 
 
-class Fit(Part):
+class NoiseSummary(Part):
     """``fit``."""
 
     horizon: Above0
@@ -133,7 +133,7 @@ class Fit(Part):
     columns: dict[str, Column]
 
 
-class Binned(Part):
+class BinnedSpectrum(Part):
     """One of ``data.columns.NAME.spectra``."""
 
     interval: Positive
@@ -159,15 +159,15 @@ class Allan(Part):
 class Noise(Part):
     """A noise record, its ``data`` apart, whose columns differ in length."""
 
-    model: Model
-    fit: Fit
+    model: NoiseConditions
+    fit: NoiseSummary
 
 
 @dataclass(frozen=True)
-class Drawn:
+class ColumnFigures:
     """What the figures of a column are drawn from."""
 
-    spectra: list[Binned]
+    spectra: list[BinnedSpectrum]
     allan: Allan
 
 
@@ -177,12 +177,12 @@ def check(record: Calibration) -> None:
         drawn_of(record, name)
 
 
-def fit_of(record: Calibration) -> Fit:
+def fit_of(record: Calibration) -> NoiseSummary:
     """Return the section ``fit``; a part that is wrong raises RecordError, one that is missing when it is read."""
-    return part(record, Fit, "fit")
+    return part(record, NoiseSummary, "fit")
 
 
-def drawn_of(record: Calibration, column: str) -> Drawn:
+def drawn_of(record: Calibration, column: str) -> ColumnFigures:
     """Return what the figures of a column are drawn from.
 
     Raises
@@ -195,12 +195,12 @@ def drawn_of(record: Calibration, column: str) -> Drawn:
     held = columns.get(column) if isinstance(columns, Mapping) else None
     if not isinstance(held, Mapping) or not isinstance(held.get("spectra"), Sequence) or not held["spectra"]:
         raise RecordError(f"the record lacks {where}.spectra")
-    spectra = [read_section(Binned, each, f"{where}.spectra[{k}]") for k, each in enumerate(held["spectra"])]
+    spectra = [read_section(BinnedSpectrum, each, f"{where}.spectra[{k}]") for k, each in enumerate(held["spectra"])]
     for k, each in enumerate(spectra):
         edges = list(zip(each.first, each.last, strict=True))
         if any(not 1 <= low <= high < each.count for low, high in edges):
             raise RecordError(f"{where}.spectra[{k}]: expected bins from 1 to {each.count - 1}")
-    return Drawn(spectra, read_section(Allan, held.get("allan"), f"{where}.allan"))
+    return ColumnFigures(spectra, read_section(Allan, held.get("allan"), f"{where}.allan"))
 
 
 # Noise coefficients as people write them: 0.3 deg/sqrt(h), 100 ug/sqrt(Hz), 5 deg/h, and so on.

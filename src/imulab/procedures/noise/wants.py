@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from imulab.errors import OptionError, RecordError, listed
-from imulab.procedures.noise.schema import Fit, fit_of
+from imulab.procedures.noise.schema import NoiseSummary, fit_of
 from imulab.records.calibration import Calibration
 
 STEPS = {"px4": 0.010, "ardupilot": 0.012}
@@ -139,7 +139,7 @@ def noise_for(
     return keys | ({"update_rate": f} if program in _WITH_RATE else {})
 
 
-def _largest(record: Calibration, fit: Fit, names: list[str]) -> Sizes:
+def _largest(record: Calibration, fit: NoiseSummary, names: list[str]) -> Sizes:
     def largest(term: str) -> float:
         keys = [f"{name}_{term}" for name in names]
         return max((record.parameters[key].value for key in keys if key in record.parameters), default=0.0)

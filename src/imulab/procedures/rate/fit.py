@@ -30,8 +30,8 @@ from imulab.procedures.rate.schema import RateTest, Run, load_test, refuse_folde
 from imulab.procedures.rate.simulate import RateRecordings
 from imulab.procedures.rate.solve import (
     Linearity,
-    Problem,
-    Solution,
+    RateProblem,
+    RateSolution,
     choose_orders,
     g_sensitivity,
     linearity_of,
@@ -208,13 +208,13 @@ def fit_test(
     return RateFit(record, tuple(dwells), linearity)
 
 
-def _upright(problem: Problem, solution: Solution) -> Problem:
+def _upright(problem: RateProblem, solution: RateSolution) -> RateProblem:
     """Return the problem without what the lean of the table axis adds about other axes."""
     gains = [found[: len(problem.faces)] for found in solution.coefficients]
     return replace(problem, mean=without_lean(problem, gains))
 
 
-def _leaning(test: RateTest, problem: Problem, axes: TableAxes) -> Problem:
+def _leaning(test: RateTest, problem: RateProblem, axes: TableAxes) -> RateProblem:
     """Return the problem with the table axes as the accelerometers see them."""
     if len(problem.faces) < 3 or len(problem.gyros) < 3:
         raise ObservabilityError(f"{test.name}: accel needs runs about x, y and z, and three gyroscopes")
@@ -258,14 +258,14 @@ def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], 
     return first, unit
 
 
-def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> Problem:
+def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> RateProblem:
     counts = [len(found.rate) for found in dwells]
     each: dict[str, Any] = {
         key: np.repeat([getattr(run, key) for run in test.runs], counts) for key in ("axis", "sign")
     }
     earth = 0.0 if test.latitude is None else EARTH * np.sin(test.latitude)
     table = np.concatenate([found.rate for found in dwells])
-    return Problem(
+    return RateProblem(
         gyros=tuple(AXES.index(name[-1]) for name in names),
         run=np.repeat(np.arange(len(dwells)), counts),
         axis=each["axis"],
@@ -307,7 +307,7 @@ def _pooled(found: Dwells) -> Any:
     return np.mean(found.variance * length, axis=0) / length
 
 
-def _check_rates(test: RateTest, problem: Problem, order: int) -> None:
+def _check_rates(test: RateTest, problem: RateProblem, order: int) -> None:
     """Refuse rates that do not tell bias, scale factor and asymmetry, or powers of the rate, apart."""
     for face in problem.faces:
         if face not in problem.gyros:
@@ -327,7 +327,7 @@ def _check_rates(test: RateTest, problem: Problem, order: int) -> None:
             )
 
 
-def _check_signs(test: RateTest, problem: Problem, solution: Solution, measured: list[int]) -> None:
+def _check_signs(test: RateTest, problem: RateProblem, solution: RateSolution, measured: list[int]) -> None:
     for i in measured:
         axis = problem.gyros[i]
         if solution.coefficients[i][problem.faces.index(axis)] < 0:

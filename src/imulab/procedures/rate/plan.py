@@ -24,7 +24,7 @@ from imulab.options import measure, parsed, text
 from imulab.procedures.rate import FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
 from imulab.procedures.rate.schema import RateTest, Run, manifest_text
 from imulab.procedures.rate.schema import shown as as_read
-from imulab.procedures.rate.solve import Problem, model_parameters, solve
+from imulab.procedures.rate.solve import RateProblem, model_parameters, solve
 from imulab.procedures.result import Record, as_record
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole, whole_number
 from imulab.recording import Array
@@ -406,7 +406,7 @@ def _predicted(test: RateTest, planned: dict[float, PlannedRate], order: int) ->
     gyros = tuple(sorted({run.axis for run in test.runs}))
     mean = np.column_stack([np.where(axis == gyro, body, 0.0) for gyro in gyros])
     variance = np.repeat(np.array(rows["variance"])[:, None], len(gyros), axis=1)
-    problem = Problem(
+    problem = RateProblem(
         gyros=gyros, run=np.array(rows["run"]), axis=axis, sign=sign, rate=body, table=table, mean=mean,
         variance=variance, level=np.array(rows["level"]), rate_uncertainty=test.spread_of(table),
     )  # fmt: skip

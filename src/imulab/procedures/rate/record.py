@@ -22,7 +22,7 @@ from imulab.procedures.rate.schema import (
     RateTest,
     SweptRun,
 )
-from imulab.procedures.rate.solve import Linearity, Problem, Solution, model_parameters, temperature_slopes
+from imulab.procedures.rate.solve import Linearity, RateProblem, RateSolution, model_parameters, temperature_slopes
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Quantity, entries
@@ -129,8 +129,8 @@ def make_record(
     test: RateTest,
     recordings: Sequence[Recording],
     dwells: Sequence[Dwells],
-    problem: Problem,
-    solution: Solution,
+    problem: RateProblem,
+    solution: RateSolution,
     linearity: Mapping[str, Linearity],
     unit: str,
     order: str,
@@ -197,7 +197,7 @@ def _with_figures(names: Sequence[str], matrix: Array, figures: Mapping[str, Par
     return Covariance((*names, *known), tuple(map(tuple, joined.tolist())))
 
 
-def _largest(problem: Problem) -> float:
+def _largest(problem: RateProblem) -> float:
     return max(float(np.abs(problem.table).max()), 0.0 if problem.reach is None else float(problem.reach.max()))
 
 
@@ -226,8 +226,8 @@ def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
 
 def _summary(
     test: RateTest,
-    problem: Problem,
-    solution: Solution,
+    problem: RateProblem,
+    solution: RateSolution,
     linearity: Mapping[str, Linearity],
     dwells: Sequence[Dwells],
 ) -> RateSummary:
@@ -251,7 +251,7 @@ def _summary(
     )
 
 
-def _axis_fit(line: Linearity, solution: Solution, number: int) -> AxisFit:
+def _axis_fit(line: Linearity, solution: RateSolution, number: int) -> AxisFit:
     """Return how well the line of one gyroscope fits; `number` is its place among those that were fitted."""
     fitted_loop, repeatability = line.fitted_loop or (None, None), line.repeatability or (None, None)
     return AxisFit(
@@ -358,7 +358,7 @@ def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], aske
     return found
 
 
-def _of_scatter(problem: Problem, solution: Solution) -> list[str]:
+def _of_scatter(problem: RateProblem, solution: RateSolution) -> list[str]:
     found: list[str] = []
     if chi_square_probability(solution.chi_square, solution.freedom) < _CHANCE:
         ratio = solution.chi_square / max(solution.freedom, 1)

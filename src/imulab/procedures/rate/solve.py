@@ -50,7 +50,7 @@ _MOST_POWERS = 5
 
 
 @dataclass(frozen=True)
-class Problem:
+class RateProblem:
     """All dwells of a test, n of them, of g gyroscopes.
 
     Attributes
@@ -116,7 +116,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Solution:
+class RateSolution:
     """Coefficients of each gyroscope, in the order of its columns, and their joint covariance.
 
     Attributes
@@ -147,7 +147,7 @@ class Solution:
     freedom: int
 
 
-def design(problem: Problem, gyro: int, order: int) -> Array:
+def design(problem: RateProblem, gyro: int, order: int) -> Array:
     """Return the columns of gyroscope number `gyro`: slopes by face, powers of its own axis's rate, zeros of runs."""
     own = problem.axis == problem.gyros[gyro]
     if problem.lean is None:
@@ -160,7 +160,7 @@ def design(problem: Problem, gyro: int, order: int) -> Array:
     return np.column_stack(columns)
 
 
-def solve(problem: Problem, orders: Sequence[int]) -> Solution:
+def solve(problem: RateProblem, orders: Sequence[int]) -> RateSolution:
     """Fit all gyroscopes together, each with powers of the rate up to its order."""
     count = len(problem.gyros)
     rates = min(len(np.unique(np.round(problem.rate[problem.axis == face], 9))) for face in problem.faces)
@@ -191,10 +191,10 @@ def solve(problem: Problem, orders: Sequence[int]) -> Solution:
     found, matrix, _ = _general(columns, problem.mean.T.ravel(), whole)
     ends = np.cumsum([0, *(design(problem, i, orders[i]).shape[1] for i in range(count))])
     coefficients = [found[a:b] for a, b in pairwise(ends)]
-    return Solution(coefficients, matrix, tuple(orders), scatter, cycle, cycle_freedom, chi_square, freedom)
+    return RateSolution(coefficients, matrix, tuple(orders), scatter, cycle, cycle_freedom, chi_square, freedom)
 
 
-def without_lean(problem: Problem, gains: Sequence[Array]) -> Array:
+def without_lean(problem: RateProblem, gains: Sequence[Array]) -> Array:
     """Return the means of runs about a gyroscope's own axis without what their table's lean adds, shape (n, g)."""
     if problem.lean is None:
         return problem.mean
@@ -207,13 +207,13 @@ def without_lean(problem: Problem, gains: Sequence[Array]) -> Array:
     return found
 
 
-def _own(problem: Problem, gains: list[Array], gyro: int) -> float:
+def _own(problem: RateProblem, gains: list[Array], gyro: int) -> float:
     """Scale factor of a gyroscope, 0 where the table never turned about its axis."""
     axis = problem.gyros[gyro]
     return float(gains[gyro][problem.faces.index(axis)]) if axis in problem.faces else 0.0
 
 
-def _shared_blocks(problem: Problem, gains: list[Array]) -> dict[tuple[int, int], Array]:
+def _shared_blocks(problem: RateProblem, gains: list[Array]) -> dict[tuple[int, int], Array]:
     """Return what the means of two gyroscopes share: errors of single rates, and the Earth's level part."""
     face = np.array([problem.faces.index(axis) for axis in problem.axis.tolist()])
     alike = np.isclose(problem.table[:, None], problem.table, rtol=1e-9, atol=1e-9).astype(np.float64)
@@ -271,7 +271,7 @@ def _root(excess: Callable[[float], float], high: float) -> float:
     return high
 
 
-def _cycles(problem: Problem, order: int, variance: Array, gains: list[Array]) -> tuple[float, int | None]:
+def _cycles(problem: RateProblem, order: int, variance: Array, gains: list[Array]) -> tuple[float, int | None]:
     """Return by how much scale factors differ from run to run of one axis, relative, all gyroscopes pooled."""
     groups, mean = [], without_lean(problem, gains)
     for i, axis in enumerate(problem.gyros):
@@ -279,7 +279,7 @@ def _cycles(problem: Problem, order: int, variance: Array, gains: list[Array]) -
         own = []
         for run in sorted(set(problem.run[problem.axis == axis].tolist())):
             which = problem.run == run
-            part = Problem(
+            part = RateProblem(
                 (axis,), np.zeros(int(which.sum()), dtype=np.int64), problem.axis[which], problem.sign[which],
                 problem.rate[which], problem.table[which], mean[which, i : i + 1],
                 problem.variance[which, i : i + 1], problem.level[which], np.zeros(int(which.sum())),
@@ -326,7 +326,7 @@ _AS_NOISE = 0.2
 """Probability beyond which what is left of the rates is their noise, which then is known better than by them."""
 
 
-def choose_orders(problem: Problem) -> tuple[int, ...]:
+def choose_orders(problem: RateProblem) -> tuple[int, ...]:
     """Return the highest power of the rate of each gyroscope that its dwells support; 1 where none was turned about.
 
     A higher order is taken if its gain is more than noise and the scatter of the rates explain (chi-square and F-test,
@@ -336,7 +336,7 @@ def choose_orders(problem: Problem) -> tuple[int, ...]:
     return tuple(_order_of(problem, i) for i in range(len(problem.gyros)))
 
 
-def _order_of(problem: Problem, gyro: int) -> int:
+def _order_of(problem: RateProblem, gyro: int) -> int:
     own = problem.axis == problem.gyros[gyro]
     if not own.any():
         return 1
@@ -451,7 +451,7 @@ class Linearity:
     kink: float | None
 
 
-def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linearity:
+def linearity_of(problem: RateProblem, gyro: int, scale: float, order: int) -> Linearity:
     """Return what a line, and powers up to `order`, leave of gyroscope number `gyro` over the rates about its axis."""
     own = problem.axis == problem.gyros[gyro]
     rate, runs = problem.rate[own], problem.run[own]
@@ -656,7 +656,7 @@ _FOLLOWS = 0.9
 
 
 def temperature_slopes(
-    recordings: Sequence[Recording], dwells: Sequence[Dwells], problem: Problem, solution: Solution
+    recordings: Sequence[Recording], dwells: Sequence[Dwells], problem: RateProblem, solution: RateSolution
 ) -> dict[str, Parameter]:
     """Return ``gyro_scale_factor_slope_i``, 1/K, of each gyroscope whose runs tell it from a drift over time."""
     temperature = _temperatures(recordings, dwells)
@@ -723,7 +723,7 @@ class _Entry:
     mounted: float = 0.0
 
 
-def _entries(problem: Problem, solution: Solution, i: int, unit: str) -> list[_Entry]:
+def _entries(problem: RateProblem, solution: RateSolution, i: int, unit: str) -> list[_Entry]:
     """Return the parameters of gyroscope number `i`: quotients of its coefficients by its scale factor."""
     faces, size, found, order = problem.faces, len(problem.faces), solution.coefficients[i], solution.orders[i]
     axis, first = AXES[problem.gyros[i]], sum(map(len, solution.coefficients[:i]))
@@ -759,7 +759,7 @@ def _entries(problem: Problem, solution: Solution, i: int, unit: str) -> list[_E
 
 
 def model_parameters(
-    test: RateTest, problem: Problem, solution: Solution, unit: str, axes: TableAxes | None = None
+    test: RateTest, problem: RateProblem, solution: RateSolution, unit: str, axes: TableAxes | None = None
 ) -> tuple[list[str], Array, Array, list[str], dict[str, float]]:
     """Return names, values, covariance and units of bias, scale factor, misalignment and powers of the rate.
 
@@ -792,7 +792,7 @@ def model_parameters(
     return names, values, matrix, [entry.unit for entry in found], freedoms
 
 
-def _by_axes(problem: Problem, found: Sequence[_Entry], axes: TableAxes) -> Array:
+def _by_axes(problem: RateProblem, found: Sequence[_Entry], axes: TableAxes) -> Array:
     """Return the covariance that the table axes' own makes: ``dT = -T dA A^-1``, columns of A the axes of the faces."""
     groups = _faces_of_runs(problem)
     sides = {axis: sum(1 for other, _ in groups if other == axis) for axis, _ in groups}
@@ -837,7 +837,7 @@ _ORDER = ["gyro_bias", "gyro_scale_factor", "gyro_misalignment", *(f"gyro_k{powe
           "gyro_g_sensitivity"]  # fmt: skip
 
 
-def _faces_of_runs(problem: Problem) -> dict[tuple[int, int], list[int]]:
+def _faces_of_runs(problem: RateProblem) -> dict[tuple[int, int], list[int]]:
     """Return the runs of each face: body axis along the table's, and which way it points."""
     found: dict[tuple[int, int], list[int]] = {}
     for run in range(problem.runs):
@@ -846,7 +846,7 @@ def _faces_of_runs(problem: Problem) -> dict[tuple[int, int], list[int]]:
     return found
 
 
-def _of_zeros(problem: Problem) -> tuple[Array, float]:
+def _of_zeros(problem: RateProblem) -> tuple[Array, float]:
     """Return the weights of the runs' zeros in the bias and, where the faces tell them apart, in G, and the freedom.
 
     Every face counts alike, and its runs alike; shape (4, runs), or (1, runs) where the bias holds the mean of G f.
@@ -872,7 +872,7 @@ def _of_zeros(problem: Problem) -> tuple[Array, float]:
     return weights, len(groups) - 4
 
 
-def g_sensitivity(problem: Problem, solution: Solution) -> Array | None:
+def g_sensitivity(problem: RateProblem, solution: RateSolution) -> Array | None:
     """Return S G of each gyroscope, output per m/s^2, shape (g, 3); None where the faces do not tell it from b."""
     weights, _ = _of_zeros(problem)
     if len(weights) < 4:
@@ -880,7 +880,7 @@ def g_sensitivity(problem: Problem, solution: Solution) -> Array | None:
     return np.array([weights[1:] @ found[len(found) - problem.runs :] for found in solution.coefficients])
 
 
-def _between_faces(problem: Problem, solution: Solution, axis: int) -> tuple[Array, float]:
+def _between_faces(problem: RateProblem, solution: RateSolution, axis: int) -> tuple[Array, float]:
     """Return what faces scatter beyond noise adds to the variances of b and G of a gyroscope, and its freedom.
 
     (rad/s)^2 .., shape (k,): the expected share of the noise is taken off, so that it does not count twice.

@@ -24,7 +24,7 @@ from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prep
 from imulab.procedures.thermal.model import AXES, Laws, forces
 from imulab.procedures.thermal.record import gyro_scale_predicted, names_and_units, of_record
 from imulab.procedures.thermal.schema import thermal_of
-from imulab.procedures.thermal.solve import Problem, linearise, together
+from imulab.procedures.thermal.solve import ThermalProblem, linearise, together
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording
@@ -439,7 +439,7 @@ def _tested(
     """Return residuals, their uncertainties, m/s^2, and the probabilities of the two tests; and f, g, shape (n, 3)."""
     g, fit = gravity.value, thermal_of(record).fit
     laws, coefficients, covariance, scale, common = of_record(record, g, gravity.standard_uncertainty)
-    problem = Problem(
+    problem = ThermalProblem(
         holds.mean / scale, holds.covariance / (scale[:, None] * scale), holds.temperature, np.zeros(len(holds)),
         holds.step, holds.shared, holds.recording, holds.group, tilt, np.zeros(3), wander=holds.wander,
     )  # fmt: skip
@@ -457,7 +457,7 @@ def _tested(
     return (g * rows.residual[rows.magnitude][order], own, within, between), force
 
 
-def _directions(problem: Problem, laws: Laws, coefficients: Array) -> Array:
+def _directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
     """Mean direction of each unmoved group under the record, shape (G, 3)."""
     force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
     count = int(problem.group.max(initial=-1)) + 1

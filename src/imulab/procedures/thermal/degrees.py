@@ -36,9 +36,9 @@ from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import AXES, GROUPS, Laws, cardinal_spline
 from imulab.procedures.thermal.schema import TestedEffect
 from imulab.procedures.thermal.solve import (
-    Problem,
     Rows,
-    Solution,
+    ThermalProblem,
+    ThermalSolution,
     between,
     excess_of,
     offset_modes,
@@ -62,7 +62,7 @@ _TUMBLE = 9
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeftOutCluster:
     """One interior temperature left out whole: degC, holds, rms of | |f| - g | there in g, chi-square per hold."""
 
     temperature: float
@@ -72,7 +72,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class Step:
+class DegreesStep:
     """Degrees that were compared: rms over the temperatures left out (g), probability of the step, whether chosen.
 
     `knots`: how many the spline of the bias had, 0 of a polynomial.
@@ -86,16 +86,16 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Found:
+class ChosenLaws:
     """Laws that were fitted: the solution, what was compared on the way, temperatures left out, what the rows tell.
 
     `missed`: higher degrees that the holds need, and how probable what these add would be by chance, where the degrees
     were stated.
     """
 
-    solution: Solution
-    steps: list[Step]
-    left_out: list[LeftOut]
+    solution: ThermalSolution
+    steps: list[DegreesStep]
+    left_out: list[LeftOutCluster]
     view: Observability
     missed: tuple[Degrees, float] | None = None
 
@@ -111,7 +111,7 @@ def clusters_of(temperature: Array) -> NDArray[np.int64]:
     return found
 
 
-def seen(solution: Solution) -> Observability:
+def seen(solution: ThermalSolution) -> Observability:
     """Return what the holds tell apart, unmoved directions included; lag and loops were judged before."""
     rows = solution.rows
     fitted = np.s_[solution.laws.size : len(solution.coefficients)]
@@ -134,7 +134,7 @@ class Split:
     untold: tuple[int, ...] = ()
 
 
-def splits(solution: Solution, cluster: NDArray[np.int64]) -> list[Split]:
+def splits(solution: ThermalSolution, cluster: NDArray[np.int64]) -> list[Split]:
     """Return the split at each interior temperature: the factor of V is what takes time, and no choice changes it."""
     rows, found = solution.rows, []
     whole = np.zeros(rows.jacobian.shape[1])
@@ -167,7 +167,7 @@ def _without_knot(jacobian: Array, laws: Laws, number: int) -> tuple[Array, tupl
     return changed, tuple(part.start + number for part in laws.parts[:3])
 
 
-def left_out(given: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOut]:
+def left_out(given: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOutCluster]:
     """Return the errors at each interior temperature under a fit, with these coefficients alone, to all others."""
     found = []
     for split in given:
@@ -183,7 +183,7 @@ def left_out(given: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOut]:
         carried = jacobian @ inverse
         scatter = split.covariance + carried @ carried.T
         chi_square = float(error @ np.linalg.solve(scatter, error)) / len(error)
-        found.append(LeftOut(split.number, len(error), float(np.sqrt(np.mean(error**2))), chi_square))
+        found.append(LeftOutCluster(split.number, len(error), float(np.sqrt(np.mean(error**2))), chi_square))
     return found
 
 
@@ -203,8 +203,8 @@ def rows_where(rows: Rows, which: NDArray[np.bool_]) -> Rows:
 
 
 def choose(
-    problem: Problem, laws: Laws, wanted: str | Degrees, tau: float | None, name: str, *, spline: bool = False
-) -> Found:
+    problem: ThermalProblem, laws: Laws, wanted: str | Degrees, tau: float | None, name: str, *, spline: bool = False
+) -> ChosenLaws:
     """Solve with the degrees wanted, or with those that data and prediction support; `spline` that of the bias.
 
     Raises
@@ -217,7 +217,7 @@ def choose(
     limit = max(len(knots) - 2, 0)
     highest = replace(laws, degrees=(min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit)))
 
-    def solved(own: Laws, known: float | None) -> Solution:
+    def solved(own: Laws, known: float | None) -> ThermalSolution:
         return solve(problem, own, tau=known)
 
     if wanted != "auto":
@@ -232,7 +232,7 @@ def choose(
         solution = bounded(solution, tau, solved)
         held = left_out(splits(solution, cluster), np.ones(own.size, dtype=np.bool_))
         missed = _missed(problem, solution, highest, tau, name)
-        return Found(solution, [], _at(held, problem, cluster), view, missed)
+        return ChosenLaws(solution, [], _at(held, problem, cluster), view, missed)
     found = _descended(problem, highest, cluster, tau, name)
     steps = found.steps
     if len(knots) >= LEAST_KNOTS:
@@ -255,7 +255,7 @@ def choose(
 
 
 def _missed(
-    problem: Problem, solution: Solution, highest: Laws, tau: float | None, name: str
+    problem: ThermalProblem, solution: ThermalSolution, highest: Laws, tau: float | None, name: str
 ) -> tuple[Degrees, float] | None:
     """Return the degrees that ``auto`` starts from, as far as the holds tell them, if stated ones are too low (1 %)."""
     own = solution.laws
@@ -276,7 +276,9 @@ def _missed(
     return (higher.laws.degrees, probability) if probability < _INSIGNIFICANT else None
 
 
-def bounded(solution: Solution, tau: float | None, solved: Callable[[Laws, float | None], Solution]) -> Solution:
+def bounded(
+    solution: ThermalSolution, tau: float | None, solved: Callable[[Laws, float | None], ThermalSolution]
+) -> ThermalSolution:
     """Return a spline's solution with the scatter between power cycles that polynomials leave, if it cannot tell it.
 
     `solved` returns the solution of laws with a scatter, or with none known.
@@ -297,26 +299,30 @@ def knots_at(temperature: Array, cluster: NDArray[np.int64], laws: Laws) -> tupl
     return (laws.low, *inner, laws.high)
 
 
-def _descended(problem: Problem, highest: Laws, cluster: NDArray[np.int64], tau: float | None, name: str) -> Found:
+def _descended(
+    problem: ThermalProblem, highest: Laws, cluster: NDArray[np.int64], tau: float | None, name: str
+) -> ChosenLaws:
     """Return the fit with the degrees to which steps down lead; a spline stays."""
     solution, view = _highest(problem, highest, tau, name)
     given = splits(solution, cluster)
     held = left_out(given, np.ones(solution.laws.size, dtype=np.bool_))
-    steps = [Step(solution.laws.degrees, rms_of(held), None, knots=len(highest.knots))]
+    steps = [DegreesStep(solution.laws.degrees, rms_of(held), None, knots=len(highest.knots))]
     while True:
         free = [group for group in range(3) if solution.laws.degrees[group] and not (group == 0 and highest.knots)]
         down = [step_down(solution, group, given) for group in free]
         steps += down
         fine = [step for step in down if may_be_taken(step, rms_of(held))]
         if not fine:
-            return Found(solution, steps, held, view)
+            return ChosenLaws(solution, steps, held, view)
         best = max(fine, key=lambda step: step.probability or 0.0)
         solution, view = _observable(problem, replace(solution.laws, degrees=best.degrees), tau, name)
         given = splits(solution, cluster)
         held = left_out(given, np.ones(solution.laws.size, dtype=np.bool_))
 
 
-def _highest(problem: Problem, laws: Laws, tau: float | None, name: str) -> tuple[Solution, Observability]:
+def _highest(
+    problem: ThermalProblem, laws: Laws, tau: float | None, name: str
+) -> tuple[ThermalSolution, Observability]:
     """Return the fit of the highest degrees, down from those given, that the holds determine."""
     while True:
         lowered = list(laws.degrees)
@@ -330,7 +336,7 @@ def _highest(problem: Problem, laws: Laws, tau: float | None, name: str) -> tupl
         laws = replace(laws, degrees=(lowered[0], lowered[1], lowered[2]))
 
 
-def bends(solution: Solution, tau: float | None) -> bool:
+def bends(solution: ThermalSolution, tau: float | None) -> bool:
     """Return whether a spline's values at the knots lie on no cubic (F at 1 %), or nobody can tell.
 
     That is where a spline takes the offset of the only recording at a knot for the law.
@@ -346,14 +352,16 @@ def bends(solution: Solution, tau: float | None) -> bool:
     return wald(solution, weights) < _INSIGNIFICANT
 
 
-def predicts(bent: Sequence[LeftOut], straight: Sequence[LeftOut]) -> bool:
+def predicts(bent: Sequence[LeftOutCluster], straight: Sequence[LeftOutCluster]) -> bool:
     """Return whether a spline predicts the temperatures that both could leave out well enough to be taken."""
     both = {each.temperature for each in bent} & {each.temperature for each in straight}
     errors = [rms_of([each for each in given if each.temperature in both]) for given in (bent, straight)]
     return errors[0] is not None and errors[1] is not None and errors[0] <= _HANDICAP * errors[1]
 
 
-def _observable(problem: Problem, laws: Laws, tau: float | None, name: str) -> tuple[Solution, Observability]:
+def _observable(
+    problem: ThermalProblem, laws: Laws, tau: float | None, name: str
+) -> tuple[ThermalSolution, Observability]:
     solution = solve(problem, laws, tau=tau)
     view = seen(solution)
     size = solution.rows.jacobian.shape[1] - len(problem.free)
@@ -367,7 +375,7 @@ def _observable(problem: Problem, laws: Laws, tau: float | None, name: str) -> t
     return solution, view
 
 
-def _help(problem: Problem, laws: Laws) -> str:
+def _help(problem: ThermalProblem, laws: Laws) -> str:
     """Return what would tell the coefficients that these holds do not."""
     if np.count_nonzero(problem.group < 0) < _TUMBLE and problem.known is None:
         return "a tumble beside the rest ramps, the unit turned through a dozen attitudes at one temperature,"
@@ -375,7 +383,7 @@ def _help(problem: Problem, laws: Laws) -> str:
     return f"{more}, or lower --degrees," if max(laws.degrees) else more
 
 
-def step_down(solution: Solution, group: int, given: Sequence[Split]) -> Step:
+def step_down(solution: ThermalSolution, group: int, given: Sequence[Split]) -> DegreesStep:
     """Return what is lost where the highest power of one kind is left out: Wald's test, and the prediction."""
     laws, degrees = solution.laws, list(solution.laws.degrees)
     gone = np.array([part.stop - 1 for part in laws.parts[3 * group : 3 * group + 3]])
@@ -384,10 +392,10 @@ def step_down(solution: Solution, group: int, given: Sequence[Split]) -> Step:
     kept[gone] = False
     degrees[group] -= 1
     lower = (degrees[0], degrees[1], degrees[2])
-    return Step(lower, rms_of(left_out(given, kept)), wald(solution, np.eye(size)[gone]), knots=len(laws.knots))
+    return DegreesStep(lower, rms_of(left_out(given, kept)), wald(solution, np.eye(size)[gone]), knots=len(laws.knots))
 
 
-def wald(solution: Solution, weights: Array) -> float:
+def wald(solution: ThermalSolution, weights: Array) -> float:
     """Return the probability of such ``weights . coefficients``, (k, first ones), if the true ones were 0."""
     size = weights.shape[1]
     value = weights @ solution.coefficients[:size]
@@ -401,13 +409,13 @@ def tail(square: float, count: int, freedom: float) -> float:
     return float(f_tail(square, count, freedom) if np.isfinite(freedom) else chi_square_tail(count * square, count))
 
 
-def rms_of(found: Sequence[LeftOut]) -> float | None:
+def rms_of(found: Sequence[LeftOutCluster]) -> float | None:
     """Return the rms over all holds of the temperatures left out; None where there are none."""
     total = sum(each.holds for each in found)
     return float(np.sqrt(sum(each.holds * each.rms**2 for each in found) / total)) if total else None
 
 
-def may_be_taken(step: Step, before: float | None) -> bool:
+def may_be_taken(step: DegreesStep, before: float | None) -> bool:
     """Return whether a step down is insignificant, and temperatures left out are known to be predicted no worse.
 
     `before` is their rms without the step: an F-test alone may lack all power.
@@ -416,7 +424,7 @@ def may_be_taken(step: Step, before: float | None) -> bool:
     return told and (step.probability or 0) > _INSIGNIFICANT
 
 
-def _at(found: Sequence[LeftOut], problem: Problem, cluster: NDArray[np.int64]) -> list[LeftOut]:
+def _at(found: Sequence[LeftOutCluster], problem: ThermalProblem, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
     """Return them with the temperature instead of its number."""
     return [replace(each, temperature=float(problem.temperature[cluster == each.temperature].mean())) for each in found]
 
@@ -439,11 +447,11 @@ _TELLS = 0.05
 """Share of the columns of lag and loops that must be left beside the laws and each other."""
 _NAMES = ("lag", *(f"loop_{axis}" for axis in AXES))
 ALL = (0, 1, 2, 3)
-"""Lag and loops of x, y and z, as `Problem.free`."""
+"""Lag and loops of x, y and z, as `ThermalProblem.free`."""
 
 
 @dataclass(frozen=True)
-class Drift:
+class LagAndLoops:
     """Lag (s) and loops (g): values, shape (4,), covariance, probability of each of the two if there were none.
 
     Where they cannot be told, `values` is None and `reason` says why, or is empty where the temperature never drifts.
@@ -456,7 +464,7 @@ class Drift:
 
     @property
     def free(self) -> tuple[int, ...]:
-        """What is significant, as `Problem.free`."""
+        """What is significant, as `ThermalProblem.free`."""
         lag, loop = (probability < _SIGNIFICANT for probability in self.probability)
         return (0,) * lag + (1, 2, 3) * loop
 
@@ -476,20 +484,20 @@ def moved(recording: NDArray[Any], temperature: Array, rate: Array) -> Array:
     return rate
 
 
-def drift_of(problem: Problem, solution: Solution, tau: float | None) -> Drift:
+def drift_of(problem: ThermalProblem, solution: ThermalSolution, tau: float | None) -> LagAndLoops:
     """Fit lag and loops beside the laws of a solution, and test each given the other."""
     reason = why_lag_is_unobservable(problem.temperature, problem.rate, solution, solution.laws.size, len(problem.free))
     if reason == "" and problem.side is not None and len(np.unique(problem.side[problem.side != 0])) == 2:
         return _of_soaks(problem, solution, tau)
     if reason is not None:
-        return Drift(reason=reason)
+        return LagAndLoops(reason=reason)
     whole = solve(replace(problem, free=ALL), solution.laws, tau=tau)
     if not whole.converged:
-        return Drift(reason="the fit of lag and loop beside the laws did not converge")
+        return LagAndLoops(reason="the fit of lag and loop beside the laws did not converge")
     return tested(whole, solution.laws.size)
 
 
-def tested(whole: Solution, size: int) -> Drift:
+def tested(whole: ThermalSolution, size: int) -> LagAndLoops:
     """Return lag and loops of a solution whose coefficients after the first `size` they are, each tested."""
     values, covariance = whole.coefficients[size:], whole.covariance[size:, size:]
     probability = []
@@ -498,25 +506,27 @@ def tested(whole: Solution, size: int) -> Drift:
         square = float(own @ np.linalg.solve(covariance[part, part], own)) / len(own)
         freedom = min(whole.degrees_of_freedom(row) for row in np.eye(size + 4)[size:][part])
         probability.append(tail(square, len(own), freedom))
-    return Drift(values, covariance, (probability[0], probability[1]))
+    return LagAndLoops(values, covariance, (probability[0], probability[1]))
 
 
-def _of_soaks(problem: Problem, solution: Solution, tau: float | None) -> Drift:
+def _of_soaks(problem: ThermalProblem, solution: ThermalSolution, tau: float | None) -> LagAndLoops:
     """Fit loops beside the laws of soaks that were reached from either side; they say nothing of a lag."""
     size, loops = solution.laws.size, ALL[1:]
     if not _told(solution, size, len(problem.free), loops):
-        return Drift(reason="the soaks reached by warming and by cooling do not tell loops and laws apart")
+        return LagAndLoops(reason="the soaks reached by warming and by cooling do not tell loops and laws apart")
     whole = solve(replace(problem, free=loops), solution.laws, tau=tau)
     if not whole.converged:
-        return Drift(reason="the fit of loops beside the laws did not converge")
+        return LagAndLoops(reason="the fit of loops beside the laws did not converge")
     own, covariance = whole.coefficients[size:], np.full((4, 4), np.nan)
     covariance[1:, 1:] = whole.covariance[size:, size:]
     square = float(own @ np.linalg.solve(covariance[1:, 1:], own)) / len(own)
     freedom = min(whole.degrees_of_freedom(row) for row in np.eye(size + 3)[size:])
-    return Drift(np.append(np.nan, own), covariance, (1.0, tail(square, len(own), freedom)))
+    return LagAndLoops(np.append(np.nan, own), covariance, (1.0, tail(square, len(own), freedom)))
 
 
-def why_lag_is_unobservable(temperature: Array, rate: Array, solution: Solution, size: int, free: int) -> str | None:
+def why_lag_is_unobservable(
+    temperature: Array, rate: Array, solution: ThermalSolution, size: int, free: int
+) -> str | None:
     """Return why lag and loop are not told: empty where the temperature never drifts, None where they are.
 
     The solution's columns for what is `free` of them come after the first `size`.
@@ -546,7 +556,7 @@ def _reason(temperature: Array, rate: Array) -> str | None:
     return None
 
 
-def _told(solution: Solution, size: int, free: int, wanted: tuple[int, ...]) -> bool:
+def _told(solution: ThermalSolution, size: int, free: int, wanted: tuple[int, ...]) -> bool:
     rows = solution.rows
     white = whitener(rows, solution.excess**2, solution.scatter.tau)
     rest = white(np.delete(rows.jacobian, np.s_[size : size + free], axis=1))
@@ -560,7 +570,7 @@ def _told(solution: Solution, size: int, free: int, wanted: tuple[int, ...]) -> 
     return bool(np.linalg.svd(columns - u @ (u.T @ columns), compute_uv=False)[-1] > _TELLS)
 
 
-def findings(drift: Drift, solution: Solution, name: str) -> list[str]:
+def findings(drift: LagAndLoops, solution: ThermalSolution, name: str) -> list[str]:
     """Return in words what was found, and what it means for corrected outputs."""
     if drift.values is None:
         return [Note(f"{name}: {drift.reason}")] if drift.reason else []
@@ -585,7 +595,7 @@ def findings(drift: Drift, solution: Solution, name: str) -> list[str]:
     return found
 
 
-def drift_effects(drift: Drift, scale: float, unit: str = "m/s^2") -> dict[str, TestedEffect | None]:
+def drift_effects(drift: LagAndLoops, scale: float, unit: str = "m/s^2") -> dict[str, TestedEffect | None]:
     """Return ``lag``, ``loop_x`` ... of the record's fit, loops times `scale` in a unit; None where not told."""
     if drift.values is None:
         return dict.fromkeys(_NAMES)
@@ -616,7 +626,9 @@ _WORTH = 0.5
 """Of the biases' uncertainty: what adds an eighth to it is said."""
 
 
-def bias_shift_from_unobserved(problem: Problem, solution: Solution, drift: Drift, name: str) -> list[str]:
+def bias_shift_from_unobserved(
+    problem: ThermalProblem, solution: ThermalSolution, drift: LagAndLoops, name: str
+) -> list[str]:
     """Return what biases may err by, for scale factor, misalignment and lag, where that adds to their uncertainty."""
     laws, rows = solution.laws, solution.rows
     groups = [group for group in _USUAL_SLOPES if not laws.degrees[group]]
@@ -738,7 +750,7 @@ _HOTTEST = 125.0
 """degC; sensors are rated to it."""
 
 
-def disagreements(holds: Holds, problem: Problem, solution: Solution, name: str) -> list[str]:
+def disagreements(holds: Holds, problem: ThermalProblem, solution: ThermalSolution, name: str) -> list[str]:
     """Return what says that recordings are hardly of one unit, mounted alike, at rest, by one thermometer."""
     bias, scale = solution.scatter.tau.tolist()
     if not solution.scatter.rank:  # nobody measured it: it was stated
@@ -777,7 +789,7 @@ def disagreements(holds: Holds, problem: Problem, solution: Solution, name: str)
     return found
 
 
-def _apart(holds: Holds, problem: Problem, laws: Laws) -> str:
+def _apart(holds: Holds, problem: ThermalProblem, laws: Laws) -> str:
     """Return which recording the others agree without, as a sentence; nothing where that is none or several."""
     numbers = np.unique(problem.recording)
     if len(numbers) < _ENOUGH:
@@ -790,7 +802,7 @@ def _apart(holds: Holds, problem: Problem, laws: Laws) -> str:
     return f" Without {holds.recordings[int(numbers[order[0]])].name} the others agree to {1e6 * best:.0f} ug"
 
 
-def _off(holds: Holds, problem: Problem, solution: Solution) -> list[str]:
+def _off(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> list[str]:
     """Return which recording lies far off the laws, by how the others, without it, scatter about theirs.
 
     Its own offsets of bias, beside the laws, are compared with those of the others by F; of scale factors, which power
@@ -834,7 +846,7 @@ def _off(holds: Holds, problem: Problem, solution: Solution) -> list[str]:
     ]
 
 
-def _without(problem: Problem, gone: NDArray[np.bool_]) -> Problem:
+def _without(problem: ThermalProblem, gone: NDArray[np.bool_]) -> ThermalProblem:
     kept = ~gone
     group = problem.group[kept]
     tied = group >= 0
@@ -855,7 +867,7 @@ def _without(problem: Problem, gone: NDArray[np.bool_]) -> Problem:
     )
 
 
-def _disagreement(problem: Problem, laws: Laws) -> float:
+def _disagreement(problem: ThermalProblem, laws: Laws) -> float:
     """Return the scatter between and within recordings about polynomials of the highest degrees, g."""
     limit = max(int(clusters_of(problem.temperature).max(initial=0)) - 1, 0)
     degrees = (min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit))

@@ -43,7 +43,7 @@ _UPPER, _LOWER = [0.5, 1.0], [0.0, 0.38]
 
 
 @dataclass(frozen=True)
-class Curves:
+class LawCurves:
     """Three laws in the unit of their figure: names, temperatures, degC (n,), values and their u, (3, n)."""
 
     names: tuple[str, ...]
@@ -63,7 +63,7 @@ class Alone:
 
 
 def law_figure(
-    title: str, what: str, unit: str, curves: Curves, alone: Alone | None, *, read: str, at_middle: str = ""
+    title: str, what: str, unit: str, curves: LawCurves, alone: Alone | None, *, read: str, at_middle: str = ""
 ) -> Figure:
     """Return the figure of three laws.
 
@@ -184,7 +184,7 @@ def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[s
             "Bias of the gyroscopes over temperature",
             "bias",
             "deg/s",
-            Curves(AXES, temperature, values, spread),
+            LawCurves(AXES, temperature, values, spread),
             _recordings(record),
             read=power_cycles(tau.from_) + " Points: the mean of each recording that stayed at its temperature.",
         ),
@@ -223,7 +223,7 @@ def _scale_factors(record: Calibration, temperature: Array, recordings: int) -> 
         "Scale factor of the gyroscopes over temperature",
         "scale factor",
         "ppm",
-        Curves(AXES, temperature, factors * values, factors * spread),
+        LawCurves(AXES, temperature, factors * values, factors * spread),
         None,
         read=f"from turns in {recordings} recordings.",
         at_middle=values_at_middle(record, [f"gyro_scale_factor_{axis}" for axis in AXES]),
@@ -357,7 +357,7 @@ def _over_temperature(group: int, record: Calibration, temperature: Array) -> Fi
     if alone is not None:
         read += " Points: what each recording at a steady temperature gives alone, bars two of its own."
     at_middle = values_at_middle(record, [f"{kind}_{axis}" for axis in axes]) if group else ""
-    curves = Curves(axes, temperature, factors * values, factors * u)
+    curves = LawCurves(axes, temperature, factors * values, factors * u)
     title = f"{name.capitalize()} over temperature"
     return law_figure(title, name, unit, curves, alone, read=read, at_middle=at_middle)
 

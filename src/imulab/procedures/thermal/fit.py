@@ -15,7 +15,7 @@ from imulab.gravity import EarthRate, Height, Latitude, LocalGravity, at_latitud
 from imulab.options import FURTHER_TRIADS, measure, parsed, text
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.procedures.thermal import degrees_text, further_of, laws_of
-from imulab.procedures.thermal.degrees import Degrees, LeftOut, Step, choose, drift_of, moving
+from imulab.procedures.thermal.degrees import Degrees, DegreesStep, LeftOutCluster, choose, drift_of, moving
 from imulab.procedures.thermal.gyro import (
     check_gyroscopes,
     fit_gyroscopes,
@@ -26,7 +26,7 @@ from imulab.procedures.thermal.gyro import (
 from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepared, sides
 from imulab.procedures.thermal.model import GROUPS, Laws, forces
 from imulab.procedures.thermal.record import make_record, with_gyroscopes
-from imulab.procedures.thermal.solve import Problem, Solution
+from imulab.procedures.thermal.solve import ThermalProblem, ThermalSolution
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array
@@ -61,8 +61,8 @@ class ThermalFit(Result):
 
     calibration: Calibration
     observability: Observability
-    degrees: tuple[Step, ...]
-    left_out: tuple[LeftOut, ...]
+    degrees: tuple[DegreesStep, ...]
+    left_out: tuple[LeftOutCluster, ...]
 
 
 def fit_thermal(
@@ -190,8 +190,8 @@ def _several(data: Data | Sequence[Data]) -> list[Any]:
 def _with_gyroscopes(
     record: Calibration,
     holds: Holds,
-    problem: Problem,
-    solution: Solution,
+    problem: ThermalProblem,
+    solution: ThermalSolution,
     scale: Array,
     wanted: str | Degrees,
     spline: bool,
@@ -236,8 +236,10 @@ def _scaling(holds: Holds, gravity: float, nominal: float | None) -> tuple[Array
     return scale, (high + low) / 2 / scale
 
 
-def _problem(holds: Holds, scale: Array, zero: Array, tilt: float, known: tuple[float, Array, Array] | None) -> Problem:
-    return Problem(
+def _problem(
+    holds: Holds, scale: Array, zero: Array, tilt: float, known: tuple[float, Array, Array] | None
+) -> ThermalProblem:
+    return ThermalProblem(
         holds.mean / scale,
         holds.covariance / (scale[:, None] * scale),
         holds.temperature,

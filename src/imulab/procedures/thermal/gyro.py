@@ -39,8 +39,8 @@ from imulab.procedures.thermal import DEGREES, FOLLOWED, LEAST_KNOTS, STRETCHES,
 from imulab.procedures.thermal.degrees import (
     ALL,
     Degrees,
-    Drift,
-    LeftOut,
+    LagAndLoops,
+    LeftOutCluster,
     bends,
     bounded,
     clusters_of,
@@ -60,10 +60,10 @@ from imulab.procedures.thermal.device import tables_of
 from imulab.procedures.thermal.holds import Cut, Holds, averaged, pooled
 from imulab.procedures.thermal.model import AXES, Laws, forces
 from imulab.procedures.thermal.solve import (
-    Problem,
     Rows,
     Scatter,
-    Solution,
+    ThermalProblem,
+    ThermalSolution,
     between,
     concluded,
     excess_of,
@@ -297,7 +297,7 @@ _RANK = 1e-7
 
 
 @dataclass(frozen=True)
-class Gyroscopes:
+class ThermalGyroscopes:
     """What was found: the holds, and the solution whose coefficients are those of the biases and then G, rad/s per g.
 
     `probability` is that of so large a G if there were none, None where the attitudes do not tell it; `aside` are the
@@ -305,12 +305,12 @@ class Gyroscopes:
     """
 
     held: RatesAtRest
-    solution: Solution
+    solution: ThermalSolution
     sensitivity: bool
     probability: float | None
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[LeftOutCluster, ...]
     aside: NDArray[np.int64]
-    drift: Drift
+    drift: LagAndLoops
 
     def at_rest(self, temperature: Array) -> Array:
         """Return the biases at temperatures (n,), rad/s, shape (n, 3)."""
@@ -323,7 +323,7 @@ class Gyroscopes:
         """Return G, rad/s per m/s^2, shape (3, 3)."""
         return self.solution.coefficients[self.size : self.size + 9].reshape(3, 3) / gravity
 
-    def again(self, held: RatesAtRest) -> Gyroscopes:
+    def again(self, held: RatesAtRest) -> ThermalGyroscopes:
         """Return the same terms fitted to other means of the same holds, with the scatter that was found."""
         laws, scatter = self.solution.laws, self.solution.scatter
         found = solve(held, laws, float(scatter.tau[0]), sensitivity=self.sensitivity, free=self.drift.free)
@@ -350,7 +350,7 @@ def fit_gyroscopes(
     name: str,
     *,
     spline: bool = False,
-) -> Gyroscopes:
+) -> ThermalGyroscopes:
     """Fit the biases over the range of temperature, degC; `tau` is their scatter between power cycles, rad/s, if known.
 
     `spline`: they are natural cubic splines with a knot at each temperature; `wanted` ``auto`` chooses between these
@@ -386,14 +386,14 @@ def fit_gyroscopes(
         replace(e, temperature=float(held.temperature[cluster == e.temperature].mean()), holds=e.holds // 3)
         for e in _left_out(solution, cluster)
     ]
-    return Gyroscopes(held, solution, found.sensitivity, found.probability, tuple(places), aside, drift)
+    return ThermalGyroscopes(held, solution, found.sensitivity, found.probability, tuple(places), aside, drift)
 
 
 @dataclass(frozen=True)
 class _Solved:
     """A solution, whether G is in it, and the probability of so large a G."""
 
-    solution: Solution
+    solution: ThermalSolution
     sensitivity: bool
     probability: float | None
 
@@ -428,7 +428,7 @@ class _Search:
         return self._bounded(by_knots) if bends(by_knots.solution, self.tau) and predicts(*errors) else found
 
     def _bounded(self, found: _Solved) -> _Solved:
-        def solved(laws: Laws, tau: float | None) -> Solution:
+        def solved(laws: Laws, tau: float | None) -> ThermalSolution:
             solution = solve(self.held, laws, tau, sensitivity=found.sensitivity)
             assert solution is not None
             return solution
@@ -436,7 +436,7 @@ class _Search:
         return replace(found, solution=bounded(found.solution, self.tau, solved))
 
 
-def _left_out(solution: Solution, cluster: NDArray[np.int64]) -> list[LeftOut]:
+def _left_out(solution: ThermalSolution, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
     return left_out(splits(solution, cluster), np.ones(len(solution.coefficients), dtype=np.bool_))
 
 
@@ -454,7 +454,7 @@ def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> _Solved:
     return _Solved(plain, False, probability)
 
 
-def _lower(solution: Solution, cluster: NDArray[np.int64]) -> Laws | None:
+def _lower(solution: ThermalSolution, cluster: NDArray[np.int64]) -> Laws | None:
     """Return laws of a degree less, or None where that step may not be taken."""
     given = splits(solution, cluster)
     before = rms_of(left_out(given, np.ones(len(solution.coefficients), dtype=np.bool_)))
@@ -462,24 +462,24 @@ def _lower(solution: Solution, cluster: NDArray[np.int64]) -> Laws | None:
     return replace(solution.laws, degrees=step.degrees) if may_be_taken(step, before) else None
 
 
-def _drift(held: RatesAtRest, solution: Solution, sensitivity: bool, tau: float | None) -> Drift:
+def _drift(held: RatesAtRest, solution: ThermalSolution, sensitivity: bool, tau: float | None) -> LagAndLoops:
     """Return lag and loops of the biases, each tested given the other."""
     size = len(solution.coefficients)
     reason = why_lag_is_unobservable(held.temperature, held.rate, solution, size, 0)
     if reason is not None:
-        return Drift(reason=reason)
+        return LagAndLoops(reason=reason)
     whole = solve(held, solution.laws, tau, sensitivity=sensitivity, free=ALL)
     if whole is None:
-        return Drift(reason="the holds in which the temperature drifts do not tell lag, loop and laws apart")
+        return LagAndLoops(reason="the holds in which the temperature drifts do not tell lag, loop and laws apart")
     return tested(whole, size)
 
 
 def solve(
     held: RatesAtRest, laws: Laws, tau: float | None, *, sensitivity: bool, free: tuple[int, ...] = ()
-) -> Solution | None:
+) -> ThermalSolution | None:
     """Return the least-squares solution, None where the holds do not determine the coefficients.
 
-    Those of the biases, of G where it is taken, and of what is `free` of lag and loops, as in `Problem`.
+    Those of the biases, of G where it is taken, and of what is `free` of lag and loops, as in `ThermalProblem`.
     """
     count = 3 * laws.terms[0] + 9 * sensitivity
     coefficients = np.zeros(count + len(free))
@@ -671,7 +671,12 @@ def _turns(attitudes: Attitudes) -> bool:
 
 
 def scale_from_turns(
-    holds: Holds, problem: Problem, solution: Solution, record: Calibration, gyros: Gyroscopes, reading: Array
+    holds: Holds,
+    problem: ThermalProblem,
+    solution: ThermalSolution,
+    record: Calibration,
+    gyros: ThermalGyroscopes,
+    reading: Array,
 ) -> ScaleLaws | None:
     """Return the laws of scale factors and misalignments, None where no recording tells them.
 
@@ -826,7 +831,7 @@ def _temperature(holds: Holds, number: int, attitudes: Attitudes) -> Array:
 
 
 def _case(
-    holds: Holds, number: int, record: Calibration, size: Array, gyros: Gyroscopes | None, unit: str
+    holds: Holds, number: int, record: Calibration, size: Array, gyros: ThermalGyroscopes | None, unit: str
 ) -> tuple[Case, Array]:
     """Return the turns of one recording, its biases and g-sensitivities taken off, and the times of its samples."""
     recording, attitudes = holds.recordings[number], holds.attitudes[number]
@@ -848,7 +853,7 @@ def _case(
 
 
 def _directions(
-    problem: Problem, solution: Solution, attitudes: Attitudes, reading: Array, temperature: Array
+    problem: ThermalProblem, solution: ThermalSolution, attitudes: Attitudes, reading: Array, temperature: Array
 ) -> tuple[Array, Array]:
     """Return the covariance of the attitudes' upward directions, rad^2, (3 n, 3 n), but for the accelerometers' laws.
 
@@ -872,7 +877,7 @@ def _directions(
     return found, (across @ moved).reshape(3 * n, size)
 
 
-def rescaled(gyros: Gyroscopes, scale: ScaleLaws) -> Gyroscopes:
+def rescaled(gyros: ThermalGyroscopes, scale: ScaleLaws) -> ThermalGyroscopes:
     """Return biases and g-sensitivities of outputs over these scale factors, whose uncertainty is not in them yet."""
     factor = 1 / scale.scale_at(gyros.held.temperature)
     held = replace(
@@ -890,7 +895,7 @@ def block_diagonal(first: Array, second: Array) -> Array:
     return joined
 
 
-def joint_covariance(gyros: Gyroscopes, scale: ScaleLaws) -> Array:
+def joint_covariance(gyros: ThermalGyroscopes, scale: ScaleLaws) -> Array:
     """Return the covariance of the coefficients of `gyros`, fitted to outputs over S(T), and of those of `scale`."""
     solution, held = gyros.solution, gyros.held
     white = whitener(solution.rows, solution.excess**2, solution.scatter.tau)

@@ -12,8 +12,8 @@ from imulab.display import UNJUDGED, Note
 from imulab.estimation.least_squares import coverage_factor
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.thermal.degrees import (
-    Drift,
-    Found,
+    ChosenLaws,
+    LagAndLoops,
     bias_shift_from_unobserved,
     clusters_of,
     disagreements,
@@ -22,8 +22,8 @@ from imulab.procedures.thermal.degrees import (
     spoken_degrees,
 )
 from imulab.procedures.thermal.gyro import (
-    Gyroscopes,
     ScaleLaws,
+    ThermalGyroscopes,
     block_diagonal,
     joint_covariance,
     notes_on_turns,
@@ -49,7 +49,14 @@ from imulab.procedures.thermal.schema import (
     TurnOn,
     thermal_of,
 )
-from imulab.procedures.thermal.solve import Own, Problem, Scatter, Solution, own_calibrations, together
+from imulab.procedures.thermal.solve import (
+    OwnCalibration,
+    Scatter,
+    ThermalProblem,
+    ThermalSolution,
+    own_calibrations,
+    together,
+)
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, StatedGravity, entries
@@ -68,9 +75,9 @@ _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every
 
 def make_record(
     holds: Holds,
-    problem: Problem,
-    found: Found,
-    drift: Drift,
+    problem: ThermalProblem,
+    found: ChosenLaws,
+    drift: LagAndLoops,
     gravity: Gravity,
     scale: Array,
     options: Mapping[str, Any],
@@ -133,7 +140,7 @@ def at_reference(laws: Laws, values: Array, covariance: Array, kind: str, unit: 
 
 
 def _summary(
-    holds: Holds, residual: Array, found: Found, drift: Drift, options: Mapping[str, Any], g: float
+    holds: Holds, residual: Array, found: ChosenLaws, drift: LagAndLoops, options: Mapping[str, Any], g: float
 ) -> ThermalSummary:
     """Return how the laws were chosen, and how well they fit."""
     solution, effects = found.solution, drift_effects(drift, g)
@@ -185,7 +192,7 @@ def _hold_residuals(holds: Holds, residual: Array, uncertainty: Array) -> HoldRe
     )
 
 
-def _alone(calibrations: list[Own], holds: Holds, factor: Array) -> OwnCalibrations | None:
+def _alone(calibrations: list[OwnCalibration], holds: Holds, factor: Array) -> OwnCalibrations | None:
     """Return what each recording gives alone; `factor` makes biases and scale factors SI, shape (6,)."""
     if not calibrations:
         return None
@@ -207,7 +214,7 @@ def interval_of(value: float, uncertainty: float, freedom: float) -> tuple[float
     return value - reach, value + reach
 
 
-def in_si_powers(solution: Solution, gravity: Gravity, scale: Array) -> tuple[Array, Array]:
+def in_si_powers(solution: ThermalSolution, gravity: Gravity, scale: Array) -> tuple[Array, Array]:
     """Return the coefficients of powers of T - T0 in SI, and their covariance.
 
     ``b = beta g``, ``S = scale sigma / g``; an error of gravity moves biases by dg/g and scale factors by -dg/g.
@@ -250,7 +257,7 @@ def of_record(record: Calibration, gravity: float, uncertainty: float) -> tuple[
     return laws, inverse @ values, inverse @ covariance @ inverse.T, scale, common
 
 
-def _residuals(problem: Problem, solution: Solution) -> tuple[Array, Array]:
+def _residuals(problem: ThermalProblem, solution: ThermalSolution) -> tuple[Array, Array]:
     """Return |f| - 1 less the lengthening by noise, and its standard uncertainty, of each hold, in g."""
     rows = solution.rows
     used = rows.magnitude & (rows.owner >= 0)
@@ -258,7 +265,7 @@ def _residuals(problem: Problem, solution: Solution) -> tuple[Array, Array]:
     return rows.residual[used][order], np.sqrt(np.diag(rows.noise)[used][order])
 
 
-def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> TurnOn:
+def _turn_on(solution: ThermalSolution, options: Mapping[str, Any], g: float) -> TurnOn:
     """Return what biases and scale factors move by between power cycles, and how that is known."""
     scatter = solution.scatter
     return TurnOn(
@@ -276,7 +283,13 @@ def told_by(scatter: Scatter) -> str:
 
 
 def _findings(
-    holds: Holds, problem: Problem, fitted: Found, drift: Drift, gravity: Gravity, options: Mapping[str, Any], name: str
+    holds: Holds,
+    problem: ThermalProblem,
+    fitted: ChosenLaws,
+    drift: LagAndLoops,
+    gravity: Gravity,
+    options: Mapping[str, Any],
+    name: str,
 ) -> list[str]:
     solution = fitted.solution
     found = [*(note for r in holds.recordings for note in r.notes), *holds.notes]
@@ -366,7 +379,7 @@ def deviation_of_force(record: Calibration, temperature: Array) -> Array:
 
 
 def with_gyroscopes(
-    record: Calibration, holds: Holds, gyros: Gyroscopes, turned: ScaleLaws | None, name: str
+    record: Calibration, holds: Holds, gyros: ThermalGyroscopes, turned: ScaleLaws | None, name: str
 ) -> Calibration:
     """Return the record with the gyroscopes' laws, their covariance (independent of the accelerometers') and data."""
     gyros = gyros if turned is None else rescaled(gyros, turned)
@@ -413,7 +426,7 @@ def with_gyroscopes(
     )
 
 
-def _to_si(gyros: Gyroscopes, gravity: float) -> Array:
+def _to_si(gyros: ThermalGyroscopes, gravity: float) -> Array:
     """Return the matrix from the fit's coefficients to those of powers of T - T0, and of G to rad/s per m/s^2."""
     size, count = gyros.size, gyros.count
     matrix = np.eye(count) / gravity
@@ -458,7 +471,7 @@ def names_and_units(laws: Laws, *, sensitivity: bool) -> tuple[list[str], list[s
     return names, units
 
 
-def _gyro_summary(gyros: Gyroscopes, turned: ScaleLaws | None, *, known: bool) -> ThermalGyroSummary:
+def _gyro_summary(gyros: ThermalGyroscopes, turned: ScaleLaws | None, *, known: bool) -> ThermalGyroSummary:
     """Return how the gyroscopes' laws were fitted, and how well; `known` says that their turn-on scatter was stated."""
     solution, effects = gyros.solution, drift_effects(gyros.drift, 1.0, "rad/s")
     return ThermalGyroSummary(
@@ -487,7 +500,7 @@ def _gyro_summary(gyros: Gyroscopes, turned: ScaleLaws | None, *, known: bool) -
     )
 
 
-def _gyro_hold_residuals(holds: Holds, gyros: Gyroscopes) -> GyroHoldResiduals:
+def _gyro_hold_residuals(holds: Holds, gyros: ThermalGyroscopes) -> GyroHoldResiduals:
     """Return each hold as the figures draw it; residuals in rad/s."""
     held = gyros.held
     return GyroHoldResiduals(
@@ -499,7 +512,7 @@ def _gyro_hold_residuals(holds: Holds, gyros: Gyroscopes) -> GyroHoldResiduals:
 
 
 def _gyro_findings(
-    record: Calibration, holds: Holds, gyros: Gyroscopes, turned: ScaleLaws | None, name: str
+    record: Calibration, holds: Holds, gyros: ThermalGyroscopes, turned: ScaleLaws | None, name: str
 ) -> list[str]:
     found = [*gyros.held.notes, *([] if gyros.held.earth is None else [gyros.held.earth.note()])]
     found += notes_on_turns(holds, gyros.aside)
@@ -533,7 +546,7 @@ def _gyro_findings(
     return [*found, *turned.notes, Note(said)]
 
 
-def _drifts(gyros: Gyroscopes, name: str) -> list[str]:
+def _drifts(gyros: ThermalGyroscopes, name: str) -> list[str]:
     """Return what lag and loop mean for corrected outputs, where they are significant."""
     drift, found = gyros.drift, []
     if drift.values is None or drift.covariance is None:

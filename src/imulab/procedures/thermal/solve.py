@@ -28,7 +28,7 @@ from imulab.recording import Array
 
 
 @dataclass(frozen=True)
-class Problem:
+class ThermalProblem:
     """Holds in units of g: readings (n, 3), covariances of the mean (n, 3, 3), temperature, step, as in `Holds`.
 
     `rate`: change of the temperature, K/s, 0 where it counts as still; `tilt`: standard deviation of the direction of
@@ -73,7 +73,7 @@ class Rows:
     magnitude: NDArray[np.bool_]
 
 
-def linearise(problem: Problem, laws: Laws, coefficients: Array, directions: Array) -> Rows:
+def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directions: Array) -> Rows:
     """Return the rows at these coefficients; `directions` are those of the unmoved groups, shape (G, 3)."""
     n, count = len(problem.reading), int(problem.recording.max(initial=0)) + 1
     parameters, design, drift, slope = parameters_of(problem, laws, coefficients)
@@ -115,7 +115,7 @@ def linearise(problem: Problem, laws: Laws, coefficients: Array, directions: Arr
     return found if problem.known is None else _with_prior(found, problem.known, laws, coefficients, problem.step.max())
 
 
-def parameters_of(problem: Problem, laws: Laws, coefficients: Array) -> tuple[Array, Array, Array, Array]:
+def parameters_of(problem: ThermalProblem, laws: Laws, coefficients: Array) -> tuple[Array, Array, Array, Array]:
     """Return the parameters of each hold (n, 9), their derivatives by the laws' coefficients, by lag and loops, by T.
 
     ``p(T - L dT/dt)`` is taken to first order, which leaves p'' (L dT/dt)^2 / 2: a microgram at 20 s and 1 K/min; the
@@ -152,7 +152,7 @@ def _per_recording(felt: Array, recording: NDArray[np.int64], count: int) -> Arr
     return columns.reshape(len(felt), -1)
 
 
-def _errors(heat: Array, owner: NDArray[np.int64], problem: Problem, count: int) -> Array:
+def _errors(heat: Array, owner: NDArray[np.int64], problem: ThermalProblem, count: int) -> Array:
     """Loadings of the temperature's errors: one for a recording, or for each hold of one that drifts."""
     number = np.where(problem.shared, problem.recording, count + np.arange(len(problem.recording)))[owner]
     return one_hot(number) * heat[:, None]
@@ -249,7 +249,7 @@ class Scatter:
 
 
 @dataclass(frozen=True)
-class Solution:
+class ThermalSolution:
     """What was found: coefficients (c,), their covariance, rows, excess (g), tau, and degrees of freedom of each.
 
     The coefficients are those of the laws, then the lag and the loops that were fitted beside them.
@@ -278,7 +278,7 @@ class Solution:
         return 1 / own if own > 0 else np.inf
 
 
-def solve(problem: Problem, laws: Laws, *, tau: float | None = None) -> Solution:
+def solve(problem: ThermalProblem, laws: Laws, *, tau: float | None = None) -> ThermalSolution:
     """Fit the laws; `tau` is the scatter of the biases from one power cycle to the next, g, if it is known."""
     still = replace(problem, free=())
     coefficients = _start(still, laws)
@@ -308,7 +308,7 @@ def solve(problem: Problem, laws: Laws, *, tau: float | None = None) -> Solution
 
 def concluded(
     laws: Laws, coefficients: Array, rows: Rows, excess: tuple[float, float], scatter: Scatter, *, converged: bool
-) -> Solution:
+) -> ThermalSolution:
     """Return what coefficients and rows at the end of a fit say; `excess` is a variance and its degrees of freedom."""
     white = whitener(rows, excess[0], scatter.tau)
     jacobian, residual = white(rows.jacobian), white(rows.residual)
@@ -316,14 +316,14 @@ def concluded(
     loading = inverse @ white(rows.offsets[0])
     count = len(coefficients)
     left = residual - jacobian @ (inverse @ residual)
-    return Solution(
+    return ThermalSolution(
         laws, coefficients, (inverse @ inverse.T)[:count, :count], rows, float(np.sqrt(excess[0])), excess[1],
         scatter, (loading @ loading.T)[:count, :count], float(left @ left), len(residual) - jacobian.shape[1],
         converged,
     )  # fmt: skip
 
 
-def _start(problem: Problem, laws: Laws) -> Array:
+def _start(problem: ThermalProblem, laws: Laws) -> Array:
     """Return the coefficients to start from: those of a fit without temperature, its outliers not told yet."""
     flat = replace(laws, degrees=(0, 0, 0), knots=())
     start = nominal(flat, problem.zero)
@@ -336,7 +336,7 @@ def nominal(laws: Laws, zero: Array) -> Array:
     return laws.constant(np.concatenate([zero, np.ones(3), np.zeros(3)]))
 
 
-def _directions(problem: Problem, laws: Laws, coefficients: Array) -> Array:
+def _directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
     """Mean direction of each unmoved group at these coefficients."""
     count = int(problem.group.max(initial=-1)) + 1
     force, _ = forces(parameters_of(problem, laws, coefficients)[0], problem.reading)
@@ -346,7 +346,13 @@ def _directions(problem: Problem, laws: Laws, coefficients: Array) -> Array:
 
 
 def _iterate(
-    problem: Problem, laws: Laws, coefficients: Array, directions: Array, excess: float, tau: Array, tolerance: float
+    problem: ThermalProblem,
+    laws: Laws,
+    coefficients: Array,
+    directions: Array,
+    excess: float,
+    tau: Array,
+    tolerance: float,
 ) -> tuple[Array, Array, Rows, bool]:
     """Gauss-Newton steps with V as it is."""
     rows = linearise(problem, laws, coefficients, directions)
@@ -432,7 +438,7 @@ _CONDITION = 1e3
 
 
 @dataclass(frozen=True)
-class Own:
+class OwnCalibration:
     """The nine parameters of one recording and their standard uncertainties, in units of g, at its temperature, degC.
 
     `recording` is its number, -1 for the prior.
@@ -444,7 +450,7 @@ class Own:
     standard_uncertainty: Array
 
 
-def own_calibrations(problem: Problem, solution: Solution) -> list[Own]:
+def own_calibrations(problem: ThermalProblem, solution: ThermalSolution) -> list[OwnCalibration]:
     """Return the calibration that each recording gives alone, where it can, and a prior's.
 
     The laws at the temperature of each hold, and nine constants added to them, fitted to ``|f| = g`` of the
@@ -473,8 +479,8 @@ def own_calibrations(problem: Problem, solution: Solution) -> list[Own]:
         values = parameters[own].mean(axis=0) - inverse @ (weight[own] * residual[own])
         by_heat = (slope[own] * problem.step[own, None]).mean(axis=0)
         u = np.sqrt((inverse**2).sum(axis=1) + by_heat**2)
-        found.append(Own(number, float(problem.temperature[own].mean()), values, u))
+        found.append(OwnCalibration(number, float(problem.temperature[own].mean()), values, u))
     if problem.known is not None:
         temperature, values, covariance = problem.known
-        found.append(Own(-1, temperature, values, np.sqrt(np.diag(covariance))))
+        found.append(OwnCalibration(-1, temperature, values, np.sqrt(np.diag(covariance))))
     return found

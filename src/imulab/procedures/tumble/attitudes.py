@@ -348,7 +348,7 @@ _BATCHES = 10
 
 
 @dataclass(frozen=True)
-class Held:
+class HeldStill:
     """The samples of all holds, one after the other, in blocks as long as a hand's tremor.
 
     `start` and `stop` are the stretches in blocks, `attitude` says whose each is; `centre` is an attitude's mean.
@@ -364,7 +364,7 @@ class Held:
     centre: Array
 
     @classmethod
-    def of(cls, recording: Recording, names: list[str], stretches: NDArray[np.int64], step: float) -> Held:
+    def of(cls, recording: Recording, names: list[str], stretches: NDArray[np.int64], step: float) -> HeldStill:
         """Return the samples of the `stretches`, rows (first, last + 1, attitude), which are `step` apart, s."""
         begin, end, attitude = np.ascontiguousarray(stretches.T)
         usual = math.ceil(_TREMOR_SECONDS / step - 0.01)
@@ -381,7 +381,7 @@ class Held:
         return cls((x, y, z), mean, scatter, length, stop - size, stop, attitude, centre)
 
 
-def _statistics(held: Held) -> tuple[Array, Array, Array]:
+def _statistics(held: HeldStill) -> tuple[Array, Array, Array]:
     """Return `Motion.moments` of each attitude, their degrees of freedom, and the share of a batch in all."""
     count = len(held.centre)
     size = held.stop - held.start
@@ -410,7 +410,7 @@ def _pooled(covariance: Array, freedom: Array, share: Array) -> Array:
     return shrunk * share[:, None, None]
 
 
-def _motion(held: Held, moments: Array, freedom: Array, share: Array) -> Motion:
+def _motion(held: HeldStill, moments: Array, freedom: Array, share: Array) -> Motion:
     """How the attitudes moved: ``D = cov(x_k) - C_w / B + [mean(e e') - C_w / 2B] / 12``, B samples in a block."""
     count, size = len(held.centre), held.stop - held.start
     sums = np.empty((3, count, 3, 3))
@@ -435,7 +435,7 @@ def _motion(held: Held, moments: Array, freedom: Array, share: Array) -> Motion:
 
 
 def covariance_and_motion(
-    held: Held, recording: Recording, names: list[str], resolution: Array
+    held: HeldStill, recording: Recording, names: list[str], resolution: Array
 ) -> tuple[Array, Motion | None]:
     """Return the covariance of each mean, with that of rounding, and the motion in the attitudes."""
     moments, freedom, share = _statistics(held)
@@ -584,7 +584,7 @@ def find_attitudes(
     for a, b, _ in stretches.tolist():
         left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
     check_clipping(recording, names, stretches)
-    held = Held.of(recording, names, stretches, blocks.duration / blocks.length)
+    held = HeldStill.of(recording, names, stretches, blocks.duration / blocks.length)
     covariance, motion = covariance_and_motion(held, recording, names, resolution)
     first = np.unique(pieces.attitude, return_index=True)[1]
     return Attitudes(

@@ -11,7 +11,7 @@ from imulab.procedures.tumble import HIGHEST_ORDER
 from imulab.procedures.tumble.attitudes import Attitudes, Motion
 from imulab.procedures.tumble.model import GAUGE, parameter_names
 from imulab.procedures.tumble.schema import data_of, model_of
-from imulab.procedures.tumble.solve import Solution
+from imulab.procedures.tumble.solve import TumbleSolution
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import from_si, parse_unit, to_si
@@ -107,7 +107,7 @@ def _untimed(attitudes: Attitudes) -> str:
     return "; without a column time every row is an attitude: a recording needs one, or a layout with sample_rate"
 
 
-def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) -> None:
+def check_residuals(attitudes: Attitudes, solution: TumbleSolution, gravity: float) -> None:
     """Check after the fit that |f| = g holds at all.
 
     Raises
@@ -123,7 +123,7 @@ def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) ->
         )
 
 
-def shake_warnings(motion: Motion | None, solution: Solution) -> list[str]:
+def shake_warnings(motion: Motion | None, solution: TumbleSolution) -> list[str]:
     """Say that holds shake too fast for magnitudes to be averaged, if that may matter: a tilt to and fro shortens f."""
     if motion is None:
         return []

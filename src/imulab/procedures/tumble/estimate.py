@@ -32,11 +32,11 @@ from imulab.procedures.tumble.orders import (
     solve_orders,
     with_known_spread,
 )
-from imulab.procedures.tumble.record import Estimate, Found, Scaling, Stated
+from imulab.procedures.tumble.record import Estimate, FittedAttitudes, Scaling, Stated
 from imulab.procedures.tumble.solve import (
-    Problem,
-    Solution,
     Threshold,
+    TumbleProblem,
+    TumbleSolution,
     evaluate,
     forces,
     helpful_attitudes,
@@ -236,7 +236,7 @@ def estimate_triad(
         from imulab.procedures.tumble.prior import findings, known_of, prior_shares, put_together
 
         known = known_of(prior, scaling, gravity, attitudes.unit)
-    aside, fitted = NONE_ASIDE, dict[int, Solution]()
+    aside, fitted = NONE_ASIDE, dict[int, TumbleSolution]()
     if loss == "auto" and rest is None and not cross:
         aside, fitted = set_aside(every, lambda of: _fits(of, order))
     used, kept = every, attitudes
@@ -270,32 +270,37 @@ def estimate_triad(
     )
 
 
-def _problem(attitudes: Attitudes, scaling: Scaling, *, robust: bool) -> Problem:
+def _problem(attitudes: Attitudes, scaling: Scaling, *, robust: bool) -> TumbleProblem:
     """Return the attitudes in units of g, relative to the nominal sensor."""
     reading = ((attitudes.mean - scaling.zero) / scaling.scale)[None]
     spread = scaling.scale[:, None] * scaling.scale
     noise = None if attitudes.covariance is None else (attitudes.covariance / spread)[None]
     motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
-    return Problem(reading, noise, 1, robust=robust, motion=motion)
+    return TumbleProblem(reading, noise, 1, robust=robust, motion=motion)
 
 
-def _fits(problem: Problem, order: int | str) -> dict[int, Solution]:
+def _fits(problem: TumbleProblem, order: int | str) -> dict[int, TumbleSolution]:
     """Fit the orders that are asked for."""
     return solve_orders(problem) if order in FROM_DATA else {int(order): solve_norm(replace(problem, order=int(order)))}
 
 
-def _found(attitudes: Attitudes, problem: Problem, solution: Solution, aside: Aside) -> Found:
+def _found(attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution, aside: Aside) -> FittedAttitudes:
     """Return all attitudes under the solution, those set aside with the down-weight 0."""
     if not aside.index:
-        return Found(attitudes, problem, solution, aside)
+        return FittedAttitudes(attitudes, problem, solution, aside)
     every = evaluate(problem, solution)
     every.down_weights[0, list(aside.index)] = 0.0
-    return Found(attitudes, problem, every, aside)
+    return FittedAttitudes(attitudes, problem, every, aside)
 
 
 def _whatever_the_order(
-    used: Problem, problem: Problem, solution: Solution, given: Stated, blended: Blended, at_blend: bool
-) -> tuple[Problem, Solution, Stated]:
+    used: TumbleProblem,
+    problem: TumbleProblem,
+    solution: TumbleSolution,
+    given: Stated,
+    blended: Blended,
+    at_blend: bool,
+) -> tuple[TumbleProblem, TumbleSolution, Stated]:
     """Return problem, solution and an uncertainty that holds whatever the order; the blend's own values if asked."""
     if not at_blend:
         about = blended.about(solution.theta[0])
@@ -322,12 +327,12 @@ def nominal_scaling(attitudes: Attitudes, gravity: float) -> Scaling:
 
 
 def _solve(
-    problem: Problem,
+    problem: TumbleProblem,
     attitudes: Attitudes,
     linearised: Threshold | None,
     choice: OrderChoice | None,
-    solved: Solution | None,
-) -> tuple[Solution, Observability]:
+    solved: TumbleSolution | None,
+) -> tuple[TumbleSolution, Observability]:
     """Solve the problem, unless that has been done by norm, and see what it determines.
 
     `linearised` is where method linearised rests, None for method norm.
@@ -358,14 +363,14 @@ def _solve(
     return solution, seen
 
 
-def _solved(problem: Problem, attitudes: Attitudes, linearised: Threshold | None) -> Solution:
+def _solved(problem: TumbleProblem, attitudes: Attitudes, linearised: Threshold | None) -> TumbleSolution:
     n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     if linearised is not None and n >= size:
         return solve_linearised(problem, attitudes.recording.name, linearised)
     return solve_norm(problem)
 
 
-def _given_order(problem: Problem, solution: Solution) -> Stated | None:
+def _given_order(problem: TumbleProblem, solution: TumbleSolution) -> Stated | None:
     """Return what is known of theta if the order is right; None where nothing tells the noise."""
     n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     freedom = n - size

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imulab.errors import OptionError
-from imulab.procedures.tumble.solve import Problem, Solution, solve_norm
+from imulab.procedures.tumble.solve import TumbleProblem, TumbleSolution, solve_norm
 from imulab.recording import Array
 
 _AT_ONCE = 2000
@@ -49,8 +49,8 @@ def check_trials(trials: int) -> None:
 
 
 def propagate(
-    problem: Problem,
-    solution: Solution,
+    problem: TumbleProblem,
+    solution: TumbleSolution,
     *,
     trials: int,
     freedom: float | None,
@@ -98,7 +98,7 @@ def propagate(
     return MonteCarlo(np.vstack(found), failed)
 
 
-def _noise(problem: Problem, solution: Solution) -> Array:
+def _noise(problem: TumbleProblem, solution: TumbleSolution) -> Array:
     """Covariance of each attitude's output to draw from, shape (n, 3, 3): as known with its excess, or as estimated."""
     n, size = problem.reading.shape[1], solution.theta.shape[1]
     identity = np.eye(3)

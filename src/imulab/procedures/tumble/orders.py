@@ -57,8 +57,8 @@ from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.model import AXES, MISALIGNMENTS, fit_lengths, norm_and_jacobian, parameter_count
 from imulab.procedures.tumble.schema import OrderRow
 from imulab.procedures.tumble.solve import (
-    Problem,
-    Solution,
+    TumbleProblem,
+    TumbleSolution,
     evaluate,
     forces,
     leave_one_out,
@@ -90,16 +90,16 @@ class OrderChoice:
 
     order: int
     rows: tuple[OrderRow, ...]
-    solutions: Mapping[int, Solution]
+    solutions: Mapping[int, TumbleSolution]
     observability: Observability
 
     @property
-    def solution(self) -> Solution:
+    def solution(self) -> TumbleSolution:
         """That of the order chosen."""
         return self.solutions[self.order]
 
 
-def solve_orders(problem: Problem) -> dict[int, Solution]:
+def solve_orders(problem: TumbleProblem) -> dict[int, TumbleSolution]:
     """Fit the orders that the attitudes are enough for: more than parameters, or as many at order 1."""
     n = problem.reading.shape[1]
     return {
@@ -109,7 +109,7 @@ def solve_orders(problem: Problem) -> dict[int, Solution]:
     }
 
 
-def choose_order(problem: Problem, gravity: float, solutions: Mapping[int, Solution]) -> OrderChoice:
+def choose_order(problem: TumbleProblem, gravity: float, solutions: Mapping[int, TumbleSolution]) -> OrderChoice:
     """Compare orders 1 to 5 and choose the one that predicts best and can be observed.
 
     All orders are compared with the same weights: each attitude's own noise, with the excess that order 1 and 2 leave
@@ -158,7 +158,7 @@ def choose_order(problem: Problem, gravity: float, solutions: Mapping[int, Solut
     return OrderChoice(chosen, tuple(rows), solutions, seen[chosen])
 
 
-def _left_out_squares(problem: Problem, fit: Solution) -> Array | None:
+def _left_out_squares(problem: TumbleProblem, fit: TumbleSolution) -> Array | None:
     """Squared error of each attitude predicted from the others, shape (n,); None where there is nothing to tell.
 
     What counts is psi, not the residual: a knocked attitude cannot be predicted by any order.
@@ -184,8 +184,8 @@ def _significant(costs: Mapping[int, float], chosen: int, order: int, n: int) ->
 
 
 def _row(
-    problem: Problem,
-    fit: Solution,
+    problem: TumbleProblem,
+    fit: TumbleSolution,
     seen: Observability,
     costs: Mapping[int, float],
     squares: Array | None,
@@ -210,7 +210,7 @@ def _row(
     )
 
 
-def _largest_uncertainty(problem: Problem, fit: Solution) -> float:
+def _largest_uncertainty(problem: TumbleProblem, fit: TumbleSolution) -> float:
     """Predicted standard uncertainty of |f|, in g, in the direction where it is largest."""
     points = sphere_points(_DIRECTIONS)[None]
     rows = norm_and_jacobian(start_parameters(problem.order), points, problem.order)[1][0]
@@ -218,7 +218,7 @@ def _largest_uncertainty(problem: Problem, fit: Solution) -> float:
     return float(np.sqrt(np.einsum("ni,ij,nj->n", rows, matrix, rows, optimize=True).max()))
 
 
-def absolute_weights(problem: Problem, fit: Solution) -> Array:
+def absolute_weights(problem: TumbleProblem, fit: TumbleSolution) -> Array:
     """Weights in true inverse variances, shape (n,): where noise is unknown, its level comes from the residuals."""
     weights: Array = fit.weights[0] / max(fit.scale[0] ** 2, _ROUNDING)  # as many attitudes as parameters leave nothing
     n, size = problem.reading.shape[1], fit.theta.shape[1]
@@ -261,7 +261,7 @@ class Pattern:
     size: float
 
 
-def find_pattern(columns: Array, solution: Solution) -> Pattern | None:
+def find_pattern(columns: Array, solution: TumbleSolution) -> Pattern | None:
     """Regress the residuals of a batch of one on `columns`, shape (n, k), beside the model; None if it cannot tell.
 
     Attitudes of weight 0 do not count.
@@ -292,7 +292,7 @@ def find_pattern(columns: Array, solution: Solution) -> Pattern | None:
     )
 
 
-def direction_findings(problem: Problem, solution: Solution, *, order_chosen: bool) -> list[str]:
+def direction_findings(problem: TumbleProblem, solution: TumbleSolution, *, order_chosen: bool) -> list[str]:
     """Say where the residuals are a function of direction that the model does not hold.
 
     Parameters
@@ -348,7 +348,7 @@ def direction_findings(problem: Problem, solution: Solution, *, order_chosen: bo
     ]
 
 
-def time_findings(attitudes: Attitudes, problem: Problem, solution: Solution) -> list[str]:
+def time_findings(attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution) -> list[str]:
     """Say where the residuals show that the zeros drift: columns ``q_i (t - mean t)``, q = d|f|/d reading."""
     if attitudes.trace is None:
         return []
@@ -420,7 +420,9 @@ class _Whitened:
         return float(self.residual @ self.residual)
 
 
-def set_aside(problem: Problem, fits: Callable[[Problem], dict[int, Solution]]) -> tuple[Aside, dict[int, Solution]]:
+def set_aside(
+    problem: TumbleProblem, fits: Callable[[TumbleProblem], dict[int, TumbleSolution]]
+) -> tuple[Aside, dict[int, TumbleSolution]]:
     """Find the attitudes that no order explains; return them and the fits of the others, by order.
 
     The search starts from the fits of all attitudes and is repeated about those of the others until it rests. Where
@@ -449,7 +451,7 @@ def set_aside(problem: Problem, fits: Callable[[Problem], dict[int, Solution]]) 
     return before, solutions
 
 
-def standing_out(solutions: Mapping[int, Solution], *, known: bool, excess: float = 0.0) -> Aside:
+def standing_out(solutions: Mapping[int, TumbleSolution], *, known: bool, excess: float = 0.0) -> Aside:
     """Find the attitudes that stand out.
 
     Parameters
@@ -472,11 +474,11 @@ def standing_out(solutions: Mapping[int, Solution], *, known: bool, excess: floa
     return best
 
 
-def _tested(solutions: Mapping[int, Solution]) -> list[int]:
+def _tested(solutions: Mapping[int, TumbleSolution]) -> list[int]:
     return [order for order in solutions if order <= HIGHEST_TESTED] or list(solutions)
 
 
-def _whitened(solution: Solution, excess: float) -> _Whitened | None:
+def _whitened(solution: TumbleSolution, excess: float) -> _Whitened | None:
     """Return None where the attitudes do not determine the parameters."""
     root = np.sqrt(solution.own_variance[0] + excess**2)
     rows = solution.jacobian[0] / root[:, None]
@@ -670,7 +672,7 @@ class Blended:
         return np.asarray(self.covariance[:size, :size] + np.outer(away, away))
 
 
-def blend_orders(problem: Problem, choice: OrderChoice) -> Blended:
+def blend_orders(problem: TumbleProblem, choice: OrderChoice) -> Blended:
     """Blend the orders from 1 to 3, or to the chosen one where that is higher, as far as the attitudes show them.
 
     Parameters
@@ -704,7 +706,7 @@ def blend_orders(problem: Problem, choice: OrderChoice) -> Blended:
     )
 
 
-def with_known_spread(problem: Problem, choice: OrderChoice, spread: tuple[float, float]) -> Blended:
+def with_known_spread(problem: TumbleProblem, choice: OrderChoice, spread: tuple[float, float]) -> Blended:
     """Return what all orders say where k2 and k3 are normal about 0 with known standard deviations.
 
     ``theta = (J' W J / s^2 + P)^-1 J' W y / s^2`` with ``P = diag(0 .., tau_2^-2, tau_3^-2)``; s^2 is 1, or where noise
@@ -743,7 +745,7 @@ def with_known_spread(problem: Problem, choice: OrderChoice, spread: tuple[float
     return Blended(theta[0], matrix, top, freedom, {}, {})
 
 
-def _highest_shown(problem: Problem, choice: OrderChoice) -> int:
+def _highest_shown(problem: TumbleProblem, choice: OrderChoice) -> int:
     """The highest order up to 3 whose steps the attitudes show, or the chosen one."""
     n = problem.reading.shape[1]
     least = 0 if problem.covariance is not None and not problem.robust else _LEAST_FREEDOM
@@ -760,14 +762,14 @@ def _highest_shown(problem: Problem, choice: OrderChoice) -> int:
     return max(shown, choice.order)
 
 
-def _refit(problem: Problem, start: Solution, common: Solution, order: int) -> Fit:
+def _refit(problem: TumbleProblem, start: TumbleSolution, common: TumbleSolution, order: int) -> Fit:
     """Fit an order with the weights, and the lengthening of |f|, of another."""
     return fit_lengths(
         start.theta, problem.reading, common.weights, common.lengthening, order, tolerance=_TOLERANCE, most=_STEPS
     )
 
 
-def _noise(problem: Problem, solution: Solution, cost: float, left: float) -> tuple[float, float | None]:
+def _noise(problem: TumbleProblem, solution: TumbleSolution, cost: float, left: float) -> tuple[float, float | None]:
     """Variance of the attitudes over that of the solution, and its degrees of freedom; None where it is known."""
     if problem.robust and left > 0:
         factor = float(huber_inflation(solution.standardised(), solution.theta.shape[1])[0])
@@ -777,7 +779,7 @@ def _noise(problem: Problem, solution: Solution, cost: float, left: float) -> tu
     return 1.0, float(solution.freedom[0]) if np.isfinite(solution.freedom[0]) else None
 
 
-def _effect_of_left_out(problem: Problem, solution: Solution, order: int) -> tuple[float, float]:
+def _effect_of_left_out(problem: TumbleProblem, solution: TumbleSolution, order: int) -> tuple[float, float]:
     """``(J'WJ)^-1 J'W J_k``: largest change of a bias and of a scale factor by one unit of a k that is left out."""
     theta = np.zeros((1, parameter_count(order)))
     theta[:, : solution.theta.shape[1]] = solution.theta

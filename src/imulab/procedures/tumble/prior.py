@@ -22,7 +22,7 @@ from imulab.procedures.tumble.checks import check_prior
 from imulab.procedures.tumble.model import GROUPS, length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.record import Scaling, scaled_parameters, si_derivative
 from imulab.procedures.tumble.schema import PriorShares, fit_of, model_of
-from imulab.procedures.tumble.solve import Prior, Problem, Solution
+from imulab.procedures.tumble.solve import Prior, TumbleProblem, TumbleSolution
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.sections import Quantity
@@ -41,7 +41,7 @@ _ALIKE = 1e-12
 
 
 @dataclass(frozen=True)
-class Known:
+class PriorNormal:
     """A record in the scaled parameters of a fit: normal, mean (p,) and covariance (p, p).
 
     `shared` says that the record rests on the same gravity, whose error is then not in the covariance.
@@ -53,7 +53,7 @@ class Known:
 
 
 @dataclass(frozen=True)
-class Aged:
+class AgedPrior:
     """A record and attitudes, put together.
 
     Attributes
@@ -76,8 +76,8 @@ class Aged:
         Whether the covariance already holds the uncertainty of gravity.
     """
 
-    problem: Problem
-    solution: Solution
+    problem: TumbleProblem
+    solution: TumbleSolution
     covariance: Array
     freedom: float | None
     probability: float
@@ -86,7 +86,7 @@ class Aged:
     with_gravity: bool
 
 
-def known_of(record: Calibration, scaling: Scaling, gravity: Gravity, unit: str) -> Known:
+def known_of(record: Calibration, scaling: Scaling, gravity: Gravity, unit: str) -> PriorNormal:
     """Return a record in the scaled parameters of attitudes measured under `gravity`.
 
     Raises
@@ -106,7 +106,7 @@ def known_of(record: Calibration, scaling: Scaling, gravity: Gravity, unit: str)
         covariance = covariance - np.outer(slope, slope)
     mean = scaled_parameters(np.array([record.value(name) for name in names]), scaling, gravity.value)
     inverse = np.linalg.inv(si_derivative(mean, scaling, gravity.value))
-    return Known(mean, inverse @ covariance @ inverse.T, common is not None)
+    return PriorNormal(mean, inverse @ covariance @ inverse.T, common is not None)
 
 
 def contradiction(residuals: Array, jacobian: Array, known: Array, noise: Array) -> tuple[float, float]:
@@ -128,7 +128,9 @@ def contradiction(residuals: Array, jacobian: Array, known: Array, noise: Array)
     return value, chi_square_probability(value, len(residuals))
 
 
-def put_together(problem: Problem, known: Known, gravity: Gravity, ageing: tuple[float | None, ...]) -> Aged:
+def put_together(
+    problem: TumbleProblem, known: PriorNormal, gravity: Gravity, ageing: tuple[float | None, ...]
+) -> AgedPrior:
     """Combine a record with attitudes of known noise.
 
     Parameters
@@ -166,7 +168,7 @@ def put_together(problem: Problem, known: Known, gravity: Gravity, ageing: tuple
         passes += 1
     spread = np.sqrt(np.diag(mixed.prior))
     root = np.linalg.inv(np.linalg.cholesky(mixed.prior / np.outer(spread, spread))) / spread
-    solution = Solution(
+    solution = TumbleSolution(
         theta=theta[None],
         residuals=residuals,
         deviations=residuals if problem.motion is not None else norm - 1,
@@ -181,7 +183,7 @@ def put_together(problem: Problem, known: Known, gravity: Gravity, ageing: tuple
         iterations=np.array([passes]),
         converged=np.array([rests]),
     )
-    return Aged(
+    return AgedPrior(
         problem=replace(problem, prior=Prior(known.mean, root)),
         solution=solution,
         covariance=mixed.covariance,
@@ -270,7 +272,9 @@ def _mixture(jacobian: Array, seen: Array, noise: Array, known: Array, ageing: t
     )
 
 
-def prior_shares(record: Calibration, known: Known, aged: Aged, scaling: Scaling, gravity: Gravity) -> PriorShares:
+def prior_shares(
+    record: Calibration, known: PriorNormal, aged: AgedPrior, scaling: Scaling, gravity: Gravity
+) -> PriorShares:
     """Return what a record says of its prior: what it aged, the test, and each parameter's share of the knowledge.
 
     The share is the variance now over that of the prior with what it aged, 1 where the data added nothing.
@@ -300,7 +304,7 @@ def prior_shares(record: Calibration, known: Known, aged: Aged, scaling: Scaling
     )
 
 
-def findings(record: Calibration, aged: Aged, recording: Recording, count: int) -> list[str]:
+def findings(record: Calibration, aged: AgedPrior, recording: Recording, count: int) -> list[str]:
     """Return what a user must know of a prior, a sentence each."""
     found = []
     mine, its = record.sensor.get("serial"), recording.metadata.get("serial")

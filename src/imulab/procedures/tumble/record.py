@@ -46,7 +46,7 @@ from imulab.procedures.tumble.schema import (
     fit_of,
     model_of,
 )
-from imulab.procedures.tumble.solve import CLOSEST, Problem, Solution, data_freedom, forces, near_vertical
+from imulab.procedures.tumble.solve import CLOSEST, TumbleProblem, TumbleSolution, data_freedom, forces, near_vertical
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import Change
@@ -70,12 +70,12 @@ _MOST_NAMED = 8
 
 
 @dataclass(frozen=True)
-class Found:
+class FittedAttitudes:
     """All attitudes that were found, those set aside included, under the solution for the others."""
 
     attitudes: Attitudes
-    problem: Problem
-    solution: Solution
+    problem: TumbleProblem
+    solution: TumbleSolution
     aside: Aside
 
 
@@ -99,11 +99,11 @@ class Estimate:
     """
 
     attitudes: Attitudes
-    problem: Problem
-    solution: Solution
+    problem: TumbleProblem
+    solution: TumbleSolution
     given_order: Stated | None
     stated: Stated | None
-    found: Found
+    found: FittedAttitudes
     observability: Observability
     orders: tuple[OrderRow, ...]
     with_gravity: bool = False
@@ -120,7 +120,7 @@ def aside_of(record: Calibration, attitudes: Attitudes) -> NDArray[np.bool_]:
     return found
 
 
-def aside_warnings(found: Found, options: Mapping[str, Any]) -> list[str]:
+def aside_warnings(found: FittedAttitudes, options: Mapping[str, Any]) -> list[str]:
     """Name the attitudes that were set aside, or say why a knocked one may not have been."""
     if options["loss"] != "auto":
         return []
@@ -166,7 +166,7 @@ def freedom_finding(attitudes: int, size: int, order: int) -> str | None:
     )
 
 
-def vertical_warnings(found: Found, method: str) -> list[str]:
+def vertical_warnings(found: FittedAttitudes, method: str) -> list[str]:
     """Name the axes that are vertical, up or down, in more than one attitude, which the linearised's source forbids."""
     if method != "linearised":
         return []
@@ -184,7 +184,7 @@ def vertical_warnings(found: Found, method: str) -> list[str]:
     return warnings
 
 
-def size_warnings(attitudes: Attitudes, solution: Solution) -> list[str]:
+def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
     """Errors that no accelerometer in physical units has: more likely the columns are not what they are said to be."""
     theta, found = solution.theta[0], []
     if parse_unit(attitudes.unit).quantity == "acceleration":
@@ -324,7 +324,7 @@ def _parameters(
     )
 
 
-def _model(attitudes: Attitudes, problem: Problem, gravity: Gravity) -> TumbleModel:
+def _model(attitudes: Attitudes, problem: TumbleProblem, gravity: Gravity) -> TumbleModel:
     """Return the law of the record, and the conditions of the test."""
     return TumbleModel(
         order=problem.order,
@@ -459,7 +459,7 @@ def si_parameters(theta: Array, scaling: Scaling, g: float, order: int) -> tuple
 
 
 def _leave_one_out(
-    orders: tuple[OrderRow, ...], problem: Problem, solution: Solution, method: str, g: float
+    orders: tuple[OrderRow, ...], problem: TumbleProblem, solution: TumbleSolution, method: str, g: float
 ) -> Length | None:
     """Error of each attitude predicted from the others, rms: from the table of orders, or by the linear formula."""
     for row in orders:
@@ -472,7 +472,9 @@ def _leave_one_out(
     return Length(value=g * float(np.sqrt(np.mean(felt**2))), unit="m/s^2")
 
 
-def _evidence(attitudes: Attitudes, scaling: Scaling, problem: Problem, solution: Solution, g: float) -> TumbleEvidence:
+def _evidence(
+    attitudes: Attitudes, scaling: Scaling, problem: TumbleProblem, solution: TumbleSolution, g: float
+) -> TumbleEvidence:
     """Return of each attitude its mean output, force and residual, and the deviation over time."""
     known = problem.covariance is not None
     before = np.linalg.norm(problem.reading[0], axis=1) - 1
@@ -506,8 +508,8 @@ def _evidence(attitudes: Attitudes, scaling: Scaling, problem: Problem, solution
 def _warnings(
     attitudes: Attitudes,
     gravity: Gravity,
-    problem: Problem,
-    solution: Solution,
+    problem: TumbleProblem,
+    solution: TumbleSolution,
     observability: Observability,
     options: Mapping[str, Any],
 ) -> list[str]:
@@ -521,13 +523,13 @@ def _warnings(
     ]
 
 
-def beyond_noise(problem: Problem, chi_square: float, freedom: float) -> bool:
+def beyond_noise(problem: TumbleProblem, chi_square: float, freedom: float) -> bool:
     """Whether attitudes scatter so much that their own noise would do it once in a hundred tests or less."""
     known = problem.covariance is not None and freedom >= 1
     return known and chi_square_probability(chi_square, freedom) < _NOT_BY_CHANCE
 
 
-def _scatter_warnings(problem: Problem, solution: Solution, chi_square: float, freedom: float) -> list[str]:
+def _scatter_warnings(problem: TumbleProblem, solution: TumbleSolution, chi_square: float, freedom: float) -> list[str]:
     """Say that the attitudes scatter beyond their noise, which the uncertainties hold anyway, or far below it."""
     known = problem.covariance is not None and problem.prior is None and not problem.robust
     if known and freedom > 0 and chi_square_probability(chi_square, freedom) > 1 - _TOO_GOOD:
@@ -545,7 +547,9 @@ def _scatter_warnings(problem: Problem, solution: Solution, chi_square: float, f
     ]
 
 
-def _pattern_warnings(attitudes: Attitudes, problem: Problem, solution: Solution, *, order_chosen: bool) -> list[str]:
+def _pattern_warnings(
+    attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution, *, order_chosen: bool
+) -> list[str]:
     """Say what the residuals follow, of the attitudes that do not stand out; with a prior they follow that too."""
     if problem.prior is not None:
         return []
@@ -559,7 +563,7 @@ def _pattern_warnings(attitudes: Attitudes, problem: Problem, solution: Solution
 
 
 def _attitude_warnings(
-    attitudes: Attitudes, problem: Problem, solution: Solution, options: Mapping[str, Any]
+    attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution, options: Mapping[str, Any]
 ) -> list[str]:
     deviation = 1e3 * solution.deviations[0]
     if problem.robust:
@@ -578,7 +582,7 @@ def _attitude_warnings(
     return single[:_MOST_NAMED] + more
 
 
-def _freedom_warnings(problem: Problem, solution: Solution, observability: Observability) -> list[str]:
+def _freedom_warnings(problem: TumbleProblem, solution: TumbleSolution, observability: Observability) -> list[str]:
     n, size = problem.reading.shape[1], solution.theta.shape[1]
     found = []
     if observability.condition > _HIGH_CONDITION:
@@ -596,7 +600,7 @@ def _freedom_warnings(problem: Problem, solution: Solution, observability: Obser
     return found
 
 
-def _outliers(problem: Problem, solution: Solution) -> dict[int, float]:
+def _outliers(problem: TumbleProblem, solution: TumbleSolution) -> dict[int, float]:
     """Return the attitudes that stand out, and by how many standard deviations.
 
     Each residual is held against the scatter of the others, with itself left out (externally studentised; Belsley, Kuh

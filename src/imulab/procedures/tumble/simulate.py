@@ -19,7 +19,7 @@ from imulab.errors import OptionError
 from imulab.files import write_text
 from imulab.options import PROGRAM, measure, parsed, text
 from imulab.procedures.tumble import HIGHEST_ORDER
-from imulab.procedures.tumble.mag.simulate import Turns, rotate, simulate_field
+from imulab.procedures.tumble.mag.simulate import HeadingTurns, rotate, simulate_field
 from imulab.quantities import in_si, whole, whole_number
 from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
@@ -47,7 +47,7 @@ class _Path:
     rate: Array
     hold: np.ndarray
     since_hold: Array
-    turns: Turns
+    turns: HeadingTurns
 
 
 def simulate_tumble(
@@ -269,7 +269,7 @@ def _path(directions: Array, sample_rate: float, hold: float, move: float, rng: 
     angle = tau**3 * (10 - 15 * tau + 6 * tau**2)
     speed = 30 * tau**2 * (1 - tau) ** 2 * sample_rate / (moving + 1)
     axis, full = _turns(directions, rng)
-    turns = Turns(np.vstack([axis, axis[-1:]]), np.append(full, 0.0), number, angle)
+    turns = HeadingTurns(np.vstack([axis, axis[-1:]]), np.append(full, 0.0), number, angle)
     axis, full = turns.axis[number], turns.full[number]
     # The body turns by +angle about the axis, so that the upward direction turns by -angle in its frame.
     turned = rotate(directions[number], axis, -full * angle)

@@ -3,7 +3,7 @@
 Least squares in units of g, the published first-order iteration, and which attitudes determine the parameters best.
 
 `solve_norm` minimises ``sum_p w_p (|f(M_p)| - 1)^2`` with the model inverted exactly; the published first-order
-iteration (linearised.py) returns the same `Solution`.
+iteration (linearised.py) returns the same `TumbleSolution`.
 
 Noise-length term: second-order expansion of |f + e|.
 
@@ -61,7 +61,7 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class Problem:
+class TumbleProblem:
     """Attitudes of a batch of units, scaled: outputs less a nominal zero, over a nominal scale, in units of g.
 
     Attributes
@@ -93,7 +93,7 @@ class Problem:
     cross: bool = False
     motion: Motion | None = None
 
-    def only(self, which: NDArray[Any]) -> Problem:
+    def only(self, which: NDArray[Any]) -> TumbleProblem:
         """Return the problem with some of its attitudes, by index or mask of shape (n,)."""
         return replace(
             self,
@@ -102,7 +102,7 @@ class Problem:
             motion=None if self.motion is None else self.motion[which],
         )
 
-    def held_still(self, solution: Solution) -> Problem:
+    def held_still(self, solution: TumbleSolution) -> TumbleProblem:
         """Return attitudes that do not move, whose magnitudes and noise are those that this problem was solved with."""
         if self.motion is None:
             return self
@@ -119,7 +119,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Solution:
+class TumbleSolution:
     """Solutions of a batch of problems, in units of g.
 
     Attributes
@@ -181,7 +181,7 @@ def start_parameters(order: int, count: int = 1, cross: bool = False) -> Array:
     return theta
 
 
-def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
+def solve_norm(problem: TumbleProblem, start: Array | None = None) -> TumbleSolution:
     """Fit |f| = 1 by weighted least squares, or with Huber's loss.
 
     Weights are ``1 / (q' C q + tau^2)``, q = d|f|/dM: each attitude's own noise along its own vertical, and what the
@@ -224,7 +224,7 @@ def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
         lengthening = np.repeat(_mean_square(fit, down, size)[:, None], n, axis=1)
         fit = _least_squares(problem, theta, down / variance, lengthening)
         theta = fit.parameters
-    return Solution(
+    return TumbleSolution(
         theta=theta,
         residuals=fit.residuals,
         deviations=fit.residuals + (0.0 if problem.motion is not None else lengthening),
@@ -241,20 +241,22 @@ def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
     )
 
 
-def _least_squares(problem: Problem, theta: Array, weights: Array, lengthening: Array, tolerance: float = 1e-9) -> Fit:
+def _least_squares(
+    problem: TumbleProblem, theta: Array, weights: Array, lengthening: Array, tolerance: float = 1e-9
+) -> Fit:
     return fit_lengths(
         theta, problem.reading, weights, lengthening, problem.order, tolerance=tolerance, most=_FIT_STEPS
     )
 
 
-def informed_rows(problem: Problem, jacobian: Array, weights: Array) -> tuple[Array, Array]:
+def informed_rows(problem: TumbleProblem, jacobian: Array, weights: Array) -> tuple[Array, Array]:
     """Return Jacobian (n + q, p) and weights (n + q,) of one problem with the rows of its prior."""
     if problem.prior is None:
         return jacobian, weights
     return np.vstack([jacobian, problem.prior.rows]), np.concatenate([weights, np.ones(len(problem.prior.rows))])
 
 
-def data_freedom(problem: Problem, jacobian: Array, weights: Array) -> float:
+def data_freedom(problem: TumbleProblem, jacobian: Array, weights: Array) -> float:
     """Return attitudes less the parameters that they, rather than the prior, determine: ``n - tr(H^-1 J' W J)``."""
     n, size = jacobian.shape
     if problem.prior is None:
@@ -271,7 +273,7 @@ def _mean_square(fit: Fit, down: Array, size: int) -> Array:
     return used
 
 
-def magnitude_noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tuple[Array, Array]:
+def magnitude_noise(problem: TumbleProblem, theta: Array, jacobian: Array | None = None) -> tuple[Array, Array]:
     """Return by how much noise lengthens |f|, and the variance of |f|, shapes (b, n)."""
     if problem.covariance is None:
         return np.zeros(problem.reading.shape[:2]), np.ones(problem.reading.shape[:2])
@@ -280,7 +282,7 @@ def magnitude_noise(problem: Problem, theta: Array, jacobian: Array | None = Non
     return length_noise(theta, jacobian, problem.covariance, problem.motion)
 
 
-def evaluate(problem: Problem, solution: Solution) -> Solution:
+def evaluate(problem: TumbleProblem, solution: TumbleSolution) -> TumbleSolution:
     """Return residuals, Jacobian and variances of all attitudes under a solution for some of them, a batch of one.
 
     The excess variance is the solution's; down-weights are ones.
@@ -302,12 +304,12 @@ def evaluate(problem: Problem, solution: Solution) -> Solution:
     )
 
 
-def forces(problem: Problem, solution: Solution) -> Array:
+def forces(problem: TumbleProblem, solution: TumbleSolution) -> Array:
     """Return the specific force in each attitude, units of g, shape (b, n, 3)."""
     return norm_and_jacobian(solution.theta, problem.reading, problem.order)[2]
 
 
-def leave_one_out(problem: Problem, solution: Solution) -> Array:
+def leave_one_out(problem: TumbleProblem, solution: TumbleSolution) -> Array:
     """Return the error |f| - 1 of each attitude under the fit to all others, shape (n,), for a batch of one.
 
     The n refits have the weights of the whole fit and no prior. Beyond some hundred attitudes no single one moves the
@@ -351,7 +353,7 @@ class Threshold:
 SOURCE_THRESHOLD = Threshold(5e-6, 2e-6, 3 / 3600 * np.pi / 180)
 
 
-def solve_linearised(problem: Problem, name: str, threshold: Threshold = SOURCE_THRESHOLD) -> Solution:
+def solve_linearised(problem: TumbleProblem, name: str, threshold: Threshold = SOURCE_THRESHOLD) -> TumbleSolution:
     """Run the published first-order iteration for a batch of one; weights and excess variance as for `solve_norm`.
 
     ``sum_i sum_j d_ji a_i^(j+1) + m_1 a_x a_y + m_2 a_y a_z + m_3 a_z a_x = (|B|^2 - 1) / 2``, solved by linear least
@@ -382,7 +384,7 @@ def solve_linearised(problem: Problem, name: str, threshold: Threshold = SOURCE_
 
 
 def _linearised_iteration(
-    problem: Problem, lengthening: Array, variance: Array, name: str, threshold: Threshold
+    problem: TumbleProblem, lengthening: Array, variance: Array, name: str, threshold: Threshold
 ) -> tuple[Array, int]:
     """Repeat the linear step until it rests; return theta, shape (1, p), and the number of passes."""
     order = problem.order
@@ -422,7 +424,7 @@ def _linearised_iteration(
     )
 
 
-def _evaluated(problem: Problem, theta: Array, iterations: int, name: str) -> Solution:
+def _evaluated(problem: TumbleProblem, theta: Array, iterations: int, name: str) -> TumbleSolution:
     """Wrap parameters of the linearised iteration as a solution."""
     norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, problem.order)
     if not np.isfinite(norm).all():
@@ -432,7 +434,7 @@ def _evaluated(problem: Problem, theta: Array, iterations: int, name: str) -> So
         )
     lengthening, own = magnitude_noise(problem, theta, jacobian)
     n = norm.shape[1]
-    return Solution(
+    return TumbleSolution(
         theta=theta,
         residuals=norm - 1 - lengthening,
         deviations=norm - 1 - (lengthening if problem.motion is not None else 0.0),
@@ -669,7 +671,7 @@ def sphere_points(count: int) -> Array:
     return points
 
 
-def helpful_attitudes(order: int, solution: Solution, count: int) -> str:
+def helpful_attitudes(order: int, solution: TumbleSolution, count: int) -> str:
     """Name the upward directions (body axes) that add most to what the attitudes determine.
 
     Each is the candidate with the largest variance of |f| under the information so far, a step of the exchange on the

@@ -40,7 +40,7 @@ _AXIS = re.compile(r"(gyro|accel)_.+")
 
 
 @dataclass(frozen=True)
-class Bins:
+class CycleBins:
     """Averages over bins of time: of b bins that hold samples, in order.
 
     Attributes
@@ -70,9 +70,9 @@ class Bins:
     def __len__(self) -> int:
         return len(self.start)
 
-    def where(self, keep: np.ndarray) -> Bins:
+    def where(self, keep: np.ndarray) -> CycleBins:
         """Return some of the bins."""
-        return Bins(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+        return CycleBins(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Cycle:
         Rows left out because every axis is exactly zero in them, as where a logger writes what it has not got.
     """
 
-    bins: Bins
+    bins: CycleBins
     axes: tuple[str, ...]
     units: tuple[str, ...]
     temperature: float
@@ -282,7 +282,7 @@ def _accumulate(
     return number[first], moments, sums
 
 
-def _bins(pieces: list[tuple[np.ndarray, Array, Array]], factors: list[float]) -> Bins:
+def _bins(pieces: list[tuple[np.ndarray, Array, Array]], factors: list[float]) -> CycleBins:
     number = np.concatenate([piece[0] for piece in pieces])
     moments = np.concatenate([piece[1] for piece in pieces])
     sums = np.concatenate([piece[2] for piece in pieces])
@@ -299,7 +299,7 @@ def _bins(pieces: list[tuple[np.ndarray, Array, Array]], factors: list[float]) -
     factor = np.array(factors)
     count = moments[:, 0]
     nodes, shares = gauss_nodes(moments[:, 1:] / count[:, None])
-    return Bins(
+    return CycleBins(
         start=number * BIN,
         stop=(number + 1) * BIN,
         count=count,
@@ -327,7 +327,7 @@ def gauss_nodes(moments: Array) -> tuple[Array, Array]:
     return mean[:, None] + np.column_stack([low, high]), np.column_stack([share, 1 - share])
 
 
-def merge(bins: Bins, edges: Array) -> Bins:
+def merge(bins: CycleBins, edges: Array) -> CycleBins:
     """Return wider bins between the given times, shape (e,); bins that cross an edge or lie outside are left out.
 
     The averages of cubics stay exact.
@@ -350,7 +350,7 @@ def merge(bins: Bins, edges: Array) -> Bins:
     apart = kept.mean - np.repeat(mean, sizes, axis=0)
     variance = np.add.reduceat(n[:, None] * (kept.variance + apart**2), first, axis=0) / count[:, None]
     groups = owner[first]
-    return Bins(edges[groups], edges[groups + 1], count, nodes + centre[:, None], shares, mean, variance)
+    return CycleBins(edges[groups], edges[groups + 1], count, nodes + centre[:, None], shares, mean, variance)
 
 
 def common_axes(cycles: list[Cycle]) -> tuple[str, ...]:
@@ -626,7 +626,7 @@ def make_curves(
     return curves, settled
 
 
-def _check_early(cycles: Sequence[Cycle], still: Sequence[Bins], settling_time: float) -> None:
+def _check_early(cycles: Sequence[Cycle], still: Sequence[CycleBins], settling_time: float) -> None:
     """Refuse a cycle that has hardly a sample of the warm-up."""
     for cycle, bins in zip(cycles, still, strict=True):
         early = int((bins.stop <= settling_time + _NEARLY).sum())
@@ -669,7 +669,7 @@ def _quietest(variance: Array) -> Array:
     return np.asarray(np.median(windows, axis=-1).min(axis=0))
 
 
-def _still(cycle: Cycle, quiet: Array) -> tuple[Bins, tuple[float, float]]:
+def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
     """Return the bins in which the unit stood still; seconds left out, and when it first moved.
 
     A bin counts as moved when its variance is far above `quiet` and above what the warm-up curve itself makes of it, or
@@ -710,7 +710,7 @@ def _running_medians(values: Array) -> Array:
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 7, axis=0), axis=-1))
 
 
-def _white_noise(still: Sequence[Bins]) -> Array:
+def _white_noise(still: Sequence[CycleBins]) -> Array:
     """Variance of the mean over one second, from differences of neighbouring bins, shape (axes,)."""
     total, number = np.zeros(still[0].mean.shape[1]), 0
     for bins in still:
@@ -724,7 +724,7 @@ def _white_noise(still: Sequence[Bins]) -> Array:
     return total / max(number, 1)
 
 
-def _settled(late: Bins, bins: Bins, noise: Array) -> tuple[Array, float, Array, Array]:
+def _settled(late: CycleBins, bins: CycleBins, noise: Array) -> tuple[Array, float, Array, Array]:
     """Mean of the settled part, its seconds, its change from start to end with standard uncertainty."""
     weight = late.count / late.count.sum()
     mean = weight @ late.mean
@@ -740,7 +740,7 @@ def _settled(late: Bins, bins: Bins, noise: Array) -> tuple[Array, float, Array,
 
 
 def _choose_settling_time(
-    cycles: Sequence[Cycle], still: Sequence[Bins], group: Index, end: Array, limit: dict[str, float]
+    cycles: Sequence[Cycle], still: Sequence[CycleBins], group: Index, end: Array, limit: dict[str, float]
 ) -> tuple[float, bool]:
     """Return the first time after which every mean curve stays below its limit, rounded up to 10 s, and whether any is.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from imulab.estimation.rows import rms
 from imulab.procedures.warmup.model import WarmupTable, evaluate, record_table
-from imulab.procedures.warmup.schema import Cycle, Fit, Warmup, drawn_of, engineering_unit
+from imulab.procedures.warmup.schema import CycleCurve, WarmupRecord, WarmupSummary, drawn_of, engineering_unit
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.traces import (
@@ -139,7 +139,7 @@ def grid(
 _LOST = "in noise"
 
 
-def models_table(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> ReportTable:
+def models_table(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]) -> ReportTable:
     """Return the models that were compared, over the axes of one kind."""
     label, factor = engineering_unit(table.units[index[0]])
     rows, highlight = [], None
@@ -175,7 +175,9 @@ def models_table(drawn: Warmup, table: WarmupTable, kind: str, index: list[int])
     )
 
 
-def units_table(fit: Fit, table: WarmupTable, kinds: dict[str, list[int]], units: list[float | None]) -> ReportTable:
+def units_table(
+    fit: WarmupSummary, table: WarmupTable, kinds: dict[str, list[int]], units: list[float | None]
+) -> ReportTable:
     """Return whether one table for the type is enough, axis by axis."""
     found = fit.repeatability
     rows = []
@@ -198,7 +200,7 @@ def units_table(fit: Fit, table: WarmupTable, kinds: dict[str, list[int]], units
     )
 
 
-def tests_table(drawn: Warmup, table: WarmupTable) -> ReportTable:
+def tests_table(drawn: WarmupRecord, table: WarmupTable) -> ReportTable:
     """Return what each calibration temperature showed, over the axes of the first kind."""
     label, factor = engineering_unit(table.units[0])
     head = next(iter(axes_by_kind(table).values()))
@@ -333,7 +335,7 @@ def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
 
 
 def _worst(
-    record: Calibration, fit: Fit, table: WarmupTable, index: list[int], factor: float, label: str
+    record: Calibration, fit: WarmupSummary, table: WarmupTable, index: list[int], factor: float, label: str
 ) -> list[tuple[str, str]]:
     """What to expect at the worst power-on temperature; nothing where a record does not hold it."""
     at = fit.worst_temperature
@@ -353,7 +355,7 @@ def _exhibits_of_table(table: WarmupTable) -> Exhibits:
     )
 
 
-def _cycles(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> Figure:
+def _cycles(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]) -> Figure:
     label, factor = engineering_unit(table.units[index[0]])
     time = np.linspace(0.0, table.settling_time * (1 - 1e-9), _POINTS)
     cells: list[list[dict[str, Any]]] = []
@@ -397,7 +399,7 @@ def _cycles(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> F
     )
 
 
-def _residuals(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> Figure:
+def _residuals(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]) -> Figure:
     label, factor = engineering_unit(table.units[index[0]])
     cells: list[list[dict[str, Any]]] = [[] for _ in index]
     data = drawn.data
@@ -429,7 +431,7 @@ def _residuals(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -
     )
 
 
-def _mean_residual(table: WarmupTable, members: list[Cycle]) -> tuple[Array, Array]:
+def _mean_residual(table: WarmupTable, members: list[CycleCurve]) -> tuple[Array, Array]:
     """Mean over cycles of curve less table, on the bins that all of them have: time (b,), residual (axes, b)."""
     size = min(len(cycle.time) for cycle in members)
     total, time = np.zeros((len(table.axes), size)), np.zeros(size)
@@ -446,7 +448,7 @@ def _inside(table: WarmupTable, temperature: float) -> float:
     return float(np.clip(temperature, table.temperatures[0], table.temperatures[-1]))
 
 
-def _by_temperature(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> Figure:
+def _by_temperature(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]) -> Figure:
     label, factor = engineering_unit(table.units[index[0]])
     fit, knots = drawn.fit, drawn.data.knots
     chosen = fit.row()

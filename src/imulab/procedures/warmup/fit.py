@@ -16,8 +16,8 @@ from imulab.procedures.warmup.cycles import Curves, Cycle, common_axes, find_pow
 from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable, coefficient_covariance, statistics
 from imulab.procedures.warmup.quality import (
     CANDIDATES,
+    CycleSpread,
     Judged,
-    Repeatability,
     after_of,
     choose,
     cycle_weights,
@@ -67,7 +67,7 @@ class WarmupFit(Result):
     calibration: Calibration
     table: WarmupTable
     models: tuple[Judged, ...]
-    repeatability: Repeatability
+    repeatability: CycleSpread
     curves: Curves
 
 

@@ -27,7 +27,7 @@ _FREE = 4
 
 
 @dataclass(frozen=True)
-class Step:
+class PlanStep:
     """One step of the programme: its start and duration, s, the set point, degC, and which cycle it belongs to."""
 
     start: float
@@ -61,7 +61,7 @@ class WarmupPlan(Shown):
         Angle random walk, rad/sqrt(s), and how well cycles repeat, as a fraction of the curve.
     """
 
-    steps: tuple[Step, ...]
+    steps: tuple[PlanStep, ...]
     duration: float
     temperatures: tuple[float, ...]
     cycles: int
@@ -201,13 +201,13 @@ def plan_warmup(
     ):
         if not low <= value <= high:
             raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
-    steps: list[Step] = []
+    steps: list[PlanStep] = []
     clock, here = 0.0, start
 
     def add(duration: float, set_point: float, action: str, cycle: int) -> None:
         nonlocal clock
         if duration > 0:
-            steps.append(Step(clock, duration, set_point, action, cycle))
+            steps.append(PlanStep(clock, duration, set_point, action, cycle))
             clock += duration
 
     for set_point in at:

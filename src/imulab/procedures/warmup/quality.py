@@ -197,7 +197,7 @@ class Worst:
     error: Array
 
 
-def worst_between(curves: Curves, chosen: Judged, spread: Repeatability) -> Worst | None:
+def worst_between(curves: Curves, chosen: Judged, spread: CycleSpread) -> Worst | None:
     """Return the error to expect at the worst power-on temperature, from temperatures left out of the fit.
 
     Interpolation over a gap h errs by up to ``f'' h^2 / 8``; a temperature between neighbours h1 and h2 away, left
@@ -261,7 +261,7 @@ def _by_group(curves: Curves, mean_squares: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Repeatability:
+class CycleSpread:
     """How well cycles repeat, root mean squares over t < T_M without white noise, per axis.
 
     Attributes
@@ -286,7 +286,7 @@ class Repeatability:
     unit: Array | None
 
 
-def repeatability(curves: Curves) -> Repeatability:
+def repeatability(curves: Curves) -> CycleSpread:
     """Return the repeatability between power cycles, the floor that no table can beat, and the spread between units.
 
     Each cycle's curve is first smoothed by a cubic in ln(1 + t / 20 s), whose four coefficients pass far less noise
@@ -325,7 +325,7 @@ def repeatability(curves: Curves) -> Repeatability:
         pairs = len(set(zip(curves.unit.tolist(), curves.group.tolist(), strict=True)))
         one = np.where(np.isfinite(cycle), cycle, 0.0) ** 2 + noise.mean(axis=0)
         unit = np.sqrt(np.maximum(between / units - one * members / pairs, 0.0))
-    return Repeatability(cycle, uncertainty, total, each, unit)
+    return CycleSpread(cycle, uncertainty, total, each, unit)
 
 
 def _squares(deviations: Array, metric: Array) -> Array:
@@ -334,7 +334,7 @@ def _squares(deviations: Array, metric: Array) -> Array:
     return found
 
 
-def cycle_weights(curves: Curves, spread: Repeatability) -> Array:
+def cycle_weights(curves: Curves, spread: CycleSpread) -> Array:
     """Return the weight of each cycle under a random effect per unit, shape (c,).
 
     ``1 / (1 + n rho)`` for each of the n cycles of a unit at a temperature, rho the variance between units over that

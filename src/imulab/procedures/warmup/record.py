@@ -9,7 +9,7 @@ import numpy as np
 
 from imulab.procedures.warmup.cycles import Curves
 from imulab.procedures.warmup.model import WarmupTable, evaluate, exit_jump
-from imulab.procedures.warmup.quality import Judged, Repeatability, Worst, after_of, expectations, quality_warnings
+from imulab.procedures.warmup.quality import CycleSpread, Judged, Worst, after_of, expectations, quality_warnings
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
@@ -22,7 +22,7 @@ def make_record(
     rows: list[Judged],
     chosen: Judged,
     table: WarmupTable,
-    spread: Repeatability,
+    spread: CycleSpread,
     covariance: Array | None,
     settled: bool,
     by_unit: bool,
@@ -80,7 +80,7 @@ def make_record(
 
 
 def _parameters(
-    curves: Curves, chosen: Judged, spread: Repeatability, worst: Worst | None
+    curves: Curves, chosen: Judged, spread: CycleSpread, worst: Worst | None
 ) -> tuple[dict[str, Parameter], tuple[str, ...], Array]:
     """Return T_M, time scales, and per axis what cycles repeat to and the model leaves; names and covariance."""
     found = {"settling_time": Parameter(curves.settling_time, None, "s")}

@@ -19,7 +19,7 @@ PerTemperature = Annotated[list[T], "temperatures"]
 Rows = Annotated[list[Annotated[list[Annotated[list[float], "terms"]], "axes"]], "rows"]
 
 
-class Model(Part):
+class WarmupModel(Part):
     """``model``; `after` is the SHA-256 of the thermal record that the cycles were corrected by, None for none."""
 
     model: str
@@ -44,7 +44,7 @@ class ModelRow(Part):
     exit_jump: PerAxis[float | None]
 
 
-class Repeatability(Part):
+class CycleRepeatability(Part):
     """``fit.repeatability``: what power cycles repeat to, and units, where there are several."""
 
     cycle: PerAxis[float | None]
@@ -53,7 +53,7 @@ class Repeatability(Part):
     unit: PerAxis[float | None] | None
 
 
-class Fit(Part):
+class WarmupSummary(Part):
     """``fit``."""
 
     cycles: int
@@ -63,7 +63,7 @@ class Fit(Part):
     exit_rms: PerAxis[float | None]
     noise: PerAxis[float | None]
     models: list[ModelRow]
-    repeatability: Repeatability
+    repeatability: CycleRepeatability
     worst_temperature: Quantity | None = None
 
     def row(self, model: str | None = None) -> ModelRow:
@@ -98,7 +98,7 @@ class HeldTable(Part):
     time_constants: list[Positive] = field(default_factory=list)
 
 
-class Cycle(Part):
+class CycleCurve(Part):
     """One of ``data.cycles``: a power cycle in bins, referenced to its settled mean."""
 
     file: str
@@ -112,10 +112,10 @@ class Cycle(Part):
     curve: PerAxis[list[float | None]]
 
 
-class Data(Part):
+class WarmupEvidence(Part):
     """``data``."""
 
-    cycles: Annotated[list[Cycle], "cycles"]
+    cycles: Annotated[list[CycleCurve], "cycles"]
 
     @property
     def knots(self) -> list[float]:
@@ -123,26 +123,26 @@ class Data(Part):
         return sorted({cycle.calibration_temperature for cycle in self.cycles})
 
 
-class Warmup(Part):
+class WarmupRecord(Part):
     """A warm-up record."""
 
-    model: Model
-    fit: Fit
+    model: WarmupModel
+    fit: WarmupSummary
     table: HeldTable
-    data: Data
+    data: WarmupEvidence
 
 
 def check(record: Calibration) -> None:
     """Check the sections of a record as it is read from its file; raises RecordError."""
-    part(record, Warmup)
+    part(record, WarmupRecord)
 
 
-def model_of(record: Calibration) -> Model:
+def model_of(record: Calibration) -> WarmupModel:
     """Return the section ``model``; a part that is wrong raises RecordError, one that is missing when it is read."""
-    return part(record, Model, "model")
+    return part(record, WarmupModel, "model")
 
 
-def drawn_of(record: Calibration) -> Warmup:
+def drawn_of(record: Calibration) -> WarmupRecord:
     """Return the sections of a record whose figures are drawn; errors as for `model_of`.
 
     Raises
@@ -150,7 +150,7 @@ def drawn_of(record: Calibration) -> Warmup:
     RecordError
         Its curves do not fit their times, or its rows by temperature the temperatures of its cycles.
     """
-    found = part(record, Warmup)
+    found = part(record, WarmupRecord)
     for number, cycle in enumerate(found.data.cycles):
         if any(len(row) != len(cycle.time) for row in cycle.curve):
             raise RecordError(f"data.cycles[{number}].curve: expected {len(cycle.time)} values an axis, as of time")

@@ -38,7 +38,7 @@ _LATE = 0.3  # s
 
 
 @dataclass(frozen=True)
-class Holds:
+class RestHolds:
     """Attitudes as samples of the gyroscopes; all of shape (n,).
 
     Attributes
@@ -60,7 +60,7 @@ class Holds:
 
 
 @dataclass(frozen=True)
-class Rest:
+class GyroRest:
     """Output at rest: zero (3,), change with specific force (3, 3) or None, and their standard uncertainties."""
 
     zero: Array
@@ -69,7 +69,7 @@ class Rest:
     slope_uncertainty: Array | None
 
 
-def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> Holds:
+def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> RestHolds:
     """Find when the gyroscopes are still: within five standard deviations of the hold's median, in all three.
 
     Raises
@@ -102,10 +102,10 @@ def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> H
             arrive[k] = min(before[-1] + margin, early[k])
         if after.size:
             leave[k] = max(after[0] - margin, late[k])
-    return Holds(start, stop, arrive, leave, still)
+    return RestHolds(start, stop, arrive, leave, still)
 
 
-def clock_notes(holds: Holds, attitudes: Attitudes, time: Array) -> list[str]:
+def clock_notes(holds: RestHolds, attitudes: Attitudes, time: Array) -> list[str]:
     """Say if the gyroscopes, on another clock perhaps, move into one end of the holds and not into the other."""
     into = np.median(time[holds.arrive] - attitudes.start), np.median(attitudes.stop - time[holds.leave])
     for late, other, when in ((*into, "stop turning {:.1f} s after"), (*into[::-1], "start turning {:.1f} s before")):
@@ -135,13 +135,13 @@ def beyond_range(output: Array) -> NDArray[np.bool_]:
 
 
 def at_rest(
-    holds: Holds,
+    holds: RestHolds,
     output: Array,
     force: Array,
     sensitivity: str,
     earth: Array | float = 0.0,
     vertical: Array | None = None,
-) -> Rest:
+) -> GyroRest:
     """Zero and g-sensitivity from the mean still outputs of each quiet hold, least squares over the holds.
 
     `earth` is what is known of the Earth's rate in each, as output, (n, 3), which is taken off. Where that is nothing,
@@ -168,13 +168,13 @@ def at_rest(
     shown = n > 7 and f_test(float((plain**2).sum()), known, float((left**2).sum()), 15, 3 * n) < _SIGNIFICANT
     if sensitivity == "no" or (sensitivity == "auto" and not shown):
         scatter: Array = np.sqrt((flat**2).sum(axis=0) / max(n - 1, 1) / n)
-        return Rest(mean.mean(axis=0), None, scatter, None)
+        return GyroRest(mean.mean(axis=0), None, scatter, None)
     solution = np.asarray(np.linalg.lstsq(whole, mean, rcond=None)[0], dtype=np.float64)
     root = np.sqrt(np.diag(np.linalg.inv(whole.T @ whole)))
     spread = np.sqrt((left**2).sum(axis=0) / max(n - 5, 1))
     wander = np.sqrt((_residuals(whole[:, :4], mean) ** 2).sum(axis=0) / max(n - 4, 1))
     uncertainty: Array = spread[:, None] * root[1:4]
-    return Rest(solution[0], solution[1:4].T, np.maximum(spread, wander) * root[0], uncertainty)
+    return GyroRest(solution[0], solution[1:4].T, np.maximum(spread, wander) * root[0], uncertainty)
 
 
 def _residuals(design: Array, values: Array) -> Array:

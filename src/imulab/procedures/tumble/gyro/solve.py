@@ -28,7 +28,7 @@ from imulab.errors import DataError
 from imulab.estimation.least_squares import Fit, covariance, f_test, least_squares
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.gyro.rest import Rest, at_rest, find_holds
+from imulab.procedures.tumble.gyro.rest import GyroRest, at_rest, find_holds
 from imulab.procedures.tumble.gyro.rotation import frame_rotations, weighted_turns
 from imulab.procedures.tumble.gyro.turns import COLUMNS, ROWS, Segments, carried, find_turns, model, start_scale
 from imulab.recording import Array
@@ -159,7 +159,7 @@ _FEWEST_STAMPS = 100
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ClockComparison:
     """The accelerometers' time less the gyroscopes', ``delay + rate (t - middle)``, with standard uncertainties; s."""
 
     delay: float
@@ -201,7 +201,7 @@ class Clock:
     uncertainty: float
     assumed: float
     of: str
-    comparison: Comparison | None
+    comparison: ClockComparison | None
     counted: bool = False
 
     def notes(self, *, apart: bool) -> list[str]:
@@ -228,7 +228,7 @@ class Clock:
         return []
 
 
-def clock_of_scale(comparison: Comparison | None, clock: float, of: str, *, counted: bool) -> Clock:
+def clock_of_scale(comparison: ClockComparison | None, clock: float, of: str, *, counted: bool) -> Clock:
     """Return what is known of the clock that the scale factors are referred to.
 
     Parameters
@@ -277,7 +277,7 @@ def evened(time: Array) -> tuple[Array, float] | None:
 
 def compare_clocks(
     own: Array, force: Array, time: Array, rate: Array, segments: Segments, *, search: bool
-) -> Comparison | None:
+) -> ClockComparison | None:
     """Compare the clocks of the two triads; None where fewer than six turns tell.
 
     Parameters
@@ -336,7 +336,7 @@ def _carried_gravity(time: Array, rate: Array, segments: Segments, step: float) 
     return time[index], up + share[:, :, None] * (segments.after - up[:, -1])[:, None, :]
 
 
-def _line(when: Array, delay: Array) -> Comparison | None:
+def _line(when: Array, delay: Array) -> ClockComparison | None:
     """Line through the delays, those left out that stand out from it (by the median slope of all pairs)."""
     if len(when) < _FEWEST:
         return None
@@ -353,7 +353,7 @@ def _line(when: Array, delay: Array) -> Comparison | None:
     spread = float((centred**2).sum())
     rate = float((centred * delay[kept]).sum()) / spread
     scatter = float(np.sqrt(((delay[kept] - mean - rate * centred) ** 2).sum() / (n - 2)))
-    return Comparison(mean, scatter / n**0.5, rate, scatter / spread**0.5, middle, n)
+    return ClockComparison(mean, scatter / n**0.5, rate, scatter / spread**0.5, middle, n)
 
 
 # The fit of the turns: from which outputs at rest, and without which turns.
@@ -398,7 +398,7 @@ class Solved:
     """Scaled parameters (p,) that fit the turns, residuals (3 m,), Jacobian (3 m, p), and what was set aside."""
 
     segments: Segments
-    rest: Rest
+    rest: GyroRest
     scale: Array
     theta: Array
     residual: Array
@@ -457,7 +457,7 @@ def solve_turns(case: Case, time: Array, sensitivity: str) -> Solved:
     return found if found.cost(both) < without.cost(both) else without
 
 
-def _solve(case: Case, segments: Segments, rest: Rest, notes: list[str]) -> Solved:
+def _solve(case: Case, segments: Segments, rest: GyroRest, notes: list[str]) -> Solved:
     """Fit the turns; those that stand out from all others are set aside one by one."""
     known = parse_unit(case.unit)
     scale = np.full(3, 1 / to_si(1.0, known.symbol)) if known.quantity == "rate" else start_scale(segments)

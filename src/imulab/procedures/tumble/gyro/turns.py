@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from imulab.display import Note
 from imulab.errors import SegmentError
-from imulab.procedures.tumble.gyro.rest import Holds, Rest, beyond_range
+from imulab.procedures.tumble.gyro.rest import GyroRest, RestHolds, beyond_range
 from imulab.procedures.tumble.gyro.rotation import Turns, composed_turns, weighted_turns
 from imulab.recording import Array
 
@@ -48,7 +48,7 @@ class Segments:
 
 
 def find_turns(
-    holds: Holds, time: Array, output: Array, force: Array, rest: Rest, moving: Array | None, name: str
+    holds: RestHolds, time: Array, output: Array, force: Array, rest: GyroRest, moving: Array | None, name: str
 ) -> tuple[Segments, list[str]]:
     """Find the turns between holds that can be used, and say which cannot: clipped ones, and those with gaps.
 

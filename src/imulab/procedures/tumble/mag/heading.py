@@ -30,8 +30,8 @@ from imulab.procedures.tumble.mag.model import (
     ACCELEROMETERS,
     FEWEST,
     MAGNETOMETERS,
-    Layout,
     Pairs,
+    ParameterLayout,
     invariants,
     mag_names,
 )
@@ -236,7 +236,7 @@ _SCATTER = 3e-3
 """Of |m|, as a part of the field, and of the dip, rad: what good recordings show (0.1 to 0.5 %, 0.16 to 0.29 deg)."""
 _STARTS, _ENOUGH, _SWEEPS = 12, 600, 40
 _RIDGE = 1e-9
-_LAYOUT = Layout(6 + len(MAGNETOMETERS), 6 + len(ACCELEROMETERS))
+_LAYOUT = ParameterLayout(6 + len(MAGNETOMETERS), 6 + len(ACCELEROMETERS))
 
 
 @dataclass(frozen=True)

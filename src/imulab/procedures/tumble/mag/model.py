@@ -99,7 +99,7 @@ def triad(theta: Array, output: Array, pairs: Pairs) -> Vectors:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ParameterLayout:
     """Where the parameters stand: magnetometers' (m), the dip, accelerometers' (f), and of directions held (d)."""
 
     mag: int
@@ -151,7 +151,7 @@ def dips(field: Array, force: Array) -> Array:
     return angle
 
 
-def invariants(theta: Array, accel: Array, mag: Array, layout: Layout) -> Invariants:
+def invariants(theta: Array, accel: Array, mag: Array, layout: ParameterLayout) -> Invariants:
     """Return residuals and derivatives at a parameter vector.
 
     ``dr0 = e' df``, ``dr1 = u' dm``, ``dr2 = t' dm/|m| + v' df/|f| - d(delta)`` with

@@ -112,7 +112,7 @@ def most_disturbed(joint: Joint) -> Disturbed:
 
 
 @dataclass(frozen=True)
-class Step:
+class FieldStep:
     """From which attitude on |m| and dip are others than before, by how much, and how improbable that is by chance."""
 
     first: int
@@ -121,7 +121,7 @@ class Step:
     probability: float
 
 
-def likeliest_step(joint: Joint) -> Step | None:
+def likeliest_step(joint: Joint) -> FieldStep | None:
     """Return the split of the attitudes, in their order, at which |m| and dip change most; None of too few attitudes.
 
     Both change by a number of their own, which the fit would have found beside its parameters; the gain, in the sum of
@@ -148,7 +148,7 @@ def likeliest_step(joint: Joint) -> Step | None:
     at = int(np.argmax(gain))
     ratio = gain[at] / 2 / (max(total - float(gain[at]), 1e-300) / (redundancy - 2))
     p = min(float(f_tail(ratio, 2.0, redundancy - 2)) * len(splits), 1.0)
-    return Step(int(splits[at]), float(size[at, 0]), float(size[at, 1]), p)
+    return FieldStep(int(splits[at]), float(size[at, 0]), float(size[at, 1]), p)
 
 
 @dataclass(frozen=True)

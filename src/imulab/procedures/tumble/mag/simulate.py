@@ -21,7 +21,7 @@ _STRONGEST = 1e-3  # T
 
 
 @dataclass(frozen=True)
-class Turns:
+class HeadingTurns:
     """How a unit is turned from attitude to attitude.
 
     Attributes
@@ -48,7 +48,7 @@ class SeenField:
 
 
 def simulate_field(
-    turns: Turns, up: Array, field: float | str | Array, dip: float | str, known: Mapping[str, float], seed: int
+    turns: HeadingTurns, up: Array, field: float | str | Array, dip: float | str, known: Mapping[str, float], seed: int
 ) -> SeenField:
     """Return outputs in uT, ``M = D m + h`` with soft iron of 5 %, a mounting within degrees and hard iron, and truth.
 

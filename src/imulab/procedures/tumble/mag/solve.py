@@ -40,7 +40,7 @@ from imulab.estimation.least_squares import chi_square_probability
 from imulab.gravity import Gravity
 from imulab.procedures import tumble
 from imulab.procedures.tumble import HEMISPHERES
-from imulab.procedures.tumble.mag.model import MAGNETOMETERS, FieldMeans, Invariants, Layout, invariants
+from imulab.procedures.tumble.mag.model import MAGNETOMETERS, FieldMeans, Invariants, ParameterLayout, invariants
 from imulab.procedures.tumble.record import Estimate, Scaling
 from imulab.quantities import in_si
 from imulab.recording import Array
@@ -217,7 +217,7 @@ def axes_of(matrix: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Held:
+class HeldDirections:
     """Groups of attitudes that point one way, relative to where the axis and the directions were at the start.
 
     Attributes
@@ -240,12 +240,12 @@ class Held:
         """Number of parameters: two of the axis, two of each group."""
         return 2 + 2 * len(self.across)
 
-    def only(self, kept: NDArray[np.intp]) -> Held:
+    def only(self, kept: NDArray[np.intp]) -> HeldDirections:
         """Return what is held of some of the attitudes."""
         return replace(self, group=self.group[kept])
 
 
-def find_held(field: Array, force: Array, groups: Sequence[Sequence[int]]) -> tuple[Held, Array]:
+def find_held(field: Array, force: Array, groups: Sequence[Sequence[int]]) -> tuple[HeldDirections, Array]:
     """Return the groups, relative to the axis that keeps its directions best, and the start of their parameters.
 
     Parameters
@@ -266,7 +266,7 @@ def find_held(field: Array, force: Array, groups: Sequence[Sequence[int]]) -> tu
     means = [axes[list(group)].mean(axis=0) @ axis for group in groups]
     across = np.array([_across(mean / np.linalg.norm(mean)) for mean in means])
     start = np.concatenate([np.zeros(2), *(b @ mean for b, mean in zip(across, means, strict=True))])
-    return Held(number, axis, _across(axis), across), start
+    return HeldDirections(number, axis, _across(axis), across), start
 
 
 def world_axes(field: Array, force: Array) -> Array:
@@ -277,7 +277,7 @@ def world_axes(field: Array, force: Array) -> Array:
     return np.stack([east, np.cross(up, east), up], axis=1)
 
 
-def with_held(found: Invariants, theta: Array, layout: Layout, held: Held) -> Invariants:
+def with_held(found: Invariants, theta: Array, layout: ParameterLayout, held: HeldDirections) -> Invariants:
     """Return the invariants with two more residuals of each attitude, ``B (C x - d)``; nil outside of the groups."""
     own = theta[layout.of_directions]
     longer = held.axis + own[:2] @ held.axis_across
@@ -304,7 +304,7 @@ def with_held(found: Invariants, theta: Array, layout: Layout, held: Held) -> In
     )
 
 
-def _change(found: Invariants, axes: Array, x: Array, layout: Layout) -> Array:
+def _change(found: Invariants, axes: Array, x: Array, layout: ParameterLayout) -> Array:
     """Return how ``C x`` changes with the triads' parameters, shape (n, 3, p)."""
     n = len(axes)
     du, de = np.zeros((n, 3, layout.size)), np.zeros((n, 3, layout.size))
@@ -380,12 +380,12 @@ class Pair:
     accel_size: int
     prior: tuple[Array, Array] | None = None
     mag_order: int = 1
-    held: Held | None = None
+    held: HeldDirections | None = None
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> ParameterLayout:
         """Where the parameters stand."""
-        return Layout(9 + 3 * self.mag_order, self.accel_size, 0 if self.held is None else self.held.size)
+        return ParameterLayout(9 + 3 * self.mag_order, self.accel_size, 0 if self.held is None else self.held.size)
 
     def only(self, kept: NDArray[np.intp]) -> Pair:
         """Return the pair with some of the attitudes, by index."""
