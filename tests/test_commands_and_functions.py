@@ -13,7 +13,6 @@ import imulab as il
 from imulab.cli import main
 from imulab.cli.app import commands
 from imulab.estimation.noise_coefficients import coefficients_dict
-from imulab.procedures.noise.check import as_json
 from imulab.records.calibration import json_text
 
 FUNCTIONS = {
@@ -407,7 +406,7 @@ def test_noise_is_checked_as_on_the_command_line(folder, capsys, monkeypatch):
     ran("noise", "check", "noise.json", "log2.csv", "--tolerance", "2 %", "--json")
     said = json.loads(capsys.readouterr().out)
     found = il.check_noise("noise.json", "log2.csv", tolerance=0.02)
-    assert said == json.loads(json_text(as_json(found)))
+    assert said == json.loads(json_text(found.to_json()))
     assert found.passed
 
 

@@ -27,9 +27,10 @@ from imulab.fleet.statistics import (
     line_statistics,
     load_limits,
     outlier_limit,
+    to_parameter_unit,
 )
-from imulab.fleet.table import display_of, to_parameter_unit
 from imulab.records.calibration import Parameter
+from imulab.report.parameters import reading_unit
 
 
 def summary(serial, value, *, u=0.1, when="2026-01-01T00:00:00Z", unit="m/s^2", freedom=None, sha="s", inputs=("f",)):
@@ -220,20 +221,20 @@ def test_dates():
         ("m/s^2", 9.80665, "mg", 1000.0),
         ("rad", 1e-3, "mrad", 1.0),
         ("rad/s", math.radians(1) / 3600, "deg/h", 1.0),
-        ("m/s^2/(m/s^2)", 1.0001, "ppm", 100.0),
+        ("m/s^2/(m/s^2)", 1.0001, "ppm off nominal", 100.0),
         ("T", 2.5e-5, "uT", 25.0),
-        ("uT/T", 1.0002e6, "ppm", 200.0),
-        ("count/T", 3e7, "count/T", 3e7),
+        ("uT/T", 1.0002e6, "ppm off nominal", 200.0),
+        ("count/T", 3e7, "count/uT", 30.0),
         ("1/(m/s^2)", 1e-6 / 9.80665, "µg/g²", 1.0),
         ("1/(m/s^2)^2", 1e-6 / 9.80665**2, "µg/g³", 1.0),
         ("rad/s/(m/s^2)", math.radians(1) / 3600 / 9.80665, "deg/h/g", 1.0),
-        ("count/(m/s^2)", 512.0, "count/(m/s^2)", 512.0),
+        ("count/(m/s^2)", 512.0, "count/g", 5021.0048),
     ],
 )
 def test_units_that_people_read(unit, value, shown, text):
-    display = display_of(unit)
-    assert display.unit == shown
-    assert display.of(value) == pytest.approx(text, rel=1e-9)
+    read = reading_unit(unit)
+    assert read.symbol == shown
+    assert read.of(value) == pytest.approx(text, rel=1e-9)
     assert to_parameter_unit(text, shown, unit) == pytest.approx(value, rel=1e-12)
     assert to_parameter_unit(value, unit, unit) == value
 

@@ -140,7 +140,7 @@ def test_several_logs_add_up_and_files_are_taken(record, tmp_path):
     assert found.log.fit["logs"] == 2
     other = replace(il.read(tmp_path / "2.csv"), metadata={"serial": "B"})
     found = il.check_noise(replace(record, sensor={"serial": "A"}), other)
-    assert any("of unit B, while the record is of A" in note for note in found.notes)
+    assert any("is of serial B, the record of A" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from imulab.cli.options import GivenFiles
 from imulab.errors import ImulabError
 from imulab.estimation.noise.rest import at_rest, long_rest
 from imulab.procedures.noise import fit, procedure
-from imulab.procedures.noise.check import as_json
 from imulab.procedures.registry import run_task
 from imulab.recording import Recording
 from imulab.records.calibration import json_text
@@ -176,7 +175,7 @@ def test_functions_and_check_read_a_large_file_in_blocks(tmp_path, monkeypatch, 
     monkeypatch.setattr(GivenFiles, "recording", None)
     assert main(["noise", "check", str(tmp_path / "record.json"), str(later), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert said == json.loads(json_text(as_json(found)))
+    assert said == json.loads(json_text(found.to_json()))
 
 
 def mended(kind):

@@ -124,7 +124,7 @@ def test_noise_records_that_do_not_serve_are_refused_or_said():
     short = noise_record("white", 2, ("gyro_1", "gyro_2", "gyro_3"), count=MEAN, scale=1e-3, serial="B")
     warnings = il.calibrate_array(still, noise=short).calibration.warnings
     assert any("the record is of 200 s, and noise that is slower does not show in it" in line for line in warnings)
-    assert any("the record is of unit B, the recording of A" in line for line in warnings)
+    assert any("the record is of serial B, the recording of A" in line for line in warnings)
 
 
 def test_the_zeros_of_a_triad_are_no_more_certain_than_its_noise_record_says():

@@ -418,7 +418,7 @@ def test_runs_of_two_units_are_refused_and_one_of_another_than_the_manifest_says
     monkeypatch.chdir(tmp_path)
     _written(tmp_path, serials=("SN1", "SN1", "SN2"))
     ran("rate", "fit", "t.toml", "-o", "r.json", status=2)
-    assert "serial SN2, but +x.csv is of serial SN1" in capsys.readouterr().err
+    assert "+x.csv is of serial SN1, +z.csv of SN2" in capsys.readouterr().err
     text = _written(tmp_path, serials=("SN1", "SN1", "SN1"))
     Path("t.toml").write_text(f'{text}\n[sensor]\nserial = "SN7"\n', encoding="utf-8")
     ran("rate", "fit", "t.toml", "-o", "r.json")

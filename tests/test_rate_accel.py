@@ -88,7 +88,7 @@ def test_a_record_of_another_unit_is_said_to_be(accel):
     named = [dataclasses.replace(one, metadata={"serial": "SIM"}) for one in made.recordings]
     made = dataclasses.replace(made, recordings=tuple(named))
     (said,) = il.fit_rate(made, accel=of_another_unit(accel), order=1).calibration.verdict.reasons
-    assert said.startswith("accel: the record is of serial SIM-0001, the recordings are of serial SIM")
+    assert said.startswith("accel: the record is of serial SIM-0001, the recordings of SIM")
     found = il.fit_rate(made, accel=of_another_unit(accel, 14e-3 * G, "SIM"), order=1).calibration
     (said,) = found.verdict.reasons
     assert found.verdict.state == "look"

@@ -116,7 +116,7 @@ def test_a_prior_of_another_unit_is_said_to_be():
     prior = il.fit_rate(simulated(11), order=1).calibration
     other = dataclasses.replace(prior, sensor={"serial": "SN7"})
     (said,) = il.fit_rate(simulated(12), order=1, prior=other).calibration.verdict.reasons
-    assert said == "prior: the record is of serial SN7, the recordings are of serial SIM: is it of this unit?"
+    assert said == "prior: the record is of serial SN7, the recordings of SIM: is it of this unit?"
 
 
 def turned(scale=1.01):

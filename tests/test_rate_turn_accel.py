@@ -46,7 +46,7 @@ def test_a_record_of_another_unit_is_said_to_be(accel):
     turns = hand(noise=1e-6, axes=np.eye(3)[[2, 0, 1]], arm=np.zeros(3))
     turns = dataclasses.replace(turns, metadata={"serial": "SIM"})
     (said,) = il.fit_turns(turns, accel=of_another_unit(accel)).calibration.verdict.reasons
-    assert said.startswith("accel: the record is of serial SIM-0001, the recordings are of serial SIM")
+    assert said.startswith("accel: the record is of serial SIM-0001, the recordings of SIM")
     (said,) = il.fit_turns(turns, accel=of_another_unit(accel, 14e-3 * G, "SIM")).calibration.verdict.reasons
     assert re.search(r"\|f\| is -14 mg off gravity in the turn at \d+.\d to \d+.\d s, more than its uncertainty", said)
     for record in (of_another_unit(accel, bias, "SIM") for bias in (0.0, 2e-3 * G)):

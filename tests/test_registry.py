@@ -10,11 +10,10 @@ import imulab as il
 from imulab.cli import main
 from imulab.cli.options import GivenFiles
 from imulab.device.tables import DeviceTable, Field, whole
-from imulab.device.unit import golden_gyroscopes
+from imulab.device.unit import correct_gyroscopes, golden_gyroscopes
 from imulab.options import file, measure, read_options
 from imulab.procedures.procedure import Procedure, Section, Task, source_of
 from imulab.procedures.registry import PROCEDURES, run_task
-from imulab.procedures.tumble.device import apply_gyro
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.triads import Accelerometers, Triads
 from imulab.report import traces
@@ -87,7 +86,7 @@ class DriftSection(Section):
         return golden_gyroscopes(table, random)
 
     def apply(self, unit, columns, recording):
-        return apply_gyro(unit, columns, recording)
+        return correct_gyroscopes(unit, columns, recording)
 
 
 class DriftProcedure(Procedure):

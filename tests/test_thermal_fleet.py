@@ -43,7 +43,7 @@ def test_several_recordings_of_each_unit_are_fitted_as_one_alone(folder):
     assert state.count("done") == 2
     alone, mixed = (row.reason for row in state.failures)
     assert alone.startswith("u1/tumble_0.csv: column temperature: spans 0.2 K")
-    assert mixed.startswith("u2/tumble_60.csv: serial SIM-0002, but u1/tumble_-20.csv is of serial SIM-0001; expected")
+    assert mixed.startswith("u1/tumble_-20.csv is of serial SIM-0001, u2/tumble_60.csv of SIM-0002; expected")
     files = names(1).split(";")
     assert main(["thermal", "fit", *files, "--degrees", "3,2,1", "-o", "one.json"], project=False) == 0
     one, many = il.load("one.json"), il.load("out/SIM-0001.json")

@@ -278,7 +278,7 @@ def test_a_record_of_another_unit_is_said(case):
     _, _, record = case
     other = il.simulate_tumble(order=1, attitudes=24, seed=2)
     notes = fit_gyro_triad(record, il.find_attitudes(other), other).notes
-    assert "gyro: the record is of SIM-0001, the recording of SIM-0002" in notes
+    assert "gyro: the record is of serial SIM-0001, the recording of SIM-0002" in notes
     assert any("|f| scatters by" in note and "is it of this unit?" in note for note in notes)
 
 

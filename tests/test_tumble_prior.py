@@ -307,7 +307,7 @@ def test_the_same_recording_does_not_count_twice_and_another_unit_is_named(imula
     assert volts.stderr == "imulab: 3.json: the prior has outputs in m/s^2, v.csv in V\n"
     other = imulab("tumble", "fit", "3.csv", "--gravity", str(G), "--prior", "4.json")
     assert other.returncode == 0, other.stderr
-    assert "the prior is a record of SIM-0004, the recording one of SIM-0003" in other.stderr
+    assert "the prior is of serial SIM-0004, the recording of SIM-0003" in other.stderr
 
 
 def test_the_command_updates_a_record_from_few_attitudes(imulab, tmp_path):

@@ -14,14 +14,12 @@ from imulab.cli.options import (
     call,
     check_outputs,
     progress_bar,
-    warn,
 )
-from imulab.display import aligned
 from imulab.errors import OptionError
 from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
-    from imulab.procedures.centrifuge.plan import Plan
+    pass
 
 
 def plan(
@@ -36,18 +34,13 @@ def plan(
 
     For wanted levels; predicts uncertainties, and says which runs are too short, too close or too noisy.
     """
+    from imulab.cli.show import finish_plan
+
     check_outputs([output], [])
     if output is not None and not output.lower().endswith((".toml", ".csv")):
         raise OptionError(f"{output}: expected a name that ends in .toml (the manifest) or .csv (the list of runs)")
     result = call(il.plan_centrifuge, **options)
-    if output is not None:
-        result.save(output)
-    head, titles, rows = result.shown()
-    print(_plan_json(result) if json else "\n".join([head, *aligned(titles, rows)]))
-    if output is not None and not json:
-        print(f"{'plan' if output.lower().endswith('.csv') else 'manifest'}: {output}")
-    for message in result.warnings:
-        warn(message)
+    finish_plan(result, output, json=json)
 
 
 def simulate(
@@ -102,36 +95,6 @@ def reduce(
     with progress_bar("runs", len(test.runs)) as progress:
         record = run_task("centrifuge", [manifest], options, GivenFiles(), progress=progress)
     finish(record, output, report, json=json)
-
-
-def _plan_json(result: Plan) -> str:
-    from imulab.records.calibration import json_text
-
-    def of(value: float | None, unit: str) -> dict[str, Any]:
-        return {"value": None if value is None or value == float("inf") else value, "unit": unit}
-
-    return json_text(
-        {
-            "runs": len(result.manifest.runs),
-            "duration": of(result.duration, "s"),
-            "static_duration": of(result.static_duration, "s"),
-            "total": of(result.total, "s"),
-            "wanted": of(result.wanted, "1"),
-            "levels": [
-                {
-                    "specific_force": of(level.force, "m/s^2"),
-                    "arm_rate": of(level.arm_rate, "rad/s"),
-                    "table_rate": of(level.table_rate, "rad/s"),
-                    "periods": level.periods,
-                    "relative_uncertainty": level.relative,
-                    "zeta_uncertainty": level.zeta,
-                    "needed": of(level.needed, "s"),
-                }
-                for level in result.levels
-            ],
-            "warnings": list(result.warnings),
-        }
-    ).rstrip()
 
 
 COMMANDS = (

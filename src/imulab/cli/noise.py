@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 import imulab as il
@@ -16,7 +15,6 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
-    note,
     quantity,
     reading,
     warn,
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from imulab.estimation.noise.rest import Rest
-    from imulab.procedures.noise.plan import NoisePlan
     from imulab.recording import Recording
 
 
@@ -71,13 +68,14 @@ def allan(file: RecordingFile, *, report: ReportFile = None, json: AsJson = Fals
 def describe(found: dict[str, Any]) -> str:
     """Return coefficients and curves as tables."""
     from imulab.display import aligned
-    from imulab.report.noise_figures import coefficient_rows, shown_unit
+    from imulab.report.noise_figures import coefficient_rows
+    from imulab.report.parameters import small_unit
     from imulab.report.traces import plain_number
 
     lines = [f"{printable(found['file'])}: {found['samples']} samples at {found['sample_rate']['value']:.6g} Hz", ""]
     lines += aligned(["column", "coefficient", "value", "u", "unit"], coefficient_rows(found))
     names = list(found["columns"])
-    units = {name: shown_unit(found["columns"][name]["unit"], "bias_instability") for name in names}
+    units = {name: small_unit(found["columns"][name]["unit"]).scale for name in names}
     lines += ["", "Allan deviation"]
     tau = found["columns"][names[0]]["tau"]
     body = [
@@ -147,46 +145,13 @@ def plan(
 
     At rest, for each noise term.
     """
-    from imulab.display import aligned
+    from imulab.cli.show import finish_plan
 
     check_outputs([output], [options["from_"]] if options["from_"] else [])
     if output is not None and not output.lower().endswith(".csv"):
         raise OptionError(f"{output}: expected a name that ends in .csv")
     result = call(il.plan_noise, **options)
-    if output:
-        result.save(output)
-    if json:
-        _print_plan(result)
-        return
-    lead, titles, rows = result.shown()
-    print("\n".join([lead, *aligned(titles, rows)]))
-    if output:
-        print(f"plan: {output}")
-
-
-def _print_plan(result: NoisePlan) -> None:
-    from imulab.procedures.noise.fit import unit_of
-    from imulab.records.calibration import json_text
-
-    terms = [
-        {
-            "column": each.column,
-            "term": each.term,
-            "value": each.value,
-            "unit": unit_of(each.term, each.unit),
-            "relative_standard_uncertainty": finite(each.uncertainty),
-            "limit": finite(each.limit),
-            "wanted": finite(each.wanted),
-            "length": None if (length := finite(each.length)) is None else {"value": length, "unit": "s"},
-        }
-        for each in result.terms
-    ]
-    print(json_text({"length": {"value": result.length, "unit": "s"}, "terms": terms}), end="")
-
-
-def finite(value: float) -> float | None:
-    """Return a number, None where it is none."""
-    return value if math.isfinite(value) else None
+    finish_plan(result, output, json=json)
 
 
 def check(
@@ -202,9 +167,8 @@ def check(
     Tests whether a log at rest is of the noise of the record; exit status 0: pass, 1: fail. Several logs add up.
     Says what differs by how much; a log that is of the same noise fails once in twenty tests.
     """
-    from imulab.cli.options import coloured
-    from imulab.display import Note
-    from imulab.procedures.noise.check import as_json, as_text, check_logs, check_page
+    from imulab.cli.show import finish_check
+    from imulab.procedures.noise.check import check_logs
     from imulab.procedures.noise.fit import read_log
     from imulab.procedures.procedure import source_of
     from imulab.procedures.registry import load
@@ -227,21 +191,7 @@ def check(
             result = check_logs(held, lambda choose: [log(file, choose) for file in files], tolerance, false_alarm)
         except RecordError as error:
             raise RecordError(f"{record}: {error}") from None
-    if report:
-        from imulab.files import write_text
-
-        write_text(report, check_page(result, held, record=record, files=files))
-    if json:
-        from imulab.records.calibration import json_text
-
-        print(json_text(as_json(result)), end="")
-    else:
-        print(as_text(result, record, files, coloured("pass" if result.passed else "fail")))
-    for message in result.notes:
-        (note if isinstance(message, Note) else warn)(message)
-    if report and not json:
-        print(f"report: {report}")
-    return 0 if result.passed else 1
+    return finish_check(result, held, record, files, [], report, json=json)
 
 
 def simulate(

@@ -15,13 +15,12 @@ from imulab.cli.options import (
     check_outputs,
     read_recording,
     reading,
-    warn,
 )
 from imulab.errors import OptionError
 from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
-    from imulab.procedures.rate.plan import RatePlan, TurnPlan
+    pass
 
 
 def plan(
@@ -36,46 +35,13 @@ def plan(
 
     And what the test will give; writes the manifest that rate fit takes.
     """
-    from imulab.display import aligned
-    from imulab.procedures.rate.plan import RatePlan
+    from imulab.cli.show import finish_plan
 
     check_outputs([output], [options["noise"]] if options["noise"] else [])
     if output is not None and not output.lower().endswith((".toml", ".csv")):
         raise OptionError(f"{output}: expected a name that ends in .toml (the manifest) or .csv (the list of stays)")
     result = call(il.plan_rate, **options)
-    if output is not None:
-        if not isinstance(result, RatePlan):
-            raise OptionError(f"{output}: turns by hand have no manifest; expected --turn without -o")
-        result.save(output)
-    head, titles, rows = result.shown()
-    print(_plan_json(result) if json else "\n".join([head, *aligned(titles, rows)]))
-    if output is not None and not json:
-        print(f"{'plan' if output.lower().endswith('.csv') else 'manifest'}: {output}")
-    for message in result.warnings if isinstance(result, RatePlan) else ():
-        warn(message)
-
-
-def _plan_json(result: RatePlan | TurnPlan) -> str:
-    from imulab.procedures.rate.plan import RatePlan
-    from imulab.records.calibration import json_text
-
-    if not isinstance(result, RatePlan):
-        reached = [{"turns": n, "relative_uncertainty": u} for n, u in enumerate(result.reached.tolist(), 1)]
-        said: dict[str, Any] = {"turns": result.turns, "stops": result.stops, "wanted": result.wanted}
-        return json_text({**said, "reached": reached}).rstrip()
-    quantity = {"rate": "rad/s", "duration": "s", "uncertainty": "rad/s", "wanted": "rad/s"}
-    return json_text(
-        {
-            "runs": len(result.test.runs),
-            "duration": {"value": result.duration, "unit": "s"},
-            "rates": [
-                {name: {"value": getattr(each, name), "unit": unit} for name, unit in quantity.items()}
-                for each in result.rates
-            ],
-            "predicted": result.predicted,
-            "warnings": list(result.warnings),
-        }
-    ).rstrip()
+    finish_plan(result, output, json=json)
 
 
 def simulate(

@@ -282,9 +282,10 @@ def _show_changes(first: str, second: str, *, json: bool) -> None:
 
         print(dumps({k: v for k, v in asdict(comparison).items() if k != "record"}, indent=1))
         return
-    serials = [record.sensor.get("serial") for record in records]
-    if all(serials) and serials[0] != serials[1]:
-        warn(f"records of different units: {serials[0]} and {serials[1]}")
+    from imulab.records.comparison import different_units
+
+    if other := different_units((first, records[0].sensor), (second, records[1].sensor)):
+        warn(f"records of different units: {other}")
     print(describe_changes(first, second, comparison, records[0]))
 
 

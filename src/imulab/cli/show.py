@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -13,19 +13,17 @@ from imulab.cli.options import call, check_outputs, coloured, note, warn
 from imulab.display import SENTENCES, Verdict, aligned, printable
 from imulab.errors import OptionError, ReadError
 from imulab.files import replacing
-from imulab.procedures.tumble.model import parameter_units
-from imulab.procedures.tumble.plan import TumblePlan, plan_tumble, roll_pitch
+from imulab.procedures.plan import PlannedAttitudes, PlannedTest
+from imulab.procedures.tumble.plan import plan_tumble
 from imulab.procedures.views import TITLES, change_rows, exhibits_of, verdict
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, json_text
 from imulab.records.comparison import RecordComparison
 from imulab.report.traces import ReportTable
-from imulab.units import STANDARD_GRAVITY
-from imulab.writers import write_csv_to
 
 if TYPE_CHECKING:
     from imulab.device.unit import Blob
-    from imulab.procedures.thermal.plan import ThermalPlan
+    from imulab.procedures.checking import RecordCheck
 
 
 # What every fit does with its result: write it, print it, say what a user must know.
@@ -72,14 +70,7 @@ def finish(
 def run(*, output: str | None, report: str | None, json: bool, **options: Any) -> None:
     """Plan, print the prediction, and write what was asked for."""
     check_plan_outputs(output, report, [name for name in (options["add"], options["from_"]) if name])
-    plan = call(plan_tumble, **options)
-    write_plan(plan, output, report)
-    if json:
-        print(_as_json(plan), end="")
-        return
-    lead, titles, rows = plan.shown()
-    print("\n".join([lead, *aligned(titles, rows)]))
-    say_written(output, report)
+    finish_plan(call(plan_tumble, **options), output, report, json=json)
 
 
 def check_plan_outputs(output: str | None, report: str | None, inputs: list[str]) -> None:
@@ -89,60 +80,67 @@ def check_plan_outputs(output: str | None, report: str | None, inputs: list[str]
         raise OptionError(f"{output}: expected a name that ends in .csv")
 
 
-def write_plan(plan: TumblePlan | ThermalPlan, output: str | None, report: str | None) -> None:
-    """Write the table and the sheet, both or neither."""
+def finish_plan(plan: PlannedTest, output: str | None, report: str | None = None, *, json: bool) -> None:
+    """Write a plan and its sheet, both or neither, print it, and say what was written and what is wrong with it."""
     with ExitStack() as stack:
-        to_csv = stack.enter_context(replacing(output)) if output else None
         to_sheet = stack.enter_context(replacing(report)) if report else None
-        if to_csv:
-            write_csv_to(plan.recording(), to_csv)
-        if to_sheet:
+        if output:
+            plan.save(output)
+        if to_sheet and isinstance(plan, PlannedAttitudes):
             to_sheet.write(plan.sheet().encode("utf-8"))
+    if json:
+        print(json_text(plan.content()), end="")
+    else:
+        print(plan.text())
+        manifest = output is not None and output.lower().endswith(".toml")
+        for name, what in ((output, "manifest" if manifest else "plan"), (report, "sheet")):
+            if name:
+                print(f"{what}: {name}")
+    for message in plan.findings():
+        warn(message)
 
 
-def say_written(output: str | None, report: str | None) -> None:
-    """Say what was written."""
-    for name, what in ((output, "plan"), (report, "sheet")):
-        if name:
-            print(f"{what}: {name}")
+# What every command that tests a record does with the result.
 
 
-def _as_json(plan: TumblePlan) -> str:
-    """Return the plan for scripts, in SI under the names of a record."""
-    angles = roll_pitch(plan.directions)
-    units = parameter_units(plan.order, "m/s^2")
-    # A bias in units of g is so many times gravity, a k_n in 1/g^(n-1) so many times its inverse power.
-    powers = {"m/s^2": 1, "1/(m/s^2)": -1} | {f"1/(m/s^2)^{n}": -n for n in range(2, plan.order)}
-    predicted = plan.uncertainties(plan.noise)
-    headings = plan.headings
-    attitudes = [
-        {"up": up, "roll": {"value": roll, "unit": "rad"}, "pitch": {"value": pitch, "unit": "rad"}}
-        for up, (roll, pitch) in zip(plan.directions.tolist(), angles.tolist(), strict=True)
+def notes_on_data(held: Calibration, recordings: Sequence[Recording]) -> list[str]:
+    """Return what a user should know of recordings that a record is tested by."""
+    corrected = [
+        f"{recording.name}: was corrected before, by {entry}; a record is checked by what the unit puts out, so the "
+        "test means nothing here"
+        for recording in recordings
+        for entry in recording.corrected_by
     ]
-    parameters = {
-        name: {"standard_uncertainty": u * STANDARD_GRAVITY ** powers.get(unit, 0), "unit": unit}
-        for (name, u), unit in zip(predicted.items(), units, strict=True)
-    }
-    if headings is not None:
-        for index, (attitude, north) in enumerate(zip(attitudes, headings.north.tolist(), strict=True)):
-            attitude |= {"north": north, "facing": headings.facing(index)}
-        parameters |= {
-            name: {"standard_uncertainty": u, "unit": "1" if name.startswith(("mag_bias", "mag_scale")) else "rad"}
-            for name, u in headings.uncertainties().items()
-        }
-    return json_text(
-        {
-            "order": plan.order,
-            "criterion": plan.criterion,
-            "condition_number": float(plan.condition_number),
-            "noise": {"value": plan.noise * STANDARD_GRAVITY, "unit": "m/s^2"},
-            "already": plan.already,
-            "warnings": [] if plan.finding is None else [plan.finding],
-            "attitudes": attitudes,
-            "again": [list(pair) for pair in plan.again],
-            "parameters": parameters,
-        }
-    )
+    from imulab.procedures.apply import warnings_of
+
+    return corrected + [warning for recording in recordings for warning in warnings_of(held, recording)]
+
+
+def finish_check(
+    check: RecordCheck,
+    held: Calibration,
+    record: str,
+    files: Sequence[str],
+    notes: Sequence[str],
+    report: str | None,
+    *,
+    json: bool,
+) -> int:
+    """Write the report, print the result and the notes; return the exit status, 0: pass, 1: fail."""
+    notes = [*notes, *check.notes]
+    if report:
+        from imulab.files import write_text
+
+        write_text(report, check.page(held, record, files, notes))
+    if json:
+        print(json_text(check.to_json(notes)).rstrip())
+    else:
+        print(check.text(record, files, coloured(check.verdict)))
+    for message in notes:
+        warn(message)
+    if report and not json:
+        print(f"report: {report}")
+    return 0 if check.passed else 1
 
 
 # Records and recordings in a few lines of plain text.
@@ -197,7 +195,7 @@ def _joined(value: object) -> str:
 
 def describe_changes(first: str, second: str, comparison: RecordComparison, record: Calibration) -> str:
     """Return what changed from one record to the other, which is of the procedure and units of `record`."""
-    lines = [f"{second} less {first}: {verdict(comparison)}", "", *aligned(TITLES, change_rows(comparison, record))]
+    lines = [f"{second} less {first}: {verdict(comparison)}", "", *aligned(TITLES, change_rows(comparison))]
     if comparison.probability is not None:
         lines += ["", f"all together: probability {comparison.probability:.2g} if nothing had changed"]
     if comparison.models:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import imulab as il
@@ -16,89 +15,19 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
-    coloured,
     progress_bar,
     quantity,
     read_recording,
     reading,
-    warn,
     whole_number,
 )
 from imulab.options import FLAG, OUTPUT, READING
 
 if TYPE_CHECKING:
-    from imulab.procedures.tumble.attitudes import Attitudes
-    from imulab.procedures.tumble.check import Check
-    from imulab.procedures.tumble.mag.check import MagCheck
     from imulab.records.calibration import Calibration
 
 
 # ``imulab tumble check``: what a test of a record by fresh attitudes found, for people and for scripts.
-
-
-def as_text(check: Check, attitudes: Attitudes, held: Calibration, record: str, file: str) -> str:
-    """Return the verdict with its p, what to do next, and the residual of every attitude."""
-    import numpy as np
-
-    from imulab.procedures.tumble.check import meaning, measured, next_step, of_magnetometers
-    from imulab.procedures.tumble.record import small_g
-
-    lines = [
-        f"{coloured('pass' if check.passed else 'fail')}: {meaning(check)}",
-        *next_step(check, record, file),
-        measured(check, attitudes),
-        *of_magnetometers(check, attitudes, held.model.get("field", {}).get("unit", "1")),
-    ]
-    for index, value in enumerate(check.residuals.tolist()):
-        beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""
-        expected = ""
-        if check.standard_uncertainty is not None:
-            expected = f" ± {small_g(check.standard_uncertainty[index])}"
-        field = ""
-        if check.mag is not None:
-            field = f", |m| {100 * check.mag.magnitude[index]:+.2f} %, dip {np.degrees(check.mag.dip[index]):+.2f} deg"
-        lines.append(f"{attitudes.label(index)}: {small_g(value)}{expected}{field}{beyond}")
-    return "\n".join(lines)
-
-
-def as_json(check: Check, attitudes: Attitudes, notes: Sequence[str]) -> str:
-    """Return the same as JSON, in SI."""
-    import numpy as np
-
-    from imulab.records.calibration import json_text
-
-    uncertainty = [None] * len(attitudes) if check.standard_uncertainty is None else check.standard_uncertainty.tolist()
-    return json_text(
-        {
-            "verdict": "pass" if check.passed else "fail",
-            "p": check.probability,
-            "chi_square": check.chi_square,
-            "degrees_of_freedom": len(attitudes),
-            "limit": None if check.limit is None else {"value": check.limit, "unit": "m/s^2"},
-            "gravity": check.gravity.entry(),
-            "attitudes": [
-                {"label": attitudes.label(i), "residual": value, "standard_uncertainty": u}
-                for i, (value, u) in enumerate(zip(np.asarray(check.residuals).tolist(), uncertainty, strict=True))
-            ],
-            **({} if check.mag is None else {"mag": _of_mag(check.mag)}),
-            "notes": [str(note) for note in notes],
-        }
-    ).rstrip()
-
-
-def _of_mag(mag: MagCheck) -> dict[str, Any]:
-    return {
-        "p": mag.probability,
-        "common": {
-            name: {"value": value, "standard_uncertainty": u, "unit": unit}
-            for name, value, u, unit in zip(
-                ("magnitude", "dip"), mag.common.tolist(), mag.common_uncertainty.tolist(), ("1", "rad"), strict=True
-            )
-        },
-        "magnitude": mag.magnitude.tolist(),
-        "dip": {"value": mag.dip.tolist(), "unit": "rad"},
-        "hard_iron_change": {"value": mag.hard_iron.tolist(), "p": mag.explained},
-    }
 
 
 # Calibrate an accelerometer triad with gravity alone.
@@ -249,9 +178,9 @@ def check(
     Tests whether they still agree with it, without refitting; exit status 0: pass, 1: fail. A record that still
     holds fails once in twenty tests.
     """
+    from imulab.cli.show import finish_check, notes_on_data
     from imulab.errors import RecordError
     from imulab.gravity import gravity_option
-    from imulab.procedures.apply import warnings_of
     from imulab.procedures.registry import load
     from imulab.procedures.tumble.attitudes import find_attitudes
     from imulab.procedures.tumble.check import check_tumble
@@ -266,22 +195,7 @@ def check(
         result = check_tumble(held, attitudes, limit=largest, gravity=local)
     except RecordError as error:
         raise RecordError(f"{record}: {error}") from None
-    recording = attitudes.recording
-    corrected = [f"{recording.name}: was corrected before, by {entry}" for entry in recording.corrected_by]
-    if corrected:
-        corrected[-1] += "; a record is checked by what the unit puts out, so the test means nothing here"
-    notes = (*corrected, *warnings_of(held, recording), *result.notes)
-    if report:
-        from imulab.files import write_text
-        from imulab.procedures.tumble.check import check_page
-
-        write_text(report, check_page(result, attitudes, held, record=record, file=file, warnings=notes))
-    print(as_json(result, attitudes, notes) if json else as_text(result, attitudes, held, record, file))
-    for message in notes:
-        warn(message)
-    if report and not json:
-        print(f"report: {report}")
-    return 0 if result.passed else 1
+    return finish_check(result, held, record, [file], notes_on_data(held, [attitudes.recording]), report, json=json)
 
 
 COMMANDS = (

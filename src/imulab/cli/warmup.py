@@ -14,13 +14,12 @@ from imulab.cli.options import (
     call,
     check_outputs,
     naming,
-    warn,
 )
 from imulab.errors import OptionError
 from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
-    from imulab.procedures.warmup.plan import WarmupPlan
+    pass
 
 
 def plan(
@@ -33,51 +32,11 @@ def plan(
 
     With its duration; says which temperatures are missing.
     """
-    from imulab.units import from_si
+    from imulab.cli.show import finish_plan
 
     check_outputs([output], [])
     result = call(il.plan_warmup, **options)
-    if output:
-        result.save(output)
-    if json:
-        _print_plan(result)
-        return
-    print(result)
-    print(
-        "standard uncertainty of a curve at its temperature: "
-        f"{from_si(result.curve_uncertainty, 'deg/h'):.2g} deg/h from noise, and "
-        f"{100 * result.repeatability_uncertainty:.2g} % of the curve from repeatability"
-    )
-    for message in result.warnings:
-        warn(message)
-    if result.proposal != result.temperatures:
-        print(f"better: --temperatures {','.join(f'{t:g}' for t in result.proposal)}")
-    if output:
-        print(f"plan: {output}")
-
-
-def _print_plan(result: WarmupPlan) -> None:
-    from dataclasses import asdict
-
-    from imulab.records.calibration import json_text
-
-    print(
-        json_text(
-            {
-                "temperatures": list(result.temperatures),
-                "cycles": result.cycles,
-                "duration": {"value": result.duration, "unit": "s"},
-                "steps": [asdict(step) for step in result.steps],
-                "curve_uncertainty": {"value": result.curve_uncertainty, "unit": "rad/s"},
-                "repeatability": {"value": result.repeatability_uncertainty, "unit": "1"},
-                "proposal": list(result.proposal),
-                "warnings": list(result.warnings),
-            }
-        ),
-        end="",
-    )
-    for message in result.warnings:
-        warn(message)
+    finish_plan(result, output, json=json)
 
 
 def simulate(

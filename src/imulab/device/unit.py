@@ -21,13 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import imulab.device._runtime as _runtime
+from imulab.columns import triad
 from imulab.device.tables import KINDS, TEXT, ArraySettings, DeviceTable, array_table, field_of, pack
 from imulab.display import first_hidden
-from imulab.errors import DataError, OptionError, RecordError
-from imulab.recording import Array
+from imulab.errors import DataError, OptionError, RecordError, UnitError
+from imulab.recording import Array, Recording
 from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
 from imulab.records.sections import Part, Positive, Size, check_sizes, holds, read
-from imulab.units import STANDARD_GRAVITY
+from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
 
 # Python face of the C core: tables loaded once, arrays in and out, streams that keep the core's state.
 
@@ -123,6 +124,76 @@ class DeviceUnit:
 
 def _columns(columns: Sequence[Array]) -> tuple[Array, ...]:
     return tuple(np.ascontiguousarray(column, dtype=np.float64) for column in columns)
+
+
+# Recordings by a unit: outputs in the unit that a record calibrates, and what gyroscopes need beside them.
+
+
+def outputs_of(recording: Recording, sensor: str, needed: str) -> list[Array]:
+    """Return the columns of a triad in the unit of the outputs that a record calibrates; errors as `output_factor`."""
+    factor = output_factor(recording.name, triad(sensor), recording.triad_unit(sensor), needed)
+    return [recording.column(name) * factor for name in triad(sensor)]
+
+
+def output_factor(name: str, columns: Sequence[str], unit: str, needed: str) -> float:
+    """Return the factor from the unit of columns to the unit of the outputs that a record calibrates.
+
+    Raises
+    ------
+    UnitError
+        There is none; the message names the recording, the columns and both units.
+    """
+    try:
+        return conversion_factor(unit, needed)
+    except UnitError:
+        what = f"column {columns[0]} is" if len(columns) == 1 else f"columns {' '.join(columns)} are"
+        raise UnitError(f"{name}: {what} in {unit}, but the record calibrates outputs in {needed}") from None
+
+
+def correct_gyroscopes(
+    unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording, temperature: Array | None = None
+) -> Recording:
+    """Return the recording with gyro_* as body rate, in their unit if that is one of rate, else in rad/s.
+
+    accel_* are the specific force (already corrected), which the g-sensitivity needs. `columns` is what the section
+    says: ``output_unit``, and ``axes`` where it holds single gyroscopes; at `temperature`, degC, shape (n,), where its
+    laws follow that, which ``range`` bounds.
+
+    Raises
+    ------
+    UnitError
+        The columns' unit cannot be converted to the record's.
+    DataError
+        The recording lacks a gyroscope, or the accelerometers that the g-sensitivity needs.
+    """
+
+    def rates(output: Sequence[Array], force: Sequence[Array] | None, at: Array | None) -> list[Array]:
+        return (unit.gyro(output, force) if at is None else unit.thermal_gyro(at, output, force))[0]
+
+    axes, accel = str(columns.get("axes", "xyz")), triad("accel")
+    outputs, kept = [np.zeros(len(recording))] * 3, {}
+    if "axes" not in columns:
+        recording.triad_unit("gyro")  # refuses what is no triad
+    for axis in axes:
+        name = f"gyro_{axis}"
+        if name not in recording:
+            raise DataError(f"{recording.name}: no column {name}, which the record corrects; found "
+                            f"{' '.join(recording.columns)}")  # fmt: skip
+        stated = parse_unit(recording.units[name])
+        kept[name] = stated.symbol if stated.quantity == "rate" else "rad/s"
+        of_unit = [name] if "axes" in columns else triad("gyro")
+        factor = output_factor(recording.name, of_unit, recording.units[name], str(columns["output_unit"]))
+        outputs["xyz".index(axis)] = recording.column(name) * factor
+    force, still = None, None if temperature is None else np.full(1, columns["range"][0])
+    if all(name in recording for name in accel):
+        force = [to_si(recording.column(name), recording.units[name]) for name in accel]
+    elif np.isnan(rates([np.zeros(1)] * 3, None, still)[0][0]):
+        raise DataError(
+            f"{recording.name}: the record corrects the gyroscopes' g-sensitivity, which needs accel_x, accel_y and "
+            f"accel_z; found {' '.join(recording.columns)}"
+        )
+    corrected = dict(zip(("gyro_x", "gyro_y", "gyro_z"), rates(outputs, force, temperature), strict=True))
+    return recording.with_columns({name: from_si(corrected[name], symbol) for name, symbol in kept.items()}, kept)
 
 
 # ---- gyro array ----------------------------------------------------------------------------------------------------

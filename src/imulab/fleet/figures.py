@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from imulab.errors import first_of
 from imulab.fleet.run import FleetState
 from imulab.fleet.statistics import FEWEST_FOR_OUTLIERS, FleetChange, FleetDrift, ParameterStatistics, change_limit
-from imulab.fleet.table import Display, FleetRow, display_of
+from imulab.fleet.table import FleetRow
 from imulab.recording import Array
 from imulab.report import traces as grid
+from imulab.report.parameters import ReadingUnit, reading_unit
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -48,7 +49,7 @@ def staggered(marked: NDArray[np.bool_], top: int) -> list[float]:
     return [round(top * (1.15 - 0.15 * (k % 7)), 3) for k in order.tolist()]
 
 
-def limits_in_view(item: ParameterStatistics, shown: Display, values: Array) -> list[float]:
+def limits_in_view(item: ParameterStatistics, shown: ReadingUnit, values: Array) -> list[float]:
     """Return the limits of a parameter that lie near enough to the values that are shown to be drawn."""
     if item.capability is None:
         return []
@@ -110,7 +111,7 @@ def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Repo
     """Return one line for each parameter: where it lies, how it spreads, what stands out, drifts, and is capable of."""
     rows = []
     for item in statistics:
-        shown = display_of(item.unit)
+        shown = reading_unit(item.unit, item.name)
         factor = abs(shown.factor)
         robust = item.robust_deviation * factor
         median = shown.of(item.median)
@@ -129,7 +130,7 @@ def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Repo
         rows.append(
             [
                 item.name,
-                shown.unit,
+                shown.symbol,
                 str(len(item.values)),
                 f"{median:.{places}f}",
                 number(robust, 3) if several else "–",
@@ -164,13 +165,13 @@ def outlier_table(statistics: Sequence[ParameterStatistics]) -> ReportTable | No
     """List the units that stand out, furthest first."""
     rows = []
     for item in statistics:
-        shown = display_of(item.unit)
+        shown = reading_unit(item.unit, item.name)
         for i in np.flatnonzero(item.outliers).tolist():
             value, error = format_uncertain(
                 float(shown.of(float(item.values[i]))), float(item.uncertainties[i]) * abs(shown.factor)
             )
             rows.append(
-                (abs(float(item.z[i])), [item.serials[i], item.name, value, error, shown.unit, f"{item.z[i]:+.1f}"])
+                (abs(float(item.z[i])), [item.serials[i], item.name, value, error, shown.symbol, f"{item.z[i]:+.1f}"])
             )
     if not rows:
         return None
@@ -192,7 +193,7 @@ def change_table(changes: Sequence[FleetChange]) -> ReportTable | None:
     limit = change_limit(sum(not change.same_files for change in changes))
     rows = []
     for change in ranked[:_MOST_ROWS]:
-        shown = display_of(change.unit)
+        shown = reading_unit(change.unit, change.name)
         factor = abs(shown.factor)
         u = None if change.standard_uncertainty is None else change.standard_uncertainty * factor
         difference, error = format_uncertain((change.new - change.old) * shown.factor, u)
@@ -200,7 +201,7 @@ def change_table(changes: Sequence[FleetChange]) -> ReportTable | None:
         remark = "same files, fitted again" if change.same_files else "changed" if z and abs(z) > limit else ""
         rows.append(
             [
-                change.serial, change.name, difference, error, shown.unit,
+                change.serial, change.name, difference, error, shown.of_difference,
                 "–" if z is None else f"{z:+.1f}", change.before[:16].replace("T", " "), remark,
             ]
         )  # fmt: skip
@@ -282,7 +283,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
     layout = grid.grid()
     beyond = 0
     for index, item in enumerate(panels):
-        shown = display_of(item.unit)
+        shown = reading_unit(item.unit, item.name)
         values = np.asarray(shown.of(item.values))
         x, y = grid.names(index)
         far = bulk(values)
@@ -305,7 +306,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
         out = item.outliers & inside
         if out.any():
             traces.append(_outlier_marks(item.serials, values, out, x, y))
-        grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}", "units")
+        grid.panel(layout, index, len(panels), f"{item.name}, {shown.symbol}", "units")
         if far is not None:
             far = replace(far, low=min(far.low, *limits, far.high), high=max(far.high, *limits, far.low))
             labels = [f"{s} {number(float(v))}" for s, v in zip(item.serials, values, strict=True)]
@@ -362,7 +363,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, 
     layout = grid.grid()
     beyond = 0
     for index, item in enumerate(panels):
-        shown = display_of(item.unit)
+        shown = reading_unit(item.unit, item.name)
         values = np.asarray(shown.of(item.values))
         x, y = grid.names(index)
         out = item.outliers
@@ -380,7 +381,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, 
                 )  # fmt: skip
         if item.drift is not None:
             traces.append(_drift_line(item.drift, shown, x, y))
-        grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
+        grid.panel(layout, index, len(panels), f"{item.name}, {shown.symbol}")
         layout[grid.axis_key(x)] |= date_axis(places) if dated else {"nticks": 5}
         far = bulk(values)
         if far is not None:
@@ -409,7 +410,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, 
     )
 
 
-def _drift_line(drift: FleetDrift, shown: Display, x: str, y: str) -> dict[str, Any]:
+def _drift_line(drift: FleetDrift, shown: ReadingUnit, x: str, y: str) -> dict[str, Any]:
     """Draw the fitted drift from the first date to the last."""
     ends = np.array([drift.value_at_start, drift.value_at_start + drift.per_day * drift.days])
     colour, dash = (BAD, "dash") if drift.significant else (QUIET, "solid")

@@ -24,11 +24,12 @@ from imulab.estimation.distributions import normal_quantile, t_cdf, t_quantile
 from imulab.files import check_keys, load_toml, number_of
 from imulab.fleet.engine import Summary
 from imulab.fleet.history import Past, sources_of
-from imulab.fleet.table import to_parameter_unit
 from imulab.procedures.procedure import OnLine
 from imulab.procedures.registry import PROCEDURES
 from imulab.recording import Array
 from imulab.records.calibration import Parameter
+from imulab.report.parameters import reading_unit
+from imulab.units import conversion_factor
 
 # Limits of parameters, from a TOML file: what a line may let pass.
 
@@ -75,26 +76,46 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
                 raise ReadError(f"{path}: {procedure}: no parameter {quoted(pattern)}; parameters: {shown}")
             for name in names:
                 key = procedure, name
-                found[key] = _limits(entry, units[key], f"{path}: {procedure}: {pattern}")
+                found[key] = _limits(entry, name, units[key], f"{path}: {procedure}: {pattern}")
     return found
 
 
-def _limits(entry: Any, unit: str, place: str) -> Limits:
+def _limits(entry: Any, name: str, unit: str, place: str) -> Limits:
     ends = {"lower": -math.inf, "upper": math.inf}
     if not isinstance(entry, dict):
         raise ReadError(f'{place}: expected {{ lower = -20, upper = 20, unit = "{unit}" }}, found {quoted(entry)}')
     check_keys(entry, (*ends, "unit"), place)
     if "unit" not in entry or not ends.keys() & entry.keys():
         raise ReadError(f"{place}: expected a unit, and lower or upper or both")
-    for name in ends.keys() & entry.keys():
-        value = number_of(entry[name], f"{place}: {name}")
+    for end in ends.keys() & entry.keys():
+        value = number_of(entry[end], f"{place}: {end}")
         try:
-            ends[name] = to_parameter_unit(value, str(entry["unit"]), unit)
+            ends[end] = to_parameter_unit(value, str(entry["unit"]), unit, name)
         except UnitError as error:
             raise UnitError(f"{place}: {error}") from None
     if not ends["lower"] < ends["upper"]:
         raise ReadError(f"{place}: lower {entry['lower']} is not below upper {entry['upper']}")
     return Limits(ends["lower"], ends["upper"])
+
+
+def to_parameter_unit(value: float, unit: str, target: str, name: str = "") -> float:
+    """Return a value in a parameter's unit; `unit` is that, one of its quantity, or the one it is read in.
+
+    Raises
+    ------
+    UnitError
+        It is none of these.
+    """
+    read = reading_unit(target, name)
+    if unit == target:
+        return value
+    if unit in (read.symbol, read.of_difference, read.symbol.replace("µ", "u")):
+        return (value - read.offset) / read.factor
+    try:
+        return value * conversion_factor(unit, target)
+    except UnitError:
+        also = "" if read.symbol == target else f" or {read.of_difference}"
+        raise UnitError(f"unit {unit!r}: expected {target}{also}") from None
 
 
 # Statistics of a line: how a parameter spreads over the units, which stand out, what drifts, what meets its limits.

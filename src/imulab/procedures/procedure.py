@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 from imulab.errors import OptionError
 from imulab.options import Option, options_of
 from imulab.records.triads import NOT_FITTED
-from imulab.units import STANDARD_GRAVITY, from_si
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,8 +23,8 @@ if TYPE_CHECKING:
     from imulab.device.unit import DeviceUnit
     from imulab.recording import Recording, Source
     from imulab.records.calibration import Calibration, Parameter
-    from imulab.records.comparison import Change
     from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, LinearFit, Triads
+    from imulab.report.parameters import Row
     from imulab.report.traces import Exhibits
 
 
@@ -129,16 +128,6 @@ class Section:
 
 
 @dataclass(frozen=True)
-class Row:
-    """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ..."""
-
-    name: str
-    value: float
-    standard_uncertainty: float | None
-    unit: str
-
-
-@dataclass(frozen=True)
 class OnLine:
     """What units of a line are compared by, where a record's parameters mean what only that record says.
 
@@ -163,15 +152,6 @@ class OnLine:
     tolerance: float
     own: frozenset[str]
     freedom: float | None
-
-
-READING_UNITS = {
-    "rad/s": (from_si(1.0, "deg/h"), "deg/h"),
-    "m/s^2": (from_si(1.0, "ug"), "µg"),
-    "rad": (1e3, "mrad"),
-    "rad/s/(m/s^2)": (from_si(STANDARD_GRAVITY, "deg/h"), "deg/h/g"),
-}
-"""Factor from an SI unit, and the unit in which people read it, where a procedure has no other."""
 
 
 class Procedure:
@@ -245,18 +225,11 @@ class Procedure:
 
     def rows(self, record: Calibration) -> Sequence[Row]:
         """Return the parameters in the units in which people read them."""
-        rows = []
-        for name, parameter in record.parameters.items():
-            factor, unit = READING_UNITS.get(parameter.unit, (1.0, parameter.unit))
-            u = parameter.standard_uncertainty
-            rows.append(Row(name, parameter.value * factor, None if u is None else u * factor, unit))
-        return rows
+        from imulab.report.parameters import rows_of
+
+        return rows_of(record)
 
     # Two records of a unit, and the units of a line.
-
-    def change_unit(self, change: Change, record: Calibration) -> tuple[float, str]:
-        """Return the factor from SI and the unit in which the change of a parameter is read."""
-        return READING_UNITS.get(change.unit, (1.0, change.unit))
 
     def same_meaning(self, name: str, first: Calibration, second: Calibration) -> bool:
         """Return whether a parameter means the same in two records."""

@@ -18,14 +18,14 @@ from imulab import report
 from imulab.display import LINES, SENTENCES, WIDTH, aligned, html_table
 from imulab.errors import OptionError, RecordError, listed
 from imulab.files import write_page
-from imulab.procedures.procedure import Row
 from imulab.procedures.registry import joined_of, procedure_of
 from imulab.procedures.registry import load as load
 from imulab.procedures.result import Drawn, Record, as_record, as_recording
 from imulab.reading import Reading
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
-from imulab.records.comparison import Change, RecordComparison, compared
+from imulab.records.comparison import RecordComparison, compared
+from imulab.report.parameters import Row, reading_unit
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -63,11 +63,6 @@ def exhibits_of(record: Calibration) -> Exhibits:
             items=[*exhibits.items, *more.items],
         )
     return exhibits
-
-
-def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
-    """Return the factor from SI and the unit in which people read the change of a parameter."""
-    return procedure_of(record).change_unit(change, record)
 
 
 def parameter_rows(record: Calibration) -> Sequence[Row]:
@@ -136,7 +131,7 @@ class Changes(Drawn, RecordComparison):
         together = "" if self.probability is None else f"; all together: p = {self.probability:.2g} if nothing changed"
         models = f"; the records differ in {', '.join(self.models)}" if self.models else ""
         headline = f"{verdict(self)}{together}{models}."
-        table = ReportTable("Changes", "", TITLES, change_rows(self, self.record))
+        table = ReportTable("Changes", "", TITLES, change_rows(self))
         return Exhibits(headline[0].upper() + headline[1:], [], [_figure(self, table.rows), table])
 
 
@@ -183,11 +178,12 @@ def verdict(comparison: RecordComparison) -> str:
     return named if changed else "no significant change"
 
 
-def change_rows(comparison: RecordComparison, record: Calibration) -> list[list[str]]:
-    """Return each change in the units in which people read it, of records like this one."""
+def change_rows(comparison: RecordComparison) -> list[list[str]]:
+    """Return each change in the units in which people read it."""
     rows = []
     for change in comparison.changes:
-        factor, unit = change_unit(change, record)
+        read = reading_unit(change.unit, change.name)
+        factor, unit = read.factor, read.of_difference
         u = change.standard_uncertainty
         texts = (plain_number(change.difference * factor, 3), "not stated")
         difference, uncertainty = texts if u is None else format_uncertain(change.difference * factor, u * abs(factor))
@@ -220,6 +216,9 @@ def _figure(comparison: RecordComparison, rows: list[list[str]]) -> Figure:
         },
         height=120 + 22 * len(judged),
     )
+
+
+# What a procedure shows of a record: its report, and the comparison of two records of a unit.
 
 
 # What recordings and records show of themselves, and what is done with them next: `imulab.display.Views`.

@@ -187,3 +187,17 @@ def _block(record: Calibration, names: list[str]) -> Array:
     index = [record.covariance.names.index(name) for name in names]
     block: Array = record.covariance.array()[np.ix_(index, index)]
     return block
+
+
+def different_units(*named: tuple[str, Mapping[str, str]], keys: Sequence[str] = ("serial",)) -> str | None:
+    """Return which two of several things are of different units, in words; None where all may be of one.
+
+    ``("a.csv", head)`` and ``("the record", sensor)`` give ``a.csv is of serial 7, the record of 8``. What states no
+    serial number, or no element of an array (`keys`), speaks for no unit.
+    """
+    for key in keys:
+        stated = [(name, head[key]) for name, head in named if head.get(key)]
+        for name, value in stated[1:]:
+            if value != stated[0][1]:
+                return f"{stated[0][0]} is of {key} {stated[0][1]}, {name} of {value}"
+    return None

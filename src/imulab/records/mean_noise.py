@@ -11,6 +11,7 @@ from imulab.errors import RecordError, listed
 from imulab.estimation.noise.terms import bias_square
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.records.comparison import different_units
 from imulab.records.sections import Above0, Part, Size, part
 
 _ENOUGH = 4.0
@@ -92,7 +93,6 @@ def mean_uncertainties(
             f"noise: the record is of {shortest:.4g} s, and noise that is slower does not show in it; expected "
             f"{_ENOUGH:g} times the {duration:.4g} s at rest, better 10 times"
         )
-    theirs, own = record.sensor.get("serial"), of.get("serial")
-    if theirs and own and theirs != own:
-        notes.append(f"noise: the record is of unit {theirs}, the recording of {own}")
+    if other := different_units(("the record", record.sensor), ("the recording", of)):
+        notes.append(f"noise: {other}")
     return np.array(found), notes

@@ -14,6 +14,7 @@ from imulab.estimation.distributions import chi_square_upper_quantile
 from imulab.recording import Array, Recording
 from imulab.report import render_page
 from imulab.report import traces as panels
+from imulab.report.parameters import reading_unit, small_unit
 from imulab.report.traces import (
     BAD,
     DASHES,
@@ -117,6 +118,8 @@ _DIGITS = 5
 _COLOURS = (GOOD, BAD, "#8e6bbd", "#c99a2e", "#4f9d69", INK)
 _MOST_LINES = len(_COLOURS)
 _MOST_NAMED = 6
+_AS_NOISE = {"bias_instability": "column_flicker", "quantisation": "column_quantisation"}
+"""Coefficients whose units alone do not say that they are noise: the parameters of a noise record that they are."""
 
 
 def noise_page(found: dict[str, Any], recording: Recording) -> str:
@@ -177,7 +180,7 @@ def interval(column: dict[str, Any]) -> tuple[Array, Array]:
 
 def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
     """Return the Allan curves of columns of one unit, as `imulab.estimation.column_noise.analyse` found them."""
-    unit, factor = shown_unit(columns[names[0]]["unit"], "bias_instability")
+    unit, factor = small_unit(columns[names[0]]["unit"]).scale
     traces: list[dict[str, Any]] = []
     fitted: list[dict[str, Any]] = []
     lowest: list[tuple[float, float, str]] = []
@@ -303,7 +306,7 @@ def coefficient_rows(found: dict[str, Any]) -> list[list[str]]:
         ):
             if key == "quantisation" and not _visible(column[key]):
                 continue
-            unit, factor = shown_unit(column["unit"], key)
+            unit, factor = reading_unit(column[key]["unit"], _AS_NOISE.get(key, "")).scale
             texts = ("not determined", "")
             if column[key]["value"] is not None:
                 texts = format_uncertain(*(column[key][part] * factor for part in ("value", "standard_uncertainty")))
@@ -319,28 +322,3 @@ def coefficient_rows(found: dict[str, Any]) -> list[list[str]]:
 def _visible(found: dict[str, Any]) -> bool:
     """Whether a coefficient is beyond three times its uncertainty."""
     return found["value"] is not None and bool(found["value"] > 3 * found["standard_uncertainty"])
-
-
-def shown_unit(unit: str, key: str) -> tuple[str, float]:
-    """Return the engineering unit of a coefficient, and the factor from SI to it."""
-    hour = math.sqrt(_HOUR)
-    if unit == "rad/s":
-        return {
-            "angle_random_walk": ("deg/sqrt(h)", hour / _DEGREE),
-            "bias_instability": ("deg/h", _HOUR / _DEGREE),
-            "rate_random_walk": ("deg/h/sqrt(h)", _HOUR * hour / _DEGREE),
-            "quantisation": ("arcsec", _HOUR / _DEGREE),
-        }[key]
-    if unit == "m/s^2":
-        return {
-            "angle_random_walk": ("m/s/sqrt(h)", hour),
-            "bias_instability": ("ug", 1e6 / 9.80665),
-            "rate_random_walk": ("ug/sqrt(h)", 1e6 * hour / 9.80665),
-            "quantisation": ("mm/s", 1e3),
-        }[key]
-    return {
-        "angle_random_walk": (f"{unit}/sqrt(Hz)", 1.0),
-        "bias_instability": (unit, 1.0),
-        "rate_random_walk": (f"{unit}/sqrt(s)", 1.0),
-        "quantisation": (f"{unit} s", 1.0),
-    }[key]

@@ -6,7 +6,7 @@ Figures and tables, axes, curves and bands, panels side by side, and marks for p
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -182,6 +182,11 @@ def figure_axis(title: str, **more: Any) -> dict[str, Any]:
     return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", **more}
 
 
+def number_axis(title: str, numbers: Sequence[int], **more: Any) -> dict[str, Any]:
+    """Return the layout of an axis of whole numbers from 1 on, such as those of attitudes or turns."""
+    return figure_axis(title, dtick=max(1, round(len(numbers) / 20)), range=[0.4, max(numbers) + 0.6], **more)
+
+
 def log_axis(title: str, **more: Any) -> dict[str, Any]:
     """Return the layout of a logarithmic axis."""
     return figure_axis(title, **{"type": "log", "dtick": 1, "exponentformat": "none"} | more)
@@ -195,6 +200,16 @@ def short_log_axis(title: str, **more: Any) -> dict[str, Any]:
 def scatter(x: Sequence[Any], y: Sequence[Any], mode: str, **more: Any) -> dict[str, Any]:
     """Return lines or markers."""
     return {"type": "scatter", "mode": mode, "x": x, "y": y, **more}
+
+
+def marker(beyond: Iterable[bool], size: int) -> dict[str, Any]:
+    """Return the look of points: circles, and those that are beyond a limit as red diamonds."""
+    marks = [bool(mark) for mark in beyond]
+    return {
+        "size": size,
+        "color": [BAD if mark else GOOD for mark in marks],
+        "symbol": ["diamond" if mark else "circle" for mark in marks],
+    }
 
 
 def band(x: Array, low: Array, high: Array, colour: str, digits: int = 7, **more: Any) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from imulab.procedures.centrifuge.schema import (
 )
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.report.parameters import reading_unit, rows_of
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -49,17 +50,6 @@ from imulab.units import STANDARD_GRAVITY, from_si
 
 PER_G = float(from_si(STANDARD_GRAVITY, "deg/h"))
 """deg/h/g in one rad/s/(m/s^2)."""
-
-ENGINEERING = {
-    "K": (PER_G, "deg/h/g"),
-    "K0": (PER_G, "deg/h/g"),
-    "zeta": (100.0, "%"),
-    "c1": (1e6 * STANDARD_GRAVITY, "ppm/g"),
-    "c2": (1e6 * STANDARD_GRAVITY**2, "ppm/g²"),
-    "direction": (180 / np.pi, "deg"),
-    "cross": (PER_G * STANDARD_GRAVITY, "deg/h/g²"),
-}
-"""By the stem of a parameter: factor from SI, and unit."""
 _BUDGET = {
     "rad": (180 * 3600 / np.pi, "arcsec"),
     "rad/(m/s^2)": (1e6 * STANDARD_GRAVITY, "µrad/g"),
@@ -73,13 +63,11 @@ _BUDGET = {
 def parameters_table(record: Calibration, fit: CentrifugeSummary) -> ReportTable:
     """Return every parameter with its uncertainty and interval."""
     rows = []
-    for name, parameter in record.parameters.items():
-        stem = next((part for part in name.split("_")[1:] if part != "down"), "")
-        factor, unit = ENGINEERING.get(stem, (1.0, parameter.unit))
-        value, u = parameter.value * factor, (parameter.standard_uncertainty or 0.0) * factor
-        ends = " to ".join(format_uncertain(value + sign * fit.coverage_factor_95[name] * u, u)[0] for sign in (-1, 1))
-        nu = fit.degrees_of_freedom[name]
-        rows.append([name, *format_uncertain(value, u), ends, unit, "many" if nu > 999 else f"{nu:.0f}"])
+    for row in rows_of(record):
+        u, nu = row.standard_uncertainty or 0.0, fit.degrees_of_freedom[row.name]
+        half = fit.coverage_factor_95[row.name] * u
+        ends = " to ".join(format_uncertain(row.value + sign * half, u)[0] for sign in (-1, 1))
+        rows.append([row.name, *row.text(), ends, row.unit, "many" if nu > 999 else f"{nu:.0f}"])
     return ReportTable(
         title="Parameters",
         caption="K_i: drift per specific force at level i; zeta_i = K_i/K_1 − 1; K(a) = K0 (1 + c1 a + c2 a²), a "
@@ -245,24 +233,30 @@ def _line(entry: DriftLine) -> tuple[str, str]:
 # What a centrifuge record says of each axis: its curve, a headline, facts, and a summary with uncertainties.
 
 
+_CURVE = {
+    name: reading_unit(unit, name)
+    for name, unit in (("K0", "rad/s/(m/s^2)"), ("c1", "1/(m/s^2)"), ("c2", "1/(m/s^2)^2"))
+}
+"""The coefficients of the curve, and how they are read."""
+
+
 def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
     """Return the curve of each axis, and what it changes up to the highest level, with uncertainties."""
     sets, top = prefixes(record), force_of(record, max(level.level for level in centrifuge_of(record).levels))
     rows = []
     for prefix in sets:
         cells = []
-        for name in ("K0", "c1", "c2"):
-            factor, _ = ENGINEERING[name]
-            found = record.parameters.get(f"{prefix}{name}")
-            u = 0.0 if found is None else (found.standard_uncertainty or 0.0) * factor
-            cells.append("–" if found is None else " ± ".join(format_uncertain(found.value * factor, u)))
+        for name, read in _CURVE.items():
+            parameter = record.parameters.get(f"{prefix}{name}")
+            texts = ("–",) if parameter is None else read.texts(parameter.value, parameter.standard_uncertainty)
+            cells.append(" ± ".join(texts))
         K, _ = curve_at(record, prefix, np.array([top]))
         change = 100 * relative(float(K[0]), record.value(f"{prefix}K0"))
         cells.append(" ± ".join(format_uncertain(change, 100 * change_uncertainty(record, prefix, top))))
         rows.append([axis_label(prefix), *cells])
     return [
         "axis",
-        *(f"{name}, {ENGINEERING[name][1]}" for name in ("K0", "c1", "c2")),
+        *(f"{name}, {read.symbol}" for name, read in _CURVE.items()),
         f"change at {text_in_g(top)}, %",
     ], rows
 

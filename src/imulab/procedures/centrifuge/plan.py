@@ -17,13 +17,13 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from imulab.display import Shown
 from imulab.errors import OptionError, quoted
 from imulab.files import write_text
 from imulab.options import measure, text
 from imulab.procedures.centrifuge.levels import Measured, RunLine, arm_rate_off, delays, mismatch, tilted, weighted
 from imulab.procedures.centrifuge.manifest import Manifest, make_manifest, manifest_text
 from imulab.procedures.centrifuge.run import LoadedRun
+from imulab.procedures.plan import PlannedTest, amount
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
 from imulab.report.plots import Plot
 from imulab.report.traces import BAD, GOOD, LEGEND, Figure, log_axis, short_log_axis
@@ -262,7 +262,7 @@ class PlannedLevel:
 
 
 @dataclass(frozen=True, repr=False)
-class Plan(Shown):
+class Plan(PlannedTest):
     """A planned test: manifest, levels, times on the centrifuge, s, wanted u(K) / K, and warnings with what to do."""
 
     manifest: Manifest
@@ -295,6 +295,33 @@ class Plan(Shown):
             "long a run must be for that)"
         )
         return head, ["level, g", "arm, deg/s", "table, deg/s", "periods", "u(K), %", "u(zeta), %", "needed, min"], rows
+
+    def content(self) -> dict[str, Any]:
+        """Return the plan for scripts, in SI."""
+        return {
+            "runs": len(self.manifest.runs),
+            "duration": amount(self.duration, "s"),
+            "static_duration": amount(self.static_duration, "s"),
+            "total": amount(self.total, "s"),
+            "wanted": amount(self.wanted, "1"),
+            "levels": [
+                {
+                    "specific_force": amount(level.force, "m/s^2"),
+                    "arm_rate": amount(level.arm_rate, "rad/s"),
+                    "table_rate": amount(level.table_rate, "rad/s"),
+                    "periods": level.periods,
+                    "relative_uncertainty": level.relative,
+                    "zeta_uncertainty": level.zeta,
+                    "needed": amount(level.needed, "s"),
+                }
+                for level in self.levels
+            ],
+            "warnings": list(self.warnings),
+        }
+
+    def findings(self) -> tuple[str, ...]:
+        """Return what is wrong with the test, with what to do."""
+        return self.warnings
 
     def save(self, path: str | Path) -> None:
         """Write the list of runs where the name ends in .csv, else the manifest.

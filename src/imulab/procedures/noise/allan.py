@@ -56,9 +56,10 @@ class AllanCurve(Drawn, noise_coefficients.DeviationCurve):
 
     def exhibits(self) -> Exhibits:
         """Return the coefficients, where there are any, the curve with its 95 % interval, and a table of it."""
-        from imulab.report.noise_figures import allan_figure, coefficient_rows, coefficients_table, shown_unit
+        from imulab.report.noise_figures import allan_figure, coefficient_rows, coefficients_table
+        from imulab.report.parameters import small_unit
 
-        unit, factor = shown_unit(self.unit, "bias_instability")
+        unit, factor = small_unit(self.unit).scale
         pairs = zip(self.deviation.tolist(), self.standard_uncertainty.tolist(), strict=True)
         rows = [
             [f"{tau:.6g}", *format_uncertain(deviation * factor, u * factor)]

@@ -10,8 +10,7 @@ from typing import Annotated, Any, ClassVar, TypeAlias, Unpack
 
 import numpy as np
 
-from imulab._version import VERSION
-from imulab.display import Bad, Note, verdict_of
+from imulab.display import Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.noise.agreement import Agreement, agreement
 from imulab.estimation.noise.analysis import CANDIDATES
@@ -21,26 +20,26 @@ from imulab.estimation.noise.spectrum import Spectrum, frequencies
 from imulab.estimation.noise.terms import NAMES, edge_as_white, prepare
 from imulab.estimation.rows import NORMAL_95
 from imulab.options import text
+from imulab.procedures.checking import RecordCheck, probability_fact, probability_text
 from imulab.procedures.noise.fit import fit_recordings, given_log
 from imulab.procedures.noise.schema import Column, NoiseSummary, drawn_of, fit_of, label
-from imulab.procedures.result import Drawn, as_record
+from imulab.procedures.result import as_record
 from imulab.quantities import fraction
 from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
-from imulab.report import render_page
+from imulab.records.comparison import different_units
 from imulab.report import traces as panels
-from imulab.report.traces import BAD, GOOD, Exhibits, Figure, ReportTable, rounded, scatter
+from imulab.report.builders import table
+from imulab.report.traces import BAD, GOOD, Exhibits, Figure, rounded, scatter
 from imulab.units import si_unit
 
-# Whether a new log at rest agrees with the noise of a record, and what differs by how much.
+# The result of a test of a noise record by a log: verdict, what changed by how much, the octaves of both spectra.
 
 
-FALSE_ALARM, TOLERANCE = "5 %", "1 %"
-_SAME_RATE = 0.01
+_DIGITS = 5
+_TICKS = [0.01, 0.1, 0.2, 0.5, 1, 2, 5, 10, 100]
 _HALF, _CERTAIN = 0.5, 0.05
-Choose: TypeAlias = Callable[[Recording], Sequence[str]]
-"""Columns of a log to test, by its first rows."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +93,26 @@ class ColumnCheck:
             parts.append(f"noise from {octaves.low[worst]:.2g} to {octaves.high[worst]:.2g} Hz {size}")
         return "; ".join(parts)
 
+    def content(self) -> dict[str, Any]:
+        """Return the same for scripts."""
+        octaves = self.agreement.octaves
+        return {
+            "p": self.probability,
+            "p_terms": self.agreement.terms_probability,
+            "p_octaves": float(octaves.probability),
+            "changes": {
+                change.term: {"ratio": change.ratio, "interval_95": [change.low, change.high]}
+                for change in self.changes
+            },
+            "octaves": [
+                {"from": float(low), "to": float(high), "unit": "Hz", "ratio": float(np.sqrt(ratio))}
+                for low, high, ratio in zip(octaves.low, octaves.high, octaves.ratio, strict=True)
+            ],
+        }
+
 
 @dataclass(frozen=True, repr=False)
-class NoiseCheck(Drawn):
+class NoiseCheck(RecordCheck):
     """How well a log agrees with a record's noise.
 
     Attributes
@@ -120,6 +136,7 @@ class NoiseCheck(Drawn):
     log: Calibration
 
     subject: ClassVar[str] = "Noise check"
+    data: ClassVar[str] = "log"
 
     @property
     def probability(self) -> float:
@@ -137,9 +154,65 @@ class NoiseCheck(Drawn):
         share = -math.expm1(math.log1p(-self.false_alarm) / len(self.columns))
         return self.columns[name].probability < share
 
+    @property
+    def worst(self) -> ColumnCheck:
+        """The column that differs most."""
+        return min(self.columns.values(), key=lambda column: column.probability)
+
+    def meaning(self) -> str:
+        """Return what the test says, in words."""
+        if self.passed:
+            return "the log agrees with the noise of the record"
+        return f"the noise is not that of the record; most in {self.worst.name}: {self.worst.text()}"
+
+    def next_step(self, record: str, files: Sequence[str]) -> str:
+        """Return how to follow the change."""
+        return (
+            f"'imulab noise fit {' '.join(files)} -o NEW.json' makes a record that follows the change, "
+            f"'imulab show {record} NEW.json' compares the two"
+        )
+
+    def measured(self) -> list[str]:
+        """Return what is said of every column."""
+        many = len(self.columns)
+        lines = [f"{probability_text(self.probability)} over {many} column{'s' if many > 1 else ''}"]
+        for name, column in self.columns.items():
+            lines.append(f"{name}: {probability_text(column.probability)}; {column.text()}")
+        return lines
+
+    def content(self) -> dict[str, Any]:
+        """Return what was measured, for scripts."""
+        return {
+            "p": self.probability,
+            "false_alarm": self.false_alarm,
+            "tolerance": self.tolerance,
+            "columns": {name: column.content() for name, column in self.columns.items()},
+        }
+
     def exhibits(self) -> Exhibits:
         """Return what its report shows."""
-        return exhibits_of_check(self)
+        columns: dict[str, Callable[[ColumnCheck], str]] = {
+            "column": lambda column: column.name,
+            "result": lambda column: "differs" if self.differs(column.name) else "agrees",
+            "p": lambda column: probability_fact(column.probability),
+            "the log against the record": ColumnCheck.text,
+        }
+        shown = table(
+            "Columns",
+            "p: of so large a difference in this column, if nothing changed. Then the terms of the record's model in "
+            "the log against the record, with 95 % intervals, the most certain change first.",
+            columns,
+            self.columns.values(),
+            highlight=None if self.passed else list(self.columns).index(self.worst.name),
+        )
+        pages = panels.pages(list(self.columns))
+        facts = [
+            ("p, if nothing changed", probability_fact(self.probability)),
+            ("false alarms", f"{100 * self.false_alarm:.3g} %"),
+            ("not held against it", f"{100 * self.tolerance:.3g} %"),
+        ]
+        figures = [_octaves(self, page, k, len(pages)) for k, page in enumerate(pages)]
+        return self.exhibits_with(facts, [shown, *figures], f"; {probability_text(self.probability)}")
 
 
 def times(ratio: float, low: float, high: float) -> str:
@@ -152,6 +225,50 @@ def times(ratio: float, low: float, high: float) -> str:
     places = max(0, -math.floor(math.log10(max(ends[1] - ends[0], 1e-9) / 2)))
     word = "larger" if change >= 0 else "smaller"
     return f"{abs(change):.{places}f} % {word} ({ends[0]:z.{places}f} to {ends[1]:z.{places}f} %)"
+
+
+def _octaves(check: NoiseCheck, names: Sequence[str], page: int, pages: int) -> Figure:
+    layout = panels.grid()
+    traces: list[dict[str, Any]] = []
+    outside = count = 0
+    for index, name in enumerate(names):
+        octaves = check.columns[name].agreement.octaves
+        x, y = panels.names(index)
+        ratio = np.sqrt(octaves.ratio)
+        low, high = (np.sqrt(end) for end in octaves.interval)
+        off = (low > 1) | (high < 1)
+        outside, count = outside + int(off.sum()), count + len(off)
+        for part, colour in ((~off, GOOD), (off, BAD)):
+            error = {"type": "data", "array": rounded((high - ratio)[part], _DIGITS), "color": colour, "width": 0,
+                     "arrayminus": rounded((ratio - low)[part], _DIGITS)}  # fmt: skip
+            f = np.sqrt(octaves.low * octaves.high)[part]
+            traces.append(
+                scatter(rounded(f, _DIGITS), rounded(ratio[part], _DIGITS), "markers", xaxis=x, yaxis=y, error_y=error,
+                        marker={"color": colour, "size": 6}, hovertemplate="%{x:.3g} Hz: %{y:.3g}<extra></extra>")
+            )  # fmt: skip
+        panels.panel(layout, index, len(names), name)
+        title = {"text": "frequency, Hz", "font": {"size": 11}, "standoff": 4}
+        layout[panels.axis_key(x)] |= {"type": "log", "dtick": 1, "title": title}
+        reach = float(np.log10(max(2.0, 1.1 * ratio.max(initial=1.0), 1.1 / ratio.min(initial=1.0))))
+        layout[panels.axis_key(y)] |= {"type": "log", "range": [-reach, reach], "tickvals": _TICKS}
+    return Figure(
+        title=panels.paged("Size of the noise in the log over that in the record, by octaves", page, pages),
+        message=f"{outside} of {count} octaves are off 1 beyond their 95 % interval; one in twenty is by chance.",
+        caption="Root of the ratio of mean squares, with its 95 % interval; 1 where nothing changed, whatever the "
+        "model. Slow noise, on the left, is of few coefficients.",
+        traces=traces,
+        layout=layout,
+        height=panels.height(len(names)),
+    )
+
+
+# Whether a new log at rest agrees with the noise of a record, and what differs by how much.
+
+
+FALSE_ALARM, TOLERANCE = "5 %", "1 %"
+_SAME_RATE = 0.01
+Choose: TypeAlias = Callable[[Recording], Sequence[str]]
+"""Columns of a log to test, by its first rows."""
 
 
 def check_noise(
@@ -270,9 +387,8 @@ def _columns(record: Calibration, fit: NoiseSummary, recordings: Sequence[Record
                     f"{recording.name}: column {name} in {recording.units[name]}, but the record has it in "
                     f"{fit.columns[name].unit}; expected the same quantity"
                 )
-        serials = [record.sensor.get("serial"), recording.metadata.get("serial")]
-        if all(serials) and serials[0] != serials[1]:
-            notes.append(f"{recording.name}: of unit {serials[1]}, while the record is of {serials[0]}")
+        if other := different_units((recording.name, recording.metadata), ("the record", record.sensor)):
+            notes.append(other)
         if recording.source is not None and recording.source.sha256 in [each.sha256 for each in record.sources]:
             notes.append(f"{recording.name}: the record was made from this log, which says nothing of a change")
     if missing := [name for name in fit.columns if name not in names]:
@@ -327,156 +443,3 @@ def _changes(sets: Sequence[Sequence[Spectrum]], column: Column) -> tuple[TermCh
             ratio, u = float(after[k] / before[k]), float(np.sqrt(covariance[k, k] + other[k, k]))
             changes.append(TermChange(term, ratio, ratio * math.exp(-NORMAL_95 * u), ratio * math.exp(NORMAL_95 * u)))
     return tuple(sorted(changes, key=lambda each: -each.score))
-
-
-# What a check of a noise record by a log shows: the verdict, what changed, and the octaves of both spectra.
-
-
-_DIGITS = 5
-_TICKS = [0.01, 0.1, 0.2, 0.5, 1, 2, 5, 10, 100]
-
-
-def meaning(check: NoiseCheck) -> str:
-    """Return what the test says, in words."""
-    if check.passed:
-        return "the log agrees with the noise of the record"
-    worst = min(check.columns.values(), key=lambda each: each.probability)
-    return f"the noise is not that of the record; most in {worst.name}: {worst.text()}"
-
-
-def p_text(probability: float) -> str:
-    """Return a probability for a sentence."""
-    return f"p = {probability:.2g}" if probability >= 1e-12 else "p below 1e-12"
-
-
-def _number_of(probability: float) -> str:
-    return p_text(probability).removeprefix("p ").removeprefix("= ")
-
-
-def exhibits_of_check(check: NoiseCheck) -> Exhibits:
-    """Return what the report shows."""
-    rows = [
-        [
-            name,
-            "differs" if check.differs(name) else "agrees",
-            p_text(each.probability).removeprefix("p ").removeprefix("= "),
-            each.text(),
-        ]
-        for name, each in check.columns.items()
-    ]
-    table = ReportTable(
-        "Columns",
-        "p: of so large a difference in this column, if nothing changed. Then the terms of the record's model in the "
-        "log against the record, with 95 % intervals, the most certain change first.",
-        ["column", "result", "p", "the log against the record"],
-        rows,
-        None if check.passed else min(range(len(rows)), key=lambda k: list(check.columns.values())[k].probability),
-    )
-    pages = panels.pages(list(check.columns))
-    return Exhibits(
-        f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}; {p_text(check.probability)}.",
-        [
-            ("p, if nothing changed", _number_of(check.probability)),
-            ("false alarms", f"{100 * check.false_alarm:.3g} %"),
-            ("not held against it", f"{100 * check.tolerance:.3g} %"),
-        ],
-        [table, *(_octaves(check, page, k, len(pages)) for k, page in enumerate(pages))],
-    )
-
-
-def _octaves(check: NoiseCheck, names: Sequence[str], page: int, pages: int) -> Figure:
-    layout = panels.grid()
-    traces: list[dict[str, Any]] = []
-    outside = count = 0
-    for index, name in enumerate(names):
-        octaves = check.columns[name].agreement.octaves
-        x, y = panels.names(index)
-        ratio = np.sqrt(octaves.ratio)
-        low, high = (np.sqrt(end) for end in octaves.interval)
-        off = (low > 1) | (high < 1)
-        outside, count = outside + int(off.sum()), count + len(off)
-        for part, colour in ((~off, GOOD), (off, BAD)):
-            error = {"type": "data", "array": rounded((high - ratio)[part], _DIGITS), "color": colour, "width": 0,
-                     "arrayminus": rounded((ratio - low)[part], _DIGITS)}  # fmt: skip
-            f = np.sqrt(octaves.low * octaves.high)[part]
-            traces.append(
-                scatter(rounded(f, _DIGITS), rounded(ratio[part], _DIGITS), "markers", xaxis=x, yaxis=y, error_y=error,
-                        marker={"color": colour, "size": 6}, hovertemplate="%{x:.3g} Hz: %{y:.3g}<extra></extra>")
-            )  # fmt: skip
-        panels.panel(layout, index, len(names), name)
-        title = {"text": "frequency, Hz", "font": {"size": 11}, "standoff": 4}
-        layout[panels.axis_key(x)] |= {"type": "log", "dtick": 1, "title": title}
-        reach = float(np.log10(max(2.0, 1.1 * ratio.max(initial=1.0), 1.1 / ratio.min(initial=1.0))))
-        layout[panels.axis_key(y)] |= {"type": "log", "range": [-reach, reach], "tickvals": _TICKS}
-    return Figure(
-        title=panels.paged("Size of the noise in the log over that in the record, by octaves", page, pages),
-        message=f"{outside} of {count} octaves are off 1 beyond their 95 % interval; one in twenty is by chance.",
-        caption="Root of the ratio of mean squares, with its 95 % interval; 1 where nothing changed, whatever the "
-        "model. Slow noise, on the left, is of few coefficients.",
-        traces=traces,
-        layout=layout,
-        height=panels.height(len(names)),
-    )
-
-
-def check_page(check: NoiseCheck, held: Calibration, *, record: str, files: Sequence[str]) -> str:
-    """Return the report."""
-    failed = [] if check.passed else [Bad(meaning(check))]
-    return render_page(
-        f"Noise check: {'pass' if check.passed else 'fail'}",
-        held.sensor.get("serial", "unit without serial number"),
-        exhibits_of_check(check),
-        verdict=verdict_of([*failed, *check.notes]),
-        notes=[note for note in check.notes if isinstance(note, Note)],
-        provenance=[
-            ("record", f"{record}, created {held.created}"),
-            *(("log", file) for file in files),
-            ("software", f"imulab {VERSION}"),
-        ],
-    )
-
-
-def as_text(check: NoiseCheck, record: str, files: Sequence[str], verdict: str) -> str:
-    """Return the verdict with its p, what to do next, and what is said of every column."""
-    lines = [f"{verdict}: {meaning(check)}"]
-    if not check.passed:
-        lines.append(
-            f"'imulab noise fit {' '.join(files)} -o NEW.json' makes a record that follows the change, "
-            f"'imulab show {record} NEW.json' compares the two"
-        )
-    many = len(check.columns)
-    lines.append(f"{p_text(check.probability)} over {many} column{'s' if many > 1 else ''}")
-    lines += [f"{name}: {p_text(each.probability)}; {each.text()}" for name, each in check.columns.items()]
-    return "\n".join(lines)
-
-
-def as_json(check: NoiseCheck) -> dict[str, Any]:
-    """Return the same for scripts."""
-    return {
-        "verdict": "pass" if check.passed else "fail",
-        "p": check.probability,
-        "false_alarm": check.false_alarm,
-        "tolerance": check.tolerance,
-        "columns": {
-            name: {
-                "p": each.probability,
-                "p_terms": each.agreement.terms_probability,
-                "p_octaves": float(each.agreement.octaves.probability),
-                "changes": {
-                    change.term: {"ratio": change.ratio, "interval_95": [change.low, change.high]}
-                    for change in each.changes
-                },
-                "octaves": [
-                    {"from": float(low), "to": float(high), "unit": "Hz", "ratio": float(np.sqrt(ratio))}
-                    for low, high, ratio in zip(
-                        each.agreement.octaves.low,
-                        each.agreement.octaves.high,
-                        each.agreement.octaves.ratio,
-                        strict=True,
-                    )
-                ],
-            }
-            for name, each in check.columns.items()
-        },
-        "notes": [str(note) for note in check.notes],
-    }

@@ -13,15 +13,15 @@ from imulab.procedures.noise.schema import (
     BinnedSpectrum,
     Column,
     NoiseSummary,
-    density,
     drawn_of,
     fit_of,
     label,
-    shown,
     split,
+    term_reading,
 )
 from imulab.records.calibration import Calibration
 from imulab.report import traces as panels
+from imulab.report.parameters import density_unit, reading_unit, small_unit
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -65,14 +65,14 @@ def exhibits(record: Calibration) -> Exhibits:
 
 def _largest(fit: NoiseSummary, unit: str) -> list[tuple[str, str]]:
     """What a filter wants of the columns with a unit: the largest of them."""
-    factor, shown_as = density(unit)
+    symbol, factor = density_unit(unit).scale
     its = [name for name, column in fit.columns.items() if column.unit == unit]
     white = max(fit.filter_white[name].value for name in its)
     walk = max(fit.filter_walk[name].value for name in its)
     kind = _NAMES.get(unit, unit)
     h = fit.horizon.value
     return [
-        (f"{kind}, white", f"{plain_number(white * factor, 3)} {shown_as}"),
+        (f"{kind}, white", f"{plain_number(white * factor, 3)} {symbol}"),
         (f"{kind}, walk at {h:g} s", f"{walk:.3g} {unit}/√s"),
     ]
 
@@ -80,7 +80,7 @@ def _largest(fit: NoiseSummary, unit: str) -> list[tuple[str, str]]:
 def _headline(record: Calibration, fit: NoiseSummary) -> str:
     parts = []
     for unit in dict.fromkeys(column.unit for column in fit.columns.values()):
-        factor, name = shown("white", unit)
+        name, factor = term_reading("white", unit).scale
         sizes = [record.value(f"{each}_white") * factor for each, column in fit.columns.items() if column.unit == unit]
         low, high = plain_number(min(sizes), 3), plain_number(max(sizes), 3)
         parts.append(f"{label('white', unit)} {low if low == high else f'{low} to {high}'} {name}")
@@ -95,7 +95,7 @@ def _terms(record: Calibration) -> ReportTable:
     units = {name: column.unit for name, column in fit_of(record).columns.items()}
     for name, p in record.parameters.items():
         column, term = split(name)
-        factor, unit = shown(term, units.get(column, p.unit))
+        unit, factor = reading_unit(p.unit, name).scale
         ends = p.interval_95 or (p.value, p.value)
         if p.value == 0 and term != "ramp":
             value, interval = "not seen", f"below {plain_number(ends[1] * factor, 2)}"
@@ -124,7 +124,7 @@ def _for_filters(fit: NoiseSummary) -> ReportTable:
     rows = []
     times = fit.bias_uncertainty[next(iter(fit.columns))].time.value
     for name, column in fit.columns.items():
-        factor, unit = shown("bias", column.unit)
+        unit, factor = small_unit(column.unit).scale
         bias = fit.bias_uncertainty[name]
         means = dict(zip(bias.time.value, bias.standard_uncertainty.value, strict=False))
         white, walk = fit.filter_white[name], fit.filter_walk[name]
@@ -187,7 +187,7 @@ def _models(fit: NoiseSummary) -> ReportTable:
 
 def _curve(record: Calibration, fit: NoiseSummary, name: str) -> Figure:
     column, allan = fit.columns[name], drawn_of(record, name).allan
-    factor, unit = shown("bias", column.unit)
+    unit, factor = small_unit(column.unit).scale
     tau, measured, fitted, low, high = (
         np.array(each) for each in (allan.tau, allan.measured, allan.fitted, allan.low, allan.high)
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +22,12 @@ from imulab.estimation.column_noise import noise_columns
 from imulab.estimation.noise.analysis import (
     CANDIDATES,
     Analysis,
-    Regression,
     allan_of_bins,
     analysed,
     ramp_coefficients,
     without_steps,
 )
-from imulab.estimation.noise.cleaning import PERHAPS, LevelChange, Line
+from imulab.estimation.noise.cleaning import PERHAPS, LevelChange
 from imulab.estimation.noise.likelihood import Flags
 from imulab.estimation.noise.rest import Rest, at_rest, long_rest
 from imulab.estimation.noise.spectrum import Stretch
@@ -59,14 +58,21 @@ from imulab.procedures.noise import (
     check_terms,
     rejected,
 )
-from imulab.procedures.noise.schema import density, shown
+from imulab.procedures.noise.model import ColumnModel, CovariateDrift
+from imulab.procedures.noise.schema import term_unit
 from imulab.procedures.result import Result, as_blocks, as_recording
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording, Source, is_large, on_disk
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.comparison import different_units
+from imulab.report.parameters import density_unit, small_unit
 from imulab.report.traces import plain_number
 from imulab.units import parse_unit, si_unit
+
+if TYPE_CHECKING:
+    pass
+
 
 # Logs at rest as they are given: short ones as recordings, large files block by block or with columns on disk.
 
@@ -117,61 +123,6 @@ def read_log(
     if found is None:
         return replace(on_disk(blocks()[0]), source=source)
     return replace(found, recording=replace(found.recording, source=source))
-
-
-# What is found of one column of a log at rest: its noise, its lines and steps, and what it drifts with.
-
-
-_COVARIATE_UNITS = {"time": "s", "temperature": "K"}
-
-
-@dataclass(frozen=True)
-class CovariateDrift:
-    """How a column follows time or temperature: slope and its uncertainty in SI, with the models without and with it.
-
-    `taken` says whether the model is that of what is left.
-    """
-
-    covariate: str
-    found: Regression
-    letters: tuple[str, str]
-    taken: bool
-
-    @property
-    def slope(self) -> float:
-        """Unit of the column over that of the covariate."""
-        return float(self.found.slope[0])
-
-    @property
-    def standard_uncertainty(self) -> float:
-        """Of the slope."""
-        return float(self.found.standard_uncertainty[0])
-
-
-@dataclass(frozen=True)
-class ColumnModel:
-    """The noise of a column.
-
-    Attributes
-    ----------
-    name, unit
-        Of the column; the unit in SI.
-    analysis
-        Spectrum, candidates, chosen model.
-    spikes, knocks, lines, steps
-        What was found that is no noise; of knocks start and length, s.
-    drifts
-        How it follows time and temperature.
-    """
-
-    name: str
-    unit: str
-    analysis: Analysis
-    spikes: int
-    knocks: tuple[tuple[float, float], ...]
-    lines: tuple[Line, ...]
-    steps: tuple[LevelChange, ...]
-    drifts: tuple[CovariateDrift, ...]
 
 
 # What a user of noise models must know, a sentence each.
@@ -252,7 +203,7 @@ def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
 def _edge(column: ColumnModel) -> str:
     """Say what a Gauss-Markov term of the shortest time constant is, and what the white noise is with it."""
     analysis = column.analysis
-    factor, unit = density(column.unit)
+    unit, factor = density_unit(column.unit).scale
     level = float(edge_as_white(analysis.values, analysis.covariance, analysis.limits[0])[0][0])
     return (
         f"the white noise, {plain_number(level * factor, 3)} {unit} at low frequencies, falls to "
@@ -272,7 +223,7 @@ def _lines(column: ColumnModel) -> str:
 def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> tuple[type[str], str] | None:
     if not drift.found.follows:
         return None
-    factor, unit = shown("bias", column.unit)
+    unit, factor = small_unit(column.unit).scale
     per = "h" if drift.covariate == "time" else "K"
     scale = factor * (3600.0 if drift.covariate == "time" else 1.0)
     slope = f"{drift.slope * scale:.2g} ± {drift.standard_uncertainty * scale:.1g} ({unit})/{per}"
@@ -286,8 +237,8 @@ def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> tuple[type[st
 
 
 def _sized(value: float, unit: str) -> str:
-    factor, name = shown("bias", unit)
-    return f"{value * factor:.3g} {name}"
+    symbol, factor = small_unit(unit).scale
+    return f"{value * factor:.3g} {symbol}"
 
 
 # The record of noise models: parameters with intervals, what filters want, and what the figures are drawn from.
@@ -300,14 +251,6 @@ _SLOW = ("flicker", "walk")
 """Terms that have a limit where the chosen model has not got them."""
 _PART = 10.0
 """Of a record: the mean over so much of it still has an uncertainty that the rest of the record tells."""
-
-
-def unit_of(term: str, unit: str) -> str:
-    """Return the SI unit of a term of a column in `unit`."""
-    integral = {"rad/s": "rad", "m/s^2": "m/s"}.get(unit, f"{unit} s")
-    rate = {"rad/s": "rad/s^2", "m/s^2": "m/s^3"}.get(unit, f"{unit}/s")
-    units = {"white": f"{unit}/sqrt(Hz)", "walk": f"{unit}/sqrt(s)", "quantisation": integral, "ramp": rate}
-    return "s" if term.endswith("_time") else units.get(term, unit)
 
 
 def no_tables(record: Calibration) -> NoReturn:
@@ -396,7 +339,7 @@ def _parameters(
             limit = value == 0 or (short and slow)
             u = None if limit else value * float(np.sqrt(covariance[k, k]))
             ends = (0.0 if limit else min(float(low[k]), value), max(float(high[k]), value))
-            found[f"{name}_{term}"] = Parameter(0.0 if limit else value, u, unit_of(term, unit), interval_95=ends)
+            found[f"{name}_{term}"] = Parameter(0.0 if limit else value, u, term_unit(term, unit), interval_95=ends)
             known += [] if limit else [k]
         names += [f"{name}_{NAMES[k]}" for k in known]
         size = values[known]
@@ -405,7 +348,7 @@ def _parameters(
             if drift.covariate == "time" and (drift.found.follows or drift.taken):
                 b, u = drift.slope, drift.standard_uncertainty
                 found[f"{name}_ramp"] = Parameter(
-                    b, u, unit_of("ramp", unit), interval_95=(b - NORMAL_95 * u, b + NORMAL_95 * u)
+                    b, u, term_unit("ramp", unit), interval_95=(b - NORMAL_95 * u, b + NORMAL_95 * u)
                 )
                 names.append(f"{name}_ramp")
                 blocks.append(np.array([[u**2]]))
@@ -452,8 +395,8 @@ def _use(column: ColumnModel, horizon: float) -> dict[str, Any]:
     times = durations(analysis.length)
     bias = analysis.average(lambda values: bias_square(values, times, dt))
     return {
-        "white": {**_value(np.sqrt(white.mean[0, 0]), unit_of("white", column.unit)), **_ends(white)},
-        "walk": {**_value(np.sqrt(walk.mean[0, 0]), unit_of("walk", column.unit)), **_ends(walk)},
+        "white": {**_value(np.sqrt(white.mean[0, 0]), term_unit("white", column.unit)), **_ends(white)},
+        "walk": {**_value(np.sqrt(walk.mean[0, 0]), term_unit("walk", column.unit)), **_ends(walk)},
         "bias": {
             "time": _value(times, "s"),
             "standard_uncertainty": _value(np.sqrt(bias.expected[0]), column.unit),
@@ -539,7 +482,7 @@ def _drift_section(drift: CovariateDrift, unit: str) -> dict[str, Any]:
 
 def drift_unit(covariate: str, unit: str) -> str:
     """Return the SI unit of a slope."""
-    return unit_of("ramp", unit) if covariate == "time" else f"({unit})/K"
+    return term_unit("ramp", unit) if covariate == "time" else f"({unit})/K"
 
 
 def _data(column: ColumnModel) -> dict[str, Any]:
@@ -820,9 +763,8 @@ def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> Non
         unit, expected = (si_unit(each.units[column]) for each in (other.recording, one))
         if unit != expected:
             raise UnitError(f"{name}: column {column} in {unit}, but {one.name} has it in {expected}")
-    serials = [rest.recording.metadata.get("serial") for rest in (first, other)]
-    if all(serials) and serials[0] != serials[1]:
-        raise DataError(f"{name}: of unit {serials[1]}, but {one.name} is of {serials[0]}: expected logs of one unit")
+    if differ := different_units((name, other.recording.metadata), (one.name, one.metadata)):
+        raise DataError(f"{differ}; expected logs of one unit")
 
 
 def _column(

@@ -10,14 +10,14 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from imulab.display import Shown
 from imulab.errors import OptionError, listed
 from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
 from imulab.estimation.noise.rest import FEWEST, SHORT
 from imulab.estimation.noise.terms import NAMES, edge_as_white
 from imulab.options import measure, repeated, text
-from imulab.procedures.noise.schema import Markov, fit_of, given_terms, label, shown
+from imulab.procedures.noise.schema import Markov, fit_of, given_terms, label, term_reading, term_unit
 from imulab.procedures.noise.simulate import RATE, names_given, terms_of
+from imulab.procedures.plan import PlannedTest, amount, finite
 from imulab.procedures.result import Record, as_record
 from imulab.quantities import fraction, in_si
 from imulab.recording import Array, Recording
@@ -65,7 +65,7 @@ class PlannedTerm:
 
 
 @dataclass(frozen=True, repr=False)
-class NoisePlan(Shown):
+class NoisePlan(PlannedTest):
     """How long to record at rest.
 
     Attributes
@@ -108,6 +108,23 @@ class NoisePlan(Shown):
         if math.isinf(longest.length):
             return f"No record reaches {_percent(longest.wanted)} of {what}."
         return f"A record of {duration_text(longest.length)} reaches what is wanted; longest for {what}."
+
+    def content(self) -> dict[str, Any]:
+        """Return the plan for scripts, in SI; null where a number is none."""
+        terms = [
+            {
+                "column": planned.column,
+                "term": planned.term,
+                "value": planned.value,
+                "unit": term_unit(planned.term, planned.unit),
+                "relative_standard_uncertainty": finite(planned.uncertainty),
+                "limit": finite(planned.limit),
+                "wanted": finite(planned.wanted),
+                "length": amount(planned.length, "s") if math.isfinite(planned.length) else None,
+            }
+            for planned in self.terms
+        ]
+        return {"length": amount(self.length, "s"), "terms": terms}
 
     def save(self, path: str | Path) -> None:
         """Write the relative standard uncertainties over the length of a record as CSV.
@@ -184,7 +201,7 @@ def _percent(share: float) -> str:
 
 
 def _row(each: PlannedTerm) -> list[str]:
-    factor, unit = shown(each.term, each.unit)
+    unit, factor = term_reading(each.term, each.unit).scale
     name = label(each.term, each.unit)
     if not each.value > 0:
         return [each.column, name, "not seen", unit, f"below {plain_number(each.limit * factor, 2)}", "–", "–"]

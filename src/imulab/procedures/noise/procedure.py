@@ -12,10 +12,8 @@ if TYPE_CHECKING:
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.estimation.noise.rest import Rest
     from imulab.procedures.noise.fit import NoiseFit
-    from imulab.procedures.procedure import Row
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
-    from imulab.records.comparison import Change
     from imulab.report.traces import Exhibits
 
 
@@ -82,16 +80,6 @@ class NoiseProcedure(Procedure):
         from imulab.procedures.noise.figures import exhibits
 
         return exhibits(record)
-
-    def rows(self, record: Calibration) -> Sequence[Row]:
-        from imulab.procedures.noise.schema import rows
-
-        return rows(record)
-
-    def change_unit(self, change: Change, record: Calibration) -> tuple[float, str]:
-        from imulab.procedures.noise.schema import change_unit
-
-        return change_unit(change, record)
 
     def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
         from imulab.procedures.noise.fit import no_tables

@@ -12,14 +12,12 @@ import numpy as np
 
 from imulab.errors import OptionError, RecordError, UnitError
 from imulab.estimation.noise.terms import NAMES, SIGMA, TIME
-from imulab.procedures.procedure import Row
 from imulab.quantities import in_si, split_quantity
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.records.comparison import Change
 from imulab.records.sections import Above0, Length, Part, Positive, Quantity, Size, part
 from imulab.records.sections import read as read_section
-from imulab.report.noise_figures import shown_unit
+from imulab.report.parameters import ReadingUnit, reading_unit
 from imulab.units import parse_unit, si_unit
 
 # What code reads of a noise record, with types.
@@ -368,34 +366,23 @@ def by_name(values: Array) -> Mapping[str, float]:
     return {name: float(value) for name, value in zip(NAMES, values, strict=True) if value}
 
 
-# The units in which people read noise: angle random walk in deg/sqrt(h), bias instability in deg/h, and so on.
+# What people call the terms of a noise model, and the units in which they read them.
 
 
-_ALLAN = {
-    "white": "angle_random_walk",
-    "flicker": "bias_instability",
-    "walk": "rate_random_walk",
-    "quantisation": "quantisation",
-}
 _LONGEST_FIRST = sorted([*NAMES, "ramp"], key=len, reverse=True)
 
 
-def shown(term: str, unit: str) -> tuple[float, str]:
-    """Return the factor from SI, and the unit, of a term of a column in `unit`; ``bias`` is a level of it."""
-    if term.endswith("_time"):
-        return 1.0, "s"
-    if term == "ramp":
-        level, name = shown("bias", unit)
-        return 3600.0 * level, f"{name}/h"
-    name, factor = shown_unit(unit, _ALLAN.get(term, "bias_instability"))
-    return factor, name
+def term_unit(term: str, unit: str) -> str:
+    """Return the SI unit of a term of a column in `unit`."""
+    integral = {"rad/s": "rad", "m/s^2": "m/s"}.get(unit, f"{unit} s")
+    rate = {"rad/s": "rad/s^2", "m/s^2": "m/s^3"}.get(unit, f"{unit}/s")
+    units = {"white": f"{unit}/sqrt(Hz)", "walk": f"{unit}/sqrt(s)", "quantisation": integral, "ramp": rate}
+    return "s" if term.endswith("_time") else units.get(term, unit)
 
 
-def density(unit: str) -> tuple[float, str]:
-    """Return the factor from SI, and the unit, of a noise density as data sheets have it."""
-    if unit == "rad/s":
-        return 180 / math.pi, "deg/s/√Hz"
-    return (1e6 / 9.80665, "µg/√Hz") if unit == "m/s^2" else (1.0, f"{unit}/√Hz")
+def term_reading(term: str, unit: str) -> ReadingUnit:
+    """Return how a term of a column in `unit` is read."""
+    return reading_unit(term_unit(term, unit), f"column_{term}")
 
 
 def label(term: str, unit: str) -> str:
@@ -421,26 +408,3 @@ def split(name: str) -> tuple[str, str]:
         if name.endswith(f"_{term}"):
             return name[: -len(term) - 1], term
     return name, ""
-
-
-def base_unit(record: Calibration, column: str) -> str:
-    """Return the SI unit of a column of a record."""
-    unit = record.parameter(f"{column}_white").unit
-    return unit.removesuffix("/sqrt(Hz)")
-
-
-def rows(record: Calibration) -> Sequence[Row]:
-    """Return the parameters of a record in the units in which people read them."""
-    found = []
-    for name, p in record.parameters.items():
-        column, term = split(name)
-        factor, unit = shown(term, base_unit(record, column)) if term else (1.0, p.unit)
-        u = p.standard_uncertainty
-        found.append(Row(name, p.value * factor, None if u is None else u * factor, unit))
-    return found
-
-
-def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
-    """Return the factor from SI and the unit in which people read the change of a parameter."""
-    column, term = split(change.name)
-    return shown(term, base_unit(record, column)) if term else (1.0, change.unit)

@@ -12,8 +12,7 @@ import numpy as np
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.noise.simulate import simulated
 from imulab.options import measure, repeated, text
-from imulab.procedures.noise.fit import unit_of
-from imulab.procedures.noise.schema import Markov, by_name, fit_of, given_terms
+from imulab.procedures.noise.schema import Markov, by_name, fit_of, given_terms, term_unit
 from imulab.procedures.result import Record, as_record
 from imulab.quantities import in_si, whole
 from imulab.recording import Array, Recording
@@ -59,7 +58,7 @@ class NoiseLog:
         head = {"model": "simulated noise", **self.sensor}
         for column, values in self.values.items():
             for term, value in by_name(values).items():
-                head[f"truth_{column}_{term}"] = f"{value!r} {unit_of(term, self.units[column])}"
+                head[f"truth_{column}_{term}"] = f"{value!r} {term_unit(term, self.units[column])}"
         return head
 
 

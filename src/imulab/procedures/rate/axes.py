@@ -23,11 +23,12 @@ from imulab.errors import DataError, RecordError
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.rate import AXES, GAINS
 from imulab.procedures.rate.dwells import Dwells, recorded_rate
-from imulab.procedures.rate.schema import PriorParameter, RatePrior, RateTest, shown
+from imulab.procedures.rate.schema import PriorParameter, RatePrior, RateTest
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
-from imulab.records.comparison import compared
+from imulab.records.comparison import compared, different_units
 from imulab.records.sections import Measured, entries
+from imulab.report.parameters import reading_unit
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
 # What accelerometers say of the table axis: its direction in the body, free of the table's level and the lever arm.
@@ -258,11 +259,8 @@ def faces_said(test: RateTest, recordings: Sequence[Recording], dwells: Sequence
 
 def other_unit_said(record: Calibration, sensor: Mapping[str, str], option: str) -> list[str]:
     """Say where the record that an option gave is of another unit than the recordings, by what both state."""
-    return [
-        f"{option}: the record is of {key} {mine}, the recordings are of {key} {its}: is it of this unit?"
-        for key in ("serial", "element")
-        if (mine := record.sensor.get(key)) and (its := sensor.get(key)) and mine != its
-    ]
+    other = different_units(("the record", record.sensor), ("the recordings", sensor), keys=("serial", "element"))
+    return [f"{option}: {other}: is it of this unit?"] if other else []
 
 
 def length_said(accel: Calibration, force: Array, uncertainty: Array, places: Sequence[str]) -> list[str]:
@@ -512,9 +510,9 @@ def _said(probability: float | None, changes: Any) -> str:
     if not differing:
         return Note(f"the prior agrees{chance}; both are one fit, but for the biases, which are new")
     worst = max(differing, key=lambda change: abs(change.deviations or 0.0))
-    factor, offset, unit = shown(worst.name, worst.unit)
+    read = reading_unit(worst.unit, worst.name)
     return (
-        f"the prior does not agree{chance}: {worst.name} differs by {factor * worst.difference:+.3g} "
-        f"{'ppm' if offset else unit}, {abs(worst.deviations or 0.0):.1f} times its uncertainty; both are one fit all "
+        f"the prior does not agree{chance}: {worst.name} differs by {read.factor * worst.difference:+.3g} "
+        f"{read.of_difference}, {abs(worst.deviations or 0.0):.1f} times its uncertainty; both are one fit all "
         "the same (see show A B)"
     )

@@ -9,9 +9,9 @@ import numpy as np
 
 from imulab.procedures.rate.record import sweep_table
 from imulab.procedures.rate.schema import AxisFit, DwellResiduals, RateRecord, prior_table, rate_of
-from imulab.procedures.rate.schema import rows as engineering_rows
 from imulab.procedures.rate.turns import turns_exhibits
 from imulab.records.calibration import Calibration
+from imulab.report.parameters import parameters_table, rows_of
 from imulab.report.traces import (
     GOOD,
     INK,
@@ -51,7 +51,11 @@ def exhibits(record: Calibration) -> Exhibits:
         ("common to all rates", "not stated" if common is None else f"{plain_number(common * _PPM, 3)} ppm"),
     ]
     items: list[Figure | ReportTable] = [
-        _parameters(record),
+        parameters_table(
+            rows_of(record),
+            "Bias, scale factor and misalignment in the frame of the faces on which the unit was mounted; nonlinearity "
+            "and hysteresis as parts of the largest rate.",
+        ),
         *([] if found.fit.prior is None else [prior_table(found.fit.prior, record)]),
         *(_left(a, found.data.dwells) for a in axes),
         _of_line(record, found),
@@ -76,21 +80,6 @@ def exhibits_of_joined(record: Calibration) -> Exhibits:
     )
     found = exhibits(own)
     return replace(found, items=found.items[1:])
-
-
-def _parameters(record: Calibration) -> ReportTable:
-    rows = []
-    for row in engineering_rows(record):
-        of = row.standard_uncertainty
-        value, u = (plain_number(row.value, 3), "–") if of is None else format_uncertain(row.value, of)
-        rows.append([row.name, value, u, row.unit])
-    return ReportTable(
-        "Parameters",
-        "Bias, scale factor and misalignment in the frame of the faces on which the unit was mounted; nonlinearity and "
-        "hysteresis as parts of the largest rate.",
-        ["parameter", "value", "u", "unit"],
-        rows,
-    )
 
 
 def _left(name: str, seen: DwellResiduals) -> Figure:

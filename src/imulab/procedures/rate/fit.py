@@ -43,6 +43,7 @@ from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
+from imulab.records.comparison import different_units
 
 
 @dataclass(frozen=True, repr=False)
@@ -231,15 +232,11 @@ def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], 
     if not first:
         recordings[0].column("gyro_x")
     unit = recordings[0].units[first[0]]
+    heads = ((run.file, recording.metadata) for run, recording in zip(test.runs, recordings, strict=True))
+    if apart := different_units(*heads, keys=("serial", "element")):
+        raise DataError(f"{apart}; expected recordings of one unit")
     seen: dict[str, int] = {}
     for index, recording in enumerate(recordings):
-        for key in ("serial", "element"):
-            mine, its = recordings[0].metadata.get(key), recording.metadata.get(key)
-            if mine and its and mine != its:
-                raise DataError(
-                    f"{test.place(index)}: {key} {its}, but {test.runs[0].file} is of {key} {mine}; expected "
-                    "recordings of one unit"
-                )
         of = "" if recording.source is None else recording.source.sha256
         if of in seen:
             raise DataError(

@@ -16,18 +16,18 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from imulab.display import Shown
 from imulab.errors import ObservabilityError, OptionError, RecordError, listed
 from imulab.files import write_text
 from imulab.gravity import EARTH, checked_latitude
 from imulab.options import measure, parsed, text
+from imulab.procedures.plan import PlannedTest, amount
 from imulab.procedures.rate import FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
 from imulab.procedures.rate.schema import RateTest, Run, manifest_text
-from imulab.procedures.rate.schema import shown as as_read
 from imulab.procedures.rate.solve import RateProblem, model_parameters, solve
 from imulab.procedures.result import Record, as_record
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole, whole_number
 from imulab.recording import Array
+from imulab.report.parameters import ReadingUnit, reading_unit
 from imulab.report.plots import Plot
 from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis, plain_number, short_log_axis
 from imulab.units import from_si
@@ -39,7 +39,7 @@ _TURNS = 1000
 
 
 @dataclass(frozen=True, repr=False)
-class TurnPlan(Shown):
+class TurnPlan(PlannedTest):
     """How many whole turns by hand reach a wanted uncertainty: n on and n back, with a stop after each.
 
     Attributes
@@ -69,6 +69,21 @@ class TurnPlan(Shown):
             f"reach {1e6 * self.reached[-1]:.3g} ppm; wanted {1e6 * self.wanted:.6g} ppm"
         )
         return head, ["turns each way", "stops", "u of the scale factor, ppm"], rows
+
+    def content(self) -> dict[str, Any]:
+        """Return the plan for scripts."""
+        reached = [{"turns": n, "relative_uncertainty": u} for n, u in enumerate(self.reached.tolist(), 1)]
+        return {"turns": self.turns, "stops": self.stops, "wanted": self.wanted, "reached": reached}
+
+    def save(self, path: str | Path) -> None:
+        """Refuse: turns by hand need no file.
+
+        Raises
+        ------
+        OptionError
+            Always.
+        """
+        raise OptionError(f"{path}: turns by hand have no manifest; expected --turn without -o")
 
     def plot(self) -> Plot:
         """Return the uncertainty over the number of turns, beside the wanted one."""
@@ -141,7 +156,7 @@ class PlannedRate:
 
 
 @dataclass(frozen=True, repr=False)
-class RatePlan(Shown):
+class RatePlan(PlannedTest):
     """A planned rate test.
 
     Attributes
@@ -185,21 +200,35 @@ class RatePlan(Shown):
         return head, ["rate, deg/s", "stay, s", "turns", "u, ppm of full", "wanted"], rows
 
     def _predicted(self) -> str:
-        words = {
-            "gyro_scale_factor": "scale factors {} ppm",
-            "gyro_misalignment": "misalignments {} mrad",
-            "gyro_bias": "biases {} deg/h",
-        }
+        kinds = (
+            ("gyro_scale_factor", "scale factors", ReadingUnit("ppm", 1e6)),
+            ("gyro_misalignment", "misalignments", reading_unit("rad")),
+            ("gyro_bias", "biases", reading_unit("rad/s")),
+        )
         said = []
-        for stem, words_ in words.items():
+        for stem, label, read in kinds:
             most = max((u for name, u in self.predicted.items() if name.startswith(stem)), default=None)
             if most is not None:
-                factor = 1e6 if stem == "gyro_scale_factor" else as_read(stem, "")[0]
-                said.append(words_.format(plain_number(most * factor, 2)))
+                said.append(f"{label} {plain_number(most * read.factor, 2)} {read.symbol}")
         table = "what all rates of the table have in common (--table-uncertainty)"
         beside = [table] if self.test.relative_uncertainty is None else []
         beside += ["the mounting, in every misalignment"] * any("misalignment" in name for name in self.predicted)
         return ", ".join(said) + (f"; on top come {' and '.join(beside)}" if beside else "")
+
+    def content(self) -> dict[str, Any]:
+        """Return the plan for scripts, in SI."""
+        units = {"rate": "rad/s", "duration": "s", "uncertainty": "rad/s", "wanted": "rad/s"}
+        return {
+            "runs": len(self.test.runs),
+            "duration": amount(self.duration, "s"),
+            "rates": [{name: amount(getattr(rate, name), unit) for name, unit in units.items()} for rate in self.rates],
+            "predicted": self.predicted,
+            "warnings": list(self.warnings),
+        }
+
+    def findings(self) -> tuple[str, ...]:
+        """Return what is out of reach, with what to do."""
+        return self.warnings
 
     def save(self, path: str | Path) -> None:
         """Write the list of stays, run by run, where the name ends in .csv, else the manifest.

@@ -16,11 +16,9 @@ if TYPE_CHECKING:
 
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.device.unit import DeviceUnit
-    from imulab.procedures.procedure import Row
     from imulab.procedures.rate.fit import RateFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
-    from imulab.records.comparison import Change
     from imulab.report.traces import Exhibits
 
 
@@ -90,9 +88,9 @@ class RateSection(Section):
         return golden_gyroscopes(table, random)
 
     def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-        from imulab.procedures.rate.device import apply_rate
+        from imulab.device.unit import correct_gyroscopes
 
-        return apply_rate(unit, columns, recording)
+        return correct_gyroscopes(unit, columns, recording)
 
 
 class RateProcedure(Procedure):
@@ -121,16 +119,6 @@ class RateProcedure(Procedure):
         from imulab.procedures.rate.figures import exhibits_of_joined
 
         return exhibits_of_joined(record)
-
-    def rows(self, record: Calibration) -> Sequence[Row]:
-        from imulab.procedures.rate.schema import rows
-
-        return rows(record)
-
-    def change_unit(self, change: Change, record: Calibration) -> tuple[float, str]:
-        from imulab.procedures.rate.schema import change_unit
-
-        return change_unit(change, record)
 
     def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
         from imulab.procedures.rate.device import tables_of

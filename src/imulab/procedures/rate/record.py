@@ -25,6 +25,7 @@ from imulab.procedures.rate.schema import (
 from imulab.procedures.rate.solve import Linearity, RateProblem, RateSolution, model_parameters, temperature_slopes
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.comparison import different_units
 from imulab.records.sections import Quantity, entries
 from imulab.report.traces import ReportTable, format_uncertain, plain_number
 from imulab.units import from_si, parse_unit
@@ -282,11 +283,8 @@ def _dwells(linearity: Mapping[str, Linearity]) -> DwellResiduals:
 
 
 def _of_sensor(test: RateTest, recordings: Sequence[Recording]) -> list[str]:
-    stated = test.sensor.get("serial")
-    other = [one for one in recordings if stated and one.metadata.get("serial", stated) != stated]
-    if not other:
-        return []
-    return [f"{other[0].name} is of serial {other[0].metadata['serial']}, the manifest of {stated}: which is the unit?"]
+    pairs = (different_units((r.name, r.metadata), ("the manifest", test.sensor)) for r in recordings)
+    return [f"{other}: which is the unit?" for other in pairs if other][:1]
 
 
 def _of_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:

@@ -38,13 +38,13 @@ from imulab.procedures.rate.axes import (
     with_prior,
 )
 from imulab.procedures.rate.schema import TurnsEvidence, TurnsModel, TurnsSummary, WholeTurns, prior_table, turns_of
-from imulab.procedures.rate.schema import rows as engineering_rows
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Quantity, entries
+from imulab.report.parameters import parameters_table, rows_of
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -54,7 +54,6 @@ from imulab.report.traces import (
     Figure,
     ReportTable,
     figure_axis,
-    format_uncertain,
     plain_number,
     rounded,
     scatter,
@@ -621,10 +620,6 @@ def turns_exhibits(record: Calibration) -> Exhibits:
     """Return the figures and tables of a record of turns."""
     found = turns_of(record)
     seen = found.data.turns
-    rows = []
-    for row in engineering_rows(record):
-        value, u = format_uncertain(row.value, row.standard_uncertainty)
-        rows.append([row.name, value, u, row.unit])
     worst = max(
         (p.standard_uncertainty or 0.0) / abs(p.value) for n, p in record.parameters.items() if "scale_factor" in n
     )
@@ -661,8 +656,7 @@ def turns_exhibits(record: Calibration) -> Exhibits:
         f"{plain_number(1e6 * worst, 3)} ppm or better.",
         [("turns", str(found.fit.turns)), ("fence", f"{plain_number(fence, 2)} deg")],
         [
-            ReportTable("Parameters", "Per clock where no uncertainty of it was stated.",
-                        ["parameter", "value", "u", "unit"], rows),
+            parameters_table(rows_of(record), "Per clock where no uncertainty of it was stated."),
             *([] if found.fit.prior is None else [prior_table(found.fit.prior, record)]),
             ReportTable(
                 "Turns",

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab._version import VERSION
 from imulab.columns import triad
-from imulab.display import Bad, Note, verdict_of
+from imulab.display import Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.gravity import EarthRate, Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
 from imulab.options import FURTHER_TRIADS, measure, text
-from imulab.procedures.result import Drawn, Record, as_record, as_recording
+from imulab.procedures.checking import RecordCheck, columns_as_rows, probability_fact, probability_text
+from imulab.procedures.result import Record, as_record, as_recording
 from imulab.procedures.thermal.degrees import parted
 from imulab.procedures.thermal.figures import own_points
 from imulab.procedures.thermal.gyro import RatesAtRest, notes_on_turns, rates_at_rest, rows_of, without_turns
@@ -29,8 +29,9 @@ from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
-from imulab.report import render_page
-from imulab.report.traces import BAD, GOOD, LEGEND, QUIET, Exhibits, Figure, ReportTable, figure_axis, rounded, scatter
+from imulab.report.builders import points, table, within_and_beyond
+from imulab.report.parameters import micro_g
+from imulab.report.traces import LEGEND, Exhibits, Figure, figure_axis
 from imulab.units import conversion_factor, from_si, parse_unit, to_si
 
 # The gyroscopes of new recordings against a record over temperature: their outputs at rest under its laws.
@@ -160,15 +161,21 @@ def _scatter(record: Calibration, given: float | str | None) -> tuple[float | No
     return float(np.hypot(between.bias.value, least)), between.rank
 
 
-# New recordings against a record over temperature, to test whether it still holds.
+# The result of a test of a record over temperature: verdict, and each residual beside its uncertainty.
 
 
 FALSE_ALARM = 0.05
-_BEYOND = 1.0  # K outside the record's range: its laws say nothing there
+_BEYOND_RANGE = 2.0
+_FAILED = (
+    "|f| differs from g between attitudes or temperatures by more than the record explains",
+    "an offset that whole recordings have in common is larger than power cycles explain",
+    "the gyroscopes at rest differ between attitudes or temperatures by more than the record explains",
+    "an offset of the gyroscopes that whole recordings have in common is larger than power cycles explain",
+)
 
 
 @dataclass(frozen=True, repr=False)
-class ThermalCheck(Drawn):
+class ThermalCheck(RecordCheck):
     """How well a record over temperature still holds.
 
     Attributes
@@ -203,10 +210,7 @@ class ThermalCheck(Drawn):
     gyro: GyroCheck | None = None
 
     subject: ClassVar[str] = "Thermal check"
-
-    def exhibits(self) -> Exhibits:
-        """Return what its report shows."""
-        return exhibits_of_check(self)
+    data: ClassVar[str] = "recording"
 
     def __repr__(self) -> str:
         worst = from_si(float(self.residuals[self.worst]), "ug")
@@ -232,6 +236,151 @@ class ThermalCheck(Drawn):
     def worst(self) -> int:
         """Index of the hold that is farthest off."""
         return int(np.argmax(np.abs(self.residuals)))
+
+    def meaning(self) -> str:
+        """Return what the test says, in words."""
+        if self.passed:
+            return "the recordings agree with the record"
+        if self.probability >= FALSE_ALARM:
+            return "no change of the unit is shown, but a hold is beyond the limit"
+        gyro = self.gyro
+        tests = (self.within, self.between, *((gyro.within, gyro.between) if gyro else ()))
+        what = _FAILED[int(np.argmin([2.0 if p is None else p for p in tests]))]
+        return (
+            f"{what}: the unit has changed since the record was made, or gravity, unit or temperature are not as "
+            "assumed"
+        )
+
+    def next_step(self, record: str, files: Sequence[str]) -> str:
+        """Return how to follow the change."""
+        return (
+            "measure again; 'imulab thermal fit' of the old recordings with this one says where they disagree, and a "
+            "record that follows the change takes recordings over temperature anew"
+        )
+
+    def measured(self) -> list[str]:
+        """Return the tests, and the residual of every hold."""
+        label, worst, u = self.holds.label, self.worst, self.standard_uncertainty
+        lines = [
+            f"{probability_text(self.probability)} over {len(self.holds)} holds (within recordings "
+            f"{probability_text(self.within)}, common to each {probability_text(self.between)}), largest |f| - g "
+            f"{_micro(self.residuals[worst])} ug ({label(worst)})"
+        ]
+        if (gyro := self.gyro) is not None:
+            row, axis_number = gyro.worst
+            off, its_u = from_si(
+                np.array([each[row, axis_number] for each in (gyro.residuals, gyro.standard_uncertainty)]), "deg/h"
+            )
+            lines.append(
+                f"gyroscopes: within recordings {probability_text(gyro.within)}, common to each "
+                f"{probability_text(gyro.between)}, largest law less output {off:+.3g} ± {its_u:.2g} deg/h "
+                f"({AXES[axis_number]}, {label(int(gyro.holds[row]))})"
+            )
+        for k, value in enumerate(self.residuals):
+            beyond = "  beyond the limit" if self.limit is not None and abs(value) > self.limit else ""
+            lines.append(f"{label(k)}: {_micro(value)} ± {_micro(u[k], '')} ug{beyond}")
+        return lines
+
+    def content(self) -> dict[str, Any]:
+        """Return what was measured, for scripts, in SI."""
+        labels = [self.holds.label(k) for k in range(len(self.holds))]
+        holds = columns_as_rows(
+            label=labels, temperature=self.holds.temperature, residual=self.residuals,
+            standard_uncertainty=self.standard_uncertainty,
+        )  # fmt: skip
+        content = {
+            "p": self.probability,
+            "p_within": self.within,
+            "p_between": self.between,
+            "limit": None if self.limit is None else {"value": self.limit, "unit": "m/s^2"},
+            "gravity": self.gravity.entry(),
+            "holds": holds,
+        }
+        if (gyro := self.gyro) is not None:
+            rows = columns_as_rows(
+                label=[labels[k] for k in gyro.holds], residual=gyro.residuals,
+                standard_uncertainty=gyro.standard_uncertainty,
+            )  # fmt: skip
+            content["gyro"] = {"p_within": gyro.within, "p_between": gyro.between, "holds": rows}
+        return content
+
+    def stated(self) -> list[tuple[str, str]]:
+        """Return gravity."""
+        return [("gravity", f"{self.gravity.value:.9g} m/s^2")]
+
+    def exhibits(self) -> Exhibits:
+        """Return what its report shows."""
+        gyro, labels = self.gyro, [self.holds.label(k) for k in range(len(self.holds))]
+        tests = {
+            "p, if nothing changed": self.probability,
+            "p within recordings": self.within,
+            "p of what each has in common": self.between,
+        }
+        if gyro:
+            tests["gyroscopes: p within recordings"] = gyro.within
+            tests["gyroscopes: p of what each has in common"] = gyro.between
+        columns: dict[str, Callable[[int], str]] = {
+            "hold": lambda k: labels[k],
+            "|f| − g, µg": lambda k: _micro(self.residuals[k]),
+            "u, µg": lambda k: _micro(self.standard_uncertainty[k], ""),
+            "(|f| − g) / u": lambda k: f"{self.residuals[k] / self.standard_uncertainty[k]:+.1f}",
+        }
+        holds = table(
+            "Holds",
+            "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all "
+            "together, with what their errors share.",
+            columns,
+            range(len(labels)),
+        )
+        residual, reach = from_si(self.residuals, "ug"), _BEYOND_RANGE * from_si(self.standard_uncertainty, "ug")
+        far = np.abs(residual) > reach
+        figure = points(
+            "Residual |f| − g of each hold under the record, over temperature",
+            "Bars: twice the standard uncertainty, from laws, power cycle, temperature and noise; the holds of a "
+            "recording have most of it in common. Red diamonds lie beyond.",
+            ("temperature, degC", self.holds.temperature),
+            (figure_axis("|f| − g, µg", zeroline=True), residual),
+            reach,
+            within_and_beyond(far),
+            labels=labels,
+            hover="%{text}<br>%{y:.1f} µg",
+            message=f"{int(far.sum())} of {len(far)} holds lie beyond twice the standard uncertainty.",
+        )
+        facts = [*((name, probability_fact(p)) for name, p in tests.items())]
+        facts.append(("largest |f| − g", f"{_micro(self.residuals[self.worst])} µg"))
+        return self.exhibits_with(facts, [figure, *([_gyroscopes(self, gyro)] if gyro else []), holds])
+
+
+def _gyroscopes(check: ThermalCheck, gyro: GyroCheck) -> Figure:
+    at = check.holds.temperature[gyro.holds]
+    residual, reach = from_si(gyro.residuals, "deg/h"), _BEYOND_RANGE * from_si(gyro.standard_uncertainty, "deg/h")
+    traces = [
+        own_points(at, residual[:, k], reach[:, k], k, name) | {"name": name, "showlegend": True}
+        for k, name in enumerate(AXES)
+    ]
+    return Figure(
+        title="The gyroscopes at rest under the record, over temperature",
+        message=f"{int((np.abs(residual) > reach).sum())} of {residual.size} outputs lie beyond twice the standard "
+        "uncertainty.",
+        caption="Bars: twice the standard uncertainty, from laws, power cycle, temperature, Earth's rate and noise.",
+        traces=traces,
+        layout={
+            "xaxis": figure_axis("temperature, degC"),
+            "yaxis": figure_axis("law less output, deg/h", zeroline=True),
+            "legend": LEGEND,
+        },
+    )
+
+
+def _micro(value: float, sign: str = "+") -> str:
+    size = micro_g(value)
+    return f"{size:{sign}.3g}" if abs(size) < 999.5 else f"{size:{sign}.0f}"
+
+
+# New recordings against a record over temperature, to test whether it still holds.
+
+
+_BEYOND = 1.0  # K outside the record's range: its laws say nothing there
 
 
 def check_thermal(
@@ -464,219 +613,3 @@ def _directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Arr
     found = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
     found /= np.linalg.norm(found, axis=1)[:, None]
     return found
-
-
-# What a check of a record over temperature shows: the verdict, and each residual beside its uncertainty.
-
-
-_BEYOND_RANGE = 2.0
-
-
-def _ug(value: float, sign: str = "+") -> str:
-    micro = from_si(float(value), "ug")
-    return f"{micro:{sign}.3g}" if abs(micro) < 999.5 else f"{micro:{sign}.0f}"
-
-
-def _p(value: float | None) -> str:
-    return "not tested" if value is None else f"p = {value:.2g}" if value >= 1e-12 else "p below 1e-12"
-
-
-_SAID = (
-    "|f| differs from g between attitudes or temperatures by more than the record explains",
-    "an offset that whole recordings have in common is larger than power cycles explain",
-    "the gyroscopes at rest differ between attitudes or temperatures by more than the record explains",
-    "an offset of the gyroscopes that whole recordings have in common is larger than power cycles explain",
-)
-
-
-def meaning(check: ThermalCheck) -> str:
-    """Return what the test says, in words."""
-    if check.passed:
-        return "the recordings agree with the record"
-    if check.probability >= 0.05:
-        return "no change of the unit is shown, but a hold is beyond the limit"
-    gyro = check.gyro
-    each = (check.within, check.between, *((gyro.within, gyro.between) if gyro else ()))
-    what = _SAID[int(np.argmin([2.0 if p is None else p for p in each]))]
-    return f"{what}: the unit has changed since the record was made, or gravity, unit or temperature are not as assumed"
-
-
-def as_text(check: ThermalCheck, verdict: str) -> str:
-    """Return the verdict with its p, what to do next, and the residual of every hold."""
-    lines = [f"{verdict}: {meaning(check)}"]
-    if not check.passed:
-        lines.append(
-            "measure again; 'imulab thermal fit' of the old recordings with this one says where they disagree, and a "
-            "record that follows the change takes recordings over temperature anew"
-        )
-    worst = check.worst
-    lines.append(
-        f"{_p(check.probability)} over {len(check.holds)} holds (within recordings {_p(check.within)}, common to each "
-        f"{_p(check.between)}), largest |f| - g {_ug(check.residuals[worst])} ug ({check.holds.label(worst)})"
-    )
-    if check.gyro is not None:
-        gyro, (row, k) = check.gyro, check.gyro.worst
-        lines.append(
-            f"gyroscopes: within recordings {_p(gyro.within)}, common to each {_p(gyro.between)}, largest law less "
-            f"output {_hourly(gyro.residuals[row, k]):+.3g} ± {_hourly(gyro.standard_uncertainty[row, k]):.2g} deg/h "
-            f"({AXES[k]}, {check.holds.label(int(gyro.holds[row]))})"
-        )
-    pairs = zip(check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True)
-    for index, (value, u) in enumerate(pairs):
-        beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""
-        lines.append(f"{check.holds.label(index)}: {_ug(value)} ± {_ug(u, '')} ug{beyond}")
-    return "\n".join(lines)
-
-
-def as_json(check: ThermalCheck) -> dict[str, Any]:
-    """Return the same for scripts, in SI."""
-    rows = zip(
-        check.holds.temperature.tolist(), check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True
-    )
-    return {
-        "verdict": "pass" if check.passed else "fail",
-        "p": check.probability,
-        "p_within": check.within,
-        "p_between": check.between,
-        "limit": None if check.limit is None else {"value": check.limit, "unit": "m/s^2"},
-        "gravity": check.gravity.entry(),
-        "holds": [
-            {"label": check.holds.label(k), "temperature": at, "residual": value, "standard_uncertainty": u}
-            for k, (at, value, u) in enumerate(rows)
-        ],
-        **({} if check.gyro is None else {"gyro": _gyro_as_json(check)}),
-        "notes": [str(note) for note in check.notes],
-    }
-
-
-def _gyro_as_json(check: ThermalCheck) -> dict[str, Any]:
-    gyro = check.gyro
-    assert gyro is not None
-    rows = zip(gyro.holds.tolist(), gyro.residuals.tolist(), gyro.standard_uncertainty.tolist(), strict=True)
-    return {
-        "p_within": gyro.within,
-        "p_between": gyro.between,
-        "holds": [
-            {"label": check.holds.label(k), "residual": residual, "standard_uncertainty": u} for k, residual, u in rows
-        ],
-    }
-
-
-def exhibits_of_check(check: ThermalCheck) -> Exhibits:
-    """Return what the report shows."""
-    worst = f"{_ug(check.residuals[check.worst])} µg"
-    facts = [
-        *(
-            (name, _p(value).removeprefix("p ").removeprefix("= "))
-            for name, value in (
-                ("p, if nothing changed", check.probability),
-                ("p within recordings", check.within),
-                ("p of what each has in common", check.between),
-                *(
-                    (
-                        ("gyroscopes: p within recordings", check.gyro.within),
-                        ("gyroscopes: p of what each has in common", check.gyro.between),
-                    )
-                    if check.gyro
-                    else ()
-                ),
-            )
-        ),
-        ("largest |f| − g", worst),
-    ]
-    rows = [
-        [check.holds.label(k), _ug(value), _ug(u, ""), f"{value / u:+.1f}"]
-        for k, (value, u) in enumerate(zip(check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True))
-    ]
-    table = ReportTable(
-        "Holds",
-        "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all together, "
-        "with what their errors share.",
-        ["hold", "|f| − g, µg", "u, µg", "(|f| − g) / u"],
-        rows,
-    )
-    return Exhibits(
-        f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}.",
-        facts,
-        [_figure(check), *([_gyro_figure(check)] if check.gyro else []), table],
-    )
-
-
-def _figure(check: ThermalCheck) -> Figure:
-    residual, u = (from_si(values, "ug") for values in (check.residuals, check.standard_uncertainty))
-    far = np.abs(residual) > _BEYOND_RANGE * u
-    traces = []
-    for which, colour, symbol in ((~far, GOOD, "circle"), (far, BAD, "diamond")):
-        if which.any():
-            bars = {
-                "type": "data",
-                "array": rounded(_BEYOND_RANGE * u[which]),
-                "color": QUIET,
-                "thickness": 1,
-                "width": 3,
-            }
-            traces.append(
-                scatter(rounded(check.holds.temperature[which]), rounded(residual[which]), "markers", error_y=bars,
-                        marker={"size": 8, "color": colour, "symbol": symbol},
-                        text=[check.holds.label(k) for k in np.flatnonzero(which).tolist()],
-                        hovertemplate="%{text}<br>%{y:.1f} µg<extra></extra>")
-            )  # fmt: skip
-    return Figure(
-        title="Residual |f| − g of each hold under the record, over temperature",
-        message=f"{int(far.sum())} of {len(far)} holds lie beyond twice the standard uncertainty.",
-        caption="Bars: twice the standard uncertainty, from laws, power cycle, temperature and noise; the holds of a "
-        "recording have most of it in common. Red diamonds lie beyond.",
-        traces=traces,
-        layout={
-            "xaxis": figure_axis("temperature, degC"),
-            "yaxis": figure_axis("|f| − g, µg", zeroline=True),
-            "showlegend": False,
-        },
-    )
-
-
-def _gyro_figure(check: ThermalCheck) -> Figure:
-    gyro = check.gyro
-    assert gyro is not None
-    at = check.holds.temperature[gyro.holds]
-    residual, u = (from_si(values, "deg/h") for values in (gyro.residuals, gyro.standard_uncertainty))
-    far = int((np.abs(residual) > _BEYOND_RANGE * u).sum())
-    traces = [
-        own_points(at, residual[:, k], _BEYOND_RANGE * u[:, k], k, name) | {"name": name, "showlegend": True}
-        for k, name in enumerate(AXES)
-    ]
-    return Figure(
-        title="The gyroscopes at rest under the record, over temperature",
-        message=f"{far} of {residual.size} outputs lie beyond twice the standard uncertainty.",
-        caption="Bars: twice the standard uncertainty, from laws, power cycle, temperature, Earth's rate and noise.",
-        traces=traces,
-        layout={
-            "xaxis": figure_axis("temperature, degC"),
-            "yaxis": figure_axis("law less output, deg/h", zeroline=True),
-            "legend": LEGEND,
-        },
-    )
-
-
-def _hourly(rate: float) -> float:
-    return float(from_si(float(rate), "deg/h"))
-
-
-def check_page(
-    check: ThermalCheck, held: Calibration, *, record: str, files: Sequence[str], warnings: Sequence[str]
-) -> str:
-    """Return the report; `warnings` are those of the command."""
-    failed = [] if check.passed else [Bad(meaning(check))]
-    return render_page(
-        f"Thermal check: {'pass' if check.passed else 'fail'}",
-        held.sensor.get("serial", "unit without serial number"),
-        exhibits_of_check(check),
-        verdict=verdict_of([*failed, *warnings]),
-        notes=[note for note in warnings if isinstance(note, Note)],
-        provenance=[
-            ("record", f"{record}, created {held.created}"),
-            *(("recording", file) for file in files),
-            ("gravity", f"{check.gravity.value:.9g} m/s^2"),
-            ("software", f"imulab {VERSION}"),
-        ],
-    )

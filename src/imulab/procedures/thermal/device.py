@@ -14,16 +14,16 @@ import numpy as np
 
 from imulab.columns import triad
 from imulab.device.tables import DeviceTable, Field, field_of, values_of, whole
-from imulab.device.unit import VECTORS, DeviceUnit
+from imulab.device.unit import VECTORS, DeviceUnit, correct_gyroscopes, outputs_of
 from imulab.display import Note
-from imulab.errors import DataError, RecordError, UnitError
+from imulab.errors import DataError, RecordError
 from imulab.procedures.procedure import OnLine
 from imulab.procedures.thermal.model import AXES, GROUPS, MISALIGNMENTS, SENSITIVITIES, Laws
 from imulab.procedures.thermal.schema import ThermalGyroModel, ThermalModel, thermal_of
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, output_to_si
-from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit, to_si
 
 # The gyroscopes of a thermal record as the table that the C core runs, and the vectors of a unit's self-test.
 
@@ -215,52 +215,20 @@ def apply_thermal(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recor
     DataError
         The recording has no accelerometer triad, or not the column of temperature that the record goes by.
     """
-    outputs = _outputs(recording, "accel", str(columns["output_unit"]))
+    outputs = outputs_of(recording, "accel", str(columns["output_unit"]))
     force, _ = unit.thermal(_temperature(columns, recording), outputs)
     return recording.with_columns(dict(zip(_ACCEL, force, strict=True)), dict.fromkeys(_ACCEL, "m/s^2"))
 
 
 def apply_gyro(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-    """Return the recording with gyro_* as body rate, in their unit if that is one of rate, else in rad/s.
-
-    accel_* are the specific force (already corrected), which the g-sensitivity needs.
+    """Return the recording with gyro_* as body rate by the laws at each sample's temperature.
 
     Raises
     ------
-    UnitError
-        The columns' unit cannot be converted to the record's.
-    DataError
-        The recording lacks a gyroscope, the temperature, or the accelerometers that the g-sensitivity needs.
+    UnitError, DataError
+        As for `correct_gyroscopes`, or the recording has no such column of temperature.
     """
-    outputs = _outputs(recording, "gyro", str(columns["output_unit"]))
-    kept = parse_unit(recording.triad_unit("gyro"))
-    kept_unit = kept.symbol if kept.quantity == "rate" else "rad/s"
-    force = None
-    if set(_ACCEL) <= set(recording.columns):
-        force = [to_si(recording.column(name), recording.units[name]) for name in _ACCEL]
-    elif np.isnan(unit.thermal_gyro(np.full(1, columns["range"][0]), [np.zeros(1)] * 3, None)[0][0][0]):
-        raise DataError(
-            f"{recording.name}: the record corrects the gyroscopes' g-sensitivity, which needs accel_x, accel_y and "
-            f"accel_z; found {' '.join(recording.columns)}"
-        )
-    rate, _ = unit.thermal_gyro(_temperature(columns, recording), outputs, force)
-    return recording.with_columns(
-        {name: from_si(values, kept_unit) for name, values in zip(_GYRO, rate, strict=True)},
-        dict.fromkeys(_GYRO, kept_unit),
-    )
-
-
-def _outputs(recording: Recording, sensor: str, needed: str) -> list[Array]:
-    """Return the columns of a triad in the unit of the outputs that the record calibrates."""
-    given = recording.triad_unit(sensor)
-    try:
-        factor = conversion_factor(given, needed)
-    except UnitError:
-        raise UnitError(
-            f"{recording.name}: columns {' '.join(triad(sensor))} are in {given}, but the record calibrates "
-            f"outputs in {needed}"
-        ) from None
-    return list((recording.triad(sensor) * factor).T)
+    return correct_gyroscopes(unit, columns, recording, _temperature(columns, recording))
 
 
 def _temperature(columns: Mapping[str, Any], recording: Recording) -> Array:

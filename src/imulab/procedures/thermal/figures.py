@@ -12,9 +12,9 @@ from imulab.procedures.thermal.degrees import moved, spoken_degrees
 from imulab.procedures.thermal.model import AXES, GROUPS
 from imulab.procedures.thermal.record import deviation_of_force, gyro_predicted, gyro_scale_predicted, predicted
 from imulab.procedures.thermal.schema import ThermalRecord, thermal_of
-from imulab.procedures.thermal.schema import rows as engineering_rows
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.report.parameters import parameters_table, rows_of
 from imulab.report.traces import (
     BAD,
     DASHES,
@@ -126,7 +126,7 @@ def power_cycles(known_from: str) -> str:
 
 def values_at_middle(record: Calibration, names: Sequence[str]) -> str:
     """Return coefficients of a record in words: as those of powers of T - T0 they are values in the middle."""
-    by_name = {row.name: row for row in engineering_rows(record)}
+    by_name = {row.name: row for row in rows_of(record)}
     found = [by_name[name] for name in names]
     each = (f"{row.name[-2:].lstrip('_')} {format_uncertain(row.value, row.standard_uncertainty)[0]}" for row in found)
     return f"{', '.join(each)} {found[0].unit}"
@@ -319,10 +319,6 @@ def _left(found: ThermalRecord) -> str:
 
 
 def _coefficients(record: Calibration) -> ReportTable:
-    rows = []
-    for row in engineering_rows(record):
-        value, u = format_uncertain(row.value, row.standard_uncertainty)
-        rows.append([row.name, value, u, row.unit])
     reference = record.model["reference_temperature"]["value"]
     model = thermal_of(record).model
     splines = [("bias_x", model.knots), ("gyro_bias_x", None if model.gyro is None else model.gyro.knots)]
@@ -331,12 +327,11 @@ def _coefficients(record: Calibration) -> ReportTable:
         for name, knots in splines
         if knots
     ]
-    return ReportTable(
-        f"Coefficients of powers of T - {reference:g} degC",
+    return parameters_table(
+        rows_of(record),
         "bias_x is the value at that temperature, bias_x_t1 its change per kelvin, bias_x_t2 the coefficient of the "
         "square ... Outside the range each law is held at its end." + "".join(at_knots),
-        ["parameter", "value", "u", "unit"],
-        rows,
+        f"Coefficients of powers of T - {reference:g} degC",
     )
 
 

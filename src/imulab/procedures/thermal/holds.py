@@ -28,6 +28,7 @@ from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
 from imulab.procedures.thermal import LEAST_SPAN, SETTLE
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes, find_attitudes
 from imulab.recording import Array, Recording, check_finite
+from imulab.records.comparison import different_units
 from imulab.units import parse_unit
 
 # Recordings at rest while the temperature drifts: what knocks leave of them, and how far their direction wanders.
@@ -459,15 +460,10 @@ def _called(recording: Recording, column: str) -> Recording:
 
 def _check_together(recordings: Sequence[Recording]) -> None:
     first = recordings[0]
+    if apart := different_units(*((r.name, r.metadata) for r in recordings), keys=("serial", "element")):
+        raise DataError(f"{apart}; expected recordings of one unit")
     seen: list[tuple[str, NDArray[np.uint64]]] = []
     for recording in recordings:
-        for key in ("serial", "element"):
-            mine, its = first.metadata.get(key), recording.metadata.get(key)
-            if mine and its and mine != its:
-                raise DataError(
-                    f"{recording.name}: {key} {its}, but {first.name} is of {key} {mine}; expected recordings of "
-                    "one unit"
-                )
         unit, other = first.triad_unit("accel"), recording.triad_unit("accel")
         if unit != other:
             raise DataError(

@@ -15,16 +15,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.polynomial import legendre
 
-from imulab.display import Shown
 from imulab.errors import ObservabilityError, OptionError
-from imulab.files import write_page
 from imulab.options import FURTHER_TRIADS, measure, parsed, text
+from imulab.procedures.plan import PlannedAttitudes, amount
 from imulab.procedures.thermal import APART, DEGREES, FOLLOWED, LEAST_SPAN, TURNED, degrees_of, further_of
 from imulab.procedures.thermal.degrees import spoken_degrees
 from imulab.procedures.thermal.gyro import VERTICAL, new_in_each
@@ -32,7 +30,7 @@ from imulab.procedures.thermal.model import SHARES, Laws, forces
 from imulab.procedures.tumble.plan import (
     STARTS,
     Known,
-    attitude_picture,
+    attitude_entry,
     candidates_of,
     noise_of,
     roll_pitch,
@@ -42,11 +40,9 @@ from imulab.procedures.tumble.plan import (
 from imulab.quantities import RANDOM_WALK, in_si, of_units, temperature_list
 from imulab.reading import Data
 from imulab.recording import Array, Recording
-from imulab.report import render_plan
 from imulab.report.plots import Plot
 from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis
 from imulab.units import STANDARD_GRAVITY, from_si
-from imulab.writers import write_csv
 
 # Which temperatures and attitudes show the laws best: the search behind a plan.
 
@@ -230,6 +226,17 @@ class GyroPlan:
         """Root of the mean square of `deviation`, rad/s."""
         return float(np.sqrt(np.mean(self.deviation**2)))
 
+    def content(self) -> dict[str, Any]:
+        """Return the same for scripts, in SI."""
+        return {
+            "noise": amount(self.noise, "rad/sqrt(s)"),
+            "turn_on_scatter": amount(self.turn_on_scatter, "rad/s"),
+            "mean": amount(self.mean, "rad/s"),
+            "predicted": {"standard_uncertainty": self.deviation.tolist(), "unit": "rad/s"},
+            "turns": self.turns,
+            "turned_at": self.turned_at,
+        }
+
     def said(self, temperature: Array) -> str:
         """Return what the plan predicts in sentences; `temperature` as of the plan, degC."""
         worst = int(np.argmax(self.deviation))
@@ -372,7 +379,7 @@ class Tried:
 
 
 @dataclass(frozen=True, repr=False)
-class ThermalPlan(Shown):
+class ThermalPlan(PlannedAttitudes):
     """Soaks and attitudes of a calibration over temperature, and what they will give.
 
     Attributes
@@ -400,6 +407,7 @@ class ThermalPlan(Shown):
         What is predicted of the gyroscopes, None unless it was asked for.
     """
 
+    sheet_title: ClassVar[str] = "Thermal plan"
     soaks: tuple[PlannedSoak, ...]
     degrees: tuple[int, int, int]
     temperature: Array
@@ -460,20 +468,44 @@ class ThermalPlan(Shown):
         ]  # fmt: skip
         return self.lead, ["soak", "degC", "reached by", "attitudes", "from, h:min", "to, h:min"], rows
 
-    def compared(self) -> tuple[list[str], list[list[str]]]:
-        """Return the numbers of soaks that were compared, as titles and rows."""
+    def tables(self) -> list[tuple[list[str], list[list[str]]]]:
+        """Return the numbers of soaks that were compared, and what the corrected force, and rate, will be off by."""
         rows = [[str(each.soaks), str(each.attitudes), _ug(each.mean), _ug(each.worst)] for each in self.tried]
-        return ["soaks", "attitudes in each", "mean sd, ug", "worst sd, ug"], rows
+        return [
+            (["soaks", "attitudes in each", "mean sd, ug", "worst sd, ug"], rows),
+            (["predicted sd of", "value", "unit"], [list(row) for row in self.predicted]),
+        ]
 
-    def save(self, path: str | Path) -> None:
-        """Write the attitudes as CSV: soak, set point, side, start, number, upward direction, roll and pitch.
-
-        Raises
-        ------
-        OptionError
-            The file cannot be written.
-        """
-        write_csv(self.recording(), path)
+    def content(self) -> dict[str, Any]:
+        """Return the plan for scripts, in SI."""
+        gyro = {} if self.gyro is None else {"gyro": self.gyro.content()}
+        return {
+            "degrees": list(self.degrees),
+            "duration": amount(self.duration, "s"),
+            "noise": amount(self.noise, "m/s^2"),
+            "turn_on_scatter": amount(self.turn_on_scatter, "m/s^2"),
+            "mean": amount(self.mean, "m/s^2"),
+            "predicted": {
+                "temperature": self.temperature.tolist(),
+                "standard_uncertainty": self.deviation.tolist(),
+                "unit": "m/s^2",
+            },
+            "soaks": [
+                {
+                    "temperature": soak.temperature,
+                    "reached_by": "warming" if soak.warming else "cooling",
+                    "start": soak.start,
+                    "duration": soak.duration,
+                    "up": soak.directions.tolist(),
+                }
+                for soak in self.soaks
+            ],
+            "compared": [
+                {"soaks": each.soaks, "attitudes": each.attitudes, "mean": each.mean, "worst": each.worst}
+                for each in self.tried
+            ],
+            **gyro,
+        }
 
     def recording(self) -> Recording:
         """Return the same as a table."""
@@ -497,29 +529,15 @@ class ThermalPlan(Shown):
         degrees = ",".join(map(str, self.degrees))
         return Recording(columns=columns, units=units, metadata={"degrees": degrees}, name="thermal plan")
 
-    def sheet(self) -> str:
-        """Return the sheet to print, a picture for each attitude, as HTML text."""
-        pictures: list[dict[str, Any]] = []
+    def pictures(self) -> list[dict[str, Any]]:
+        """Return what the sheet shows of each attitude, soak by soak."""
+        pictures = []
         for number, soak in enumerate(self.soaks, 1):
             heading = f"Soak {number}: {soak.temperature:.1f} degC, reached by {_side(soak)}, {_hours(soak.start)}"
             for index, up in enumerate(soak.directions):
-                roll, pitch = np.degrees(roll_pitch(up[None]))[0]
-                pictures.append(
-                    {
-                        "heading": "" if index else heading,
-                        "number": f"{number}.{index + 1}",
-                        "picture": attitude_picture(up),
-                        "facing": "",
-                        "up": "(" + ", ".join(f"{value:+.2f}" for value in up) + ")",
-                        "roll": f"{roll:.1f}",
-                        "pitch": f"{pitch:.1f}",
-                    }
-                )
-        return render_plan("Thermal plan", self.lead, pictures, self.predicted)
-
-    def report(self, path: str | Path) -> None:
-        """Write the sheet to print as an HTML file; errors as for `save`."""
-        write_page(path, self.sheet())
+                of_soak = {"heading": "" if index else heading}
+                pictures.append(of_soak | attitude_entry(f"{number}.{index + 1}", up))
+        return pictures
 
     def plot(self) -> Plot:
         """Return the standard deviation of the corrected force, and rate, over temperature, and where soaks are."""

@@ -13,11 +13,10 @@ if TYPE_CHECKING:
 
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.device.unit import DeviceUnit
-    from imulab.procedures.procedure import OnLine, Row
+    from imulab.procedures.procedure import OnLine
     from imulab.procedures.thermal.fit import ThermalFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
-    from imulab.records.comparison import Change
     from imulab.records.triads import AccelerometerLaws, GyroscopeLaws
     from imulab.report.traces import Exhibits
 
@@ -133,16 +132,6 @@ class ThermalProcedure(Procedure):
         from imulab.procedures.thermal.figures import exhibits
 
         return exhibits(record)
-
-    def rows(self, record: Calibration) -> Sequence[Row]:
-        from imulab.procedures.thermal.schema import rows
-
-        return rows(record)
-
-    def change_unit(self, change: Change, record: Calibration) -> tuple[float, str]:
-        from imulab.procedures.thermal.schema import change_unit
-
-        return change_unit(change, record)
 
     def comparable(self, first: Calibration, second: Calibration) -> tuple[Calibration, Calibration]:
         from imulab.procedures.thermal.device import at_common_temperatures

@@ -2,37 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab._version import VERSION
 from imulab.columns import triad
-from imulab.display import Bad, Note, verdict_of
+from imulab.device.unit import output_factor
+from imulab.display import Note
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import median
 from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_place, local_gravity
 from imulab.options import measure
-from imulab.procedures.result import Drawn, Record, as_record
+from imulab.procedures.checking import RecordCheck, columns_as_rows, probability_fact, probability_text
+from imulab.procedures.result import Record, as_record
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED
-from imulab.procedures.tumble.record import Scaling, micro_g, scaled_parameters, small_g
+from imulab.procedures.tumble.record import Scaling, scaled_parameters
 from imulab.procedures.tumble.schema import attitudes_of, fit_of, model_of
 from imulab.quantities import in_si
 from imulab.reading import Reading
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report import render_page
+from imulab.report.builders import table
+from imulab.report.parameters import micro_g, reading_unit, small_g
 from imulab.report.traces import (
     BAD,
-    GOOD,
     QUIET,
     Exhibits,
     Figure,
@@ -42,18 +43,29 @@ from imulab.report.traces import (
     edge_note,
     figure_axis,
     format_uncertain,
+    marker,
+    number_axis,
     rounded,
     scatter,
 )
+from imulab.units import from_si
 
 if TYPE_CHECKING:
     from imulab.procedures.tumble.mag.check import MagCheck
 
-# Fresh attitudes against a record, to test whether it still holds.
+# The result of a test of a tumble record by fresh attitudes: verdict, and each residual beside its uncertainty.
+
+
+_BEYOND = 2.0
+"""Standard uncertainties beyond which a residual is marked."""
+_BEYOND_BOTH = float(np.sqrt(2 * np.log(20.0)))
+"""The same of two at once, which one in twenty exceeds by chance."""
+_LEAST = 1e-300
+"""The least probability that is told as a number."""
 
 
 @dataclass(frozen=True, repr=False)
-class Check(Drawn):
+class Check(RecordCheck):
     """How well a record still holds.
 
     Attributes
@@ -90,10 +102,7 @@ class Check(Drawn):
     mag: MagCheck | None = None
 
     subject: ClassVar[str] = "Tumble check"
-
-    def exhibits(self) -> Exhibits:
-        """Return what its report shows."""
-        return exhibits_of_check(self, self.attitudes)
+    data: ClassVar[str] = "file"
 
     def __repr__(self) -> str:
         p = "" if self.probability is None else f", p = {self.probability:.2g}"
@@ -128,6 +137,214 @@ class Check(Drawn):
     def worst(self) -> int:
         """Index of the attitude that is farthest off."""
         return int(np.argmax(np.abs(self.residuals)))
+
+    @property
+    def limit_alone(self) -> bool:
+        """Whether the test would pass without the limit."""
+        return self.probability is not None and self.accelerometers_agree and self.magnetometers_agree
+
+    def meaning(self) -> str:
+        """Return what the test says, in words."""
+        if self.passed:
+            return "the attitudes agree with the record"
+        if self.limit_alone:
+            return "no change of the unit is shown, but an attitude is beyond the limit"
+        if self.accelerometers_agree:
+            return "hard or soft iron has changed since the record was made, or iron was near"
+        return "the unit has changed since the record was made, or gravity, unit or attitudes are not as assumed"
+
+    def next_step(self, record: str, files: Sequence[str]) -> str:
+        """Return what to do, or to know, where the test failed."""
+        if self.limit_alone:
+            return "the limit is smaller than the uncertainty of the attitudes can tell"
+        if self.accelerometers_agree:
+            return (
+                "measure again away from iron, or 'imulab tumble mag FILE -o NEW.json' with 16 or more attitudes for a "
+                "record that follows the change"
+            )
+        return (
+            f"measure again, or 'imulab tumble fit {' '.join(files)} --prior {record} -o NEW.json' for a record that "
+            "follows the change"
+        )
+
+    def summary(self) -> str:
+        """Return p and the largest residual."""
+        n, worst = len(self.attitudes), self.worst
+        test = "not tested, the record states no uncertainties"
+        if self.probability is not None:
+            test = f"{probability_text(self.probability, _LEAST)} (chi-square {self.chi_square:.3g} of {n})"
+        limit = "" if self.limit is None else f", limit {small_g(self.limit)}"
+        return (
+            f"{test}, {n} attitudes, largest |f| - g {small_g(self.residuals[worst])} "
+            f"({self.attitudes.label(worst)}){limit}"
+        )
+
+    def measured(self) -> list[str]:
+        """Return the tests, and the residual of every attitude."""
+        lines = [self.summary(), *self._of_magnetometers()]
+        for k, value in enumerate(self.residuals.tolist()):
+            u = "" if self.standard_uncertainty is None else f" ± {small_g(self.standard_uncertainty[k])}"
+            field = ""
+            if self.mag is not None:
+                field = f", |m| {100 * self.mag.magnitude[k]:+.2f} %, dip {np.degrees(self.mag.dip[k]):+.2f} deg"
+            beyond = "  beyond the limit" if self.limit is not None and abs(value) > self.limit else ""
+            lines.append(f"{self.attitudes.label(k)}: {small_g(value)}{u}{field}{beyond}")
+        return lines
+
+    def _of_magnetometers(self) -> list[str]:
+        mag = self.mag
+        if mag is None:
+            return []
+        worst, agree = mag.worst, "stay the same" if self.magnetometers_agree else "do not stay the same"
+        magnitude = format_uncertain(100 * mag.common[0], 100 * mag.common_uncertainty[0])
+        dip = format_uncertain(*np.degrees([mag.common[1], mag.common_uncertainty[1]]).tolist())
+        lines = [
+            f"magnetometers: |m| and dip {agree}, {probability_text(mag.probability, _LEAST)}, farthest off |m| "
+            f"{100 * mag.magnitude[worst]:+.2g} %, dip {np.degrees(mag.dip[worst]):+.2g} deg "
+            f"({self.attitudes.label(worst)})",
+            f"field against that of the record: |m| {' ± '.join(magnitude)} %, dip {' ± '.join(dip)} deg (not tested: "
+            "of the place)",
+        ]
+        if not self.magnetometers_agree and mag.explained >= self.false_alarm:
+            read = reading_unit(mag.unit, "mag_bias_x")
+            places = 2 if mag.unit == "T" else 4
+            change = ", ".join(f"{value * read.factor:+.{places}f}" for value in mag.hard_iron.tolist())
+            lines.append(f"a hard iron that changed by ({change}) {read.symbol} explains it (p = {mag.explained:.2g})")
+        return lines
+
+    def content(self) -> dict[str, Any]:
+        """Return what was measured, for scripts, in SI."""
+        n = len(self.attitudes)
+        stated = [None] * n if self.standard_uncertainty is None else self.standard_uncertainty
+        residuals = columns_as_rows(
+            label=(self.attitudes.label(k) for k in range(n)), residual=self.residuals, standard_uncertainty=stated
+        )
+        return {
+            "p": self.probability,
+            "chi_square": self.chi_square,
+            "degrees_of_freedom": n,
+            "limit": None if self.limit is None else {"value": self.limit, "unit": "m/s^2"},
+            "gravity": self.gravity.entry(),
+            "attitudes": residuals,
+            **({} if self.mag is None else {"mag": self.mag.content()}),
+        }
+
+    def stated(self) -> list[tuple[str, str]]:
+        """Return gravity."""
+        return [("gravity", f"{self.gravity.value:.9g} m/s^2")]
+
+    def exhibits(self) -> Exhibits:
+        """Return what its report shows."""
+        facts = [("attitudes", str(len(self.attitudes))), ("largest |f| − g", small_g(self.residuals[self.worst]))]
+        if self.probability is not None:
+            facts.insert(0, ("p, if nothing changed", probability_fact(self.probability, _LEAST)))
+        if self.limit is not None:
+            facts.append(("limit", small_g(self.limit)))
+        fields = [] if self.mag is None else [_fields(self, self.mag)]
+        return self.exhibits_with(facts, [_residuals(self), *fields, _table(self)], f"; {self.summary()}")
+
+    def beyond(self) -> NDArray[np.bool_]:
+        """Return which attitudes are beyond the limit, or beyond twice their uncertainty, shape (n,)."""
+        size = np.abs(self.residuals)
+        beyond = np.zeros(len(size), dtype=bool)
+        if self.limit is not None:
+            beyond |= size > self.limit
+        if self.standard_uncertainty is not None:
+            beyond |= size > _BEYOND * self.standard_uncertainty
+        return beyond
+
+
+def _residuals(check: Check) -> Figure:
+    attitudes, beyond = check.attitudes, check.beyond()
+    number = list(range(1, len(attitudes) + 1))
+    residual = from_si(check.residuals, "ug")
+    labels = [attitudes.label(k) for k in range(len(attitudes))]
+    trace = scatter(
+        number, residual.tolist(), "markers", marker=marker(beyond, 9), text=labels,
+        hovertemplate="%{text}<br>%{y:.1f} µg<extra></extra>",
+    )  # fmt: skip
+    room, bars = 0.0, " The record states no uncertainties."
+    if check.standard_uncertainty is not None:
+        half = (_BEYOND * from_si(check.standard_uncertainty, "ug")).tolist()
+        trace["error_y"] = {"type": "data", "array": half, "color": QUIET, "thickness": 1, "width": 3}
+        room = float(np.median(half))
+        bars = (
+            " Bars: twice the standard uncertainty, from record and attitude; one in twenty lies farther off by chance."
+        )
+    far = bulk(residual, room=room)
+    edges = [] if far is None else edge_marks(far, residual, number, [small_g(v) for v in check.residuals.tolist()])
+    ends = [] if check.limit is None else [-micro_g(check.limit), micro_g(check.limit)]
+    line = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "line": {"color": BAD, "dash": "dash", "width": 1.5}}
+    count = int(beyond.sum())
+    return Figure(
+        title="Residual |f| − g of each fresh attitude under the record",
+        message=f"{count} of {len(number)} attitudes {'lies' if count == 1 else 'lie'} beyond "
+        f"{'the limit or ' if ends else ''}twice the standard uncertainty.",
+        caption=f"f is the specific force by the record, g local gravity.{bars}"
+        f"{' Dashed: the limit.' if ends else ''} Red diamonds lie beyond."
+        + edge_note(0 if far is None else int(far.beyond.sum())),
+        traces=[trace, *edges],
+        layout={
+            "xaxis": number_axis("attitude", number),
+            "yaxis": figure_axis("|f| − g, µg", zeroline=True, zerolinecolor=QUIET)
+            | ({} if far is None else {"range": [far.low, far.high]}),
+            "showlegend": False,
+            "shapes": [{**line, "y0": end, "y1": end} for end in ends],
+        },
+    )
+
+
+def _fields(check: Check, mag: MagCheck) -> Figure:
+    """Return |m| and dip of each fresh attitude, less what all have in common."""
+    attitudes = check.attitudes
+    number = list(range(1, len(attitudes) + 1))
+    far = np.hypot(mag.magnitude / mag.magnitude_uncertainty, mag.dip / mag.dip_uncertainty) > _BEYOND_BOTH
+    labels, traces = [attitudes.label(k) for k in range(len(attitudes))], []
+    for values, sigma, unit, place in (
+        (100 * mag.magnitude, 100 * mag.magnitude_uncertainty, "%", "y2"),
+        (np.degrees(mag.dip), np.degrees(mag.dip_uncertainty), "deg", "y"),
+    ):
+        bars = {"type": "data", "array": rounded(2 * sigma), "color": QUIET, "thickness": 1, "width": 3}
+        traces.append(
+            scatter(number, rounded(values), "markers", marker=marker(far, 8), error_y=bars, text=labels, yaxis=place,
+                    hovertemplate=f"%{{text}}<br>%{{y:+.2f}} {unit}<extra></extra>")
+        )  # fmt: skip
+    return Figure(
+        title="Magnitude and dip of the field in each fresh attitude under the record",
+        message=f"{int(far.sum())} of {len(number)} attitudes {'lies' if far.sum() == 1 else 'lie'} beyond what "
+        "one in twenty does by chance.",
+        caption="|m| and dip less what all attitudes have in common, which is of the place. Bars: twice the "
+        "standard uncertainty, from the record and the scatter of its attitudes.",
+        traces=traces,
+        layout={
+            "xaxis": number_axis("attitude", number),
+            "yaxis": figure_axis("dip, deg", domain=[0, 0.46], zeroline=True),
+            "yaxis2": figure_axis("|m|, %", domain=[0.54, 1], zeroline=True),
+            "showlegend": False,
+        },
+        height=460,
+    )
+
+
+def _table(check: Check) -> ReportTable:
+    u, beyond = check.standard_uncertainty, check.beyond()
+    columns: dict[str, Callable[[int], str]] = {
+        "attitude": check.attitudes.label,
+        "|f| − g": lambda k: small_g(check.residuals[k]),
+        "u": lambda k: "not stated" if u is None else small_g(u[k]),
+        "(|f| − g) / u": lambda k: "–" if u is None else f"{check.residuals[k] / u[k]:+.1f}",
+        "remark": lambda k: "beyond" if beyond[k] else "",
+    }
+    return table(
+        "Attitudes",
+        "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all attitudes "
+        f"together, with what their errors share; it fails where p is below {100 * check.false_alarm:g} %.",
+        columns,
+        range(len(check.attitudes)),
+    )
+
+
+# Fresh attitudes against a record, to test whether it still holds.
 
 
 def check_tumble(
@@ -261,10 +478,8 @@ def _gravity(record: Calibration, given: float | str | Gravity | None, attitudes
 
 
 def _in_unit_of(record: Calibration, attitudes: Attitudes) -> Attitudes:
-    from imulab.procedures.tumble.device import output_factor
-
     unit = model_of(record).output_unit
-    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, unit)
+    factor = output_factor(attitudes.recording.name, triad("accel"), attitudes.unit, unit)
     return replace(
         attitudes,
         mean=attitudes.mean * factor,
@@ -303,261 +518,3 @@ def _freedom(record: Calibration) -> float | None:
     """Degrees of freedom where the record's uncertainties rest on a scatter of few residuals; None: noise was known."""
     fit = fit_of(record)
     return None if fit.noise == "known" else float(fit.degrees_of_freedom)
-
-
-# The report of a test of a record by fresh attitudes: verdict, and each residual beside its uncertainty.
-
-
-_BEYOND = 2.0
-"""Standard uncertainties beyond which a residual is marked."""
-_BEYOND_BOTH = float(np.sqrt(2 * np.log(20.0)))
-"""The same of two at once, which one in twenty exceeds by chance."""
-
-
-def meaning(check: Check) -> str:
-    """Return what the test says, in words."""
-    if check.passed:
-        return "the attitudes agree with the record"
-    if _limit_alone(check):
-        return "no change of the unit is shown, but an attitude is beyond the limit"
-    if check.accelerometers_agree:
-        return "hard or soft iron has changed since the record was made, or iron was near"
-    return "the unit has changed since the record was made, or gravity, unit or attitudes are not as assumed"
-
-
-def next_step(check: Check, record: str, file: str) -> list[str]:
-    """Return what to do or to know where the test failed."""
-    if check.passed:
-        return []
-    if _limit_alone(check):
-        return ["the limit is smaller than the uncertainty of the attitudes can tell"]
-    if check.accelerometers_agree:
-        return [
-            "measure again away from iron, or 'imulab tumble mag FILE -o NEW.json' with 16 or more attitudes for a "
-            "record that follows the change"
-        ]
-    return [
-        f"measure again, or 'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the "
-        "change"
-    ]
-
-
-def measured(check: Check, attitudes: Attitudes) -> str:
-    """Return p and the largest residual."""
-    n = len(attitudes)
-    test = "not tested, the record states no uncertainties"
-    if check.probability is not None:
-        p = f"p = {check.probability:.2g}" if check.probability else "p below 1e-300"
-        test = f"{p} (chi-square {check.chi_square:.3g} of {n})"
-    limit = "" if check.limit is None else f", limit {small_g(check.limit)}"
-    return (
-        f"{test}, {n} attitudes, largest |f| - g {small_g(check.residuals[check.worst])} "
-        f"({attitudes.label(check.worst)}){limit}"
-    )
-
-
-def of_magnetometers(check: Check, attitudes: Attitudes, unit: str) -> list[str]:
-    """Return what the test of the magnetometers says; `unit` is that of the record's biases."""
-    mag = check.mag
-    if mag is None:
-        return []
-    p = f"p = {mag.probability:.2g}" if mag.probability else "p below 1e-300"
-    worst = mag.worst
-    lines = [
-        f"magnetometers: |m| and dip {'stay the same' if check.magnetometers_agree else 'do not stay the same'}, {p}, "
-        f"farthest off |m| {100 * mag.magnitude[worst]:+.2g} %, dip {np.degrees(mag.dip[worst]):+.2g} deg "
-        f"({attitudes.label(worst)})",
-        f"field against that of the record: |m| {format_both(100 * mag.common[0], 100 * mag.common_uncertainty[0])} %, "
-        f"dip {format_both(*np.degrees([mag.common[1], mag.common_uncertainty[1]]).tolist())} deg (not tested: of the "
-        "place)",
-    ]
-    if not check.magnetometers_agree and mag.explained >= check.false_alarm:
-        of = "uT" if unit == "T" else "of the field"
-        shown = ", ".join(f"{1e6 * v:+.2f}" if unit == "T" else f"{v:+.4f}" for v in mag.hard_iron.tolist())
-        lines.append(f"a hard iron that changed by ({shown}) {of} explains it (p = {mag.explained:.2g})")
-    return lines
-
-
-def format_both(value: float, uncertainty: float) -> str:
-    """Return ``+0.12 ± 0.05``."""
-    return " ± ".join(format_uncertain(value, uncertainty))
-
-
-def _limit_alone(check: Check) -> bool:
-    return check.probability is not None and check.accelerometers_agree and check.magnetometers_agree
-
-
-def check_page(
-    check: Check, attitudes: Attitudes, held: Calibration, *, record: str, file: str, warnings: Sequence[str]
-) -> str:
-    """Return the report; `warnings` are those of the command."""
-    failed = [] if check.passed else [Bad(meaning(check)), *next_step(check, record, file)]
-    return render_page(
-        f"Tumble check: {'pass' if check.passed else 'fail'}",
-        held.sensor.get("serial", "unit without serial number"),
-        exhibits_of_check(check, attitudes),
-        verdict=verdict_of([*failed, *warnings]),
-        notes=[note for note in warnings if isinstance(note, Note)],
-        provenance=[
-            ("record", f"{record}, created {held.created}"),
-            ("file", file),
-            ("gravity", f"{check.gravity.value:.9g} m/s^2"),
-            ("software", f"imulab {VERSION}"),
-        ],
-    )
-
-
-def exhibits_of_check(check: Check, attitudes: Attitudes) -> Exhibits:
-    """Return what the report shows."""
-    facts = [("attitudes", str(len(attitudes))), ("largest |f| − g", small_g(check.residuals[check.worst]))]
-    if check.probability is not None:
-        facts.insert(0, ("p, if nothing changed", f"{check.probability:.2g}" if check.probability else "below 1e-300"))
-    if check.limit is not None:
-        facts.append(("limit", small_g(check.limit)))
-    return Exhibits(
-        f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}; {measured(check, attitudes)}.",
-        facts,
-        [_figure(check, attitudes), *_mag_figures(check, attitudes), _table(check, attitudes)],
-    )
-
-
-def _beyond(check: Check) -> NDArray[np.bool_]:
-    """Return which attitudes are beyond the limit, or beyond twice their uncertainty."""
-    size = np.abs(check.residuals)
-    beyond = np.zeros(len(size), dtype=bool)
-    if check.limit is not None:
-        beyond |= size > check.limit
-    if check.standard_uncertainty is not None:
-        beyond |= size > _BEYOND * check.standard_uncertainty
-    return beyond
-
-
-def _figure(check: Check, attitudes: Attitudes) -> Figure:
-    number = list(range(1, len(attitudes) + 1))
-    residual = np.array([micro_g(value) for value in check.residuals.tolist()])
-    beyond = _beyond(check)
-    trace = _points(attitudes, residual, beyond)
-    room, bars = 0.0, " The record states no uncertainties."
-    if check.standard_uncertainty is not None:
-        half = [_BEYOND * micro_g(value) for value in check.standard_uncertainty.tolist()]
-        trace["error_y"] = {"type": "data", "array": half, "color": QUIET, "thickness": 1, "width": 3}
-        room = float(np.median(half))
-        bars = (
-            " Bars: twice the standard uncertainty, from record and attitude; one in twenty lies farther off by chance."
-        )
-    far = bulk(residual, room=room)
-    marks = [] if far is None else edge_marks(far, residual, number, [small_g(v) for v in check.residuals.tolist()])
-    limit = [] if check.limit is None else [-micro_g(check.limit), micro_g(check.limit)]
-    count = int(beyond.sum())
-    return Figure(
-        title="Residual |f| − g of each fresh attitude under the record",
-        message=f"{count} of {len(number)} attitudes {'lies' if count == 1 else 'lie'} beyond "
-        f"{'the limit or ' if limit else ''}twice the standard uncertainty.",
-        caption=f"f is the specific force by the record, g local gravity.{bars}"
-        f"{' Dashed: the limit.' if limit else ''} Red diamonds lie beyond."
-        + edge_note(0 if far is None else int(far.beyond.sum())),
-        traces=[trace, *marks],
-        layout={
-            "xaxis": {
-                "title": {"text": "attitude"},
-                "dtick": max(1, round(len(number) / 20)),
-                "range": [0.4, len(number) + 0.6],
-                "gridcolor": "#e6eaed",
-                "zeroline": False,
-            },
-            "yaxis": {
-                "title": {"text": "|f| − g, µg"},
-                "gridcolor": "#e6eaed",
-                "zerolinecolor": QUIET,
-                **({} if far is None else {"range": [far.low, far.high]}),
-            },
-            "showlegend": False,
-            "shapes": [
-                {
-                    "type": "line",
-                    "xref": "paper",
-                    "x0": 0,
-                    "x1": 1,
-                    "y0": end,
-                    "y1": end,
-                    "line": {"color": BAD, "dash": "dash", "width": 1.5},
-                }
-                for end in limit
-            ],
-        },
-    )
-
-
-def _points(attitudes: Attitudes, residual: Array, beyond: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return the residual of each attitude, µg, as a point, marked where it is beyond."""
-    return {
-        "type": "scatter",
-        "mode": "markers",
-        "x": list(range(1, len(attitudes) + 1)),
-        "y": residual.tolist(),
-        "marker": {
-            "size": 9,
-            "color": [BAD if mark else GOOD for mark in beyond.tolist()],
-            "symbol": ["diamond" if mark else "circle" for mark in beyond.tolist()],
-        },
-        "text": [attitudes.label(i) for i in range(len(attitudes))],
-        "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
-    }
-
-
-def _mag_figures(check: Check, attitudes: Attitudes) -> list[Figure]:
-    """Return |m| and dip of each fresh attitude, less what all have in common."""
-    mag = check.mag
-    if mag is None:
-        return []
-    number = list(range(1, len(attitudes) + 1))
-    far = np.hypot(mag.magnitude / mag.magnitude_uncertainty, mag.dip / mag.dip_uncertainty) > _BEYOND_BOTH
-    marker = {
-        "size": 8, "color": [BAD if mark else GOOD for mark in far.tolist()],
-        "symbol": ["diamond" if mark else "circle" for mark in far.tolist()],
-    }  # fmt: skip
-    texts, traces = [attitudes.label(i) for i in range(len(attitudes))], []
-    for values, sigma, unit, place in (
-        (100 * mag.magnitude, 100 * mag.magnitude_uncertainty, "%", "y2"),
-        (np.degrees(mag.dip), np.degrees(mag.dip_uncertainty), "deg", "y"),
-    ):
-        bars = {"type": "data", "array": rounded(2 * sigma), "color": QUIET, "thickness": 1, "width": 3}
-        traces.append(
-            scatter(number, rounded(values), "markers", marker=marker, error_y=bars, text=texts, yaxis=place,
-                    hovertemplate=f"%{{text}}<br>%{{y:+.2f}} {unit}<extra></extra>")
-        )  # fmt: skip
-    return [
-        Figure(
-            title="Magnitude and dip of the field in each fresh attitude under the record",
-            message=f"{int(far.sum())} of {len(number)} attitudes {'lies' if far.sum() == 1 else 'lie'} beyond what "
-            "one in twenty does by chance.",
-            caption="|m| and dip less what all attitudes have in common, which is of the place. Bars: twice the "
-            "standard uncertainty, from the record and the scatter of its attitudes.",
-            traces=traces,
-            layout={
-                "xaxis": figure_axis("attitude", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6]),
-                "yaxis": figure_axis("dip, deg", domain=[0, 0.46], zeroline=True),
-                "yaxis2": figure_axis("|m|, %", domain=[0.54, 1], zeroline=True),
-                "showlegend": False,
-            },
-            height=460,
-        )
-    ]
-
-
-def _table(check: Check, attitudes: Attitudes) -> ReportTable:
-    rows = []
-    beyond = _beyond(check)
-    for i, value in enumerate(check.residuals.tolist()):
-        u, ratio = "not stated", "–"
-        if check.standard_uncertainty is not None:
-            own = float(check.standard_uncertainty[i])
-            u, ratio = small_g(own), f"{value / own:+.1f}"
-        rows.append([attitudes.label(i), small_g(value), u, ratio, "beyond" if beyond[i] else ""])
-    return ReportTable(
-        "Attitudes",
-        "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all attitudes "
-        f"together, with what their errors share; it fails where p is below {100 * check.false_alarm:g} %.",
-        ["attitude", "|f| − g", "u", "(|f| − g) / u", "remark"],
-        rows,
-    )

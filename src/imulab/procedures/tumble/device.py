@@ -26,8 +26,8 @@ from imulab.device.tables import (
     values_of,
     whole,
 )
-from imulab.device.unit import VECTORS, DeviceUnit
-from imulab.errors import DataError, RecordError, UnitError
+from imulab.device.unit import VECTORS, DeviceUnit, outputs_of
+from imulab.errors import RecordError
 from imulab.estimation.least_squares import covariance, least_squares, leverage, observability, plausible_excess
 from imulab.procedures.tumble import HIGHEST_ORDER
 from imulab.procedures.tumble.model import AXES, gravity_slope, norm_and_jacobian, parameter_names
@@ -45,7 +45,7 @@ from imulab.records.triads import (
     text_in_g,
 )
 from imulab.report.traces import plain_number
-from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
+from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si
 
 # A tumble record as the tables that the C core runs, and the vectors by which an exported unit tests itself.
 
@@ -186,38 +186,8 @@ def apply_tumble(unit: DeviceUnit, columns: Mapping[str, Any], recording: Record
     DataError
         The recording has no accelerometer triad.
     """
-    force, _ = unit.tumble(_outputs(recording, "accel", str(columns["output_unit"])))
+    force, _ = unit.tumble(outputs_of(recording, "accel", str(columns["output_unit"])))
     return recording.with_columns(dict(zip(_ACCEL, force, strict=True)), dict.fromkeys(_ACCEL, "m/s^2"))
-
-
-def apply_gyro(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-    """Return the recording with gyro_* as body rate, in their unit if that is one of rate, else in rad/s.
-
-    accel_* are the specific force (already corrected), which the g-sensitivity needs.
-
-    Raises
-    ------
-    UnitError
-        The columns' unit cannot be converted to the record's.
-    DataError
-        The recording lacks a gyroscope, or the accelerometers that the record's g-sensitivity needs.
-    """
-    outputs = _outputs(recording, "gyro", str(columns["output_unit"]))
-    kept = parse_unit(recording.triad_unit("gyro"))
-    kept_unit = kept.symbol if kept.quantity == "rate" else "rad/s"
-    force = None
-    if any(name in recording for name in _ACCEL):
-        force = [to_si(recording.column(name), recording.units[name]) for name in _ACCEL]
-    elif np.isnan(unit.gyro([np.zeros(1)] * 3, None)[0][0][0]):
-        raise DataError(
-            f"{recording.name}: the record corrects the gyroscopes' g-sensitivity, which needs accel_x, accel_y and "
-            f"accel_z; found {' '.join(recording.columns)}"
-        )
-    rate, _ = unit.gyro(outputs, force)
-    return recording.with_columns(
-        {name: from_si(values, kept_unit) for name, values in zip(_GYRO, rate, strict=True)},
-        dict.fromkeys(_GYRO, kept_unit),
-    )
 
 
 def apply_mag(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
@@ -230,35 +200,11 @@ def apply_mag(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording
     DataError
         The recording has no magnetometer triad.
     """
-    field, _ = unit.mag(_outputs(recording, "mag", str(columns["output_unit"])))
+    field, _ = unit.mag(outputs_of(recording, "mag", str(columns["output_unit"])))
     known = "uT" if columns["field_unit"] == "T" else "1"
     return recording.with_columns(
         {name: from_si(values, known) for name, values in zip(_MAG, field, strict=True)}, dict.fromkeys(_MAG, known)
     )
-
-
-def _outputs(recording: Recording, sensor: str, needed: str) -> list[Array]:
-    """Columns of a triad in the unit of the outputs that the record calibrates."""
-    factor = output_factor(recording.name, sensor, recording.triad_unit(sensor), needed)
-    columns = [recording.column(f"{sensor}_{axis}") for axis in AXES]
-    return columns if factor == 1.0 else [column * factor for column in columns]
-
-
-def output_factor(name: str, sensor: str, unit: str, needed: str) -> float:
-    """Return the factor from a triad's unit to the unit of the outputs that a record calibrates.
-
-    Raises
-    ------
-    UnitError
-        There is none; the message names the recording and both units.
-    """
-    try:
-        return conversion_factor(unit, needed)
-    except UnitError:
-        raise UnitError(
-            f"{name}: columns {' '.join(f'{sensor}_{axis}' for axis in AXES)} are in {unit}, "
-            f"but the record calibrates outputs in {needed}"
-        ) from None
 
 
 def specific_force(record: Calibration, output: Array) -> Array:

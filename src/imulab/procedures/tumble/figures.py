@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from imulab.estimation.rows import median, quantile, rms
+from imulab.procedures.tumble import record as engineering
 from imulab.procedures.tumble.model import AXES
-from imulab.procedures.tumble.record import engineering_rows, micro_g, propagated_rows, small_g
 from imulab.procedures.tumble.schema import (
     DeviationTrace,
     HeldAttitudes,
@@ -25,6 +25,7 @@ from imulab.procedures.tumble.schema import (
 )
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.report.parameters import micro_g, small_g
 from imulab.report.traces import (
     ALARM,
     BAD,
@@ -190,7 +191,7 @@ def parameters_table(record: Calibration) -> ReportTable:
     fit, model = fit_of(record), model_of(record)
     factors = {False: fit.coverage_factor_95, True: None if fit.gyro is None else fit.gyro.coverage_factor_95}
     rows = []
-    for row in engineering_rows(record):
+    for row in engineering.rows(record):
         factor = factors[row.name.startswith("gyro_")]
         value, uncertainty = row.text()
         interval = "not stated"
@@ -235,7 +236,7 @@ def parameters_table(record: Calibration) -> ReportTable:
 
 def propagated_table(record: Calibration, trials: Trials) -> ReportTable:
     """Return the intervals by propagation of distributions beside the linear ones."""
-    rows = propagated_rows(record, trials)
+    rows = engineering.propagated_rows(record, trials)
     failed = f", {trials.failed} more did not converge" if trials.failed else ""
     return ReportTable(
         title="Monte Carlo",

@@ -11,23 +11,22 @@ from dataclasses import dataclass, replace
 from itertools import product
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
 
 from imulab.columns import triad
-from imulab.display import Shown
 from imulab.errors import DataError, ImulabError, ObservabilityError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.least_squares import observability
-from imulab.files import write_page
 from imulab.options import choice, either, file, parsed, text
+from imulab.procedures.plan import PlannedAttitudes, amount
 from imulab.procedures.registry import load
 from imulab.procedures.result import as_recording
 from imulab.procedures.tumble import CRITERIA, HIGHEST_ORDER, METHODS
 from imulab.procedures.tumble.attitudes import find_attitudes
 from imulab.procedures.tumble.estimate import check_method
 from imulab.procedures.tumble.fit import fit_tumble
-from imulab.procedures.tumble.model import parameter_count, parameter_names
+from imulab.procedures.tumble.model import parameter_count, parameter_names, parameter_units
 from imulab.procedures.tumble.record import freedom_finding, predicted_rows
 from imulab.procedures.tumble.schema import attitudes_of, data_of, fit_of, model_of
 from imulab.procedures.tumble.solve import CLOSEST, Search, information_rows, inverse, optimal_set, sphere_points
@@ -36,10 +35,8 @@ from imulab.reading import Data
 from imulab.recording import Array, Recording, check_finite
 from imulab.records import is_json
 from imulab.records.calibration import Calibration
-from imulab.report import render_plan
 from imulab.report.traces import GOOD, Figure, figure_axis
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
-from imulab.writers import write_csv
 
 if TYPE_CHECKING:
     from imulab.procedures.tumble.mag.heading import Headings
@@ -432,7 +429,7 @@ def _camera() -> Array:
 
 
 @dataclass(frozen=True, repr=False)
-class TumblePlan(Shown, Plan):
+class TumblePlan(PlannedAttitudes, Plan):
     """Attitudes to measure, in the order that turns least, and what they will give.
 
     Attributes
@@ -449,6 +446,7 @@ class TumblePlan(Shown, Plan):
         Which way each attitude faces, for a magnetometer; None where that was not asked for.
     """
 
+    sheet_title: ClassVar[str] = "Tumble plan"
     criterion: str
     noise: float
     noise_from: str
@@ -494,27 +492,42 @@ class TumblePlan(Shown, Plan):
         """Return the plan in a few sentences, and the predicted uncertainties."""
         return self.lead, ["parameter", "predicted u", "unit"], [list(row) for row in self.predicted]
 
-    def save(self, path: str | Path) -> None:
-        """Write the attitudes as CSV: number, upward direction in the body frame (and that of north), roll and pitch.
-
-        Raises
-        ------
-        OptionError
-            The file cannot be written.
-        """
-        write_csv(self.recording(), path)
+    def content(self) -> dict[str, Any]:
+        """Return the plan for scripts, in SI under the names of a record."""
+        units = parameter_units(self.order, "m/s^2")
+        # A bias in units of g is so many times gravity, a k_n in 1/g^(n-1) so many times its inverse power.
+        powers = {"m/s^2": 1, "1/(m/s^2)": -1} | {f"1/(m/s^2)^{n}": -n for n in range(2, self.order)}
+        predicted, angles = self.uncertainties(self.noise), roll_pitch(self.directions)
+        attitudes: list[dict[str, Any]] = [
+            {"up": up, "roll": amount(roll, "rad"), "pitch": amount(pitch, "rad")}
+            for up, (roll, pitch) in zip(self.directions.tolist(), angles.tolist(), strict=True)
+        ]
+        parameters = {
+            name: {"standard_uncertainty": u * STANDARD_GRAVITY ** powers.get(unit, 0), "unit": unit}
+            for (name, u), unit in zip(predicted.items(), units, strict=True)
+        }
+        if self.headings is not None:
+            for index, (attitude, north) in enumerate(zip(attitudes, self.headings.north.tolist(), strict=True)):
+                attitude |= {"north": north, "facing": self.headings.facing(index)}
+            parameters |= {
+                name: {"standard_uncertainty": u, "unit": "1" if name.startswith(("mag_bias", "mag_scale")) else "rad"}
+                for name, u in self.headings.uncertainties().items()
+            }
+        return {
+            "order": self.order,
+            "criterion": self.criterion,
+            "condition_number": float(self.condition_number),
+            "noise": amount(self.noise * STANDARD_GRAVITY, "m/s^2"),
+            "already": self.already,
+            "warnings": [] if self.finding is None else [self.finding],
+            "attitudes": attitudes,
+            "again": [list(pair) for pair in self.again],
+            "parameters": parameters,
+        }
 
     def recording(self) -> Recording:
         """Return the same as a table."""
         return plan_recording(self, None if self.headings is None else self.headings.north)
-
-    def sheet(self) -> str:
-        """Return the sheet to print, a picture for each attitude, as HTML text."""
-        return render_plan("Tumble plan", self.lead, self._pictures(), self.predicted)
-
-    def report(self, path: str | Path) -> None:
-        """Write the sheet to print as an HTML file; errors as for `save`."""
-        write_page(path, self.sheet())
 
     def plot(self) -> Plot:
         """Return roll and pitch of the attitudes, numbered in their order."""
@@ -533,22 +546,28 @@ class TumblePlan(Shown, Plan):
 
         return Plot(Figure("Attitudes to measure", self.lead, [trace], layout), "Tumble plan")
 
-    def _pictures(self) -> list[dict[str, str]]:
-        angles = np.degrees(roll_pitch(self.directions))
-        pictures = []
-        for index, (up, (roll, pitch)) in enumerate(zip(self.directions, angles, strict=True)):
-            north = None if self.headings is None else self.headings.north[index]
-            pictures.append(
-                {
-                    "number": str(index + 1),
-                    "picture": attitude_picture(up, north),
-                    "facing": "" if self.headings is None else self.headings.facing(index),
-                    "up": "(" + ", ".join(f"{value:+.2f}" for value in up) + ")",
-                    "roll": f"{roll:.1f}",
-                    "pitch": f"{pitch:.1f}",
-                }
-            )
-        return pictures
+    def pictures(self) -> list[dict[str, Any]]:
+        """Return what the sheet shows of each attitude."""
+        headings = self.headings
+        return [
+            attitude_entry(str(k + 1), up)
+            if headings is None
+            else attitude_entry(str(k + 1), up, headings.north[k], headings.facing(k))
+            for k, up in enumerate(self.directions)
+        ]
+
+
+def attitude_entry(number: str, up: Array, north: Array | None = None, facing: str = "") -> dict[str, str]:
+    """Return what a sheet shows of an attitude: its number, picture, upward direction, roll and pitch, deg."""
+    roll, pitch = np.degrees(roll_pitch(up[None]))[0]
+    return {
+        "number": number,
+        "picture": attitude_picture(up, north),
+        "facing": facing,
+        "up": "(" + ", ".join(f"{value:+.2f}" for value in up) + ")",
+        "roll": f"{roll:.1f}",
+        "pitch": f"{pitch:.1f}",
+    }
 
 
 # A plan from what people have: noise, candidates and earlier attitudes as numbers, texts, files, records or arrays.

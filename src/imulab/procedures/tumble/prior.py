@@ -25,6 +25,7 @@ from imulab.procedures.tumble.schema import PriorShares, fit_of, model_of
 from imulab.procedures.tumble.solve import Prior, TumbleProblem, TumbleSolution
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
+from imulab.records.comparison import different_units
 from imulab.records.sections import Quantity
 
 _SCALE = 2.0
@@ -307,9 +308,8 @@ def prior_shares(
 def findings(record: Calibration, aged: AgedPrior, recording: Recording, count: int) -> list[str]:
     """Return what a user must know of a prior, a sentence each."""
     found = []
-    mine, its = record.sensor.get("serial"), recording.metadata.get("serial")
-    if mine and its and mine != its:
-        found.append(f"the prior is a record of {mine}, the recording one of {its}")
+    if other := different_units(("the prior", record.sensor), ("the recording", recording.metadata)):
+        found.append(other)
     if aged.probability < FALSE_ALARM:
         sizes = [f"{1e6 * tau:.3g} {unit}" for tau, unit in zip(aged.ageing, ("µg", "ppm", "µrad"), strict=False)]
         few = (

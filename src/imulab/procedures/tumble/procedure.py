@@ -15,13 +15,12 @@ if TYPE_CHECKING:
 
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.device.unit import DeviceUnit
-    from imulab.procedures.procedure import Row
     from imulab.procedures.tumble.attitudes import Attitudes
     from imulab.procedures.tumble.fit import TumbleFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
-    from imulab.records.comparison import Change
     from imulab.records.triads import LinearFit, Triads
+    from imulab.report.parameters import Row
     from imulab.report.traces import Exhibits
 
 
@@ -158,9 +157,9 @@ class GyroscopeSection(Section):
         return golden_gyroscopes(table, random)
 
     def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-        from imulab.procedures.tumble.device import apply_gyro
+        from imulab.device.unit import correct_gyroscopes
 
-        return apply_gyro(unit, columns, recording)
+        return correct_gyroscopes(unit, columns, recording)
 
 
 class MagnetometerSection(Section):
@@ -203,14 +202,9 @@ class TumbleProcedure(Procedure):
         return exhibits(record)
 
     def rows(self, record: Calibration) -> Sequence[Row]:
-        from imulab.procedures.tumble.record import engineering_rows
+        from imulab.procedures.tumble.record import rows
 
-        return engineering_rows(record)
-
-    def change_unit(self, change: Change, record: Calibration) -> tuple[float, str]:
-        from imulab.procedures.tumble.record import change_unit
-
-        return change_unit(change, record)
+        return rows(record)
 
     def same_meaning(self, name: str, first: Calibration, second: Calibration) -> bool:
         from imulab.procedures.tumble.record import same_meaning

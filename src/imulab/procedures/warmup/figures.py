@@ -8,9 +8,10 @@ import numpy as np
 
 from imulab.estimation.rows import rms
 from imulab.procedures.warmup.model import WarmupTable, evaluate, record_table
-from imulab.procedures.warmup.schema import CycleCurve, WarmupRecord, WarmupSummary, drawn_of, engineering_unit
+from imulab.procedures.warmup.schema import CycleCurve, WarmupRecord, WarmupSummary, drawn_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.report.parameters import small_unit
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -141,7 +142,7 @@ _LOST = "in noise"
 
 def models_table(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]) -> ReportTable:
     """Return the models that were compared, over the axes of one kind."""
-    label, factor = engineering_unit(table.units[index[0]])
+    label, factor = small_unit(table.units[index[0]]).scale
     rows, highlight = [], None
     fit = drawn.fit
     for number, row in enumerate(fit.models):
@@ -183,7 +184,7 @@ def units_table(
     rows = []
     for index in kinds.values():
         for i in index:
-            label, factor = engineering_unit(table.units[i])
+            label, factor = small_unit(table.units[i]).scale
             unit, cycle, uncertainty = units[i], found.cycle[i], found.standard_uncertainty[i]
             verdict = "–"
             if unit is not None and cycle is not None and uncertainty is not None:
@@ -202,7 +203,7 @@ def units_table(
 
 def tests_table(drawn: WarmupRecord, table: WarmupTable) -> ReportTable:
     """Return what each calibration temperature showed, over the axes of the first kind."""
-    label, factor = engineering_unit(table.units[0])
+    label, factor = small_unit(table.units[0]).scale
     head = next(iter(axes_by_kind(table).values()))
     chosen = drawn.fit.row()
     rows = []
@@ -277,7 +278,7 @@ def exhibits(record: Calibration) -> Exhibits:
     drawn = drawn_of(record)
     fit = drawn.fit
     chosen, none = fit.row(), fit.row("none")
-    head, (label, factor) = next(iter(by_kind.values())), engineering_unit(table.units[0])
+    head, (label, factor) = next(iter(by_kind.values())), small_unit(table.units[0]).scale
     before, after = (rms_of(row.training, head) * factor for row in (none, chosen))
     left = f"{plain_number(after, 2)} {label}" if after > 0 else "nothing above the noise"
     floor = fit.repeatability.cycle
@@ -322,7 +323,7 @@ def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
     fit = drawn_of(record).fit if record.fit else None
     rows = []
     for i, axis in enumerate(table.axes):
-        label, factor = engineering_unit(table.units[i])
+        label, factor = small_unit(table.units[i]).scale
         cells = ["–" if z is None else plain_number(float(z[i, 0]) * factor, 3) for z in first]
         if fit is not None:
             cells += [rms_text(fit.row(name).training, [i], factor) for name in ("none", None)]
@@ -356,7 +357,7 @@ def _exhibits_of_table(table: WarmupTable) -> Exhibits:
 
 
 def _cycles(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]) -> Figure:
-    label, factor = engineering_unit(table.units[index[0]])
+    label, factor = small_unit(table.units[index[0]]).scale
     time = np.linspace(0.0, table.settling_time * (1 - 1e-9), _POINTS)
     cells: list[list[dict[str, Any]]] = []
     for i in index:
@@ -400,7 +401,7 @@ def _cycles(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]
 
 
 def _residuals(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]) -> Figure:
-    label, factor = engineering_unit(table.units[index[0]])
+    label, factor = small_unit(table.units[index[0]]).scale
     cells: list[list[dict[str, Any]]] = [[] for _ in index]
     data = drawn.data
     for at in data.knots:
@@ -449,7 +450,7 @@ def _inside(table: WarmupTable, temperature: float) -> float:
 
 
 def _by_temperature(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]) -> Figure:
-    label, factor = engineering_unit(table.units[index[0]])
+    label, factor = small_unit(table.units[index[0]]).scale
     fit, knots = drawn.fit, drawn.data.knots
     chosen = fit.row()
     lines = [
@@ -500,7 +501,7 @@ def _over_temperature(table: WarmupTable) -> Figure:
     names = []
     for number, index in enumerate(axes_by_kind(table).values()):
         i = index[int(np.argmax(spread[index]))]
-        label, factor = engineering_unit(table.units[i])
+        label, factor = small_unit(table.units[i]).scale
         names.append((table.axes[i], label))
         suffix = "" if number == 0 else "2"
         for j, instant in enumerate(instants):

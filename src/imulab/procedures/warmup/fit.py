@@ -31,6 +31,7 @@ from imulab.quantities import in_si, number, temperature_list
 from imulab.reading import Data, Reading
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.records.comparison import different_units
 
 TOLERANCE = 1.0
 """How far a power-on temperature may lie from its calibration temperature, K."""
@@ -289,13 +290,5 @@ def _check_together(cycles: Sequence[Cycle], pool: str) -> None:
                 f"{unnamed[0]}: no serial in the head of the file; --pool type needs it to tell units apart"
             )
         return
-    serials: dict[str, str] = {}
-    for cycle in cycles:
-        if cycle.serial:
-            serials.setdefault(cycle.serial, cycle.name)
-    if len(serials) > 1:
-        (first, one), (second, other) = list(serials.items())[:2]
-        raise DataError(
-            f"{other}: of unit {second}, but {one} is of {first}: expected power cycles of one unit (--pool type fits "
-            "one table to several)"
-        )
+    if other := different_units(*((cycle.name, {"serial": cycle.serial or ""}) for cycle in cycles)):
+        raise DataError(f"{other}; expected power cycles of one unit (--pool type fits one table to several)")

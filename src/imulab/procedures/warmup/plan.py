@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 
-from imulab.display import Shown
 from imulab.errors import OptionError
 from imulab.options import measure, parsed, text
+from imulab.procedures.plan import PlannedTest, amount
 from imulab.procedures.warmup import TEMPERATURES
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, temperature_list, whole
 from imulab.recording import Recording
 from imulab.report.plots import Plot
 from imulab.report.traces import GOOD, LEGEND, QUIET, Figure
+from imulab.units import from_si
 from imulab.writers import write_csv
 
 WIDEST = 20.0
@@ -38,7 +39,7 @@ class PlanStep:
 
 
 @dataclass(frozen=True, repr=False)
-class WarmupPlan(Shown):
+class WarmupPlan(PlannedTest):
     """A chamber programme.
 
     Attributes
@@ -98,6 +99,34 @@ class WarmupPlan(Shown):
             end = steps[-1].start + steps[-1].duration
             rows.append([f"{at:g}", str(self.cycles), _hours(steps[0].start), _hours(end)])
         return head, ["set point, degC", "cycles", "from, h:min", "to, h:min"], rows
+
+    def remarks(self) -> list[str]:
+        """Return how well a curve will be known, and better temperatures where there are any."""
+        lines = [
+            "standard uncertainty of a curve at its temperature: "
+            f"{from_si(self.curve_uncertainty, 'deg/h'):.2g} deg/h from noise, and "
+            f"{100 * self.repeatability_uncertainty:.2g} % of the curve from repeatability"
+        ]
+        if self.proposal != self.temperatures:
+            lines.append(f"better: --temperatures {','.join(f'{t:g}' for t in self.proposal)}")
+        return lines
+
+    def content(self) -> dict[str, Any]:
+        """Return the plan for scripts, in SI."""
+        return {
+            "temperatures": list(self.temperatures),
+            "cycles": self.cycles,
+            "duration": amount(self.duration, "s"),
+            "steps": [asdict(step) for step in self.steps],
+            "curve_uncertainty": amount(self.curve_uncertainty, "rad/s"),
+            "repeatability": amount(self.repeatability_uncertainty, "1"),
+            "proposal": list(self.proposal),
+            "warnings": list(self.warnings),
+        }
+
+    def findings(self) -> tuple[str, ...]:
+        """Return what is wrong with the temperatures, and what would be better."""
+        return self.warnings
 
     def save(self, path: str | Path) -> None:
         """Write the programme as CSV.

@@ -27,8 +27,8 @@ from imulab.procedures.warmup.model import (
     solve,
     statistics,
 )
-from imulab.procedures.warmup.schema import in_engineering
 from imulab.recording import Array
+from imulab.report.parameters import small_text
 
 # How good a model is: what it leaves of cycles and temperatures that it has not seen, and where it jumps.
 
@@ -392,7 +392,7 @@ def expectations(curves: Curves, chosen: Judged, worst: Worst | None) -> list[st
     stated = chosen.left_temperature
     if worst is not None and stated is not None and (worst.error > _MORE * stated + _ROUNDING).any():
         said = [
-            f"{in_engineering(max(worst.error[i] for i in index), curves.units[index[0]])} ({kind})"
+            f"{small_text(max(worst.error[i] for i in index), curves.units[index[0]])} ({kind})"
             for kind, index in curves.kinds().items()
         ]
         found.append(
@@ -471,7 +471,7 @@ def _sizes(curves: Curves) -> list[str]:
     """What a unit in a column's title that is not that of its numbers looks like."""
     largest = np.nanmax(np.abs(curves.mean), axis=(0, 1))
     return [
-        f"{axis} changes by {in_engineering(change, unit)} after power-on: does its column have the right unit?"
+        f"{axis} changes by {small_text(change, unit)} after power-on: does its column have the right unit?"
         for axis, change, unit in zip(curves.axes, largest, curves.units, strict=True)
         if change > _IMPROBABLE.get(unit, np.inf)
     ]
@@ -500,7 +500,7 @@ def _drifts(curves: Curves, chosen: Judged) -> list[str]:
             found.append(
                 f"not settled: {kind} still drifts in the settled part of {int(share.any(axis=1).sum())} of "
                 f"{len(curves.cycles)} cycles, most in {curves.cycles[row].name} ({curves.axes[axis]}, "
-                f"{in_engineering(curves.drift[row, axis], curves.units[axis])} from T_M to its end); Z is relative to "
+                f"{small_text(curves.drift[row, axis], curves.units[axis])} from T_M to its end); Z is relative to "
                 "the mean of that part"
             )
     return found
@@ -551,8 +551,8 @@ def _odd_cycles(curves: Curves) -> list[str]:
     unit = curves.units[column]
     names = [curves.cycles[i].name for i in np.flatnonzero(odd.any(axis=1))]
     return [
-        f"a power cycle differs from the others at its temperature by {in_engineering(apart[row, column], unit)} "
-        f"({curves.axes[column]}), where cycles usually differ by {in_engineering(usual[column], unit)}: look at "
+        f"a power cycle differs from the others at its temperature by {small_text(apart[row, column], unit)} "
+        f"({curves.axes[column]}), where cycles usually differ by {small_text(usual[column], unit)}: look at "
         f"{_named(names)}, and leave out what is wrong"
     ]
 

@@ -1,4 +1,4 @@
-"""What a warm-up record holds, with types, and the units in which people read it."""
+"""What code reads of a warm-up record, with types; its table is `imulab.procedures.warmup.model.WarmupTable`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from typing import Annotated, TypeVar
 from imulab.errors import RecordError
 from imulab.records.calibration import Calibration
 from imulab.records.sections import Above0, Part, Positive, Quantity, Size, field, part
-from imulab.report.traces import plain_number
-from imulab.units import conversion_factor
 
 # What code reads of a warm-up record, with types; its table is `imulab.procedures.warmup.model.WarmupTable`.
 
@@ -158,23 +156,3 @@ def drawn_of(record: Calibration) -> WarmupRecord:
     if rows != knots:
         raise RecordError(f"fit.repeatability.by_temperature: expected {knots} rows, one a temperature, found {rows}")
     return found
-
-
-# The units in which people read warm-up: deg/h and µg.
-
-
-_SHOWN = {"rad/s": ("deg/h", "deg/h"), "m/s^2": ("ug", "µg")}
-
-
-def engineering_unit(unit: str) -> tuple[str, float]:
-    """Return the unit in which a quantity is shown, and the factor from its SI unit."""
-    if unit not in _SHOWN:
-        return unit, 1.0
-    symbol, label = _SHOWN[unit]
-    return label, conversion_factor(unit, symbol)
-
-
-def in_engineering(value: float, unit: str, digits: int = 3) -> str:
-    """Return a value with its unit as text."""
-    label, factor = engineering_unit(unit)
-    return f"{plain_number(value * factor, digits)} {label}"

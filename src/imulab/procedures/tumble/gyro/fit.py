@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
+from imulab.device.unit import output_factor
 from imulab.display import UNJUDGED, Bad, Note
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
 from imulab.estimation.least_squares import Observability, coverage_factor, observability
@@ -30,7 +31,7 @@ from imulab.options import PROGRAM, choice, measure
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.procedures.tumble import CLOCKS, SENSITIVITIES
 from imulab.procedures.tumble.attitudes import Attitudes, find_attitudes
-from imulab.procedures.tumble.device import output_factor, specific_force
+from imulab.procedures.tumble.device import specific_force
 from imulab.procedures.tumble.gyro.rest import clock_notes, direction_covariance, find_holds
 from imulab.procedures.tumble.gyro.solve import (
     CRYSTAL,
@@ -64,6 +65,7 @@ from imulab.quantities import in_si
 from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.comparison import different_units
 from imulab.records.mean_noise import mean_uncertainties
 from imulab.records.sections import Length, Measured, entries
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
@@ -162,7 +164,7 @@ def fit_gyro_triad(
     check_finite(recording, triad("gyro"))
     left_out = leave_out(recording, triad("gyro"))
     time, output = check_time(recording), left_out.recording.triad("gyro")
-    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, model_of(record).output_unit)
+    factor = output_factor(attitudes.recording.name, triad("accel"), attitudes.unit, model_of(record).output_unit)
     means = attitudes.mean * factor
     own = attitudes.recording.si("time")
     moving = leave_out(attitudes.recording, triad("accel")).recording
@@ -301,8 +303,8 @@ def _observability_of_turns(found: Solved, freedom: int, name: str) -> Observabi
 
 def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
     """Say if the accelerometers' record is hardly of this unit."""
-    mine, its = record.sensor.get("serial"), attitudes.recording.metadata.get("serial")
-    found = [f"gyro: the record is of {mine}, the recording of {its}"] if mine and its and mine != its else []
+    other = different_units(("the record", record.sensor), ("the recording", attitudes.recording.metadata))
+    found = [f"gyro: {other}"] if other else []
     length = np.linalg.norm(force, axis=1)
     scatter, usual = float(length.std()), fit_of(record).rms.value
     if scatter > _FOREIGN * usual + _TOUCHED:

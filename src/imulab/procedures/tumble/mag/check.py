@@ -13,12 +13,15 @@ a change of hard iron alone would explain what is left, and which.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from imulab.columns import triad
+from imulab.device.unit import output_factor
 from imulab.estimation.distributions import f_tail
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.device import field_in_body, output_factor, specific_force
+from imulab.procedures.tumble.device import field_in_body, specific_force
 from imulab.procedures.tumble.mag.heading import Law, law_of
 from imulab.procedures.tumble.mag.model import dips, outputs_of
 from imulab.procedures.tumble.schema import fit_of, mag_model_of
@@ -50,6 +53,8 @@ class MagCheck:
         Change of hard iron that would explain the attitudes best, in the unit of the record's biases, shape (3,).
     explained
         Probability of what such a change leaves.
+    unit
+        Of the record's biases: T, or 1 where they are parts of the field.
     """
 
     magnitude: Array
@@ -61,12 +66,30 @@ class MagCheck:
     probability: float
     hard_iron: Array
     explained: float
+    unit: str
 
     @property
     def worst(self) -> int:
         """Index of the attitude that is farthest off, in units of its uncertainties."""
         off = (self.magnitude / self.magnitude_uncertainty) ** 2 + (self.dip / self.dip_uncertainty) ** 2
         return int(np.argmax(off))
+
+    def content(self) -> dict[str, Any]:
+        """Return the same for scripts, in SI."""
+        return {
+            "p": self.probability,
+            "common": {
+                name: {
+                    "value": float(self.common[k]),
+                    "standard_uncertainty": float(self.common_uncertainty[k]),
+                    "unit": unit,
+                }
+                for k, (name, unit) in enumerate((("magnitude", "1"), ("dip", "rad")))
+            },
+            "magnitude": self.magnitude.tolist(),
+            "dip": {"value": self.dip.tolist(), "unit": "rad"},
+            "hard_iron_change": {"value": self.hard_iron.tolist(), "p": self.explained},
+        }
 
 
 def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
@@ -91,7 +114,7 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
     law, fit, n = law_of(record), fit_of(record).mag, len(attitudes)
     assert fit is not None
     means = outputs_of(attitudes, np.arange(n))
-    factor = output_factor(attitudes.recording.name, "mag", means.unit, mag_model_of(record).mag_output_unit)
+    factor = output_factor(attitudes.recording.name, triad("mag"), means.unit, mag_model_of(record).mag_output_unit)
     field = field_in_body(record, means.mean * factor)
     force = specific_force(record, attitudes.mean)
     length, dip = float(record.model["field"]["value"]), record.value("dip")
@@ -112,6 +135,7 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
         float(f_tail(value / (2 * n - 2), 2.0 * n - 2, freedom)),
         moved,
         float(f_tail(after / (2 * n - 5), 2.0 * n - 5, freedom)),
+        record.model.get("field", {}).get("unit", "1"),
     )  # fmt: skip
 
 

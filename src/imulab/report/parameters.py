@@ -1,0 +1,202 @@
+"""Parameters as people read them: in the units of the IEEE standards, as rows and as a table.
+
+One table of units serves every procedure, reports, comparisons and fleets. Biases are read in mg and deg/h, scale
+factors in ppm off nominal or output per g and per deg/s, misalignments in mrad, nonlinearity in µg/g² and
+ppm/(deg/s), acceleration-sensitive drift in deg/h/g; noise, and what changes in a kelvin, in smaller units.
+Records, blobs and exported C stay in SI.
+
+Source: IEEE Std 528, 836, 952 and 1293, the units in which they state a model's coefficients.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from typing import overload
+
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.report.traces import ReportTable, format_uncertain, plain_number
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+_DEG, _DEG_H, _MG = (from_si(1.0, symbol) for symbol in ("deg", "deg/h", "mg"))
+_PER_G, _HOUR, _ROOT_HOUR = STANDARD_GRAVITY, 3600.0, 60.0
+_BY_UNIT = {
+    "m/s^2": ("mg", _MG),
+    "rad/s": ("deg/h", _DEG_H),
+    "rad": ("mrad", 1e3),
+    "T": ("uT", 1e6),
+    "rad/s/(m/s^2)": ("deg/h/g", _DEG_H * _PER_G),
+    "rad/s/(m/s^2)^2": ("deg/h/g²", _DEG_H * _PER_G**2),
+    "1/K": ("ppm/K", 1e6),
+    "rad/s/sqrt(Hz)": ("deg/sqrt(h)", _DEG * _ROOT_HOUR),
+    "m/s^2/sqrt(Hz)": ("m/s/sqrt(h)", _ROOT_HOUR),
+    "rad/s/sqrt(s)": ("deg/h/sqrt(h)", _DEG_H * _ROOT_HOUR),
+    "m/s^2/sqrt(s)": ("µg/sqrt(h)", 1e3 * _MG * _ROOT_HOUR),
+    "rad/s^2": ("deg/h/h", _DEG_H * _HOUR),
+    "m/s^3": ("µg/h", 1e3 * _MG * _HOUR),
+    "m/s": ("mm/s", 1e3),
+}
+"""SI unit to the unit in which it is read, and the factor."""
+_SMALL = {"m/s^2": ("µg", 1e3 * _MG)}
+_BY_NAME = (
+    (r"dip|(.*_)?direction(_\d+)?", {"rad": ("deg", _DEG)}),
+    (r".*_quantisation", {"rad": ("arcsec", 3600 * _DEG)}),
+    (r".*_(flicker|sigma)|(repeatability|unit_spread|\w+_error|\w+_jump)_.*", _SMALL),
+    (r"gyro_delay_\w", {"s": ("ms", 1e3)}),
+    (r"gyro_\w+", {"1": ("ppm", 1e6)}),
+    (r"mag_bias_\w", {"1": ("of the field", 1.0)}),
+    (r"(.*_)?zeta_\d+", {"1": ("%", 100.0)}),
+    (r"(.*_)?c[12]", {"1/(m/s^2)": ("ppm/g", 1e6 * _PER_G), "1/(m/s^2)^2": ("ppm/g²", 1e6 * _PER_G**2)}),
+)
+"""Parameters that are read otherwise than their unit alone says."""
+_SENSED = {"/(m/s^2)": ("acceleration", "/g", _PER_G), "/(rad/s)": ("rate", "/(deg/s)", 1 / _DEG),
+           "/T": ("magnetic field", "/uT", 1e-6)}  # fmt: skip
+"""What a scale factor is over: the quantity that a nominal one puts out, and how an output per it is read."""
+_PER_KELVIN = re.compile(r"(.+?)(/K(?:\^\d)?)")
+_PER_KELVIN_SMALL = {"mg": ("µg", 1e3), "mrad": ("µrad", 1e3)}
+_NONLINEARITY = re.compile(r"1/\((m/s\^2|rad/s)\)(?:\^(\d))?")
+_POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingUnit:
+    """How a value in SI is read: ``reading = factor value + offset``, in `symbol`."""
+
+    symbol: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+    @overload
+    def of(self, value: float) -> float: ...
+    @overload
+    def of(self, value: Array) -> Array: ...
+    def of(self, value: float | Array) -> float | Array:
+        """Return a value as it is read."""
+        return value * self.factor + self.offset
+
+    def texts(self, value: float, uncertainty: float | None) -> tuple[str, str]:
+        """Return a value and its standard uncertainty as texts."""
+        return format_uncertain(self.of(value), None if uncertainty is None else uncertainty * abs(self.factor))
+
+    @property
+    def scale(self) -> tuple[str, float]:
+        """Symbol and factor, of a unit without an offset."""
+        return self.symbol, self.factor
+
+    @property
+    def of_difference(self) -> str:
+        """The symbol of a difference, which has no offset."""
+        return "ppm" if self.offset else self.symbol
+
+
+@dataclass(frozen=True)
+class Row:
+    """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ...
+
+    `given_order` is the standard uncertainty if the order chosen from the data is right, None where none was chosen.
+    `interval` is the 95 % interval where the parameter has one of its own.
+    """
+
+    name: str
+    value: float
+    standard_uncertainty: float | None
+    unit: str
+    given_order: float | None = None
+    interval: tuple[float, float] | None = None
+
+    def text(self) -> tuple[str, str]:
+        """Return value and uncertainty as text."""
+        return format_uncertain(self.value, self.standard_uncertainty)
+
+
+@cache
+def reading_unit(unit: str, name: str = "") -> ReadingUnit:
+    """Return how a parameter is read by its SI unit, and by its name where the unit alone does not tell."""
+    for pattern, by_unit in _BY_NAME:
+        if unit in by_unit and re.fullmatch(pattern, name):
+            return ReadingUnit(*by_unit[unit])
+    if unit in _BY_UNIT:
+        return ReadingUnit(*_BY_UNIT[unit])
+    if name.endswith("_ramp"):
+        return ReadingUnit(f"{unit.removesuffix('/s')}/h", _HOUR)
+    if (law := _PER_KELVIN.fullmatch(unit)) is not None:
+        whole = reading_unit(law[1], name)
+        symbol, more = _PER_KELVIN_SMALL.get(whole.symbol, (whole.of_difference, 1.0))
+        return ReadingUnit(symbol + law[2], whole.factor * more)
+    if (power := _NONLINEARITY.fullmatch(unit)) is not None:
+        degree = int(power[2] or 1)
+        if power[1] == "m/s^2":
+            return ReadingUnit(f"µg/g{_POWERS[degree + 1]}", 1e6 * STANDARD_GRAVITY**degree)
+        return ReadingUnit(f"ppm/(deg/s){'' if degree == 1 else _POWERS[degree]}", 1e6 / _DEG**degree)
+    for over, (quantity, per, factor) in _SENSED.items():
+        output = unit.removesuffix(over)
+        if output != unit:
+            nominal = parse_unit(output)
+            if nominal.quantity == quantity:
+                return ReadingUnit("ppm off nominal", 1e6 * nominal.factor, -1e6)
+            return ReadingUnit(output + per, factor)
+    return ReadingUnit(unit)
+
+
+def small_unit(unit: str) -> ReadingUnit:
+    """Return how noise, drift and residuals of a quantity are read: µg and deg/h, all others in their own unit."""
+    return ReadingUnit(*_SMALL.get(unit, _BY_UNIT.get(unit, (unit, 1.0))))
+
+
+def density_unit(unit: str) -> ReadingUnit:
+    """Return how the noise density of a quantity is read, as data sheets have it."""
+    known = {"rad/s": ("deg/s/√Hz", _DEG), "m/s^2": ("µg/√Hz", 1e3 * _MG)}
+    return ReadingUnit(*known.get(unit, (f"{unit}/√Hz", 1.0)))
+
+
+def small_text(value: float, unit: str, digits: int = 3) -> str:
+    """Return a drift or residual with its unit as text."""
+    read = small_unit(unit)
+    return f"{plain_number(value * read.factor, digits)} {read.symbol}"
+
+
+def micro_g(value: float) -> float:
+    """Return an acceleration, m/s^2, in µg."""
+    return float(from_si(value, "ug"))
+
+
+def small_g(value: float) -> str:
+    """Return an acceleration, m/s^2, as text in µg, mg or g, three significant digits."""
+    micro = micro_g(value)
+    if abs(micro) < 999.5:
+        return f"{micro:.3g} µg"
+    return f"{micro / 1e3:.4g} mg" if abs(micro) < 1e6 else f"{micro / 1e6:.3g} g"
+
+
+def rows_of(record: Calibration) -> list[Row]:
+    """Return the parameters of a record as they are read."""
+    rows = []
+    for name, parameter in record.parameters.items():
+        read = reading_unit(parameter.unit, name)
+        u, given, interval = (
+            parameter.standard_uncertainty, parameter.standard_uncertainty_given_order, parameter.interval_95,
+        )  # fmt: skip
+        low_high = None if interval is None else sorted(read.of(end) for end in interval)
+        rows.append(
+            Row(
+                name,
+                read.of(parameter.value),
+                None if u is None else u * abs(read.factor),
+                read.symbol,
+                None if given is None else given * abs(read.factor),
+                None if low_high is None else (low_high[0], low_high[1]),
+            )
+        )
+    return rows
+
+
+def parameters_table(rows: Iterable[Row], caption: str, title: str = "Parameters") -> ReportTable:
+    """Return a table of parameters; a dash stands where one states no uncertainty."""
+    cells = []
+    for row in rows:
+        texts = (plain_number(row.value, 3), "–") if row.standard_uncertainty is None else row.text()
+        cells.append([row.name, *texts, row.unit])
+    return ReportTable(title, caption, ["parameter", "value", "u", "unit"], cells)
