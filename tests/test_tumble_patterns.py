@@ -7,8 +7,8 @@ import pytest
 
 import imulab as il
 from conftest import table
+from imulab.estimation.decisions import RESIDUALS_FOLLOW_DIRECTION
 from imulab.procedures.tumble.attitudes import Trace
-from imulab.procedures.tumble.orders import FALSE_ALARM
 from reference import tumble as reference
 
 G = 9.80665
@@ -45,7 +45,8 @@ def test_where_nothing_is_wrong_they_are_silent(count, stated, reduced):
     found = [warned(rng, count, sigma=20 * UG, stated=stated) for _ in range(trials)]
     for alarms in zip(*found, strict=True):
         share = np.mean([bool(w) for w in alarms])
-        assert share <= FALSE_ALARM + 3 * np.sqrt(FALSE_ALARM / trials)
+        level = RESIDUALS_FOLLOW_DIRECTION.level
+        assert share <= level + 3 * np.sqrt(level / trials)
 
 
 def test_cross_terms_are_named_with_their_sizes():

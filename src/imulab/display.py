@@ -71,7 +71,7 @@ def first_hidden(value: Any, where: str = "") -> str | None:
 
 LINES = 12
 """Of a result, as Python shows it."""
-WIDTH = 150
+WIDTH = 150  # characters of a line that a notebook shows
 
 
 class Shown:

@@ -112,11 +112,11 @@ def _umask() -> int:
 # TOML files: layouts, manifests of tests, limits, the project file.
 
 
-_LARGEST = 1_000_000
+_LARGEST = 1_000_000  # bytes of a file of settings
 _MOST_DOTS = 50  # the time that a key takes grows with the square of its dots
 _NUMBER = re.compile(r"(?<![\w.])\d++\.\d++(?:[eE][-+]?\d++)?(?![\w.])")
 _DOT = re.compile(r"(?<!\.)\.(?!\.)")
-_WIDEST = 1 << 63
+_WIDEST = 1 << 63  # TOML's integers have 64 bits
 
 
 def load_toml(path: str | Path, name: str, what: str) -> dict[str, Any]:

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 
 _EQUATORIAL_GRAVITY = 9.7803253359  # m/s^2
-_SOMIGLIANA_K = 0.00193185265241
-_ECCENTRICITY_SQUARED = 0.00669437999013
+_SOMIGLIANA_K = 0.00193185265241  # of WGS 84, as all constants of the normal gravity
+_ECCENTRICITY_SQUARED = 0.00669437999013  # of WGS 84
 _SEMI_MAJOR_AXIS = 6378137.0  # m
-_FLATTENING = 1.0 / 298.257223563
+_FLATTENING = 1.0 / 298.257223563  # of WGS 84
 _M = 0.00344978650684  # omega^2 a^2 b / GM
 
 ANOMALY = 3.5e-4
@@ -45,11 +45,11 @@ _TOLD_APART = 3e-6
 """Relative; far below any scale factor's uncertainty; a height of 10 m."""
 _POSSIBLE = (0.5, 50.0)
 """What the gravity of some place may be, m/s^2: a small moon's, twice Jupiter's."""
-_ON_EARTH = (9.76, 9.84)
-_ROUNDED = 1e-5
+_ON_EARTH = (9.76, 9.84)  # m/s^2, with mountains and the poles
+_ROUNDED = 1e-5  # m/s^2: half of the last digit of a value that is stated well enough to count as exact
 _USELESS = 0.01
 """Half of the last digit, m/s^2, above which a stated value counts as rounded."""
-_TO_MICRO = 1e6
+_TO_MICRO = 1e6  # to ppm
 
 
 @dataclass(frozen=True)

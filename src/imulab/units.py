@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # the command line parses units before it needs NumPy
 STANDARD_GRAVITY = 9.80665
 """Standard acceleration of gravity, m/s^2. A unit of measurement, not the gravity of any place."""
 
-_DEGREE = math.pi / 180.0
+_DEGREE = math.pi / 180.0  # rad
 
 
 @dataclass(frozen=True, slots=True)

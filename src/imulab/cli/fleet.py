@@ -17,7 +17,7 @@ from imulab.options import OUTPUT
 if TYPE_CHECKING:
     from imulab.fleet.run import FleetState
 
-_FEW = 3
+_FAILURES_NAMED = 3  # failures that are named; the rest is counted
 
 
 def run(
@@ -112,8 +112,8 @@ def _verdict(state: FleetState) -> int:
     failures = state.failures
     if not failures:
         return 0
-    shown = "; ".join(f"{row.unit.serial}: {row.reason}" for row in failures[:_FEW])
-    more = f"; and {len(failures) - _FEW} more" if len(failures) > _FEW else ""
+    shown = "; ".join(f"{row.unit.serial}: {row.reason}" for row in failures[:_FAILURES_NAMED])
+    more = f"; and {len(failures) - _FAILURES_NAMED} more" if len(failures) > _FAILURES_NAMED else ""
     print(f"imulab: {len(failures)} of {len(state.rows)} units failed: {shown}{more}", file=sys.stderr)
     return 2
 

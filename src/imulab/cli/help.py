@@ -10,7 +10,7 @@ from textwrap import TextWrapper
 from imulab.cli.command import HELP, Command
 from imulab.options import GROUPS, Option
 
-_WIDEST, _COLUMN = 100, 30
+_WIDEST, _COLUMN = 100, 30  # characters of a line of help; of the column of options at most
 _KEPT = "\xa0"  # a space where no line ends
 _TITLES = {GROUPS[0]: "Options", GROUPS[-1]: "Options of all commands"}
 

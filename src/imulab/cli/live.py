@@ -167,8 +167,8 @@ def open(  # noqa: A001 -- the name of the command
 # ``imulab live``: a guided test while the unit is connected, from the plug to the record.
 
 
-_WAIT = 0.05
-_EVERY = 0.1
+_WAIT = 0.05  # s for which one look at the source waits for samples
+_EVERY = 0.1  # s between two drawings of the terminal: ten a second look smooth
 
 
 def live(

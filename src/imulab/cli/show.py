@@ -146,7 +146,7 @@ def finish_check(
 # Records and recordings in a few lines of plain text.
 
 
-_GAP = 1.5
+_GAP = 1.5  # of the usual step: a longer one is counted as a gap, as where recordings are read
 
 
 def describe_record(record: Calibration, *, provenance: bool = True) -> str:

@@ -27,7 +27,7 @@ from imulab.units import conversion_factor, from_si
 
 VERSION, WITH_POWERS = 1, 2
 """Of the format; the second where gyroscopes have powers of the rate, which older cores then refuse as newer."""
-TEXT = 0
+TEXT = 0  # kind of the section that holds a record's text
 KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5, "mag": 6, "thermal": 7, "thermal_gyro": 8}
 
 
@@ -138,7 +138,7 @@ def field_of(table: DeviceTable, name: str) -> NDArray[Any]:
 # How a gyro array is fused, as settings and as the table that the C core runs.
 
 
-MOST_ELEMENTS = 64
+MOST_ELEMENTS = 64  # of an axis, as IL_ARRAY_ELEMENTS of the largest configuration of the C core
 MOST_COUNT = 1_000_000_000
 """Largest starting count of the growing memory."""
 
@@ -309,7 +309,7 @@ def _shaped(values: Any, shape: tuple[int, ...], name: str) -> Array | None:
 # The table of a triad of gyroscopes, and the polynomials that accelerometers and gyroscopes have.
 
 
-HIGHEST_POWER = 5
+HIGHEST_POWER = 5  # of the rate in the C core's polynomial
 _BEYOND = 1.05
 """Noise, bias and the Earth's rate do not exceed the largest rate by more."""
 

@@ -352,7 +352,7 @@ def _listed(value: Any) -> Any:
 # Vectors by which an exported unit tests itself, of the tables that several procedures make.
 
 
-VECTORS = 64
+VECTORS = 64  # inputs and outputs that the exported self-test compares
 
 
 def golden_gyroscopes(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
@@ -371,7 +371,7 @@ def golden_gyroscopes(table: DeviceTable, rng: np.random.Generator) -> dict[str,
 
 
 FORMAT = "imulab.blob"
-_HEAD = 16
+_HEAD = 16  # bytes of the head of a blob
 
 
 class _Kind(Part):

@@ -36,9 +36,10 @@ from imulab.units import from_si, parse_unit, si_unit
 
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 """How far the zero of a sensor at rest may drift, SI, and the unit to say it in."""
-_NOISE_REACH = 20.0
-_LARGEST = 1e140
-_MOST_NAMED, _MOST_COLUMNS = 3, 6
+_NOISE_REACH = 20.0  # times the noise: a step of the level up to there may be of the noise, not of a motion
+_LARGEST = 1e140  # beyond it, or below its inverse, squares overflow or vanish in double precision
+_MOST_NAMED, _MOST_COLUMNS = 3, 6  # lines of a column, and columns with lines, that a note names
+# Samples that noise is told from; degrees of freedom of an Allan deviation that is shown
 FEWEST, _LEAST_FREEDOM = 50, 4.0
 _COARSE = 2.2  # of the deviation from sample to sample; whole counts of an angle show steps of 2.0 of it at most
 _FITTED = 0.5  # averaging times that a band tells, in terms of 1/f_max

@@ -45,7 +45,7 @@ _HUBER = 1.345
 _PEAK, _PER_DEGREE, _PER_SQUARE = 0.25, 40.0, 19.0
 """Exponent b of the prior of an excess variance: the smaller, the more is thought of none."""
 _TOLD = 0.5  # degrees of freedom below which nothing is left to tell an excess from
-_EXCESSES = 64
+_EXCESSES = 64  # midpoints of the grid of excess variances over which its posterior is integrated
 _REACH, _LEAST_CHI_SQUARE, _LEAST_EXCESS = 8.0, 1e-3, 1e-3  # where the grid of excess variances ends
 _SENSED = 1e-9
 """Columns of the Jacobian shorter than this, relative to the longest, are parameters that nothing senses."""
@@ -157,8 +157,8 @@ class Observability:
         return [names[i] for i in np.argsort(-share, kind="stable") if share[i] > 0.2 * share.max()]
 
 
-_WORST_CONDITION = 2000.0
-_WORST_CURVATURE = 2.0
+_WORST_CONDITION = 2000.0  # a singular value this far below the largest is not determined by the data
+_WORST_CURVATURE = 2.0  # noises: u^2/2 of a direction, which the model bends by, that shows it undetermined
 
 
 def observability(jacobian: Array, weights: Array) -> Observability:
@@ -314,7 +314,7 @@ def bayesian_information(cost: float, size: int, count: int) -> float:
     return float(count * np.log(max(cost, np.finfo(float).tiny) / count) + size * np.log(count))
 
 
-def chi_square_limit(freedom: int, probability: float = 1e-2) -> float:
+def chi_square_limit(freedom: int, probability: float) -> float:
     """Return the value that chi-square exceeds with the given probability; infinite without degrees of freedom."""
     return float(chi_square_upper_quantile(probability, freedom)) if freedom > 0 else float("inf")
 
@@ -333,7 +333,7 @@ def chi_square_probability(value: float, freedom: float) -> float:
 # Nested models blended: what their estimates say together, whichever of them is right.
 
 
-_MIDPOINTS = 160
+_MIDPOINTS = 160  # of the integral over the share of an order's effect
 _ROOTS = (np.arange(_MIDPOINTS) + 0.5) / _MIDPOINTS
 _SHARES = _ROOTS**3
 """Midpoints in the cube root: a large gain leaves shares far below 1 / 160."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError
 from imulab.estimation import TAUS
+from imulab.estimation.decisions import NOISE_MODEL_REJECTED
 from imulab.estimation.noise.analysis import Analysis, average, intervals_of
 from imulab.estimation.noise.spectrum import frequencies
 from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, bias_square, letters
@@ -25,9 +26,9 @@ from imulab.recording import Array
 # Allan deviation.
 
 
-_CHUNK = 1 << 14
-_DENSE_PER_DECADE = 24
-_FEWEST = 3
+_CHUNK = 1 << 14  # samples whose differences are squared at once: they stay in the processor's cache
+_DENSE_PER_DECADE = 24  # averaging times in a decade of a dense curve, 10 % apart
+_FEWEST = 3  # samples: an Allan variance needs two neighbouring means, and one more for a second pair
 
 
 @dataclass(frozen=True, repr=False)
@@ -154,8 +155,6 @@ def _freedom(length: int, counts: np.ndarray, variance: Array) -> Array:
 
 
 COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk", "quantisation")
-_UNFIT = 0.01
-"""Probability of the test of fit below which the model is not that of the record."""
 _EDGE, _SHARE = 1.5, 0.003
 """Of the shortest time constant, and of the record: what is as fast is a filter, where the band has no level end."""
 _LEVELS = 0.01
@@ -219,7 +218,7 @@ def read_coefficients(columns: Sequence[Analysis]) -> list[NoiseCoefficients]:
 
 def fits(found: Analysis) -> bool:
     """Whether the test of fit lets the best model pass at 1 %."""
-    return bool(found.test.probability >= _UNFIT)
+    return bool(found.test.probability >= NOISE_MODEL_REJECTED.level)
 
 
 def _candidates(found: Analysis) -> tuple[int, int, int]:

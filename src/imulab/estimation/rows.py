@@ -96,11 +96,11 @@ def rms(values: ArrayLike) -> float:
 # A level that jumps, in samples of a sensor at rest: no noise, though an Allan curve reads it as one.
 
 
-_BLOCKS, _SMALLEST = 256, 16
+_BLOCKS, _SMALLEST = 256, 16  # means over which a jump is looked for; samples of a mean at least
 _LIMITS = {4: 5.5, 8: 5.8, 16: 7.0}
 """Blocks on each side of a step to how many times the usual difference it must be: white noise, 1/f noise, random walk
 and sums of them reach one of these in 4 of 1000 recordings at most."""
-_WHITE = 5.0
+_WHITE = 5.0  # sigma of white noise that a jump exceeds, beside the limit by the scatter of the other differences
 _REACHES = (8, 16, 32, 64)
 """Blocks on each side of a step over which it is held against smooth drifts."""
 _TAUS = np.geomspace(0.003, 2.0, 20)
@@ -194,9 +194,9 @@ def _misfit(basis: Array, values: Array) -> float:
 FAR = "far from the rows on both sides"
 MOST = 0.05
 """Share of a stretch at rest that may be left out: more, and what is left is hardly to be trusted either."""
-_FAR = 10.0
+_GLITCH_SIGMAS = 10.0
 """Standard deviations of the noise around it, or steps of its output, beyond which a sample is none."""
-_A_FEW = 1e-3
+_SHARE_NOTED = 1e-3  # share of all rows below which rows left out are a note
 _FAR_ZERO = 5.0  # usual steps around it
 _BESIDE = 4  # samples on both sides
 _QUIET = 4.0  # times the steps of the quietest fifth
@@ -204,7 +204,7 @@ _AROUND = 64  # samples whose differences tell the noise
 HISTORY, _FEW_ZEROS = 50, 0.02
 """A row of zeros is none of a gyro at rest whose last 50 rows hold hardly a zero."""
 _LONGEST_ZERO = 20  # rows; gyros without noise rest at zero for longer
-_BY_CHANCE = 3.0
+_BEYOND_CHANCE_ZEROS = 3.0  # times what chance makes, and six roots of it: beyond are zeros that were no readings
 _UPPER, _TO_SIGMA = 24, 0.615
 """Three quarters of 32 steps, not half: a log may hold each sample twice. To the standard deviation of white noise."""
 
@@ -235,7 +235,7 @@ class LeftOut:
             count = int(np.count_nonzero(seen))
             if count:
                 # A few knocks are in every recording; zeros and repeats are a fault of the logger.
-                kind_of = Note if kind == FAR and count < _A_FEW * len(seen) else str
+                kind_of = Note if kind == FAR and count < _SHARE_NOTED * len(seen) else str
                 found.append(
                     kind_of(
                         f"{count} row{'s' * (count > 1)} of {_shown(self.names)} left out: {kind}, first at "
@@ -333,7 +333,9 @@ def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
     count, n = int(np.count_nonzero(every)), len(every)
     by_chance = n * float(np.prod([np.count_nonzero(each) / n for each in same]))
     rare = (
-        len(values) > 1 and count > _BY_CHANCE * by_chance + 2 * _BY_CHANCE * np.sqrt(by_chance) and count <= MOST * n
+        len(values) > 1
+        and count > _BEYOND_CHANCE_ZEROS * by_chance + 2 * _BEYOND_CHANCE_ZEROS * np.sqrt(by_chance)
+        and count <= MOST * n
     )
     return every if rare else np.zeros_like(every)
 
@@ -366,8 +368,8 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     if resolution == np.inf:
         return far, alone
     moving = wide > _QUIET * max(quantile(local, 0.2), resolution)
-    least = _FAR * resolution
-    limits = np.maximum(_FAR * _TO_SIGMA * wide, least)
+    least = _GLITCH_SIGMAS * resolution
+    limits = np.maximum(_GLITCH_SIGMAS * _TO_SIGMA * wide, least)
 
     def part(samples: NDArray[np.intp]) -> NDArray[np.intp]:
         return np.minimum(samples // _AROUND, count - 1)

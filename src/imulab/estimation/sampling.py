@@ -13,11 +13,11 @@ from imulab.units import to_si
 
 WIDEST_GAP = 10.0
 """Sampling intervals across which readings are interpolated at most."""
-_FEWEST = 3
-_GAP = 1.5
-_COARSE = 0.2
-_BLOCKS, _SMALLEST_BLOCK = 100, 100
-SAME_RATE = 0.05
+_FEWEST = 3  # samples of a recording that has a rate
+GAP = 1.5  # of the usual step: a longer one is a gap
+_COARSE = 0.2  # share of steps beyond the limit from which these are the grain of the stamps, not gaps
+_BLOCKS, _SMALLEST_BLOCK = 100, 100  # of steps whose medians show a change of rate; steps of a block at least
+SAME_RATE = 0.05  # relative: parts of a recording whose steps are this near have one rate
 _SLOWEST, _FASTEST = 5.0, 20_000.0  # Hz, of sensors as they are logged
 _USUAL = (10.0, 10_000.0)  # Hz
 BRIDGED = 0.01  # of all rows
@@ -30,12 +30,12 @@ def usual_step(step: Array) -> tuple[float, float]:
     (stamps in whole milliseconds at 700 Hz alternate between 1 and 2 ms), and the limit is 1.5 times the step that a
     fifth exceed. The usual step is the mean of those that are no gaps.
     """
-    if step.max() <= _GAP * step.min():  # no gap, whatever the median is
+    if step.max() <= GAP * step.min():  # no gap, whatever the median is
         usual = float(step.mean())
-        return usual, _GAP * usual
-    longest = _GAP * median(step)
+        return usual, GAP * usual
+    longest = GAP * median(step)
     if np.mean(step > longest) > _COARSE:
-        longest = _GAP * quantile(step, 1 - _COARSE)
+        longest = GAP * quantile(step, 1 - _COARSE)
     return float(step[step <= longest].mean()), longest
 
 

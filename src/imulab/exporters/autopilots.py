@@ -29,6 +29,7 @@ from imulab.exporters import ExportOptions
 from imulab.exporters.matrices import FieldCorrection, ardupilot_rows, px4_rows, symmetric
 from imulab.exporters.model import (
     AXES,
+    NEGLIGIBLE,
     UnitModel,
     accel_terms,
     gyro_terms,
@@ -100,7 +101,6 @@ def corrections(
 
 
 _NODES = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
-_NEGLIGIBLE = 1e-6
 _CORNERS = np.array([corner for corner in product((-1.0, 0.0, 1.0), repeat=3) if any(corner)])
 _FORCES = STANDARD_GRAVITY * _CORNERS / np.linalg.norm(_CORNERS, axis=1)[:, None]
 
@@ -209,7 +209,7 @@ def _settle(
     span = f"from {laws.low:g} to {laws.high:g} degC"
     follows = [f"the offset changes by up to {text_in_g(slope)} per K {span}"]
     worst, left = float(np.abs(error).max()), list(costs)
-    if worst > _NEGLIGIBLE * STANDARD_GRAVITY:
+    if worst > NEGLIGIBLE * STANDARD_GRAVITY:
         rms = float(np.sqrt(np.mean(error**2)))
         left.insert(
             0,
@@ -229,9 +229,9 @@ def _settle(
 # axis.
 
 
-_INT32, _FLOAT = 6, 9
-_CAL_SCALES = (0.1, 3.0)
-_LARGEST_ID = 2**31 - 1
+_INT32, _FLOAT = 6, 9  # MAV_PARAM_TYPE of MAVLink
+_CAL_SCALES = (0.1, 3.0)  # as PX4's CAL_ACC_*SCALE takes
+_LARGEST_ID = 2**31 - 1  # of PX4's CAL_ACC_ID, a signed 32-bit parameter
 _PX4_THERMAL = (
     "corrected = (raw - X1 d - X2 d^2 - X3 d^3 - OFF) * SCALE, m/s^2, d = T - TREF, T in degC held within TMIN to TMAX",
     "PX4 takes a new temperature only where it has moved by more than 1 K; TC_A_ENABLE needs a reboot",
@@ -337,9 +337,9 @@ def _write_px4(
 # axis.
 
 
-_LARGEST_OFFSET = 3.5
-_INS_SCALES = (0.8, 1.2)
-_REFERENCE = 35.0
+_LARGEST_OFFSET = 3.5  # m/s^2, which ArduPilot accepts
+_INS_SCALES = (0.8, 1.2)  # which ArduPilot accepts
+_REFERENCE = 35.0  # degC about which ArduPilot's temperature polynomials are written
 _ARDUPILOT_THERMAL = (
     "corrected = (raw - P(T) + P(CALTEMP) - OFFS) * SCAL, m/s^2, P = 1e-6 (ACC1 t + ACC2 t^2 + ACC3 t^3), t = T - 35,"
     " T in degC held within TMIN to TMAX",

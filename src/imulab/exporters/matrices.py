@@ -51,7 +51,7 @@ from imulab.units import conversion_factor, parse_unit
 
 
 _NEGLIGIBLE = np.radians(0.01)
-_NEGLIGIBLE_QUADRATIC = 1e-4
+_NEGLIGIBLE_QUADRATIC = 1e-4  # of the field: less is lost without a word when quadratic terms are left out
 
 
 @dataclass(frozen=True)

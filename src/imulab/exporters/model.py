@@ -21,7 +21,7 @@ from imulab.records.triads import CROSS_TERMS, Accelerometers, Gyroscopes, Magne
 from imulab.units import STANDARD_GRAVITY
 
 AXES = "xyz"
-_NEGLIGIBLE = 1e-6
+NEGLIGIBLE = 1e-6  # of g: what an export leaves out and is less is not told
 _GRID = np.linspace(-STANDARD_GRAVITY, STANDARD_GRAVITY, 21)
 
 
@@ -129,7 +129,7 @@ def held_accelerometers(
     """
     accel = unit.accel
     error = accel_loss(accel, correction(accel))
-    if error <= _NEGLIGIBLE * STANDARD_GRAVITY:
+    if error <= NEGLIGIBLE * STANDARD_GRAVITY:
         return accel, error, []
     what = "bias, scale factor and misalignment" if misalignment else "bias and scale factor"
     fit = procedure_of(unit.record).linear_fit(unit.record, misalignment=misalignment)
@@ -162,7 +162,7 @@ def gyro_terms(gyro: Gyroscopes, *, bias: bool) -> tuple[list[str], list[str]]:
     """
     names, costs = [], []
     share = float(np.abs(gyro.gain - np.eye(3)).sum(axis=1).max()) if gyro.unit == "rad/s" else np.inf
-    if share > _NEGLIGIBLE:
+    if share > NEGLIGIBLE:
         names += ["gyro_scale_factor", "gyro_misalignment"]
         costs.append(
             f"up to {100 * share:.3g} % of the rate" if np.isfinite(share) else "as much as the gyroscopes' scale"
@@ -214,7 +214,7 @@ def settle_losses(
         Something that matters would be lost, and that was not asked for.
     """
     names, costs = list(gyro[0]), list(gyro[1])
-    if accel[0] and accel[1] > _NEGLIGIBLE * STANDARD_GRAVITY:
+    if accel[0] and accel[1] > NEGLIGIBLE * STANDARD_GRAVITY:
         names = accel[0] + names
         costs.insert(0, f"up to {text_in_g(accel[1])} within +-1 g")
     if not costs:

@@ -99,7 +99,7 @@ def which_are_drawn(statistics: Sequence[ParameterStatistics], panels: Sequence[
 # The tables of a fleet's report: every parameter, units that stand out, changes, failures.
 
 
-_MOST_ROWS = 40
+_MOST_ROWS = 40  # of a table on the page; the rest is in the files beside
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -249,8 +249,8 @@ def failure_table(failures: Sequence[FleetRow]) -> ReportTable | None:
 # What the report of a fleet shows: its parameters over units and dates, and what changed since last time.
 
 
-MOST_PANELS = 24
-_MOST_POINTS = 1500
+MOST_PANELS = 24  # of a page; the parameters that change most have them
+_MOST_POINTS = 1500  # of a panel; usual units beyond are thinned, others never
 
 
 def shown_first(statistics: Sequence[ParameterStatistics]) -> list[ParameterStatistics]:

@@ -15,7 +15,7 @@ from imulab.fleet.engine import Summary
 from imulab.fleet.manifest import masked
 from imulab.records.calibration import Parameter
 
-_MANY = 500
+_SERIALS_AT_ONCE = 500  # serials asked for at once: SQLite takes 999 variables at least
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class History:
         found: dict[int, Past] = {}
         values: dict[int, dict[str, Parameter]] = {}
         with _in_one_line(self._name), self._engine.connect() as connection:
-            for start in range(0, len(serials), _MANY):
+            for start in range(0, len(serials), _SERIALS_AT_ONCE):
                 query = (
                     sa.select(
                         c.id, c.serial, c.procedure, c.date, c.created, c.content_sha256, c.sources_sha256,
@@ -130,7 +130,7 @@ class History:
                         p.name, p.value, p.standard_uncertainty, p.unit,
                     )
                     .select_from(self._calibrations.outerjoin(self._parameters))
-                    .where(c.serial.in_(serials[start : start + _MANY]))
+                    .where(c.serial.in_(serials[start : start + _SERIALS_AT_ONCE]))
                     .order_by(c.created, c.id)
                 )  # fmt: skip
                 for row in connection.execute(query):

@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[A-Za-z][A-Za-z0-9+.-]*)*://")
-_BLOCK = 1 << 22
+_BLOCK = 1 << 22  # bytes copied at once
 SCHEMES = ("file", "https", "s3", "gs", "az")
 """Where files may be fetched from; a manifest is somebody else's text, and fsspec knows dozens of others."""
-_LARGEST = 1 << 33
+_LARGEST = 1 << 33  # bytes of a file that is fetched: 8 GiB
 _LOGIN = re.compile(r"(?<=://)[^/@\s]*@")
 _SECRET = re.compile(r"([?&][\w-]*(?:pass|pwd|token|secret|key|sig|auth)[\w-]*=)[^&\s]+", re.IGNORECASE)
 
@@ -268,7 +268,7 @@ class UnitFiles:
 
 COLUMNS = ("serial", "procedure", "file")
 _SERIAL = re.compile(r"[^\W_][\w .+=@()-]*")
-_LONGEST_SERIAL = 120
+_LONGEST_SERIAL = 120  # bytes, as a serial is part of the names of files
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{name}{digit}" for name in ("com", "lpt") for digit in range(10))}
 
 

@@ -33,7 +33,7 @@ from imulab.procedures.registry import PROCEDURES
 from imulab.report import render_page
 from imulab.report.traces import Exhibits, Figure, ReportTable
 
-_NAMED = 4
+_NAMED = 4  # units that a sentence names
 _FEWEST_TO_DRAW = 4
 """Fewer units have no distribution: the table says all there is."""
 

@@ -41,8 +41,8 @@ from imulab.quantities import whole, whole_number
 
 _FRUITLESS = 5
 """Losses of workers in a row, without a unit done between them, before giving up."""
-_FLUSH = 2.0
-_NAMED = 3
+_FLUSH = 2.0  # s between two writings of what is done
+_NAMED = 3  # units that a sentence names
 TABLE, HISTORY = "parameters.csv", "history.sqlite"
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import ReadError, UnitError, listed, quoted
+from imulab.estimation.decisions import FLEET_CHANGE, FLEET_DRIFT
 from imulab.estimation.distributions import normal_quantile, t_cdf, t_quantile
 from imulab.files import check_keys, load_toml, number_of
 from imulab.fleet.engine import Summary
@@ -122,16 +123,16 @@ def to_parameter_unit(value: float, unit: str, target: str, name: str = "") -> f
 
 
 _MAD_TO_SIGMA = 1.482602218505602  # unrounded, as these numbers are shown in full
+# Sqrt(pi / 2): mean distance from the median to standard deviation of normal values
 _MEAN_TO_SIGMA = 1.2533141373155001
-FEWEST_FOR_OUTLIERS = 8
+FEWEST_FOR_OUTLIERS = 8  # units of which one can stand out
+# Numbers of units; between them the limit goes with the logarithm
 _SIZES = (8, 10, 12, 15, 20, 30, 50, 100, 300, 1000, 10000)
 _BEYOND = (7.90, 6.90, 6.29, 5.92, 5.24, 4.80, 4.46, 4.31, 4.34, 4.52, 4.84)
 """Largest robust z of so many normal values: passed by one sample in a hundred (simulated, 400 to 200 000 samples)."""
-_FEWEST_FOR_DRIFT = 8
-_SHORTEST_SPAN = 1.0 / 24
-_DRIFT_LEVEL = 0.001
-_FALSE_ALARM = 0.01
-_ONE_SIDED_95 = 1.6448536269514722
+_FEWEST_FOR_DRIFT = 8  # units through which a line has a scatter
+_SHORTEST_SPAN = 1.0 / 24  # days: an hour; calibrations within it tell no drift
+_ONE_SIDED_95 = 1.6448536269514722  # standard uncertainties
 
 
 @dataclass(frozen=True)
@@ -373,7 +374,7 @@ def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> FleetDrif
     return FleetDrift(
         per_day=slope,
         standard_uncertainty=uncertainty,
-        significant=abs(slope) > uncertainty * float(t_quantile(1 - _DRIFT_LEVEL / 2, freedom)),
+        significant=abs(slope) > uncertainty * float(t_quantile(1 - FLEET_DRIFT.level / 2, freedom)),
         start=start,
         value_at_start=float(value.mean() + slope * (start - day.mean())),
         days=float(np.ptp(day)),
@@ -422,7 +423,7 @@ def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past
 
 def change_limit(count: int) -> float:
     """Return the deviations that one in so many normal changes is beyond in one set out of a hundred."""
-    return float(-normal_quantile(_FALSE_ALARM / 2 / max(count, 1)))
+    return float(-normal_quantile(FLEET_CHANGE.level / 2 / max(count, 1)))
 
 
 def _compared(

@@ -28,7 +28,7 @@ from imulab.records.calibration import Calibration
 
 MOST_ATTEMPTS = 3
 """A unit that was under work when its process ended this often is not tried again."""
-_PATIENCE = 60.0
+_PATIENCE = 60.0  # s that a store which another process holds is waited for
 _HIDDEN = ".fleet"
 
 

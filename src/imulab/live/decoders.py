@@ -27,7 +27,7 @@ from imulab.recording import Array
 
 
 Rows = list[list[float]]
-_LONGEST = 1 << 14
+_LONGEST = 1 << 14  # bytes: what has no end of line for longer is no text
 
 
 def units_of(sensor: str, unit: str) -> dict[str, str]:
@@ -268,8 +268,8 @@ def _looked_up(document: Any, key: str) -> Any:
 # Streams of binary messages: MAVLink 1 and 2, and MSP v1 and v2.
 
 
-_V1, _V2 = 0xFE, 0xFD
-_SIGNED, _SIGNATURE = 1, 13
+_V1, _V2 = 0xFE, 0xFD  # first bytes of frames of MAVLink 1 and 2
+_SIGNED, _SIGNATURE = 1, 13  # flag and bytes of a signature in MAVLink 2
 _RAW = [f"{axis}{sensor}" for sensor in ("acc", "gyro", "mag") for axis in "xyz"]
 _SCALED = units_of("accel", "mg") | units_of("gyro", "mrad/s") | units_of("mag", "mgauss")
 MESSAGES: dict[str, tuple[str, dict[str, str], list[str]]] = {
@@ -288,7 +288,7 @@ MESSAGES: dict[str, tuple[str, dict[str, str], list[str]]] = {
     ),
 }
 """Messages of MAVLink that are taken, the best first: unit of the stamp, columns, fields."""
-MSP_RAW_IMU = 102
+MSP_RAW_IMU = 102  # number of that message of Betaflight and INAV
 _POLL = b"$M<\x00" + bytes([MSP_RAW_IMU, MSP_RAW_IMU])
 
 

@@ -36,10 +36,10 @@ from imulab.units import STANDARD_GRAVITY
 # A layout to start from for a stream of numbers that nobody has described: offered, never taken.
 
 
-_FEWEST = 5
+_FEWEST = 5  # lines from which columns are told
 _UNITS = (("m/s^2", STANDARD_GRAVITY), ("g", 1.0), ("mg", 1000.0))
-_NEAR = 0.25
-_STEADY = 0.2
+_NEAR = 0.25  # relative: a mean this near to g, in some unit, is a specific force
+_STEADY = 0.2  # relative scatter of the length of three columns that are a specific force in a hand
 
 
 @dataclass(frozen=True)
@@ -156,11 +156,11 @@ def _prefix(rows: list[list[str]]) -> str:
 
 FIRST = 2.0
 """So many seconds of a stream say what it is."""
-_MOST = 1 << 18
-_SILENT = 0.5
-_POLL_AGAIN = 0.1
+_MOST = 1 << 18  # bytes that are held until the format is known
+_SILENT = 0.5  # s without an answer after which a device is asked again
+_POLL_AGAIN = 0.1  # s between two questions to a device that answers
 _TEXT = bytes(range(32, 127)) + b"\r\n\t"
-_MOSTLY = 0.9
+_MOSTLY = 0.9  # share of printable bytes from which a stream is text
 STRAIGHTENED = "arrival time, straightened by a robust line"
 """What the head of a recording says of times without a device's stamps."""
 

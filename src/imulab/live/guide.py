@@ -111,14 +111,14 @@ _OFF = 2.0
 """A plan that is longer or shorter by more than this factor, and two attitudes, is made anew."""
 _MUCH = 10.0
 """Scatter of the attitudes over their own noise from which on something else than noise must be at work."""
-_FIVE = 5
-_LOWERS = 0.05
-_LONGEST = 10.0
-_ROUNDS = 4
-_SEED = 1
+_FIVE = 5  # attitudes ahead for which a gain is computed at once
+_LOWERS = 0.05  # share of the uncertainty that more time in an attitude must gain to be asked for
+_LONGEST = 10.0  # s of a hold that is asked for
+_ROUNDS = 4  # of the search for how many attitudes are still needed
+_SEED = 1  # of the search, so that the same attitudes get the same advice
 _OTHERS = 0.1
 """What a parameter without a target counts for, over what the one with the lowest target does."""
-_GUESSED_NOISE = 1e-4
+_GUESSED_NOISE = 1e-4  # g: of an attitude before any is held
 _PRIOR = 1e-2
 """Before they are measured, parameters are known to about this in units of g: enough to weigh one hold."""
 

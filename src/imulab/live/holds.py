@@ -14,7 +14,7 @@ import numpy as np
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, SMALLEST_BLOCK
 from imulab.recording import Array
 
-BLOCK = 0.1
+BLOCK = 0.1  # s over which the scatter of samples is computed, as in a recording
 WINDOW, TRIM = 6, 3
 """Blocks of a window, and of what is left out at both ends of a hold."""
 SHORTEST, SURE = 12, 15
@@ -22,14 +22,15 @@ SHORTEST, SURE = 12, 15
 
 `find_attitudes` needs 10; its threshold is its own.
 """
-_THRESHOLD = 10.0
+_THRESHOLD = 10.0  # times the quiet variance up to which the unit rests
 _LOUDEST = 0.03
 """No variance within a window is that of rest beyond this part of the reading, squared."""
-_SAME = 2e-3
+_SAME = 2e-3  # of g: a hold that moved less from the one before is the same attitude, as in a recording
+# Of the histogram of log10 of variances, where it begins, and bins in a decade
 _BINS, _LOWEST, _PER_DECADE = 1200, -22.0, 50
-_QUIET = 0.05
-_GAP, _GAP_STEPS = 0.25, 6.0
-_LEARNED = 50
+_QUIET = 0.05  # quantile of the variances that is the quiet one
+_GAP, _GAP_STEPS = 0.25, 6.0  # s, and usual steps: a longer gap ends a hold, as in a recording
+_LEARNED = 50  # samples from which the usual step is told
 
 
 @dataclass(frozen=True)

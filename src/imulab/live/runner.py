@@ -28,8 +28,8 @@ from imulab.writers import decimal_rows, write_csv_to
 
 EVERY = 1.0
 """Written to the file at least every so many seconds: what a sudden end may lose."""
-_PAUSE = 1.0
-_END = 1 << 12
+_PAUSE = 1.0  # s between two parts of a recording that goes on
+_END = 1 << 12  # bytes at the end of a recording in which its last line is looked for
 
 
 class Recorder:
@@ -203,7 +203,7 @@ def _head_lines(text: bytes) -> int:
 # A session with its source and its recording: what a terminal and a page run alike, a step at a time.
 
 
-_SILENT = 3.0
+_SILENT = 3.0  # s without samples after which it is said
 _BEFORE, _BEHIND = 1.0, 0.6
 """What is cut out with an attitude that is dropped, s: the settling before it, and the moment of taking it up."""
 

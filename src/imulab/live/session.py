@@ -24,14 +24,14 @@ from imulab.units import conversion_factor, parse_unit, to_si
 # What is wrong with a stream or a unit, said when it happens and once, in one sentence with what to do.
 
 
-_FAR = 0.2
+_OFF_GRAVITY = 0.2
 """Part of g by which a unit of MEMS size is never off."""
 _UNITS = ("m/s^2", "g", "mg")
-_CONSTANT = 3.0
-_WARMING, _PER_MINUTE = 5.0, 2.0
-_MINUTE = 60.0
-_LOST = 0.01
-_FEWEST = 500
+_CONSTANT = 3.0  # s in which a reading that lived has not changed
+_WARMING, _PER_MINUTE = 5.0, 2.0  # K since the beginning, and K in a minute, by which a unit still warms up
+_MINUTE = 60.0  # s
+_LOST = 0.01  # share of lost samples from which it is said
+_FEWEST = 500  # samples from which lost ones are a share
 
 
 @dataclass
@@ -60,9 +60,9 @@ class Watch:
         if parse_unit(unit).quantity != "acceleration":
             return [] if length else self._once("unit", "all three outputs are 0: are the accelerometers on?")
         expected = gravity * conversion_factor("m/s^2", unit)
-        if abs(length / expected - 1) <= _FAR:
+        if abs(length / expected - 1) <= _OFF_GRAVITY:
             return []
-        fits = [u for u in _UNITS if abs(length / (gravity * conversion_factor("m/s^2", u)) - 1) <= _FAR]
+        fits = [u for u in _UNITS if abs(length / (gravity * conversion_factor("m/s^2", u)) - 1) <= _OFF_GRAVITY]
         asked = f"is its unit {fits[0]}?" if fits else "is its unit right, and its range?"
         return self._once(
             "unit", f"the accelerometers read {length:.4g} {unit} at rest, where {expected:.4g} is expected: {asked}"

@@ -32,7 +32,7 @@ from imulab.units import STANDARD_GRAVITY, from_si
 # A simulated unit on a simulated table: turned by the guide, by hand, or from one random attitude to the next.
 
 
-_LONGEST = 60.0
+_LONGEST = 60.0  # s of a hold of the simulated unit
 _STRUCK, _SHIFT = 0.5, 5e-3 * STANDARD_GRAVITY
 """When an attitude is knocked, s after it is put down: before it is accepted; and by how much, m/s^2."""
 _KEYS = ("seed", "order", "rate", "noise", "hold", "move", "unit", "gravity", "knock", "gyro", "field", "dip", "speed")
@@ -203,10 +203,10 @@ def _random_direction(rng: np.random.Generator) -> Array:
 
 
 KINDS = ("serial:PORT[@BAUD]", "udp:PORT", "tcp:HOST:PORT", "-", "replay:FILE[@SPEED]", "simulate[:key=value,..]")
-BAUD = 115_200
-_PATIENCE = 0.1
-_STEP = 0.05
-_CHUNK = 1 << 16
+BAUD = 115_200  # of a serial port, where none is stated
+_PATIENCE = 0.1  # s that one read waits, so that a thread can be ended
+_STEP = 0.05  # s of a block of a replay or a simulation
+_CHUNK = 1 << 16  # bytes read at once; a UDP datagram has fewer
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ _LATE = 1.5
 """Steps in time longer than so many usual ones have lost samples between them."""
 _ALIKE = 5
 """So many steps that are alike tell the rate."""
-_POINTS, _APART = 48, 0.5
+_POINTS, _APART = 48, 0.5  # pairs of number and arrival by which the rate is told, s apart
 _PAUSE, _PAUSE_STEPS = 0.5, 20.0
 """A stream without stamps that falls behind by more than both, s and steps, has paused."""
 

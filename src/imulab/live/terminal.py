@@ -17,13 +17,13 @@ from imulab.report.traces import format_uncertain
 from imulab.units import STANDARD_GRAVITY
 
 _COLOURS = {"waiting": "white", "moving": "yellow", "settling": "yellow", "still": "cyan", "accepted": "green"}
-_ROWS, _COLUMNS = 9, 37
-_MILLI = 1e3
-_BAR = 14
+_ROWS, _COLUMNS = 9, 37  # of the sphere on the terminal
+_MILLI = 1e3  # to mg
+_BAR = 14  # characters of a bar
 _EVENTS = 3
 """Lines that are left for what has happened, above the picture."""
-_MOST_WARNINGS = 3
-_NARROW = 70
+_MOST_WARNINGS = 3  # the latest
+_NARROW = 70  # characters of a terminal whose table has narrow gaps
 
 
 def draw(view: View, width: int = 80, height: int = 24, *, by_hand: bool = False) -> Group:

@@ -34,7 +34,7 @@ from imulab.units import STANDARD_GRAVITY
 # What is to be seen of a session at one moment: numbers and sentences that a terminal and a page draw alike.
 
 
-_FULL, _HALF, _LITTLE = 0.88, 0.55, 0.2
+_FULL, _HALF, _LITTLE = 0.88, 0.55, 0.2  # sines of how far a side is turned, from which a movement is called so
 
 
 @dataclass(frozen=True)

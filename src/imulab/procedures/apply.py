@@ -71,7 +71,7 @@ def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) 
 # Records and blobs to corrected recordings: the C core does the arithmetic, the registry knows each section.
 
 
-_FAR_IN_TEMPERATURE = 20.0
+_FAR_IN_TEMPERATURE = 20.0  # K between calibration and use from which the drift of usual biases is warned of
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from imulab.quantities import whole
 from imulab.records.calibration import Calibration
 
 _FIRMWARE = ("c", "blob")
-_DEVICE_IDS = 2**32
+_DEVICE_IDS = 2**32  # numbers of 32 bits
 
 
 def _nothing(message: str) -> None:

@@ -30,7 +30,7 @@ __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
 _LOG = logging.getLogger(__name__)
 """Says of each file what it is, and how many rows of which times were read in how long."""
-_HEAD = 1 << 16
+_HEAD = 1 << 16  # bytes by which a format is told
 _PART = 1 << 22
 """Rows whose blocks are joined as they are read."""
 

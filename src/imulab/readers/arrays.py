@@ -13,7 +13,7 @@ from imulab.readers.layout import Readings
 from imulab.reading import Layout
 from imulab.recording import Array, Recording
 
-ROWS = 1 << 16
+ROWS = 1 << 16  # of a block of a table held in memory
 _INDEXED = re.compile(r"(.*?)\[(\d{1,9})\]")
 
 

@@ -22,7 +22,7 @@ from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Array, Recording
 
 MAGIC = b"\xa3\x95\x80"
-_FMT = 128
+_FMT = 128  # message that says how the others are laid out
 _KINDS = {
     "a": ("<i2", 32, 1.0),
     "b": ("i1", 1, 1.0),

@@ -22,6 +22,7 @@ from imulab.errors import ReadError
 # Compressed parts of files, unpacked within bounds: a few kilobytes can pretend to hold terabytes.
 
 
+# Bytes unpacked that are always allowed; times the packed size; never beyond
 _SMALL, _RATIO, _LARGEST = 1 << 26, 200, 1 << 33
 _raised: ContextVar[int | None] = ContextVar("unpack_limit", default=None)
 

@@ -14,7 +14,7 @@ from imulab.readers.formats import Budget, library
 from imulab.reading import Layout
 from imulab.recording import Array, Recording
 
-_LISTED = 20
+_LISTED = 20  # names that a message lists
 
 
 def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:

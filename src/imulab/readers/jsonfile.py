@@ -25,7 +25,7 @@ from imulab.records.calibration import FORMAT
 
 LARGEST = 20_000_000
 """Bytes of a file: what they hold may take 35 times as many in memory."""
-_LISTED = 20
+_LISTED = 20  # keys that a message lists
 
 
 class _Literal(str):

@@ -65,8 +65,8 @@ _KEYS = (
 _COLUMN_KEYS = ("from", "unit", "scale", "zero", "scale_factor")
 _ASCII = bytes(range(32, 92)) + bytes(range(93, 127)) + b"\\u0041\t\n"
 """What an encoding of titles must leave as it is; the escape is one that unicode_escape would change."""
-_LARGEST = 1e30
-_RATES = (1e-6, 1e9)
+_LARGEST = 1e30  # a scale or offset beyond it, or below its inverse, is a slip of the pen
+_RATES = (1e-6, 1e9)  # Hz, of any sensor
 _BY_COLUMN = {
     "scale_factor": '{ value = 0.02, unit = "V/(deg/s)" }',
     "zero": '{ value = 2.5, unit = "V" }',
@@ -278,7 +278,7 @@ def _sample_rate(entry: Any, path: str) -> float | None:
 # What was read to readings in the units of a layout, block by block.
 
 
-_COUNTERS = [2.0**8, 2.0**16, 2.0**32]
+_COUNTERS = [2.0**8, 2.0**16, 2.0**32]  # where counters of 8, 16 and 32 bits begin anew
 _LOST_AT_WRAP = 16
 """Steps that a counter may miss where it begins again."""
 

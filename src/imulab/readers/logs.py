@@ -19,8 +19,8 @@ MORE, FULL, DAMAGED = range(3)
 Integers = NDArray[np.int64]
 PLAINLY_MORE = 1.5
 """Times as many samples as of a message that holds the same: that one is logged at a low rate, to be looked at."""
-_AT_ONCE = 1 << 18
-BLOCK_BYTES = 1 << 23
+_AT_ONCE = 1 << 18  # messages whose starts are held at once
+BLOCK_BYTES = 1 << 23  # read at once
 _MCAP_READ = (3, 4, 5, 6)  # schema, channel, message, chunk; attachments may be larger than memory
 
 

@@ -23,14 +23,15 @@ from imulab.readers.formats import Budget, unpack
 from imulab.reading import Layout
 from imulab.recording import Array, Recording
 
-_HEAD = 128
-_MATRIX, _COMPRESSED = 14, 15
+_HEAD = 128  # bytes of the head of a MAT-file, level 5
+_MATRIX, _COMPRESSED = 14, 15  # miMATRIX and miCOMPRESSED of the MAT-file format
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+# MxSTRUCT_CLASS, mxDOUBLE_CLASS and mxUINT64_CLASS of the MAT-file format
 _STRUCT, _FIRST_NUMBER, _LAST_NUMBER = 2, 6, 15
 _CLASSES = {1: "a cell", 2: "a struct", 3: "an object", 4: "text", 5: "a sparse matrix"}
-_COMPLEX = 0x0800
-_DEEPEST = 20
-_LISTED = 20
+_COMPLEX = 0x0800  # flag of a complex array
+_DEEPEST = 20  # structs within structs
+_LISTED = 20  # names that a message lists
 
 
 class _DamagedError(Exception):

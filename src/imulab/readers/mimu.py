@@ -24,8 +24,8 @@ from imulab.units import STANDARD_GRAVITY
 _FRAME = np.dtype(
     [("head", "u1"), ("sequence", ">u2"), ("size", "u1"), ("stamp", ">u4"), ("data", ">i2", (8, 6)), ("sum", ">u2")]
 )
-_HEAD, _SIZE = 0xAA, 0x64
-_SEARCH = 4096
+_HEAD, _SIZE = 0xAA, 0x64  # first byte of a frame, and bytes of its payload
+_SEARCH = 4096  # bytes within which the first frame is looked for
 _CLOCK = 64e6  # Hz
 _WRAP = 1 << 32  # ticks, 67 s
 _RESTARTED = 60_000  # frames: a sequence that jumps further was begun anew

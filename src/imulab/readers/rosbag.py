@@ -85,10 +85,10 @@ BAG_MAGIC = b"#ROSBAG V"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
 _BAG_LINE = b"#ROSBAG V2.0\n"
-_FOOTER = 29
-_LARGEST_CHUNK = 1 << 31
-_LARGEST_VALUE = 1 << 28
-_AT_ONCE = 1 << 13
+_FOOTER = 29  # bytes of the footer of an MCAP file without its magic
+_LARGEST_CHUNK = 1 << 31  # bytes, unpacked, that memory is given for
+_LARGEST_VALUE = 1 << 28  # bytes of a value in SQLite that are read
+_AT_ONCE = 1 << 13  # rows of the database that are fetched at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -443,7 +443,7 @@ _MOST_FIELD = 1e-3
 """T; ten times and more what a magnetometer of a moving unit sees, hard iron included, or can put out."""
 _EARTH = (15e-6, 120e-6)
 """T; fields on Earth with the hard iron of an ordinary unit, so narrow that one unit at most fits a number."""
-_ENOUGH = 4096  # samples to find out what a topic reports; a chunk may hold only one
+_SAMPLES_LOOKED_AT = 4096  # samples to find out what a topic reports; a chunk may hold only one
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
@@ -604,7 +604,7 @@ def _reported(pieces: Iterator[Piece], name: str, topic: str) -> tuple[list[bool
         if piece.stream == 0:
             there = [there[i] or bool(np.isfinite(piece.values[:, 3 * i : 3 * i + 3]).any()) for i in (0, 1)]
             count += len(piece.ticks)
-            if all(there) or count >= _ENOUGH:
+            if all(there) or count >= _SAMPLES_LOOKED_AT:
                 break
     if not count:
         raise ReadError(f"{name}: no messages on {topic}")

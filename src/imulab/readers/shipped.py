@@ -10,7 +10,7 @@ from imulab.readers.layout import load_layout, shipped_file, shipped_names
 from imulab.readers.text import titles_of
 from imulab.reading import Layout
 
-_MOST_LINES = 200
+_MOST_LINES = 200  # of a head by which a known logger is told
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,8 @@ from imulab.recording import Array, Recording, check_time
 
 Ticks = NDArray[np.int64]
 
-_ROWS = 1 << 16
-_PATIENCE = 1 << 20
+_ROWS = 1 << 16  # samples of the slowest stream after which rows are joined
+_PATIENCE = 1 << 20  # samples that are held while another stream lags behind
 _MUCH = 0.1
 """Part of a stream whose loss is warned of by every command."""
 
@@ -368,7 +368,7 @@ def _note(buffer: _Buffer, clock: _Buffer, per_second: int) -> str:
 # Recordings of one unit whose sensors have a file each, as phones and the x-IMU3 write them, to one recording.
 
 
-_PER_SECOND = 10**9
+_PER_SECOND = 10**9  # ticks that times are joined by: 1 ns
 
 
 def join_recordings(recording: Recording, others: Sequence[Recording]) -> Recording:

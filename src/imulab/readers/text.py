@@ -32,10 +32,10 @@ from imulab.writers import powers_of_five
 # The bytes of a text file as lines: one by one for the head, whole blocks of them below.
 
 
-_BLOCK_BYTES = 1 << 21
-WORTH_SHARING = 1 << 19
-_MOST_THREADS = 8
-LONGEST_LINE = 1 << 20
+_BLOCK_BYTES = 1 << 21  # read at once
+WORTH_SHARING = 1 << 19  # bytes from which a block is shared among threads
+_MOST_THREADS = 8  # that parse one file
+LONGEST_LINE = 1 << 20  # bytes: what has no end of line for longer is no text
 
 
 class ParserThreads:
@@ -264,8 +264,8 @@ def _is_pipe(stream: BinaryIO) -> bool:
 
 _text.prepare(powers_of_five())
 _TITLE = re.compile(r"[^,\[\]]+\[[^,\[\]]+\]")
-_DATE = 1 << 30
-_NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE = 1, 2, 3
+_DATE = 1 << 30  # flag, beyond any column's number, of a column that holds dates
+_NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE = 1, 2, 3  # problems that the parser in C reports
 _MOST_ABOVE = 100  # lines above the titles
 _UNENDED = Note("the last line has no line end: if the file was cut there, its last number is short")
 

@@ -22,7 +22,7 @@ from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Recording
 
 MAGIC = b"ULog\x01\x12\x35"
-_HEADER = 16
+_HEADER = 16  # bytes: magic, version, start time
 _SIZES = {
     "int8_t": "i1",
     "uint8_t": "u1",
@@ -44,7 +44,7 @@ _MAGS = ("sensor_mag", "vehicle_magnetometer")
 """Magnetometers, gauss: as measured, and as PX4 has corrected and turned them."""
 _MAG = dict.fromkeys(triad("mag"), "gauss")
 _VECTORS = ("gyro_rad", "accelerometer_m_s2", "magnetometer_ga")
-_NO_ACCEL = 2**31 - 1
+_NO_ACCEL = 2**31 - 1  # relative time by which PX4 marks a sample without acceleration
 _KEPT = {"sys_name": "autopilot", "ver_hw": "hardware", "sys_uuid": "autopilot_uuid"}
 
 

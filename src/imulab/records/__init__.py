@@ -9,7 +9,7 @@ from imulab.errors import readable
 # Whether a file is a record, told by its first bytes.
 
 
-_LARGEST_RECORD = 1 << 26
+_LARGEST_RECORD = 1 << 26  # bytes; no record is larger
 
 
 def is_json(file: str) -> bool:

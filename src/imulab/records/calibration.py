@@ -148,7 +148,7 @@ def _add_value(text: bytes, escapes: bool, pieces: list[bytes]) -> bool:
 
 
 FORMAT = "imulab.calibration"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 1  # of records; it rises when old readers cannot read new records
 BLOB_MAGIC = b"\x89IMULAB\n"
 
 

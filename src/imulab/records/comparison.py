@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import RecordError
+from imulab.estimation.decisions import PARAMETER_CHANGED
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
-_FALSE_ALARM = 0.05
 _SINGULAR = 1e-9
 """Eigenvalues of the correlations below this share of the largest belong to parameters that follow from others."""
 _ALIKE = {"degC": (1.0, 0.0), "s": (0.0, 0.1)}
@@ -87,7 +87,7 @@ def compared(
     judged = [name for name in shared if _uncertainty(name, first, second)]
     if not judged:
         raise RecordError("a record without uncertainties cannot be compared")
-    share = 1 - _FALSE_ALARM / len(judged)
+    share = 1 - PARAMETER_CHANGED.level / len(judged)
     changes = []
     for name in shared:
         uncertainty = _uncertainty(name, first, second)

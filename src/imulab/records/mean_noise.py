@@ -14,7 +14,7 @@ from imulab.records.calibration import Calibration
 from imulab.records.comparison import different_units
 from imulab.records.sections import Above0, Part, Size, part
 
-_ENOUGH = 4.0
+_TIMES_THE_REST = 4.0
 """Means of so much less than the record: 93 to 99 % of them are within twice their uncertainty."""
 
 
@@ -88,10 +88,10 @@ def mean_uncertainties(
         found.append(np.sqrt(square[-1] * np.interp(np.log(duration), np.log(time), more)))
     notes = []
     shortest = min(fit.columns[name].length.value for name in columns)
-    if shortest < _ENOUGH * duration:
+    if shortest < _TIMES_THE_REST * duration:
         notes.append(
             f"noise: the record is of {shortest:.4g} s, and noise that is slower does not show in it; expected "
-            f"{_ENOUGH:g} times the {duration:.4g} s at rest, better 10 times"
+            f"{_TIMES_THE_REST:g} times the {duration:.4g} s at rest, better 10 times"
         )
     if other := different_units(("the record", record.sensor), ("the recording", of)):
         notes.append(f"noise: {other}")

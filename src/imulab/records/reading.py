@@ -18,7 +18,7 @@ from imulab.records.calibration import BLOB_MAGIC, FORMAT, SCHEMA_VERSION, Calib
 from imulab.records.sections import check_sizes, read
 
 _CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
-_ROUNDING = 1.0 + 1e-6
+_ROUNDING = 1.0 + 1e-6  # of a covariance in decimals, relative
 _NEEDED = ("procedure", "sensor", "created", "software", "sources", "model", "parameters", "covariance", "fit")
 
 

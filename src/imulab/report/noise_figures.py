@@ -111,13 +111,13 @@ def _trace(place: Array, values: Array, name: str, number: int) -> dict[str, Any
 # The report of the noise of a recording at rest: coefficients, Allan curves with their intervals, and the samples.
 
 
-_HOUR = 3600.0
-_DEGREE = math.pi / 180
-_BLOCKS = 400
-_DIGITS = 5
+_HOUR = 3600.0  # s
+_DEGREE = math.pi / 180  # rad
+_BLOCKS = 400  # means of the samples that the drawing over time has
+_DIGITS = 5  # of the numbers in a drawing
 _COLOURS = (GOOD, BAD, "#8e6bbd", "#c99a2e", "#4f9d69", INK)
 _MOST_LINES = len(_COLOURS)
-_MOST_NAMED = 6
+_MOST_NAMED = 6  # columns whose numbers the caption says
 _AS_NOISE = {"bias_instability": "column_flicker", "quantisation": "column_quantisation"}
 """Coefficients whose units alone do not say that they are noise: the parameters of a noise record that they are."""
 

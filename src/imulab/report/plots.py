@@ -20,7 +20,7 @@ from imulab.report import json_for_script, render_page
 from imulab.report.traces import INK, Exhibits, Figure
 
 PICTURES = ("png", "svg", "pdf")
-_WIDTH = 900
+_WIDTH = 900  # pixels
 _LIBRARY = ("vendor", "plotly-cartesian.min.js")
 _BASE = {
     "font": {"family": 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif', "size": 13, "color": INK},
@@ -29,7 +29,7 @@ _BASE = {
     "paper_bgcolor": "#ffffff",
     "plot_bgcolor": "#ffffff",
 }
-_TITLE_HEIGHT = 40
+_TITLE_HEIGHT = 40  # pixels
 _TITLE = {"x": 0, "xanchor": "left", "yref": "container", "y": 1, "yanchor": "top", "pad": {"l": 10, "t": 14}}
 
 

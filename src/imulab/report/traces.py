@@ -98,11 +98,11 @@ def format_uncertain(value: float, uncertainty: float | None, digits: int = 2) -
 # Figures for a phone: panels that stand side by side go beneath one another.
 
 
-_LEAST, _MOST = 150, 300
-_GAP = 74
+_LEAST, _MOST = 150, 300  # height of a panel on a phone, pixels
+_GAP = 74  # pixels between panels
 _KEY_LINE = 21
 """Height of a panel, room between panels for ticks and titles, and height of a line of the key, pixels."""
-_MOST_NUMBERS = 8
+_MOST_NUMBERS = 8  # along an axis of a narrow panel
 
 
 def narrow(figure: Figure) -> dict[str, Any] | None:
@@ -244,12 +244,14 @@ def strongest_pair(matrix: Array, names: Sequence[str]) -> str:
 # Axes that show the bulk of the points, and marks at their edge for the few that lie far beyond.
 
 
-_FAR = 12.0
-_MOST_OUT = 0.1
-_WORTH = 2.5
-_PAD = 0.08
-_FEWEST = 5
-_MOST_LABELS = 4
+_DEVIATIONS_OFF_AXIS = (  # robust standard deviations: farther points are left out of the range of the axis
+    12.0  # standard deviations (robust) from the median: farther points are left out of the axis's range
+)
+_MOST_OUT = 0.1  # share of far points from which they are no exceptions, and all are shown
+_WORTH = 2.5  # times the usual range that the whole must have to be cut
+_PAD = 0.08  # of the range, free at both ends
+_FEWEST = 5  # points of which a range can be usual
+_MOST_LABELS = 4  # points outside the range that are labelled
 
 
 @dataclass(frozen=True)
@@ -282,7 +284,7 @@ def bulk(values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.
         return None
     if usual is None:
         distance = np.abs(values - np.median(values[finite]))
-        usual = distance <= _FAR * MAD_TO_SIGMA * float(np.median(distance[finite]))
+        usual = distance <= _DEVIATIONS_OFF_AXIS * MAD_TO_SIGMA * float(np.median(distance[finite]))
         if np.count_nonzero(finite & ~usual) > _MOST_OUT * len(values):
             return None
     inside = values[finite & usual]
@@ -361,10 +363,10 @@ def edge_note(count: int) -> str:
 # Small multiples: a grid of panels, three across, and what is drawn in them.
 
 
-COLUMNS = 3
-_GAP_ACROSS = 0.075
-_ROW_HEIGHT = 215
-_ROWS = 4
+COLUMNS = 3  # of panels
+_GAP_ACROSS = 0.075  # of the width, between two panels
+_ROW_HEIGHT = 215  # pixels
+_ROWS = 4  # of panels in one figure
 
 Item = TypeVar("Item")
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # Powers of ten to 128 bits, which the C modules read and print numbers with; made when the first is needed.
 
 
-_LOWEST, _HIGHEST = -342, 308
+_LOWEST, _HIGHEST = -342, 308  # powers of ten between which double precision has numbers
 
 
 @cache
@@ -81,8 +81,8 @@ def _prepare() -> bool:
 # Recordings to native CSV and Parquet.
 
 
-_ROWS_AT_ONCE = 65536
-_ROW_GROUP = 1 << 18
+_ROWS_AT_ONCE = 65536  # of text that is made in memory
+_ROW_GROUP = 1 << 18  # rows of a row group of a Parquet file
 
 
 def write(blocks: Recording | Iterable[Recording], path: str | Path) -> None:

@@ -19,9 +19,9 @@ from imulab.estimation.noise.spectrum import Spectrum, frequencies
 from imulab.estimation.noise.terms import Bins, prepare
 from imulab.recording import Array
 
-_DRAWS = 100
-_TAIL = 0.025
-_SMALLEST, _LARGEST, _MOST_ALIKE, _FAR = 1e-12, 1 - 1e-9, 0.99, 9.0
+_DRAWS = 100  # spectra drawn from the common model: they tell how the two tests go together
+_TAIL = 0.025  # on both sides of a 95 % interval
+_SMALLEST, _LARGEST, _MOST_ALIKE, _LARGEST_SCORE = 1e-12, 1 - 1e-9, 0.99, 9.0
 """Of probabilities, correlations and normal scores."""
 
 
@@ -150,8 +150,8 @@ def _either(least: float, correlation: float) -> float:
     in its place, 4 % of all pairs more were below 0.5 than should be.
     """
     rho = min(max(correlation, 0.0), _MOST_ALIKE)
-    start = max(float(-normal_quantile(min(max(least, 1e-300), _LARGEST))), -_FAR)
-    x = np.linspace(start, start + _FAR, 2001)
+    start = max(float(-normal_quantile(min(max(least, 1e-300), _LARGEST))), -_LARGEST_SCORE)
+    x = np.linspace(start, start + _LARGEST_SCORE, 2001)
     both = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi) * normal_cdf((rho * x - start) / np.sqrt(1 - rho**2))
     return float(np.clip(2 * least - (both.sum() - (both[0] + both[-1]) / 2) * (x[1] - x[0]), 0, 1))
 

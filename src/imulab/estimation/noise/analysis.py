@@ -17,8 +17,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.decisions import FOLLOWS_COVARIATE, LEVEL_STEP
 from imulab.estimation.distributions import chi_square_tail, normal_cdf
-from imulab.estimation.noise.cleaning import STEP, LevelChange, find_steps, step_coefficients
+from imulab.estimation.noise.cleaning import LevelChange, find_steps, step_coefficients
 from imulab.estimation.noise.likelihood import (
     Allowance,
     Band,
@@ -41,8 +42,10 @@ from imulab.recording import Array
 
 Refit = Callable[[Sequence[Spectrum]], tuple[Sequence[Array], float]]
 """Fits a model to spectra; returns its variance in each bin of each of them, (b,), and its deviance."""
+# Of regression and fit of the noise to what is left, one after the other
 _REGRESSION_ROUNDS = 3
-_PLAIN, _PENALTY, _GAIN = 3.0, 4.0, 6.0
+# Of a covariate in deviance, as for a term of the model; what the deviance must fall by beyond it
+_PENALTY, _GAIN = 4.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class Regression:
     def follows(self) -> bool:
         """Whether a slope is beyond 3 standard uncertainties, and the deviance, at 4 a parameter, falls by 6."""
         z = np.abs(self.slope) / self.standard_uncertainty
-        return bool(z.max() > _PLAIN and self.gain - _PENALTY * len(z) >= _GAIN)
+        return bool(z.max() > FOLLOWS_COVARIATE.limit and self.gain - _PENALTY * len(z) >= _GAIN)
 
 
 def ramp_coefficients(stretch: Stretch) -> Array:
@@ -153,8 +156,8 @@ def without(stretch: Stretch, taken: Array) -> Stretch:
 
 
 _SHORTEST, _LONGEST = 4.0, 10.0  # tau f_max at least; parts of the record at least
-_STEP = 1e-4
-_NODES = 32
+_STEP = 1e-4  # relative change of a parameter from which slopes are taken
+_NODES = 32  # midpoints of the integral of an Allan variance over a bin
 
 
 @dataclass(frozen=True)
@@ -274,7 +277,7 @@ PER_PARAMETER, _RIVAL, _QUANTISATION = 4.0, 4.0, 12.0
 """What a parameter must gain in deviance, how near a rival is, what quantisation noise must gain."""
 _LARGEST_VARIANCE = 2.0
 """Of the logarithm of a square: beyond it the expansion that it comes from says nothing more."""
-_HALVINGS = 60
+_HALVINGS = 60  # of a bracket that holds a quantile: to the last digit of a double
 
 
 @dataclass(frozen=True)
@@ -532,7 +535,7 @@ class Analysis:
         """Return the variance of the coefficients in the bins of each spectrum, (b,)."""
         return _split(self.bins.variances(self.values[None])[0], self.spectra)
 
-    def steps(self, stretches: Sequence[Stretch], limit: float = STEP) -> list[tuple[LevelChange, ...]]:
+    def steps(self, stretches: Sequence[Stretch], limit: float = LEVEL_STEP.limit) -> list[tuple[LevelChange, ...]]:
         """Return the changes of level of stretches, its own or these before something was taken out, by its noise."""
         found, start = [], 0
         variances = self.variances()

@@ -8,14 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.decisions import LEVEL_STEP, SPECTRAL_LINE
 from imulab.estimation.distributions import chi_square_upper_quantile
 from imulab.estimation.rows import median, medians, quantile
 from imulab.recording import Array
 
-_BLOCK, _SPIKE = 50, 6.0
+_BLOCK, _SPIKE = 50, 6.0  # samples of a block whose median is the level; a spike is so many sigma off it
 _CHUNK = 1 << 16  # samples whose deviations are looked at together
 _TO_SIGMA = 1.959964  # 95 % of |x| of a normal distribution
-_FALSE_ALARM, _FEWEST, _SKIRT = 1e-9, 16, 3
+# Coefficients of a bin that has a median of its own; coefficients left out on each side of a line
+_FEWEST, _SKIRT = 16, 3
 _LEAST = 100  # coefficients whose median tells the level: that of 16 is off by a factor of 3 now and then
 _STRONG, _NEAR, _WANDERS, _MOST_STRONG, _ROUNDS = 1e3, 50, 0.01, 8, 14
 """Lines so far above the median are fitted, by so many coefficients on both sides, if so little of them is left."""
@@ -23,11 +25,10 @@ _STRONG_SLOW, _SLOW = 1e5, 200
 """The same of the lowest coefficients, where slow noise is read: a sway there must not pass for a line."""
 _NOISE = 3.0
 """Over the median of the squares of coefficients: their mean is 2.2 of it, and scatters over 100 of them."""
-STEP, PERHAPS = 5.0, 4.0
-"""|z| beyond which a change of level is a step; and may be one that the fit took for random walk."""
-_MOST_STEPS = 5
+_MOST_STEPS = 5  # of a stretch: noise with more is no noise with steps
+# Blocks whose median is what is usual around one; blocks needed; share that may be knocked
 _AROUND, _FEWEST_BLOCKS, _MOST_KNOCKED = 21, 64, 0.05
-_LEVEL, _FIFTH, _LOUD = 6.0, 10, 3.0
+_KNOCK_OFF, _FIFTH, _LOUD = 6.0, 10, 3.0
 """How many sigma the median of a knocked block is off those around it; or how many times as far as in nineteen of
 twenty blocks its ten outermost samples are from its median."""
 
@@ -109,7 +110,7 @@ def knocks_removed(samples: Array) -> tuple[Array, NDArray[np.int64]]:
     around = np.lib.stride_tricks.sliding_window_view(np.pad(level, _AROUND // 2, mode="reflect"), _AROUND)
     off = np.abs(level - medians(around))
     knocked = np.zeros(count, dtype=np.bool_)
-    for size, limit in ((off, _LEVEL / _TO_SIGMA), (far, _LOUD)):
+    for size, limit in ((off, _KNOCK_OFF / _TO_SIGMA), (far, _LOUD)):
         usual = limit * quantile(size, 0.95)
         knocked |= (size > usual) & (quantile(size, 0.9) > 0)  # whole counts hardly ever differ
     if not 0 < np.count_nonzero(knocked) <= _MOST_KNOCKED * count:
@@ -139,7 +140,7 @@ def line_groups(
     tuple
         Which coefficients are no lines, shape (J,), and the lines, the largest first.
     """
-    limit = float(chi_square_upper_quantile(_FALSE_ALARM, averages) / chi_square_upper_quantile(0.5, averages))
+    limit = float(chi_square_upper_quantile(SPECTRAL_LINE.level, averages) / chi_square_upper_quantile(0.5, averages))
     noise = averages / float(chi_square_upper_quantile(0.5, averages))  # the mean of chi-square over its median
     fine = np.ones(len(squares), dtype=np.bool_)
     level = _levels(squares, first, last)
@@ -227,7 +228,7 @@ def _sine_coefficients(j: Array, place: float, count: int) -> Array:
 
 
 def find_steps(
-    slow: Array, variances: Array, count: int, interval: float, limit: float = STEP
+    slow: Array, variances: Array, count: int, interval: float, limit: float = LEVEL_STEP.limit
 ) -> tuple[LevelChange, ...]:
     """Find steps of the level, one after the other, by their size over its standard uncertainty under the noise model.
 

@@ -11,8 +11,8 @@ from imulab.recording import Array
 
 LONGEST = 1e9
 """s, 30 years: no record is as long."""
-_FEWEST, _DRAWN = 500, 100
-_PER_DECADE = 6
+_FEWEST, _DRAWN = 500, 100  # samples of the shortest record that is planned; records drawn to tell what a length shows
+_PER_DECADE = 6  # lengths in a decade that are tried
 
 
 def accuracy(values: Array, interval: float, length: float, highest: float | None = None, ripple: float = 0.0) -> Array:

@@ -16,6 +16,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.decisions import BIN_OFF_MODEL
 from imulab.estimation.noise.spectrum import Spectrum, frequencies
 from imulab.estimation.noise.terms import LINEAR, NAMES, SIGMA, TIME, Bins
 from imulab.estimation.rows import NORMAL_95
@@ -26,10 +27,12 @@ from imulab.recording import Array
 
 _AGREE, _SIGMAS, _SHARP = 0.03, 3.0, 0.2
 """How far two octaves may be apart, beyond so many sigma; up to where these sigma tell of an agreement at all."""
+# A band up to this share of the Nyquist frequency is whole; one below this share of the sampling rate, where an octave
+# below Nyquist is 0.25, is filtered
 _FULL, _NEARLY_FULL = 0.999, 0.24
-_MANY, _FEWEST = 200, 16
+_RIPPLE_FREEDOM, _FEWEST_BINS = 200, 16
 """Coefficients of a bin that tells the ripple; such bins that are needed to tell it."""
-_OFF_SIGMAS, _OFF = 5.0, 0.10
+_OFF = 0.10  # a bin that is off by less, relative, is kept whatever its scatter
 _BOUND, _EXPECTED = 6.635, 0.9819
 """Of the squared deviation of a bin in terms of its variance: at most so much counts, and what is then expected."""
 
@@ -73,7 +76,7 @@ def usable_band(spectra: Sequence[Spectrum]) -> Band:
     highest = nyquist
     if not _same_level(f, p, d, highest, 2) and _rising(f, p, d, nyquist):
         return Band(nyquist, True)
-    while highest == nyquist or d[f <= highest / 4].sum() > _MANY:
+    while highest == nyquist or d[f <= highest / 4].sum() > _RIPPLE_FREEDOM:
         if _same_level(f, p, d, highest, 2):
             far, u = _apart(f, p, d, highest, 2)
             full = highest > _FULL * nyquist
@@ -175,13 +178,13 @@ def _far_bins(logarithm: Array, freedom: Array, ripple: float) -> NDArray[np.boo
     """Which bins are off by 5 sigma and 10 %, the ripple allowed for."""
     u = np.sqrt(2 / np.maximum(freedom, 1) + ripple**2)
     size = np.abs(logarithm)
-    return np.asarray((freedom > _FEWEST) & (size > np.log1p(_OFF)) & (size > _OFF_SIGMAS * u))
+    return np.asarray((freedom > _FEWEST_BINS) & (size > np.log1p(_OFF)) & (size > BIN_OFF_MODEL.limit * u))
 
 
 def _ripple(logarithm: Array, freedom: Array) -> float:
     """Scatter of the levels of bins beyond what their numbers of coefficients explain."""
-    many = freedom > _MANY
-    if np.count_nonzero(many) < _FEWEST:
+    many = freedom > _RIPPLE_FREEDOM
+    if np.count_nonzero(many) < _FEWEST_BINS:
         return 0.0
     square, chance = logarithm[many] ** 2, 2 / freedom[many]
 
@@ -205,9 +208,11 @@ Flags = NDArray[np.bool_]
 _SIZES = [*range(LINEAR), *SIGMA]
 _NONE, _LITTLE = 1e-6, 0.03
 """A term below this share of every bin is 0; at which share one begins that was 0."""
+# Time constants on a grid, the best of which are starts, after so many updates of the sizes
 _GRID, _STARTS, _UPDATES = 8, 3, 12
 _ROUNDS, _DONE, _LONGEST = 60, 1e-5, 2.0
 """Rounds of scoring at most, change of the deviance that ends them, longest step of a logarithm."""
+# Of Levenberg and Marquardt's steps, which are pure Newton steps below, and no steps above
 _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e8
 _ROWS = 2000  # rows of a batch whose arrays stay small
 
@@ -497,7 +502,7 @@ def _inverse(fisher: Array, free: Flags) -> Array:
 # Intervals of the parameters of a noise model from the profile of its likelihood.
 
 
-_LEVEL = 3.84
+_DEVIANCE_95 = 3.84
 """The 95 % point of chi-square with one degree of freedom."""
 _END_TRIALS, _EXACT = 14, 0.01
 """Trials for an end at most, and how close the root of the deviance must come to that of the level."""
@@ -568,7 +573,7 @@ class _Ends:
         )
         values, found = values.copy(), self._never_reached(values)
         low = np.log(values[np.arange(len(values)), self.parameter])
-        below = np.full(len(low), -np.sqrt(_LEVEL))
+        below = np.full(len(low), -np.sqrt(_DEVIANCE_95))
         high, above, last = np.full((3, len(low)), np.nan)
         trial = low + self.side * first
         for _ in range(_END_TRIALS):
@@ -607,7 +612,7 @@ class _Ends:
         some = (without > 0).any(axis=1)
         rows, without = rows[some], without[some]
         rest = score(self.bins, without, without > 0, self.limits, self.power[rows], self.freedom[rows])
-        found[rows[rest.deviance - self.lowest[rows] < _LEVEL]] = 0.0
+        found[rows[rest.deviance - self.lowest[rows] < _DEVIANCE_95]] = 0.0
         return found
 
     def _held(self, values: Array, at: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -617,6 +622,6 @@ class _Ends:
         free = held > 0
         free[index, self.parameter[rows]] = False
         fitted = score(self.bins, held, free, self.limits, self.power[rows], self.freedom[rows])
-        root = np.sqrt(np.maximum(fitted.deviance - self.lowest[rows], 0)) - np.sqrt(_LEVEL)
+        root = np.sqrt(np.maximum(fitted.deviance - self.lowest[rows], 0)) - np.sqrt(_DEVIANCE_95)
         # What vanished here may be something again at the next trial.
         return root, np.where(fitted.values > 0, fitted.values, np.where(np.isin(np.arange(8), TIME), held, 0.1 * held))

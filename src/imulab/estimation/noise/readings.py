@@ -23,17 +23,17 @@ from imulab.units import STANDARD_GRAVITY, to_si
 # Whether the unit of samples at rest can be right: by the steps of known sensors, gravity and the Earth's rate.
 
 
-_MOST_SAMPLES, _OF_STEPS = 100_000, 20_000
+_MOST_SAMPLES, _OF_STEPS = 100_000, 20_000  # samples that are looked at; and of these for the steps of an output
 _STEPS = (*(full / 32768 for full in (125, 250, 500, 1000, 2000)), *(1 / lsb for lsb in (262.4, 131, 65.5, 32.8, 16.4)),
           0.004375, 0.00875, 0.0175, 0.035, 0.07)  # fmt: skip
 """deg/s, of gyroscopes of 16 bits."""
-_ALIKE = 1e-3
+_ALIKE = 1e-3  # relative: a step of the output this near to a known sensor's is that sensor's
 _LOUDEST_GYRO, _QUIET = 0.3, 0.035
 """deg/s/sqrt(Hz), louder than any gyroscope in use; deg/sqrt(h), so quiet that it shows the Earth's rate."""
 _EARTH, _PLAIN_OFFSET = (4.0, 100.0), 10.0
 """deg/h that three such gyroscopes show at rest, the Earth's 15 and their offsets together; not zeroed ones, whose mean
 is within ten standard uncertainties of 0."""
-_NEAR_STEP = 0.03
+_NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit makes that the likely one
 
 
 def doubtful_units(recording: Recording, names: Sequence[str], rate: float) -> list[str]:
@@ -101,10 +101,10 @@ def _step(samples: Array) -> float:
 # Rows of a log at rest that are no readings of their own: zeros in place of lost readings, and repeated readings.
 
 
-_SEEN, _SOME = 100_000, 5000
+_SEEN, _SOME = 100_000, 5000  # samples that are looked at; and of these for the levels of an output
 LEVELS = 6
 """Different values of an output at least, for what is at one of them to be told."""
-_FEW, _PILED, _MOST = 10, 4, 0.05
+_CHANCE_ZEROS, _PILED, _MOST = 10, 4, 0.05
 """Zeros are dropouts beyond so many, and so many times as many as the next level holds: a reading cut to whole counts
 has twice as many. So large a share is refused."""
 _BESIDE, _STEPS_BESIDE, _SHARE = 0.5, 5.0, 0.15
@@ -113,7 +113,7 @@ _COARSE = 0.25
 """Standard deviations: zeros among readings of larger steps are not told from lost ones."""
 _LONGEST, _REGULAR, _FEWEST_READINGS = 50, 0.98, 20
 """Rows for which a reading stands at most; share of the readings that stand for a multiple of them; readings needed."""
-_FINE, _BY_CHANCE = 4.0, 0.27
+_FINE, _REPEATS_PER_STEP = 4.0, 0.27
 """Steps of output in the usual change that tell repeats from chance, which makes 0.27 over their number of them."""
 
 
@@ -164,7 +164,7 @@ def dropouts(values: Array) -> NDArray[np.bool_] | None:
     """
     zero: NDArray[np.bool_] = np.asarray(values == 0)
     count = int(np.count_nonzero(zero))
-    if not _FEW < count < len(values) / 2:
+    if not _CHANCE_ZEROS < count < len(values) / 2:
         return None
     rest = values[~zero]
     levels = distinct(rest[:_SOME])
@@ -178,7 +178,7 @@ def dropouts(values: Array) -> NDArray[np.bool_] | None:
     if step > _COARSE * sigma or not (len(above) and len(below)):
         return None
     next_to = max(int(np.count_nonzero(side == side.min())) for side in (above, below))
-    return zero if count > _PILED * next_to + _FEW else None
+    return zero if count > _PILED * next_to + _CHANCE_ZEROS else None
 
 
 def _without_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Recording, list[str]]:
@@ -235,7 +235,7 @@ def _repeated(columns: Sequence[Array], kinds: Sequence[str]) -> float:
             (values,) = (each for each, its in zip(columns, kinds, strict=True) if its == kind)
             steps = np.abs(np.diff(values))
             usual = median(steps[steps > 0]) / resolution(values) if steps.any() else 0.0
-            chance = _BY_CHANCE / usual if usual >= _FINE else 1.0
+            chance = _REPEATS_PER_STEP / usual if usual >= _FINE else 1.0
         if share > 3 * chance + _MOST:
             found = max(found, share)
     return found

@@ -44,8 +44,11 @@ FEWEST, SHORT = 500, 100.0
 """Samples of a stretch at least; s below which only white noise and limits of the rest can be told."""
 MOST, SHARE = 16, 0.05
 """Stretches between gaps at most, and how long each must be in terms of the longest."""
-_PILED, _A_FEW = 2, 10
-_SEEN = 100_000
+_PILED, _FEW_AT_END = (  # times the readings at the level beside, and so many more: the end of a range
+    2,
+    10,
+)  # times the readings at the level beside, and so many more: an output is at the end of its range
+_SEEN = 100_000  # samples of which distinct values are counted
 
 
 @dataclass(frozen=True)
@@ -233,7 +236,7 @@ def _parts(time: Array) -> tuple[list[tuple[int, int, Array | None]], int, int]:
 
 def is_clipped(piled: int, next_to: int) -> bool:
     """Whether the outermost level has too many samples for noise, by how many the next level has."""
-    return piled > _A_FEW and piled > _PILED * next_to + _A_FEW
+    return piled > _FEW_AT_END and piled > _PILED * next_to + _FEW_AT_END
 
 
 def _clipped(values: Array) -> float | None:
@@ -242,7 +245,7 @@ def _clipped(values: Array) -> float | None:
         return None
     for limit, outside, nearest in ((values.max(), np.less, np.max), (values.min(), np.greater, np.min)):
         piled = int(np.count_nonzero(values == limit))
-        if piled > _A_FEW:
+        if piled > _FEW_AT_END:
             below = nearest(values[outside(values, limit)])
             if is_clipped(piled, int(np.count_nonzero(values == below))):
                 return float(limit)
@@ -252,7 +255,7 @@ def _clipped(values: Array) -> float | None:
 # A log at rest of any length, block by block as it is read: its rows go into spectra, and are not kept.
 
 
-_FEW = 100
+_FEWEST_STEPS = 100
 """Steps of time whose usual one tells the rate."""
 
 
@@ -438,7 +441,7 @@ class _Log:
             raise _AsWholeError
         if self._head is None:
             self._begin(block, steps, columns)
-        elif len(steps) >= _FEW and abs(np.log(usual_step(steps)[0] / self._usual)) > SAME_RATE:
+        elif len(steps) >= _FEWEST_STEPS and abs(np.log(usual_step(steps)[0] / self._usual)) > SAME_RATE:
             raise _AsWholeError
         for name, level in self._levels.items():
             level.add(columns[name])

@@ -14,7 +14,7 @@ import numpy as np
 from imulab.errors import OptionError
 from imulab.recording import Array
 
-_BLOCK = 1 << 17
+_BLOCK = 1 << 17  # samples drawn at once; it bounds memory, and the numbers depend on it
 _PER_DECADE, _SHORTEST, _LONGEST = 2.5, 0.25, 10.0
 """Time constants of the 1/f sum: how many a decade, and from where, in samples, to where, in records."""
 TERMS = ("white", "flicker", "walk", "quantisation", "gm1_sigma", "gm1_time", "gm2_sigma", "gm2_time", "ramp")

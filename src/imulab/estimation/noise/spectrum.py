@@ -22,7 +22,7 @@ from imulab.recording import Array
 # The spectrum that noise models are fitted to: mean squares of cosine coefficients in bins of frequency.
 
 
-_ALONE, _PER_DECADE = 24, 60
+_ALONE, _PER_DECADE = 24, 60  # lowest coefficients that have a bin of their own; bins in a decade beyond
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ _MEANS = 1 << 21
 """Means that are kept at most: twice as many samples go into each when there are more."""
 _SHARE = 32
 """Of the means' frequencies only the lowest 32nd is used: averaging takes .08 % from a slow noise at its end."""
-SLOW = 1 << 19
-_FINE = 1 << 10
+SLOW = 1 << 19  # coefficients of the lowest frequencies that are kept one by one, for steps and covariates
+_FINE = 1 << 10  # angles of the finer of the two tables whose products give all sines
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ LINEAR, SIGMA, TIME = 4, (4, 6), (5, 7)
 """How many terms come before the Gauss-Markov ones, and where those have their parameters."""
 _LETTERS = {"N": (0,), "B": (1,), "K": (2,), "Q": (3,)}
 _FLICKER = 2 * math.log(2) / math.pi
-_NODES = 16
+_NODES = 16  # frequencies of a bin up to which a term is summed over each, beyond which by Gauss
 _SERIES = 0.5
 """Below this many time constants, differences of exponentials are summed as power series."""
 
@@ -282,7 +282,7 @@ _AT_BOUND = 1.5
 """A Gauss-Markov term within this factor of the shortest time constant is the edge of the band, no slow noise."""
 _WHITE_TO_FILTER = 3.0
 """Horizons of so many time constants see a Gauss-Markov term as white noise."""
-_NO_TIME = 1e-30
+_NO_TIME = 1e-30  # s: stands for none where a ratio of times is taken
 _OF_FLICKER = 0.1
 """Share of B^2 h that is white to a filter.
 

@@ -33,13 +33,13 @@ from imulab.live.page.server import Hub, Message, PagePart, receive_file, report
 from imulab.options import options_of
 from imulab.reading import Reading
 
-_WIDEST = 4000
+_WIDEST = 4000  # pixels of a drawing that a page asks for
 _LONGEST = 1 << 20
 """Bytes of a JSON object."""
 _READING = tuple(option.name for option in options_of(Reading))
 _HERE = "/api/workbench"
 _ANY = "application/octet-stream"
-_PIECE = 1 << 20
+_PIECE = 1 << 20  # bytes sent at once
 
 
 class Workbench(PagePart):

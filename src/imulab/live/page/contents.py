@@ -23,7 +23,7 @@ from imulab.options import options_of, part_of, read_options
 from imulab.reading import Reading
 from imulab.recording import Array, Recording
 
-_EVERY = 0.15
+_EVERY = 0.15  # s between two messages of progress
 
 
 def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[str, Any]]:

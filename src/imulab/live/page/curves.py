@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from imulab.recording import Array, Recording
 
-BUCKET = 256
+BUCKET = 256  # rows whose extremes are kept
 _FINE = 2000 * BUCKET
 """Up to so many rows a view is made of the samples themselves."""
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap, as for `find_attitudes`."""
-_MOST_GAPS = 1000
+_MOST_GAPS = 1000  # that are marked
 _NUMBER = np.dtype("<f8")
 
 

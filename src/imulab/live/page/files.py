@@ -27,7 +27,7 @@ from imulab.records import is_json
 # The files of a session: those in its folder, and those that the command line named. The page reaches no others.
 
 
-_LONGEST = 200
+_LONGEST = 200  # bytes of a name; file systems take 255
 _WINDOWS = sys.platform == "win32"
 _NO_WINDOWS_NAME = re.compile(
     r"(?i)^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin\$|conout\$) *(\.|$)|[<>\"|?*]|[. ]$"

@@ -49,10 +49,10 @@ from imulab.procedures.views import exhibits_of, parameter_rows, rendered
 from imulab.records.calibration import Calibration
 from imulab.report.traces import format_uncertain
 
-_WAIT, _EVERY = 0.05, 0.1
-_TOLD = 0.3
-_EVENTS = 60
-_PATIENCE = 5.0
+_WAIT, _EVERY = 0.05, 0.1  # s of one look at the source; s between two messages to the pages
+_TOLD = 0.3  # s that the last message has to reach the pages
+_EVENTS = 60  # that a page shows which is opened later
+_PATIENCE = 5.0  # s for a thread to end, and for a page that is just being opened
 
 
 class GuidedPart(PagePart):

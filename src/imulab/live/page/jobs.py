@@ -24,7 +24,7 @@ from imulab.options import Option
 
 
 _FILE = re.compile(r"FILE|RECORD|[A-Z]+\.[a-z]+")
-_LONGEST_TEXT = 10_000
+_LONGEST_TEXT = 10_000  # characters of a field
 
 
 @dataclass(frozen=True)
@@ -208,8 +208,9 @@ def _texts(value: Any, called: str) -> Sequence[str]:
 # Commands that the page runs: each in a process of its own, as if typed, with what it says and what it makes.
 
 
+# Bytes of output, lines, and characters of a line, that are kept of a job
 _LONGEST, _MOST_LINES, _LONGEST_LINE = 1 << 20, 1000, 4000
-_GRACE, _EVERY = 5.0, 0.1
+_GRACE, _EVERY = 5.0, 0.1  # s for a process to end before it is killed; s between two messages
 _WINDOWS = sys.platform == "win32"
 
 

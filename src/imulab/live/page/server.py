@@ -55,7 +55,7 @@ from imulab.errors import ImulabError, OptionError, quoted
 TOKEN_HEADER = "x-imulab-token"
 LOCAL, EVERY = "127.0.0.1", ("0.0.0.0", "::")
 _NAMES = (LOCAL, "localhost")
-_HTTP_PORT = 80
+_HTTP_PORT = 80  # which browsers leave out of the Host header
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -246,7 +246,7 @@ async def receive_file(request: Request, path: Path) -> int:
 
 
 Message = dict[str, Any]
-_MOST_WAITING = 1000
+_MOST_WAITING = 1000  # messages for a page that is slow; older ones are dropped
 
 
 class PagePart:
@@ -369,8 +369,8 @@ def _plain(value: Any) -> Any:
 
 UPLOAD_LIMIT = 4 << 30
 """Bytes of one request, 4 GiB."""
-_SOCKET_LIMIT = 1 << 16
-_GRACE = 2
+_SOCKET_LIMIT = 1 << 16  # bytes of a message from a page
+_GRACE = 2  # s for open requests when the server ends
 
 
 def application(token: str, parts: Sequence[PagePart], *, host: str = LOCAL, limit: int = UPLOAD_LIMIT) -> Starlette:

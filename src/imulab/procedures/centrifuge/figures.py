@@ -361,8 +361,8 @@ def text_in_g(force: float) -> str:
 # The figures and tables of a centrifuge record, from the record alone.
 
 
-_POINTS = 121
-_SHOWN_SPECTRA = 3
+_POINTS = 121  # of a curve
+_SHOWN_SPECTRA = 3  # the lowest, the middle and the highest level
 _DECADES = [10.0**n for n in range(-6, 7)]
 _SPECTRUM_CAPTION = (
     "Hann-windowed, height of a sine. The FOG's line is rotation: tilt and flexure of the table axis. What is left of "

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from imulab.display import Note
 from imulab.errors import DataError
+from imulab.estimation.decisions import CYCLES_SCATTER
 from imulab.estimation.least_squares import chi_square_limit, excess_variance
 from imulab.procedures.centrifuge.lines import Complex, three_sigma
 from imulab.procedures.centrifuge.manifest import SAME_LEVEL, Manifest, fog_share, real_covariance
@@ -31,9 +32,6 @@ from imulab.procedures.centrifuge.run import LoadedRun
 from imulab.recording import Array
 
 # Repeatability: what a power cycle does to the drift beyond noise, and what a run does besides.
-
-
-_LEVEL = 0.05
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ def _excess(parts: Sequence[_Scatter]) -> tuple[float, float, int]:
     if not freedom:
         return 0.0, 0.0, 0
     chi_square = float((values**2 / variance).sum())
-    if chi_square <= chi_square_limit(freedom, _LEVEL):
+    if chi_square <= chi_square_limit(freedom, CYCLES_SCATTER.level):
         return 0.0, chi_square, freedom
     return float(excess_variance(values[None], variance[None], freedom)[0]), chi_square, freedom
 
@@ -464,7 +462,7 @@ def _deviations(members: list[list[RunLine]]) -> list[Deviations]:
 # How the channels of a test differ besides the drift: tilt and delay of the FOG, scale mismatch and azimuth.
 
 
-_STEPS = 12
+_STEPS = 12  # of the iterations for tilt and delay
 _LEAST = 3e-4
 """Gravity terms at the net rate, on a base that is not level, look like a mismatch of this size."""
 

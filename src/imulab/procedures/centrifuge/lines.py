@@ -30,25 +30,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError
+from imulab.estimation.decisions import EARTH_LINE_SEEN, RIG_ERROR
 from imulab.estimation.least_squares import coverage_factor
-from imulab.procedures.centrifuge.manifest import EARTH_RATE
+from imulab.gravity import EARTH
 from imulab.recording import Array
 from imulab.units import from_si, to_si
 
 # A run compressed as it streams by: sums over cells of about one table period, from which all else is computed.
 
 
+# Rows of the design of a cell; those that are a cosine have the sine beside them
 CONSTANT, TIME, CHI, CHI2, CHI3, NET, TIME_CHI, TIME_NET = 0, 1, 2, 4, 6, 8, 10, 12
-COLUMNS = 14
+COLUMNS = 14  # of the design of a cell
 _CHUNK = 16384
 """Samples worked on at once: small enough to stay in the cache."""
 _BINS = 16
 """Means per cell that are kept as a time series."""
-_PRODUCT = 800
+_PRODUCT = 800  # samples of a matrix product that is not spread over threads
 FIRST_LOOK = 1024
 """Samples from which the sampling period is found."""
-FEWEST_PER_PERIOD = 8
-_GAP = 2.5
+FEWEST_PER_PERIOD = 8  # samples of a turn of the table: third harmonics need more than six
+_GAP = 2.5  # usual steps: a longer one is a gap
 
 
 @dataclass(frozen=True)
@@ -304,12 +306,12 @@ def _part(samples: CellSamples, first: int, last: int) -> CellSamples:
 
 Complex = NDArray[np.complex128]
 
-SIZE = 10
+SIZE = 10  # coefficients of a channel in the regression over cells
 TREND, LINE, SECOND, THIRD, ROOM = 1, 2, 4, 6, 8
 """Rows of the solution: constant is 0, then trend; lines at chi, 2 chi, 3 chi; the line at the net rate."""
-_BLOCKS = 64
-_SINGULAR = 1e-7
-_STEPS = 30
+_BLOCKS = 64  # parts of a run by whose scatter a line's noise is known
+_SINGULAR = 1e-7  # eigenvalue of the scaled normal matrix below which a column is left out
+_STEPS = 30  # of Newton's method for the rates
 
 
 @dataclass(frozen=True)
@@ -736,8 +738,6 @@ def in_degrees(rate: float, digits: int = 6) -> str:
 
 MISMATCH = to_si(0.5, "deg/s")
 _DOUBT = to_si(0.01, "deg/s")
-_SIGNIFICANT = 20.0
-"""Power of a line over the expected power of noise there: one false alarm in 1e8."""
 _PLAUSIBLE = to_si(1.0, "deg/h")
 _POLAR = to_si(0.05, "deg/h")
 
@@ -836,7 +836,7 @@ def find_rates(cells: Cells, place: str) -> Rates:
 
 def three_sigma(freedom: float | None) -> float:
     """Return the factor of a standard uncertainty of so many degrees of freedom that is exceeded as seldom as 3."""
-    return coverage_factor(freedom, 0.9973)
+    return coverage_factor(freedom, 1 - RIG_ERROR.level)
 
 
 def _check_net(expected: float, found: float, reach: float, place: str) -> list[str]:
@@ -862,7 +862,7 @@ def _check_units(solution: LineRegression, noise: Complex, place: str) -> list[s
     """Check Earth rate for a size that it cannot have, and the gyroscope's size and direction against the FOG's."""
     line = solution.line(ROOM)
     fog, earth = line[-1], float(abs(line[-1]))
-    if not _POLAR < earth < 1.2 * EARTH_RATE:
+    if not _POLAR < earth < 1.2 * EARTH:
         raise DataError(
             f"{place}: column fog shows Earth rate as {from_si(earth, 'deg/h'):.4g} deg/h, expected up to 15.04 deg/h: "
             "is its unit or scale factor wrong?"
@@ -910,7 +910,7 @@ def residual_noise(cells: Cells, solution: LineRegression) -> Complex:
 def _significant(solution: LineRegression, row: int, channel: int, noise: Complex) -> bool:
     size = abs(solution.line(row)[channel])
     power = 2 * solution.gain(row) * float(noise[channel, channel].real)
-    return bool(size > FAINT and size**2 > _SIGNIFICANT * power)
+    return bool(size > FAINT and size**2 > EARTH_LINE_SEEN.limit * power)
 
 
 def _encoder_rate(cells: Cells) -> float:
@@ -947,7 +947,7 @@ def _net_start(cells: Cells, table_shift: float, fog: int, place: str) -> float 
         index = int(np.argmax(np.where(near, height, 0.0)))
         sign = 1.0 if cells.net_rate > 0 else -1.0
         return sign * (_peak_rate(index, rates, height) - net)
-    far = peak & (height > _PLAUSIBLE) & (height < 1.1 * EARTH_RATE) & (rates > 2 * bin_width)
+    far = peak & (height > _PLAUSIBLE) & (height < 1.1 * EARTH) & (rates > 2 * bin_width)
     for times in (1, 2, 3):
         far &= np.abs(rates - times * abs(cells.table_rate)) > 3 * bin_width
     if far.any():

@@ -32,8 +32,6 @@ Force = TypeVar("Force", float, Array)
 K_UNIT = "rad/s/(m/s^2)"
 CURVE_UNITS = {"K0": K_UNIT, "c1": "1/(m/s^2)", "c2": "1/(m/s^2)^2"}
 CROSS_UNIT = "rad/s/(m/s^2)^2"
-EARTH_RATE = 7.292115e-5
-"""rad/s (WGS 84)."""
 
 
 def specific_force(arm_rate: float, radius: float) -> float:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import OptionError, listed
+from imulab.estimation.decisions import CURVE_TERM
 from imulab.estimation.least_squares import blend, chi_square_limit, chi_square_probability, coverage_factor
 from imulab.procedures.centrifuge import CURVES
 from imulab.procedures.centrifuge.levels import (
@@ -40,8 +41,7 @@ from imulab.recording import Array
 
 
 _NESTED = ("constant", "c1", "c1+c2")
-_GAIN = 0.05
-_CURVE_ROUNDING = 1e-9
+_CURVE_ROUNDING = 1e-9  # of K, relative: noise that exact data are given
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,9 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
         largest = max(names, key=lambda name: len(CURVES[name]))
         freedom = len(K) - 1 - len(CURVES[largest])
         scale = max(1.0, min(value[2] for value in found.values()) / freedom) if freedom > 0 else 1.0
-        chosen = min(names, key=lambda name: found[name][2] / scale + chi_square_limit(1, _GAIN) * len(CURVES[name]))
+        chosen = min(
+            names, key=lambda name: found[name][2] / scale + chi_square_limit(1, CURVE_TERM.level) * len(CURVES[name])
+        )
     coefficients, matrix, chi_square = found[chosen]
     given = matrix @ covariance @ matrix.T
     return CurveFit(

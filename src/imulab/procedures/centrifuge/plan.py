@@ -32,9 +32,9 @@ from imulab.units import STANDARD_GRAVITY, from_si, to_si
 # Errors that survive the subtraction of the FOG: which of them the data bound, and by how much.
 
 
-FLEXURE = 1e-7 / STANDARD_GRAVITY
-_DELAY = 1e-3
-_MISMATCH = 5e-3
+FLEXURE = 1e-7 / STANDARD_GRAVITY  # rad/(m/s^2): 0.1 µrad a g, the flexure of a stiff arm, where none is stated
+_DELAY = 1e-3  # s between FOG and X that a data logger may have, where the data do not show it
+_MISMATCH = 5e-3  # of a scale factor: 0.5 % between FOG and X, where the data do not show it
 
 
 @dataclass(frozen=True)
@@ -229,10 +229,10 @@ def _radius(test: Measured, manifest: Manifest) -> BudgetEntry:
 
 DRIFT = {"deg/h/g": 0.01745329251994329577 / 3600 / 9.80665, "rad/s/(m/s^2)": 1.0}
 """Units of K that texts have, in SI."""
-PERIODS_ASKED = 500
+PERIODS_ASKED = 500  # of the table in a run, as the source of method fourier asks for
 _NEAR = 0.05
 """A table rate this close to a multiple of the net rate, as part of the net rate, is warned of."""
-_LONGEST = 7200.0
+_LONGEST = 7200.0  # s of a run that a plan proposes
 _HIGHEST_RATE = 50.0  # rad/s
 
 

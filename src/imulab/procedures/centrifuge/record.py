@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.estimation.decisions import CURVE_MISSES, DRIFT_DIRECTION_TURNS
 from imulab.procedures.centrifuge.levels import Levels, RunLine, amplitude_lost, axis_lines
 from imulab.procedures.centrifuge.lines import in_degrees
 from imulab.procedures.centrifuge.manifest import Manifest, real_covariance, window_text
@@ -15,8 +16,7 @@ from imulab.procedures.centrifuge.run import LoadedRun, StaticRun
 from imulab.recording import Array, Source
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
-_UNLIKELY = 0.01
-_LOST = 1e-4
+_LOST = 1e-4  # of the amplitude: method fourier loses less without a word
 
 
 def make_record(
@@ -276,14 +276,14 @@ def _warnings(
                 f"{100 * off[worst.index]:.2g} % of the amplitude (in the uncertainty); method least-squares follows it"
             )
     for prefix, fitted in estimates.curves.items():
-        if fitted.probability is not None and fitted.probability < _UNLIKELY:
+        if fitted.probability is not None and fitted.probability < CURVE_MISSES.level:
             found.append(
                 f"{prefix.rstrip('_')}: K(a) is not described by the curve {fitted.model} within its uncertainty "
                 f"(chi-square "
                 f"{fitted.chi_square:.1f} with {fitted.freedom} degrees of freedom)"
             )
     for prefix, probability in estimates.turning.items():
-        if probability < _UNLIKELY:
+        if probability < DRIFT_DIRECTION_TURNS.level:
             angles = [
                 float(np.degrees(np.angle(level.line["xy".index(prefix[0])])))
                 for level in levels.items

@@ -133,11 +133,12 @@ def _rate(block: Recording, name: str, manifest: Manifest) -> Array:
 
 
 _MISMATCH = to_si(0.5, "deg/s")
-_STANDS_OUT = 8.0
-_UNSTEADY = 0.05
-_SLOW, _SLOW_WARNING = 0.1, 0.02
-_RATE_CHANGE = 1e-3
-_ROUNDS = 8
+_STANDS_OUT = 8.0  # sigma beyond which a cell is a disturbance, besides the share of the signal below
+_UNSTEADY = 0.05  # of the size of the signal in a cell
+_SLOW, _SLOW_WARNING = 0.1, 0.02  # of the amplitude: slow changes beyond are refused, and beyond the second warned of
+_RATE_CHANGE = 1e-3  # of the table's rate within a run
+_ROUNDS = 8  # in which disturbed cells are left out, as long as more are seen
+# Parts of a run whose lines drift in one direction where they correlate by more with time
 _SEGMENTS, _STEADILY = 8, 0.9
 
 
@@ -327,6 +328,7 @@ def _peak_shift(cells: Cells, rate: float) -> float:
 
 _STEP = to_si(5.0, "deg/h")
 """A second off the straight line through the record by less than this is no motion, however small the noise."""
+# Sigma within blocks, and steps of the output, that a jump of a log at rest exceeds
 _STEP_SIGMA, _STEP_STEPS = 10.0, 8.0
 _DRIFT = to_si(20.0, "deg/h")
 """More than a warm gyroscope drifts over a static record, or a table held by its servo shakes."""
@@ -334,8 +336,8 @@ _LINE = to_si(1.0, "deg/h")
 """More than rest shows at a rate that the table has in this test."""
 _LOWEST_BIN = 3
 """A drift that bends shows in the first bins of a spectrum."""
-_AROUND = 16
-_FEWEST = 64
+_AROUND = 16  # bins on both sides whose median is the floor of a spectrum
+_FEWEST = 64  # samples of a spectrum
 _TURNED = np.radians(0.05)
 
 
@@ -438,9 +440,9 @@ def _step(cells: Cells, names: tuple[str, ...]) -> str | None:
 # One run of a centrifuge test, streamed: its blocks to lines with their noise.
 
 
-_MOST_LOST = 0.5
-_SPECTRUM_HALF_WIDTH = 24
-_SPECTRUM_POINTS = 4
+_MOST_LOST = 0.5  # share of a run that gaps and bad samples may take
+_SPECTRUM_HALF_WIDTH = 24  # resolutions of the run, on both sides of a line, that are drawn
+_SPECTRUM_POINTS = 4  # drawn in a resolution
 
 
 @dataclass(frozen=True)

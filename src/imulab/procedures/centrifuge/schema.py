@@ -200,7 +200,7 @@ def force_of(record: Calibration, number: int) -> float:
 
 
 _OF_A_LEVEL = re.compile(r"_(K|zeta|cross)_\d+$")
-_SAME_LEVEL = 0.01
+_SAME_LEVEL = 0.01  # relative: levels of two records this near are compared as one
 
 
 def same_meaning(name: str, first: Calibration, second: Calibration) -> bool:

@@ -33,10 +33,10 @@ from imulab.writers import write_csv
 # A simulated centrifuge test: every term of the error model as a named parameter, block by block.
 
 
-_DEG_H = np.pi / 180 / 3600
-_DEG_ROOT_H = np.pi / 180 / 60
-_PER_G = 1 / STANDARD_GRAVITY
-_BLOCK = 65536
+_DEG_H = np.pi / 180 / 3600  # rad/s
+_DEG_ROOT_H = np.pi / 180 / 60  # rad/sqrt(s)
+_PER_G = 1 / STANDARD_GRAVITY  # 1/(m/s^2)
+_BLOCK = 65536  # samples made at once; it bounds memory, and the numbers depend on it
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 
 from imulab.errors import ObservabilityError
 from imulab.estimation.column_noise import ColumnNoise, columns_noise
+from imulab.estimation.decisions import READINGS_LATE
 from imulab.estimation.noise_coefficients import DeviationCurve
+from imulab.estimation.sampling import GAP
 from imulab.procedures.gyro_array.elements import Elements
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -90,8 +92,8 @@ def unseen(noises: Mapping[str, ColumnNoise], rest: AtRest) -> list[str]:
 # Alignment of an array's elements against their consensus, from a recording in motion.
 
 
-_BLOCKS = 20
-_WORST = 0.05
+_BLOCKS = 20  # parts of a motion by whose scatter uncertainties are known (jackknife)
+_WORST = 0.05  # uncertainty, relative and in rad, of an alignment that is of use
 _VISIBLE = 25.0  # variance of the motion over that of the noise, in the direction where it is least
 _NEAR_PERMUTATION = 0.35  # rad
 
@@ -221,13 +223,11 @@ def nominal_orientation(matrix: Array) -> Array:
 # Elements of an array that answer late, and their alignment in spite of it.
 
 
-_STEPS = 8
-_CLEAR = 4.0
+_STEPS = 8  # of Gauss and Newton
 _HARMLESS = 1e-4  # s; 5 ppm of scale factor in motion at 5 Hz
 _SETTLED = 0.02  # standard uncertainties
-_GAP = 1.5
 _BESIDE = 4  # samples beside a gap that a spline does not follow
-_FEWEST = 100
+_FEWEST = 100  # samples that tell a latency
 _LONGEST = 0.1  # s, of a step
 
 
@@ -276,7 +276,7 @@ def align_in_time(time: Array, readings: Array, white: Array, truth: Array | Non
 
 def _is_late(delay: Array, u: Array) -> NDArray[np.bool_]:
     """Which latencies are clear, and not too small to matter."""
-    found: NDArray[np.bool_] = np.abs(delay) > np.maximum(_CLEAR * u, _HARMLESS)
+    found: NDArray[np.bool_] = np.abs(delay) > np.maximum(READINGS_LATE.limit * u, _HARMLESS)
     return found
 
 
@@ -310,7 +310,7 @@ def _regressed(
         rate = truth - truth.mean(axis=0)
     change = np.einsum("iab,mb->mai", found.sensing, np.gradient(rate, time, axis=0))
     left = centred - np.einsum("iab,mb->mai", found.sensing, rate)
-    gap = np.diff(time) > _GAP * np.median(np.diff(time))
+    gap = np.diff(time) > GAP * np.median(np.diff(time))
     change[np.append(gap, False) | np.insert(gap, 0, False)] = 0.0
     inverse = 1 / white**2
     across = -np.einsum("mai,mai,ai->mi", left, change, inverse)
@@ -340,6 +340,6 @@ def _without_delays(time: Array, readings: Array, delay: Array) -> tuple[Array, 
     reach = float(np.abs(delay).max())
     fine = (time >= time[0] + reach) & (time <= time[-1] - reach)
     width = int(reach / usual) + _BESIDE
-    for k in np.flatnonzero(np.diff(time) > _GAP * usual).tolist():
+    for k in np.flatnonzero(np.diff(time) > GAP * usual).tolist():
         fine[max(k - width, 0) : k + width + 1] = False
     return moved, fine

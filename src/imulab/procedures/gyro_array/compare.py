@@ -16,6 +16,7 @@ import numpy as np
 
 from imulab.device import METHODS
 from imulab.errors import DataError, ImulabError, OptionError, listed
+from imulab.estimation.decisions import METHOD_FOLLOWS_LESS
 from imulab.estimation.noise_coefficients import allan_deviation
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.estimation.sampling import sampling_rate
@@ -48,8 +49,8 @@ from imulab.report.traces import Exhibits
 # What a comparison compares with: the gyros of an array that work, and the least noise of any fixed weights.
 
 
-_IN_USE = 0.5
-_FEWEST = 2
+_IN_USE = 0.5  # share of the time: an element that is used for less is left out of a comparison
+_FEWEST = 2  # elements with a common time
 
 
 @dataclass(frozen=True)
@@ -131,12 +132,12 @@ def _limit(error: Array) -> float:
 # Response of a method of fusion to a small white probe that all gyros see.
 
 
-_PROBE_SAMPLES = 16_384
-_SEGMENT = 256
+_PROBE_SAMPLES = 16_384  # by which the response of a method is measured
+_SEGMENT = 256  # samples of a spectrum
 _HALF_POWER = math.sqrt(0.5)
 _FROZEN, _UNUSUAL = 0.5, 20.0  # s; times as long as usual
-_FOLLOWED = 0.95
-_FEWEST_PAIRS = 4
+_FOLLOWED = 0.95  # of the time in which an element must move to be counted
+_FEWEST_PAIRS = 4  # segments that a response has a scatter by
 
 
 @dataclass(frozen=True)
@@ -255,14 +256,14 @@ def _transfer(probe: Array, response: Array) -> tuple[Array, float]:
 # What fusing really buys: every method over one recording, with errors, limit, Allan curves and bandwidth.
 
 
-_TRACE = 800
-_QUIET_FACTOR = 3.0
-_SHORTEST_QUIET = 5.0
+_TRACE = 800  # points of a drawing
+_QUIET_FACTOR = 3.0  # times the usual scatter up to which a window is quiet
+_SHORTEST_QUIET = 5.0  # s of rest by which methods are compared where no truth is known
 _FILTERED = 0.9  # of half the sampling rate
 _BEYOND_LIMIT = 0.97  # of the least noise that weights alone can reach
-_FOLLOWS, _SURE, _FINEST = 0.95, 2.0, 0.01
+_FOLLOWS, _FINEST = 0.95, 0.01  # share of a motion that a method must follow; least uncertainty of it that is shown
 _NOTHING = 1e-9  # of a gyro's noise
-_HALVES = 2 * FEWEST_ROBUST
+_HALVES = 2 * FEWEST_ROBUST  # elements of which each half can be fused robustly
 
 
 @dataclass(frozen=True, repr=False)
@@ -577,7 +578,7 @@ def _filtering(
         slow = min(response[method], key=lambda answer: answer.gain)
         narrow = min(row.bandwidth for row in rows)
         beyond = min((row.over_limit for row in rows if row.over_limit > 0), default=1.0)
-        if slow.gain + _SURE * slow.gain_uncertainty < _FOLLOWS:
+        if slow.gain + METHOD_FOLLOWS_LESS.limit * slow.gain_uncertainty < _FOLLOWS:
             verbs = "does not move and counts" if len(slow.blind) == 1 else "do not move and count"
             why = f": {' '.join(slow.blind)} {verbs} in it"
             found.append(

@@ -14,7 +14,7 @@ from imulab.procedures.gyro_array.schema import array_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
-_SAMPLES = 300
+_SAMPLES = 300  # of the exported self-test
 
 
 def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:

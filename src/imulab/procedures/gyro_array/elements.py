@@ -19,7 +19,7 @@ import numpy as np
 from imulab.display import Bad, Note
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.estimation.noise_coefficients import resolution
-from imulab.estimation.sampling import usual_step
+from imulab.estimation.sampling import GAP, usual_step
 from imulab.procedures.gyro_array.schema import array_of
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration
@@ -28,10 +28,10 @@ from imulab.units import conversion_factor, from_si, parse_unit
 # What a gyro array is: which columns of a recording are its elements, and what a record says of them.
 
 
-FEWEST_ROBUST = 3
+FEWEST_ROBUST = 3  # elements of which one can be outvoted
 SOURCE_RATES = (50.0, 200.0)
 """Sampling rates for which the source states its recursion, Hz."""
-MOST_ELEMENTS = 64
+MOST_ELEMENTS = 64  # as IL_ARRAY_ELEMENTS of the largest configuration of the C core
 _ELEMENT = re.compile(r"gyro_(?:([xyz])_)?([1-9][0-9]*)")
 _MISNUMBERED = re.compile(r"gyro_(?:[xyz]_)?0[0-9]*")
 
@@ -266,10 +266,9 @@ def unit_of_angle(unit: str) -> tuple[str, float]:
 # Elements on clocks of their own, brought to one; gaps in time.
 
 
-_GAP = 1.5
-_MOST_OFFSET = 0.5
-_TO_ESTIMATE = 16
-_MOST_NAMED = 3
+_MOST_OFFSET = 0.5  # s between the time of an element and of its row
+_TO_ESTIMATE = 16  # steps from which the usual one is told
+_MOST_NAMED = 3  # gaps that a warning names
 
 
 @dataclass
@@ -306,7 +305,7 @@ class SampleClock:
         if len(self.steps) < _TO_ESTIMATE:
             self.steps += step[: _TO_ESTIMATE - len(self.steps)].tolist()
         if self.steps:
-            longest = usual_step(np.array(self.steps))[1] if self.nominal is None else _GAP / self.nominal
+            longest = usual_step(np.array(self.steps))[1] if self.nominal is None else GAP / self.nominal
             wide = np.flatnonzero(step > longest)
             for index in wide.tolist():
                 self.count += 1
@@ -528,19 +527,19 @@ def _samples(count: int) -> str:
 
 
 _FEWEST = 100  # samples
-_EVERY_ROW, _THINNED = 20_000, 16
+_EVERY_ROW, _THINNED = 20_000, 16  # rows looked at each, and one in so many beyond
 _FOLLOWS = 0.81
 """Share of a gyro's variance that the first element must explain: a correlation of 0.9."""
 _ONE_AXIS = 0.8  # of what is explained
-_APART = 20.0
-_WITHIN = 8.0
+_APART = 20.0  # times apart: groups of elements whose readings differ by so much have different units
+_WITHIN = 8.0  # times apart within such a group
 _FACTORS = {
     180 / math.pi: "rad/s labelled deg/s, or the other way round",
     3600.0: "deg/h labelled deg/s, or the other way round",
     3600 * 180 / math.pi: "rad/s labelled deg/h, or the other way round",
     1000.0: "thousandths, or the other way round",
 }
-_NEAR = 1.6
+_NEAR = 1.6  # times: a ratio this near to that of two units is theirs
 _UNTURNED = "array calibrate --moving finds it, and --calibration puts it right"
 
 Map = tuple[tuple[int, int] | None, ...]
@@ -791,20 +790,20 @@ def _mirrored(seen: Map) -> str:
 
 
 _WINDOW = 1.0  # s
-_FEWEST_WINDOWS = 12
-_SMALLEST_WINDOW = 8
-_QUIETEST = 0.1
-_QUIET_FACTOR = 3.0
+_FEWEST_WINDOWS = 12  # of a recording
+_SMALLEST_WINDOW = 8  # samples
+_QUIETEST = 0.1  # quantile of the windows' scatter that is the usual one at rest
+_QUIET_FACTOR = 3.0  # times the usual scatter up to which a window is quiet
 _STEP_NOISE = 0.29
 """Standard deviation that rounding brings at least, in steps of the output."""
 _DRIFT = math.radians(1.0)
 """How far the zero of a gyro at rest may wander within one recording, rad/s."""
 _SHORTEST = 5  # windows
-_TOGETHER = 10.0
-_ALIKE = 1.25
+_TOGETHER = 10.0  # times what each element does by itself: beyond, the array turned
+_ALIKE = 1.25  # times, between quartiles of the elements: what they share in unlike sizes is no motion
 _STEADY, _STEADY_SPREAD = math.radians(5.0), 0.1
 _LARGEST_ZERO = math.radians(100.0)
-_MOST_SAMPLES = 20_000
+_MOST_SAMPLES = 20_000  # by which a fast motion is looked for
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ def method_texts(row: MethodRow, factor: float, digits: int, *, halves: bool) ->
 # The figures and tables of a comparison of methods, from its record alone.
 
 
-_MOST_NAMED = 4
+_MOST_NAMED = 4  # methods that a sentence names
 _PALETTE = {
     "robust": GOOD,
     "mean": "#7a8790",

@@ -30,11 +30,11 @@ from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import parse_unit, to_si
 
-_FEWEST_SAMPLES = 200
+_FEWEST_SAMPLES = 200  # at rest by which variances are told
 _FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix
-_OVERLAP = 8
-_CLIPPED_RUN = 3
-_SHARED = 0.5
+_OVERLAP = 8  # windows that begin in the length of one
+_CLIPPED_RUN = 3  # equal readings in a row at an end of the range that show a clipped output
+_SHARED = 0.5  # mean correlation of the noise of elements from which it is warned of
 
 
 @dataclass(frozen=True, repr=False)

@@ -45,8 +45,8 @@ from imulab.units import conversion_factor, from_si, parse_unit
 
 RATE_WALK = math.radians(1.4)
 """Default process noise, rad/s/sqrt(s): follows 12.5 deg/s at 0.1 Hz, sampled at 50 Hz, without a visible lag."""
-_BIAS_WALK = 0.004
-_LOWEST = 0.05
+_BIAS_WALK = 0.004  # of the white noise, in a second, that biases are let walk by
+_LOWEST = 0.05  # of the mean variance: no element is believed to be quieter
 
 
 def steady_gain(white: Array, walk: Array, rate_walk: float, step: float) -> Array:
@@ -232,8 +232,8 @@ def parse_memory(text: str, option: str = "--memory") -> tuple[str | float, int]
 
 
 _NEED_THREE = ("robust", "support", "least-squares")
-_FOR_NOISE = 10_000
-_WITHOUT_UNIT = 16.0
+_FOR_NOISE = 10_000  # samples by which the noise is told where none is stated
+_WITHOUT_UNIT = 16.0  # rad/s in a second, or times the noise: the walk of a motion that nothing is known of
 
 
 @dataclass(frozen=True)

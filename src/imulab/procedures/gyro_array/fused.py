@@ -34,7 +34,7 @@ STATES = (
     (HELD, "held (end of its range?)", "diamond", "#8e6bbd"),
 )
 """Flag, what it means, its mark and its colour."""
-_PIECES = 240
+_PIECES = 240  # parts of the time of which health is drawn
 _COLOURS = (GOOD, BAD, "#8e6bbd")
 
 

@@ -16,11 +16,11 @@ from imulab.procedures.gyro_array.elements import MOST_ELEMENTS
 from imulab.recording import Array, Recording, check_time
 from imulab.units import conversion_factor, parse_unit
 
-_MOST_POINTS = 1 << 20
-_FEWEST_POINTS, _FEWEST_LEVELS = 100, 8
+_MOST_POINTS = 1 << 20  # of the common time over which recordings are correlated
+_FEWEST_POINTS, _FEWEST_LEVELS = 100, 8  # samples, and different readings, of recordings that can be correlated
 _LEAST_MOTION = 1e-6  # of the variance of the whole
-_ALIKE = 0.8
-_SECOND = 0.9
+_ALIKE = 0.8  # correlation from which two recordings are of one motion
+_SECOND = 0.9  # of the best correlation: a second place this good leaves the offset open
 
 
 @dataclass(frozen=True, repr=False)

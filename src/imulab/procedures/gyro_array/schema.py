@@ -14,7 +14,7 @@ from imulab.records.sections import Above0, Length, Part, Positive, Quantity, ho
 T = TypeVar("T")
 PerAxis = Annotated[list[T], "axes"]
 PerElement = Annotated[list[T], "elements"]
-_LEAST_WHITE = 0.05
+_LEAST_WHITE = 0.05  # of the mean noise: no element is believed to be quieter, as in the core
 Square = Annotated[list[Annotated[list[float], "elements"]], "elements"]
 
 

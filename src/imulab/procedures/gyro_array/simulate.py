@@ -19,8 +19,8 @@ from imulab.quantities import in_si, quantity, whole
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, parse_unit
 
-_MOST_READINGS = 200_000_000
-_DEG = math.pi / 180
+_MOST_READINGS = 200_000_000  # of a simulation: it bounds memory
+_DEG = math.pi / 180  # rad
 
 
 @dataclass(frozen=True)

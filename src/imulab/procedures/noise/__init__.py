@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from imulab.errors import OptionError, listed
+from imulab.estimation.decisions import NOISE_MODEL_REJECTED
 
 # What the options of the noise procedure may be.
 
@@ -14,12 +15,11 @@ COVARIATES = ("time", "temperature")
 SAY_STEPS = "say"
 STEPS = (SAY_STEPS, "remove")
 LETTERS = {"N": "white", "B": "1/f", "K": "random walk", "G": "Gauss-Markov", "Q": "quantisation of the angle"}
-_REJECTED = 0.01
 
 
 def rejected(probability: float, columns: int) -> bool:
     """Return whether a test of fit speaks against a model: a good one of so many columns does so in 1 % of records."""
-    return probability < _REJECTED / columns
+    return probability < NOISE_MODEL_REJECTED.level / columns
 
 
 def check_terms(text: str, called: str = "terms") -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from imulab.display import Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
+from imulab.estimation.decisions import NOISE_CHECK
 from imulab.estimation.noise.agreement import Agreement, agreement
 from imulab.estimation.noise.analysis import CANDIDATES
 from imulab.estimation.noise.likelihood import fit, time_limits, within
@@ -37,6 +38,9 @@ from imulab.units import si_unit
 # The result of a test of a noise record by a log: verdict, what changed by how much, the octaves of both spectra.
 
 
+FALSE_ALARM, TOLERANCE = f"{100 * NOISE_CHECK.level:g} %", "1 %"
+_SAME_RATE = 0.01  # relative: a log of another rate has another spectrum
+# Changes of size by less are said in per cent; octaves this improbable are named in the text
 _DIGITS = 5
 _TICKS = [0.01, 0.1, 0.2, 0.5, 1, 2, 5, 10, 100]
 _HALF, _CERTAIN = 0.5, 0.05

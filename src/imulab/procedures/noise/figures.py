@@ -39,10 +39,10 @@ from imulab.report.traces import (
     scatter,
 )
 
-_DIGITS = 5
+_DIGITS = 5  # of the numbers in a drawing
 _PARTS = ("white", "1/f", "walk", "quantisation", "Gauss-Markov", "second Gauss-Markov")
 _COLOURS = (BAD, "#8e6bbd", "#c99a2e", QUIET, "#4f9d69", "#4f9d69")
-_MOST_CURVES = 12
+_MOST_CURVES = 12  # columns that have a drawing of their own
 _SEEN = 0.03
 """A part is drawn where it makes this share of the deviation somewhere."""
 _NAMES = {"rad/s": "gyroscopes", "m/s^2": "accelerometers"}

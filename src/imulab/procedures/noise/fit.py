@@ -19,6 +19,7 @@ from imulab.arguments import checked
 from imulab.display import Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed, several
 from imulab.estimation.column_noise import noise_columns
+from imulab.estimation.decisions import LEVEL_STEP_PERHAPS
 from imulab.estimation.noise.analysis import (
     CANDIDATES,
     Analysis,
@@ -27,7 +28,7 @@ from imulab.estimation.noise.analysis import (
     ramp_coefficients,
     without_steps,
 )
-from imulab.estimation.noise.cleaning import PERHAPS, LevelChange
+from imulab.estimation.noise.cleaning import LevelChange
 from imulab.estimation.noise.likelihood import Flags
 from imulab.estimation.noise.rest import Rest, at_rest, long_rest
 from imulab.estimation.noise.spectrum import Stretch
@@ -128,8 +129,9 @@ def read_log(
 # What a user of noise models must know, a sentence each.
 
 
-_MANY_SPIKES = 0.01
-_MOST_NAMED = 3
+_MANY_SPIKES = 0.01  # share of samples, or of the time, from which spikes or knocks are no note
+_MOST_NAMED = 3  # lines of a spectrum that are named
+# Parts of a record that a horizon may last; share of white noise that a roll-off may take without a word
 _SLOW_FACTOR, _LEANS = 10.0, 0.005
 
 
@@ -244,8 +246,8 @@ def _sized(value: float, unit: str) -> str:
 # The record of noise models: parameters with intervals, what filters want, and what the figures are drawn from.
 
 
-_DIGITS = 7
-_TAILS = (0.025, 0.975)
+_DIGITS = 7  # of the numbers in a record
+_TAILS = (0.025, 0.975)  # of a 95 % interval
 _PAIRS = tuple(zip(SIGMA, TIME, strict=True))
 _SLOW = ("flicker", "walk")
 """Terms that have a limit where the chosen model has not got them."""
@@ -531,7 +533,7 @@ def _numbers(values: Array) -> list[float]:
 # Logs at rest to noise models, column by column.
 
 
-_SAME_RATE = 0.01
+_SAME_RATE = 0.01  # relative: logs of other rates have no common spectrum
 
 
 @dataclass(frozen=True, repr=False)
@@ -779,7 +781,7 @@ def _column(
     stretches = [each for rest in rests for each in rest.stretches(name)]
     spikes, lines = sum(each.spikes for each in stretches), _longest(stretches).lines
     analysis = analysed(stretches, candidates, band)
-    found = analysis.steps(stretches, PERHAPS)
+    found = analysis.steps(stretches, LEVEL_STEP_PERHAPS.limit)
     if any(found):  # by noise that has no step: fitted to one, the model takes some of it for random walk
         without = analysed(without_steps(stretches, found), candidates, band)
         found = without.steps(stretches)

@@ -27,9 +27,9 @@ from imulab.report.traces import DASHES, LEGEND, QUIET, Figure, log_axis, plain_
 from imulab.writers import write_csv
 
 WANTED = "10 %"
-_DRAWS = 30
+_DRAWS = 30  # records drawn for the limits of a record of another length
 _ANY = ""
-_HOUR = 3600.0
+_HOUR = 3600.0  # s
 _UNITS = ((1.0, "s", 120.0), (60.0, "min", 120.0), (_HOUR, "h", 100.0), (24 * _HOUR, "d", math.inf))
 _COLOURS = ("#1f6f8b", "#c8553d", "#8e6bbd", "#c99a2e", "#4f9d69", "#22303a")
 

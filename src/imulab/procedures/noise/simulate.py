@@ -22,7 +22,7 @@ from imulab.units import from_si
 RATE, DURATION = "100 Hz", "1 h"
 _SHOWN = {"rad/s": "deg/s", "m/s^2": "m/s^2"}
 _SENSORS = {"rad/s": "gyro", "m/s^2": "accel"}
-_MOST_SAMPLES, _MOST_AT_ONCE = 1e11, 3e8
+_MOST_SAMPLES, _MOST_AT_ONCE = 1e11, 3e8  # of a simulated log; of one that is held in memory, all columns together
 _NAME = re.compile(r"[A-Za-z]\w*")
 
 

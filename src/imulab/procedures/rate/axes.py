@@ -20,6 +20,7 @@ import numpy as np
 
 from imulab.display import UNJUDGED, Note
 from imulab.errors import DataError, RecordError
+from imulab.estimation.decisions import LENGTH_AT_REST_OFF, RATE_PRIOR_CONTRADICTED
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.rate import AXES, GAINS
 from imulab.procedures.rate.dwells import Dwells, recorded_rate
@@ -37,7 +38,7 @@ from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 BY_ACCELEROMETERS = "that of the accelerometers"
 """The frame of a record's misalignments."""
 _FACE = np.cos(np.radians(30))
-_SURE, _POWER_CYCLE = 3.0, 3e-3 * STANDARD_GRAVITY
+_POWER_CYCLE = 3e-3 * STANDARD_GRAVITY
 """Standard uncertainties, and m/s^2 that biases may move by until they are switched on again, of |f| about g."""
 _PIECE = 0.02  # s
 _BATCHES, _FEWEST = 32, 8
@@ -266,7 +267,7 @@ def other_unit_said(record: Calibration, sensor: Mapping[str, str], option: str)
 def length_said(accel: Calibration, force: Array, uncertainty: Array, places: Sequence[str]) -> list[str]:
     """Say where |f| of m forces (m, 3), m/s^2, is not g, by more than the record and a power cycle explain."""
     off = np.linalg.norm(force, axis=1) - float(accel.model["gravity"]["value"])
-    beyond = np.abs(off) - _SURE * uncertainty - _POWER_CYCLE
+    beyond = np.abs(off) - LENGTH_AT_REST_OFF.limit * uncertainty - _POWER_CYCLE
     k = int(np.argmax(beyond))
     if beyond[k] <= 0:
         return []
@@ -323,8 +324,7 @@ def _with_interval(name: str, p: Parameter) -> Parameter:
 # An earlier record of the same gyroscopes beside a new one: whether they agree, and both as one fit.
 
 
-_TINY = 1e-12
-_CHANCE = 0.01
+_TINY = 1e-12  # of the largest eigenvalue: what two records share without any uncertainty
 _APART = 5.0  # K, beyond which a thermal record counts temperatures as different
 
 
@@ -502,7 +502,7 @@ def _measured(parameter: Parameter) -> Measured:
 def _said(probability: float | None, changes: Any) -> str:
     chance = "" if probability is None else f" (probability {probability:.2g})"
     differing = [change for change in changes if change.significant]
-    if not differing and probability is not None and probability < _CHANCE:
+    if not differing and probability is not None and probability < RATE_PRIOR_CONTRADICTED.level:
         return (
             f"the prior does not agree{chance}: all parameters together, no one parameter by itself; both are one fit "
             "all the same (see show A B)"

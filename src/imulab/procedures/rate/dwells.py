@@ -33,7 +33,7 @@ from imulab.units import from_si, parse_unit, to_si
 # How far the mean of a zero over a recording is from that over the next: white noise, and what wanders (1/f).
 
 
-PARTS = 64
+PARTS = 64  # of a record over which white noise and random walk are told apart
 _RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 121)])
 
 
@@ -78,6 +78,7 @@ ONE, TIME, RATE, SQUARE, CUBE, TURN, BOW, *DERIVATIVES = range(11)
 it falls, that times the square of the rate over its largest, and its four derivatives."""
 WHOLE = 8.8
 """Steps that eight steps take at most where no sample is missing."""
+# Parts of a sweep by whose scatter uncertainties are known; samples at once, to bound memory
 _SWEEP_BATCHES, _SWEEP_BLOCK = 32, 1 << 15
 _POWERS = np.vander(np.arange(-4.0, 5.0), increasing=True).T
 KERNELS = np.linalg.solve(_POWERS, np.diag([1.0, 1.0, 2.0, 6.0, 24.0, 0.0, 0.0, 0.0, 0.0]))[:, 1:5].T
@@ -238,13 +239,14 @@ def felt_rate(samples: Samples, weights: Array) -> Array:
 # A run whose rate changes all the time: what the gyroscopes' delay and bandwidth do to it, and means by rate.
 
 
-_BINS, _FEWEST_BLOCKS = 20, 10
+_BINS, _FEWEST_BLOCKS = 20, 10  # of the rate in which residuals are averaged; samples of one at least
+# Shares of the spectrum: below its end, and within so many bins of a sine's peak
 _POWER, _SINE, _BESIDE = 0.999, 0.998, 3
-_PER_PERIOD = 16
-_BESIDE_NOISE = 8
-_SMOOTH = 0.02
-_LONGEST = 1 << 17
-_SHOWN = 3.0
+_PER_PERIOD = 16  # pieces of a period of the fastest motion, over which samples are averaged
+_BESIDE_NOISE = 8  # samples on both sides over which noise is averaged
+_SMOOTH = 0.02  # of the largest step of the rate: it changes all the time if more steps than half exceed this
+_LONGEST = 1 << 17  # samples that are analysed; more are thinned
+_SHOWN = 3.0  # standard uncertainties that the square of the lag beyond a delay must exceed
 _OWN, _CLEAR = 1e-3, 100
 """Share of a derivative's power that is its own, not the rate's and lower ones', and how far that exceeds noise."""
 _TOLD = 0.05
@@ -608,15 +610,15 @@ _BLOCK, _SIDE, _SETTLING, _LEAST = 0.1, 5, 3, 10
 """s, and numbers of such blocks: compared on either side, left out at either end, and the shortest dwell."""
 _SIGMAS, _OF_STEP, _OF_COLUMN, _RIPPLE = 6.0, 1 / 20, 2e-5, 2e-3
 """Changes that count: of the noise, the smallest listed step, the largest recorded rate, and the rate itself."""
-_BATCHES = 8
-_FEW, _OF_RANGE, _SWEEP, _FLAT = 3, 0.02, 500, 0.03
+_BATCHES = 8  # parts of a dwell by whose scatter its mean is known
+_FEWEST_LEVELS, _OF_RANGE, _SWEEP, _FLAT = 3, 0.02, 500, 0.03
 """Rates of steps; share of the range that a step keeps to; samples of a sweep; share of its range at one output."""
-_NEXT_TO = 0.3
+_NEXT_TO = 0.3  # of the gap between listed rates: dwells nearer to one are of it
 _ALIKE, _OUT = 5e-3, 5.0
 """Of the largest rate, and of what is usual: by how much visits of one rate differ at most."""
-_STANDS = 0.2
-_WRONG = 0.5
-_ROUNDING = 1e-9
+_STANDS = 0.2  # of the usual scatter: an end that scatters less is a table that stands
+_WRONG = 0.5  # of the largest span: the axis that the manifest names spans less, so another was turned
+_ROUNDING = 1e-9  # of the largest reading: scatter below it is none
 _ROBUST = 0.6745 * np.sqrt(2)
 
 
@@ -689,7 +691,9 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
         raise SegmentError(
             f"{place}: a sweep needs the table's rate at every sample: expected table_rate or table_angle"
         )
-    if column is not None and (run.sweep or (_levels(blocks, stretches, size) < _FEW and is_smooth(column, blocks))):
+    if column is not None and (
+        run.sweep or (_levels(blocks, stretches, size) < _FEWEST_LEVELS and is_smooth(column, blocks))
+    ):
         return _swept(recording, time, column, outputs, names, main, place)
     if len(stretches) < 3:
         raise SegmentError(

@@ -27,7 +27,7 @@ from imulab.report.traces import (
 )
 from imulab.units import from_si
 
-_PPM = 1e6
+_PPM = 1e6  # to ppm
 _LOOKS = (("rising", "triangle-up", "#c8553d"), ("falling", "triangle-down", GOOD), ("turning", "circle", INK))
 
 

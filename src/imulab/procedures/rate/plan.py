@@ -35,7 +35,7 @@ from imulab.units import from_si
 # How many whole turns by hand against a fence reach a wanted uncertainty of scale factors.
 
 
-_TURNS = 1000
+_TURNS = 1000  # on and back that a plan asks for at most
 
 
 @dataclass(frozen=True, repr=False)
@@ -127,7 +127,7 @@ _FLOOR = 0.664
 """Allan deviation of flicker noise over B (IEEE Std 952)."""
 _LEAST, _SETTLING = 5.0, 0.6
 """s: the shortest dwell, and what `find_dwells` leaves out of a dwell at its ends."""
-_LONGEST, _LONGEST_TURN = 600.0, 60.0
+_LONGEST, _LONGEST_TURN = 600.0, 60.0  # s of a dwell, and of a whole turn, that a plan asks for
 
 
 @dataclass(frozen=True)

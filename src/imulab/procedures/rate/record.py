@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from imulab.display import Bad, Note
+from imulab.estimation.decisions import DWELLS_SCATTER, HYSTERESIS, LINE_BENDS, SCALE_OFF_UNIT
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
 from imulab.gravity import EARTH
 from imulab.procedures.rate import AXES
@@ -120,9 +121,7 @@ def sweep_table(sweeps: Sequence[SweptRun]) -> ReportTable:
 # The calibration record of a rate test: parameters under tumble gyro's names, in SI, and what its figures need.
 
 
-_CHANCE = 0.01
-_OFF = 0.1
-_MATTERS = 3.0
+_MATTERS = 3.0  # times the uncertainty of a bias: the Earth's rate is warned of if it is larger
 _LARGEST = ("nonlinearity", "hysteresis")
 
 
@@ -292,7 +291,7 @@ def _of_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
     if nominal.quantity != "rate":
         return []
     off = {n[-1]: p.value * nominal.factor - 1 for n, p in parameters.items() if n.startswith("gyro_scale_factor")}
-    if max(map(abs, off.values())) <= _OFF:
+    if max(map(abs, off.values())) <= SCALE_OFF_UNIT:
         return []
     said = " ".join(f"{axis} {100 * value:+.3g} %" for axis, value in off.items())
     return [Bad(f"the scale factors are off by {said}: is the unit ({unit}) right, or that of the table's rates?")]
@@ -329,12 +328,12 @@ def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool
 def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], asked: str) -> list[str]:
     found: list[str] = []
     for axis, of in linearity.items():
-        if asked != "auto" and of.probability < _CHANCE and of.by_polynomial > of.by_noise:
+        if asked != "auto" and of.probability < LINE_BENDS.level and of.by_polynomial > of.by_noise:
             found.append(
                 f"gyro_{axis}: the output bends by {1e6 * of.by_polynomial:.3g} ppm of the largest rate beyond order "
                 f"{asked}, and beyond the noise of its dwells: is a higher order supported (--order auto)?"
             )
-        elif asked == "auto" and of.probability < _CHANCE and orders[axis] == 1:
+        elif asked == "auto" and of.probability < LINE_BENDS.level and orders[axis] == 1:
             found.append(
                 Note(
                     f"gyro_{axis}: the output bends by {1e6 * of.nonlinearity[0]:.3g} ppm of the largest rate, beyond "
@@ -348,7 +347,7 @@ def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], aske
                 f"kink at 0 that no power of the rate compensates: at most {1e6 * of.by_polynomial:.3g} ppm of the "
                 "largest rate are left"
             )
-        if of.loop is not None and of.loop < _CHANCE and of.hysteresis is not None:
+        if of.loop is not None and of.loop < HYSTERESIS.level and of.hysteresis is not None:
             found.append(
                 f"gyro_{axis}: rising and falling rates differ by {1e6 * of.hysteresis[0]:+.3g} ppm of the largest "
                 "rate (hysteresis), which no calibration removes"
@@ -358,7 +357,7 @@ def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], aske
 
 def _of_scatter(problem: RateProblem, solution: RateSolution) -> list[str]:
     found: list[str] = []
-    if chi_square_probability(solution.chi_square, solution.freedom) < _CHANCE:
+    if chi_square_probability(solution.chi_square, solution.freedom) < DWELLS_SCATTER.level:
         ratio = solution.chi_square / max(solution.freedom, 1)
         found.append(
             Note(

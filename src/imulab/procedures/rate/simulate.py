@@ -27,7 +27,7 @@ from imulab.writers import write_csv
 
 _ACCELERATION = np.radians(200.0)  # rad/s^2, of the table
 _LOWEST, _HIGHEST, _SHORTEST = 0.05, 2.0, 20.0  # Hz and s, of a sweep
-_FINER = 8
+_FINER = 8  # points between samples at which the lag is integrated
 _SCALE, _TILT, _ZERO = 5e-3, 3e-3, np.radians(0.3)
 
 

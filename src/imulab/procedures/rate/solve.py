@@ -29,6 +29,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.decisions import (
+    DWELLS_SCATTER,
+    HYSTERESIS_SCATTERS,
+    RATE_POWER,
+    RATES_SCATTER_AS_NOISE,
+    RUNS_SCATTER,
+    SLOPES_KINK,
+)
 from imulab.estimation.distributions import normal_cdf, t_cdf
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor, f_test
 from imulab.gravity import EARTH
@@ -43,10 +51,9 @@ from imulab.units import STANDARD_GRAVITY, parse_unit
 # All dwells of a test to bias, scale factor, misalignment and nonlinearity, by generalised least squares.
 
 
-_CHANCE = 0.01
-_HALVINGS = 60
-_EXACT = 1e-10
-_MOST_POWERS = 5
+_HALVINGS = 60  # of a bracket, which ends before at 0.1 %
+EXACT = 1e-10  # of the largest reading: noise that data without noise are given
+_MOST_POWERS = 5  # of the rate that scatter is judged beside
 
 
 @dataclass(frozen=True)
@@ -170,7 +177,7 @@ def solve(problem: RateProblem, orders: Sequence[int]) -> RateSolution:
     ]
     gains = [found[: len(problem.faces)] for found in slopes]
     blocks = _shared_blocks(problem, gains)
-    variance = problem.variance + (_EXACT * np.abs(problem.mean).max()) ** 2
+    variance = problem.variance + (EXACT * np.abs(problem.mean).max()) ** 2
     scatter, chi_square, freedom = np.zeros(count), 0.0, 0
     for i in range(count):
         columns = design(problem, i, most)
@@ -230,7 +237,7 @@ def _shared_blocks(problem: RateProblem, gains: list[Array]) -> dict[tuple[int, 
 
 
 def _weighted(columns: Array, values: Array, variance: Array) -> Array:
-    weight = 1 / np.sqrt(variance + (_EXACT * np.abs(values).max()) ** 2 + 1e-300)
+    weight = 1 / np.sqrt(variance + (EXACT * np.abs(values).max()) ** 2 + 1e-300)
     size = np.abs(columns).max(axis=0)
     found = np.linalg.lstsq(columns / size * weight[:, None], values * weight, rcond=None)[0]
     return np.asarray(found / size)
@@ -253,7 +260,7 @@ def _scatter(columns: Array, values: Array, base: Array) -> tuple[float, float]:
     """Return the standard deviation to add to each dwell so that chi-square is as expected, and chi-square before."""
     freedom = len(columns) - columns.shape[1]
     chi_square = _general(columns, values, base)[2]
-    if freedom < 1 or chi_square_probability(chi_square, freedom) > _CHANCE:
+    if freedom < 1 or chi_square_probability(chi_square, freedom) > DWELLS_SCATTER.level:
         return 0.0, chi_square
     high = float(np.diag(base).mean()) * chi_square
     added = _root(lambda x: _general(columns, values, base + x * np.eye(len(base)))[2] - freedom, high)
@@ -302,7 +309,7 @@ def _cycles(problem: RateProblem, order: int, variance: Array, gains: list[Array
         return total
 
     before = chi_square(0.0)
-    if chi_square_probability(before, freedom) > _CHANCE:
+    if chi_square_probability(before, freedom) > RUNS_SCATTER.level:
         return 0.0, None
     high = max(float(group[:, 1].max()) for group in groups) * before
     return float(np.sqrt(_root(lambda x: chi_square(x) - freedom, high))), freedom
@@ -321,9 +328,7 @@ def _diagonal(blocks: list[Array]) -> Array:
 # Which powers of the rate a gyroscope's output supports: by F-test, and by each rate predicted from the others.
 
 
-HIGHEST = 5
-_AS_NOISE = 0.2
-"""Probability beyond which what is left of the rates is their noise, which then is known better than by them."""
+HIGHEST = 5  # power of the rate, as in the C core
 
 
 def choose_orders(problem: RateProblem) -> tuple[int, ...]:
@@ -349,7 +354,7 @@ def _order_of(problem: RateProblem, gyro: int) -> int:
     slope = float(np.ptp(values) / max(np.ptp(problem.rate[own]), 1e-300))
     stated = problem.rate_uncertainty[own] * slope
     of_rate = np.outer(stated, stated) * (key[:, None] == key)
-    noise = problem.variance[own, gyro] + (_EXACT * np.abs(values).max()) ** 2
+    noise = problem.variance[own, gyro] + (EXACT * np.abs(values).max()) ** 2
     lower = np.linalg.cholesky(np.diag(noise) + of_rate)
     visits = (key[:, None] == np.arange(count)).astype(np.float64)
 
@@ -384,19 +389,19 @@ def _order_of(problem: RateProblem, gyro: int) -> int:
 
 def _significant(costs: Mapping[int, float], below: int, order: int, count: int) -> bool:
     by_noise = chi_square_probability(costs[below] - costs[order], order - below)
-    if chi_square_probability(costs[order], count - order - 1) > _AS_NOISE:
-        return by_noise < _CHANCE
-    return max(by_noise, f_test(costs[below], below + 1, costs[order], order + 1, count)) < _CHANCE
+    if chi_square_probability(costs[order], count - order - 1) > RATES_SCATTER_AS_NOISE.level:
+        return by_noise < RATE_POWER.level
+    return max(by_noise, f_test(costs[below], below + 1, costs[order], order + 1, count)) < RATE_POWER.level
 
 
 # What a straight line leaves of a gyroscope's output over the rate: nonlinearity, asymmetry and hysteresis.
 
 
-_ONE_SIDED = 1.645
-_SMALL = 1e-3
+_ONE_SIDED = 1.645  # standard uncertainties: 95 % of normal values lie below
+_SMALL = 1e-3  # of the largest rate: if smaller ones all show, the threshold is below them
 _BY_PARTS = 15
 """Degrees of freedom of what the parts of a sweep say of its delay: half of them, since frequencies differ."""
-_RATES, _POWERS, _SURE = 7, 5, 3.29
+_RATES, _POWERS = 7, 5
 """Different rates that tell a kink from powers of the rate, such powers, and standard uncertainties of 1 in 1000."""
 
 
@@ -456,7 +461,7 @@ def linearity_of(problem: RateProblem, gyro: int, scale: float, order: int) -> L
     own = problem.axis == problem.gyros[gyro]
     rate, runs = problem.rate[own], problem.run[own]
     values = problem.mean[own, gyro] / scale
-    variance = problem.variance[own, gyro] / scale**2 + (_EXACT * np.abs(rate).max()) ** 2
+    variance = problem.variance[own, gyro] / scale**2 + (EXACT * np.abs(rate).max()) ** 2
     key = np.unique(np.round(problem.table[own] * problem.sign[own], 6), return_inverse=True)[1]
     of_rate = problem.rate_uncertainty[own] ** 2
     zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
@@ -547,7 +552,7 @@ def _kink(rate: Array, values: Array, variance: Array, zeros: Array, count: int)
     left, found = _fitted(columns, values, variance)
     freedom = len(values) - np.linalg.matrix_rank(columns)
     beyond = max(float(np.sum(left**2 / variance)) / freedom, 1.0) if freedom > 0 else 1.0
-    return 2 * float(found[0, 0]) if abs(found[0, 0]) > _SURE * np.sqrt(found[0, 1] * beyond) else None
+    return 2 * float(found[0, 0]) if abs(found[0, 0]) > SLOPES_KINK.limit * np.sqrt(found[0, 1] * beyond) else None
 
 
 def _beyond_noise(
@@ -558,7 +563,11 @@ def _beyond_noise(
     columns = np.column_stack([cells[:, None] == np.arange(cells.max() + 1), zeros]).astype(np.float64)
     freedom = len(values) - int(np.linalg.matrix_rank(columns))
     chi_square = float(np.sum(_fitted(columns, values, variance)[0] ** 2 / variance))
-    return (chi_square, freedom) if freedom and chi_square_probability(chi_square, freedom) < _CHANCE else None
+    return (
+        (chi_square, freedom)
+        if freedom and chi_square_probability(chi_square, freedom) < HYSTERESIS_SCATTERS.level
+        else None
+    )
 
 
 def _hysteresis(
@@ -600,7 +609,7 @@ def _hysteresis(
     t = float(abs(slope) / np.sqrt(1 / spread + table[:, 3].max()))
     found = [2 * float(t_cdf(-t, _BY_PARTS) if table[:, 3].any() else normal_cdf(-t))]
     freedom, wide = len(rows) - 1, [1.0]
-    if chi_square_probability(chi_square, freedom) < _CHANCE:  # the loop has another shape, or dwells scatter more
+    if chi_square_probability(chi_square, freedom) < HYSTERESIS_SCATTERS.level:  # another shape, or dwells scatter more
         wide.append(chi_square / freedom)
         found.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), freedom)))
     if beyond:
@@ -708,7 +717,7 @@ def _explained(values: Array, time: Array) -> float:
 # From the coefficients of a rate test to bias, scale factor, misalignment, powers of the rate and g-sensitivity.
 
 
-_APART = 0.3
+_APART = 0.3  # singular value of ones and gravity on the faces: below it bias and g-sensitivity are not told apart
 
 
 @dataclass(frozen=True)

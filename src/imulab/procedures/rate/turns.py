@@ -22,6 +22,7 @@ import numpy as np
 
 from imulab.display import UNJUDGED, Bad, Note
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
+from imulab.estimation.decisions import SCALE_OFF_UNIT, TURNS_ACROSS_SCATTER, TURNS_SCATTER
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
 from imulab.options import measure, text
 from imulab.procedures.rate import AXES, FENCE, gyros_of, part_of_one
@@ -63,13 +64,13 @@ from imulab.units import from_si, parse_unit, to_si
 # What spoils a turn by hand unseen: stamps that come in bursts, gaps in the turning, and an output at its end.
 
 
-_QUICK, _MANY = 0.25, 0.25
+_QUICK, _SHARE_IN_BURSTS = 0.25, 0.25  # of the mean step; share of such steps from which stamps come in bursts
 _KEEPS = 0.1  # s
-_GAP = 3.0
+_GAP = 3.0  # usual steps: within a longer one motion may be hidden
 _SHAKE = (2 * np.pi * 2.0) ** 2 / 12
 """Of a rate that a hand varies at 2 Hz, what a straight line across a gap leaves: times the rate and the gap cubed."""
-_STILL_SAMPLES = 10
-_QUIET = 0.5
+_STILL_SAMPLES = 10  # samples in a row that repeat exactly: a sensor that hangs
+_QUIET = 0.5  # share of repeats from which repeating is usual for the output
 
 
 def even_stamps(time: Array, name: str) -> tuple[Array, list[str]]:
@@ -80,7 +81,7 @@ def even_stamps(time: Array, name: str) -> tuple[Array, list[str]]:
     """
     step = np.diff(time)
     mean = float(step.mean())
-    if float((step < _QUICK * mean).mean()) < _MANY:
+    if float((step < _QUICK * mean).mean()) < _SHARE_IN_BURSTS:
         return time, []
     count = np.arange(len(time), dtype=np.float64)
     even = np.polynomial.Polynomial.fit(count, time, 1)(count)
@@ -130,7 +131,9 @@ def check_motions(time: Array, rate: Array, rests: list[tuple[int, int]], fence:
 
 
 _BLOCK = 0.1  # s
-_LEAST, _TRIM = 6, 1
+_LEAST, _TRIM = 6, 1  # blocks of a rest; blocks that are cut off at both its ends
+# Times the quiet scatter; of the largest rate; sigma of a block's mean; and what lies off the middle of a rest by so
+# many medians, over up to 10 blocks, is no rest
 _STILL, _OF_LARGEST, _NOISE, _OUT, _OUT_WIDE, _WIDEST = 5.0, 0.02, 4.0, 3.0, 2.0, 10
 _TURNED = np.radians(15)
 
@@ -332,12 +335,11 @@ def carried(quaternion: Array, direction: Array) -> Array:
 # Misalignment from whole turns by hand, whose axis in the body accelerometers tell.
 
 
-_TURN = 2 * np.pi
+_TURN = 2 * np.pi  # rad
 _SMOOTH = 0.05  # s
-_BATCHES = 8
+_BATCHES = 8  # parts of a turn by whose scatter angles across it are known
 _FACE = np.cos(np.radians(30))
-_CHANCE = 0.01
-_EXACT = 1e-12
+_EXACT = 1e-12  # of a turn: noise that data without noise are given
 
 
 def check_accel(accel: Calibration, recording: Recording) -> None:
@@ -467,7 +469,9 @@ def _scattered(left: Array, count: Array, noise: Array) -> Array:
     if not freedom:
         return np.asarray(np.sqrt(variance))
     chi_square = np.sum((left / noise) ** 2, axis=0)
-    beyond = np.array([chi_square_probability(float(value), freedom) < _CHANCE for value in chi_square])
+    beyond = np.array(
+        [chi_square_probability(float(value), freedom) < TURNS_ACROSS_SCATTER.level for value in chi_square]
+    )
     return np.asarray(np.sqrt(variance * np.where(beyond, chi_square / freedom, 1.0)))
 
 
@@ -534,7 +538,6 @@ def _extended(record: Calibration, matrix: Array, covariance: Array) -> Calibrat
 # The calibration record of whole turns, and what its report shows.
 
 
-_FAR = 0.1
 _LOOKS = {"x": ("circle", INK), "y": ("diamond", GOOD), "z": ("square", BAD)}
 
 
@@ -595,7 +598,7 @@ def turns_record(
 def _findings(found: Mapping[str, AxisTurns], clock: float | None) -> list[str]:
     said: list[str] = []
     for a, of in found.items():
-        if abs(of.scale - 1) > _FAR:
+        if abs(of.scale - 1) > SCALE_OFF_UNIT:
             said.append(Bad(f"gyro_{a}: the scale factor is off by {100 * (of.scale - 1):+.3g} %: is the unit right?"))
         if of.freedom is not None:
             said.append(Note(f"gyro_{a}: the turns scatter more than the fence; its interval is Student's t of them"))
@@ -933,7 +936,7 @@ def _scale(motions: Motions, own: list[int], axis: int, angle: Array, count: Arr
     scale = variance * float(weight @ angle)
     left = angle - scale * turned
     chi_square, freedom = float(left @ np.linalg.solve(covariance, left)), len(own) - 1
-    beyond = freedom > 0 and chi_square_probability(chi_square, freedom) < _CHANCE
+    beyond = freedom > 0 and chi_square_probability(chi_square, freedom) < TURNS_SCATTER.level
     wide = chi_square / freedom if beyond else 1.0
     return AxisTurns(
         count=count,

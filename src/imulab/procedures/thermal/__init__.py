@@ -12,14 +12,14 @@ from imulab.errors import OptionError
 LAWS = ("cubic", "rough")
 DEGREES = (3, 2, 1)
 """Of bias, scale factor and misalignment."""
-HIGHEST = 5
+HIGHEST = 5  # degree of a law
 TEMPERATURES = "-20,0,25,45,60"
 APART = 5.0
 """K: temperatures that lie closer count as one."""
-LEAST_SPAN = 10.0
+LEAST_SPAN = 10.0  # K between coldest and hottest: less is no test over temperature
 LEAST_KNOTS = 5
 """Temperatures from which a spline of the bias is tried."""
-SETTLE = 300.0
+SETTLE = 300.0  # s of a soak that settles a small unit in a chamber
 TURNED, FOLLOWED = 9, 3
 """Attitudes of a recording whose turns tell scale factors of gyroscopes; temperatures at which these follow it."""
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from imulab.columns import triad
 from imulab.display import Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError
+from imulab.estimation.decisions import THERMAL_CHECK
 from imulab.gravity import EarthRate, Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
 from imulab.options import FURTHER_TRIADS, measure, text
 from imulab.procedures.checking import RecordCheck, columns_as_rows, probability_fact, probability_text
@@ -164,14 +165,14 @@ def _scatter(record: Calibration, given: float | str | None) -> tuple[float | No
 # The result of a test of a record over temperature: verdict, and each residual beside its uncertainty.
 
 
-FALSE_ALARM = 0.05
-_BEYOND_RANGE = 2.0
+_BEYOND_RANGE = 2.0  # standard uncertainties: what is farther off is drawn as such
 _FAILED = (
     "|f| differs from g between attitudes or temperatures by more than the record explains",
     "an offset that whole recordings have in common is larger than power cycles explain",
     "the gyroscopes at rest differ between attitudes or temperatures by more than the record explains",
     "an offset of the gyroscopes that whole recordings have in common is larger than power cycles explain",
 )
+_BEYOND = 1.0  # K outside the record's range: its laws say nothing there
 
 
 @dataclass(frozen=True, repr=False)
@@ -230,7 +231,7 @@ class ThermalCheck(RecordCheck):
     def passed(self) -> bool:
         """Whether the tests find no contradiction at 5 %, and every hold is within the limit, if there is one."""
         within = self.limit is None or bool((np.abs(self.residuals) <= self.limit).all())
-        return within and self.probability >= FALSE_ALARM
+        return within and self.probability >= THERMAL_CHECK.level
 
     @property
     def worst(self) -> int:
@@ -241,7 +242,7 @@ class ThermalCheck(RecordCheck):
         """Return what the test says, in words."""
         if self.passed:
             return "the recordings agree with the record"
-        if self.probability >= FALSE_ALARM:
+        if self.probability >= THERMAL_CHECK.level:
             return "no change of the unit is shown, but a hold is beyond the limit"
         gyro = self.gyro
         tests = (self.within, self.between, *((gyro.within, gyro.between) if gyro else ()))

@@ -29,6 +29,13 @@ from numpy.typing import NDArray
 
 from imulab.display import Note
 from imulab.errors import ObservabilityError
+from imulab.estimation.decisions import (
+    LAG_OR_LOOP,
+    RECORDING_DISAGREEMENT,
+    THERMAL_DEGREES_TOO_LOW,
+    THERMAL_LAW_BENDS,
+    THERMAL_POWER,
+)
 from imulab.estimation.distributions import chi_square_tail, f_tail
 from imulab.estimation.least_squares import Observability, chi_square_probability, observability
 from imulab.procedures.thermal import APART, DEGREES, LEAST_KNOTS, STRETCHES, TURNS
@@ -52,11 +59,10 @@ from imulab.recording import Array
 
 
 Degrees = tuple[int, int, int]
-_INSIGNIFICANT = 0.01
-_NO_WORSE = 1.0
+_NO_WORSE = 1.0  # times the error at temperatures left out that a lower degree may have
 _HANDICAP = 1.1
 """Error at temperatures left out, over that of polynomials, up to which a spline is taken."""
-_TOLD = 2000.0
+_TOLD = 2000.0  # condition number up to which a temperature can be left out
 _TUMBLE = 9
 """Attitudes that tell the parameters at one temperature."""
 
@@ -273,7 +279,7 @@ def _missed(
     if not added:
         return None
     probability = wald(higher, np.eye(higher.laws.size)[added])
-    return (higher.laws.degrees, probability) if probability < _INSIGNIFICANT else None
+    return (higher.laws.degrees, probability) if probability < THERMAL_DEGREES_TOO_LOW.level else None
 
 
 def bounded(
@@ -349,7 +355,7 @@ def bends(solution: ThermalSolution, tau: float | None) -> bool:
     weights = np.zeros((3 * (count - 4), 3 * count))
     for axis, part in enumerate(laws.parts[:3]):
         weights[axis * (count - 4) : (axis + 1) * (count - 4), part] = beside
-    return wald(solution, weights) < _INSIGNIFICANT
+    return wald(solution, weights) < THERMAL_LAW_BENDS.level
 
 
 def predicts(bent: Sequence[LeftOutCluster], straight: Sequence[LeftOutCluster]) -> bool:
@@ -421,7 +427,7 @@ def may_be_taken(step: DegreesStep, before: float | None) -> bool:
     `before` is their rms without the step: an F-test alone may lack all power.
     """
     told = step.left_out is not None and before is not None and step.left_out <= _NO_WORSE * before
-    return told and (step.probability or 0) > _INSIGNIFICANT
+    return told and (step.probability or 0) > THERMAL_POWER.level
 
 
 def _at(found: Sequence[LeftOutCluster], problem: ThermalProblem, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
@@ -438,7 +444,6 @@ def spoken_degrees(degrees: Degrees, knots: int = 0) -> str:
 # Whether biases lag behind the thermometer, or differ between warming and cooling.
 
 
-_SIGNIFICANT = 0.01
 _STILL = 0.05
 """Share of the fastest change in a recording below which its sign is that of the thermometer's noise."""
 _SHARED = 0.5
@@ -465,7 +470,7 @@ class LagAndLoops:
     @property
     def free(self) -> tuple[int, ...]:
         """What is significant, as `ThermalProblem.free`."""
-        lag, loop = (probability < _SIGNIFICANT for probability in self.probability)
+        lag, loop = (probability < LAG_OR_LOOP.level for probability in self.probability)
         return (0,) * lag + (1, 2, 3) * loop
 
 
@@ -621,7 +626,7 @@ def drift_effects(drift: LagAndLoops, scale: float, unit: str = "m/s^2") -> dict
 _USUAL_SLOPES = {1: (STRETCHES, f"{1e6 * STRETCHES:.0f} ppm/K"), 2: (TURNS, f"{1e6 * TURNS:.0f} urad/K")}
 _LAG = 5.0
 """s, that a sensor on the thermometer's own board may lag behind it."""
-_PLACES = 33
+_PLACES = 33  # temperatures at which the largest shift of the biases is sought
 _WORTH = 0.5
 """Of the biases' uncertainty: what adds an eighth to it is said."""
 
@@ -675,7 +680,7 @@ def bias_shift_from_unobserved(
 # Residuals under a record parted in two: what a recording has in common, as power cycles have, and the rest.
 
 
-_SEEN = 1e-6
+_SEEN = 1e-6  # of the largest singular value: what is below is rounding
 
 
 def parted(
@@ -734,14 +739,12 @@ _STRETCHES = 0.005
 """What scale factors hardly move by."""
 _SCATTERS, _NOISE = 0.25e-3, 4.0
 """Scatter of |f| within recordings that is asked about: in g, and in units of what the holds' own noise explains."""
-_ENOUGH = 5
+_FEWEST_TO_COMPARE = 5
 """Temperatures that show the bends of a law, and recordings of which one can be told to stand apart."""
 _APART = 0.4
 """Share of their disagreement that the others keep where one recording stands apart."""
 _ATTITUDES = 6
 """Of a recording whose own scale factors can be told."""
-_CHANCE = 0.005
-"""How often chance lets a recording lie off the others so, in biases or in scale factors."""
 _OFF_BIAS, _OFF_SCALE = 0.5e-3, 3e-4
 """Less than this is not asked about, in g and in 1."""
 _USUAL = 1e-4
@@ -755,7 +758,7 @@ def disagreements(holds: Holds, problem: ThermalProblem, solution: ThermalSoluti
     bias, scale = solution.scatter.tau.tolist()
     if not solution.scatter.rank:  # nobody measured it: it was stated
         bias = 0.0
-    many = int(clusters_of(problem.temperature).max(initial=0)) + 1 >= _ENOUGH
+    many = int(clusters_of(problem.temperature).max(initial=0)) + 1 >= _FEWEST_TO_COMPARE
     differ = [
         text
         for size, text in (
@@ -792,7 +795,7 @@ def disagreements(holds: Holds, problem: ThermalProblem, solution: ThermalSoluti
 def _apart(holds: Holds, problem: ThermalProblem, laws: Laws) -> str:
     """Return which recording the others agree without, as a sentence; nothing where that is none or several."""
     numbers = np.unique(problem.recording)
-    if len(numbers) < _ENOUGH:
+    if len(numbers) < _FEWEST_TO_COMPARE:
         return ""
     left = [_disagreement(_without(problem, problem.recording == number), laws) for number in numbers]
     order = np.argsort(left)
@@ -811,7 +814,7 @@ def _off(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> li
     """
     rows = solution.rows
     numbers, attitudes = np.unique(problem.recording, return_counts=True)
-    if len(numbers) < _ENOUGH:
+    if len(numbers) < _FEWEST_TO_COMPARE:
         return []
     whose = np.where(rows.owner >= 0, problem.recording[rows.owner], -1)
     asked = []
@@ -836,7 +839,7 @@ def _off(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> li
                 continue
             size = float(np.sqrt(np.sum((force / s) ** 2) / 3))
             chance = len(numbers) * tail(float(np.mean(force**2)), len(s), told)
-            if chance < _CHANCE and size > least:
+            if chance < RECORDING_DISAGREEMENT.level and size > least:
                 by = f"{1e6 * size:.0f} ppm in scale factors" if kind else f"{1e3 * size:.2g} mg in biases"
                 asked.append((chance, f"{holds.recordings[number].name}: lies off the other recordings by {by}"))
     return [

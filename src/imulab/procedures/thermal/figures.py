@@ -237,8 +237,8 @@ def _hourly(rate: float) -> float:
 # What a thermal record shows: each parameter over temperature with its band, what is left, and how it predicts.
 
 
-_POINTS = 81
-_MANY, _PARTS, _FEWEST = 60, 9, 3
+_POINTS = 81  # of a curve
+_POINTS_DRAWN_ALONE, _PARTS, _FEWEST = 60, 9, 3
 """Holds whose bars hide one another; the parts that they are averaged in, an odd number, since a soak in the middle is
 not to be parted; and the fewest of one."""
 _READ = (
@@ -246,7 +246,7 @@ _READ = (
     ("scale factor", 1e6, "ppm"),
     ("misalignment", 1e3, "mrad"),
 )
-_MICRO_G = 1e6 / STANDARD_GRAVITY
+_MICRO_G = 1e6 / STANDARD_GRAVITY  # to µg
 
 
 def exhibits(record: Calibration) -> Exhibits:
@@ -391,7 +391,7 @@ def _residuals(found: ThermalRecord) -> Figure:
     held = found.data.holds
     temperature, residual, u = (np.array(each) for each in (held.temperature, held.residual, held.standard_uncertainty))
     rate = moved(np.array(held.recording), temperature, np.array(held.rate))
-    many, edges = len(residual) > _MANY, np.linspace(temperature.min(), temperature.max(), _PARTS + 1)
+    many, edges = len(residual) > _POINTS_DRAWN_ALONE, np.linspace(temperature.min(), temperature.max(), _PARTS + 1)
     traces = []
     for label, which, symbol, colour in (
         ("warming", rate > 0, "triangle-up", BAD),

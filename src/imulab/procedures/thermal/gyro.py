@@ -32,6 +32,7 @@ from imulab.columns import triad
 from imulab.device.unit import DeviceUnit
 from imulab.display import Bad, Note
 from imulab.errors import DataError, ObservabilityError, SegmentError, UnitError
+from imulab.estimation.decisions import BIAS_FOLLOWS_GRAVITY, SCALE_LAW_SCATTERS, SCALE_OFF_UNIT, TURNED_IN_HOLD
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
 from imulab.gravity import EARTH, EarthRate
@@ -71,7 +72,7 @@ from imulab.procedures.thermal.solve import (
     whitener,
 )
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.gyro.rest import beyond_range
+from imulab.procedures.tumble.gyro.rest import QUIET_SHARE, STILL_SIGMAS, beyond_range
 from imulab.procedures.tumble.gyro.solve import Case, Solved, solve_turns, turn_covariance
 from imulab.procedures.tumble.gyro.turns import by_directions, model, shared_covariance
 from imulab.recording import Array, Recording, check_finite
@@ -112,9 +113,7 @@ def earth_at_rest(force: Array, attitude: NDArray[np.int64], earth: EarthRate | 
 
 
 _COLUMNS = triad("gyro")
-_STILL = 5.0
-_QUIET = 0.75
-_FEWEST = 12
+_FEWEST = 12  # still samples that have a mean and a scatter
 _LARGEST = np.radians(60.0)
 """No gyroscope that anyone calibrates has a larger bias, rad/s."""
 
@@ -274,8 +273,8 @@ def _still_cuts(
     found: list[Cut | None] = []
     notes = []
     for index, piece, m in zip(own.tolist(), pieces, median, strict=True):
-        still = (np.abs(output[piece] - m) <= _STILL * sigma).all(axis=1)
-        if still.sum() < max(_QUIET * len(still), _FEWEST):
+        still = (np.abs(output[piece] - m) <= STILL_SIGMAS * sigma).all(axis=1)
+        if still.sum() < max(QUIET_SHARE * len(still), _FEWEST):
             notes.append(f"gyro: {holds.label(index)} left out: the gyroscopes turn, which accelerometers do not see")
             found.append(None)
             continue
@@ -287,13 +286,10 @@ def _still_cuts(
 # The gyroscopes over temperature: the bias from all holds at rest, linear, with the accelerometers' nuisances.
 
 
-_PASSES = 4
-_SIGNIFICANT = 0.01
-_FAR = 8.0
-"""Standard deviations beyond which a hold differs from the others of its recording by a turn."""
+_PASSES = 4  # with weights that bound the influence of a hold
 _TELL = 4
 """Holds of a recording that tell which of them differs."""
-_RANK = 1e-7
+_RANK = 1e-7  # singular value that rounding leaves of columns that are alike
 
 
 @dataclass(frozen=True)
@@ -446,7 +442,7 @@ def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> _Solved:
     probability = None
     if whole is not None:
         probability = wald(whole, np.eye(len(whole.coefficients))[-9:])
-        if probability < _SIGNIFICANT:
+        if probability < BIAS_FOLLOWS_GRAVITY.level:
             return _Solved(whole, True, probability)
     plain = solve(held, laws, tau, sensitivity=False)
     if plain is None:
@@ -565,7 +561,9 @@ def without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[n
         weight = 1 / (1 + (far / 2) ** 2)
     many = np.bincount(held.recording)[held.recording] >= _TELL
     own = np.sqrt(np.einsum("nii->ni", held.covariance)).max(axis=1)
-    out = (far > _FAR) & many & (np.abs(left).max(axis=1) > np.maximum(_FAR * own, EARTH))
+    out = (
+        (far > TURNED_IN_HOLD.limit) & many & (np.abs(left).max(axis=1) > np.maximum(TURNED_IN_HOLD.limit * own, EARTH))
+    )
     return held.part(~out), held.index[out]
 
 
@@ -583,7 +581,6 @@ def notes_on_turns(holds: Holds, aside: NDArray[np.int64]) -> list[str]:
 
 CRYSTAL = 50e-6
 """Standard uncertainty of the rate of the clock that all recordings are timed by."""
-_WORST = 0.1
 _LARGE_MISS, _ASKEW = 2.0, 0.2  # deg, rad
 
 
@@ -778,7 +775,7 @@ def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> Sc
     left = values - rows @ coefficients
     square = float(left @ weight @ left)
     freedom = 9 * len(found) - len(coefficients)
-    if freedom and chi_square_probability(square, freedom) < _SIGNIFICANT:
+    if freedom and chi_square_probability(square, freedom) < SCALE_LAW_SCATTERS.level:
         notes.append(
             f"gyro: the scale factors of {len(found)} recordings differ by more than their uncertainties explain "
             f"(chi-square {square:.0f} of {freedom}), which are widened: turn at more temperatures, and further"
@@ -789,7 +786,7 @@ def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> Sc
     if not degree:
         notes += _constant(float(temperature.mean()), over, float(np.sqrt(np.diag(matrix)[:3].max())))
     middle = coefficients[: size : degree + 1] - 1
-    if np.abs(middle).max() > _WORST:
+    if np.abs(middle).max() > SCALE_OFF_UNIT:
         off = " ".join(f"{100 * value:+.3g}" for value in middle)
         notes.append(
             Bad(f"gyro: the scale factors are off by {off} % (x y z): is the unit, or the sample rate, wrong?")

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from imulab.columns import triad
 from imulab.display import Note
 from imulab.errors import DataError, OptionError
+from imulab.estimation.decisions import DIRECTION_WANDERS
 from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
 from imulab.procedures.thermal import LEAST_SPAN, SETTLE
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes, find_attitudes
@@ -34,16 +35,14 @@ from imulab.units import parse_unit
 # Recordings at rest while the temperature drifts: what knocks leave of them, and how far their direction wanders.
 
 
-_FEW, _TURNED = 0.005, 0.1
+_SHARE_IN_TAILS, _TURNED = 0.005, 0.1
 """A recording whose outputs but for a few move by less than this share of g is one at rest."""
 _BLOCK, _SHAKEN, _OFF, _BESIDE = 0.5, 4.0, 8.0, 5
 """A knock: blocks (s) that scatter with so many times the usual variance, or lie so many standard deviations off the
 median of those beside, so many on each side."""
 _LEAST_BLOCK, _MOSTLY = 8, 0.5
 """Samples of a block, and share of the time that knocks leave of a recording at rest."""
-_SMOOTH = 8
-_SURE = 5.0
-"""Twice the logarithm of a likelihood ratio, which chance exceeds in 1.3 % of ramps."""
+_SMOOTH = 8  # degree of the polynomial in temperature that a direction at rest may follow
 _RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e4, 81)])
 
 
@@ -53,7 +52,7 @@ def stretches_at_rest(outputs: Array, time: Array) -> NDArray[np.int64] | None:
     Knocks lie between them; a change of its direction does not end one.
     """
     still = _between_knocks(outputs, time)
-    ends = np.quantile(outputs[still], [_FEW, 1 - _FEW], axis=0)
+    ends = np.quantile(outputs[still], [_SHARE_IN_TAILS, 1 - _SHARE_IN_TAILS], axis=0)
     if np.ptp(ends, axis=0).max() > _TURNED * np.linalg.norm(ends.mean(axis=0)):
         return None
     return np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
@@ -106,7 +105,7 @@ def wandering(direction: Array, temperature: Array, time: Array) -> float:
     level = (squares / relative).mean(axis=1) / 2
     likelihood = -2 * (len(sizes) * np.log(level) + np.log(relative).sum(axis=1))
     best = int(np.argmax(likelihood))
-    if likelihood[best] - likelihood[0] < _SURE:
+    if likelihood[best] - likelihood[0] < DIRECTION_WANDERS.limit:
         return 0.0
     return float(level[best] * _RATIOS[best] / unit)
 
@@ -115,7 +114,7 @@ def wandering(direction: Array, temperature: Array, time: Array) -> float:
 
 
 _CUT = 1.0  # K
-_BATCHES = 10
+_BATCHES = 10  # parts of a hold by whose scatter its mean is known
 _FEWEST = 20
 """Samples of a cut: what is shorter joins the one before."""
 _SIDES = {"warming": 1.0, "cooling": -1.0}

@@ -47,13 +47,13 @@ from imulab.units import STANDARD_GRAVITY, from_si
 # Which temperatures and attitudes show the laws best: the search behind a plan.
 
 
-_PLACES = 41
-_SWEEPS = 3
+_PLACES = 41  # temperatures over which the uncertainty of a plan is averaged
+_SWEEPS = 3  # of exchanges
 _CLOSEST = np.cos(np.radians(3.0))
 """Two attitudes of a soak closer than this are one attitude."""
 _RIDGE = 1e-6
 """Information that keeps the matrix regular while the attitudes of a start determine too little."""
-_UNDETERMINED = 1e4
+_UNDETERMINED = 1e4  # variance of a coefficient, in that of one attitude, that a plan does not determine
 
 
 def nodes(count: int) -> Array:
@@ -341,7 +341,7 @@ def plan_gyroscopes(
 # A plan over temperature as its user has it: what it predicts, its CSV to measure by, its sheet, its figure.
 
 
-_ROWS = 9
+_ROWS = 9  # temperatures of the printed table
 _RATE = "#7a4f9a"
 
 
@@ -585,7 +585,7 @@ _FEWEST, _MOST, _SOAKS = 3, 40, 24
 """Attitudes of a soak; soaks."""
 _SCANNED = 12
 """Attitudes of a soak by which numbers of soaks are compared: more of them change sizes, not the order."""
-_STARTS, _AS_GOOD = 4, 1.02
+_STARTS, _AS_GOOD = 4, 1.02  # of the search; plans within 2 % of the best are as good, and the simplest is taken
 _ROOM = 23.0  # degC, from which the chamber starts
 
 

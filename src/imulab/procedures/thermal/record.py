@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.display import UNJUDGED, Note
+from imulab.estimation.decisions import HOLD_DISAGREEMENT, TEMPERATURE_MISSED
 from imulab.estimation.least_squares import coverage_factor
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.thermal.degrees import (
@@ -65,9 +66,7 @@ from imulab.units import from_si, parse_unit
 # The calibration record of a thermal test: coefficients in SI, and what its figures need.
 
 
-_STANDS_OUT = 5.0
-_MOST_NAMED = 6
-_WORSE = 3.0
+_MOST_NAMED = 6  # holds that warnings name
 _SAME = 1e-9
 """Of two values of gravity that are one."""
 _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every temperature"
@@ -325,7 +324,7 @@ def _findings(
     found += bias_shift_from_unobserved(problem, solution, drift, name)
     if options["degrees"] == "auto":
         found.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
-    far = [each for each in fitted.left_out if each.chi_square > _WORSE**2]
+    far = [each for each in fitted.left_out if each.chi_square > TEMPERATURE_MISSED.limit**2]
     found += [
         f"{each.temperature:.0f} degC, left out, is missed by {1e6 * each.rms:.0f} ug rms, more than its uncertainty "
         "explains: the unit's law has a bend between the temperatures; record one more there"
@@ -337,7 +336,7 @@ def _findings(
     whole, own = (together(rows, solution.excess**2, tau) for tau in (solution.scatter.tau, np.zeros(2)))
     left = own @ np.linalg.solve(whole, rows.residual)
     standard = np.abs(left) / np.sqrt(np.diag(rows.noise) + solution.excess**2)
-    out = np.flatnonzero((standard > _STANDS_OUT) & (rows.owner >= 0))
+    out = np.flatnonzero((standard > HOLD_DISAGREEMENT.limit) & (rows.owner >= 0))
     for index in out[np.argsort(-standard[out], kind="stable")][:_MOST_NAMED].tolist():
         what = "its magnitude" if rows.magnitude[index] else "its direction, although nothing was to move: a knock?"
         found.append(f"{holds.label(int(rows.owner[index]))} stands out by {standard[index]:.0f} u in {what}")
@@ -526,7 +525,7 @@ def _gyro_findings(
         f"gyro: {each.temperature:.0f} degC, left out, is missed by {np.degrees(each.rms):.2g} deg/s rms, more than "
         "its uncertainty explains: the law has a bend between the temperatures; record one more there"
         for each in gyros.left_out
-        if each.chi_square > _WORSE**2
+        if each.chi_square > TEMPERATURE_MISSED.limit**2
     ]
     if scatter.bound:
         left = np.degrees(3600 * scatter.tau[0])

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.decisions import SCALES_SCATTER_BETWEEN_CYCLES
 from imulab.estimation.least_squares import chi_square_probability, plausible_excess
 from imulab.procedures.thermal.model import Laws, forces
 from imulab.recording import Array
@@ -218,8 +219,8 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
 # Least squares of ``|f(M_p, T_p)| = g`` over the holds of all recordings, with what is common to some of them.
 
 
-_PASSES, _STEPS = 4, 12
-_RESTS = 1e-10
+_PASSES, _STEPS = 4, 12  # in which scatter and solution agree; steps of Newton's method in each
+_RESTS = 1e-10  # relative change of the coefficients that ends the steps
 _LOOSE = 0.01
 """What temperature is taken to change, in g, while the fit starts."""
 _SEEN = 1e-7
@@ -394,7 +395,7 @@ def between(rows: Rows, excess: float) -> Scatter:
     second, probability = 0.0, None
     if len(s):
         probability = chi_square_probability(float((force**2).sum()), len(s))
-        if probability < 0.05:
+        if probability < SCALES_SCATTER_BETWEEN_CYCLES.level:
             second = _moments(s, force)
             white = whitener(rows, excess, np.array([0.0, second]))
             residual, laws, bias = white(rows.residual), white(rows.jacobian), white(rows.offsets[0])

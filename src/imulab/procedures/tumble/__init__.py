@@ -14,7 +14,7 @@ from imulab.units import STANDARD_GRAVITY
 # The words that the options of a tumble test take.
 
 
-HIGHEST_ORDER = 5
+HIGHEST_ORDER = 5  # of the polynomial of an output in the specific force
 FROM_DATA = ("auto", "blend")
 ORDERS = ("auto", *map(str, range(HIGHEST_ORDER + 1)), "blend")
 METHODS = ("norm", "linearised")

@@ -198,7 +198,7 @@ class Attitudes:
 # A table of attitudes: a recording without time, each of whose rows is an attitude at rest.
 
 
-_LONG_TABLE = 1000
+_LONG_TABLE = 1000  # rows: more are hardly means of attitudes, but samples whose time is missing
 _NO_TIME = (
     "no time column: each of the {} rows was taken as an attitude at rest; is this a recording with "
     "motion? Then it needs a column time, or a layout with sample_rate"
@@ -259,8 +259,8 @@ def stated_covariance(recording: Recording, names: list[str], unit: str) -> Arra
 # Clipped samples: a flat top where an axis reached the end of its range.
 
 
-_FEWEST_SAMPLES = 5
-_FEWEST_ROWS = 4
+_FEWEST_SAMPLES = 5  # equal samples at an end of the range that show a clipped output
+_FEWEST_ROWS = 4  # attitudes at one extreme reading that show a clipped output
 _USUAL_TIES = 3.0
 """A flat top is held by this many times more samples than values otherwise share (coarse counts share many)."""
 
@@ -467,11 +467,11 @@ def resolutions(recording: Recording, names: list[str], part: int | None = None)
 # A continuous recording to static attitudes.
 
 
-_BLOCK_SECONDS = 0.1
+_BLOCK_SECONDS = 0.1  # s over which the scatter of samples is computed
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap; no window reaches across it."""
-_SLOW = 5.0
-_MUCH_LOST = 0.05
+_SLOW = 5.0  # Hz: of slower samples too few fall into a hold
+_MUCH_LOST = 0.05  # share of the time that gaps may take without a warning
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)
 _DRIFT, _AS_GOOD = 1.0, 1.1
 """K by which the temperature moves where the ellipsoid moves with it, and the share of the least error that then tells
@@ -479,8 +479,8 @@ thresholds apart no more."""
 _SAME_ATTITUDE = 2e-3
 """Pieces of one hold whose means differ by less than this fraction of g (rad) are one attitude: averaging them
 shortens the vector by less than 0.5 ug."""
-_TRACE_POINTS = 2000
-_A_PART = 2000
+_TRACE_POINTS = 2000  # of the drawing of the scatter over time
+_A_PART = 2000  # samples by which the resolution of an output is told
 
 
 @dataclass(frozen=True)
@@ -764,7 +764,7 @@ def _trace(variance: Array, time: Array, blocks: _Blocks, width: int, threshold:
 
 
 TumbleData: TypeAlias = Attitudes | Data
-_SYMMETRIC = 1e-9
+_SYMMETRIC = 1e-9  # relative rounding of a covariance read from decimals
 
 
 def as_attitudes(

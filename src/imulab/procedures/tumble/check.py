@@ -13,6 +13,7 @@ from imulab.columns import triad
 from imulab.device.unit import output_factor
 from imulab.display import Note
 from imulab.errors import OptionError, RecordError
+from imulab.estimation.decisions import ATTITUDES_DISTURBED, TUMBLE_CHECK
 from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import median
@@ -23,7 +24,6 @@ from imulab.procedures.result import Record, as_record
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
-from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED
 from imulab.procedures.tumble.record import Scaling, scaled_parameters
 from imulab.procedures.tumble.schema import attitudes_of, fit_of, model_of
 from imulab.quantities import in_si
@@ -121,7 +121,7 @@ class Check(RecordCheck):
     @property
     def false_alarm(self) -> float:
         """Probability below which a test fails: 5 % shared by those that are made."""
-        return FALSE_ALARM if self.mag is None or self.probability is None else FALSE_ALARM / 2
+        return TUMBLE_CHECK.level if self.mag is None or self.probability is None else TUMBLE_CHECK.level / 2
 
     @property
     def accelerometers_agree(self) -> bool:
@@ -509,7 +509,7 @@ def _excess(record: Calibration, g: float) -> float:
     freedom, reduced = fit.degrees_of_freedom, fit.reduced_chi_square
     if fit.noise != "known" or not reduced or freedom < 1:
         return 0.0
-    if chi_square_probability(reduced * freedom, freedom) > SCATTERED:
+    if chi_square_probability(reduced * freedom, freedom) > ATTITUDES_DISTURBED.level:
         return 0.0
     return (fit.excess.value / g) ** 2
 

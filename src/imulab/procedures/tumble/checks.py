@@ -16,14 +16,14 @@ from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import from_si, parse_unit, to_si
 
-_MANY_ROWS = 200
-_ENOUGH_TO_TELL = 5
-_DEAD_SPAN = 0.02
-_GYRO_SPAN = 0.05
-_PROPORTIONAL = 0.9999
-_FARTHEST = 5.0
-_WORST_RMS = 0.1
-_LEAST_EIGENVALUE = 1e-12
+_MANY_ROWS = 200  # rows of a table of means from which samples may have been taken for attitudes
+_ENOUGH_TO_TELL = 5  # attitudes in which an axis that works has turned
+_DEAD_SPAN = 0.02  # of the largest span of the three axes: an axis that spans less is dead
+_GYRO_SPAN = 0.05  # of the swing within the recording: outputs whose holds differ by less are rates
+_PROPORTIONAL = 0.9999  # correlation of two axes from which one is a copy of the other
+_FARTHEST = 5.0  # times the usual magnitude, or its inverse: such an attitude is no specific force
+_WORST_RMS = 0.1  # g: what a fit may leave; more is no triad of accelerometers at rest
+_LEAST_EIGENVALUE = 1e-12  # of a stated correlation matrix, for rounding
 _SHAKES, _LEAST_SHORTENING = 3.0, 2e-5  # standard uncertainties of |f| in an attitude; of g
 
 

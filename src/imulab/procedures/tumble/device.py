@@ -168,7 +168,7 @@ def golden_magnetometers(table: DeviceTable, rng: np.random.Generator) -> dict[s
 # A tumble record applied: raw triads to specific force and body rate, by the C core.
 
 
-_FAR = 2.0
+_LARGEST_FORCE = 2.0  # g: outputs at rest or in a hand hardly exceed it; more is a wrong unit or another record
 _ACCEL = triad("accel")
 _GYRO = triad("gyro")
 _MAG = triad("mag")
@@ -245,7 +245,7 @@ def beyond_test(record: Calibration, recording: Recording) -> tuple[int, float]:
     factor = conversion_factor(recording.triad_unit("accel"), model.output_unit)
     reading = np.abs(recording.triad("accel") * factor / scale - bias)
     largest = np.where(np.isfinite(reading), reading, 0.0).max(axis=1, initial=0.0)
-    return int(np.count_nonzero(largest > _FAR * STANDARD_GRAVITY)), float(largest.max(initial=0.0))
+    return int(np.count_nonzero(largest > _LARGEST_FORCE * STANDARD_GRAVITY)), float(largest.max(initial=0.0))
 
 
 def beyond_message(record: Calibration, count: int, largest: float) -> str:
@@ -257,7 +257,7 @@ def beyond_message(record: Calibration, count: int, largest: float) -> str:
 # A record at a smaller model: fitted anew to the attitudes that the record holds.
 
 
-_LINEAR = 1
+_LINEAR = 1  # order
 _WEIGHED = 3  # passes until weights and excess agree
 _KEPT = 0.5  # attitudes that count for less than half were set aside by the record's own fit
 

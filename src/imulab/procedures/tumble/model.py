@@ -29,9 +29,9 @@ AXES = ("x", "y", "z")
 MISALIGNMENTS = ("yx", "zx", "zy")
 GROUPS = {"bias": slice(0, 3), "scale_factor": slice(3, 6), "misalignment": slice(6, 9)}
 """What ages, and where it stands among the parameters."""
-_UNUSUAL = 3.0
-_NEXT = [1, 2, 0]
-_CROSS_PASSES = 30
+_UNUSUAL = 3.0  # times the median of own over expected noise: such a hold says nothing of the others
+_NEXT = [1, 2, 0]  # axis after x, y, z
+_CROSS_PASSES = 30  # at most; the error shrinks by 2 |k s| in each
 GAUGE = "x input axis along body x, y input axis in the body xy plane"
 
 

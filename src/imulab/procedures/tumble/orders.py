@@ -39,6 +39,14 @@ from math import comb, lgamma, log
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.decisions import (
+    ATTITUDE_SET_ASIDE,
+    ATTITUDES_FIT_STATED_NOISE,
+    RESIDUALS_FOLLOW_DIRECTION,
+    RESIDUALS_FOLLOW_TIME,
+    TUMBLE_ORDER_ABOVE_TWO,
+    TUMBLE_ORDER_TWO,
+)
 from imulab.estimation.distributions import f_tail, normal_cdf, t_cdf
 from imulab.estimation.least_squares import (
     Fit,
@@ -72,12 +80,9 @@ from imulab.records.triads import CROSS_TERMS
 # Which order of the model the attitudes support.
 
 
-_SIGNIFICANT = 0.05
-_SIGNIFICANT_BEYOND = 0.01
-"""For orders above 2: four tests at 5 % each would find something too often."""
 _BLIND_SPOT = 4.0
 """Predicted standard uncertainty of |f| anywhere on the sphere, over the scatter at order 1, where an order guesses."""
-_DIRECTIONS = 400
+_DIRECTIONS = 400  # over the sphere, 10 deg apart, in which an order's |f| is judged
 _ROUNDING = 1e-30
 """Smallest variance of |f| that is told from rounding, g^2."""
 _NOTHING_KNOWN = 1e12
@@ -176,7 +181,7 @@ def _smaller(squares: Array, best: Array, weights: Array) -> bool:
 
 
 def _significant(costs: Mapping[int, float], chosen: int, order: int, n: int) -> bool:
-    level = _SIGNIFICANT if order <= 2 else _SIGNIFICANT_BEYOND
+    level = (TUMBLE_ORDER_TWO if order <= 2 else TUMBLE_ORDER_ABOVE_TWO).level
     return all(
         f_test(costs[below], parameter_count(below), costs[order], parameter_count(order), n) < level
         for below in {chosen, order - 1}
@@ -233,12 +238,10 @@ def absolute_weights(problem: TumbleProblem, fit: TumbleSolution) -> Array:
 # Residuals that are no scatter: a function of the direction of gravity, or of time.
 
 
-FALSE_ALARM = 0.01
-"""Share of tests without any pattern in which one is named: 1 % for direction, 1 % for time."""
 _FEWEST = 4  # degrees of freedom that must be left beside a pattern
 _TOLD_APART = 0.02  # share of a column that the model must leave of it
 _TINY = 1e-7  # g: patterns below 0.1 µg are rounding
-_MICRO = 1e6
+_MICRO = 1e6  # to µg and ppm
 
 
 @dataclass(frozen=True)
@@ -320,7 +323,7 @@ def direction_findings(problem: TumbleProblem, solution: TumbleSolution, *, orde
         return []
     likeliest = min(patterns, key=lambda name: patterns[name].probability)
     pattern = patterns[likeliest]
-    if pattern.probability * len(patterns) > FALSE_ALARM:
+    if pattern.probability * len(patterns) > RESIDUALS_FOLLOW_DIRECTION.level:
         return []
     unit, terms = "µg/g²", list(CROSS_TERMS)
     if likeliest == "order" and problem.order:
@@ -356,7 +359,7 @@ def time_findings(attitudes: Attitudes, problem: TumbleProblem, solution: Tumble
     span = float(attitudes.stop[-1] - attitudes.start[0])
     time = (middle - middle.mean()) / span
     pattern = find_pattern(-solution.jacobian[0][:, 0:3] * time[:, None], solution)
-    if pattern is None or pattern.size < _TINY or pattern.probability > FALSE_ALARM:
+    if pattern is None or pattern.size < _TINY or pattern.probability > RESIDUALS_FOLLOW_TIME.level:
         return []
     sizes = ", ".join(
         f"{axis} {1e3 * value:+.2g} ± {1e3 * u:.1g} mg"
@@ -377,20 +380,19 @@ def _chance(probability: float) -> str:
 
 Index = NDArray[np.intp]
 
-HIGHEST_TESTED = 3
-_MOST = 3
-_EXHAUSTIVE = 60
-_MOST_OF_MANY = 12
-_SHARE_OF_MANY = 20
+HIGHEST_TESTED = 3  # order for which knocks are looked for: higher ones explain a knock by themselves
+_MOST = 3  # attitudes that are set aside of few
+_EXHAUSTIVE = 60  # attitudes up to which all sets are tried
+_MOST_OF_MANY = 12  # attitudes that are set aside of many, and one in so many at most
+_SHARE_OF_MANY = 20  # one attitude in so many
 FREEDOM = {True: 3, False: 5}
 """Least degrees of freedom that are left to tell a knock by, noise known or not: on a real recording of 17 attitudes,
 order 2 with 4 left agreed by chance to 0.02 mg without one attitude, and predicted nine times worse."""
-_CHANCE = 0.003
 _SEPARABLE = 0.02
 """Least eigenvalue of R_SS: below it the others do not say where these attitudes should be."""
-_DETERMINED = 2000.0
-_PASSES, _SEARCHES = 5, 5
-_FIRST_LOOK = 32
+_DETERMINED = 2000.0  # singular values apart, beyond which the others do not determine the model
+_PASSES, _SEARCHES = 5, 5  # exchanges of members of a set; searches, each by the fit without the set found before
+_FIRST_LOOK = 32  # likeliest sets whose gain is computed first; mostly these hold the best
 
 
 @dataclass(frozen=True)
@@ -510,7 +512,11 @@ def _candidates(white: _Whitened, known: bool) -> Iterator[tuple[Aside, float]]:
         rss = max(white.squares - gain, 1e-12 * white.squares, 1e-300)
         z = shift / spread
         if _admissible(z, gain, rss, n, freedom, known):
-            scale = 1.0 if known and rss <= chi_square_limit(freedom) else np.sqrt(rss / freedom)
+            scale = (
+                1.0
+                if known and rss <= chi_square_limit(freedom, ATTITUDES_FIT_STATED_NOISE.level)
+                else np.sqrt(rss / freedom)
+            )
             order = np.argsort(chosen)
             aside = Aside(tuple(chosen[order].tolist()), tuple((z[order] / scale).tolist()))
             yield aside, _criterion(rss, n, size, m, known)
@@ -529,9 +535,9 @@ def _admissible(z: Array, gain: float, rss: float, n: int, freedom: int, known: 
     m, least = len(z), float(np.abs(z).min())
     tests = n - m + 1
     return bool(
-        2 * tests * t_cdf(-least / np.sqrt(rss / freedom), freedom) < _CHANCE
-        and (not known or 2 * tests * normal_cdf(-least) < _CHANCE)
-        and comb(n, m) * f_tail(gain * freedom / (m * rss), m, freedom) < _CHANCE
+        2 * tests * t_cdf(-least / np.sqrt(rss / freedom), freedom) < ATTITUDE_SET_ASIDE.level
+        and (not known or 2 * tests * normal_cdf(-least) < ATTITUDE_SET_ASIDE.level)
+        and comb(n, m) * f_tail(gain * freedom / (m * rss), m, freedom) < ATTITUDE_SET_ASIDE.level
     )
 
 
@@ -540,7 +546,7 @@ def _criterion(rss: float, n: int, size: int, m: int, known: bool) -> float:
     freedom = n - size - m
     scale, price = max(rss / freedom, 1e-300), 0.0
     if known:
-        fits = rss <= chi_square_limit(freedom)
+        fits = rss <= chi_square_limit(freedom, ATTITUDES_FIT_STATED_NOISE.level)
         scale, price = (1.0, 0.0) if fits else (max(1.0, scale), log(n))
     sets = lgamma(n + 1) - lgamma(m + 1) - lgamma(n - m + 1)
     return (n - m) * log(scale) + rss / scale + (size + 1.5 * m) * log(n) + 2 * sets + price
@@ -630,13 +636,13 @@ def _best_addition(white: _Whitened, chosen: Index) -> int | None:
 # The uncertainty of a triad whatever the order of its nonlinearity: orders 1 to 3, or to the chosen one, blended.
 
 
-HIGHEST_BLENDED = 3
+HIGHEST_BLENDED = 3  # order that the blend allows for: k3; higher ones are taken where they are seen
 _UNSEEN = 10.0
 """Factor by which a step raises the uncertainty of a bias or scale factor from which the attitudes do not show it."""
-_LEAST_FREEDOM = 2
-_TOLERANCE, _STEPS = 1e-9, 40
-_BLEND_PASSES = 8
-_TINY_WEIGHT = 1e-300
+_LEAST_FREEDOM = 2  # degrees of freedom that an order must leave where the noise is estimated
+_TOLERANCE, _STEPS = 1e-9, 40  # of a fit in scaled parameters, and its most steps
+_BLEND_PASSES = 8  # in which noise, weights and order agree
+_TINY_WEIGHT = 1e-300  # stands for a variance of 0
 
 
 @dataclass(frozen=True)

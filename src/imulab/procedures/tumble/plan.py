@@ -48,8 +48,8 @@ STARTS = ("sphere", "fixture:15", "head:15")
 # Which attitudes to measure: D- or A-optimal sets for a tumble test, and what they will give.
 
 
-MOST_ATTITUDES = 300
-_CANDIDATES = 900
+MOST_ATTITUDES = 300  # of a plan: nobody turns a unit more often
+_CANDIDATES = 900  # directions over the sphere, 7 deg apart
 
 
 @dataclass(frozen=True)
@@ -274,8 +274,8 @@ def shortest_path(directions: Array) -> Array:
 # A plan on disk: CSV to measure by and to plan on from, and a printable sheet with a picture of each attitude.
 
 
-_SIZE = 62.0
-_LARGEST_LETTER, _SMALLEST_LETTER = 13.0, 6.5
+_SIZE = 62.0  # pixels from the middle of a drawing to its edge
+_LARGEST_LETTER, _SMALLEST_LETTER = 13.0, 6.5  # pixels
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float) * [1.0, 0.7, 0.35]
 _FACES = (
     (0, (4, 5, 7, 6), "+x"), (0, (0, 1, 3, 2), "−x"), (1, (2, 3, 7, 6), "+y"),

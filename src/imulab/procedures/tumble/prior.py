@@ -16,6 +16,7 @@ import numpy as np
 
 from imulab.display import Bad
 from imulab.errors import RecordError
+from imulab.estimation.decisions import ATTITUDES_DISTURBED, PRIOR_CONTRADICTED, PRIOR_EXPLAINS_NOTHING
 from imulab.estimation.least_squares import chi_square_probability, plausible_excess
 from imulab.gravity import Gravity
 from imulab.procedures.tumble.checks import check_prior
@@ -28,17 +29,14 @@ from imulab.records.calibration import Calibration
 from imulab.records.comparison import different_units
 from imulab.records.sections import Quantity
 
-_SCALE = 2.0
+_SCALE = 2.0  # half width of the half-Cauchy prior of an ageing, in the noise of an attitude
 _STEPS = np.geomspace(0.05, 50.0, 12)
-_PASSES = 8
-_AT_REST = 1e-3
-_NO_WEIGHT = 1e-8
-_DETERMINED = 1e-6
-SCATTERED = 0.01
-FALSE_ALARM = 0.05
-_FEW = 9
-_IMPOSSIBLE = 1e-6
-_ALIKE = 1e-12
+_PASSES = 8  # in which ageing and solution agree
+_AT_REST = 1e-3  # of the standard uncertainty: smaller changes end the passes
+_NO_WEIGHT = 1e-8  # of the mixture, below which a component is left out
+_DETERMINED = 1e-6  # of the largest singular value: directions below it are left to the prior
+_ASKED = 9  # attitudes below which several parameters may have changed without being told apart
+_ALIKE = 1e-12  # keeps a correlation matrix of rounded decimals invertible
 
 
 @dataclass(frozen=True)
@@ -203,7 +201,7 @@ def scatter(jacobian: Array, seen: Array, own: Array) -> float:
     """
     missed, left = _left_of(jacobian, seen, own)
     freedom = len(own) - left.shape[1]
-    if freedom < 1 or chi_square_probability(float((missed**2 / own).sum()), freedom) > SCATTERED:
+    if freedom < 1 or chi_square_probability(float((missed**2 / own).sum()), freedom) > ATTITUDES_DISTURBED.level:
         return 0.0
     return unexplained(jacobian, seen, own)[0]
 
@@ -310,20 +308,20 @@ def findings(record: Calibration, aged: AgedPrior, recording: Recording, count: 
     found = []
     if other := different_units(("the prior", record.sensor), ("the recording", recording.metadata)):
         found.append(other)
-    if aged.probability < FALSE_ALARM:
+    if aged.probability < PRIOR_CONTRADICTED.level:
         sizes = [f"{1e6 * tau:.3g} {unit}" for tau, unit in zip(aged.ageing, ("µg", "ppm", "µrad"), strict=False)]
         few = (
             f"; with {count} attitudes intervals may be too narrow where several parameters changed at once, "
-            f"{_FEW} or more are asked for"
+            f"{_ASKED} or more are asked for"
         )
         found.append(
             f"prior and attitudes contradict each other (p = {aged.probability:.2g}): the unit has changed since the "
             "prior was made, or attitudes were disturbed; the prior was widened as far as they ask (bias, scale factor"
-            f"{', misalignment' if len(sizes) > 2 else ''}: {', '.join(sizes)}){few if count < _FEW else ''}"
+            f"{', misalignment' if len(sizes) > 2 else ''}: {', '.join(sizes)}){few if count < _ASKED else ''}"
         )
     residuals, variance = aged.solution.residuals[0], aged.solution.variance[0]
     rms, times = float(np.sqrt(np.mean(residuals**2))), float(np.sqrt(np.mean(residuals**2 / variance)))
-    if chi_square_probability(float((residuals**2 / variance).sum()), len(residuals)) < _IMPOSSIBLE:
+    if chi_square_probability(float((residuals**2 / variance).sum()), len(residuals)) < PRIOR_EXPLAINS_NOTHING.level:
         found.append(
             Bad(
                 "no ageing of bias, scale factor and misalignment explains these attitudes: they miss the result by "

@@ -15,6 +15,13 @@ from numpy.typing import NDArray
 
 from imulab.display import Note
 from imulab.errors import first_of
+from imulab.estimation.decisions import (
+    ATTITUDE_STANDS_OUT,
+    ATTITUDE_STANDS_OUT_BY,
+    ATTITUDES_SCATTER,
+    ATTITUDES_TOO_QUIET,
+    SCALE_OFF_UNIT,
+)
 from imulab.estimation.least_squares import Observability, chi_square_probability, coverage_factor, leverage
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -61,11 +68,11 @@ if TYPE_CHECKING:
 
 _SELDOM_MISSED = 6
 """Degrees of freedom at the highest order tested from which a knock is seldom missed."""
-_NEGLIGIBLE = 0.01
+_NEGLIGIBLE = 0.01  # µg or ppm: an order that is left out and moves less is not named
+# Degrees of freedom below which an order is hardly checked; and that are asked for then
 FEW_DEGREES, _ENOUGH_DEGREES = 5, 9
-_WORST_SCALE = 0.1
-_WORST_MISALIGNMENT = 0.1
-_MOST_NAMED = 8
+_WORST_MISALIGNMENT = 0.1  # rad: a larger misalignment is an axis with another name or sign
+_MOST_NAMED = 8  # attitudes that a warning names
 
 
 @dataclass(frozen=True)
@@ -190,7 +197,7 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
         found += [
             f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?"
             for axis, value in zip(AXES, theta[3:6], strict=True)
-            if abs(value - 1) > _WORST_SCALE
+            if abs(value - 1) > SCALE_OFF_UNIT
         ]
     found += [
         f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?"
@@ -224,12 +231,9 @@ def assumption_notes(stated: Stated | None) -> list[str]:
 # The calibration record of a tumble test: parameters in SI, and what its figures need.
 
 
-_STANDS_OUT = 5.0
-_TOO_GOOD = 1e-3
-_DOWN_WEIGHTED = 0.5
-_NOT_BY_CHANCE = 0.01
-_HIGH_CONDITION = 300.0
-_TO_MICRO = 1e6
+_DOWN_WEIGHTED = 0.5  # Huber's weight below which an attitude is named, and left out of patterns
+_HIGH_CONDITION = 300.0  # condition number from which the attitudes hardly tell parameters apart
+_TO_MICRO = 1e6  # to µg and ppm
 _REMEDIES = {
     ("norm", "square"): "--loss auto sets it aside",
     ("norm", "auto"): "it was not set aside: --loss huber limits its pull",
@@ -525,13 +529,13 @@ def _warnings(
 def beyond_noise(problem: TumbleProblem, chi_square: float, freedom: float) -> bool:
     """Whether attitudes scatter so much that their own noise would do it once in a hundred tests or less."""
     known = problem.covariance is not None and freedom >= 1
-    return known and chi_square_probability(chi_square, freedom) < _NOT_BY_CHANCE
+    return known and chi_square_probability(chi_square, freedom) < ATTITUDES_SCATTER.level
 
 
 def _scatter_warnings(problem: TumbleProblem, solution: TumbleSolution, chi_square: float, freedom: float) -> list[str]:
     """Say that the attitudes scatter beyond their noise, which the uncertainties hold anyway, or far below it."""
     known = problem.covariance is not None and problem.prior is None and not problem.robust
-    if known and freedom > 0 and chi_square_probability(chi_square, freedom) > 1 - _TOO_GOOD:
+    if known and freedom > 0 and chi_square_probability(chi_square, freedom) > 1 - ATTITUDES_TOO_QUIET.level:
         return [
             "the attitudes scatter less than their own noise lets expect (reduced chi-square "
             f"{chi_square / freedom:.3g}): that noise is overstated, and every uncertainty is about "
@@ -614,7 +618,7 @@ def _outliers(problem: TumbleProblem, solution: TumbleSolution) -> dict[int, flo
     others = np.sqrt(np.maximum(((standard**2 * share).sum() - standard**2) / (freedom - 1), 0.0))
     least = 1.0 if problem.covariance is not None else 1e-12
     standard = standard / np.maximum(others, least)
-    limit = max(_STANDS_OUT, coverage_factor(freedom - 1, 1 - 1e-3 / n))
+    limit = max(ATTITUDE_STANDS_OUT_BY.limit, coverage_factor(freedom - 1, 1 - ATTITUDE_STANDS_OUT.level / n))
     return {i: float(standard[i]) for i in np.flatnonzero(standard > limit).tolist()}
 
 

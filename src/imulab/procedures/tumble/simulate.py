@@ -28,7 +28,7 @@ from imulab.writers import write_csv
 # A simulated tumble test: a unit turned by hand through static attitudes, with its truth.
 
 
-_MOST_SAMPLES = 1e7
+_MOST_SAMPLES = 1e7  # of a simulated test: it bounds memory
 _RING_FREQUENCY = 12.0  # Hz
 _RING_DECAY = 0.08  # s
 _KNOCK = 30.0  # m/s^2
@@ -345,10 +345,10 @@ def _gyro(rate: Array, rng: np.random.Generator, known: Mapping[str, float]) -> 
 # A simulated production line: units that are calibrated twice, with what a line must notice built in.
 
 
-_FEWEST, _MOST = 8, 2000
+_FEWEST, _MOST = 8, 2000  # units of a simulated fleet: fewer have no statistics, more take minutes
 _BEGIN = datetime(2026, 3, 2, 9)
 _AGAIN = timedelta(days=182)
-_FAR_OFF, _CHANGED = 4, 6
+_FAR_OFF, _CHANGED = 4, 6  # number of the unit with a bias far off the others', and of that whose bias changes
 LIMITS = """[tumble]
 "bias_*" = { lower = -40, upper = 40, unit = "mg" }
 "scale_factor_*" = { lower = -9000, upper = 9000, unit = "ppm" }

@@ -42,10 +42,10 @@ from imulab.units import from_si
 
 
 REWEIGHTING_PASSES = {False: 4, True: 30}
-WEIGHTS_AT_REST = 1e-4
-_FIT_STEPS = 40
+WEIGHTS_AT_REST = 1e-4  # relative change of the weights that ends the iteration
+_FIT_STEPS = 40  # of Levenberg and Marquardt
 _REFIT_STEPS = 15  # without one attitude of many the solution is near; what wanders for longer is not determined
-_REFIT_AT_MOST = 150
+_REFIT_AT_MOST = 150  # attitudes up to which each is left out by a fit of its own; above, the linear formula serves
 _REFIT_TOLERANCE = 1e-7  # the next step would be a thousandth of it, or less
 
 
@@ -327,7 +327,7 @@ def leave_one_out(problem: TumbleProblem, solution: TumbleSolution) -> Array:
 # The published first-order iteration of a tumble test (method ``linearised``), and the source's rules for it.
 
 
-_PASSES = 50
+_PASSES = 50  # of the source's iteration at most
 _DIVERGED = 0.98
 """A relative change of scale, or of bias in g, after which the linear step cannot be meant."""
 
@@ -458,21 +458,21 @@ CLOSEST = np.radians(3.0)
 """Two attitudes closer than this are the same attitude: the same axis vertical."""
 _KEPT_CLEAR = 2 * CLOSEST
 """What a plan with distinct verticals keeps from a vertical axis, so that an attitude put down 3 deg off does too."""
-_STARTS = 12
-_ENOUGH = 600  # attitudes over all starts: with many attitudes the first start is as good as the best
-_SWEEPS = 40
+_STARTS = 12  # of the search for a set of attitudes
+_ATTITUDES_OVER_STARTS = 600  # attitudes over all starts: with many attitudes the first start is as good as the best
+_SWEEPS = 40  # of exchanges from one start
 _POLISH_RADII = np.repeat(np.radians([8.0, 3.0, 1.0]), 4)
-_CAP = 48
+_CAP = 48  # directions around an attitude that are tried in its place
 _BALANCED = 3
 """So many of the best starts are polished and balanced."""
-_BALANCE_ROUNDS = 6
+_BALANCE_ROUNDS = 6  # of exchanges that even out how well each axis is known
 _BALANCE_RADII = np.repeat(np.radians([3.0, 1.0]), 3)
 _AS_GOOD = 1.01
 """Sums of variances within this factor of the least are taken for equal."""
 _RIDGE = 1e-9
 """Information that keeps the matrix regular while attitudes are still missing."""
-_UNDETERMINED = 1e6
-_QUICK_ROUNDS = 2
+_UNDETERMINED = 1e6  # variance, in that of one attitude's noise, of a parameter that a set does not determine
+_QUICK_ROUNDS = 2  # of exchanges where a person waits for the next attitude
 _QUICK_RADII = np.radians([8.0, 3.0, 3.0, 1.0])
 
 
@@ -555,7 +555,10 @@ def optimal_set(search: Search, points: Array, count: int, seed: int, *, free: b
     """
     rng = np.random.default_rng(seed)
     rows = information_rows(points, search.order)
-    starts = [_exchange(search, points, rows, count, rng) for _ in range(max(2, min(_STARTS, _ENOUGH // count)))]
+    starts = [
+        _exchange(search, points, rows, count, rng)
+        for _ in range(max(2, min(_STARTS, _ATTITUDES_OVER_STARTS // count)))
+    ]
     starts.sort(key=lambda directions: _cost(search.covariance(directions), search.criterion))
     if not np.isfinite(_cost(search.covariance(starts[0]), search.criterion)):
         return None
@@ -658,7 +661,7 @@ def _cost(covariance: Array, criterion: str) -> float:
 # Which further attitudes would tell apart what these cannot.
 
 
-_CANDIDATES = 400
+_CANDIDATES = 400  # directions, 10 deg apart, among which the next attitude is chosen
 
 
 def sphere_points(count: int) -> Array:

@@ -35,7 +35,7 @@ from imulab.units import conversion_factor, parse_unit, si_unit
 
 BIN = 1.0
 """Width of a bin, s."""
-_DAY = 86400.0
+_DAY = 86400.0  # s: a longer cycle has another unit of time
 _AXIS = re.compile(r"(gyro|accel)_.+")
 
 
@@ -414,12 +414,12 @@ SETTLED = 30.0
 """A settled part shorter than this does not make a reference, s."""
 _WIDTH, _GROWTH = 2.0, 0.15
 """Bins are two seconds wide at first, later this share of the time since power-on: few, so that noise weighs little."""
-_MOVED = 9.0
-_MOVED_RANGE = 0.02
-_APART, _APART_RANGE = 10.0, 0.1
+_MOVED = 9.0  # times the quiet variance of a second in which the unit moved; more in seconds of few samples
+_MOVED_RANGE = 0.02  # of the range of a curve: its own change within a second is no motion
+_APART, _APART_RANGE = 10.0, 0.1  # sigma by which a second stands apart from those around; and of the range of a curve
 _QUIET = 60  # s
-_FEWEST = 10
-_NEARLY = 1e-9
+_FEWEST = 10  # s of samples before T_M that a curve needs
+_NEARLY = 1e-9  # s, and K: rounding of decimal limits
 
 Index = NDArray[np.intp]
 

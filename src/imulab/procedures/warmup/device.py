@@ -145,7 +145,7 @@ def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
 
 
 _TICK, _LONG, _LONG_TICK = 1e-6, 2000.0, 1e-4  # s: the core counts time in ticks, 2^32 of them
-_LAST_TICK = 2**32 - 1
+_LAST_TICK = 2**32 - 1  # the core's counter stops there
 _PIECE = 32768  # samples at a time: their ticks stay in the cache
 
 

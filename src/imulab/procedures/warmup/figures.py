@@ -32,8 +32,8 @@ from imulab.report.traces import (
 # A row of plots that share their axes, coloured by temperature.
 
 
-_ACROSS = 3
-_DECADES = [1, 10, 100, 1000]
+_ACROSS = 3  # panels in a row
+_DECADES = [1, 10, 100, 1000]  # s that an axis of time is numbered by
 _SCALE = ("#2c4fa3", "#3d8fc4", "#58b5a6", "#a3bf58", "#e0a83c", "#d5663a", "#a8322f")
 """Cold to warm; distinct in lightness too."""
 
@@ -265,8 +265,8 @@ def largest_text(values: list[float | None], index: list[int], factor: float) ->
 # The figures and tables of a warm-up record, from the record alone.
 
 
-_POINTS = 121
-_INSTANTS = (0.0, 30.0, 100.0, 200.0)
+_POINTS = 121  # of a curve
+_INSTANTS = (0.0, 30.0, 100.0, 200.0)  # s after power-on that are drawn over the temperature
 
 
 def exhibits(record: Calibration) -> Exhibits:

@@ -305,8 +305,8 @@ _CLOSEST = 1.6
 """Neighbouring time constants differ by this factor at least: closer ones cannot be told apart."""
 SCALE_LIMIT = 3.0
 """Longest time scale that is sought, in units of T_M."""
-_PASSES = 3
-_WORST_CONDITION = 1e8
+_PASSES = 3  # in which cycles are carried to their knot by the slopes that the amplitudes have
+_WORST_CONDITION = 1e8  # beyond which exponentials are one
 _SHRINK = 2.0
 """Degrees of freedom with which the scatter of all temperatures counts at each one."""
 

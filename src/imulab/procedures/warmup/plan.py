@@ -24,7 +24,7 @@ from imulab.writers import write_csv
 
 WIDEST = 20.0
 """Intervals of power-on temperature wider than this are warned about, K."""
-_FREE = 4
+_FREE = 4  # parameters of a curve at one temperature
 
 
 @dataclass(frozen=True)

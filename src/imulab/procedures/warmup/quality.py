@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from imulab.display import Bad, Note
 from imulab.errors import DataError, first_of
+from imulab.estimation.decisions import STILL_DRIFTS
 from imulab.procedures.correction_order import thermals_of
 from imulab.procedures.warmup.cycles import SETTLED, Curves, Cycle
 from imulab.procedures.warmup.model import (
@@ -352,19 +353,18 @@ def cycle_weights(curves: Curves, spread: CycleSpread) -> Array:
 # What is wrong with a warm-up test, a sentence each.
 
 
-_COLD = 1.0
-_FAR = 0.5
-_LATE = 0.5
-_CLEAR = 4.0
-_DRIFT_SHARE = 0.5
-_MOST_NAMED = 3
-_WIDE = 20.0
-_AT_LIMIT = 1.02
-_COUNTS = 0.05
-_ROUNDING = 1e-12
+_COLD = 1.0  # K above the chamber at power-on: the unit was still warm
+_OFF_SET_POINT = 0.5  # K from the set point
+_LATE = 0.5  # s after power-on: the fastest part of the curve is then gone
+_DRIFT_SHARE = 0.5  # of what the model leaves over: less drift of the settled part counts nothing beside it
+_MOST_NAMED = 3  # cycles that a warning names
+_WIDE = 20.0  # K between knots from which one curve for all of an interval is doubted
+_AT_LIMIT = 1.02  # a time constant within 2 % of the limit of the search has come to rest there
+_COUNTS = 0.05  # of a curve: a part that is smaller matters to nobody
+_ROUNDING = 1e-12  # of the reference, relative
 _PAUSE, _MOSTLY = 5, 0.5
 """Seconds of exactly repeated samples that are no coarse output, in a column that changes most of the time."""
-_MORE, _ODD = 1.2, 4.0
+_MORE, _ODD = 1.2, 4.0  # times the error at temperatures left out that is worth saying; medians by which a cycle is odd
 _IMPROBABLE = {"rad/s": np.radians(5.0), "m/s^2": 1.0}
 """A change after power-on that no instrument with a warm-up table has: 5 deg/s, 0.1 g."""
 
@@ -488,7 +488,7 @@ def _motion(curves: Curves) -> list[str]:
 
 def _drifts(curves: Curves, chosen: Judged) -> list[str]:
     """Settled parts that go on changing by much of what the model leaves over."""
-    clear = np.abs(curves.drift) > _CLEAR * curves.drift_uncertainty
+    clear = np.abs(curves.drift) > STILL_DRIFTS.limit * curves.drift_uncertainty
     largest = np.sqrt((curves.mean**2).mean(axis=(0, 1)))
     big = np.abs(curves.drift) > np.maximum(_DRIFT_SHARE * chosen.training, 0.05 * largest)
     found = []
@@ -513,7 +513,7 @@ def _temperatures(curves: Curves) -> list[str]:
         reading = cycle.temperature if cycle.first_reading is None else max(cycle.temperature, cycle.first_reading)
         if reading - chamber > _COLD:
             warm.append(f"{cycle.name} ({reading - chamber:+.2g} K)")
-        elif abs(cycle.temperature - nominal) > _FAR:
+        elif abs(cycle.temperature - nominal) > _OFF_SET_POINT:
             far.append(f"{cycle.name} ({cycle.temperature - nominal:+.2g} K)")
     found = []
     if warm:
@@ -522,7 +522,7 @@ def _temperatures(curves: Curves) -> list[str]:
             f"{_named(warm)}"
         )
     if far:
-        found.append(f"power-on temperature more than {_FAR:g} K from the set point: {_named(far)}")
+        found.append(f"power-on temperature more than {_OFF_SET_POINT:g} K from the set point: {_named(far)}")
     return found
 
 

@@ -13,7 +13,7 @@ from imulab.procedures.warmup.quality import CycleSpread, Judged, Worst, after_o
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
-_DIGITS = 7
+_DIGITS = 7  # of the numbers in a record
 
 
 def make_record(

@@ -26,8 +26,8 @@ from imulab.writers import write_csv
 GYRO_AXES = ("gyro_x", "gyro_y", "gyro_z")
 ACCEL_AXES = ("accel_x", "accel_y", "accel_z")
 
-_DEG_PER_HOUR = np.pi / 180 / 3600
-_MICRO_G = 1e-6 * STANDARD_GRAVITY
+_DEG_PER_HOUR = np.pi / 180 / 3600  # rad/s
+_MICRO_G = 1e-6 * STANDARD_GRAVITY  # m/s^2
 _TAU = np.array([20.0, 60.0, 180.0])  # s: die, package, housing
 _TAU_BY_KELVIN = -1e-3  # 1/K: convection is better when warm
 _REST = 20.0  # degC at which the time constants hold

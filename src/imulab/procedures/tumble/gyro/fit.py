@@ -24,6 +24,7 @@ from imulab.columns import triad
 from imulab.device.unit import output_factor
 from imulab.display import UNJUDGED, Bad, Note
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
+from imulab.estimation.decisions import SCALE_OFF_UNIT, SCALES_OFF_ALIKE
 from imulab.estimation.least_squares import Observability, coverage_factor, observability
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.gravity import EARTH, EarthRate, at_latitude
@@ -74,7 +75,8 @@ from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
 
 PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
-_EVENER = 0.9
+_EVENER = 0.9  # even time stamps are taken if the turns miss by this share of what they miss with those read
+# Times the record's scatter, and 1 mg: attitudes that scatter more under it are of another unit
 _FOREIGN, _TOUCHED = 5.0, 1e-3 * STANDARD_GRAVITY
 
 
@@ -378,7 +380,6 @@ def _result(
 
 
 _AXES = ("x", "y", "z")
-_WORST_SCALE = 0.1
 _USUAL = (
     (np.degrees(1), "are the rates in deg/s?"),
     (np.radians(1), "are the rates in rad/s?"),
@@ -387,7 +388,6 @@ _USUAL = (
 )
 """Factors by which scale factors are off, and what makes them so."""
 _ALIKE = 5.7  # Student's t of three at 1 %, over root 3
-_CLEAR = 4.0
 _SMALLEST_ALIKE = 0.05  # %
 _LARGE_MISS = 2.0  # deg
 
@@ -544,9 +544,9 @@ def _off_nominal(fit: GyroFit) -> list[str]:
     ratio = fit.scale_factor * known.factor
     error = 100 * (ratio - 1)
     listed = " ".join(f"{value:+.3g}" for value in error.tolist())
-    if np.abs(error).max() > 100 * _WORST_SCALE:
+    if np.abs(error).max() > 100 * SCALE_OFF_UNIT:
         middle = float(np.exp(np.mean(np.log(np.abs(ratio)))))
-        guess = next((f": {says}" for of, says in _USUAL if abs(middle / of - 1) < _WORST_SCALE), "")
+        guess = next((f": {says}" for of, says in _USUAL if abs(middle / of - 1) < SCALE_OFF_UNIT), "")
         return [
             Bad(
                 f"gyro: the scale factors are off by {listed} % (x y z){guess or ': is the unit right?'}; check the "
@@ -555,7 +555,7 @@ def _off_nominal(fit: GyroFit) -> list[str]:
         ]
     mean, spread = float(error.mean()), float(error.std(ddof=1))
     own = 100 * float(np.sqrt(np.diag(fit.covariance)[:3]).max() / fit.scale_factor.mean())
-    if abs(mean) > max(_ALIKE * spread, _CLEAR * own, _SMALLEST_ALIKE):
+    if abs(mean) > max(_ALIKE * spread, SCALES_OFF_ALIKE.limit * own, _SMALLEST_ALIKE):
         return [
             f"gyro: the scale factors are off by {listed} % (x y z), all by the same: a sample rate or a clock that is "
             "off by as much does that; compare the time stamps with a clock"

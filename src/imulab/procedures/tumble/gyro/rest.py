@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError
+from imulab.estimation.decisions import BIAS_FOLLOWS_GRAVITY
 from imulab.estimation.least_squares import f_test
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -27,11 +28,10 @@ from imulab.records.calibration import Calibration
 
 
 _EDGE = 0.1  # s back into the 0.3 s of each hold that segmentation drops
-_STILL = 5.0
+STILL_SIGMAS = 5.0  # sigma of the hold's own noise within which a gyroscope is still
 _MARGIN = 0.1  # s
 _DEEPEST = 2.0  # s
-_SIGNIFICANT = 0.01
-_QUIET = 0.75
+QUIET_SHARE = 0.75  # share of still samples of a hold that tells the zero
 _FLAT_TOP = 4  # readings in a row
 _CUT_OFF = 3.0  # steps of the output
 _LATE = 0.3  # s
@@ -93,7 +93,7 @@ def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> R
     arrive, leave = first.copy(), last.copy()
     for k in range(len(start)):
         here = slice(first[k], last[k] + 1)
-        still[here] = (np.abs(output[here] - median[k]) <= _STILL * sigma).all(axis=1)
+        still[here] = (np.abs(output[here] - median[k]) <= STILL_SIGMAS * sigma).all(axis=1)
         if not still[start[k] : stop[k]].any():
             still[here] = True  # it turns all the time: nothing tells rest from motion
         moved = first[k] + np.flatnonzero(~still[here])
@@ -152,7 +152,7 @@ def at_rest(
     kept = np.where(holds.still[:, None], np.column_stack([output, np.ones(len(output))]), 0.0)
     sums = np.add.reduceat(np.vstack([kept, np.zeros((1, 4))]), edges, axis=0)[::2]
     fraction = sums[:, 3] / (holds.stop - holds.start)
-    quiet = fraction >= min(_QUIET, float(np.median(fraction)))
+    quiet = fraction >= min(QUIET_SHARE, float(np.median(fraction)))
     mean, force = (sums[:, :3] / sums[:, 3:] - earth)[quiet], force[quiet]
     n = len(mean)
     middle = (holds.start + holds.stop)[quiet] / 2
@@ -165,7 +165,8 @@ def at_rest(
         along, known = _residuals(drift, vertical[quiet]), 7
         part = float((along * plain).sum()) / max(float((along**2).sum()), 1e-300)
         plain = plain - np.clip(part, -1, 1) * along
-    shown = n > 7 and f_test(float((plain**2).sum()), known, float((left**2).sum()), 15, 3 * n) < _SIGNIFICANT
+    chance = f_test(float((plain**2).sum()), known, float((left**2).sum()), 15, 3 * n) if n > 7 else 1.0
+    shown = chance < BIAS_FOLLOWS_GRAVITY.level
     if sensitivity == "no" or (sensitivity == "auto" and not shown):
         scatter: Array = np.sqrt((flat**2).sum(axis=0) / max(n - 1, 1) / n)
         return GyroRest(mean.mean(axis=0), None, scatter, None)

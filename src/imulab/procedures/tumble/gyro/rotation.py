@@ -116,7 +116,7 @@ def _turns(angle: Array, weights: Array, start: NDArray[np.int64], stop: NDArray
 
 
 _LONGEST_TURN = 20.0  # s; beyond it the drift of a cheap gyroscope counts
-_FEWEST_TURNS = 4
+_FEWEST_TURNS = 4  # turns by which the axes of both triads are matched
 _WRONG = np.radians(15.0)
 _RIGHT = np.radians(5.0)
 

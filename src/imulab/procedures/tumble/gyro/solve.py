@@ -25,6 +25,13 @@ from numpy.typing import NDArray
 
 from imulab.display import Bad, Note
 from imulab.errors import DataError
+from imulab.estimation.decisions import (
+    CLOCKS_DISAGREE,
+    SAMPLES_COME_LATE,
+    SCALE_CHANGE,
+    SCALE_CHANGES_WITH_RATE,
+    TURN_DISAGREEMENT,
+)
 from imulab.estimation.least_squares import Fit, covariance, f_test, least_squares
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -37,9 +44,7 @@ from imulab.units import parse_unit, to_si
 # Whether the scale factors of the gyroscopes change with the rate, from what the turns miss.
 
 
-_SIGNIFICANT = 0.01
-_CLEAR_SLOPE = 3.0
-_FEWEST_LEFT = 6
+_FEWEST_LEFT = 6  # degrees of freedom that the test must leave
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,7 @@ class Nonlinearity:
 
     def notes(self) -> list[str]:
         """Say what changes with the rate, if it is beyond chance."""
-        if not self.probability < _SIGNIFICANT:
+        if not self.probability < SCALE_CHANGES_WITH_RATE.level:
             return []
         found = []
         for i, axis in enumerate("xyz"):
@@ -77,7 +82,7 @@ class Nonlinearity:
                 ("from slow turns to", self.odd[i], self.odd_uncertainty[i]),
                 ("between the two directions at", 2 * self.even[i], 2 * self.even_uncertainty[i]),
             ):
-                if abs(value) > _CLEAR_SLOPE * u:
+                if abs(value) > SCALE_CHANGE.limit * u:
                     rate = np.degrees(self.largest[i])
                     found.append(f"of {axis} by {100 * value:+.2g} % (u {100 * u:.1g} %) {what} {rate:.0f} deg/s")
         changes = "; ".join(found) or "of which axis, they do not tell"
@@ -148,14 +153,12 @@ CRYSTAL = 50 * 1e-6  # as '50 ppm' is read, so that the two compare equal
 """Standard uncertainty of the rate of a clock that nothing is known of but that a crystal drives it."""
 _KNOT = 0.05  # s
 _LAGS = np.linspace(-2.0, 2.0, 21)  # s
-_STEPS = 6
-_CLEAR = 2.58
-_CLEAR_DELAY = 4.0
-_OUTLIER = 4.0 * MAD_TO_SIGMA
-_FEWEST = 6
+_STEPS = 6  # of Newton's method for a turn's delay, each 0.3 s at most
+_OUTLIER = 4.0 * MAD_TO_SIGMA  # medians of the distance from the line, 5.9 of them: farther turns do not tell the clock
+_FEWEST = 6  # turns through which a line has a scatter
 _LATENCY = 5e-3  # s
 _JITTER, _COUNTED = 0.02, 1e-6  # of a step
-_FEWEST_STAMPS = 100
+_FEWEST_STAMPS = 100  # between gaps, through which a line is drawn
 
 
 @dataclass(frozen=True)
@@ -179,7 +182,7 @@ class ClockComparison:
 
     def clear(self, clock: float) -> bool:
         """Whether two such clocks do not explain the difference (at 1 %)."""
-        return bool(abs(self.rate) > _CLEAR * math.sqrt(self.variance(clock)))
+        return bool(abs(self.rate) > CLOCKS_DISAGREE.limit * math.sqrt(self.variance(clock)))
 
 
 @dataclass(frozen=True)
@@ -217,7 +220,7 @@ class Clock:
                 "true one, use --clock-of accel"
             ]
         late = -found.delay
-        if not apart and abs(late) > max(_LATENCY, _CLEAR_DELAY * found.delay_uncertainty):
+        if not apart and abs(late) > max(_LATENCY, SAMPLES_COME_LATE.limit * found.delay_uncertainty):
             return [
                 Note(
                     f"gyro: its samples come {1e3 * late:+.1f} ms after the accelerometers' of the same time (u "
@@ -360,11 +363,10 @@ def _line(when: Array, delay: Array) -> ClockComparison | None:
 
 
 _WORST_TURN = np.radians(20.0)
-_FAR = np.radians(8.0)
+_UNIT_DOUBTED = np.radians(8.0)
 _STANDS_OUT = 3.0  # medians; of 30 turns whose misses are normal, none is so far out in 94 % of tests
-_BY_CHANCE = 1e-3
-_REWEIGHTED = 6
-_MANY = 3  # one turn in so many
+_REWEIGHTED = 6  # fits with bounded influence before turns are called out
+_TOO_MANY_OUT = 3  # one turn in so many
 
 
 @dataclass(frozen=True)
@@ -463,7 +465,7 @@ def _solve(case: Case, segments: Segments, rest: GyroRest, notes: list[str]) -> 
     scale = np.full(3, 1 / to_si(1.0, known.symbol)) if known.quantity == "rate" else start_scale(segments)
     theta = np.zeros(12 if case.fit_bias else 9)
     residual = model(segments, scale, theta, case.fit_bias)[0].reshape(-1, 3)
-    if known.quantity == "rate" and np.median(np.linalg.norm(residual, axis=1)) > _FAR:
+    if known.quantity == "rate" and np.median(np.linalg.norm(residual, axis=1)) > _UNIT_DOUBTED:
         scale = start_scale(segments)  # the stated unit may be wrong
     weights: Array = np.ones(len(segments.before))
     fit = _fitted(segments, scale, theta, weights)
@@ -486,7 +488,7 @@ def _solve(case: Case, segments: Segments, rest: GyroRest, notes: list[str]) -> 
         f"others by {np.degrees(others):.3g} deg rms: knocked, or samples lost?"
         for start, stop, size in aside.tolist()
     ]
-    if out.sum() * _MANY > len(out):
+    if out.sum() * _TOO_MANY_OUT > len(out):
         notes.append(
             Bad(
                 f"gyro: {int(out.sum())} of {len(out)} turns stand out from the others: too many to tell which are "
@@ -531,7 +533,7 @@ def _outliers(segments: Segments, scale: Array, fit: Fit) -> tuple[NDArray[np.bo
     far = np.einsum("mi,mi->m", residual, np.linalg.solve(np.eye(3) + spread, residual[:, :, None])[:, :, 0])
     cost = float((residual[~out] ** 2).sum())
     for k in np.flatnonzero(out).tolist():
-        out[k] = m * f_test(cost + float(far[k]), size, cost, size + 2, left + size + 2) < _BY_CHANCE
+        out[k] = m * f_test(cost + float(far[k]), size, cost, size + 2, left + size + 2) < TURN_DISAGREEMENT.level
     return out, np.linalg.norm(residual, axis=1)
 
 

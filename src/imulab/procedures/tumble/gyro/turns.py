@@ -16,9 +16,10 @@ from imulab.procedures.tumble.gyro.rest import GyroRest, RestHolds, beyond_range
 from imulab.procedures.tumble.gyro.rotation import Turns, composed_turns, weighted_turns
 from imulab.recording import Array
 
-ROWS, COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)
-_FEWEST_TURNS = 8
+ROWS, COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)  # of the six misalignments in their matrix
+_FEWEST_TURNS = 8  # turns that tell nine parameters, two equations each
 _LONGEST_TURN = 60.0  # s
+# S, usual steps, and usual bursts of steps: a gap in a turn loses part of it
 _GAP_SECONDS, _GAP_STEPS, _GAP_BURSTS = 0.05, 4.5, 2.0
 _FEW_BROKEN = 0.1  # of the turns: the others are as good without them
 _COARSE = 4  # steps taken as one where a scale factor is only to be found roughly

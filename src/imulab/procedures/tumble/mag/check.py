@@ -28,9 +28,9 @@ from imulab.procedures.tumble.schema import fit_of, mag_model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
-FEWEST = 4
-_PASSES = 5
-_LEAST_FREE = 3.0
+FEWEST = 4  # attitudes that leave |m| and dip degrees of freedom beside the place's field
+_PASSES = 5  # in which a hard iron that moved is found
+_LEAST_FREE = 3.0  # degrees of freedom: the mean of F, which is matched, exists above 2
 
 
 @dataclass(frozen=True)

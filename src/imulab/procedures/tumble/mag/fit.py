@@ -11,6 +11,13 @@ from numpy.typing import NDArray
 
 from imulab.display import UNJUDGED, Bad, Note
 from imulab.errors import DataError, OptionError, listed, quoted
+from imulab.estimation.decisions import (
+    DIP_MOVES_ACCELEROMETERS,
+    DIP_OFF_STATED,
+    FIELD_ORDER_TWO,
+    FIELD_SET_ASIDE,
+    FIELD_STEP,
+)
 from imulab.estimation.least_squares import coverage_factor, f_test
 from imulab.estimation.rows import rms
 from imulab.gravity import Height, Latitude, LocalGravity, at_place
@@ -23,7 +30,6 @@ from imulab.procedures.tumble.estimate import check_field
 from imulab.procedures.tumble.gyro.fit import with_gyro_of
 from imulab.procedures.tumble.mag.model import FEWEST, FieldMeans, mag_names, most_at_an_extreme
 from imulab.procedures.tumble.mag.prepare import (
-    FALSE_ALARM,
     Disturbed,
     Seen,
     check_seen,
@@ -49,16 +55,12 @@ from imulab.units import parse_unit
 
 
 _AXES = "xyz"
-_FEW = 16
-_MOVED = 3.0
-"""Standard uncertainties of an accelerometer parameter beyond which the joint fit moves it too far."""
+_ATTITUDES_ASKED = 16  # attitudes below which the noise of |m| and dip is hardly told
 _ONE_WAY = 6.0
 """Condition number from which turning the heading would halve the uncertainty, or better."""
 _LARGE_RMS, _LARGE_DIP = 0.02, np.radians(1.0)
 """Scatter of |m| and dip that steady attitudes in one field do not have; the worst of real ones: 0.5 %, 0.3 deg."""
 _HOPELESS = 5.0  # times that
-_STEPS_BY_CHANCE = 0.01
-_OF_NORMAL = 1.96
 _POINTING = np.radians(3.0)
 _OF_THE_EARTH = 22e-6, 67e-6  # T
 _BUILDING = 1.4
@@ -261,7 +263,7 @@ def _scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> list[st
 def _step(joint: Joint, labels: Sequence[str]) -> list[str]:
     """Say if |m| and dip are others from some attitude on."""
     step = likeliest_step(joint)
-    if step is None or step.probability > _STEPS_BY_CHANCE:
+    if step is None or step.probability > FIELD_STEP.level:
         return []
     return [
         f"mag: from {labels[step.first]} on |m| is {100 * abs(step.magnitude):.2g} % "
@@ -276,7 +278,7 @@ def _stated_dip(found: Parameter, stated: Sequence[float] | None) -> list[str]:
     if stated is None:
         return []
     off, sigma = found.value - stated[0], float(np.hypot(found.standard_uncertainty or 0.0, stated[1]))
-    if abs(off) <= _OF_NORMAL * sigma:
+    if abs(off) <= DIP_OFF_STATED.limit * sigma:
         return []
     return [
         f"mag: the dip of {np.degrees(found.value):.2f} deg is {np.degrees(abs(off)):.2g} deg "
@@ -305,8 +307,10 @@ def _warnings(
     attitudes = ready.estimate.attitudes
     found = [_note_set_aside(attitudes.label(one.index), one) for one in aside]
     n = len(joint.pair.mag)
-    if n < _FEW:
-        found.append(f"mag: {n} attitudes leave little to tell the noise from; {_FEW} or more are asked for")
+    if n < _ATTITUDES_ASKED:
+        found.append(
+            f"mag: {n} attitudes leave little to tell the noise from; {_ATTITUDES_ASKED} or more are asked for"
+        )
     if not joint.converged:
         found.append(
             "mag: the fit of both triads did not come to rest: more attitudes, at several headings, would help"
@@ -319,7 +323,7 @@ def _warnings(
             f"{np.degrees(heading):.2g} deg only; attitudes {which} once more, facing a quarter turn away, would help "
             "most"
         )
-    far = {name: value for name, value in moved.items() if abs(value) > _MOVED}
+    far = {name: value for name, value in moved.items() if abs(value) > DIP_MOVES_ACCELEROMETERS.limit}
     if far:
         name, value = max(far.items(), key=lambda item: abs(item[1]))
         found.append(
@@ -370,8 +374,7 @@ _STEEPEST = np.radians(87.0)
 _OFF = np.radians(0.5)
 _CONTRADICTS = 4.0
 """Standard uncertainties, and rad, beyond which a stated dip is refused."""
-_GAIN = 0.9
-_SIGNIFICANT = 0.01
+_GAIN = 0.9  # of the leave-one-out errors of |m| and dip, multiplied: quadratic terms must gain 10 %
 _MOST_ASIDE = 5
 """At most one attitude of so many is set aside."""
 
@@ -552,7 +555,7 @@ def _leave_out_disturbed(joint: Joint, ready: Ready) -> tuple[Joint, tuple[Distu
     left = np.arange(len(ready.pair.mag))
     while len(left) > FEWEST and len(aside) < len(ready.pair.mag) // _MOST_ASIDE:
         worst = most_disturbed(joint)
-        if worst.probability >= FALSE_ALARM:
+        if worst.probability >= FIELD_SET_ASIDE.level:
             break
         without = np.delete(left, worst.index)
         fewer = ready.pair.only(without)
@@ -578,7 +581,7 @@ def _order_two(joint: Joint, asked: str, *, robust: bool) -> Joint:
     ]
     size = len(joint.theta)
     p = f_test(cost[0], size, cost[1], size + 3, joint.found.residuals.size)
-    return second if better and p < _SIGNIFICANT else joint
+    return second if better and p < FIELD_ORDER_TWO.level else joint
 
 
 def _check_result(joint: Joint, ready: Ready, place: Place) -> None:

@@ -234,8 +234,9 @@ QUARTERS = ("north", "east", "south", "west")
 _DIP = np.radians(67.0)
 _SCATTER = 3e-3
 """Of |m|, as a part of the field, and of the dip, rad: what good recordings show (0.1 to 0.5 %, 0.16 to 0.29 deg)."""
-_STARTS, _ENOUGH, _SWEEPS = 12, 600, 40
-_RIDGE = 1e-9
+# Of the search; attitudes over all of them (with many, the first is as good); sweeps of one
+_STARTS, _ATTITUDES_OVER_STARTS, _SWEEPS = 12, 600, 40
+_RIDGE = 1e-9  # keeps a design that is not determined yet invertible
 _LAYOUT = ParameterLayout(6 + len(MAGNETOMETERS), 6 + len(ACCELEROMETERS))
 
 
@@ -386,7 +387,7 @@ def _exchange(rows: Array, base: Array, rng: np.random.Generator) -> NDArray[np.
     fixed = base.T @ base + _RIDGE * np.eye(size)
     best: NDArray[np.int64] = np.zeros(count, dtype=np.int64)
     least = np.inf
-    for _ in range(max(2, min(_STARTS, _ENOUGH // count))):
+    for _ in range(max(2, min(_STARTS, _ATTITUDES_OVER_STARTS // count))):
         chosen = np.asarray(rng.integers(steps, size=count), dtype=np.int64)
         total = fixed + each[np.arange(count), chosen].sum(axis=0)
         for _ in range(_SWEEPS):

@@ -196,13 +196,13 @@ def mag_names(order: int) -> list[str]:
 # The magnetometers in the attitudes that the accelerometers found: means, and how certain they are.
 
 
-FEWEST = 10
-_BATCHES = 8
-_DEAD = 1e-3
+FEWEST = 10  # attitudes for the nine parameters of |m| and one to check
+_BATCHES = 8  # parts of a hold by whose scatter its mean is known
+_DEAD = 1e-3  # of the largest span: an axis that spans less is dead
 _CLIPPED = 0.3
 """Share of the attitudes at one extreme of an axis from which it is taken for saturated."""
-_FLAT = 0.05
-_FAR = 4.5
+_FLAT = 0.05  # of the largest spread: outputs that spread less across a plane lie in it
+_MAGNET_NEAR = 4.5
 """Distance from the middle of the outputs, over its median: up to 4.1 where axes differ in scale by a factor of 2."""
 _FIELDS = (5e-6, 2e-4)
 """Magnitudes that the field can have near the Earth's surface, T: from a quarter of the least to thrice the most."""
@@ -384,7 +384,7 @@ def _check_far(mean: Array, labels: Sequence[str], kept: NDArray[np.intp], name:
     distance = np.linalg.norm(mean - np.median(mean, axis=0), axis=1)
     distance /= np.median(distance)
     worst = int(np.argmax(distance))
-    if distance[worst] > _FAR:
+    if distance[worst] > _MAGNET_NEAR:
         raise DataError(
             f"{name}: {labels[worst]}: the outputs of mag_x mag_y mag_z lie {distance[worst]:.1f} times as far from "
             f"the middle of all as usual: was a magnet near? leave the attitude out with --drop {kept[worst] + 1}"

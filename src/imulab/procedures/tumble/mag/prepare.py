@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, quoted
+from imulab.estimation.decisions import ACCELEROMETERS_CONTRADICT_RECORD
 from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.gravity import Gravity, local_gravity
@@ -44,12 +45,11 @@ from imulab.records.calibration import Calibration
 # What the attitudes say of the fit itself: predicted errors, attitudes that were disturbed, what cannot be seen.
 
 
-FALSE_ALARM = 0.05
 WORST_CONDITION = 30.0
 """Attitudes that all face one way have 45 and more; within 20 deg of one way 7, at any heading 3."""
 _BLIND = 1 / 2000
 """Singular value, relative to the largest, below which a combination is not determined."""
-_HELPS = 0.05
+_HELPS = 0.05  # mean square of magnetic east along a direction: below it a turn about that does not show in the dip
 _LEAST_PART = 3
 """Attitudes before and after a step: of fewer each is held against all others."""
 
@@ -231,9 +231,6 @@ def heading_uncertainty(joint: Joint, covariance: Array) -> tuple[float, float]:
 # What the joint fit of both triads starts from: the accelerometers by themselves, and where the magnetometers are.
 
 
-_DISAGREES = 1e-3
-
-
 def prepare(
     attitudes: Attitudes,
     known: Calibration | None,
@@ -359,7 +356,7 @@ def _prior(
         off = estimate.solution.theta[0] - held.mean
         distance = float(off @ np.linalg.solve(own.covariance + held.covariance, off))
         p = chi_square_probability(distance, len(off))
-        if p < _DISAGREES:
+        if p < ACCELEROMETERS_CONTRADICT_RECORD.level:
             gyroscopes = "; its gyroscopes were left out" if "gyro_output_unit" in known.model else ""
             return None, [
                 f"mag: the accelerometers of {attitudes.recording.name} contradict their record (p = {p:.2g}): it was "

@@ -12,7 +12,7 @@ from imulab.errors import OptionError
 from imulab.quantities import in_si
 from imulab.recording import Array
 
-_SOFT_IRON = 0.05
+_SOFT_IRON = 0.05  # of the scale factor, as some real units have
 _HARD_IRON = 0.5  # of the field
 _MOUNTING = np.radians(3.0)
 _NOISE = 3e-3  # of the field, one sample

@@ -36,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import OptionError, quoted
+from imulab.estimation.decisions import FIELD_SCATTERS, HEMISPHERE_OF_DIP
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.gravity import Gravity
 from imulab.procedures import tumble
@@ -50,8 +51,6 @@ from imulab.recording import Array
 
 _EQUATOR = math.radians(20.0)
 """The magnetic equator lies within 16 deg of the geographic one."""
-_SURE = 4.0
-"""Standard uncertainties of a stated dip from which its sign is one of the hemisphere."""
 
 Dip = float | str | tuple[float, float]
 
@@ -82,7 +81,7 @@ def stated_place(hemisphere: str | None, latitude: float | str | None, dip: Dip 
         raise OptionError(f"hemisphere {quoted(hemisphere)}: expected north or south")
     known = None if dip is None else stated_dip(dip)
     sides = {"hemisphere": hemisphere, "latitude": hemisphere_at(latitude)}
-    if known is not None and abs(known[0]) > _SURE * known[1]:
+    if known is not None and abs(known[0]) > HEMISPHERE_OF_DIP.limit * known[1]:
         sides["dip"] = "north" if known[0] > 0 else "south"
     given = {name: side for name, side in sides.items() if side is not None}
     first = next(iter(given), "")
@@ -329,17 +328,16 @@ def _across(direction: Array) -> Array:
 # One fit of both triads: every attitude's |f|, |m| and dip, each with its variance.
 
 
-_STEPS = 60
-_TOLERANCE = 1e-11
+_STEPS = 60  # of Levenberg and Marquardt
+_TOLERANCE = 1e-11  # step in scaled parameters at which the fit rests
 _CLOSE = 0.03
 """Standard deviations of the residuals to which parameters need to be known for a pass over the variances."""
 _DAMPING, _NEAR = 1e-4, 1e-9
 """Where a minimisation starts, and where one that was near."""
-_PASSES = 50
+_PASSES = 50  # in which noise and solution agree
 _RESTS = 1e-3
-_BEYOND_BY_CHANCE = 0.05
 """Probability of chi-square below which attitudes whose noise is known scatter beyond it."""
-_HUBER = 2.0
+_HUBER = 2.0  # standard deviations of |m| and dip together from which the pull of an attitude is bounded
 _LEAST = 1e-24  # variance that exact data leave, or rounding in them
 _BLOCKS = np.array([0, 1, 2, 3, 3])
 """Whose variance each residual of an attitude has: |f|, |m|, dip, direction held."""
@@ -632,7 +630,7 @@ def _scatters_beyond(found: Invariants, known: Array) -> Array:
     n, size = len(known), found.by_parameters.shape[2]
     chi = (found.residuals[:, :3] ** 2 / (np.einsum("nii->ni", known) + _LEAST))[:, 1:].sum(axis=0)
     freedom = max(n - size / 3, 1.0)
-    return np.array([chi_square_probability(float(value), freedom) < _BEYOND_BY_CHANCE for value in chi])
+    return np.array([chi_square_probability(float(value), freedom) < FIELD_SCATTERS.level for value in chi])
 
 
 def _huber(found: Invariants, known: Array, extra: Array) -> Array:
