@@ -38,11 +38,9 @@ from imulab.units import si_unit
 # The result of a test of a noise record by a log: verdict, what changed by how much, the octaves of both spectra.
 
 
-FALSE_ALARM, TOLERANCE = f"{100 * NOISE_CHECK.level:g} %", "1 %"
-_SAME_RATE = 0.01  # relative: a log of another rate has another spectrum
+_DIGITS = 5  # of the numbers in a drawing
+_TICKS = [0.01, 0.1, 0.2, 0.5, 1, 2, 5, 10, 100]  # of an axis of ratios
 # Changes of size by less are said in per cent; octaves this improbable are named in the text
-_DIGITS = 5
-_TICKS = [0.01, 0.1, 0.2, 0.5, 1, 2, 5, 10, 100]
 _HALF, _CERTAIN = 0.5, 0.05
 
 
@@ -269,8 +267,8 @@ def _octaves(check: NoiseCheck, names: Sequence[str], page: int, pages: int) -> 
 # Whether a new log at rest agrees with the noise of a record, and what differs by how much.
 
 
-FALSE_ALARM, TOLERANCE = "5 %", "1 %"
-_SAME_RATE = 0.01
+FALSE_ALARM, TOLERANCE = f"{100 * NOISE_CHECK.level:g} %", "1 %"
+_SAME_RATE = 0.01  # relative: a log of another rate has another spectrum
 Choose: TypeAlias = Callable[[Recording], Sequence[str]]
 """Columns of a log to test, by its first rows."""
 
