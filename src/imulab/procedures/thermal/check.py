@@ -172,7 +172,6 @@ _FAILED = (
     "the gyroscopes at rest differ between attitudes or temperatures by more than the record explains",
     "an offset of the gyroscopes that whole recordings have in common is larger than power cycles explain",
 )
-_BEYOND = 1.0  # K outside the record's range: its laws say nothing there
 
 
 @dataclass(frozen=True, repr=False)
