@@ -120,34 +120,38 @@ def _union(hint: Any) -> tuple[Any, ...]:
     return get_args(hint) if get_origin(hint) in (Union, UnionType) else ()
 
 
-def described(found: object) -> str:
+def described(value: object) -> str:
     """Return what was found in place of something else, for a message."""
-    kind = type(found)
+    kind = type(value)
     if kind.__name__ == "Calibration":
-        return f"a {getattr(found, 'procedure', '')} record (arguments in the wrong order?)"
+        return f"a {getattr(value, 'procedure', '')} record (arguments in the wrong order?)"
     if kind.__name__ == "Recording":
-        return f"the recording {getattr(found, 'name', '')} (arguments in the wrong order?)"
+        return f"the recording {getattr(value, 'name', '')} (arguments in the wrong order?)"
     if kind.__module__.partition(".")[0] == "imulab":
         return kind.__name__
     if kind.__name__ == "LazyFrame":
         return "a LazyFrame, which collect() makes a data frame"
-    shape = getattr(found, "shape", None)
-    return f"{kind.__name__} of shape {shape}" if isinstance(shape, tuple) and shape else quoted(found)
+    shape = getattr(value, "shape", None)
+    return f"{kind.__name__} of shape {shape}" if isinstance(shape, tuple) and shape else quoted(value)
 
 
 def _check_call(function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
     name, signature = function.__qualname__, inspect.signature(function)
-    own = {key: p for key, p in signature.parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    parameters = {key: p for key, p in signature.parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
     try:
-        given = signature.bind(*args, **kwargs).arguments
+        bound = signature.bind(*args, **kwargs).arguments
     except TypeError as error:
-        for key in kwargs.keys() - own.keys():
-            raise OptionError(f"{name}: unknown option {key!r}; known: {listed(own, key)}") from None
-        shown = (f"{key}=" if p.kind is p.KEYWORD_ONLY else key for key, p in own.items() if key not in ("self", "cls"))
+        for key in kwargs.keys() - parameters.keys():
+            raise OptionError(f"{name}: unknown option {key!r}; known: {listed(parameters, key)}") from None
+        shown = (
+            f"{key}=" if p.kind is p.KEYWORD_ONLY else key
+            for key, p in parameters.items()
+            if key not in ("self", "cls")
+        )
         raise OptionError(f"{name}: {error}; expected {name}({', '.join(shown)})") from None
     for key, hint in hints(function).items():
-        if key in own and key in given:
-            check(given[key], hint, f"{name}: {key}")
+        if key in parameters and key in bound:
+            check(bound[key], hint, f"{name}: {key}")
 
 
 def _fits(value: object, hint: Any) -> bool:

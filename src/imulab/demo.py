@@ -145,12 +145,12 @@ def run(folder: str | Path, main: Callable[[list[str]], int]) -> str:
     cards: list[Card] = []
     with _inside(home):
         for scenario in SCENARIOS:
-            said = ""
+            output = ""
             lines.append(f"{scenario.name}: {scenario.question}")
             for line in scenario.lines:
                 lines.append(f"  $ {line}")
-                said = _done(line, main)
-            answer, figure, verdict = (said, None, None) if not scenario.record else _found(scenario)
+                output = _done(line, main)
+            answer, figure, verdict = (output, None, None) if not scenario.record else _found(scenario)
             lines += [f"  {answer}", ""]
             cards.append(Card(scenario.question, answer, scenario.lines, figure, scenario.report, verdict))
         lead = (

@@ -37,9 +37,9 @@ def may_hide(data: bytes) -> bool:
     return b"\\" in data or (bool(others) and has_hidden(others.decode("utf-8")))
 
 
-def _escape(found: re.Match[str]) -> str:
+def _escape(match: re.Match[str]) -> str:
     r"""Return a character as Python writes it in `repr`: ``\x1b``, ``\u2028``."""
-    code = ord(found[0])
+    code = ord(match[0])
     return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
 
 
@@ -57,12 +57,12 @@ def first_hidden(value: Any, where: str = "") -> str | None:
             place = f"{where}.{printable(str(key))}"
             if has_hidden(str(key)):
                 return place.lstrip(".")
-            if found := first_hidden(item, place):
-                return found
+            if hidden := first_hidden(item, place):
+                return hidden
     elif isinstance(value, Sequence) and not set(map(type, value)) <= {float, int}:
         for index, item in enumerate(value):
-            if found := first_hidden(item, f"{where}[{index}]"):
-                return found
+            if hidden := first_hidden(item, f"{where}[{index}]"):
+                return hidden
     return None
 
 

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 
-def listed(known: Iterable[str], found: object) -> str:
+def listed(known: Iterable[str], word: object) -> str:
     """Return the known words for a message, and which of them was meant: ``square huber; did you mean 'huber'?``."""
     names = list(known)
-    return " ".join(names) + meant(names, found)
+    return " ".join(names) + meant(names, word)
 
 
 def quoted(value: object, longest: int = 60) -> str:
@@ -35,7 +35,7 @@ def first_of(names: Sequence[str], most: int, between: str = ", ") -> str:
     return between.join(names[:most]) + more
 
 
-def meant(known: Iterable[str], found: object, alike: float = 0.6) -> str:
+def meant(known: Iterable[str], word: object, alike: float = 0.6) -> str:
     """Return ``; did you mean 'huber'?`` where a word nearly is one of those known, else nothing.
 
     `alike` is how much of two words must agree, from 0 to 1.
@@ -43,7 +43,7 @@ def meant(known: Iterable[str], found: object, alike: float = 0.6) -> str:
     from difflib import get_close_matches
 
     names = {name.lower(): name for name in known}
-    close = get_close_matches(str(found).lower(), names, n=1, cutoff=alike)
+    close = get_close_matches(str(word).lower(), names, n=1, cutoff=alike)
     return f"; did you mean {names[close[0]]!r}?" if close else ""
 
 

@@ -31,10 +31,10 @@ def real_path(path: str | Path) -> Path:
     OptionError
         The links go round in a circle.
     """
-    found = Path(os.path.realpath(file_name(path)))
-    if found.is_symlink():
+    target = Path(os.path.realpath(file_name(path)))
+    if target.is_symlink():
         raise OptionError(f"{path}: cannot be written: too many levels of symbolic links")
-    return found
+    return target
 
 
 @contextmanager

@@ -63,10 +63,10 @@ class Units:
 
     def of(self, column: str, stated: str | None = None) -> str:
         """Return the unit of a column; `stated` is that of its title."""
-        given = next((key for key in _stems(column) if key in self.each), None)
-        if given is not None:
-            self.used.add(given)
-            symbol = self._known(column, self.each[given])
+        stem = next((key for key in _stems(column) if key in self.each), None)
+        if stem is not None:
+            self.used.add(stem)
+            symbol = self._known(column, self.each[stem])
             if stated is not None and self._known(column, stated) != symbol:
                 raise OptionError(f"{self.name}: column {column} [{stated}]: units has {symbol!r} for it; expected one")
             return symbol
@@ -132,11 +132,11 @@ def columns_of_arrays(
         A name is nearly one of those known, or time is stated twice.
     """
     where = "units={{'{sensor}': '{unit}'}}"
-    found = Units(name, units or {}, unit, where, DEFAULT_UNITS)
+    known_units = Units(name, units or {}, unit, where, DEFAULT_UNITS)
     entries = [
         part for title, values in arrays.items() if values is not None for part in _split(str(title), values, name)
     ]
-    return _put_together(entries, found, rate)
+    return _put_together(entries, known_units, rate)
 
 
 def columns_of_frame(
@@ -161,7 +161,7 @@ def columns_of_frame(
     if not is_frame(frame):
         raise DataError(f"expected a data frame of pandas or polars, found {described(frame)}")
     where = "a title such as '{name} [{unit}]', or units={{'{sensor}': '{unit}'}}"
-    found = Units(name, units or {}, unit, where)
+    known_units = Units(name, units or {}, unit, where)
     titles = {original: _joined(original) for original in frame.columns}
     if len(titles) < len(frame.columns):
         twice = next(title for title in titles if list(frame.columns).count(title) > 1)
@@ -170,7 +170,7 @@ def columns_of_frame(
     index = getattr(frame, "index", None)
     if index is not None and not any(key == "time" for key, _, _ in entries):
         entries[:0] = _times_of(index, name, stated=rate is not None)
-    return _put_together(entries, found, rate)
+    return _put_together(entries, known_units, rate)
 
 
 def is_frame(value: object) -> bool:
@@ -203,11 +203,11 @@ def data_frame(columns: Mapping[str, Any], library: str | None = None) -> Any:
 
 def _stems(column: str) -> list[str]:
     """``truth_gyro_x_3`` and what it is a part of: ``truth_gyro_x``, ``truth_gyro``, and the same of ``gyro_x_3``."""
-    found = []
+    stems = []
     for whole in dict.fromkeys((column, re.sub("^(truth|std)_", "", column))):
         parts = whole.split("_")
-        found += ["_".join(parts[:count]) for count in range(len(parts), 0, -1)]
-    return [stem for stem in found if stem not in ("truth", "std")]
+        stems += ["_".join(parts[:count]) for count in range(len(parts), 0, -1)]
+    return [stem for stem in stems if stem not in ("truth", "std")]
 
 
 def _joined(title: Any) -> str:

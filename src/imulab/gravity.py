@@ -85,7 +85,7 @@ Latitude: TypeAlias = Annotated[float | str | None, text("DEG", unit="deg"), _GR
 Height: TypeAlias = Annotated[float | str | None, text("M", unit="m"), _GROUP]
 
 
-def local_gravity(given: float | str | Gravity | None, recording: Recording) -> Gravity:
+def local_gravity(stated: float | str | Gravity | None, recording: Recording) -> Gravity:
     """Return what was given, else what the head of the recording says, else standard gravity.
 
     Raises
@@ -93,7 +93,7 @@ def local_gravity(given: float | str | Gravity | None, recording: Recording) -> 
     OptionError
         The value cannot be the gravity of any place.
     """
-    if given is None:
+    if stated is None:
         local = _of_head(recording) or Gravity(
             STANDARD_GRAVITY,
             "standard gravity, none given",
@@ -102,14 +102,14 @@ def local_gravity(given: float | str | Gravity | None, recording: Recording) -> 
             f"inherits its difference from the local value (0.5 % from pole to equator; {100 * _ANYWHERE / 9.8:.2g} % "
             "is in its uncertainty); give --gravity, or --latitude and --height",
         )
-    elif isinstance(given, str):
-        local = stated_gravity(given, "gravity")
-    elif isinstance(given, Gravity):
-        local = given
-    elif isinstance(given, numbers.Real):
-        local = Gravity(float(given), "argument")
+    elif isinstance(stated, str):
+        local = stated_gravity(stated, "gravity")
+    elif isinstance(stated, Gravity):
+        local = stated
+    elif isinstance(stated, numbers.Real):
+        local = Gravity(float(stated), "argument")
     else:
-        raise OptionError(f"gravity {quoted(given)}: expected a number, m/s^2, or a text such as '9.81362+-0.00002'")
+        raise OptionError(f"gravity {quoted(stated)}: expected a number, m/s^2, or a text such as '9.81362+-0.00002'")
     _check_possible(local.value)
     return local
 
@@ -152,8 +152,12 @@ def gravity_option(
     OptionError
         An option is no quantity of its kind, is out of range, or does not go with another.
     """
-    found = at_place(gravity, latitude, height, label, beside=beside)
-    return stated_gravity(found, label.format("gravity")) if isinstance(found, str) else found
+    gravity_of_place = at_place(gravity, latitude, height, label, beside=beside)
+    return (
+        stated_gravity(gravity_of_place, label.format("gravity"))
+        if isinstance(gravity_of_place, str)
+        else gravity_of_place
+    )
 
 
 def at_place(
@@ -258,16 +262,17 @@ def _of_head(recording: Recording) -> Gravity | None:
     if text is None:
         return None
     try:
-        found = stated_gravity(text, "gravity")
+        stated = stated_gravity(text, "gravity")
     except OptionError:
         return None
-    relative = _TO_MICRO * found.standard_uncertainty / found.value
+    relative = _TO_MICRO * stated.standard_uncertainty / stated.value
     size = f"{relative:.3g} ppm" if relative < 999.5 else f"{relative / 1e4:.2g} %"
     known = f" (± {size})" if relative else ""
-    said = (
-        f"gravity {found.value:.6g} m/s^2{known} was taken from the head of {recording.name}, as no option gave another"
+    words = (
+        f"gravity {stated.value:.6g} m/s^2{known} was taken from the head of {recording.name}, "
+        "as no option gave another"
     )
-    return Gravity(found.value, f"head of {recording.name}", found.standard_uncertainty, Note(said))
+    return Gravity(stated.value, f"head of {recording.name}", stated.standard_uncertainty, Note(words))
 
 
 def checked_latitude(latitude: float, name: str = "latitude") -> float:

@@ -201,8 +201,8 @@ class Recording:
             self.column(name)
         units = {name: parse_unit(self.units[name]).symbol for name in names}
         if len(set(units.values())) > 1:
-            found = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
-            raise UnitError(f"{self.name}: the axes of a triad must share one unit, found {found}")
+            described_units = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
+            raise UnitError(f"{self.name}: the axes of a triad must share one unit, found {described_units}")
         return units[names[0]]
 
     def mean_temperature(self) -> float | None:
@@ -281,9 +281,9 @@ class Recording:
         >>> il.Recording.from_arrays(accel=np.tile([0.0, 0.0, 1.0], (200, 1)), rate=100.0, unit="g")
         Recording(arrays: 200 samples of time [s], accel_x [g], accel_y [g], accel_z [g])
         """
-        given = {"time": time, "accel": accel, "gyro": gyro, "mag": mag, "temperature": temperature, **columns}
-        found, symbols = columns_of_arrays(given, rate=rate, unit=unit, units=units, name=name)
-        return cls(found, symbols, metadata or {}, name)
+        arrays = {"time": time, "accel": accel, "gyro": gyro, "mag": mag, "temperature": temperature, **columns}
+        converted, symbols = columns_of_arrays(arrays, rate=rate, unit=unit, units=units, name=name)
+        return cls(converted, symbols, metadata or {}, name)
 
     @classmethod
     @checked
@@ -326,8 +326,8 @@ class Recording:
         >>> il.Recording.from_frame(frame).units["accel_x"]
         'm/s^2'
         """
-        found, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
-        return cls(found, symbols, metadata or {}, name)
+        converted, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
+        return cls(converted, symbols, metadata or {}, name)
 
     @overload
     def to_frame(self, library: Literal["pandas"] | None = None) -> pandas.DataFrame: ...
@@ -545,19 +545,19 @@ def with_power_on_temperature(blocks: Iterable[Recording]) -> Iterator[Recording
     DataError
         Neither the head nor the column temperature of the first block holds one.
     """
-    found: float | None = None
+    temperature: float | None = None
     for block in blocks:
         stated = power_on_temperature(block)
         if stated is not None and math.isfinite(stated):
             yield block
             continue
-        found = first_reading(block) if found is None else found
-        if found is None:
+        temperature = first_reading(block) if temperature is None else temperature
+        if temperature is None:
             raise DataError(
                 f"{block.name}: no power_on_temperature in the head of the file, and no reading in a column "
                 "temperature to take its place"
             )
-        head = {"power_on_temperature": f"{found!r}", TAKEN_FROM: "the first reading of the column temperature"}
+        head = {"power_on_temperature": f"{temperature!r}", TAKEN_FROM: "the first reading of the column temperature"}
         yield replace(block, metadata={**block.metadata, **head})
 
 

@@ -255,8 +255,8 @@ def array_table(settings: ArraySettings) -> DeviceTable:
         raise OptionError(f"memory {s.memory}: expected growing, or a gain between 0 and 1")
     if not (s.rate > 0 and np.isfinite(s.rate)):
         raise OptionError(f"rate {s.rate}: expected more than 0 Hz")
-    given = s.initial_bias if not isinstance(s.initial_bias, str) else None
-    if given is None and s.initial_bias not in STARTS:
+    stated_bias = s.initial_bias if not isinstance(s.initial_bias, str) else None
+    if stated_bias is None and s.initial_bias not in STARTS:
         raise OptionError(f"initial bias {s.initial_bias!r}: expected first, zero or biases")
 
     def samples(time: float, least: int) -> np.int64:
@@ -266,7 +266,7 @@ def array_table(settings: ArraySettings) -> DeviceTable:
         "method": METHODS.index(s.method),
         "elements": n,
         "axes": axes,
-        "initial": 2 if given is not None else STARTS.index(s.initial_bias),
+        "initial": 2 if stated_bias is not None else STARTS.index(s.initial_bias),
         "kernel": ("gaussian", "exponential").index(s.kernel),
         "start": s.start,
         "cap": samples(s.memory_time, 100),
@@ -285,7 +285,7 @@ def array_table(settings: ArraySettings) -> DeviceTable:
     pointed = {
         "offset": _shaped(s.bias, (axes, n), "bias"),
         "matrix": _shaped(s.matrices, (n, axes, axes), "matrices"),
-        "bias": _shaped(given, (axes, n), "initial bias"),
+        "bias": _shaped(stated_bias, (axes, n), "initial bias"),
         "weight": _shaped(s.weights, (axes, n), "weights"),
         "gain": _shaped(s.gain, (axes, n + 1, n), "gain"),
     }
@@ -298,12 +298,12 @@ def array_table(settings: ArraySettings) -> DeviceTable:
 def _shaped(values: Any, shape: tuple[int, ...], name: str) -> Array | None:
     if values is None:
         return None
-    found = np.asarray(values, dtype=np.float64)
-    if found.size != np.prod(shape):
-        raise OptionError(f"{name}: expected shape {shape}, found {found.shape}")
-    if not np.isfinite(found).all():
+    array = np.asarray(values, dtype=np.float64)
+    if array.size != np.prod(shape):
+        raise OptionError(f"{name}: expected shape {shape}, found {array.shape}")
+    if not np.isfinite(array).all():
         raise OptionError(f"{name}: expected finite numbers")
-    return found.reshape(shape)
+    return array.reshape(shape)
 
 
 # The table of a triad of gyroscopes, and the polynomials that accelerometers and gyroscopes have.
@@ -352,12 +352,12 @@ def gyro_powers(record: Calibration) -> Array:
     RecordError
         One is in another unit.
     """
-    found = np.zeros((HIGHEST_POWER - 1, 3))
+    powers = np.zeros((HIGHEST_POWER - 1, 3))
     for row, power in enumerate(range(2, HIGHEST_POWER + 1)):
         for i, axis in enumerate("xyz"):
             if (name := f"gyro_k{power}_{axis}") in record.parameters:
-                found[row, i] = values_of(record, [name], "1/(rad/s)" + (f"^{power - 1}" if power > 2 else ""))[0]
-    return found[: int(np.max(np.flatnonzero(found.any(axis=1)) + 1, initial=0))]
+                powers[row, i] = values_of(record, [name], "1/(rad/s)" + (f"^{power - 1}" if power > 2 else ""))[0]
+    return powers[: int(np.max(np.flatnonzero(powers.any(axis=1)) + 1, initial=0))]
 
 
 def polynomial(nonlinearity: Array) -> tuple[Field, Field, Field]:

@@ -114,11 +114,11 @@ class DeviceUnit:
         `factors` turn the table's units into those of the columns. The columns given are left as they are; `into` are
         columns to fill instead of new ones.
         """
-        given = [None if column is None else np.ascontiguousarray(column, dtype=np.float64) for column in output]
-        out = [None if c is None else np.empty_like(c) for c in given] if into is None else list(into)
-        scale = np.ones(len(given)) if factors is None else np.array(factors, dtype=np.float64)
+        columns = [None if column is None else np.ascontiguousarray(column, dtype=np.float64) for column in output]
+        out = [None if c is None else np.empty_like(c) for c in columns] if into is None else list(into)
+        scale = np.ones(len(columns)) if factors is None else np.array(factors, dtype=np.float64)
         count = np.ascontiguousarray(ticks, dtype=np.uint32)
-        covered = _runtime.warmup(self._unit, float(temperature), float(tick), count, tuple(given), scale, tuple(out))
+        covered = _runtime.warmup(self._unit, float(temperature), float(tick), count, tuple(columns), scale, tuple(out))
         return out, covered
 
 
@@ -512,8 +512,8 @@ def _check_text(text: Any, kinds: list[str]) -> None:
 
 
 def _complete(kind: type[Part], text: Any, place: str) -> None:
-    found = read(kind, text, place)
-    missing = [key for key in kind.__struct_fields__ if not holds(found, key)]
+    held = read(kind, text, place)
+    missing = [key for key in kind.__struct_fields__ if not holds(held, key)]
     if missing:
         raise RecordError(f"{place} lacks {missing[0]}")
 

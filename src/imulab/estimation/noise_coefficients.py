@@ -208,97 +208,99 @@ def read_coefficients(columns: Sequence[Analysis]) -> list[NoiseCoefficients]:
     record plainly better, there is no B and no K, unless they are the filter of the sensor. Where the test of fit
     rejects the best model at 1 %, there is no number but N, as the level at the end of the band, where that is level.
     """
-    wanted = [(k, index) for k, found in enumerate(columns) for index in sorted({*_candidates(found)} - {-1})]
+    wanted = [(k, index) for k, analysis in enumerate(columns) for index in sorted({*_candidates(analysis)} - {-1})]
     ends = dict(zip(wanted, intervals_of([columns[k] for k, _ in wanted], [index for _, index in wanted]), strict=True))
     return [
-        _read(found, *({i: ends[k, i] for i in _candidates(found) if i >= 0}, _candidates(found)))
-        for k, found in enumerate(columns)
+        _read(analysis, *({i: ends[k, i] for i in _candidates(analysis) if i >= 0}, _candidates(analysis)))
+        for k, analysis in enumerate(columns)
     ]
 
 
-def fits(found: Analysis) -> bool:
+def fits(analysis: Analysis) -> bool:
     """Whether the test of fit lets the best model pass at 1 %."""
-    return bool(found.test.probability >= NOISE_MODEL_REJECTED.level)
+    return bool(analysis.test.probability >= NOISE_MODEL_REJECTED.level)
 
 
-def _candidates(found: Analysis) -> tuple[int, int, int]:
+def _candidates(analysis: Analysis) -> tuple[int, int, int]:
     """From which candidates N, B and K are taken; -1 for none."""
-    if not fits(found):
+    if not fits(analysis):
         return (-1, -1, -1)
-    names = ["".join(sorted(letters(model).replace("Q", ""))) for model in found.choice.models[0]]
-    near = found.choice.rivals[0].copy()
-    near[found.index] = True
-    if any("G" not in name for name, one in zip(names, near.tolist(), strict=True) if one):
+    names = ["".join(sorted(letters(model).replace("Q", ""))) for model in analysis.choice.models[0]]
+    near = analysis.choice.rivals[0].copy()
+    near[analysis.index] = True
+    if any("G" not in name for name, is_near in zip(names, near.tolist(), strict=True) if is_near):
         every = names.index("BKN")
         return (every, every, every)
-    if (found.values[list(TIME)] <= _fast(found)).all():
+    if (analysis.values[list(TIME)] <= _fast(analysis)).all():
         flicker, walk = (names.index(each) if each in names else -1 for each in ("BGN", "GKN"))
         return (-1, flicker, walk)
     return (-1, -1, -1)
 
 
-def _fast(found: Analysis) -> float:
+def _fast(analysis: Analysis) -> float:
     """Up to which time constant a Gauss-Markov process is the filter of the sensor, s."""
-    return max(_EDGE * found.limits[0], 0.0 if found.band.flat else _SHARE * found.length)
+    return max(_EDGE * analysis.limits[0], 0.0 if analysis.band.flat else _SHARE * analysis.length)
 
 
-def _white(found: Analysis) -> Coefficient:
+def _white(analysis: Analysis) -> Coefficient:
     """White noise, with what lies behind a filter, over all candidates."""
 
     def square(values: Array) -> Array:
         sizes, times = values[..., list(SIGMA)], values[..., list(TIME)]
-        density = np.where(times <= _fast(found), 2 * sizes**2 * times, 0.0)
+        density = np.where(times <= _fast(analysis), 2 * sizes**2 * times, 0.0)
         return np.asarray(values[..., :1] ** 2 + density.sum(axis=-1, keepdims=True))
 
-    white = average(found.choice, square)
+    white = average(analysis.choice, square)
     return _coefficient(*(math.sqrt(float(white.quantile(level)[0, 0])) for level in (0.5, 0.025, 0.975)))
 
 
 def _read(
-    found: Analysis, ends: Mapping[int, tuple[Array, Array]], candidates: tuple[int, int, int]
+    analysis: Analysis, ends: Mapping[int, tuple[Array, Array]], candidates: tuple[int, int, int]
 ) -> NoiseCoefficients:
-    band = found.band
+    band = analysis.band
     # Half of the band is given up where nothing is filtered.
-    filtered = band.highest * found.interval < 0.24
-    if not fits(found):
-        reason = f"the noise is not that of the model (test of fit: p = {found.test.probability:.1g})"
+    filtered = band.highest * analysis.interval < 0.24
+    if not fits(analysis):
+        reason = f"the noise is not that of the model (test of fit: p = {analysis.test.probability:.1g})"
         none = undetermined(reason, band.highest, filtered)
-        return replace(none, angle_random_walk=_level(found)) if band.flat else none
+        return replace(none, angle_random_walk=_level(analysis)) if band.flat else none
 
     def one(k: int, index: int) -> Coefficient:
         if index < 0:
-            return _not_determined(f"the noise is also {_markov(found)}, no 1/f noise or random walk: imulab noise fit")
-        return _coefficient(*(float(part[k]) for part in (found.choice.values[0, index], *ends[index])))
+            return _not_determined(
+                f"the noise is also {_markov(analysis)}, no 1/f noise or random walk: imulab noise fit"
+            )
+        return _coefficient(*(float(part[k]) for part in (analysis.choice.values[0, index], *ends[index])))
 
-    white = one(0, candidates[0]) if candidates[0] >= 0 else _white(found)
+    white = one(0, candidates[0]) if candidates[0] >= 0 else _white(analysis)
     angle = _not_determined("does not show" if band.full else f"would show above {band.highest:.4g} Hz only")
-    if found.model[NAMES.index("quantisation")] and candidates[0] >= 0:
+    if analysis.model[NAMES.index("quantisation")] and candidates[0] >= 0:
         angle = one(3, candidates[0])
     flicker, walk = one(1, candidates[1]), one(2, candidates[2])
     filtered = filtered or (not band.flat and candidates[0] < 0)
     return NoiseCoefficients(_widened(white, band.roll_off), flicker, walk, angle, band.highest, filtered)
 
 
-def _widened(found: Coefficient, relative: float) -> Coefficient:
+def _widened(coefficient: Coefficient, relative: float) -> Coefficient:
     """A coefficient with a further relative standard uncertainty."""
-    value, more = found.value, relative * found.value
-    sides = [math.hypot(end - value, NORMAL_95 * more) for end in found.interval]
+    value, more = coefficient.value, relative * coefficient.value
+    sides = [math.hypot(end - value, NORMAL_95 * more) for end in coefficient.interval]
     return _coefficient(value, value - sides[0], value + sides[1])
 
 
-def _level(found: Analysis) -> Coefficient:
+def _level(analysis: Analysis) -> Coefficient:
     """White noise as the level of the two highest octaves of the band, which agree."""
-    highest = found.band.highest
-    f = np.concatenate([frequencies(each) for each in found.spectra])
-    top = np.where(f > highest / 4, found.bins.freedom, 0.0)
-    value = math.sqrt(float((top * found.bins.power).sum() / top.sum()) * found.interval)
+    highest = analysis.band.highest
+    f = np.concatenate([frequencies(each) for each in analysis.spectra])
+    top = np.where(f > highest / 4, analysis.bins.freedom, 0.0)
+    value = math.sqrt(float((top * analysis.bins.power).sum() / top.sum()) * analysis.interval)
     u = value * math.hypot(_LEVELS, math.sqrt(1 / (2 * float(top.sum()))))
     return Coefficient(value, u, (value - NORMAL_95 * u, value + NORMAL_95 * u))
 
 
-def _markov(found: Analysis) -> str:
+def _markov(analysis: Analysis) -> str:
     """Say which Gauss-Markov processes were found."""
-    times = [f"{found.values[t]:.3g}" for t, size in zip(TIME, SIGMA, strict=True) if found.values[size] > 0]
+    times = [f"{analysis.values[t]:.3g}" for t, size in zip(TIME, SIGMA, strict=True) if analysis.values[size] > 0]
     return f"a Gauss-Markov {'process' if len(times) == 1 else 'processes'} of {' and '.join(times)} s"
 
 
@@ -316,16 +318,16 @@ def undetermined(reason: str, highest: float = 0.0, filtered: bool = False) -> N
     return NoiseCoefficients(none, none, none, none, highest, filtered)
 
 
-def mean_uncertainty(found: Analysis, duration: float) -> float:
+def mean_uncertainty(analysis: Analysis, duration: float) -> float:
     """Return the standard uncertainty of a mean over a duration, s, as a measure of the bias.
 
     ``u^2`` of `use.bias_square`, averaged over all candidate models, each times exp(variance of ln u^2 / 2).
     """
-    square = average(found.choice, lambda values: bias_square(values, np.array([duration]), found.interval))
+    square = average(analysis.choice, lambda values: bias_square(values, np.array([duration]), analysis.interval))
     return float(np.sqrt(square.expected[0, 0]))
 
 
-def unseen(found: Analysis, coefficients: NoiseCoefficients, duration: float) -> float:
+def unseen(analysis: Analysis, coefficients: NoiseCoefficients, duration: float) -> float:
     """Return how many times as large noise that does not show could make that uncertainty; 1 where that is below 2.
 
     1/f noise or random walk at the upper end of its interval, beside the white noise.
@@ -336,8 +338,8 @@ def unseen(found: Analysis, coefficients: NoiseCoefficients, duration: float) ->
         return 1.0
     ends = np.zeros((2, len(NAMES)))
     ends[:, 0], ends[0, 1], ends[1, 2] = white, *slow
-    largest = float(bias_square(ends, np.array([duration]), found.interval).max())
-    ratio = math.sqrt(largest) / mean_uncertainty(found, duration)
+    largest = float(bias_square(ends, np.array([duration]), analysis.interval).max())
+    ratio = math.sqrt(largest) / mean_uncertainty(analysis, duration)
     return ratio if ratio > _MUCH else 1.0
 
 
@@ -350,18 +352,18 @@ def resolution(samples: Array) -> float:
     return float(np.diff(values).min()) if len(values) > 1 else 0.0
 
 
-def coefficients_dict(found: NoiseCoefficients, unit: str) -> dict[str, Any]:
+def coefficients_dict(coefficients: NoiseCoefficients, unit: str) -> dict[str, Any]:
     """Return the coefficients as plain JSON values with their units: null, and why, where one is not determined."""
     units = (f"{unit}/sqrt(Hz)", unit, f"{unit}/sqrt(s)", {"rad/s": "rad", "m/s^2": "m/s"}.get(unit, f"{unit} s"))
     listed: dict[str, Any] = {}
     for name, its in zip(COEFFICIENTS, units, strict=True):
-        one: Coefficient = getattr(found, name)
-        known = not one.reason
+        coefficient: Coefficient = getattr(coefficients, name)
+        known = not coefficient.reason
         listed[name] = {
-            "value": one.value if known else None,
-            "standard_uncertainty": one.standard_uncertainty if known else None,
-            "interval_95": list(one.interval) if known else None,
+            "value": coefficient.value if known else None,
+            "standard_uncertainty": coefficient.standard_uncertainty if known else None,
+            "interval_95": list(coefficient.interval) if known else None,
             "unit": its,
-            **({} if known else {"reason": one.reason}),
+            **({} if known else {"reason": coefficient.reason}),
         }
     return listed

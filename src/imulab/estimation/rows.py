@@ -133,7 +133,7 @@ def find_step(samples: Array) -> Step | None:
     means = samples[: _BLOCKS * length].reshape(_BLOCKS, length).mean(axis=1)
     total = np.concatenate([[0.0], np.cumsum(means - means.mean())])
     white = deviation_of_steps(samples) / np.sqrt(length)
-    best, found = 1.0, None
+    best, step = 1.0, None
     for width, limit in _LIMITS.items():
         place = np.arange(width, _BLOCKS - width + 1)
         change = (total[place + width] - 2 * total[place] + total[place - width]) / width
@@ -142,8 +142,8 @@ def find_step(samples: Array) -> Step | None:
         least = max(limit * MAD_TO_SIGMA * median(others), _WHITE * white / np.sqrt(width))
         if least > 0 and abs(change[index]) > best * least:
             best = abs(change[index]) / least
-            found = Step(float(change[index]), int(place[index]) * length, 4 * length)
-    return found if found is not None and _jumps(means, found.sample // length) else None
+            step = Step(float(change[index]), int(place[index]) * length, 4 * length)
+    return step if step is not None and _jumps(means, step.sample // length) else None
 
 
 def deviation_of_steps(samples: Array) -> float:
@@ -167,7 +167,7 @@ def _jumps(means: Array, place: int) -> bool:
         rises = [[np.exp(sign * (time - sign) / (2 * tau)) for tau in _TAUS] for sign in (-1, 1)]
         powers = np.vander(time, 5, increasing=True)
         # Two neighbouring exponentials have every time constant between theirs.
-        pairs = [pair for one in rises for pair in pairwise(one)]
+        pairs = [pair for rise in rises for pair in pairwise(rise)]
         smooth = min(
             _misfit(np.column_stack(basis), part) for basis in ([powers], *([powers[:, :3], *p] for p in pairs))
         )
@@ -175,7 +175,7 @@ def _jumps(means: Array, place: int) -> bool:
         jumping = min(
             _misfit(np.column_stack([basis, step]), part)
             for step in later.T.astype(np.float64)
-            for basis in (powers[:, :3], *(np.column_stack([powers[:, 0], r]) for one in rises for r in one))
+            for basis in (powers[:, :3], *(np.column_stack([powers[:, 0], r]) for rise in rises for r in rise))
         )
         allowed = _ALLOWED * smooth if reach < _REACHES[-1] else -_PLAIN * jumping
         if jumping > smooth + allowed / (count - 5):
@@ -229,20 +229,20 @@ class LeftOut:
 
     def notes(self, rest: NDArray[np.bool_] | None = None) -> list[str]:
         """Say what was left out and why, a sentence for each kind; of knocks and the like only what is `rest`, (n,)."""
-        found = []
+        notes = []
         for kind, rows in self.kinds.items():
-            seen = rows & rest if rest is not None and kind == FAR else rows
-            count = int(np.count_nonzero(seen))
+            left_out = rows & rest if rest is not None and kind == FAR else rows
+            count = int(np.count_nonzero(left_out))
             if count:
                 # A few knocks are in every recording; zeros and repeats are a fault of the logger.
-                kind_of = Note if kind == FAR and count < _SHARE_NOTED * len(seen) else str
-                found.append(
+                kind_of = Note if kind == FAR and count < _SHARE_NOTED * len(left_out) else str
+                notes.append(
                     kind_of(
                         f"{count} row{'s' * (count > 1)} of {_shown(self.names)} left out: {kind}, first at "
-                        f"{self.recording.place(int(np.argmax(seen)))}"
+                        f"{self.recording.place(int(np.argmax(left_out)))}"
                     )
                 )
-        return found
+        return notes
 
     def check(self, start: int, stop: int, where: str) -> None:
         """Check that not too much is left out between two samples of a stretch at rest, called `where` in messages.
@@ -288,10 +288,10 @@ def leave_out(recording: Recording, names: Sequence[str]) -> LeftOut:
     zero = zero_rows(values, never_zero)
     if not never_zero:
         zero &= ~_long_runs(zero)
-    found = {"exact zeros": zero, "exact repeats of the row before": repeated_rows(values) & ~zero}
-    found[FAR], found["an exact zero of one column"] = far_rows(values, zero)
-    kinds = {kind: rows for kind, rows in found.items() if rows.any()}
-    bad = np.logical_or.reduce(list(found.values()))
+    by_kind = {"exact zeros": zero, "exact repeats of the row before": repeated_rows(values) & ~zero}
+    by_kind[FAR], by_kind["an exact zero of one column"] = far_rows(values, zero)
+    kinds = {kind: rows for kind, rows in by_kind.items() if rows.any()}
+    bad = np.logical_or.reduce(list(by_kind.values()))
     index, good = np.flatnonzero(bad), np.flatnonzero(~bad)
     if not index.size or not good.size:
         return LeftOut(recording, tuple(names), kinds)
@@ -321,9 +321,9 @@ def zero_rows(values: Sequence[Array], never_zero: bool = False) -> NDArray[np.b
     first = np.cumsum(~every)[every]
     before = np.maximum(first, min(HISTORY, len(count) - 1))  # near the start: of the rows after it, too
     rare = count[before] - count[np.maximum(before - HISTORY, 0)] <= _FEW_ZEROS * len(values) * HISTORY
-    found = np.zeros_like(every)
-    found[np.flatnonzero(every)[rare & (first > 0) & (before >= HISTORY)]] = True
-    return found
+    zeros = np.zeros_like(every)
+    zeros[np.flatnonzero(every)[rare & (first > 0) & (before >= HISTORY)]] = True
+    return zeros
 
 
 def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
@@ -342,13 +342,13 @@ def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
 
 def far_rows(values: Sequence[Array], known: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the rows with a sample far from the rows on both sides, and those with a zero that is; not the `known`."""
-    found = np.zeros((2, len(known)), dtype=np.bool_)
+    far = np.zeros((2, len(known)), dtype=np.bool_)
     good = np.flatnonzero(~known)
     if len(good) >= 2 * _AROUND:
         part = good if len(good) < len(known) else slice(None)
         for column in values:
-            found[:, part] |= _far_samples(column[part])
-    return found[0] & ~found[1], found[1]
+            far[:, part] |= _far_samples(column[part])
+    return far[0] & ~far[1], far[1]
 
 
 def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

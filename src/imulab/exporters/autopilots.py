@@ -306,7 +306,7 @@ def _write_px4(
     folder: Path,
     origin: Sequence[str],
     values: Sequence[tuple[str, float | str]],
-    said: Sequence[str],
+    remarks: Sequence[str],
     options: ExportOptions,
 ) -> list[Path]:
     """Write rows of name and value, texts as whole numbers, after comments on what they are."""
@@ -322,7 +322,7 @@ def _write_px4(
         origin[1],
         "no axes are turned: the record's axes are taken as the sensor's; PX4's body frame is FRD (-g on z at rest)",
         *([unknown] if options.device_id == 0 else []),
-        *said,
+        *remarks,
         "",
         "Vehicle-Id Component-Id Name Value Type",
     ]
@@ -413,14 +413,14 @@ def _coefficients(sensor: str, powers: Array) -> list[tuple[str, float]]:
 
 
 def _save_ardupilot(
-    folder: Path, origin: Sequence[str], rows: Sequence[tuple[str, float]], said: Sequence[str]
+    folder: Path, origin: Sequence[str], rows: Sequence[tuple[str, float]], remarks: Sequence[str]
 ) -> list[Path]:
     """Write rows of name and value after comments on what they are."""
     comments = [
         "ArduPilot parameters, " + origin[0],
         origin[1],
         "no axes are turned: the record's axes are taken as ArduPilot's body axes (FRD, after the board's rotation)",
-        *said,
+        *remarks,
     ]
     lines = [f"# {line}" for line in comments] + [f"{name},{single_precision(value)}" for name, value in rows]
     return write_one(folder, "imulab.param", lines)

@@ -63,14 +63,14 @@ def noise_lines(options: ExportOptions, indent: str) -> list[str]:
         raise OptionError(f"{options.noise_file}: lacks 'columns'; expected what 'imulab allan --json' printed")
     lines = []
     for key, (sensor, coefficient, unit) in _KEYS.items():
-        found = [_value(columns[name], coefficient, name, options.noise_file) for name in _names(columns, sensor)]
-        value = max((one for one in found if one is not None), default=0.0)
-        if None in found:  # the largest of the others may not be the largest of all
+        per_axis = [_value(columns[name], coefficient, name, options.noise_file) for name in _names(columns, sensor)]
+        value = max((coefficient_value for coefficient_value in per_axis if coefficient_value is not None), default=0.0)
+        if None in per_axis:  # the largest of the others may not be the largest of all
             lines.append(f"{indent}# {key} is not known: not determined on every axis (imulab allan says why)")
         elif value > 0:
-            lines.append(f"{indent}{key}: {yaml_number(value)}  # {unit}, the largest of {len(found)} axes")
+            lines.append(f"{indent}{key}: {yaml_number(value)}  # {unit}, the largest of {len(per_axis)} axes")
         else:
-            lines.append(f"{indent}# {key} is not known: {'not resolved' if found else 'not measured'}")
+            lines.append(f"{indent}# {key} is not known: {'not resolved' if per_axis else 'not measured'}")
     rate = options.noise.get("sample_rate")
     rate = rate.get("value") if isinstance(rate, Mapping) else rate
     if isinstance(rate, int | float) and rate > 0:

@@ -260,8 +260,8 @@ def shown_first(statistics: Sequence[ParameterStatistics]) -> list[ParameterStat
 
     def weight(item: ParameterStatistics) -> tuple[float, float]:
         cpk = math.inf if item.capability is None else item.capability.cpk
-        found = int(item.outliers.sum()) + (item.drift is not None and item.drift.significant)
-        return cpk, -float(found)
+        alarms = int(item.outliers.sum()) + (item.drift is not None and item.drift.significant)
+        return cpk, -float(alarms)
 
     chosen = sorted(statistics, key=weight)[:MOST_PANELS]
     return [item for item in statistics if item in chosen]

@@ -86,7 +86,7 @@ class History:
         rows: list[dict[str, Any]] = []
         with _in_one_line(self._name), self._engine.begin() as connection:
             for summary in summaries:
-                found = connection.execute(
+                calibration = connection.execute(
                     insert,
                     {
                         "serial": summary.serial,
@@ -100,10 +100,10 @@ class History:
                         "warnings": json.dumps(summary.warnings, ensure_ascii=False),
                     },
                 ).scalar()
-                if found is not None:
+                if calibration is not None:
                     rows += (
                         {
-                            "calibration": found,
+                            "calibration": calibration,
                             "name": name,
                             "value": p.value,
                             "standard_uncertainty": p.standard_uncertainty,
@@ -119,7 +119,7 @@ class History:
         import sqlalchemy as sa
 
         c, p = self._calibrations.c, self._parameters.c
-        found: dict[int, Past] = {}
+        calibrations: dict[int, Past] = {}
         values: dict[int, dict[str, Parameter]] = {}
         with _in_one_line(self._name), self._engine.connect() as connection:
             for start in range(0, len(serials), _SERIALS_AT_ONCE):
@@ -137,13 +137,13 @@ class History:
                     parameters = values.setdefault(row.id, {})
                     if row.name is not None:
                         parameters[row.name] = Parameter(row.value, row.standard_uncertainty, row.unit)
-                    if row.id not in found:
-                        found[row.id] = Past(
+                    if row.id not in calibrations:
+                        calibrations[row.id] = Past(
                             row.serial, row.procedure, row.date, row.created, row.content_sha256, row.sources_sha256,
                             parameters, row.degrees_of_freedom,
                         )  # fmt: skip
         past: dict[str, list[Past]] = {}
-        for item in found.values():
+        for item in calibrations.values():
             past.setdefault(item.serial, []).append(item)
         return past
 

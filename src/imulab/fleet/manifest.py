@@ -316,15 +316,15 @@ def load_fleet(path: str) -> FleetManifest:
     titles = rows[0][1]
     _check_columns(titles, path)
     units: list[FleetUnit] = []
-    seen: dict[str, tuple[str, str]] = {}
+    places: dict[str, tuple[str, str]] = {}
     for place, cells in rows[1:]:
         unit = _unit(place, dict(zip(titles, cells, strict=True)))
         key = unit.serial.casefold()
-        if key in seen:
-            first, other = seen[key]
+        if key in places:
+            first, other = places[key]
             same = "" if other == unit.serial else f" (as {other!r}; file names may not tell them apart)"
             raise OptionError(f"{place}, column serial: {unit.serial!r} is already in {first}{same}")
-        seen[key] = place.partition(": ")[2], unit.serial
+        places[key] = place.partition(": ")[2], unit.serial
         units.append(unit)
     if not units:
         raise OptionError(f"{path}: no rows below the titles; expected one row for each unit")

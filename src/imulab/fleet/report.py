@@ -73,14 +73,14 @@ def write_fleet_report(
     folder, limits = os.fspath(folder), None if limits is None else os.fspath(limits)
     state = fleet_status(folder)
     refuse_overwriting([Path(output)], {**own_files(Store(Path(folder)), state.manifest), **read_by(state.manifest)})
-    exhibits, found = _exhibits(state, limits, history)
+    exhibits, summaries = _exhibits(state, limits, history)
     provenance = [
         ("folder", folder),
         ("manifest", state.manifest.name),
         ("units", f"{len(state.rows)}: {', '.join(f'{state.count(s)} {s}' for s in ('done', 'failed', 'missing'))}"),
         ("limits", limits or "none given"),
-        ("records made", " to ".join(sorted({min(s.created for s in found), max(s.created for s in found)}))),
-        ("software", ", ".join(sorted({summary.software for summary in found}))),
+        ("records made", " to ".join(sorted({min(s.created for s in summaries), max(s.created for s in summaries)}))),
+        ("software", ", ".join(sorted({summary.software for summary in summaries}))),
     ]
     write_text(
         output,
@@ -95,17 +95,17 @@ def exhibits_of_folder(folder: str, *, limits: str | None = None, history: str |
 
 def _exhibits(state: FleetState, limits: str | None, history: str | None) -> tuple[Exhibits, list[Summary]]:
     """Return what the report shows, and the summaries that it is made of."""
-    found = [row.summary for row in state.rows if row.summary is not None]
-    if not found:
+    summaries = [row.summary for row in state.rows if row.summary is not None]
+    if not summaries:
         raise OptionError(
             f"{state.folder}: no records yet: {state.count('failed')} units failed, the others are missing"
         )
-    known = {} if limits is None else load_limits(limits, parameter_units(found))
-    statistics = line_statistics(found, known)
+    known = {} if limits is None else load_limits(limits, parameter_units(summaries))
+    statistics = line_statistics(summaries, known)
     with ExitStack() as stack:
         past = _history(state.folder, history, stack)
-        changes = [] if past is None else changes_since(found, past.of([summary.serial for summary in found]))
-    return fleet_exhibits(state, statistics, changes), found
+        changes = [] if past is None else changes_since(summaries, past.of([summary.serial for summary in summaries]))
+    return fleet_exhibits(state, statistics, changes), summaries
 
 
 def fleet_exhibits(
@@ -169,8 +169,8 @@ def _standing(statistics: Sequence[ParameterStatistics], out: set[str]) -> Itera
         most[item.procedure] = max(most.get(item.procedure, 0), len(item.values))
     for procedure, count in most.items():
         if count < FEWEST_FOR_OUTLIERS:
-            of = f" of {PROCEDURES[procedure].line_title}" if len(most) > 1 else ""
-            yield f"too few units{of} ({count} of {FEWEST_FOR_OUTLIERS}) to tell which stands out"
+            procedure_named = f" of {PROCEDURES[procedure].line_title}" if len(most) > 1 else ""
+            yield f"too few units{procedure_named} ({count} of {FEWEST_FOR_OUTLIERS}) to tell which stands out"
 
 
 def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
@@ -183,11 +183,11 @@ def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
     return stack.enter_context(open_history(url, there=True))
 
 
-def _differing(found: Sequence[Summary]) -> Iterator[str]:
+def _differing(summaries: Sequence[Summary]) -> Iterator[str]:
     """Say which parameters the units are not compared by, and what takes their place."""
-    reasons = {procedure: why for (procedure, _), why in not_compared(found).items()}
+    reasons = {procedure: why for (procedure, _), why in not_compared(summaries).items()}
     for procedure, why in reasons.items():
-        mine = [summary for summary in found if summary.procedure == procedure and summary.on_line is not None]
+        mine = [summary for summary in summaries if summary.procedure == procedure and summary.on_line is not None]
         title = PROCEDURES[procedure].line_title
         bare = [summary.serial for summary in mine if summary.on_line and not summary.on_line.parameters]
         yield (
@@ -200,8 +200,8 @@ def _differing(found: Sequence[Summary]) -> Iterator[str]:
 
 
 def _warnings(state: FleetState) -> list[str]:
-    found = [row.summary for row in state.rows if row.summary is not None]
-    notes = list(_differing(found))
+    summaries = [row.summary for row in state.rows if row.summary is not None]
+    notes = list(_differing(summaries))
     if state.at_work:
         notes.append(
             f"A run is at work on the folder ({state.at_work}): this is what was there when the report was made."

@@ -102,8 +102,8 @@ class FleetState(Shown):
     @property
     def verdicts(self) -> str:
         """How many records are good, to be looked at, and bad, as ``2 good, 1 look``; empty without any."""
-        found = {state: sum(row.verdict == state for row in self.rows) for state in SENTENCES}
-        return ", ".join(f"{count} {state}" for state, count in found.items() if count)
+        counts = {state: sum(row.verdict == state for row in self.rows) for state in SENTENCES}
+        return ", ".join(f"{count} {state}" for state, count in counts.items() if count)
 
     @property
     def failures(self) -> tuple[FleetRow, ...]:
@@ -209,14 +209,14 @@ def read_by(fleet: FleetManifest) -> dict[str, str]:
     """Return the files here that a fleet reads, full name to name: manifest, recordings, layouts, priors."""
     if is_url(fleet.base):
         return {}
-    found = {_absolute(os.path.join(fleet.base, Path(fleet.name).name)): fleet.name}  # noqa: PTH118
+    files = {_absolute(os.path.join(fleet.base, Path(fleet.name).name)): fleet.name}  # noqa: PTH118
     for unit in fleet.units:
         options = PROCEDURES[unit.procedure].task.options
         paths = [unit.options[o.name] for o in options if o.reads.file and o.name in unit.options]
         for name in (*unit.files, *paths):
             if not is_url(name):
-                found[_absolute(os.path.join(fleet.base, name))] = name  # noqa: PTH118
-    return found
+                files[_absolute(os.path.join(fleet.base, name))] = name  # noqa: PTH118
+    return files
 
 
 def own_files(store: Store, fleet: FleetManifest, *, table: bool = True) -> dict[str, str]:

@@ -61,7 +61,7 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
         A unit is not one of the parameter's.
     """
     table = load_toml(path, str(path), "limits")
-    found: dict[tuple[str, str], Limits] = {}
+    limits: dict[tuple[str, str], Limits] = {}
     for procedure, entries in table.items():
         if procedure not in PROCEDURES:
             raise ReadError(
@@ -77,8 +77,8 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
                 raise ReadError(f"{path}: {procedure}: no parameter {quoted(pattern)}; parameters: {shown}")
             for name in names:
                 key = procedure, name
-                found[key] = _limits(entry, name, units[key], f"{path}: {procedure}: {pattern}")
-    return found
+                limits[key] = _limits(entry, name, units[key], f"{path}: {procedure}: {pattern}")
+    return limits
 
 
 def _limits(entry: Any, name: str, unit: str, place: str) -> Limits:
@@ -239,10 +239,10 @@ class FleetChange:
 def days_of(text: str) -> float | None:
     """Return an ISO 8601 date as days since 1970 (UTC where it names no zone), or None."""
     try:
-        found = datetime.fromisoformat(text.strip())
+        date = datetime.fromisoformat(text.strip())
     except ValueError:
         return None
-    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() / 86400.0
+    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp() / 86400.0
 
 
 def outlier_limit(count: int) -> float:
@@ -254,16 +254,16 @@ def outlier_limit(count: int) -> float:
 
 def parameter_units(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
     """Return the unit of every parameter; of records in different units, that of most."""
-    found: dict[tuple[str, str], Counter[str]] = {}
+    units: dict[tuple[str, str], Counter[str]] = {}
     for summary in summaries:
         for name, parameter in summary.parameters.items():
-            found.setdefault((summary.procedure, name), Counter())[parameter.unit] += 1
-    return {key: count.most_common(1)[0][0] for key, count in found.items()}
+            units.setdefault((summary.procedure, name), Counter())[parameter.unit] += 1
+    return {key: count.most_common(1)[0][0] for key, count in units.items()}
 
 
 def not_compared(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
     """Return which parameters the units are not compared by, since they are about different numbers, and why."""
-    found: dict[tuple[str, str], str] = {}
+    reasons: dict[tuple[str, str], str] = {}
     for procedure in dict.fromkeys(summary.procedure for summary in summaries):
         lines = [s.on_line for s in summaries if s.procedure == procedure and s.on_line is not None]
         if not all(_mean_the_same(lines[0], line) for line in lines):
@@ -272,20 +272,20 @@ def not_compared(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
             why = f"{name.replace('_', ' ')} from {min(values):z.1f} to {max(values):z.1f} {unit}"
             if max(values) - min(values) <= lines[0].tolerance:
                 why = "model of different forms"
-            found |= {(procedure, own): why for line in lines for own in line.own}
-    return found
+            reasons |= {(procedure, coefficient): why for line in lines for coefficient in line.own}
+    return reasons
 
 
-def _mean_the_same(one: OnLine, other: OnLine) -> bool:
-    pairs = zip_longest(one.means, other.means, fillvalue=math.inf)
-    return all(abs(a - b) <= one.tolerance for a, b in pairs)
+def _mean_the_same(first: OnLine, second: OnLine) -> bool:
+    pairs = zip_longest(first.means, second.means, fillvalue=math.inf)
+    return all(abs(a - b) <= first.tolerance for a, b in pairs)
 
 
 def line_statistics(
     summaries: Sequence[Summary], limits: Mapping[tuple[str, str], Limits]
 ) -> list[ParameterStatistics]:
     """Return the statistics of every parameter that units can be compared by, in the order of the records."""
-    found = []
+    statistics = []
     left_out = not_compared(summaries)
     for (procedure, name), unit in parameter_units(summaries).items():
         if (procedure, name) in left_out:
@@ -297,7 +297,7 @@ def line_statistics(
             and (parameter := summary.parameters.get(name)) is not None
             and parameter.unit == unit
         ]
-        found.append(
+        statistics.append(
             _statistics(
                 procedure, name, unit,
                 tuple(summary.serial for summary, _ in mine),
@@ -307,7 +307,7 @@ def line_statistics(
                 limits.get((procedure, name)),
             )
         )  # fmt: skip
-    return found
+    return statistics
 
 
 def _statistics(
@@ -409,8 +409,8 @@ def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past
         for name, new in summary.parameters.items():
             old = last.parameters.get(name)
             # A history does not say what a calibration's own coefficients are about.
-            own = summary.on_line is not None and name in summary.on_line.own
-            if old is None or old.unit != new.unit or own:
+            by_coefficients = summary.on_line is not None and name in summary.on_line.own
+            if old is None or old.unit != new.unit or by_coefficients:
                 continue
             u, z = _compared(new, summary.freedom, old, last.freedom)
             changes.append(

@@ -50,26 +50,26 @@ def columns_of(rows: Sequence[FleetRow]) -> dict[str, list[Any]]:
     """
     columns: dict[str, list[Any]] = {name: [] for name in HEAD}
     for number, row in enumerate(rows):
-        found = row.summary
+        summary = row.summary
         head = (
             row.unit.serial,
             row.unit.procedure,
             row.status,
             row.verdict,
-            row.reason if found is None else " | ".join(found.verdict.reasons),
-            "" if found is None else " | ".join(found.warnings),
-            "" if found is None else found.date or "",
-            "" if found is None else found.created,
-            "" if found is None else found.software,
+            row.reason if summary is None else " | ".join(summary.verdict.reasons),
+            "" if summary is None else " | ".join(summary.warnings),
+            "" if summary is None else summary.date or "",
+            "" if summary is None else summary.created,
+            "" if summary is None else summary.software,
             ";".join(row.unit.files),
-            "" if found is None else found.content_sha256,
+            "" if summary is None else summary.content_sha256,
         )
         for name, value in zip(HEAD, head, strict=True):
             columns[name].append(value)
-        if found is not None and found.on_line is not None:
-            title = "{} [{}]".format(*found.on_line.about)
-            columns.setdefault(title, [None] * len(rows))[number] = found.on_line.means[0]
-        for name, parameter in {} if found is None else found.parameters.items():
+        if summary is not None and summary.on_line is not None:
+            title = "{} [{}]".format(*summary.on_line.about)
+            columns.setdefault(title, [None] * len(rows))[number] = summary.on_line.means[0]
+        for name, parameter in {} if summary is None else summary.parameters.items():
             for title, number_found in (
                 (f"{name} [{parameter.unit}]", parameter.value),
                 (f"std_{name} [{parameter.unit}]", parameter.standard_uncertainty),

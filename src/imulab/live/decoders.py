@@ -206,10 +206,10 @@ class LayoutDecoder(LineDecoder):
             document = json.loads(text)
             return [float(_looked_up(document, key)) for key in self._keys]
         delimiter = None if self._layout.delimiter == " " else self._layout.delimiter
-        found = self._layout.behind_prefix([field.strip() for field in text.split(delimiter)])
-        if found is None:
+        behind = self._layout.behind_prefix([field.strip() for field in text.split(delimiter)])
+        if behind is None:
             return None
-        fields = found
+        fields = behind
         if self._titled:
             titles = [field.strip('"') for field in fields]
             if all(key in titles for key in self._keys):

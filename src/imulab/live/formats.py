@@ -100,15 +100,15 @@ def _of_json(lines: list[str], seconds: float) -> Guess | None:
 
 
 def _flat(document: dict[str, object], before: str = "") -> dict[str, float]:
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     for key, value in document.items():
         if isinstance(value, dict):
-            found |= _flat(value, f"{before}{key}.")
+            numbers |= _flat(value, f"{before}{key}.")
         elif isinstance(value, list):
-            found |= _flat({str(place): each for place, each in enumerate(value)}, f"{before}{key}.")
+            numbers |= _flat({str(place): each for place, each in enumerate(value)}, f"{before}{key}.")
         elif isinstance(value, int | float):
-            found[f"{before}{key}"] = float(value)
-    return found
+            numbers[f"{before}{key}"] = float(value)
+    return numbers
 
 
 def _guess(head: list[str], names: list[str | int], table: Array, seconds: float) -> Guess | None:
@@ -147,7 +147,7 @@ def _triad(stem: str, names: list[str | int], start: int, unit: str) -> list[str
 def _prefix(rows: list[list[str]]) -> str:
     """Return the first field that most lines share where it is no number."""
     first = [row[0] for row in rows if len(row) > 1]
-    pairs = [one for one, other in pairwise(first) if one == other and not is_number(one)]
+    pairs = [field for field, other in pairwise(first) if field == other and not is_number(field)]
     return max(set(pairs), key=pairs.count) if len(pairs) > len(first) / 2 else ""
 
 

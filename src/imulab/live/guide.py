@@ -53,7 +53,7 @@ def read_targets(text: str | None) -> tuple[Target, ...]:
     OptionError
         It is no list of parameters with an uncertainty each.
     """
-    found = []
+    targets = []
     for part in (text or "").split(",") if text is not None else []:
         match = re.fullmatch(r"\s*([a-z_0-9]+)\s+(.+?)\s*", part)
         if match is None:
@@ -64,8 +64,8 @@ def read_targets(text: str | None) -> tuple[Target, ...]:
         value = quantity(match[2], "--target", *_KINDS[stem])
         if not 0 < value < float("inf"):
             raise OptionError(f"--target {text!r}: expected standard uncertainties above 0")
-        found.append(Target(stem, value, match[2]))
-    return tuple(found)
+        targets.append(Target(stem, value, match[2]))
+    return tuple(targets)
 
 
 def share_of(target: Target, record: Calibration, gravity: float) -> float:
@@ -225,12 +225,12 @@ class Guide:
         """Say where the attitudes disagree by far more than each scatters by itself; empty where they do not."""
         if self.fit is None or len(self.kept) < self._sure:
             return ""
-        own = float(np.median([self._own_noise(each.mean, each.covariance) for each in self.kept]))
-        if self._excess() < _MUCH * own:
+        usual = float(np.median([self._own_noise(each.mean, each.covariance) for each in self.kept]))
+        if self._excess() < _MUCH * usual:
             return ""
         higher = "--order auto" if self.order != "auto" else "a still table"
         return (
-            f"the attitudes disagree by {1e3 * self._excess():.2g} mg, {self._excess() / own:.0f} times what each "
+            f"the attitudes disagree by {1e3 * self._excess():.2g} mg, {self._excess() / usual:.0f} times what each "
             f"scatters by itself: more of them help little; {higher} may"
         )
 
@@ -287,8 +287,8 @@ class Guide:
 
     def noise(self) -> float:
         """Return the noise of |f| in the usual attitude, in units of g, with the scatter beyond that of the holds."""
-        own = [self._own_noise(each.mean, each.covariance) for each in self.kept]
-        usual = float(np.median(own)) if own else _GUESSED_NOISE
+        noises = [self._own_noise(each.mean, each.covariance) for each in self.kept]
+        usual = float(np.median(noises)) if noises else _GUESSED_NOISE
         return float(np.hypot(usual, self._excess()))
 
     def _own_noise(self, mean: Array, covariance: Array) -> float:
@@ -307,13 +307,14 @@ class Guide:
         """
         if seconds >= _LONGEST:
             return False
-        own, excess, usual = self._own_noise(mean, covariance), self._excess(), self.noise()
+        hold_noise, excess, usual = self._own_noise(mean, covariance), self._excess(), self.noise()
         others = np.vstack([self.directions(), self.outstanding()])
         rows = information_rows(others, self.model_order) / usual
         row = information_rows((mean / np.linalg.norm(mean))[None], self.model_order)[0]
         base = rows.T @ rows + np.eye(rows.shape[1]) / _PRIOR**2
         now, longer = (
-            np.diag(np.linalg.inv(base + np.outer(row, row) / (own**2 / times + excess**2))) for times in (1.0, 2.0)
+            np.diag(np.linalg.inv(base + np.outer(row, row) / (hold_noise**2 / times + excess**2)))
+            for times in (1.0, 2.0)
         )
         return bool(np.sqrt((longer / now).min()) < 1 - _LOWERS)
 
@@ -335,8 +336,8 @@ class Guide:
         """Return the standard uncertainty over its target for each parameter that has one."""
         if self.fit is None:
             return {}
-        found = [shares_of(target, self.fit.calibration, self.local_gravity) for target in self.targets]
-        return {name: share for shares in found for name, share in shares.items()}
+        by_target = [shares_of(target, self.fit.calibration, self.local_gravity) for target in self.targets]
+        return {name: share for shares in by_target for name, share in shares.items()}
 
     def wanted(self) -> int:
         """Return how many attitudes the session will need in all, as far as can be told."""
@@ -398,9 +399,9 @@ class Guide:
 
     def _planned(self, count: int, there: Array, *, move: bool = True) -> Array:
         points = sphere_candidates()
-        found = quick_set(Search(self.model_order, "A", there), points, count, _SEED, weight=self._weight(), move=move)
-        if found is not None:
-            return found
+        chosen = quick_set(Search(self.model_order, "A", there), points, count, _SEED, weight=self._weight(), move=move)
+        if chosen is not None:
+            return chosen
         # Readings that no unit at rest has, as of a dead axis, or attitudes too much alike: plan as if none were there.
         fewest = max(count, parameter_count(self.model_order) + 1)
         anew = quick_set(Search(self.model_order, "A", np.empty((0, 3))), points, fewest, _SEED, move=move)

@@ -182,15 +182,15 @@ class Stillness:
         self._last = ended
         return self._made(ended)
 
-    def _made(self, found: _Sum) -> Hold | None:
-        if not found.count:
+    def _made(self, total: _Sum) -> Hold | None:
+        if not total.count:
             return None
-        own, freedom = found.squares, max(found.count - 1, 0)
-        spread = self._pooled / self._freedom if self._freedom else own / max(freedom, 1)
-        spread = (POOL_DEGREES * spread + own) / (POOL_DEGREES + freedom)
+        squares, freedom = total.squares, max(total.count - 1, 0)
+        spread = self._pooled / self._freedom if self._freedom else squares / max(freedom, 1)
+        spread = (POOL_DEGREES * spread + squares) / (POOL_DEGREES + freedom)
         if not np.any(spread):
             spread = np.diag(np.where(np.isfinite(self._resolution), self._resolution, 0.0) ** 2 / 12)
-        return Hold(found.start, found.stop, found.mean.copy(), spread / found.count, found.count, found.resumed)
+        return Hold(total.start, total.stop, total.mean.copy(), spread / total.count, total.count, total.resumed)
 
 
 class _Sum:

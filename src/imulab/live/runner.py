@@ -259,8 +259,8 @@ class Runner:
         """
         events: list[Event] = []
         arrived = self.source.get(wait)
-        for one in arrived:
-            events += self._take(self._fed(one.data, one.time), one.time)
+        for piece in arrived:
+            events += self._take(self._fed(piece.data, piece.time), piece.time)
             self._answer()
         now = self.source.now()
         if not arrived:
@@ -306,8 +306,8 @@ class Runner:
     def listen(self, wait: float) -> list[Recording]:
         """Return the samples that have come, after `wait` seconds at most, without session and recording."""
         blocks: list[Recording] = []
-        for one in self.source.get(wait):
-            blocks += self._fed(one.data, one.time)
+        for piece in self.source.get(wait):
+            blocks += self._fed(piece.data, piece.time)
             self._answer()
         return [block for block in blocks if len(block)]
 
@@ -342,8 +342,8 @@ class Runner:
             self._fit_due = False
             self.recorder.flush()
             self._further.begin()
-        found = self._further.found()
-        return [] if found is None else self.session.know(*found)
+        result = self._further.found()
+        return [] if result is None else self.session.know(*result)
 
     def _answer(self) -> None:
         if self._stream.to_send:

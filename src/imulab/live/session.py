@@ -70,7 +70,7 @@ class Watch:
 
     def moment(self, moment: Moment) -> list[str]:
         """Look for an axis that is dead, or that has reached the end of its range."""
-        found: list[str] = []
+        messages: list[str] = []
         for k, axis in enumerate("xyz"):
             since, value = self._since[k], float(moment.mean[k])
             if not moment.constant[k] or value != self._held[k]:
@@ -81,15 +81,15 @@ class Watch:
             if since is None or moment.time - since < _CONSTANT or not any(self._lively):
                 continue
             if not self._lively[k]:
-                found += self._once(
+                messages += self._once(
                     f"dead {axis}", f"accel_{axis} has read {value:g} since the beginning: is the axis connected?"
                 )
             elif abs(value) >= np.abs(moment.mean).max():
-                found += self._once(
+                messages += self._once(
                     f"clipped {axis}",
                     f"accel_{axis} stays at exactly {value:g}: clipped? set the unit to a larger range and start again",
                 )
-        return found
+        return messages
 
     def block(self, block: Recording, time: float) -> list[str]:
         """Look at the temperature."""
@@ -104,25 +104,25 @@ class Watch:
             last.append((time, now))
             del last[1 : max(len(last) - int(_MINUTE), 1)]  # the first, and those of the last minute
         first, minute = last[0][1], last[min(1, len(last) - 1)]
-        found = []
+        messages = []
         if time - minute[0] > _MINUTE / 2 and abs(now - minute[1]) > _PER_MINUTE:
-            found += self._once(
+            messages += self._once(
                 "temperature rate",
                 f"the temperature changes by {now - minute[1]:+.1f} K within a minute: wait until it is steady",
             )
         if abs(now - first) > _WARMING:
-            found += self._once(
+            messages += self._once(
                 "temperature",
                 f"the temperature has changed by {now - first:+.1f} K since the beginning: the zeros will have, too",
             )
-        return found
+        return messages
 
     def counts(self, counts: Counts, samples: int) -> list[str]:
         """Look at what the stream has lost."""
-        found = []
+        messages = []
         came = samples + counts.repeated + counts.reordered + counts.stray
         if counts.stray:
-            found += self._once(
+            messages += self._once(
                 "stray",
                 "a sample whose time fits neither those before nor those after is left out, as any more will be: is "
                 "the cable all right?",
@@ -145,13 +145,13 @@ class Watch:
                 ),
             ):
                 if number > _LOST * samples:
-                    found += self._once(key, f"{number} {text}")
+                    messages += self._once(key, f"{number} {text}")
         if counts.restarts:
-            found += self._once(
+            messages += self._once(
                 f"restart {counts.restarts}",
                 "the device has started again, or its clock was set: is its power or its cable loose?",
             )
-        return found
+        return messages
 
 
 # A guided session: blocks of samples go in, events come out, and a view says at any moment what is to be seen.

@@ -168,27 +168,27 @@ def simulated_unit(text: str, *, follow: bool) -> tuple[SimulatedUnit, float]:
     OptionError
         A key or value is none.
     """
-    given: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     for pair in text.split(",") if text else []:
         key, equals, value = (part.strip() for part in pair.partition("="))
         where = f"simulate: {key}"
         if key not in _KEYS or not equals:
             raise OptionError(f"simulate:{text}: expected key=value, the keys being {listed(_KEYS, key)}")
         if key == "unit":
-            given[key] = value
+            settings[key] = value
         elif key == "speed":
-            given[key] = number(value, where)
+            settings[key] = number(value, where)
         elif key in _KINDS:
-            given[key] = quantity(value, where, *_KINDS[key])
+            settings[key] = quantity(value, where, *_KINDS[key])
         else:
-            given[key] = whole_number(value, where)
-    if given.setdefault("gyro", 0) not in (0, 1):
-        raise OptionError(f"simulate: gyro {given['gyro']}: expected 1 (with gyroscopes) or 0")
-    given["gyro"] = bool(given["gyro"])
-    speed = given.pop("speed", 1.0)
+            settings[key] = whole_number(value, where)
+    if settings.setdefault("gyro", 0) not in (0, 1):
+        raise OptionError(f"simulate: gyro {settings['gyro']}: expected 1 (with gyroscopes) or 0")
+    settings["gyro"] = bool(settings["gyro"])
+    speed = settings.pop("speed", 1.0)
     if not 0 <= speed <= 1e6:
         raise OptionError(f"simulate: speed {speed:g}; expected 0 (as fast as it goes) to 1e6")
-    unit = SimulatedUnit(**given, follow=follow)
+    unit = SimulatedUnit(**settings, follow=follow)
     replace(unit)._leg(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), {}, 0)  # refuses what cannot be
     return unit, speed
 
@@ -301,16 +301,16 @@ class Threaded(LiveSource):
 
     def get(self, wait: float) -> list[Arrived]:
         """Return what has come, after `wait` seconds at most."""
-        found: list[Arrived] = []
+        arrived: list[Arrived] = []
         try:
-            one = self._queue.get(timeout=wait)
-            while one is not None:
-                found.append(one)
-                one = self._queue.get_nowait()
+            piece = self._queue.get(timeout=wait)
+            while piece is not None:
+                arrived.append(piece)
+                piece = self._queue.get_nowait()
             self.ended = True
         except Empty:
             pass
-        return found
+        return arrived
 
     def send(self, data: bytes) -> None:
         """Send bytes; that the unit is gone is found by the thread that reads."""
@@ -356,9 +356,9 @@ class Paced(LiveSource):
                 time.sleep(min(left, wait))
                 if left > wait:
                     return []
-        found, self._waiting = self._waiting, None
-        self._time = found.time
-        return [found]
+        arrived, self._waiting = self._waiting, None
+        self._time = arrived.time
+        return [arrived]
 
     def now(self) -> float:
         """Return the time of the last block."""
@@ -461,16 +461,16 @@ def _serial(rest: str) -> LiveSource:
 
 def _why_no_port(port: str, error: Exception) -> str:
     number = getattr(error, "errno", None)
-    said = str(error).lower()
-    if number == errno.ENOENT or "filenotfound" in said:
+    reason = str(error).lower()
+    if number == errno.ENOENT or "filenotfound" in reason:
         known = " ".join(device for device, _ in serial_ports()) or "none"
         return f"no such port; ports of this machine: {known}"
-    if number in (errno.EACCES, errno.EPERM) and "lock" not in said:
+    if number in (errno.EACCES, errno.EPERM) and "lock" not in reason:
         return (
             "not permitted; add yourself to the group that owns the port (on most Linux systems: sudo usermod -aG "
             "dialout $USER, then log in anew)"
         )
-    if number in (errno.EBUSY, errno.EAGAIN) or "lock" in said:
+    if number in (errno.EBUSY, errno.EAGAIN) or "lock" in reason:
         return "the port is busy: another program has it open (a serial monitor? close it)"
     return f"cannot be opened: {_reason(error)}"
 

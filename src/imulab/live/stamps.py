@@ -266,6 +266,6 @@ class ArrivalClock:
         if len(self._numbers) < 3:
             return 0.0, 0.0
         x, y = np.array(self._numbers), np.array(self._arrivals)
-        one, other = np.triu_indices(len(x), 1)
-        slope = float(np.median((y[other] - y[one]) / (x[other] - x[one])))
+        earlier, later = np.triu_indices(len(x), 1)
+        slope = float(np.median((y[later] - y[earlier]) / (x[later] - x[earlier])))
         return max(slope, 1e-7), float(np.median(y - slope * x))

@@ -161,8 +161,8 @@ def corrected_reading(ready: Loaded, block: Recording, *, gyro: bool) -> Correct
     """
     after = apply(ready, block)
 
-    def length(of: Recording, sensor: str) -> float:
-        return float(np.linalg.norm([of.si(name).mean() for name in triad(sensor)]))
+    def length(recording: Recording, sensor: str) -> float:
+        return float(np.linalg.norm([recording.si(name).mean() for name in triad(sensor)]))
 
     raw = None if block.units["accel_x"] == "count" else length(block, "accel")
     return CorrectedReading(raw, length(after, "accel"), length(after, "gyro") if gyro else None)
@@ -207,12 +207,12 @@ class FurtherFits:
         if self._process is None or self._answer is None or not self._answer.poll():
             return None
         try:
-            found: Found = self._answer.recv()
+            result: Found = self._answer.recv()
         except EOFError:
-            found = (), ("the fit of the further triads was ended from outside",)
+            result = (), ("the fit of the further triads was ended from outside",)
         self._after = monotonic() + _REST * (monotonic() - self._begun)
         self.close()
-        return found
+        return result
 
     def close(self) -> None:
         """End a fit that is still running."""

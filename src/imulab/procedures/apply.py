@@ -123,13 +123,17 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
         There is nothing to apply in it, or it lacks a parameter.
     """
     if isinstance(record, Blob):
-        given = [(str(entry["kind"]), entry) for entry in record.text["sections"]]
-        known = [(section(kind), {**entry, **columns}) for kind, entry in given]
-        unknown = [kind for (kind, _), (found, _) in zip(given, known, strict=True) if found is None]
+        entries = [(str(entry["kind"]), entry) for entry in record.text["sections"]]
+        known = [(section(kind), {**entry, **columns}) for kind, entry in entries]
+        unknown = [kind for (kind, _), (known_section, _) in zip(entries, known, strict=True) if known_section is None]
         if unknown:
             raise RecordError(f"{record.name}: a section {unknown[0]!r} cannot be applied to a recording")
         # The table of an array is for `array fuse`; it leaves the other columns of a recording alone.
-        chain = tuple((found, entry) for found, entry in known if found is not None and found.corrects)
+        chain = tuple(
+            (known_section, entry)
+            for known_section, entry in known
+            if known_section is not None and known_section.corrects
+        )
         if not chain:
             raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse takes it")
         holds = (sha256(record.data).hexdigest(), *map(str, record.text.get("records", ())))
@@ -151,19 +155,19 @@ def with_heading(chain: Sequence[Loaded], records: Sequence[Calibration | Blob])
     RecordError
         None of the records holds accelerometers and magnetometers.
     """
-    found, why = list(chain), ""
+    extended, why = list(chain), ""
     for index in reversed(range(len(records))):
         record = records[index]
         if isinstance(record, Blob) or not procedure_of(record).has_heading:
             kind = "a blob" if isinstance(record, Blob) else f"a {record.procedure} record"
-            why = why or f"{found[index].name}: heading needs a record with magnetometers, found {kind}"
+            why = why or f"{extended[index].name}: heading needs a record with magnetometers, found {kind}"
             continue
         try:
-            found[index] = replace(found[index], further=procedure_of(record).heading(record))
+            extended[index] = replace(extended[index], further=procedure_of(record).heading(record))
         except RecordError as error:
-            why = f"{found[index].name}: {error}"
+            why = f"{extended[index].name}: {error}"
             continue
-        return found
+        return extended
     raise RecordError(why)
 
 
@@ -262,7 +266,7 @@ def _entries(ready: Loaded) -> Iterator[str]:
     """What a corrected recording says: a line per record; for a blob one for itself, then one per record in it."""
     made = [(columns.get("record", ready.holds[0]), part.kind) for part, columns in ready.sections]
     for digest in dict.fromkeys((ready.holds[0], *(digest for digest, _ in made))):
-        yield entry(ready.name, digest, [kind for of, kind in made if of == digest])
+        yield entry(ready.name, digest, [kind for source, kind in made if source == digest])
 
 
 def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterable[Recording]) -> Iterator[Recording]:
@@ -277,19 +281,19 @@ def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterabl
     check_order([part.kind for ready in chain for part, _ in ready.sections])
     since_power_on = any(part.since_power_on for ready in chain for part, _ in ready.sections)
     end = -math.inf
-    for number, given in enumerate(blocks):
-        if since_power_on and given.time is not None and len(given):  # within a block `apply` looks itself
-            if not given.time[0] > end:
+    for number, raw in enumerate(blocks):
+        if since_power_on and raw.time is not None and len(raw):  # within a block `apply` looks itself
+            if not raw.time[0] > end:
                 raise DataError(
-                    f"{given.name}: {given.place(0)}, column time: time does not rise: expected more than {end:.9g} s, "
-                    f"found {given.time[0]:.9g} s"
+                    f"{raw.name}: {raw.place(0)}, column time: time does not rise: expected more than {end:.9g} s, "
+                    f"found {raw.time[0]:.9g} s"
                 )
-            end = float(given.time[-1])
-        block = given
+            end = float(raw.time[-1])
+        block = raw
         for ready in chain:
             block = apply(ready, block)
-        if number == 0 and block is given:
-            raise DataError(next(iter(_why_unchanged(chain, given)), f"{given.name}: nothing to correct in it"))
+        if number == 0 and block is raw:
+            raise DataError(next(iter(_why_unchanged(chain, raw)), f"{raw.name}: nothing to correct in it"))
         yield block
 
 
@@ -323,29 +327,29 @@ def _parts(record: Calibration | Blob) -> list[tuple[Section | None, Mapping[str
 
 def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     """Return what a user should know about applying this record to this recording."""
-    found = []
+    messages = []
     if isinstance(record, Calibration) and record.verdict.state == "bad":
-        found.append(f"the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
+        messages.append(f"the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
     sensor = record.text["sensor"] if isinstance(record, Blob) else record.sensor
     for key in ("serial", "element"):
         mine, its = sensor.get(key), recording.metadata.get(key)
         if mine and its and mine != its:
-            found.append(f"{recording.name}: {key} {its}, but the record was made for {mine}")
+            messages.append(f"{recording.name}: {key} {its}, but the record was made for {mine}")
     parts = [(part, columns) for part, columns in _parts(record) if part is not None]
     triads = [part.triad for part, _ in parts if part.triad]
     absent = [triad for triad in triads if not _has_any(recording, triad)]
     if absent and len(absent) < len(triads):
         there = " and ".join(KINDS[triad].sensors for triad in triads if triad not in absent)
         missing = " and ".join(KINDS[triad].sensors for triad in absent)
-        found.append(Note(f"{recording.name}: no {missing} in it: its {there} alone are corrected"))
+        messages.append(Note(f"{recording.name}: no {missing} in it: its {there} alone are corrected"))
     for part, columns in parts:
-        found += part.remarks(columns, recording)
+        messages += part.remarks(columns, recording)
     made = None if isinstance(record, Blob) else record.model.get("temperature")
     here = recording.mean_temperature()
     if made is None or here is None or abs(here - made["value"]) <= _FAR_IN_TEMPERATURE:
-        return found
+        return messages
     return [
-        *found,
+        *messages,
         f"{recording.name}: temperature {here:.1f} degC is {abs(here - made['value']):.0f} K away from the "
         f"{made['value']:.1f} degC at which the record was made",
     ]

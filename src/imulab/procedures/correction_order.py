@@ -74,22 +74,22 @@ def check_after(
     RecordError
         The table was fitted to cycles that no thermal record had corrected, or that another had.
     """
-    found = list(before)
+    applied = list(before)
     for kind, columns, hashes in sections:
         if kind in SENSORS:
-            found.append(Thermal(hashes, SENSORS[kind]))
+            applied.append(Thermal(hashes, SENSORS[kind]))
         if kind != "warmup":
             continue
         sensors = {str(axis).partition("_")[0] for axis in columns["axes"]}
-        own, after = [each for each in found if each.sensor in sensors], columns.get("after")
-        if after is None and own:
+        earlier, after = [each for each in applied if each.sensor in sensors], columns.get("after")
+        if after is None and earlier:
             raise RecordError(
-                f"a warm-up record after a thermal one, both of columns {own[0].sensor}_*, whose cycles no thermal "
+                f"a warm-up record after a thermal one, both of columns {earlier[0].sensor}_*, whose cycles no thermal "
                 "record had corrected: what follows the temperature would be taken off twice; expected a warm-up "
                 "record of cycles that were corrected by the thermal one (imulab apply, then warmup fit)"
             )
-        if after is not None and not any(after in each.hashes for each in own):
+        if after is not None and not any(after in each.hashes for each in earlier):
             raise RecordError(
                 f"a warm-up record whose cycles were corrected by the thermal record sha256:{after[:12]}, "
-                f"with {'another' if own else 'none'} before it: expected that one"
+                f"with {'another' if earlier else 'none'} before it: expected that one"
             )

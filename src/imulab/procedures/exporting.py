@@ -99,11 +99,14 @@ def export(
         raise OptionError(f"device_id {number}: expected a number from 0 to {_DEVICE_IDS - 1}")
     if Path(folder).exists() and not Path(folder).is_dir():
         raise OptionError(f"{os.fspath(folder)}: expected a folder to write to, found a file")
-    given = list(records) if isinstance(records, Sequence) and not isinstance(records, str) else [records]
-    if not given:
+    listed_records = list(records) if isinstance(records, Sequence) and not isinstance(records, str) else [records]
+    if not listed_records:
         raise OptionError("export: records: expected one or more, found none")
-    loaded = [load(os.fspath(one)) if isinstance(one, str | PathLike) else as_record(one, "export") for one in given]
-    names = [os.fspath(one) if isinstance(one, str | PathLike) else "the record" for one in given]
+    loaded = [
+        load(os.fspath(item)) if isinstance(item, str | PathLike) else as_record(item, "export")
+        for item in listed_records
+    ]
+    names = [os.fspath(item) if isinstance(item, str | PathLike) else "the record" for item in listed_records]
     fusion = None if method is None and memory is None else _fusion(to, method, memory, loaded)
     if to in _FIRMWARE:
         for name, record in zip(names, loaded, strict=True):
@@ -115,10 +118,10 @@ def export(
         if record.verdict.state == "bad":
             tell(f"{name}: the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
     file = os.fspath(noise) if isinstance(noise, str | PathLike) else "the noise"
-    found: Mapping[str, Any] = _noise_of(noise, file) if isinstance(noise, Calibration) else {}
+    noise_keys: Mapping[str, Any] = _noise_of(noise, file) if isinstance(noise, Calibration) else {}
     if noise and not isinstance(noise, Calibration):
-        found = noise if isinstance(noise, Mapping) else _noise(file)
-    options = ExportOptions(lossy, number, found, file if noise else "", fusion, mag_mount, tell)
+        noise_keys = noise if isinstance(noise, Mapping) else _noise(file)
+    options = ExportOptions(lossy, number, noise_keys, file if noise else "", fusion, mag_mount, tell)
     return exporters.export(to, loaded, Path(folder), options)
 
 

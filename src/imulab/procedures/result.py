@@ -104,9 +104,9 @@ class Drawn(Shown):
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
         """Return the headline and the first table."""
-        found = self.exhibits()
-        table = next((item for item in found.items if isinstance(item, ReportTable)), None)
-        return found.headline, *(([], []) if table is None else (table.columns, table.rows))
+        exhibits = self.exhibits()
+        table = next((item for item in exhibits.items if isinstance(item, ReportTable)), None)
+        return exhibits.headline, *(([], []) if table is None else (table.columns, table.rows))
 
     @overload
     def plot(self, name: None = None) -> Plots: ...
@@ -123,8 +123,8 @@ class Drawn(Shown):
         """
         from imulab.report.plots import Plots
 
-        found = self.exhibits()
-        plots = Plots([item for item in found.items if isinstance(item, Figure)], self.subject)
+        exhibits = self.exhibits()
+        plots = Plots([item for item in exhibits.items if isinstance(item, Figure)], self.subject)
         return plots if name is None else plots[name]
 
 
@@ -174,18 +174,18 @@ def as_recording(
     """
     called = function.__name__
     check_keywords(reading, function)
-    given = {key: value for key, value in reading.items() if value is not None}
-    part: dict[str, Any] = {key: given.get(key) for key in _PART}
+    stated = {key: value for key, value in reading.items() if value is not None}
+    part: dict[str, Any] = {key: stated.get(key) for key in _PART}
     if isinstance(data, str | os.PathLike):
-        _refuse(given, _OF_ARRAYS, called, _TITLED)
-        return read(os.fspath(data), **_only(given, _OF_FILES), **part)
-    _refuse(given, _OF_FILES, called, "only files have that")
+        _refuse(stated, _OF_ARRAYS, called, _TITLED)
+        return read(os.fspath(data), **_only(stated, _OF_FILES), **part)
+    _refuse(stated, _OF_FILES, called, "only files have that")
     if isinstance(data, Recording):
-        _refuse(given, _OF_ARRAYS, called, "a recording has its own")
+        _refuse(stated, _OF_ARRAYS, called, "a recording has its own")
         return _cut(data, **part)
-    arrays = _only(given, ("rate", "unit", "units"))
+    arrays = _only(stated, ("rate", "unit", "units"))
     if is_frame(data):
-        _refuse(given, ("time",), called, "a data frame has it as the column 'time'")
+        _refuse(stated, ("time",), called, "a data frame has it as the column 'time'")
         return _cut(Recording.from_frame(data, **arrays), **part)  # type: ignore[arg-type]
     named: Mapping[str, ArrayLike]
     if isinstance(data, Mapping):
@@ -194,7 +194,7 @@ def as_recording(
         samples = _array(data, called, name)
         named = {"accel": samples} if columns is None else columns(samples)
     whole = {"rate": None, "unit": None, "units": None, **arrays, "name": "arrays"}
-    return _cut(Recording(*columns_of_arrays({**_only(given, ("time",)), **named}, **whole), name="arrays"), **part)
+    return _cut(Recording(*columns_of_arrays({**_only(stated, ("time",)), **named}, **whole), name="arrays"), **part)
 
 
 def as_blocks(
@@ -205,14 +205,14 @@ def as_blocks(
         whole = as_recording(data, reading, function, name=name)
         return iter((whole,)), whole.source
     check_keywords(reading, function)
-    given = {key: value for key, value in reading.items() if value is not None}
-    _refuse(given, _OF_ARRAYS, function.__name__, _TITLED)
-    part = _only(given, _PART)
+    stated = {key: value for key, value in reading.items() if value is not None}
+    _refuse(stated, _OF_ARRAYS, function.__name__, _TITLED)
+    part = _only(stated, _PART)
     path, source = Path(data), None
     if path.is_file():
         with path.open("rb") as stream:
             source = Source(str(data), hashlib.file_digest(stream, "sha256").hexdigest())
-    return read_blocks(path, **_only(given, _OF_FILES), **part), source
+    return read_blocks(path, **_only(stated, _OF_FILES), **part), source
 
 
 def as_record(record: Record, called: str) -> Calibration:
@@ -234,7 +234,7 @@ def as_record(record: Record, called: str) -> Calibration:
     raise OptionError(f"{called}: expected a record or the name of its file, found {described(record)}")
 
 
-def check_keywords(given: Mapping[str, Any], function: Callable[..., Any]) -> None:
+def check_keywords(keywords: Mapping[str, Any], function: Callable[..., Any]) -> None:
     """Refuse keywords that a function does not have.
 
     Raises
@@ -242,25 +242,25 @@ def check_keywords(given: Mapping[str, Any], function: Callable[..., Any]) -> No
     OptionError
         There is one; the message says which was meant. Or one that says how data are to be read has another type.
     """
-    own = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
-    known = dict.fromkeys([*own, *Sampling.__annotations__, *Reading.__annotations__])
-    for key in given:
+    parameters = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
+    known = dict.fromkeys([*parameters, *Sampling.__annotations__, *Reading.__annotations__])
+    for key in keywords:
         if key not in known:
             raise OptionError(f"{function.__name__}: unknown option {key!r}; known: {listed(known, key)}")
-        if (hint := _HINTS.get(key)) is not None and given[key] is not None:
-            check(given[key], hint, f"{function.__name__}: {key}")
+        if (hint := _HINTS.get(key)) is not None and keywords[key] is not None:
+            check(keywords[key], hint, f"{function.__name__}: {key}")
 
 
 def _array(data: object, called: str, name: str) -> NDArray[Any]:
     """Return samples without a name as an array of numbers."""
     if isinstance(data, np.ndarray | list | tuple) or hasattr(data, "__array__"):
         try:
-            found = unmasked(data)
+            samples = unmasked(data)
         except ValueError:
-            found = np.empty(0, dtype=object)
-        if found.dtype.kind in "iufbO" and found.ndim > 1:
-            return found
-        shape = f"an array of shape {found.shape}" if found.dtype.kind in "iufb" else "a list of something else"
+            samples = np.empty(0, dtype=object)
+        if samples.dtype.kind in "iufbO" and samples.ndim > 1:
+            return samples
+        shape = f"an array of shape {samples.shape}" if samples.dtype.kind in "iufb" else "a list of something else"
         raise DataError(f"{called}: {name}: expected an array of numbers, a row for each sample, found {shape}")
     raise DataError(f"{called}: {name}: expected {_EXPECTED}, found {described(data)}")
 
@@ -274,11 +274,11 @@ def _cut(recording: Recording, window: Window | None, element: int | None) -> Re
     return replace(parts[0], columns=joined)
 
 
-def _refuse(given: Mapping[str, Any], keys: Iterable[str], called: str, reason: str) -> None:
+def _refuse(stated: Mapping[str, Any], keys: Iterable[str], called: str, reason: str) -> None:
     for key in keys:
-        if key in given:
+        if key in stated:
             raise OptionError(f"{called}: {key} does not go with such data: {reason}")
 
 
-def _only(given: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
-    return {key: given[key] for key in keys if key in given}
+def _only(stated: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    return {key: stated[key] for key in keys if key in stated}

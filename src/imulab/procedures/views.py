@@ -164,10 +164,10 @@ def compare_records(first: Record, second: Record) -> Changes:
     >>> il.compare_records(first.calibration, second.calibration).models
     ('order 1 and 2',)
     """
-    one, other = (as_record(record, "compare_records") for record in (first, second))
-    procedure = procedure_of(one)
-    pair = procedure.comparable(one, other) if other.procedure == one.procedure else (one, other)
-    return Changes(**vars(compared(*pair, procedure.same_meaning)), record=one)
+    earlier, later = (as_record(record, "compare_records") for record in (first, second))
+    procedure = procedure_of(earlier)
+    pair = procedure.comparable(earlier, later) if later.procedure == earlier.procedure else (earlier, later)
+    return Changes(**vars(compared(*pair, procedure.same_meaning)), record=earlier)
 
 
 def verdict(comparison: RecordComparison) -> str:
@@ -235,7 +235,7 @@ def text(record: Calibration) -> str:
     more = f" (and {len(verdict.reasons) - 1} more)" if len(verdict.reasons) > 1 else ""
     lines = [_title(record), f"{verdict.state}: {SENTENCES[verdict.state]}{reasons}{more}"]
     lines += [headline] if (headline := _headline(record)) else []
-    rows = [f"  {_short(line)}" for line in aligned(*found)] if (found := _summary(record))[1] else _grouped(record)
+    rows = [f"  {_short(line)}" for line in aligned(*table)] if (table := _summary(record))[1] else _grouped(record)
     room = LINES - len(lines)
     if len(rows) > room:
         rows = [*rows[: room - 1], f"  ... and {len(rows) - room + 1} more: to_frame() has all parameters"]
@@ -263,8 +263,8 @@ def plots(record: Calibration, name: str | int | None) -> Plots | Plot:
     """Return the figures of a record's report, or the one of this name."""
     from imulab.report.plots import Plots
 
-    found = Plots(exhibits_of(record).figures, _title(record))
-    return found if name is None else found[name]
+    drawn = Plots(exhibits_of(record).figures, _title(record))
+    return drawn if name is None else drawn[name]
 
 
 def apply_to(
@@ -309,8 +309,8 @@ def recording_plots(recording: Recording, name: str | int | None) -> Plots | Plo
     from imulab.report.noise_figures import channel_figures
     from imulab.report.plots import Plots
 
-    found = Plots(channel_figures(recording), recording.name)
-    return found if name is None else found[name]
+    drawn = Plots(channel_figures(recording), recording.name)
+    return drawn if name is None else drawn[name]
 
 
 def _title(record: Calibration) -> str:

@@ -165,8 +165,8 @@ def _joined(parts: list[Array]) -> Array:
         return first
     begins = [part.__array_interface__["data"][0] for part in parts]
     follows = [begin + part.nbytes for begin, part in zip(begins, parts, strict=True)]
-    one = first.base is not None and all(part.base is first.base and part.strides == (8,) for part in parts)
-    if one and begins[1:] == follows[:-1]:
+    contiguous = first.base is not None and all(part.base is first.base and part.strides == (8,) for part in parts)
+    if contiguous and begins[1:] == follows[:-1]:
         return as_strided(first, shape=(sum(map(len, parts)),), strides=(8,))
     return np.concatenate(parts)
 
@@ -252,8 +252,8 @@ def _found(file: str | Path) -> list[str]:
     """Return a note of the layout that fits a file without a column that imulab knows."""
     from imulab.readers.shipped import advice
 
-    found = advice(_head(file))
-    return [Note(found)] if found else []
+    hint = advice(_head(file))
+    return [Note(hint)] if hint else []
 
 
 def _advised(error: ImulabError, file: str | Path, layout: Layout | None) -> ImulabError:

@@ -25,7 +25,7 @@ def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | 
     ReadError
         The layout takes a column by number, or says what belongs to text.
     """
-    found: dict[str, tuple[str, int | None]] = {}
+    variables: dict[str, tuple[str, int | None]] = {}
     text = ("prefix", "skip_incomplete") if kind != "JSON" else ("prefix",)
     for key in text:
         if getattr(layout, key):
@@ -45,8 +45,8 @@ def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | 
                 f'{name}: {layout.name}: column {column}: unit "iso" is for text, and this is a {kind} file'
             )
         match = _INDEXED.fullmatch(entry.origin)
-        found[column] = (match[1], int(match[2])) if match else (entry.origin, None)
-    return found
+        variables[column] = (match[1], int(match[2])) if match else (entry.origin, None)
+    return variables
 
 
 def sliced(
@@ -124,8 +124,8 @@ def recordings(
         The columns have different lengths, or none at all.
     """
     if len(set(lengths.values())) > 1:
-        found = ", ".join(f"{column} {length}" for column, length in lengths.items())
-        raise ReadError(f"{name}: columns of different length: {found}")
+        described = ", ".join(f"{column} {length}" for column, length in lengths.items())
+        raise ReadError(f"{name}: columns of different length: {described}")
     total = next(iter(lengths.values()), 0)
     if total == 0:
         raise ReadError(f"{name}: no rows of data")

@@ -237,8 +237,8 @@ def _choose(
     there = {place: source for place, source in every.items() if place[0] != "MAG"}
     titles = {title for title, _ in there}
     if not titles:
-        found = " ".join(sorted(contents.other | {title for title, _ in every})) or "none"
-        raise ReadError(f"{name}: no IMU, ACC or GYR messages; messages found: {found}")
+        known = " ".join(sorted(contents.other | {title for title, _ in every})) or "none"
+        raise ReadError(f"{name}: no IMU, ACC or GYR messages; messages found: {known}")
     instance = selection.instance or 0
     topic = wanted or ("IMU" if "IMU" in titles else "ACC" if "ACC" in titles else "GYR")
     samples = {title: contents.counts[there[title, instance][0], instance] for title, n in there if n == instance}
@@ -255,8 +255,8 @@ def _choose(
                 f"ACC, which has {samples['ACC']} samples, is read rather than {samples['IMU']} of IMU; a topic chooses"
             )
     if (topic, instance) not in there:
-        found = ", ".join(f"{title} {number}" for title, number in sorted(there))
-        raise OptionError(f"{name}: no {topic} of instance {instance}; found {found}")
+        known = ", ".join(f"{title} {number}" for title, number in sorted(there))
+        raise OptionError(f"{name}: no {topic} of instance {instance}; found {known}")
     several = sum(title == topic for title, _ in there)
     if several > 1:
         contents.notes.append(f"instance {instance} of {several} of {topic}")

@@ -74,26 +74,26 @@ def _unpacked(dataset: Any) -> int:
 
 def _dataset(h5py: Any, file: Any, variable: str) -> tuple[Any, str | None]:
     """Return a dataset, or a table's dataset and the name of its member."""
-    found = _get(h5py, file, variable)
-    if isinstance(found, h5py.Dataset):
-        return found, None
+    item = _get(h5py, file, variable)
+    if isinstance(item, h5py.Dataset):
+        return item, None
     parent, _, member = variable.rpartition("/")
-    found = _get(h5py, file, parent)
-    if isinstance(found, h5py.Dataset) and found.dtype.names and member in found.dtype.names:
-        return found, member
+    item = _get(h5py, file, parent)
+    if isinstance(item, h5py.Dataset) and item.dtype.names and member in item.dtype.names:
+        return item, member
     return None, None
 
 
 def _get(h5py: Any, file: Any, path: str) -> Any:
     """Return what lies at a path of this file, or None; links that lead into other files are not followed."""
-    found = file
+    item = file
     for part in path.strip("/").split("/"):
-        if not part or not isinstance(found, h5py.Group):
+        if not part or not isinstance(item, h5py.Group):
             return None
-        if isinstance(found.get(part, getlink=True), h5py.ExternalLink):
+        if isinstance(item.get(part, getlink=True), h5py.ExternalLink):
             return None
-        found = found.get(part)
-    return found
+        item = item.get(part)
+    return item
 
 
 def _list(h5py: Any, file: Any) -> str:

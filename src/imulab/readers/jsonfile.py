@@ -51,9 +51,9 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
         if isinstance(document, dict) and document.get("format") == FORMAT:
             raise ReadError(f"{name}: expected a recording, found JSON (a calibration record?)")
         if layout is None:
-            found = _listed(_names(document))
+            keys = _listed(_names(document))
             raise ReadError(
-                f"{name}: not a calibration record; of a recording --layout says which key is what; found {found}"
+                f"{name}: not a calibration record; of a recording --layout says which key is what; found {keys}"
             )
     except RecursionError:
         raise ReadError(f"{name}: nests arrays or objects hundreds of levels deep; expected records") from None

@@ -155,7 +155,7 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
 
 def _with_tables(columns: dict[str, Any], table: dict[str, Any], path: str) -> dict[str, Any]:
     """Return the columns with what the tables [scale_factor] and [zero] say of them."""
-    found = dict(columns)
+    merged = dict(columns)
     for key, example in _BY_COLUMN.items():
         entries = table.get(key, {})
         if not isinstance(entries, dict):
@@ -163,11 +163,11 @@ def _with_tables(columns: dict[str, Any], table: dict[str, Any], path: str) -> d
         for name, entry in entries.items():
             if name not in columns:
                 raise ReadError(f"{path}: {key}: no column {quoted(name)}; columns: {listed(columns, name)}")
-            if isinstance(found[name], dict):
-                if key in found[name]:
+            if isinstance(merged[name], dict):
+                if key in merged[name]:
                     raise ReadError(f"{path}: column {name}: {key} is given twice, here and under [{key}]")
-                found[name] = {**found[name], key: entry}
-    return found
+                merged[name] = {**merged[name], key: entry}
+    return merged
 
 
 def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:

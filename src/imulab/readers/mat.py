@@ -69,13 +69,13 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
     try:
         budget = Budget(path, name)
         with path.open("rb") as stream:
-            variables = {found.name: found for found in _variables(stream.read(), roots if layout else None, budget)}
+            variables = {known.name: known for known in _variables(stream.read(), roots if layout else None, budget)}
     except (_DamagedError, EOFError, zlib.error, struct.error, UnicodeDecodeError, ValueError, MemoryError) as error:
         raise ReadError(f"{name}: truncated or damaged, not a whole MATLAB file: {error}") from None
     if layout is None:
         names = [name for variable in variables.values() for name in variable.describe()]
-        found = ", ".join(names[:_LISTED]) + (" ..." if len(names) > _LISTED else "") or "none"
-        raise ReadError(f"{name}: say with --layout FILE.toml which variable is which column; variables found: {found}")
+        known = ", ".join(names[:_LISTED]) + (" ..." if len(names) > _LISTED else "") or "none"
+        raise ReadError(f"{name}: say with --layout FILE.toml which variable is which column; variables found: {known}")
     take: dict[str, Callable[[int, int], Array]] = {}
     lengths: dict[str, int] = {}
     for column, (path_there, number) in wanted.items():

@@ -121,14 +121,14 @@ def _good(data: bytes) -> np.ndarray:
 
 def _frames(data: bytes) -> tuple[np.ndarray, int, int | None]:
     """Return the good frames, the number of bytes skipped after the first of them, and where a last, cut one begins."""
-    found, skipped, size, cut = [], 0, _FRAME.itemsize, None
+    frames, skipped, size, cut = [], 0, _FRAME.itemsize, None
     place = _first_frame(data)
     while place is not None:
         count = (len(data) - place) // size
         run = data[place : place + count * size]
         good = _good(run) if count else np.empty(0, dtype=bool)
         length = count if good.all() else int(np.argmin(good))
-        found.append(np.frombuffer(run[: length * size], dtype=_FRAME))
+        frames.append(np.frombuffer(run[: length * size], dtype=_FRAME))
         place += length * size
         step = _first_frame(data[place:], len(data))
         if step is None:
@@ -139,7 +139,7 @@ def _frames(data: bytes) -> tuple[np.ndarray, int, int | None]:
             break
         skipped += step
         place += step
-    return (np.concatenate(found) if found else np.empty(0, dtype=_FRAME)), skipped, cut
+    return (np.concatenate(frames) if frames else np.empty(0, dtype=_FRAME)), skipped, cut
 
 
 def _begins_frame(rest: bytes) -> bool:

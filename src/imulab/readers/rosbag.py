@@ -49,7 +49,7 @@ def files_of(folder: Path, name: str) -> list[Path]:
     ReadError
         There is none, or one that the folder's metadata lists is missing or compressed as a whole.
     """
-    found = sorted((p for p in folder.iterdir() if p.suffix in (".mcap", ".db3")), key=_natural)
+    paths = sorted((p for p in folder.iterdir() if p.suffix in (".mcap", ".db3")), key=_natural)
     metadata = folder / "metadata.yaml"
     listed: list[str] = []
     if metadata.is_file():
@@ -61,13 +61,13 @@ def files_of(folder: Path, name: str) -> list[Path]:
             raise ReadError(f"{name}: {entry} is listed in metadata.yaml, but it is not there")
     if listed:
         return [folder / Path(entry).name for entry in listed]
-    if not found:
+    if not paths:
         common = next((ending for ending in (".csv", ".parquet") if any(folder.glob(f"*{ending}"))), "")
         raise ReadError(
             f"{name}: expected a file, found a folder that is no ROS 2 bag (no .mcap or .db3 in it)"
             + (f"; name the files in it: {name}/*{common}" if common else "")
         )
-    return found
+    return paths
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -154,11 +154,11 @@ class Bag:
             self._end = index
             counts = [self._number(fields, key, 4) for key in (b"conn_count", b"chunk_count")]
             stream.seek(index)
-            self.topics, found = self._index(stream)
-            if found != counts:
+            self.topics, indexed = self._index(stream)
+            if indexed != counts:
                 raise ReadError(
                     f"{name}: truncated or damaged: expected {counts[0]} connections and {counts[1]} chunks in the "
-                    f"index, found {found[0]} and {found[1]}"
+                    f"index, found {indexed[0]} and {indexed[1]}"
                 )
 
     def messages(self, numbers: Iterable[int]) -> Iterator[logs.Records]:
@@ -264,8 +264,8 @@ class Mcap:
         self._channels: dict[int, Topic] = {}
         self._define(records)
         if not self._channels or not self._schemas:  # a summary need not repeat them
-            for found in self._blocks():
-                self._define(found)
+            for block in self._blocks():
+                self._define(block)
         self.topics = list(self._channels.values())
 
     def messages(self, numbers: Iterable[int]) -> Iterator[logs.Records]:
@@ -362,13 +362,13 @@ class Sqlite:
     def _check_tables(self) -> None:
         """Refuse a view or a computed column in the place of a table: what they give is bounded by no file's size."""
         for table in ("topics", "messages"):
-            found = [
+            tables = [
                 row
                 for rows in self._query(f"SELECT type, sql FROM sqlite_master WHERE name = '{table}'")
                 for row in rows
             ]
             computed = [row for rows in self._query(f"PRAGMA table_xinfo({table})") for row in rows if row[6]]
-            if [kind for kind, _ in found] != ["table"] or computed or "VIRTUAL" in str(found[0][1]).upper():
+            if [kind for kind, _ in tables] != ["table"] or computed or "VIRTUAL" in str(tables[0][1]).upper():
                 raise ReadError(f"{self._name}: not a ROS 2 bag, or damaged: expected a plain table {table}")
 
     def _query(self, text: str) -> Iterator[list[tuple[Any, ...]]]:
@@ -406,8 +406,8 @@ def _decompressed(data: bytes, method: str, size: int, budget: Budget, name: str
         except Exception as error:  # each library has errors of its own
             raise ReadError(f"{name}: {where} is damaged: {method} says {error}") from None
     if len(chunk) != size:
-        found = len(chunk) if len(chunk) <= size else f"more than {size}"
-        raise ReadError(f"{name}: {where} is damaged: expected {size} bytes, found {found}")
+        held = len(chunk) if len(chunk) <= size else f"more than {size}"
+        raise ReadError(f"{name}: {where} is damaged: expected {size} bytes, found {held}")
     return chunk
 
 
@@ -515,8 +515,8 @@ def _choose(topics: list[Topic], wanted: str | None, name: str) -> tuple[list[st
     """Return the topics of an Imu, one or two, and that of a magnetometer if one is asked for."""
     there = _of_type(topics, _IMU)
     if not there:
-        found = ", ".join(dict.fromkeys(f"{t.name} ({t.type})" for t in topics)) or "none"
-        raise ReadError(f"{name}: no topic of sensor_msgs/Imu; topics found: {found}")
+        known = ", ".join(dict.fromkeys(f"{t.name} ({t.type})" for t in topics)) or "none"
+        raise ReadError(f"{name}: no topic of sensor_msgs/Imu; topics found: {known}")
     fields = _of_type(topics, _FIELD)
     entries = wanted.split(",") if wanted is not None else []
     named = [entry if entry.startswith("/") or entry in (*there, *fields) else f"/{entry}" for entry in entries]
@@ -578,8 +578,8 @@ def _in_tesla(pieces: Iterator[Piece], stream: int, topic: str, notes: list[str]
         size = np.linalg.norm(piece.values, axis=1)
         if factor is None and np.isfinite(size).any():
             usual = float(np.median(size[np.isfinite(size)]))
-            factor, said = _unit_of_field(usual, topic)
-            notes += said
+            factor, remarks = _unit_of_field(usual, topic)
+            notes += remarks
         yield replace(piece, values=piece.values * factor) if factor else piece
 
 
@@ -635,10 +635,10 @@ def _decoded(records: logs.Records, indices: logs.Integers, topic: Topic, name: 
     count = _DOUBLES[topic.type]
     offsets, sizes = records.offsets[indices], records.sizes[indices]
 
-    def refuse(found: int) -> None:
+    def refuse(length: int) -> None:
         first = records.block[int(offsets[0]) : int(offsets[0]) + 4]
         hint = "; each message is compressed: convert the bag first ('ros2 bag convert')" if first == _ZSTD else ""
-        raise ReadError(f"{name}: {topic.name}: a message of {found} bytes is no {topic.type}{hint}")
+        raise ReadError(f"{name}: {topic.name}: a message of {length} bytes is no {topic.type}{hint}")
 
     if sizes.min() < 16:
         refuse(int(sizes.min()))

@@ -92,7 +92,7 @@ def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Ite
         yield from blocks
         return
     first, last = (-np.inf if window[0] is None else window[0]), (np.inf if window[1] is None else window[1])
-    low, high, found = np.inf, -np.inf, False
+    low, high, any_row = np.inf, -np.inf, False
     for block in blocks:
         time = block.time
         if time is None:
@@ -103,15 +103,15 @@ def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Ite
         inside = (time >= first) & (time <= last)
         edges = np.flatnonzero(np.diff(inside, prepend=False, append=False))
         for start, stop in edges.reshape(-1, 2).tolist():
-            found = True
+            any_row = True
             yield replace(
                 block,
                 columns={key: values[start:stop] for key, values in block.columns.items()},
                 first_row=block.first_row + start,
             )
-        if found and finite.size and finite.min() > last:
+        if any_row and finite.size and finite.min() > last:
             break
-    if not found:
+    if not any_row:
         raise OptionError(
             f"{name}: nothing in the window {first:g} to {last:g} s; the file runs from {low:g} to {high:g} s"
         )
@@ -135,11 +135,11 @@ def of_element(blocks: Iterator[Recording], element: int | None, name: str) -> I
             raise OptionError(f"{name}: no columns of several IMUs; leave out the element {element}")
         if element not in there:
             raise OptionError(f"{name}: no element {element}; elements found: {' '.join(map(str, there))}")
-        own = {column: column for column, number in numbers.items() if number is None}
-        own |= {column: column.rpartition("_")[0] for column, number in numbers.items() if number == element}
+        renamed = {column: column for column, number in numbers.items() if number is None}
+        renamed |= {column: column.rpartition("_")[0] for column, number in numbers.items() if number == element}
         yield replace(
             block,
-            columns={own[column]: values for column, values in block.columns.items() if column in own},
-            units={own[column]: unit for column, unit in block.units.items() if column in own},
+            columns={renamed[column]: values for column, values in block.columns.items() if column in renamed},
+            units={renamed[column]: unit for column, unit in block.units.items() if column in renamed},
             metadata={**block.metadata, "element": str(element)},
         )

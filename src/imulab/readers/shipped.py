@@ -35,11 +35,11 @@ class Shipped:
 @cache
 def shipped() -> tuple[Shipped, ...]:
     """Return all of them, by name."""
-    found = []
+    layouts = []
     for name in shipped_names():
         text = (shipped_file(name) or Path()).read_text(encoding="utf-8")
-        found.append(Shipped(name, text.partition("\n")[0].removeprefix("# "), load_layout(name)))
-    return tuple(found)
+        layouts.append(Shipped(name, text.partition("\n")[0].removeprefix("# "), load_layout(name)))
+    return tuple(layouts)
 
 
 def fitting(head: bytes) -> list[str]:

@@ -265,7 +265,7 @@ def _left_out(clock: _Buffer, others: list[_Buffer]) -> list[str]:
 def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
     """Say by how much the first stream that ends ends before the others, and warn where that is much of them."""
     timed = [(b.last, b.first, b) for b in buffers if b.last is not None and b.first is not None and b.stream.bounds]
-    end, _, first = min(timed, key=lambda one: one[0])
+    end, _, first = min(timed, key=lambda ending: ending[0])
     messages = []
     for last, start, buffer in timed:
         left = last - end
@@ -410,23 +410,23 @@ def join_recordings(recording: Recording, others: Sequence[Recording]) -> Record
         raise OptionError("others: expected one recording or more to join, found none")
     every = [recording, *others]
     streams, pieces, taken = [], [], {"time": recording.name}
-    for number, one in enumerate(every):
-        if one.time is None:
-            raise DataError(f"{one.name}: no column time, by which it could be joined")
-        time = check_time(one)
-        _check_overlap(recording, one)
-        names = [name for name in one.columns if name != "time"]
+    for number, part in enumerate(every):
+        if part.time is None:
+            raise DataError(f"{part.name}: no column time, by which it could be joined")
+        time = check_time(part)
+        _check_overlap(recording, part)
+        names = [name for name in part.columns if name != "time"]
         for name in names:
             if name in taken:
-                raise DataError(f"{one.name}: column {name}, which {taken[name]} has too; expected other sensors")
-            taken[name] = one.name
+                raise DataError(f"{part.name}: column {name}, which {taken[name]} has too; expected other sensors")
+            taken[name] = part.name
         kinds = {kind_of(name) for name in names}
-        units = {name: one.units[name] for name in names}
+        units = {name: part.units[name] for name in names}
         streams.append(
-            LoggedStream(one.name, units, slow=kinds == {"temperature"}, placed="mag" in kinds and number > 0)
+            LoggedStream(part.name, units, slow=kinds == {"temperature"}, placed="mag" in kinds and number > 0)
         )
         ticks = np.rint(time * _PER_SECOND).astype(np.int64)
-        pieces.append(Piece(number, ticks, np.column_stack([one.columns[name] for name in names])))
+        pieces.append(Piece(number, ticks, np.column_stack([part.columns[name] for name in names])))
     # The first comes last, when all that its rows need is there.
     blocks = list(
         on_one_clock(
@@ -439,13 +439,13 @@ def join_recordings(recording: Recording, others: Sequence[Recording]) -> Record
         )
     )
     columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
-    notes = dict.fromkeys(note for one in (*every, *blocks) for note in one.notes)
+    notes = dict.fromkeys(note for part in (*every, *blocks) for note in part.notes)
     return replace(blocks[0], columns=columns, source=recording.source, notes=tuple(notes))
 
 
 def _check_overlap(first: Recording, other: Recording) -> None:
     """Refuse recordings of different times."""
-    ends = [(float(one.si("time")[0]), float(one.si("time")[-1])) for one in (first, other)]
+    ends = [(float(part.si("time")[0]), float(part.si("time")[-1])) for part in (first, other)]
     if ends[1][0] > ends[0][1] or ends[0][0] > ends[1][1]:
         (a, b), (c, d) = ends
         raise DataError(

@@ -193,9 +193,9 @@ class Lines:
         while True:
             lines = self._rest[self._at :].split(b"\n")
             whole = lines if self._ended or self.waiting > LONGEST_LINE else lines[:-1]
-            found = next((line for line in whole if line.strip() and not line.startswith(b"#")), b"")
-            if found or whole is lines:
-                return found
+            line_of_data = next((line for line in whole if line.strip() and not line.startswith(b"#")), b"")
+            if line_of_data or whole is lines:
+                return line_of_data
             self._read_more()
 
     def line(self, encoding: str = "utf-8", errors: str = "strict", hint: str = "") -> str | None:
@@ -322,13 +322,13 @@ class TextFile:
 
     def blocks(self) -> Iterator[Recording]:
         """Yield the rows as recordings; there is at least one row, or the file is refused."""
-        last, told = None, False
+        last, noted = None, False
         for block in self._blocks():
             if not self._skips:
                 yield block
                 continue
             if self._lines.live:
-                first, told = self._incomplete > 0 and not told, told or self._incomplete > 0
+                first, noted = self._incomplete > 0 and not noted, noted or self._incomplete > 0
                 yield replace(block, notes=(*block.notes, self._skipped())) if first else block
                 continue
             if last is not None:
@@ -450,8 +450,8 @@ class TextFile:
             index = origin if isinstance(origin, int) else present.index(origin) if origin in present else -1
             if not 0 <= index < len(present):
                 what = f"column {origin}" if isinstance(origin, int) else f"a column named {origin!r}"
-                found = f"{len(present)} columns" if isinstance(origin, int) else several(present)
-                raise ReadError(f"{self._name}: {layout.name} takes {name} from {what}, found {found}")
+                known = f"{len(present)} columns" if isinstance(origin, int) else several(present)
+                raise ReadError(f"{self._name}: {layout.name} takes {name} from {what}, found {known}")
             if slots[index] >= 0:
                 other = list(layout.columns)[slots[index] & ~_DATE]
                 raise ReadError(f"{self._name}: {layout.name} takes both {other} and {name} from column {origin}")
@@ -587,14 +587,14 @@ class TextFile:
             raise ReadError(f"{place}: expected {expected} fields, found an empty line")
         if problem == _WRONG_COUNT:
             raise ReadError(f"{place}: expected {expected} fields, found {field}")
-        found = _fields(line, self._delimiter)[field].strip(" \t\r")
+        entry = _fields(line, self._delimiter)[field].strip(" \t\r")
         column = self._titles[int(self._slots[field]) & ~_DATE]
-        shown = found if len(found) <= 40 else found[:37] + "..."
+        shown = entry if len(entry) <= 40 else entry[:37] + "..."
         if problem == _NOT_A_DATE:
             raise ReadError(
                 f"{place}, column {column}: expected a date and time such as 2026-11-22T15:04:05.250Z, found {shown!r}"
             )
-        comma = " (a decimal comma? expected a point)" if re.fullmatch(r"[-+]?\d+,\d+", found) else ""
+        comma = " (a decimal comma? expected a point)" if re.fullmatch(r"[-+]?\d+,\d+", entry) else ""
         if comma and self._layout:
             comma += '; decimal = "," in the layout reads it'
         raise ReadError(f"{place}, column {column}: expected a number, found {shown!r}{comma}")

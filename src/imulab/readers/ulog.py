@@ -186,8 +186,8 @@ def _choose(
         wanted = _raw_or_combined(samples, wanted, contents.notes)
     chosen = [title for title in wanted if (title, instance) in there]
     if not chosen:
-        found = ", ".join(f"{title} {number}" for title, number in sorted(there))
-        raise OptionError(f"{name}: no {' '.join(wanted)} of instance {instance}; found {found}")
+        known = ", ".join(f"{title} {number}" for title, number in sorted(there))
+        raise OptionError(f"{name}: no {' '.join(wanted)} of instance {instance}; found {known}")
     several = [f"{title} {number}" for title, number in sorted(there) if title in wanted]
     if len(several) > len(chosen):
         contents.notes.append(f"instance {instance} of {', '.join(several)}")
@@ -228,8 +228,8 @@ def _magnetometer(contents: _Contents, wanted: int | None, instance: int, name: 
     title = next((title for title in _MAGS if any(title == other for other, _ in there)), None)
     places = sorted(place for other, place in there if other == title)
     if wanted is not None and (title != _MAGS[0] or wanted not in places):
-        found = ", ".join(f"{other} {place}" for other, place in sorted(there)) or "none"
-        raise OptionError(f"{name}: no {_MAGS[0]} of instance {wanted}; magnetometers found: {found}")
+        known = ", ".join(f"{other} {place}" for other, place in sorted(there)) or "none"
+        raise OptionError(f"{name}: no {_MAGS[0]} of instance {wanted}; magnetometers found: {known}")
     if title is None:
         return []
     place = wanted if wanted is not None else instance if instance in places else places[0]

@@ -148,12 +148,12 @@ def _uncertainty(name: str, first: Calibration, second: Calibration) -> float | 
 
 def _shared(first: Calibration, second: Calibration, names: list[str]) -> Array:
     """Covariance that a difference does not have, since both records have the error in common (gravity of a place)."""
-    found = np.zeros((len(names), len(names)))
+    total = np.zeros((len(names), len(names)))
     mine, its = (record.fit.get("shared", {}) for record in (first, second))
     for what in mine.keys() & its.keys():
-        one, other = (np.array([terms[what].get(name, 0.0) for name in names]) for terms in (mine, its))
-        found += np.outer(one, other) + np.outer(other, one)
-    return found
+        first_terms, second_terms = (np.array([terms[what].get(name, 0.0) for name in names]) for terms in (mine, its))
+        total += np.outer(first_terms, second_terms) + np.outer(second_terms, first_terms)
+    return total
 
 
 def _freedom(record: Calibration, name: str) -> float | None:

@@ -45,7 +45,7 @@ class _Fit(Part):
 
 
 def mean_uncertainties(
-    record: Calibration, columns: Sequence[str], duration: float, unit: str, of: Mapping[str, str]
+    record: Calibration, columns: Sequence[str], duration: float, unit: str, head: Mapping[str, str]
 ) -> tuple[Array, list[str]]:
     """Return the standard uncertainty of the mean of each column over a duration, shape (k,), and what there is to say.
 
@@ -62,7 +62,7 @@ def mean_uncertainties(
         At rest, s.
     unit
         SI unit that their noise must have.
-    of
+    head
         The head of the recording, whose ``serial`` is held against that of the record.
 
     Raises
@@ -73,7 +73,7 @@ def mean_uncertainties(
     if "bias_uncertainty" not in record.fit:
         raise RecordError(f"noise: expected a record of imulab noise fit, found a {record.procedure} record")
     fit = part(record, _Fit, "fit")
-    found = []
+    uncertainties = []
     for name in columns:
         if name not in fit.columns:
             raise RecordError(f"noise: the record has no column {name}; its columns: {listed(fit.columns, name)}")
@@ -85,7 +85,7 @@ def mean_uncertainties(
         models = np.array([each.values for each in column.candidates])
         square = weights @ bias_square(models, np.append(time, duration), column.interval.value) / weights.sum()
         more = np.array(stated.standard_uncertainty.value) ** 2 / square[:-1]
-        found.append(np.sqrt(square[-1] * np.interp(np.log(duration), np.log(time), more)))
+        uncertainties.append(np.sqrt(square[-1] * np.interp(np.log(duration), np.log(time), more)))
     notes = []
     shortest = min(fit.columns[name].length.value for name in columns)
     if shortest < _TIMES_THE_REST * duration:
@@ -93,6 +93,6 @@ def mean_uncertainties(
             f"noise: the record is of {shortest:.4g} s, and noise that is slower does not show in it; expected "
             f"{_TIMES_THE_REST:g} times the {duration:.4g} s at rest, better 10 times"
         )
-    if other := different_units(("the record", record.sensor), ("the recording", of)):
+    if other := different_units(("the record", record.sensor), ("the recording", head)):
         notes.append(f"noise: {other}")
-    return np.array(found), notes
+    return np.array(uncertainties), notes

@@ -37,7 +37,7 @@ def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
             f"{name}: a blob, which holds a unit's numbers without uncertainties or history: expected the record it "
             "was made from (show, apply and array fuse take blobs)"
         )
-    content, found = _as_sealed(data) or (_content(data, name), None)
+    content, computed = _as_sealed(data) or (_content(data, name), None)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise RecordError(f'{name}: not a calibration record: expected the key "format": "{FORMAT}"')
     version = content.get("version")
@@ -52,12 +52,12 @@ def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
     if stated is None:
         raise RecordError(f"{name}: the record has no content_sha256: it was altered after it was written")
     try:
-        found = found or content_sha256(content)
+        computed = computed or content_sha256(content)
     except ValueError as error:  # a number beyond the range of a double, or text that is no Unicode
         raise RecordError(f"{name}: the record was altered after it was written ({error})") from None
-    if stated != found:
+    if stated != computed:
         raise RecordError(f"{name}: the record was altered after it was written (its content_sha256 does not match)")
-    return _validated(content, name, plain=not may_hide(data)), found
+    return _validated(content, name, plain=not may_hide(data)), computed
 
 
 def _as_sealed(data: bytes) -> tuple[dict[str, Any], str] | None:
@@ -126,8 +126,8 @@ def _check_numbers(record: Calibration) -> None:
     names, matrix = record.covariance.names, record.covariance.array()
     unknown = [key for key in names if key not in record.parameters]
     if unknown or len(set(names)) < len(names):
-        found = unknown[0] if unknown else next(key for key in names if names.count(key) > 1)
-        raise RecordError(f"covariance.names: expected each a parameter, once, found {found!r}")
+        wrong = unknown[0] if unknown else next(key for key in names if names.count(key) > 1)
+        raise RecordError(f"covariance.names: expected each a parameter, once, found {wrong!r}")
     spread = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     if (np.diag(matrix) < 0).any() or (np.abs(matrix) > _ROUNDING * np.outer(spread, spread)).any():
         raise RecordError("covariance.matrix: a correlation beyond 1, or a variance below 0")

@@ -80,8 +80,8 @@ def _in_pieces(knots: Array, coefficient: Array, temperature: Array) -> Array:
     start, stop = knots[piece], knots[piece + 1]
     theta = (2 * held - start - stop) / (stop - start)
     powers = theta[:, None] ** np.arange(coefficient.shape[2])
-    found: Array = np.einsum("nk,nik->ni", powers, coefficient[piece])
-    return found
+    laws: Array = np.einsum("nk,nik->ni", powers, coefficient[piece])
+    return laws
 
 
 @dataclass(frozen=True)

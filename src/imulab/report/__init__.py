@@ -61,12 +61,12 @@ def render_page(
 
 def _column_kinds(table: ReportTable) -> list[str]:
     """Return ``unit`` or ``text`` for the columns that hold no number; the first stands at the left anyway."""
-    found = [""] * len(table.columns)
+    kinds = [""] * len(table.columns)
     for number, title in enumerate(table.columns[1:], start=1):
         cells = [row[number] for row in table.rows if row[number] not in ("", "–")]
         if cells and not any(_NUMBER.match(cell) for cell in cells):
-            found[number] = "unit" if title == "unit" else "text"
-    return found
+            kinds[number] = "unit" if title == "unit" else "text"
+    return kinds
 
 
 def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicted: list[tuple[str, str, str]]) -> str:
@@ -134,8 +134,8 @@ def _screen(figure: Figure) -> dict[str, Any]:
 def _policy(*scripts: str) -> str:
     """Return the content security policy of a page: its own scripts, by their SHA-256, and nothing from elsewhere."""
     digests = [b64encode(sha256(script.encode("utf-8")).digest()).decode("ascii") for script in scripts]
-    own = " ".join(f"'sha256-{digest}'" for digest in digests)
-    return f"default-src 'none'; script-src {own}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
+    hashes = " ".join(f"'sha256-{digest}'" for digest in digests)
+    return f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
 
 
 @cache

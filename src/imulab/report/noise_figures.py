@@ -122,47 +122,49 @@ _AS_NOISE = {"bias_instability": "column_flicker", "quantisation": "column_quant
 """Coefficients whose units alone do not say that they are noise: the parameters of a noise record that they are."""
 
 
-def noise_page(found: dict[str, Any], recording: Recording) -> str:
+def noise_page(analysis: dict[str, Any], recording: Recording) -> str:
     """Return the report of what `imulab.estimation.column_noise.analyse` found, and of the recording it was given."""
-    verdict = verdict_of(found["warnings"])
+    verdict = verdict_of(analysis["warnings"])
     return render_page(
         "Noise at rest",
-        found["sensor"].get("serial", found["file"]),
-        exhibits_of_noise(found, recording),
+        analysis["sensor"].get("serial", analysis["file"]),
+        exhibits_of_noise(analysis, recording),
         verdict=verdict,
-        notes=[note for note in found["warnings"] if isinstance(note, Note)],
+        notes=[note for note in analysis["warnings"] if isinstance(note, Note)],
         provenance=[
-            ("file", found["file"]),
-            ("samples", f"{found['samples']} at {found['sample_rate']['value']:.6g} Hz"),
-            ("averaging times", found["taus"]),
-            *((f"sensor {key}", value) for key, value in found["sensor"].items()),
+            ("file", analysis["file"]),
+            ("samples", f"{analysis['samples']} at {analysis['sample_rate']['value']:.6g} Hz"),
+            ("averaging times", analysis["taus"]),
+            *((f"sensor {key}", value) for key, value in analysis["sensor"].items()),
             ("software", f"imulab {VERSION}"),
         ],
     )
 
 
-def exhibits_of_noise(found: dict[str, Any], recording: Recording) -> Exhibits:
+def exhibits_of_noise(analysis: dict[str, Any], recording: Recording) -> Exhibits:
     """Return what the report shows."""
-    length = found["samples"] / found["sample_rate"]["value"]
+    length = analysis["samples"] / analysis["sample_rate"]["value"]
     kinds: dict[str, list[str]] = {}
-    for name, column in found["columns"].items():
+    for name, column in analysis["columns"].items():
         kinds.setdefault(column["unit"], []).append(name)
-    rows = coefficient_rows(found)
+    rows = coefficient_rows(analysis)
     white = [row for row in rows if row[1] in ("angle random walk", "velocity random walk", "white noise")]
     known = [f"{row[0]} {row[2]} ± {row[3]} {row[4]}" for row in white if row[2] != "not determined"]
     more = f" and {len(known) - _MOST_NAMED} more columns in the table" if len(known) > _MOST_NAMED else ""
     lost = f"; not determined for {len(white) - len(known)} of {len(white)} columns" if len(known) < len(white) else ""
     items: list[Figure | ReportTable] = [coefficients_table(rows)]
     for names in kinds.values():
-        items += [allan_figure(found["columns"], names[k : k + _MOST_LINES]) for k in range(0, len(names), _MOST_LINES)]
-    items += [_samples(found, recording, page) for page in panels.pages(list(found["columns"]))]
+        items += [
+            allan_figure(analysis["columns"], names[k : k + _MOST_LINES]) for k in range(0, len(names), _MOST_LINES)
+        ]
+    items += [_samples(analysis, recording, page) for page in panels.pages(list(analysis["columns"]))]
     return Exhibits(
         headline=f"At rest for {length:.4g} s; white noise, as angle or velocity random walk: "
         + (f"{'; '.join(known[:_MOST_NAMED])}{more}{lost}." if known else "not determined."),
         facts=[
             ("length", f"{length:.4g} s"),
-            ("sampling rate", f"{found['sample_rate']['value']:.6g} Hz"),
-            ("columns", str(len(found["columns"]))),
+            ("sampling rate", f"{analysis['sample_rate']['value']:.6g} Hz"),
+            ("columns", str(len(analysis["columns"]))),
         ],
         items=items,
     )
@@ -236,18 +238,18 @@ def _fitted(column: dict[str, Any], factor: float, name: str, colour: str) -> li
     ]
 
 
-def _samples(found: dict[str, Any], recording: Recording, names: Sequence[str]) -> Figure:
+def _samples(analysis: dict[str, Any], recording: Recording, names: Sequence[str]) -> Figure:
     """Range and mean of the samples in equal blocks, so that a spike is seen whatever the length."""
     layout = panels.grid()
     traces: list[dict[str, Any]] = []
     beyond = 0
-    rate = found["sample_rate"]["value"]
+    rate = analysis["sample_rate"]["value"]
     for index, name in enumerate(names):
         unit, factor = {"rad/s": ("deg/s", 1 / _DEGREE), "m/s^2": ("mg", 1e3 / 9.80665)}.get(
-            found["columns"][name]["unit"], (found["columns"][name]["unit"], 1.0)
+            analysis["columns"][name]["unit"], (analysis["columns"][name]["unit"], 1.0)
         )
         values = recording.si(name)
-        values = factor * (values[np.isfinite(values)] - found["columns"][name]["mean"])
+        values = factor * (values[np.isfinite(values)] - analysis["columns"][name]["mean"])
         size = max(1, len(values) // _BLOCKS)
         blocks = values[: len(values) // size * size].reshape(-1, size)
         time = (np.arange(len(blocks)) + 0.5) * size / rate
@@ -294,10 +296,10 @@ def coefficients_table(rows: list[list[str]]) -> ReportTable:
     )
 
 
-def coefficient_rows(found: dict[str, Any]) -> list[list[str]]:
+def coefficient_rows(analysis: dict[str, Any]) -> list[list[str]]:
     """Return column, coefficient, value, uncertainty and unit of everything that an analysis found."""
     rows = []
-    for name, column in found["columns"].items():
+    for name, column in analysis["columns"].items():
         for key, title in (
             ("angle_random_walk", "angle random walk"),
             ("bias_instability", "bias instability"),
@@ -319,6 +321,6 @@ def coefficient_rows(found: dict[str, Any]) -> list[list[str]]:
     return rows
 
 
-def _visible(found: dict[str, Any]) -> bool:
+def _visible(coefficient: dict[str, Any]) -> bool:
     """Whether a coefficient is beyond three times its uncertainty."""
-    return found["value"] is not None and bool(found["value"] > 3 * found["standard_uncertainty"])
+    return coefficient["value"] is not None and bool(coefficient["value"] > 3 * coefficient["standard_uncertainty"])

@@ -117,12 +117,12 @@ class Plots(Sequence[Plot]):
                 expected = f"a number from 0 to {len(self) - 1}, or one of {listed(map(repr, self.names), which)}"
                 raise OptionError(f"plot {quoted(which)}: expected {expected}") from None
         asked = which.lower()
-        found = [plot for plot in self._plots if all(word in plot.name.lower() for word in asked.split())]
-        first = [plot for plot in found if plot.name.lower().startswith(asked)]
-        if len(first or found) == 1:
-            return (first or found)[0]
-        names = [repr(plot.name) for plot in found or self]
-        problem = f"{len(found)} figures of that name" if found else "no such figure"
+        matching = [plot for plot in self._plots if all(word in plot.name.lower() for word in asked.split())]
+        first = [plot for plot in matching if plot.name.lower().startswith(asked)]
+        if len(first or matching) == 1:
+            return (first or matching)[0]
+        names = [repr(plot.name) for plot in matching or self]
+        problem = f"{len(matching)} figures of that name" if matching else "no such figure"
         raise OptionError(f"plot {which!r}: {problem}; expected one of {listed(names, which)}")
 
     def __iter__(self) -> Iterator[Plot]:
@@ -212,13 +212,13 @@ def _legend_height(figure: Figure) -> int:
 def _html(plot: Plot) -> str:
     """Return a figure as HTML that draws itself without a network."""
     place, figure = f"imulab-{uuid4().hex[:12]}", plot.figure
-    said = "".join(f"<p>{escape(text)}</p>" for text in (figure.message, figure.caption) if text)
+    paragraphs = "".join(f"<p>{escape(text)}</p>" for text in (figure.message, figure.caption) if text)
     packed = f'"{_packed()}"' if _FIRST.carries() else "null"
     script = files("imulab.report").joinpath("notebook.js").read_text(encoding="utf-8")
     return (
         f'<div style="background: #fff; color: {INK}; font-family: system-ui, sans-serif; max-width: 1000px; '
         f'padding: 4px 10px"><div style="font-size: 17px">{escape(plot.name)}</div>'
-        f'<div id="{place}" style="height: {figure.height}px"></div>{said}</div>\n'
+        f'<div id="{place}" style="height: {figure.height}px"></div>{paragraphs}</div>\n'
         f'<script>{script}("{place}", {json_for_script(_untitled(figure))}, {packed})</script>'
     )
 

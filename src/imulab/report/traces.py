@@ -222,8 +222,8 @@ def band(x: Array, low: Array, high: Array, colour: str, digits: int = 7, **more
 
 def rounded(values: Any, digits: int = 7) -> list[float | None]:
     """Return values for a figure, which needs no more than seven digits; what is not finite leaves a gap."""
-    found = np.asarray(values, dtype=np.float64)
-    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in found.tolist()]
+    numbers = np.asarray(values, dtype=np.float64)
+    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in numbers.tolist()]
 
 
 def correlation_map(matrix: Array, names: Sequence[str], **more: Any) -> dict[str, Any]:
@@ -299,7 +299,7 @@ def bulk(values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.
 
 
 def edge_marks(
-    found: Bulk, values: Array, beside: Sequence[Any], labels: Sequence[str], *, axes: tuple[str, str] = ("x", "y"),
+    bulk: Bulk, values: Array, beside: Sequence[Any], labels: Sequence[str], *, axes: tuple[str, str] = ("x", "y"),
     upright: bool = True,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Return triangles at the edge of an axis for the values beyond it, with a label each where they are few.
@@ -319,10 +319,10 @@ def edge_marks(
     """
     traces = []
     for above in (False, True):
-        index = np.flatnonzero(found.beyond & ((values > found.high) if above else (values < found.low))).tolist()
+        index = np.flatnonzero(bulk.beyond & ((values > bulk.high) if above else (values < bulk.low))).tolist()
         if not index:
             continue
-        edge = [found.high if above else found.low] * len(index)
+        edge = [bulk.high if above else bulk.low] * len(index)
         other = [beside[i] for i in index]
         symbol, place = {
             (True, True): ("triangle-up", "bottom center"), (True, False): ("triangle-down", "top center"),

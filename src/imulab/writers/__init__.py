@@ -224,7 +224,10 @@ def _head(recording: Recording) -> str:
     for name in recording.columns:
         if not name or set(name) & set(',"[]#\r\n') or name != name.strip():
             raise OptionError(f"{recording.name}: column name {name!r} cannot be written to CSV")
-    pairs = [*_clean(recording.metadata).items(), *((CORRECTED_BY, _one_line(one)) for one in recording.corrected_by)]
+    pairs = [
+        *_clean(recording.metadata).items(),
+        *((CORRECTED_BY, _one_line(entry)) for entry in recording.corrected_by),
+    ]
     comments = "".join(f"# {key}: {value}\n" for key, value in pairs)
     titles = ",".join(_title(name, unit) for name, unit in recording.units.items())
     return f"{comments}{titles}\n"

@@ -172,9 +172,9 @@ def _levels(squares: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -
         near = np.flatnonzero((width < _FEWEST) & (centre >= half) & (centre < min(most, len(squares) - half)))
         if near.size:
             level[near] = medians(squares[centre[near, None] + np.arange(-half, half + 1)])
-    found = np.zeros(len(squares))
-    found[first[0] - 1 : last[-1]] = np.repeat(level, width)
-    return found
+    levels = np.zeros(len(squares))
+    levels[first[0] - 1 : last[-1]] = np.repeat(level, width)
+    return levels
 
 
 def strong_lines_removed(c: Array, lines: Sequence[Line], interval: float) -> tuple[Array, tuple[Line, ...]]:
@@ -245,15 +245,15 @@ def find_steps(
     limit
         Of ``|z|``.
     """
-    found: list[LevelChange] = []
+    steps: list[LevelChange] = []
     c = slow
-    while len(found) < _MOST_STEPS:
+    while len(steps) < _MOST_STEPS:
         place, size, u = _largest_step(c, variances, count)
         if not abs(size) > limit * u:
             break
-        found.append(LevelChange(place * interval, size, u))
+        steps.append(LevelChange(place * interval, size, u))
         c = c - size * step_coefficients(len(c), place, count)
-    return tuple(sorted(found, key=lambda step: step.time))
+    return tuple(sorted(steps, key=lambda step: step.time))
 
 
 def step_coefficients(many: int, place: float, count: int) -> Array:

@@ -296,11 +296,11 @@ def _best(bins: Bins, models: Flags, limits: tuple[float, float], power: Array, 
     """The deepest minimum that is reached from the best three starts of each model."""
     chosen, start = _starts(bins, models, limits, power, freedom)
     spectrum = chosen // len(models)
-    found = score(bins, start, start > 0, limits, power[spectrum], freedom[spectrum])
-    order = np.lexsort([found.deviance, chosen])
+    fits = score(bins, start, start > 0, limits, power[spectrum], freedom[spectrum])
+    order = np.lexsort([fits.deviance, chosen])
     best = order[np.flatnonzero(np.r_[True, np.diff(chosen[order]) > 0])]
     shape = (len(power), len(models))
-    values, reached = found.values[best].reshape(*shape, -1), found.deviance[best].reshape(shape)
+    values, reached = fits.values[best].reshape(*shape, -1), fits.deviance[best].reshape(shape)
     for index in np.argsort(models.sum(axis=1)).tolist():
         inner = np.flatnonzero((models <= models[index]).all(axis=1) & (models < models[index]).any(axis=1))
         if inner.size:
@@ -538,9 +538,9 @@ def profile(
     absent = best.values[row, parameter] == 0
     spread = np.sqrt(best.covariance[row, parameter, parameter])
     start[absent, parameter[absent]], spread[absent] = ends.just_visible(best.values[row[absent]], absent), _FIRST
-    found = np.full((2, *values.shape), np.nan)
-    found[(side > 0).astype(int), row, parameter] = ends.find(start, np.clip(NORMAL_95 * spread, 1e-6, _FIRST))
-    return found[0], found[1]
+    ends_found = np.full((2, *values.shape), np.nan)
+    ends_found[(side > 0).astype(int), row, parameter] = ends.find(start, np.clip(NORMAL_95 * spread, 1e-6, _FIRST))
+    return ends_found[0], ends_found[1]
 
 
 @dataclass(frozen=True)
@@ -571,13 +571,13 @@ class _Ends:
         floor, ceiling = (
             np.where(timed, np.log(edge), far) for edge, far in zip(self.limits, (-700, 700), strict=True)
         )
-        values, found = values.copy(), self._never_reached(values)
+        values, ends = values.copy(), self._never_reached(values)
         low = np.log(values[np.arange(len(values)), self.parameter])
         below = np.full(len(low), -np.sqrt(_DEVIANCE_95))
         high, above, last = np.full((3, len(low)), np.nan)
         trial = low + self.side * first
         for _ in range(_END_TRIALS):
-            rows = np.flatnonzero(np.isnan(found))
+            rows = np.flatnonzero(np.isnan(ends))
             if not rows.size:
                 break
             at = np.clip(trial[rows], floor[rows], ceiling[rows])
@@ -588,7 +588,7 @@ class _Ends:
             )
             done = (np.abs(root) < _EXACT) | at_limit
             end = np.where(at_limit, np.where(self.side[rows] < 0, *self.limits), np.exp(at))
-            found[rows[done]] = end[done]
+            ends[rows[done]] = end[done]
             moved = np.where(at == low[rows], 1.0, np.abs(at - low[rows]))
             reach = np.clip(moved * -root / np.maximum(root - below[rows], 1e-9), 0.1 * first[rows], 2.0)
             # A bound that stays where it was for the second time counts half (the Illinois rule).
@@ -599,11 +599,11 @@ class _Ends:
             last[rows] = out
             between = low[rows] - below[rows] * (high[rows] - low[rows]) / (above[rows] - below[rows])
             trial[rows] = np.where(np.isnan(high[rows]), low[rows] + self.side[rows] * reach, between)
-        return np.where(np.isnan(found), np.exp(np.clip(trial, floor, ceiling)), found)
+        return np.where(np.isnan(ends), np.exp(np.clip(trial, floor, ceiling)), ends)
 
     def _never_reached(self, start: Array) -> Array:
         """0 for lower ends of terms without which the model fits as well, NaN for all others."""
-        found = np.full(len(start), np.nan)
+        ends = np.full(len(start), np.nan)
         rows = np.flatnonzero((self.side < 0) & ~np.isin(self.parameter, TIME))
         without = start[rows].copy()
         without[np.arange(len(rows)), self.parameter[rows]] = 0
@@ -612,8 +612,8 @@ class _Ends:
         some = (without > 0).any(axis=1)
         rows, without = rows[some], without[some]
         rest = score(self.bins, without, without > 0, self.limits, self.power[rows], self.freedom[rows])
-        found[rows[rest.deviance - self.lowest[rows] < _DEVIANCE_95]] = 0.0
-        return found
+        ends[rows[rest.deviance - self.lowest[rows] < _DEVIANCE_95]] = 0.0
+        return ends
 
     def _held(self, values: Array, at: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
         """Root of the deviance above its minimum, less that of the level, with the parameter held, and the best fit."""

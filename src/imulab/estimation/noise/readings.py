@@ -182,11 +182,11 @@ def dropouts(values: Array) -> NDArray[np.bool_] | None:
 
 
 def _without_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Recording, list[str]]:
-    found = {name: lost for name in names if (lost := dropouts(recording.column(name))) is not None}
-    if not found:
+    lost_rows = {name: lost for name in names if (lost := dropouts(recording.column(name))) is not None}
+    if not lost_rows:
         return recording, []
     columns, row = {}, np.arange(len(recording), dtype=np.float64)
-    for name, lost in found.items():
+    for name, lost in lost_rows.items():
         share = float(lost.mean())
         if share > _MOST:
             raise DataError(
@@ -197,9 +197,9 @@ def _without_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Recor
         mended = np.array(recording.column(name), dtype=np.float64)
         mended[lost] = np.interp(row[lost], row[~lost], mended[~lost])
         columns[name] = stored_as(mended, recording.column(name))
-    bad = np.logical_or.reduce(list(found.values()))
+    bad = np.logical_or.reduce(list(lost_rows.values()))
     note = (
-        f"{recording.name}: {_columns(list(found))}: exact zeros in {int(np.count_nonzero(bad))} rows, the first "
+        f"{recording.name}: {_columns(list(lost_rows))}: exact zeros in {int(np.count_nonzero(bad))} rows, the first "
         f"{recording.place(int(np.argmax(bad)))}, in place of lost readings: bridged by straight lines"
     )
     return recording.with_columns(columns, {}), [note]
@@ -226,7 +226,7 @@ def _first_rows(columns: Sequence[Array], count: int) -> NDArray[np.intp]:
 
 def _repeated(columns: Sequence[Array], kinds: Sequence[str]) -> float:
     """The largest share of rows, over sensors, that repeat the readings of the row before more often than by chance."""
-    found = 0.0
+    largest = 0.0
     for kind in dict.fromkeys(kinds):
         same = [values[1:] == values[:-1] for values, its in zip(columns, kinds, strict=True) if its == kind]
         share = float(np.mean(np.logical_and.reduce(same)))
@@ -237,8 +237,8 @@ def _repeated(columns: Sequence[Array], kinds: Sequence[str]) -> float:
             usual = median(steps[steps > 0]) / resolution(values) if steps.any() else 0.0
             chance = _REPEATS_PER_STEP / usual if usual >= _FINE else 1.0
         if share > 3 * chance + _MOST:
-            found = max(found, share)
-    return found
+            largest = max(largest, share)
+    return largest
 
 
 def _columns(names: Sequence[str]) -> str:

@@ -365,22 +365,22 @@ def edge_as_white(values: Array, covariance: Array, shortest: float) -> tuple[Ar
     edge = np.flatnonzero(at_band_edge(values, shortest))
     if not edge.size:
         return values, covariance
-    found, turn = values.copy(), np.eye(len(values))
+    terms, turn = values.copy(), np.eye(len(values))
     parts = np.zeros(len(values))
     parts[0] = values[0] ** 2
     for k in edge.tolist():
         parts[[SIGMA[k], TIME[k]]] = 2 * values[SIGMA[k]] ** 2 * values[TIME[k]]
-        found[[SIGMA[k], TIME[k]]] = 0.0
-    found[0] = np.sqrt(white_square(values, np.zeros(1), shortest)[0])
+        terms[[SIGMA[k], TIME[k]]] = 0.0
+    terms[0] = np.sqrt(white_square(values, np.zeros(1), shortest)[0])
     # d ln N: of a term's variance by S as by N, by T half as much.
     parts[list(TIME)] /= 2
-    turn[0] = parts / found[0] ** 2
-    turn[found == 0] = 0.0
-    if found[SIGMA[0]] == 0:
+    turn[0] = parts / terms[0] ** 2
+    turn[terms == 0] = 0.0
+    if terms[SIGMA[0]] == 0:
         order = np.arange(len(values))
         order[[*SIGMA, *TIME]] = [*SIGMA[::-1], *TIME[::-1]]
-        found, turn = found[order], turn[order]
-    return found, np.asarray(turn @ covariance @ turn.T)
+        terms, turn = terms[order], turn[order]
+    return terms, np.asarray(turn @ covariance @ turn.T)
 
 
 def _is_fast(values: Array, k: int, horizon: Array, shortest: float) -> NDArray[np.bool_]:

@@ -158,13 +158,13 @@ class Workbench(PagePart):
         return report_response(Path(name).read_text(encoding="utf-8"))
 
     async def _open(self, request: Request) -> Response:
-        given = await _object(request)
-        reading = given.get("reading") or {}
+        asked = await _object(request)
+        reading = asked.get("reading") or {}
         if not isinstance(reading, dict) or not all(
             key in _READING and isinstance(text, str) for key, text in reading.items()
         ):
             raise OptionError(f"reading: expected texts for {' '.join(_READING)}")
-        name = self._files.path(str(given.get("file")))
+        name = self._files.path(str(asked.get("file")))
         layout = reading.get("layout", "")
         if set(layout) & {"/", "\\"} or Path(layout or "\0").exists():
             reading = {**reading, "layout": self._files.path(layout)}
@@ -179,12 +179,12 @@ class Workbench(PagePart):
         )
         return _json({key: value for key, value in asdict(shown).items() if key != "rows"})
 
-    def _made(self, given: Mapping[str, Any]) -> tuple[Form, list[str], list[str]]:
+    def _made(self, asked: Mapping[str, Any]) -> tuple[Form, list[str], list[str]]:
         """Return the form, the words and the outputs that a page's values make."""
-        form = self._forms.get(str(given.get("command")))
-        values = given.get("values")
+        form = self._forms.get(str(asked.get("command")))
+        values = asked.get("values")
         if form is None or not isinstance(values, dict):
-            raise OptionError(f"command {quoted(given.get('command'))}: not among those offered")
+            raise OptionError(f"command {quoted(asked.get('command'))}: not among those offered")
         inputs = [Path(each) for field in form.fields if not field.flag for each in _listed(values.get(field.name))]
         outputs: list[str] = []
         running = {path for job in self._jobs.jobs.values() if job.state == "running" for path in job.outputs}
@@ -194,9 +194,13 @@ class Workbench(PagePart):
             """Name what is made after the last file, and after what is done where that alone would not tell."""
             stem = inputs[-1].name.partition(".")[0] if inputs else form.path.replace(" ", "-")
             done = str(values.get("to") or form.path.split()[-1])
-            told = f"{stem}-{done}{ending}" if ending in ("", *(each.suffix for each in inputs)) else f"{stem}{ending}"
+            default_name = (
+                f"{stem}-{done}{ending}" if ending in ("", *(each.suffix for each in inputs)) else f"{stem}{ending}"
+            )
             outputs.append(
-                self._files.new(name, taken.union(outputs)) if name else self._files.unused(told, taken.union(outputs))
+                self._files.new(name, taken.union(outputs))
+                if name
+                else self._files.unused(default_name, taken.union(outputs))
             )
             return outputs[-1]
 
@@ -233,20 +237,20 @@ def _job_message(job: PageJob) -> Message:
 
 
 def _opening_message(opening: Opening) -> Message:
-    own = {"file": opening.name, "reading": opening.reading, "opening": opening.number}
-    return {"type": "opening", **own, **opening.about}
+    identity = {"file": opening.name, "reading": opening.reading, "opening": opening.number}
+    return {"type": "opening", **identity, **opening.about}
 
 
 def _number(text: str | None, key: str) -> float | None:
     if not text:
         return None
     try:
-        found = float(text)
+        value = float(text)
     except ValueError:
-        found = math.nan
-    if not math.isfinite(found):
+        value = math.nan
+    if not math.isfinite(value):
         raise OptionError(f"{key} {quoted(text)}: expected a number")
-    return found
+    return value
 
 
 async def _object(request: Request) -> dict[str, Any]:
@@ -256,12 +260,12 @@ async def _object(request: Request) -> dict[str, Any]:
         if len(text) > _LONGEST:
             raise OptionError(f"expected a JSON object of at most {_LONGEST >> 10} KiB")
     try:
-        found = json.loads(text)
+        document = json.loads(text)
     except (ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict):
+        document = None
+    if not isinstance(document, dict):
         raise OptionError("expected a JSON object")
-    return found
+    return document
 
 
 def _to_be_saved(name: str) -> dict[str, str]:

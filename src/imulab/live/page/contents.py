@@ -52,12 +52,12 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
     from imulab.readers import read_blocks
 
     options = read_options(options_of(Reading), reading, "--{}")
-    writer, notes, said, block = Writer(folder), dict[str, None](), 0.0, None
+    writer, notes, last_sent, block = Writer(folder), dict[str, None](), 0.0, None
     for block in read_blocks(file, options["layout"], **part_of(options)):
         writer.add(block)
         notes |= dict.fromkeys(block.notes)
-        if monotonic() - said > _EVERY:
-            said = monotonic()
+        if monotonic() - last_sent > _EVERY:
+            last_sent = monotonic()
             yield {"head": asdict(writer.head), "metadata": dict(block.metadata), "notes": list(notes)}
     about = {"metadata": dict(block.metadata) if block else {}, "notes": list(notes)}
     yield {"head": asdict(writer.head), **about, "done": True}
@@ -76,10 +76,10 @@ def attitudes(folder: Path, head: Head, name: str) -> dict[str, Any]:
     columns["time"] = _all(folder / "time.values", head.rows)
     units = {**{each: head.units[each] for each in names}, "time": "s"}
     try:
-        found = find_attitudes(Recording(columns, units, name=name))
+        known = find_attitudes(Recording(columns, units, name=name))
     except ImulabError as error:
         return {"attitudes": [], "unknown": str(error)}
-    return {"attitudes": [list(ends) for ends in zip(found.start.tolist(), found.stop.tolist(), strict=True)]}
+    return {"attitudes": [list(ends) for ends in zip(known.start.tolist(), known.stop.tolist(), strict=True)]}
 
 
 def _all(path: Path, count: int) -> Array:
@@ -90,8 +90,8 @@ def main() -> int:
     """Read the file that the command line names; the exit status is 2 where it cannot be read."""
     file, folder, reading = sys.argv[1:4]
     try:
-        for found in contents(file, Path(folder), json.loads(reading)):
-            print(json.dumps(found), flush=True)
+        for message in contents(file, Path(folder), json.loads(reading)):
+            print(json.dumps(message), flush=True)
     except ImulabError as error:
         print(json.dumps({"error": str(error)}), flush=True)
         return 2

@@ -104,10 +104,10 @@ class Writer:
         if behind.size and not (behind.min() >= 0 and np.isfinite(head.last)):  # nor with a time that is not a number
             head.timed = False
         elif behind.size and behind.max() > head.longest_step:
-            found = np.flatnonzero(behind > head.longest_step)
-            head.gap_count += len(found)
-            ends_of = time[found if ends else found + 1]
-            gaps = np.column_stack([ends_of - behind[found], ends_of])[: _MOST_GAPS - len(head.gaps)]
+            places = np.flatnonzero(behind > head.longest_step)
+            head.gap_count += len(places)
+            ends_of = time[places if ends else places + 1]
+            gaps = np.column_stack([ends_of - behind[places], ends_of])[: _MOST_GAPS - len(head.gaps)]
             head.gaps += [(a, b) for a, b in gaps.tolist()]
 
 
@@ -168,11 +168,11 @@ def view(folder: Path, head: Head, start: float | None, stop: float | None, widt
             unit = BUCKET if coarse else 1
             begins = edges[:-1] // unit
             values = _values(source, int(edges[-1]) // unit)[begins[0] if len(begins) else 0 :]
-            found = smallest.reduceat(values, begins - begins[0]) if len(begins) else np.empty(0)
+            extremes = smallest.reduceat(values, begins - begins[0]) if len(begins) else np.empty(0)
             if coarse and last > full:
                 rest = _values(_file(folder, number, "values"), head.rows)[full:last]
-                found = np.append(found, smallest.reduce(rest))
-            both.append(found)
+                extremes = np.append(extremes, smallest.reduce(rest))
+            both.append(extremes)
         low[name], high[name] = both
     if coarse and last > full:
         edges = np.append(edges, last)

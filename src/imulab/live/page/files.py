@@ -266,8 +266,8 @@ class Opening:
     @property
     def head(self) -> Head:
         """What there is to view so far."""
-        told = self.about.get("head", {})
-        return Head(**{key: value for key, value in told.items() if key in _KNOWN})
+        described = self.about.get("head", {})
+        return Head(**{key: value for key, value in described.items() if key in _KNOWN})
 
 
 class Openings:
@@ -291,8 +291,8 @@ class Openings:
             status = os.stat(name)  # noqa: PTH116 -- a name, and its stamp
         except OSError as error:
             raise OptionError(f"{name}: cannot be read: {error.strerror}") from None
-        stamp, given = (status.st_size, status.st_mtime_ns), {key: text for key, text in reading.items() if text}
-        key = json.dumps([name, given], sort_keys=True)
+        stamp, chosen = (status.st_size, status.st_mtime_ns), {key: text for key, text in reading.items() if text}
+        key = json.dumps([name, chosen], sort_keys=True)
         known = self._open.pop(key, None)
         if known is not None and known.stamp == stamp:
             self._open[key] = known
@@ -304,13 +304,13 @@ class Openings:
         self._number += 1
         folder = self._place / str(self._number)
         folder.mkdir()
-        found = self._open[key] = Opening(self._number, name, given, stamp, folder)
-        found.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "imulab.live.page.contents", name, str(folder), json.dumps(given)],
+        opening = self._open[key] = Opening(self._number, name, chosen, stamp, folder)
+        opening.process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "imulab.live.page.contents", name, str(folder), json.dumps(chosen)],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, encoding="utf-8",
         )  # fmt: skip
-        threading.Thread(target=self._listen, args=(found,), daemon=True).start()
-        return found
+        threading.Thread(target=self._listen, args=(opening,), daemon=True).start()
+        return opening
 
     def known(self, number: int) -> Opening:
         """Return a file that is open, by the number of its opening.
@@ -320,9 +320,9 @@ class Openings:
         OptionError
             It is not, or not any more.
         """
-        for found in self._open.values():
-            if found.number == number:
-                return found
+        for opening in self._open.values():
+            if opening.number == number:
+                return opening
         raise OptionError("this recording is not open any more: choose it again")
 
     def view(self, opening: Opening, start: float | None, stop: float | None, width: int) -> CurveView:

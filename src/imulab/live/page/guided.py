@@ -150,15 +150,15 @@ class GuidedPart(PagePart):
 
     def _measured(self) -> bool:
         """Measure until a person finishes or the stream ends; return whether there is a record then."""
-        runner, told = self._runner, 0.0
+        runner, last_shown = self._runner, 0.0
         self._phase, self._finish = "measuring", False
         while not (self._stop.is_set() or self._finish or runner.ended):
             events = [*self._answers(), *runner.step(_WAIT)]
             for event in events:
                 self._told(event)
-            if events or monotonic() - told > _EVERY:
+            if events or monotonic() - last_shown > _EVERY:
                 self._show()
-                told = monotonic()
+                last_shown = monotonic()
         if self._stop.is_set():
             return False
         self._phase = "computing"
@@ -221,15 +221,15 @@ class GuidedPart(PagePart):
     def _follow(self) -> None:
         """Show that the record corrects: the length of the reading, raw and corrected, until the end."""
         assert self.record is not None
-        ready, runner, told = loaded(self.record), self._runner, 0.0
+        ready, runner, last_shown = loaded(self.record), self._runner, 0.0
         gravity = runner.session.guide.local_gravity
         gyro = "gyro_bias_x" in self.record.parameters
         while not (self._stop.is_set() or runner.ended):
             blocks = runner.listen(_WAIT)
-            if blocks and monotonic() - told > _EVERY:
-                found = corrected_reading(ready, blocks[-1], gyro=gyro and "gyro_x" in blocks[-1])
-                self._tell({"type": "corrected", **asdict(found), "gravity": gravity}, latest=True)
-                told = monotonic()
+            if blocks and monotonic() - last_shown > _EVERY:
+                shown = corrected_reading(ready, blocks[-1], gyro=gyro and "gyro_x" in blocks[-1])
+                self._tell({"type": "corrected", **asdict(shown), "gravity": gravity}, latest=True)
+                last_shown = monotonic()
 
     def _result(self, record: Calibration) -> Message:
         names = {"record": self._record_name, "report": "report", "recording": Path(self._runner.recorder.path).name}

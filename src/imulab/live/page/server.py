@@ -142,8 +142,8 @@ class Guard:
         """Return the answer to a request that goes no further; None for the others."""
         headers, port = Headers(scope=scope), scope["server"][1]
         host = headers.get("host", "")
-        name, colon, given = _parted(host)
-        if not self._is_here(name) or given != ("" if port == _HTTP_PORT and not colon else str(port)):
+        name, colon, offered = _parted(host)
+        if not self._is_here(name) or offered != ("" if port == _HTTP_PORT and not colon else str(port)):
             return PlainTextResponse(_STRANGER, 421)
         if headers.get("origin", f"http://{host}") != f"http://{host}" or (
             headers.get("sec-fetch-site", "none") in ("cross-site", "same-site") and scope.get("path") != "/"
@@ -154,8 +154,8 @@ class Guard:
             if not length.isdigit() or int(length) > self._limit:
                 return PlainTextResponse(f"Too large: at most {self._limit >> 20} MiB at once.", 413)
         cookie = f"imulab_{port}"
-        given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
-        if scope["type"] == "http" and scope["path"] == "/" and self._opens(given):
+        offered = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
+        if scope["type"] == "http" and scope["path"] == "/" and self._opens(offered):
             answer = RedirectResponse("/", 303)
             answer.set_cookie(cookie, self._key, httponly=True, samesite="strict", path="/")
             return answer
@@ -169,12 +169,12 @@ class Guard:
             return True
         return name.lower() in (*_NAMES, in_address(self._host).lower())
 
-    def _opens(self, given: str) -> bool:
+    def _opens(self, token: str) -> bool:
         """Whether what an address holds lets its browser in."""
-        if self._once and _same(given, self._once):
+        if self._once and _same(token, self._once):
             self._once = ""
             return True
-        return _same(given, self._token)
+        return _same(token, self._token)
 
     def _counted(self, receive: Receive) -> Receive:
         """Return `receive` for a body that ends with an error where it is longer than is taken."""
@@ -192,16 +192,16 @@ class Guard:
         return counted
 
 
-def _same(one: str, other: str) -> bool:
-    return secrets.compare_digest(one.encode("utf-8"), other.encode("utf-8"))
+def _same(first: str, other: str) -> bool:
+    return secrets.compare_digest(first.encode("utf-8"), other.encode("utf-8"))
 
 
 def _cookie(headers: Headers, name: str) -> str:
     try:
-        found = SimpleCookie(headers.get("cookie", "")).get(name)
+        cookie = SimpleCookie(headers.get("cookie", "")).get(name)
     except CookieError:
         return ""
-    return found.value if found else ""
+    return cookie.value if cookie else ""
 
 
 def inside(folder: Path, name: str) -> Path:

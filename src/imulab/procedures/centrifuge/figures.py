@@ -109,11 +109,11 @@ def curve_table(fit: CentrifugeSummary, sets: list[str]) -> ReportTable:
     """Return the models of the curve that were tried."""
     rows = []
     for prefix in sets:
-        found = fit.curves[prefix.rstrip("_")]
+        curve = fit.curves[prefix.rstrip("_")]
         axis = prefix.rstrip("_").replace("_", " ")
         rows += [
             [axis, each.model, str(each.coefficients), f"{each.chi_square:.2f}", "chosen" * each.chosen]
-            for each in found.tried
+            for each in curve.tried
         ]
     return ReportTable(
         "Terms of the curve",
@@ -135,10 +135,10 @@ def cycle_tables(cycles: list[CycleRow]) -> list[ReportTable]:
     rows = []
     for cycle in cycles:
         for key in sets:
-            found = cycle.of(key)
+            values = cycle.of(key)
             cells = [
                 " ± ".join(format_uncertain(100 * z.value, 100 * (z.standard_uncertainty or 0.0))) if z else "–"
-                for z in (found.get(name) for name in names)
+                for z in (values.get(name) for name in names)
             ]
             rows.append([str(cycle.power_cycle), key.replace("_", " "), *cells])
     return [
@@ -287,21 +287,21 @@ def headline(record: Calibration, prefix: str) -> str:
 
 def facts(record: Calibration, sets: list[str]) -> list[tuple[str, str]]:
     """Return the figures that the head of a report shows: name and value."""
-    found = []
+    lines = []
     for prefix in sets[:2]:
         K0 = record.parameter(f"{prefix}K0")
         value, u = format_uncertain(K0.value * PER_G, (K0.standard_uncertainty or 0.0) * PER_G, digits=1)
         digits = u.replace(".", "").lstrip("0")
-        found.append((f"K0 {axis_label(prefix)}, deg/h/g", f"{value}({digits})"))
+        lines.append((f"K0 {axis_label(prefix)}, deg/h/g", f"{value}({digits})"))
     r = centrifuge_of(record)
     loaded = [row for row in r.runs if row.role == "loaded"]
-    found += [
+    lines += [
         ("curve", ", ".join(dict.fromkeys(r.model.curve.values()))),
         ("levels", str(len(r.levels))),
         ("loaded runs", str(len(loaded))),
         ("highest level", text_in_g(r.model.highest_specific_force.value)),
     ]
-    return found
+    return lines
 
 
 def _per_g(record: Calibration, name: str) -> str:
@@ -540,8 +540,8 @@ def _repeatability(record: Calibration, r: CentrifugeRecord, sets: list[str]) ->
         for cycle_number, cycle in enumerate(cycles):
             x, y, bars = [], [], []
             for index, run in enumerate(r.runs):
-                found = run.line(letter)
-                if run.role != "loaded" or run.power_cycle != cycle or found is None or found.K is None:
+                run_line = run.line(letter)
+                if run.role != "loaded" or run.power_cycle != cycle or run_line is None or run_line.K is None:
                     continue
                 prefix = f"{letter}_" + ("down_" if run.spin_axis == "down" else "")
                 if index not in number_of:
@@ -549,8 +549,8 @@ def _repeatability(record: Calibration, r: CentrifugeRecord, sets: list[str]) ->
                 level = number_of[index]
                 K = record.value(f"{prefix}K_{level}")
                 x.append(level + 0.5 * ((cycle_number + 0.5) / len(cycles) - 0.5) + 0.06 * (run.sense < 0))
-                y.append(100 * relative(found.K.value, K))
-                bars.append(100 * (relative(found.K.standard_uncertainty or 0.0, K) + 1))
+                y.append(100 * relative(run_line.K.value, K))
+                bars.append(100 * (relative(run_line.K.standard_uncertainty or 0.0, K) + 1))
             colour = _CYCLES[cycle_number % len(_CYCLES)]
             traces.append(
                 _scatter(x, y, f"power cycle {cycle:g}", "markers", **_place(number),
@@ -576,21 +576,21 @@ def _repeatability(record: Calibration, r: CentrifugeRecord, sets: list[str]) ->
         if size
     ]
     text = "; ".join(words) + ": in the uncertainties" if words else "The scatter is explained by the noise"
-    said = f"{text}." if len(cycles) > 1 else "One power cycle only: nothing is known of repeatability."
-    caption = f"K of each run, relative to that of its level; bars are one standard uncertainty of a run. {said}"
+    message = f"{text}." if len(cycles) > 1 else "One power cycle only: nothing is known of repeatability."
+    caption = f"K of each run, relative to that of its level; bars are one standard uncertainty of a run. {message}"
     return Figure("Repeatability over power cycles", caption, traces, layout, height=400)
 
 
 def _spectra(r: CentrifugeRecord) -> list[Figure]:
     """Spectra of X, FOG and residual around the table rate, at the lowest, a middle and the highest level."""
-    found = [spectrum for spectrum in r.data.spectra if spectrum.spin_axis == r.data.spectra[0].spin_axis]
-    if not found:
+    shown = [spectrum for spectrum in r.data.spectra if spectrum.spin_axis == r.data.spectra[0].spin_axis]
+    if not shown:
         return []
-    picked = sorted({0, len(found) // 2, len(found) - 1})[:_SHOWN_SPECTRA]
+    picked = sorted({0, len(shown) // 2, len(shown) - 1})[:_SHOWN_SPECTRA]
     traces: list[dict[str, Any]] = []
     titles, annotations = [], []
     for number, index in enumerate(picked):
-        spectrum = found[index]
+        spectrum = shown[index]
         x, y = names(number)
         rate = from_si(np.array(spectrum.rate), "deg/s")
         lines = zip(_SPECTRA, (QUIET, "#b8860b", GOOD), ("solid", "dot", "dash"), strict=True)

@@ -110,7 +110,7 @@ def fit_centrifuge(
         raise OptionError(f"fit_centrifuge: expected a manifest or its file, found {quoted(manifest)}")
     if not callable(recording_of):
         raise OptionError("fit_centrifuge: a manifest without its file needs recording_of, a function of a run")
-    seen = _Seen(recording_of)
+    recordings = _Seen(recording_of)
     statics: list[StaticRun] = []
     runs: list[LoadedRun] = []
     numbers, drawn = level_numbers(manifest), set[tuple[str, int]]()
@@ -118,19 +118,19 @@ def fit_centrifuge(
     for done, index in enumerate(order, start=1):
         run = manifest.runs[index]
         if run.role == "static":
-            statics.append(reduce_static(seen(run), manifest, index))
+            statics.append(reduce_static(recordings(run), manifest, index))
         else:
             rest = _rest(statics, run, manifest, index) if method == "fourier" else None
             place = run.spin_axis, numbers[index]
-            runs.append(reduce_run(seen(run), manifest, index, rest, spectrum=place not in drawn))
+            runs.append(reduce_run(recordings(run), manifest, index, rest, spectrum=place not in drawn))
             drawn.add(place)
         if progress is not None:
             progress(done)
     _same_channels(statics, runs, manifest)
     levels = before = pool_levels(runs, manifest, method)
-    found = find_corrections(runs, before.lines, correct=method == "least-squares")
-    if found.common:
-        levels = pool_levels(corrected(runs, found), manifest, method)
+    corrections = find_corrections(runs, before.lines, correct=method == "least-squares")
+    if corrections.common:
+        levels = pool_levels(corrected(runs, corrections), manifest, method)
     estimates = estimate(levels, manifest, method=method, curve=curve)
     record = make_record(
         manifest=manifest,
@@ -138,11 +138,11 @@ def fit_centrifuge(
         runs=runs,
         levels=levels,
         estimates=estimates,
-        budget=error_budget(runs, before.lines, manifest, found.corrected),
-        found=found.warnings,
+        budget=error_budget(runs, before.lines, manifest, corrections.corrected),
+        findings=corrections.warnings,
         options={"method": method, "curve": curve},
         sources=sources() if sources is not None else (),
-        temperature=float(np.mean(seen.temperatures)) if seen.temperatures else None,
+        temperature=float(np.mean(recordings.temperatures)) if recordings.temperatures else None,
     )
     return CentrifugeFit(record, tuple(runs), levels, estimates)
 

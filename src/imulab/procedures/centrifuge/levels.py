@@ -99,9 +99,9 @@ def _fitted(a: Deviations, values: Array, variance: Array) -> tuple[Array, Array
     levels, cycles = np.unique(a.level), np.unique(a.cycle)
     design = np.concatenate([a.level[:, None] == levels, a.cycle[:, None] == cycles], axis=1).astype(float)
     root = 1 / np.sqrt(np.maximum(variance, 1e-24))
-    found, _, rank, _ = np.linalg.lstsq(design * root[:, None], values * root, rcond=1e-9)
+    effects, _, rank, _ = np.linalg.lstsq(design * root[:, None], values * root, rcond=1e-9)
     weights: Array = design[:, len(levels) :].T @ root**2
-    effect = found[len(levels) :]
+    effect = effects[len(levels) :]
     return effect - np.average(effect, weights=weights), weights, int(rank)
 
 
@@ -305,27 +305,27 @@ def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> L
     return Levels(tuple(items), lines, repeatability, (*warnings, *_scatter_warnings(repeatability)))
 
 
-def _scatter_warnings(found: Repeatability) -> list[str]:
+def _scatter_warnings(spread: Repeatability) -> list[str]:
     warnings: list[str] = []
-    if found.cycle:
+    if spread.cycle:
         warnings.append(
             Note(
-                f"K differs between power cycles by {100 * np.sqrt(found.cycle):.2g} % (one standard deviation) beyond "
-                "the noise, at all levels alike: added to every K and the curve; zeta hardly knows of it"
+                f"K differs between power cycles by {100 * np.sqrt(spread.cycle):.2g} % (one standard deviation) "
+                "beyond the noise, at all levels alike: added to every K and the curve; zeta hardly knows of it"
             )
         )
-    if found.turn:
+    if spread.turn:
         warnings.append(
             Note(
-                f"the direction of the drift differs between power cycles by {np.degrees(np.sqrt(found.turn)):.2g} deg "
-                "(one standard deviation) beyond the noise: added to its uncertainty"
+                f"the direction of the drift differs between power cycles by {np.degrees(np.sqrt(spread.turn)):.2g} "
+                "deg (one standard deviation) beyond the noise: added to its uncertainty"
             )
         )
-    if found.run:
+    if spread.run:
         warnings.append(
             Note(
-                f"K differs between runs of a power cycle by {100 * np.sqrt(found.run):.2g} % (one standard deviation) "
-                "beyond the noise: added to each run's uncertainty"
+                f"K differs between runs of a power cycle by {100 * np.sqrt(spread.run):.2g} % (one standard "
+                "deviation) beyond the noise: added to each run's uncertainty"
             )
         )
     return warnings
@@ -345,8 +345,8 @@ def _run_line(run: LoadedRun, manifest: Manifest, method: str, directed: bool) -
         line = size.astype(np.complex128)
     vector = as_vector(line)
     off, u = arm_rate_off(run)
-    found = abs(off) if abs(off) > three_sigma(run.rates.net_freedom) * u else 0.0
-    relative = 2 * float(np.hypot(manifest.rate_uncertainty, found)) / run.run.arm_rate
+    clear_offset = abs(off) if abs(off) > three_sigma(run.rates.net_freedom) * u else 0.0
+    relative = 2 * float(np.hypot(manifest.rate_uncertainty, clear_offset)) / run.run.arm_rate
     lost = amplitude_lost(run, manifest, method)
     rate = (relative**2 + lost**2) * np.outer(vector, vector)
     return RunLine(
@@ -401,16 +401,16 @@ def _radial(line: RunLine, axis: int, excess: float, *, rates: bool = True) -> f
     return noise + float(np.trace(line.rate[pair, pair])) + excess * float(abs(line.line[axis])) ** 2
 
 
-def pooled(number: int, spin_axis: str, group: list[RunLine], found: Repeatability, directed: bool) -> Level:
+def pooled(number: int, spin_axis: str, group: list[RunLine], repeatability: Repeatability, directed: bool) -> Level:
     """Return the level that runs at one specific force make, their scatter beyond the noise given."""
     axes = len(group[0].line)
-    weights = np.array([_weights(group, axis, found.run + found.cycle) for axis in range(axes)])
+    weights = np.array([_weights(group, axis, repeatability.run + repeatability.cycle) for axis in range(axes)])
     line = np.einsum("ar,ra->a", weights, np.array([member.line for member in group]))
     spread = np.repeat(weights, 2, axis=0)
-    own = np.kron(np.eye(axes), np.ones((2, 2)))  # what a run does to one axis it need not do to the other
+    axis_blocks = np.kron(np.eye(axes), np.ones((2, 2)))  # what a run does to one axis it need not do to the other
     covariance = np.zeros((2 * axes, 2 * axes))
     for r, member in enumerate(group):
-        total = member.noise + member.rate + found.run * own * np.outer(member.vector, member.vector)
+        total = member.noise + member.rate + repeatability.run * axis_blocks * np.outer(member.vector, member.vector)
         covariance += spread[:, r, None] * total * spread[None, :, r]
     component = np.zeros(axes)
     dof = np.zeros(axes)
@@ -418,9 +418,9 @@ def pooled(number: int, spin_axis: str, group: list[RunLine], found: Repeatabili
         pair = slice(2 * axis, 2 * axis + 2)
         noise = weights[axis] ** 2 * [float(np.trace(member.noise[pair, pair])) / 2 for member in group]
         component[axis] = noise.sum()
-        between = float((weights[axis] ** 2 * found.run * np.abs([m.line[axis] for m in group]) ** 2).sum())
+        between = float((weights[axis] ** 2 * repeatability.run * np.abs([m.line[axis] for m in group]) ** 2).sum())
         known = float((weights[axis] ** 2 * [float(np.trace(m.rate[pair, pair])) for m in group]).sum())
-        spent = (noise**2 / [member.freedom for member in group]).sum() + between**2 / max(found.run_freedom, 1)
+        spent = (noise**2 / [member.freedom for member in group]).sum() + between**2 / max(repeatability.run_freedom, 1)
         dof[axis] = (noise.sum() + between + known) ** 2 / max(spent, 1e-300)
     cycles = np.array([member.source.run.power_cycle for member in group])
     return Level(
@@ -433,7 +433,7 @@ def pooled(number: int, spin_axis: str, group: list[RunLine], found: Repeatabili
 
 def _deviations(members: list[list[RunLine]]) -> list[Deviations]:
     """What each axis's runs found relative to the mean of their level and sense."""
-    found = []
+    by_axis = []
     for axis in range(len(members[0][0].line)):
         rows: list[tuple[int, int, float, float, float, float]] = []
         label = 0
@@ -455,8 +455,8 @@ def _deviations(members: list[list[RunLine]]) -> list[Deviations]:
                     across = _radial(member, axis, 0.0, rates=False) / abs(mean) ** 2
                     rows.append((label, member.source.run.power_cycle, value.real, value.imag, along, across))
         columns = np.array(rows).reshape(-1, 6).T
-        found.append(Deviations(columns[0].astype(np.int64), columns[1].astype(np.int64), *columns[2:]))
-    return found
+        by_axis.append(Deviations(columns[0].astype(np.int64), columns[1].astype(np.int64), *columns[2:]))
+    return by_axis
 
 
 # How the channels of a test differ besides the drift: tilt and delay of the FOG, scale mismatch and azimuth.
@@ -546,34 +546,38 @@ def mismatch(test: Measured, axis: int = 0, delay: float = 0.0) -> Mismatch | No
 
     `delay` is that of the FOG against the axis, s.
     """
-    seen = [run for run in test.runs if run.rates.net_rate is not None]
-    if not seen:
+    with_net_line = [run for run in test.runs if run.rates.net_rate is not None]
+    if not with_net_line:
         return None
     # What is fixed in the room passes Y a quarter turn before X.
     quarter = (1.0, -1j)[axis]
-    expected = np.array([quarter * run.room[-1] * np.exp(-1j * (run.rates.net_rate or 0.0) * delay) for run in seen])
-    ratio = np.array([run.room[axis] for run in seen]) / expected - 1
-    share = [np.array([1.0, -quarter]) for _ in seen]
-    noise = [run.room_covariance[np.ix_([axis, -1], [axis, -1])] for run in seen]
+    expected = np.array(
+        [quarter * run.room[-1] * np.exp(-1j * (run.rates.net_rate or 0.0) * delay) for run in with_net_line]
+    )
+    ratio = np.array([run.room[axis] for run in with_net_line]) / expected - 1
+    share = [np.array([1.0, -quarter]) for _ in with_net_line]
+    noise = [run.room_covariance[np.ix_([axis, -1], [axis, -1])] for run in with_net_line]
     variance = (
         np.array([(s @ C @ s.conj()).real / 2 for s, C in zip(share, noise, strict=True)]) / np.abs(expected) ** 2
     )
     # A run's own noise at the net rate comes from a few blocks: that of all runs together is known better.
-    seconds = np.array([run.duration for run in seen])
+    seconds = np.array([run.duration for run in with_net_line])
     variance = np.maximum((variance * seconds).mean() / seconds, 1e-300)
     weight = 1 / variance
-    turned = ratio.real + 1j * ratio.imag * [run.run.sense for run in seen]
+    turned = ratio.real + 1j * ratio.imag * [run.run.sense for run in with_net_line]
     value = complex((weight * turned).sum() / weight.sum())
     u = np.sqrt(_scatter(_pairs(turned - value), np.concatenate([variance] * 2), 2) / weight.sum())
-    return Mismatch(value.real, value.imag, float(u), max(2 * len(seen) - 2, 1))
+    return Mismatch(value.real, value.imag, float(u), max(2 * len(with_net_line) - 2, 1))
 
 
-def _seen(found: Mismatch | None, sense: Array) -> Complex:
+def _seen(mismatch_found: Mismatch | None, sense: Array) -> Complex:
     """How an axis shows the FOG's rotation: what is not clear of its uncertainty counts as none."""
     share = np.ones(len(sense), dtype=np.complex128)
-    if found is not None:
-        reach = max(three_sigma(found.freedom) * found.uncertainty, _LEAST)
-        share += found.scale * (abs(found.scale) > reach) + 1j * sense * found.azimuth * (abs(found.azimuth) > reach)
+    if mismatch_found is not None:
+        reach = max(three_sigma(mismatch_found.freedom) * mismatch_found.uncertainty, _LEAST)
+        share += mismatch_found.scale * (abs(mismatch_found.scale) > reach) + 1j * sense * mismatch_found.azimuth * (
+            abs(mismatch_found.azimuth) > reach
+        )
     return share
 
 
@@ -603,24 +607,26 @@ def delays(test: Measured) -> Delays | None:
         return None
     parameters, covariance, _ = tilted(test)
     tau, u_tau = float(parameters[4]), float(np.sqrt(covariance[4, 4]))
-    own, u_own = _own_delay(test, tau)
-    lever = (_own_delay(test, tau + u_tau)[0] - own) / max(u_tau, 1e-300)
-    return Delays(tau, u_tau, own, float(np.hypot(u_own, lever * u_tau)), float(np.hypot(u_own, (1 - lever) * u_tau)))
+    axis_delay, u_own = _own_delay(test, tau)
+    lever = (_own_delay(test, tau + u_tau)[0] - axis_delay) / max(u_tau, 1e-300)
+    return Delays(
+        tau, u_tau, axis_delay, float(np.hypot(u_own, lever * u_tau)), float(np.hypot(u_own, (1 - lever) * u_tau))
+    )
 
 
 def _own_delay(test: Measured, tau: float) -> tuple[float, float]:
     """Delay of X and its uncertainty, that of the FOG given, s."""
-    own = u = 0.0
+    axis_delay = u = 0.0
     sense = np.array([run.run.sense for run in test.runs])
     design = np.stack([np.ones(len(test.table)), test.table], axis=1)
     for _ in range(_STEPS):
-        share = _seen(mismatch(test, 0, tau - own), sense)
-        drift = (test.x - share * test.fog * np.exp(-1j * test.table * (tau - own))) / test.force
+        share = _seen(mismatch(test, 0, tau - axis_delay), sense)
+        drift = (test.x - share * test.fog * np.exp(-1j * test.table * (tau - axis_delay))) / test.force
         angle = np.angle(drift / (drift / np.maximum(test.line_variance, 1e-300)).sum())
         variance = test.line_variance / np.abs(drift) ** 2
         slope, matrix = weighted(design, angle, variance)
         u = float(np.sqrt(matrix[1, 1] * _scatter(angle - design @ slope, variance, 2)))
-        before, own = own, float(slope[1])
-        if abs(own - before) < 1e-9:
+        before, axis_delay = axis_delay, float(slope[1])
+        if abs(axis_delay - before) < 1e-9:
             break
-    return own, u
+    return axis_delay, u

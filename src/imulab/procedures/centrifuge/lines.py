@@ -470,8 +470,8 @@ def _rate_column(cells: Cells, P: Array, beta: Array, row: int, linear: int, mid
     """Derivative of a line with respect to its rate times `half`, in the columns of the cells, shape (c, 14)."""
     turned = beta[row + 1] * P[:, :, row] - beta[row] * P[:, :, row + 1]
     column: Array = turned * ((cells.centre - middle) / half)[:, None]
-    own = {TIME_CHI: CHI, TIME_NET: NET}[linear]
-    column[:, linear : linear + 2] += turned[:, own : own + 2] / half
+    turned_pair = {TIME_CHI: CHI, TIME_NET: NET}[linear]
+    column[:, linear : linear + 2] += turned[:, turned_pair : turned_pair + 2] / half
     return column
 
 
@@ -696,10 +696,10 @@ def search_line(cells: Cells, series: Array, rate: float, within: float) -> tupl
     if reach < FINE // 2:
         return 0.0, float(height[centre]) / floor
     low, high = max(centre - reach, 0), min(centre + reach + 1, len(height))
-    found: Array = np.asarray(height[low:high], dtype=np.float64)
+    heights: Array = np.asarray(height[low:high], dtype=np.float64)
     grid: Array = np.arange(low, high, dtype=np.float64) * step - abs(rate)
-    shift = interpolated(grid, found)
-    return float(np.sign(rate)) * shift, float(found.max()) / floor
+    shift = interpolated(grid, heights)
+    return float(np.sign(rate)) * shift, float(heights.max()) / floor
 
 
 def interpolated(grid: Array, height: Array) -> float:
@@ -839,21 +839,21 @@ def three_sigma(freedom: float | None) -> float:
     return coverage_factor(freedom, 1 - RIG_ERROR.level)
 
 
-def _check_net(expected: float, found: float, reach: float, place: str) -> list[str]:
-    off = abs(found - expected)
+def _check_net(expected: float, measured: float, reach: float, place: str) -> list[str]:
+    off = abs(measured - expected)
     if off > max(MISMATCH, reach):
-        raise _mismatch(expected, found, place)
+        raise _mismatch(expected, measured, place)
     if off > max(_DOUBT, reach):
         return [
-            f"{place}: the net rate measured on Earth rate is {in_degrees(found)} ± {in_degrees(reach / 3)}, "
-            f"{in_degrees(found - expected)} from arm_rate less table_rate: the difference is in u of this run's K"
+            f"{place}: the net rate measured on Earth rate is {in_degrees(measured)} ± {in_degrees(reach / 3)}, "
+            f"{in_degrees(measured - expected)} from arm_rate less table_rate: the difference is in u of this run's K"
         ]
     return []
 
 
-def _mismatch(expected: float, found: float, place: str) -> DataError:
+def _mismatch(expected: float, rate: float, place: str) -> DataError:
     return DataError(
-        f"{place}: rates do not match: the FOG's Earth-rate line is at {in_degrees(abs(found))}, expected the net rate "
+        f"{place}: rates do not match: the FOG's Earth-rate line is at {in_degrees(abs(rate))}, expected the net rate "
         f"{in_degrees(abs(expected))} (arm_rate less table_rate)"
     )
 
@@ -891,8 +891,8 @@ def _check_units(solution: LineRegression, noise: Complex, place: str) -> list[s
 def _noise(cells: Cells, solution: LineRegression, row: int) -> tuple[Complex, float]:
     """Noise of a line by its scatter over blocks, or by the residuals where the run is too short, and its freedom."""
     least = 2 * np.pi / max(abs(cells.net_rate), 1e-9) if row == ROOM else 0.0
-    found = scatter(cells, solution, row, least=min(least, cells.duration / 3))
-    return (residual_noise(cells, solution), 1e9) if found is None else (found.noise, found.freedom)
+    scattered = scatter(cells, solution, row, least=min(least, cells.duration / 3))
+    return (residual_noise(cells, solution), 1e9) if scattered is None else (scattered.noise, scattered.freedom)
 
 
 def residual_noise(cells: Cells, solution: LineRegression) -> Complex:
@@ -965,11 +965,11 @@ def _peak_rate(index: int, rates: Array, height: Array) -> float:
 
 def _strongest_elsewhere(cells: Cells, fog: int) -> str:
     """Where the FOG's strongest line is instead: the rate of another run, perhaps."""
-    found = strongest_line(cells, cells.series[fog], 1.5 * abs(cells.net_rate))
+    strongest = strongest_line(cells, cells.series[fog], 1.5 * abs(cells.net_rate))
     return (
         ""
-        if found is None
-        else f" {in_degrees(abs(cells.table_rate))} (its strongest line is at {in_degrees(found, 5)})"
+        if strongest is None
+        else f" {in_degrees(abs(cells.table_rate))} (its strongest line is at {in_degrees(strongest, 5)})"
     )
 
 

@@ -102,14 +102,14 @@ def window_text(window: Window) -> str:
     return ":".join("" if end is None else f"{end:.12g}" for end in window)
 
 
-def overlap(one: Window, other: Window) -> bool:
+def overlap(first_window: Window, other: Window) -> bool:
     """Return whether two windows have more than a bound in common; a window overlaps itself unless it is empty."""
 
     def ends(window: Window) -> tuple[float, float]:
         first, last = window
         return (-math.inf if first is None else first), (math.inf if last is None else last)
 
-    (first, last), (begin, end) = ends(one), ends(other)
+    (first, last), (begin, end) = ends(first_window), ends(other)
     return first < end and begin < last
 
 
@@ -279,12 +279,12 @@ def check_runs(manifest: Manifest) -> None:
         A file twice without windows that lie apart, no loaded run, a power cycle without static run, lines that
         coincide, no reference run.
     """
-    seen: dict[str, list[int]] = {}
+    runs_of_file: dict[str, list[int]] = {}
     static = {run.power_cycle for run in manifest.runs if run.role == "static"}
     loaded = [run for run in manifest.runs if run.role == "loaded"]
     for index, run in enumerate(manifest.runs):
         place = manifest.place(index)
-        for other in seen.setdefault(run.file, []):
+        for other in runs_of_file.setdefault(run.file, []):
             if run.window is None or (window := manifest.runs[other].window) is None:
                 raise ReadError(
                     f"{place}: the same file as run {other + 1}; expected a file for each run, or a window in each "
@@ -295,7 +295,7 @@ def check_runs(manifest: Manifest) -> None:
                     f"{place}: its window overlaps {window_text(window)} of run {other + 1}; expected windows that "
                     "lie apart"
                 )
-        seen[run.file].append(index)
+        runs_of_file[run.file].append(index)
         if run.role != "loaded":
             continue
         if run.power_cycle not in static:
@@ -332,10 +332,10 @@ def _check_reference(manifest: Manifest) -> None:
             f"{_in_g(manifest.reference)} (reference), the nearest is this one at {_in_g(manifest.force(reference))}"
         )
     for spin_axis in sorted({run.spin_axis for run in manifest.runs if run.role == "loaded"}):
-        own, run = nearest((spin_axis,))
+        run_index, run = nearest((spin_axis,))
         if abs(run.arm_rate / reference.arm_rate - 1) > SAME_LEVEL:
             raise ReadError(
-                f"{manifest.place(own)}: no reference run (K_1) with the spin axis {spin_axis}: expected one at "
+                f"{manifest.place(run_index)}: no reference run (K_1) with the spin axis {spin_axis}: expected one at "
                 f"{_degrees(reference.arm_rate)} of the arm as in {reference.file}, the nearest is this one at "
                 f"{_degrees(run.arm_rate)}"
             )
@@ -386,14 +386,14 @@ def _scale_factors(table: Any, name: str) -> dict[str, tuple[float, str]]:
     if not isinstance(table, dict):
         raise ReadError(f"{name}: scale_factor: expected {example('scale_factor')}, found {table!r}")
     check_keys(table, COLUMNS, f"{name}: scale_factor")
-    found = {}
+    factors = {}
     for key, entry in table.items():
         place = f"{name}: scale_factor: {key}"
         known = scale_factor_of(entry, place, example("scale_factor"))
         if known.measured.quantity != "rate":
             raise UnitError(f"{place}: expected a unit of output per rate, found {entry['unit']!r}")
-        found[key] = (known.value * (1.0 / known.measured.factor), known.output.symbol)
-    return found
+        factors[key] = (known.value * (1.0 / known.measured.factor), known.output.symbol)
+    return factors
 
 
 def _degrees(rate: float) -> str:

@@ -106,39 +106,40 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
         raise OptionError(f"curve {model!r}: {len(K)} levels; expected at least {len(CURVES[model]) + 1}")
     names = [name for name, terms in CURVES.items() if len(terms) + 1 <= max(len(K) - 1, 1) or name == model]
     whitened = np.asarray(np.linalg.cholesky(_regular(covariance, K)), dtype=np.float64)
-    found = {name: _solve(force, K, whitened, CURVES[name]) for name in names}
+    solutions = {name: _solve(force, K, whitened, CURVES[name]) for name in names}
     chosen = model
     if model == "auto":
         largest = max(names, key=lambda name: len(CURVES[name]))
         freedom = len(K) - 1 - len(CURVES[largest])
-        scale = max(1.0, min(value[2] for value in found.values()) / freedom) if freedom > 0 else 1.0
+        scale = max(1.0, min(value[2] for value in solutions.values()) / freedom) if freedom > 0 else 1.0
         chosen = min(
-            names, key=lambda name: found[name][2] / scale + chi_square_limit(1, CURVE_TERM.level) * len(CURVES[name])
+            names,
+            key=lambda name: solutions[name][2] / scale + chi_square_limit(1, CURVE_TERM.level) * len(CURVES[name]),
         )
-    coefficients, matrix, chi_square = found[chosen]
-    given = matrix @ covariance @ matrix.T
+    coefficients, matrix, chi_square = solutions[chosen]
+    matrix_of_noise = matrix @ covariance @ matrix.T
     return CurveFit(
         chosen, coefficients, matrix,
-        _blended(force, K, whitened, covariance, coefficients, given) if model == "auto" else given,
+        _blended(force, K, whitened, covariance, coefficients, matrix_of_noise) if model == "auto" else matrix_of_noise,
         chi_square, len(K) - 1 - len(CURVES[chosen]),
-        tuple((name, 1 + len(CURVES[name]), found[name][2], name == chosen) for name in names),
+        tuple((name, 1 + len(CURVES[name]), solutions[name][2], name == chosen) for name in names),
     )  # fmt: skip
 
 
-def _blended(force: Array, K: Array, root: Array, covariance: Array, chosen: Array, given: Array) -> Array:
+def _blended(force: Array, K: Array, root: Array, covariance: Array, chosen: Array, chosen_covariance: Array) -> Array:
     """Covariance of the chosen coefficients whichever model is right: nowhere less than that given the model."""
     nested = [name for name in _NESTED if len(CURVES[name]) < len(K)]
     steps = [_solve(force, K, root, CURVES[name]) for name in nested]
     squares = np.array([chi_square for *_, chi_square in steps])
-    found = blend(
+    blended = blend(
         np.array([coefficients for coefficients, *_ in steps]),
         np.array([matrix @ covariance @ matrix.T for _, matrix, _ in steps]),
         -np.diff(squares), np.ones(len(steps) - 1), prior=0.0,
     )  # fmt: skip
     scale = np.max(force) ** np.arange(3.0)
-    values, vectors = np.linalg.eigh((found.about(chosen) - given) * np.outer(scale, scale))
+    values, vectors = np.linalg.eigh((blended.about(chosen) - chosen_covariance) * np.outer(scale, scale))
     more: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scale, scale)
-    return given + more
+    return chosen_covariance + more
 
 
 def _regular(covariance: Array, K: Array) -> Array:
@@ -234,19 +235,19 @@ class _Finding:
 
 def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: bool) -> tuple[float, list[_Finding]]:
     """How much the FOG's line is turned back by, s, and what was found of delays."""
-    found = delays(test)
-    if found is None:
+    delay = delays(test)
+    if delay is None:
         return 0.0, []
     late = 0.0
     shown: list[_Finding] = []
     top = float(np.abs(test.table).max())
-    turning = _is_clear(found.own, found.own_uncertainty) and abs(found.own) * top > _FLOOR
-    size = max(abs(found.fog), abs(found.late)) if turning else abs(found.late)
-    clear = _is_clear(found.fog, found.fog_uncertainty) or (_is_clear(found.late, found.uncertainty) and not turning)
+    turning = _is_clear(delay.own, delay.own_uncertainty) and abs(delay.own) * top > _FLOOR
+    size = max(abs(delay.fog), abs(delay.late)) if turning else abs(delay.late)
+    clear = _is_clear(delay.fog, delay.fog_uncertainty) or (_is_clear(delay.late, delay.uncertainty) and not turning)
     if clear and size * top * test.fog_share > _FLOOR:
         named: tuple[str, ...] = ()
         if correct and not turning:
-            late, size, named = found.late, found.uncertainty, ("delay of the FOG", "delay of X")
+            late, size, named = delay.late, delay.uncertainty, ("delay of the FOG", "delay of X")
             done = "its line was turned back by that, and what is uncertain of it is in u"
         else:
             done = "added to u, not corrected, since " + (
@@ -258,8 +259,8 @@ def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: boo
         shown.append(
             _Finding(
                 (1j * size * test.table * turn * test.fog)[:, None] * _QUARTER[:axes],
-                f"the FOG is {1e3 * found.fog:.3g} ± {1e3 * found.fog_uncertainty:.1g} ms late against table_angle, "
-                f"which changes K at the highest level by up to {100 * abs(found.fog) * top * test.fog_share:.2g} %: "
+                f"the FOG is {1e3 * delay.fog:.3g} ± {1e3 * delay.fog_uncertainty:.1g} ms late against table_angle, "
+                f"which changes K at the highest level by up to {100 * abs(delay.fog) * top * test.fog_share:.2g} %: "
                 f"{done}; mend the timing or the filters of the channels",
                 named,
             )
@@ -268,10 +269,10 @@ def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: boo
         drift = np.array([lines[run.index].line * run.force for run in test.runs])
         shown.append(
             _Finding(
-                1j * found.own * test.table[:, None] * drift,
-                f"X turns against table_angle as if it were {1e3 * found.own:.3g} ± {1e3 * found.own_uncertainty:.1g} "
+                1j * delay.own * test.table[:, None] * drift,
+                f"X turns against table_angle as if it were {1e3 * delay.own:.3g} ± {1e3 * delay.own_uncertainty:.1g} "
                 "ms late (differential flexure looks the same): added to the uncertainty of the direction, which it "
-                f"changes by up to {np.degrees(abs(found.own) * top):.2g} deg at the highest level",
+                f"changes by up to {np.degrees(abs(delay.own) * top):.2g} deg at the highest level",
             )
         )
     return late, shown
@@ -308,9 +309,12 @@ def _difference(test: Measured, axis: int, axes: int, late: float, *, correct: b
     return change, shown
 
 
-def corrected(runs: Sequence[LoadedRun], found: Corrections) -> list[LoadedRun]:
+def corrected(runs: Sequence[LoadedRun], corrections: Corrections) -> list[LoadedRun]:
     """Return the runs with the factors of their FOG's line and what is common to all of them."""
-    return [replace(run, fog_factor=found.fog.get(run.index), common=found.common.get(run.index)) for run in runs]
+    return [
+        replace(run, fog_factor=corrections.fog.get(run.index), common=corrections.common.get(run.index))
+        for run in runs
+    ]
 
 
 def _is_clear(value: float, uncertainty: float, freedom: float | None = None) -> bool:
@@ -433,7 +437,7 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
     values = np.array([row.value for row in rows])
     radius = np.array([row.radius for row in rows]) * manifest.radius_uncertainty / manifest.radius
     covariance = J @ V @ J.T + np.outer(radius, radius)
-    given = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    given_model = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     for prefix, chosen in curves.items():
         _widen(covariance, [row.name for row in rows], prefix, chosen, J, V)
     freedom = _freedom(J, V, common, radius, levels, width)
@@ -448,7 +452,7 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
         curves=curves,
         turning=turning,
         cross=cross,
-        given=given,
+        given=given_model,
         warnings=tuple(warnings),
     )
 
@@ -549,7 +553,7 @@ def _cross(
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Add the cross terms where a level has the spin axis both ways: half the difference of its lines over g."""
     where = {(level.spin_axis, level.number): index for index, level in enumerate(items)}
-    found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    by_level: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for (spin_axis, number), up in where.items():
         down = where.get(("down", number))
         if spin_axis != "up" or down is None:
@@ -558,7 +562,7 @@ def _cross(
             warnings.append(f"level {number}: no table_angle, so that spin-axis cross terms cannot be separated")
             continue
         difference = (items[up].line - items[down].line) / (2 * manifest.gravity)
-        found[number] = (difference, (items[up].line + items[down].line) / 2)
+        by_level[number] = (difference, (items[up].line + items[down].line) / 2)
         for axis in range(axes):
             modulus = max(abs(difference[axis]), 1e-300)
             derivative = np.zeros(size)
@@ -566,7 +570,7 @@ def _cross(
             derivative[up * width + 2 * axis : up * width + 2 * axis + 2] = pair
             derivative[down * width + 2 * axis : down * width + 2 * axis + 2] = -pair
             rows.append(_Row(f"{'xy'[axis]}_cross_{number}", float(modulus), CROSS_UNIT, derivative, -float(modulus)))
-    return found
+    return by_level
 
 
 def _cycles(levels: Levels, size: int, width: int) -> Array:
@@ -574,9 +578,9 @@ def _cycles(levels: Levels, size: int, width: int) -> Array:
 
     In units of the mean K of a set, not of each level's own: a noisy level would take a share of its own noise.
     """
-    found = levels.repeatability
+    repeatability = levels.repeatability
     total = np.zeros((size, size))
-    if not found.cycle and not found.turn:
+    if not repeatability.cycle and not repeatability.turn:
         return total
     for axis in range(width // 2):
         for cycle in {cycle for level in levels.items for cycle in level.cycles}:
@@ -589,7 +593,7 @@ def _cycles(levels: Levels, size: int, width: int) -> Array:
                 place = index * width + 2 * axis
                 along[place : place + 2] = share * unit.real, share * unit.imag
                 across[place : place + 2] = -share * unit.imag, share * unit.real
-            total += found.cycle * np.outer(along, along) + found.turn * np.outer(across, across)
+            total += repeatability.cycle * np.outer(along, along) + repeatability.turn * np.outer(across, across)
     return total
 
 
@@ -606,8 +610,8 @@ def _freedom(J: Array, V: Array, common: Array, radius: Array, levels: Levels, w
     spent = cycles**2 / max(levels.repeatability.freedom, 1)
     for index, level in enumerate(levels.items):
         part = slice(index * width, (index + 1) * width)
-        own = V[part, part] - common[part, part]
-        mine = np.einsum("pi,ij,pj->p", J[:, part], own, J[:, part])
+        run_noise = V[part, part] - common[part, part]
+        mine = np.einsum("pi,ij,pj->p", J[:, part], run_noise, J[:, part])
         # An axis's own share decides which of the degrees of freedom counts.
         shares = np.abs(J[:, part]).reshape(len(J), -1, 2).sum(axis=2)
         nu = level.freedom[np.argmax(shares, axis=1)]
@@ -636,27 +640,27 @@ def power_cycles(levels: Levels, method: str) -> list[dict[str, Any]]:
             mine = [line for line in group if line.source.run.power_cycle == cycle]
             if not mine:
                 continue
-            own = pooled(level.number, level.spin_axis, mine, repeatability, level.directed)
-            for axis, letter in enumerate("xy"[: len(own.line)]):
-                size = float(abs(own.line[axis]))
-                unit = np.array([own.line[axis].real, own.line[axis].imag]) / max(size, 1e-300)
+            level_of_cycle = pooled(level.number, level.spin_axis, mine, repeatability, level.directed)
+            for axis, letter in enumerate("xy"[: len(level_of_cycle.line)]):
+                size = float(abs(level_of_cycle.line[axis]))
+                unit = np.array([level_of_cycle.line[axis].real, level_of_cycle.line[axis].imag]) / max(size, 1e-300)
                 pair = slice(2 * axis, 2 * axis + 2)
-                u = float(np.sqrt(unit @ own.covariance[pair, pair] @ unit))
+                u = float(np.sqrt(unit @ level_of_cycle.covariance[pair, pair] @ unit))
                 if level.directed and method == "least-squares":
-                    size -= float(own.component_variance[axis]) / (2 * max(size, 1e-300))
-                found = row.setdefault(letter if level.spin_axis == "up" else f"{letter}_down", {})
-                found[f"K_{level.number}"] = {"value": size, "standard_uncertainty": u, "unit": K_UNIT}
-        for found in row.values():
-            if isinstance(found, dict) and "K_1" in found:
-                found |= _zeta_of_cycle(found)
+                    size -= float(level_of_cycle.component_variance[axis]) / (2 * max(size, 1e-300))
+                values = row.setdefault(letter if level.spin_axis == "up" else f"{letter}_down", {})
+                values[f"K_{level.number}"] = {"value": size, "standard_uncertainty": u, "unit": K_UNIT}
+        for values in row.values():
+            if isinstance(values, dict) and "K_1" in values:
+                values |= _zeta_of_cycle(values)
         rows.append(row)
     return rows
 
 
-def _zeta_of_cycle(found: dict[str, Any]) -> dict[str, Any]:
-    first = found["K_1"]
+def _zeta_of_cycle(values: dict[str, Any]) -> dict[str, Any]:
+    first = values["K_1"]
     zeta = {}
-    for name, K in found.items():
+    for name, K in values.items():
         if name == "K_1":
             continue
         ratio = K["value"] / first["value"]

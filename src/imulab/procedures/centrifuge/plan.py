@@ -130,9 +130,9 @@ def _flexure(test: Measured) -> BudgetEntry:
     for column, label in enumerate(np.unique(labels)):
         design[labels == label, column] = 1.0
     design[:, -1] = test.arm
-    found = [weighted(design, part, test.line_variance) for part in (test.line.real, test.line.imag)]
-    value = abs(complex(found[0][0][-1], found[1][0][-1]))
-    u = float(np.sqrt(found[0][1][-1, -1]))
+    fits = [weighted(design, part, test.line_variance) for part in (test.line.real, test.line.imag)]
+    value = abs(complex(fits[0][0][-1], fits[1][0][-1]))
+    u = float(np.sqrt(fits[0][1][-1, -1]))
     return BudgetEntry(
         "differential flexure", True, value, u, "rad/(m/s^2)", 0.0, value * reach,
         "difference of the senses",
@@ -141,17 +141,17 @@ def _flexure(test: Measured) -> BudgetEntry:
 
 def _scale_mismatch(test: Measured) -> list[BudgetEntry]:
     """Scale mismatch and azimuth of X against the FOG, by Earth rate."""
-    found = mismatch(test)
-    if found is None:
+    measured = mismatch(test)
+    if measured is None:
         return [
             BudgetEntry("scale mismatch", False, _MISMATCH, None, "1", _MISMATCH * test.fog_share, None,
                   "needs an Earth-rate line"),
         ]  # fmt: skip
     entries = []
-    for error, value, unit in (("scale mismatch", found.scale, "1"), ("FOG azimuth", found.azimuth, "rad")):
-        effect = float(np.hypot(value, found.uncertainty)) * test.fog_share
+    for error, value, unit in (("scale mismatch", measured.scale, "1"), ("FOG azimuth", measured.azimuth, "rad")):
+        effect = float(np.hypot(value, measured.uncertainty)) * test.fog_share
         entries.append(
-            BudgetEntry(error, True, value, found.uncertainty, unit, 0.0 if test.both else effect,
+            BudgetEntry(error, True, value, measured.uncertainty, unit, 0.0 if test.both else effect,
                   effect if test.both else None, "Earth-rate line"),
         )  # fmt: skip
     return entries
@@ -160,15 +160,15 @@ def _scale_mismatch(test: Measured) -> list[BudgetEntry]:
 def _delays(test: Measured) -> list[BudgetEntry]:
     """Delays of FOG and X against the encoder: by the turning of their lines with the table rate."""
     per_second = float(np.abs(test.table).max()) * test.fog_share
-    found = delays(test)
-    if found is None:
+    measured = delays(test)
+    if measured is None:
         basis = "needs encoder, 3 levels"
         return [BudgetEntry("delay, FOG to X", False, _DELAY, None, "s", _DELAY * per_second, None, basis)]
-    effect = float(np.hypot(found.late, found.uncertainty)) * per_second
+    effect = float(np.hypot(measured.late, measured.uncertainty)) * per_second
     return [
-        BudgetEntry("delay of the FOG", True, found.fog, found.fog_uncertainty, "s", effect, None,
+        BudgetEntry("delay of the FOG", True, measured.fog, measured.fog_uncertainty, "s", effect, None,
               "FOG phase over table rate"),
-        BudgetEntry("delay of X", True, found.own, found.own_uncertainty, "s", effect, None,
+        BudgetEntry("delay of X", True, measured.own, measured.own_uncertainty, "s", effect, None,
               "drift phase over table rate"),
     ]  # fmt: skip
 
@@ -502,7 +502,7 @@ def _planned_levels(levels: Sequence[float], test: _Test) -> list[PlannedLevel]:
     return planned
 
 
-def read_levels(given: Sequence[float] | str) -> list[float]:
+def read_levels(stated: Sequence[float] | str) -> list[float]:
     """Return specific forces, m/s^2, given as such or as a text of them in g, with commas.
 
     Raises
@@ -511,15 +511,15 @@ def read_levels(given: Sequence[float] | str) -> list[float]:
         They are none.
     """
     try:
-        values = [float(part) for part in (given.removesuffix("g").split(",") if isinstance(given, str) else given)]
+        values = [float(part) for part in (stated.removesuffix("g").split(",") if isinstance(stated, str) else stated)]
     except (TypeError, ValueError):
         raise OptionError(
-            f"levels {quoted(given)}: expected specific forces in g, with commas, such as 1,2,5,10"
+            f"levels {quoted(stated)}: expected specific forces in g, with commas, such as 1,2,5,10"
         ) from None
-    if not isinstance(given, str):
+    if not isinstance(stated, str):
         return values
     if not all(0 < value < 1e4 for value in values):
-        raise OptionError(f"levels {given!r}: expected specific forces above 0 g")
+        raise OptionError(f"levels {stated!r}: expected specific forces above 0 g")
     return [to_si(value, "g") for value in values]
 
 
@@ -552,7 +552,7 @@ def _warnings(
     uncertainty: float,
     both_senses: bool,
 ) -> list[str]:
-    found = []
+    messages = []
     for level in planned:
         name = f"{from_si(level.force, 'g'):.4g} g"
         for times, words in ((0.5, "half the net rate"), (1.0, "the net rate"), (2.0, "twice the net rate"),
@@ -561,29 +561,29 @@ def _warnings(
                 continue
             better = net_rate * (1 + 3 * _NEAR)
             refused = " (reduce refuses it where they coincide)" if times <= 1 else ""
-            found.append(
+            messages.append(
                 f"{name}: table rate {_deg(level.table_rate)} is near {words}: Earth rate and the drift fall on one "
                 f"line or its harmonic{refused}; take a net rate of {_deg(better)} or move the level by some percent"
             )
         if level.relative > uncertainty:
-            found.append(_too_short(name, level, duration, runs, uncertainty))
+            messages.append(_too_short(name, level, duration, runs, uncertainty))
     few = [level for level in planned if level.periods < PERIODS_ASKED]
     if few:
         longest = max(PERIODS_ASKED * 2 * math.pi / level.table_rate for level in few)
         names = ", ".join(f"{from_si(level.force, 'g'):.4g} g ({level.periods:.0f})" for level in few)
-        found.append(
+        messages.append(
             f"{names}: fewer than the {PERIODS_ASKED} table periods that method fourier asks for "
             f"({_time(longest)} would give "
             "them at every level); method least-squares does not need them"
         )
     if not both_senses:
         top = planned[-1]
-        found.append(
+        messages.append(
             f"one sense of rotation only: differential flexure ({1e6 * to_si(FLEXURE, 'g'):.1g} µrad/g would be "
             f"{100 * top.arm_rate * FLEXURE / K:.2g} % of K at {from_si(top.force, 'g'):.4g} g), scale mismatch and "
             "azimuth are not separated; run both senses (--both-senses, with table_angle recorded)"
         )
-    return found
+    return messages
 
 
 def _too_short(name: str, level: PlannedLevel, duration: float, runs: int, uncertainty: float) -> str:

@@ -27,7 +27,7 @@ def make_record(
     levels: Levels,
     estimates: Estimates,
     budget: Sequence[Mapping[str, Any]],
-    found: Sequence[str] = (),
+    findings: Sequence[str] = (),
     options: Mapping[str, Any],
     sources: Sequence[Source] = (),
     temperature: float | None = None,
@@ -58,7 +58,7 @@ def make_record(
         data={"spectra": _spectra(runs, levels), "statics": [_static(static) for static in statics]},
         sensor=dict(manifest.sensor),
         sources=tuple(sources),
-        warnings=(*found, *_warnings(manifest, runs, levels, estimates, method)),
+        warnings=(*findings, *_warnings(manifest, runs, levels, estimates, method)),
         sections={"levels": _levels(levels, estimates), "runs": _runs(manifest, statics, runs, levels, method)},
     )
 
@@ -185,8 +185,8 @@ def _loaded(run: LoadedRun, pooled: RunLine | None, method: str) -> dict[str, An
         "blocks": run.blocks,
     }  # fmt: skip
     names = [*"xy"[: len(line)], "fog"]
-    own = run.line if method == "least-squares" or run.whole_periods is None else run.whole_periods.line
-    shown = [*line, own[-1]]
+    own_lines = run.line if method == "least-squares" or run.whole_periods is None else run.whole_periods.line
+    shown = [*line, own_lines[-1]]
     fog = run.covariance[-1:, -1:]
     spreads = [*(real[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] for i in range(len(line))), real_covariance(fog)]
     for number, (name, value, spread) in enumerate(zip(names, shown, spreads, strict=True)):
@@ -256,28 +256,28 @@ def _rounded(values: Array, digits: int) -> list[float]:
 def _warnings(
     manifest: Manifest, runs: Sequence[LoadedRun], levels: Levels, estimates: Estimates, method: str
 ) -> tuple[str, ...]:
-    found = [message for run in runs for message in run.warnings]
-    found += [*levels.warnings, *estimates.warnings]
+    messages = [message for run in runs for message in run.warnings]
+    messages += [*levels.warnings, *estimates.warnings]
     if method == "fourier":
         few = [run for run in runs if run.whole_periods is not None and run.whole_periods.periods <= 500]
         if few:
             least = min(few, key=lambda run: run.whole_periods.periods if run.whole_periods else 0)
             periods = least.whole_periods.periods if least.whole_periods else 0
-            found.append(
+            messages.append(
                 f"{len(few)} runs have 500 table periods or fewer (least: {least.run.file}, {periods}): drift leaks "
                 "into whole-period sums; method least-squares has no such limit"
             )
         off = {run.index: amplitude_lost(run, manifest, method) for run in runs}
         worst = max(runs, key=lambda run: off[run.index])
         if off[worst.index] > _LOST:
-            found.append(
+            messages.append(
                 f"method fourier takes the manifest's table rate: in {worst.run.file} the rate measured is "
                 f"{in_degrees(abs(worst.rates.table_rate))}, not {in_degrees(worst.run.table_rate)}, which costs "
                 f"{100 * off[worst.index]:.2g} % of the amplitude (in the uncertainty); method least-squares follows it"
             )
     for prefix, fitted in estimates.curves.items():
         if fitted.probability is not None and fitted.probability < CURVE_MISSES.level:
-            found.append(
+            messages.append(
                 f"{prefix.rstrip('_')}: K(a) is not described by the curve {fitted.model} within its uncertainty "
                 f"(chi-square "
                 f"{fitted.chi_square:.1f} with {fitted.freedom} degrees of freedom)"
@@ -290,14 +290,14 @@ def _warnings(
                 if (level.spin_axis == "down") == ("down" in prefix)
             ]
             span = float(np.ptp(np.unwrap(np.radians(angles))))
-            found.append(
+            messages.append(
                 f"{prefix.rstrip('_')}: the direction of the drift turns by {np.degrees(span):.2g} deg between the "
                 f"levels: "
                 "nonlinearity that the magnitude does not show"
             )
     senses = {run.run.sense for run in runs}
     if len(senses) == 1 and len(runs) > 1:
-        found.append(
+        messages.append(
             "one sense of rotation only: differential flexure, scale mismatch and a delay of the FOG within what the "
             "error budget leaves open are not separated from K(a), and not in u; run both senses"
             + (
@@ -306,4 +306,4 @@ def _warnings(
                 else "; no table_angle: no direction of the drift, which apply needs"
             )
         )
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(messages))

@@ -81,9 +81,9 @@ class Channels:
         try:
             yield from self._samples()
         except ImulabError as error:
-            name, found, rest = str(error).partition(": ")
+            name, colon, rest = str(error).partition(": ")
             # What does not name the run names its file alone, as it was opened: that is in `place` already.
-            raise type(error)(f"{place}: {rest if found and name.endswith(file) else error}") from None
+            raise type(error)(f"{place}: {rest if colon and name.endswith(file) else error}") from None
 
     def _samples(self) -> Iterator[CellSamples]:
         end = -np.inf
@@ -159,10 +159,10 @@ def steady_part(cells: Cells, place: str) -> tuple[Cells, list[str]]:
         cells = whole.cut(first, last)
     warnings: list[str] = []
     for _ in range(_ROUNDS):
-        found = _unsteady_blocks(cells, place)
-        if found is None:
+        unsteady = _unsteady_blocks(cells, place)
+        if unsteady is None:
             break
-        low, high, message = found
+        low, high, message = unsteady
         if low == 0 and high == len(cells.centre):
             warnings += message
             break
@@ -194,10 +194,10 @@ def _steady_encoder(cells: Cells, place: str) -> tuple[int, int]:
         return 0, count
     usual = float(np.median(rate))
     if abs(usual) > _MISMATCH:
-        found = cells.table_rate + usual
-        sense = "; is the sense of the run wrong?" if found * cells.table_rate < 0 else ""
+        measured = cells.table_rate + usual
+        sense = "; is the sense of the run wrong?" if measured * cells.table_rate < 0 else ""
         raise DataError(
-            f"{place}: column table_angle turns at {in_degrees(found)}, expected table_rate "
+            f"{place}: column table_angle turns at {in_degrees(measured)}, expected table_rate "
             f"{in_degrees(cells.table_rate)}{sense}"
         )
     spread = MAD_TO_SIGMA * float(np.median(np.abs(rate - usual)))
@@ -235,13 +235,13 @@ def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | N
         _check_wandering(cells, place)
         return None
     solution = solve(cells, shift, _peak_shift(cells, cells.net_rate))
-    found = scatter(cells, solution)
-    if found is None or len(found.centre) < 6:
+    scattered = scatter(cells, solution)
+    if scattered is None or len(scattered.centre) < 6:
         return None
     size = np.abs(solution.line(LINE))
     # Against the median of the blocks: the line of the whole run has the disturbance in it.
-    middle = np.median(found.deviation.real, axis=0) + 1j * np.median(found.deviation.imag, axis=0)
-    deviation = np.abs(found.deviation - middle)
+    middle = np.median(scattered.deviation.real, axis=0) + 1j * np.median(scattered.deviation.imag, axis=0)
+    deviation = np.abs(scattered.deviation - middle)
     sigma = np.median(deviation, axis=0) / 1.1774
     # Below `FAINT` nothing is seen of a gyroscope: a simulated line without noise has no scatter to compare with.
     bad: NDArray[np.bool_] = np.any(deviation > _STANDS_OUT * sigma + _UNSTEADY * size + FAINT, axis=1)
@@ -251,12 +251,12 @@ def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | N
     if bad.all() or bad[low:high].any():
         index = low + int(np.argmax(bad[low:high]))
         raise DataError(
-            f"{place}: the line at the table rate changes near {found.centre[index]:.1f} s; expected steady rates "
+            f"{place}: the line at the table rate changes near {scattered.centre[index]:.1f} s; expected steady rates "
             "(a rate ramp or a disturbance inside the run)"
         )
     if low > 0 or high < count:
-        return int(found.edges[low]), int(found.edges[high]), []
-    return 0, len(cells.centre), _slow_change(found.deviation, size, place)
+        return int(scattered.edges[low]), int(scattered.edges[high]), []
+    return 0, len(cells.centre), _slow_change(scattered.deviation, size, place)
 
 
 def _check_wandering(cells: Cells, place: str) -> None:
@@ -546,12 +546,12 @@ def reduce_run(
     used, warnings = steady_part(cells, place)
     rates = find_rates(used, place)
     solution = rates.solution
-    found = scatter(used, solution)
-    if found is None:
+    scattered = scatter(used, solution)
+    if scattered is None:
         noise, freedom, blocks_used = residual_noise(used, solution), float(max(used.samples - 10, 1)), 0
         warnings.append(f"{place}: too short for noise from blocks of the run; white noise is assumed")
     else:
-        noise, freedom, blocks_used = found.noise, found.freedom, len(found.centre)
+        noise, freedom, blocks_used = scattered.noise, scattered.freedom, len(scattered.centre)
     if not solution.kept.all():
         warnings.append(f"{place}: too short to tell all lines apart; some harmonics or the net rate were left out")
     warnings += [

@@ -353,13 +353,13 @@ def _gyroscope(motion: _Motion, axis: AxisTruth, psi: float, rig: RigTruth) -> A
     along_x, along_y = a * np.cos(chi), a * np.sin(chi)
     growth = 1 + axis.c1 * a + axis.c2 * a**2
     spin = motion.up * rig.gravity
-    own = a * np.cos(chi - psi)
+    along_drift = a * np.cos(chi - psi)
     level = rig.gravity * rig.base_tilt
     base = rig.base_phase - motion.net_angle
     rate: Array = (1 + axis.scale_error) * _common(motion, psi, axis.out_of_plane, rig)
     rate += axis.bias + axis.drift * motion.time
     rate += (growth * axis.D_x + spin * axis.cross_x) * along_x + (growth * axis.D_y + spin * axis.cross_y) * along_y
-    rate += axis.quadratic * own**2 + axis.cubic * own**3
+    rate += axis.quadratic * along_drift**2 + axis.cubic * along_drift**3
     rate += axis.D_x * level * np.cos(base) + axis.D_y * level * np.sin(base)
     if axis.differential_flexure:
         rate += motion.arm * axis.differential_flexure * a * np.cos(chi + axis.differential_phase - psi)

@@ -65,12 +65,12 @@ def at_rest(
     each = columns_noise(columns, rate, candidates=_CANDIDATES)
     notes: list[str] = []
     if record is None:
-        spread = np.array([one.mean_uncertainty(duration) for one in each])
+        spread = np.array([gyro.mean_uncertainty(duration) for gyro in each])
     else:
         names = [name for row in elements.names for name in row]
         spread, notes = mean_uncertainties(record, names, duration, "rad/s", head)
     noise = tuple(tuple(each[k : k + n]) for k in range(0, len(each), n))
-    curves = tuple(tuple(one.curve for one in row) for row in noise)
+    curves = tuple(tuple(gyro.curve for gyro in row) for row in noise)
     white = np.array([[curve.deviation[0] for curve in row] for row in curves])
     spread = spread.reshape(len(elements.axes), n)
     return AtRest(readings.mean(axis=0), curves, noise, white, spread, duration, rate), notes
@@ -252,45 +252,46 @@ def align_in_time(time: Array, readings: Array, white: Array, truth: Array | Non
     delay, u = np.zeros(count), np.full(count, np.inf)
     moved, fine = readings, np.ones(len(time), dtype=np.bool_)
     # Late elements alone can make an alignment uncertain: only the last one must be good enough.
-    found = align(readings, white, truth, strict=False)
+    alignment = align(readings, white, truth, strict=False)
     for _ in range(_STEPS):
-        if fine.sum() < _FEWEST or not np.isfinite(found.sensing).all():
+        if fine.sum() < _FEWEST or not np.isfinite(alignment.sensing).all():
             break
-        step, u = _regressed(time[fine], moved[fine], white, found, None if truth is None else truth[fine])
+        step, u = _regressed(time[fine], moved[fine], white, alignment, None if truth is None else truth[fine])
         if truth is None:
             step = step - np.median(step)
         delay = delay + np.clip(step, -_LONGEST, _LONGEST)
         if moved is readings and not _is_late(delay, u).any():
             break
         moved, fine = _without_delays(time, readings, delay)
-        found = align(moved[fine], white, None if truth is None else truth[fine], strict=False)
+        alignment = align(moved[fine], white, None if truth is None else truth[fine], strict=False)
         if np.abs(step).max() < _SETTLED * u.min():
             break
     known = bool(np.isfinite(u).all() and np.isfinite(delay).all())
     if not known or not _is_late(delay, u).any() or fine.sum() < _FEWEST:
-        found = align(readings, white, truth)
+        alignment = align(readings, white, truth)
     else:
-        found = align(moved[fine], white, None if truth is None else truth[fine])
-    return replace(found, latency=delay, latency_uncertainty=u) if known else found
+        alignment = align(moved[fine], white, None if truth is None else truth[fine])
+    return replace(alignment, latency=delay, latency_uncertainty=u) if known else alignment
 
 
 def _is_late(delay: Array, u: Array) -> NDArray[np.bool_]:
     """Which latencies are clear, and not too small to matter."""
-    found: NDArray[np.bool_] = np.abs(delay) > np.maximum(READINGS_LATE.limit * u, _HARMLESS)
-    return found
+    late: NDArray[np.bool_] = np.abs(delay) > np.maximum(READINGS_LATE.limit * u, _HARMLESS)
+    return late
 
 
-def latency_notes(found: Alignment, names: Sequence[str]) -> list[str]:
+def latency_notes(alignment: Alignment, names: Sequence[str]) -> list[str]:
     """Say which elements are late, under these names."""
-    if found.latency is None or found.latency_uncertainty is None:
+    if alignment.latency is None or alignment.latency_uncertainty is None:
         return []
-    late = np.flatnonzero(_is_late(found.latency, found.latency_uncertainty)).tolist()
+    late = np.flatnonzero(_is_late(alignment.latency, alignment.latency_uncertainty)).tolist()
     if not late:
         return []
     listed = ", ".join(
-        f"{names[i]} by {1e3 * found.latency[i]:+.3g} ms (u {1e3 * found.latency_uncertainty[i]:.1g} ms)" for i in late
+        f"{names[i]} by {1e3 * alignment.latency[i]:+.3g} ms (u {1e3 * alignment.latency_uncertainty[i]:.1g} ms)"
+        for i in late
     )
-    than = "the truth" if found.gauge == "truth_rate" else "the array's median"
+    than = "the truth" if alignment.gauge == "truth_rate" else "the array's median"
     return [
         f"readings come later than {than}: {listed}; scale factors and alignment are of readings moved by as much, but "
         "array fuse does not move them: give such an element a column time_i of its own, or mend the logger"
@@ -298,18 +299,18 @@ def latency_notes(found: Alignment, names: Sequence[str]) -> list[str]:
 
 
 def _regressed(
-    time: Array, readings: Array, white: Array, found: Alignment, truth: Array | None
+    time: Array, readings: Array, white: Array, alignment: Alignment, truth: Array | None
 ) -> tuple[Array, Array]:
     """Latency that is left of each element, s, and its standard uncertainty by jackknife over 20 stretches."""
-    weight = found.sensing / white.T[:, :, None] ** 2
+    weight = alignment.sensing / white.T[:, :, None] ** 2
     centred = readings - readings.mean(axis=0)
     if truth is None:
-        normal = np.einsum("iab,iac->bc", found.sensing, weight)
+        normal = np.einsum("iab,iac->bc", alignment.sensing, weight)
         rate = np.linalg.solve(normal, np.einsum("iab,mai->bm", weight, centred)).T
     else:
         rate = truth - truth.mean(axis=0)
-    change = np.einsum("iab,mb->mai", found.sensing, np.gradient(rate, time, axis=0))
-    left = centred - np.einsum("iab,mb->mai", found.sensing, rate)
+    change = np.einsum("iab,mb->mai", alignment.sensing, np.gradient(rate, time, axis=0))
+    left = centred - np.einsum("iab,mb->mai", alignment.sensing, rate)
     gap = np.diff(time) > GAP * np.median(np.diff(time))
     change[np.append(gap, False) | np.insert(gap, 0, False)] = 0.0
     inverse = 1 / white**2

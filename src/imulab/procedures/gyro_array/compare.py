@@ -173,20 +173,20 @@ def responses(
     step = np.diff(readings, axis=0)
     rng = np.random.default_rng(0)
     probe = rng.standard_normal(readings.shape[:2]) * _noise(step)
-    seen = np.repeat(probe[:, :, None], elements.count, axis=2)
+    shaken_by = np.repeat(probe[:, :, None], elements.count, axis=2)
     if record is not None:
         matrices = array_calibration(record, elements).matrices
         if matrices is not None:
-            seen = np.einsum("nab,mb->man", np.linalg.inv(matrices), probe)
+            shaken_by = np.einsum("nab,mb->man", np.linalg.inv(matrices), probe)
     frozen = _frozen(step, rate)
-    seen[frozen] = 0.0
+    shaken_by[frozen] = 0.0
     plain, shaken = (
         open_stream(options, elements, rate, readings).process(np.ascontiguousarray(part)).rate
-        for part in (readings, readings + seen)
+        for part in (readings, readings + shaken_by)
     )
     response = shaken - plain
     skip = len(response) // 4
-    found = []
+    edges = []
     for a in range(len(elements.axes)):
         gain, uncertainty = _transfer(probe[skip:, a], np.nan_to_num(response[skip:, a]))
         frequency = np.linspace(0, rate / 2, len(gain))
@@ -198,8 +198,8 @@ def responses(
             share = (high - _HALF_POWER) / (high - low) if high > _HALF_POWER else 0.0
             edge = float(frequency[k - 1] + share * (frequency[k] - frequency[k - 1]))
         blind = tuple(name for i, name in enumerate(elements.names[a]) if frozen[:, a, i].mean() > 1 - _FOLLOWED)
-        found.append(Response(edge, float(gain[0]), uncertainty, blind))
-    return found
+        edges.append(Response(edge, float(gain[0]), uncertainty, blind))
+    return edges
 
 
 def _noise(step: Array) -> Array:
@@ -207,12 +207,12 @@ def _noise(step: Array) -> Array:
 
     The median gyro's: neither spikes nor a turn during a part of the recording make the probe larger.
     """
-    found = np.ones(step.shape[1])
+    sigma = np.ones(step.shape[1])
     for a in range(step.shape[1]):
         sizes = [np.median(np.abs(column[np.isfinite(column)])) for column in step[:, a].T if np.isfinite(column).any()]
         size = MAD_TO_SIGMA * float(np.median(sizes)) / math.sqrt(2) if sizes else 0.0
-        found[a] = size if size > 0 else 1.0
-    return found
+        sigma[a] = size if size > 0 else 1.0
+    return sigma
 
 
 def _frozen(step: Array, rate: float) -> np.ndarray:
@@ -243,13 +243,13 @@ def _transfer(probe: Array, response: Array) -> tuple[Array, float]:
         (np.fft.rfft(window * probe[s : s + size]), np.fft.rfft(window * response[s : s + size])) for s in starts
     ]
     cross = np.array([np.conj(p) * r for p, r in spectra])
-    own = np.array([np.abs(p) ** 2 for p, _ in spectra])
-    gain: Array = np.abs(cross.sum(axis=0)) / np.maximum(own.sum(axis=0), 1e-300)
+    power = np.array([np.abs(p) ** 2 for p, _ in spectra])
+    gain: Array = np.abs(cross.sum(axis=0)) / np.maximum(power.sum(axis=0), 1e-300)
     pairs = np.arange(0, len(spectra), 2)
     if len(pairs) < _FEWEST_PAIRS:
         return gain, math.inf
-    left = [np.add.reduceat(part[:, 0], pairs) for part in (cross, own)]
-    without = np.abs(cross[:, 0].sum() - left[0]) / np.maximum(own[:, 0].sum() - left[1], 1e-300)
+    left = [np.add.reduceat(part[:, 0], pairs) for part in (cross, power)]
+    without = np.abs(cross[:, 0].sum() - left[0]) / np.maximum(power[:, 0].sum() - left[1], 1e-300)
     return gain, float(np.sqrt((len(pairs) - 1) / len(pairs) * ((without - without.mean()) ** 2).sum()))
 
 
@@ -293,9 +293,9 @@ class Comparison(Drawn):
 
     def __repr__(self) -> str:
         lines = [f"Comparison of {len(self.figures)} methods, rate std in {' '.join(self.elements.units)}"]
-        for method, found in self.figures.items():
-            told = found if isinstance(found, str) else " ".join(f"{axis.rate_std:.4g}" for axis in found)
-            lines.append(f"  {method:13}  {told[:120]}")
+        for method, rows in self.figures.items():
+            text = rows if isinstance(rows, str) else " ".join(f"{axis.rate_std:.4g}" for axis in rows)
+            lines.append(f"  {method:13}  {text[:120]}")
         return "\n".join(lines)
 
 
@@ -418,14 +418,14 @@ def _evaluate(
     known = runs.rates["robust"].flags if "robust" in runs.rates else None
     singles = [single_gyros(error[:, a], None if known is None else known[part, a]) for a in axes]
     off = {method: fused.rate[part] - reference for method, fused in runs.rates.items()}
-    found: dict[str, tuple[MethodRow, ...] | str] = {
+    evaluated: dict[str, tuple[MethodRow, ...] | str] = {
         m: tuple(
             _figures(wrong[:, a], rate, singles[a], runs.response[m][a].bandwidth, runs.halves[m][a]) for a in axes
         )
         for m, wrong in off.items()
     }
-    found |= runs.failed
-    figures = {method: found[method] for method in METHODS}
+    evaluated |= runs.failed
+    figures = {method: evaluated[method] for method in METHODS}
     curves: dict[str, Any] = {m: [_curve(wrong[:, a], rate) for a in axes] for m, wrong in off.items()}
     curves["single gyro"] = [_curve(error[:, a, singles[a].middle], rate) for a in axes]
     return figures, {
@@ -571,7 +571,7 @@ def _filtering(
     figures: dict[str, tuple[MethodRow, ...] | str], response: dict[str, list[Response]], rate: float
 ) -> list[str]:
     """Warn where less noise is bought by not following the motion: its fast part (a low-pass filter), or all of it."""
-    found = []
+    messages = []
     for method, rows in figures.items():
         if isinstance(rows, str):
             continue
@@ -581,21 +581,21 @@ def _filtering(
         if slow.gain + METHOD_FOLLOWS_LESS.limit * slow.gain_uncertainty < _FOLLOWS:
             verbs = "does not move and counts" if len(slow.blind) == 1 else "do not move and count"
             why = f": {' '.join(slow.blind)} {verbs} in it"
-            found.append(
+            messages.append(
                 f"{method}: it follows only {slow.gain:.2f} ± {max(slow.gain_uncertainty, _FINEST):.2f} of a motion"
                 f"{why if slow.blind else ''}"
             )
         elif narrow < _FILTERED * rate / 2:
-            found.append(
+            messages.append(
                 f"{method}: its bandwidth is {narrow:.3g} Hz of {rate / 2:.3g} Hz: where its rate noise is lower that "
                 "is low-pass filtering, which does not lower the angle error"
             )
         elif beyond < _BEYOND_LIMIT:
-            found.append(
+            messages.append(
                 f"{method}: its noise from sample to sample is {beyond:.2f} of the least that weights can reach: that "
                 "is low-pass filtering, which does not lower the angle error"
             )
-    return found
+    return messages
 
 
 # The source's two experiments, over many seeds: every method with and without a calibrated start.
@@ -639,7 +639,7 @@ def run_experiment(
     if not 1 <= seeds <= 10_000:
         raise OptionError(f"seeds {seeds}: expected 1 to 10000")
     rate = EXPERIMENTS[experiment][0]
-    found: dict[tuple[str, bool], list[tuple[float, float, float, float]]] = {}
+    by_method: dict[tuple[str, bool], list[tuple[float, float, float, float]]] = {}
     for seed in range(1, seeds + 1):
         recording = simulate_array(experiment=experiment, seed=seed, **vars(noise or NoiseModel()))
         # The stretch at rest comes first; the same gyros with the same turn-on biases.
@@ -668,9 +668,9 @@ def run_experiment(
                 )
                 stream = open_stream(options, elements, rate, readings[:10_000])
                 error = stream.process(readings, flags=False).rate[:, 0] - truth[:, 0]
-                found.setdefault((method, calibrated), []).append(rate_figures(error, rate))
+                by_method.setdefault((method, calibrated), []).append(rate_figures(error, rate))
         progress(seed)
     return [
         ExperimentRow(method, calibrated, *map(float, np.median(np.array(values), axis=0)))
-        for (method, calibrated), values in sorted(found.items(), key=lambda item: item[0][1])
+        for (method, calibrated), values in sorted(by_method.items(), key=lambda item: item[0][1])
     ]

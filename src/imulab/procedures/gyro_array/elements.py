@@ -108,33 +108,35 @@ def find_elements(recording: Recording) -> Elements:
     UnitError
         The elements of an axis have different units.
     """
-    found: dict[str, dict[int, str]] = {}
+    by_axis: dict[str, dict[int, str]] = {}
     for name in recording.columns:
         match = _ELEMENT.fullmatch(name)
         if match:
-            found.setdefault(match[1] or "", {})[int(match[2])] = name
+            by_axis.setdefault(match[1] or "", {})[int(match[2])] = name
         elif _MISNUMBERED.fullmatch(name):
             raise DataError(f"{recording.name}: column {name}: expected elements numbered 1 2 3 ..")
-    if not found:
+    if not by_axis:
         raise DataError(
             f"{recording.name}: no columns gyro_1 gyro_2 .. (one axis) or gyro_x_1 .. gyro_z_n (three); "
             f"found {' '.join(recording.columns)}"
         )
-    if "" in found and len(found) > 1:
-        raise DataError(f"{recording.name}: both {found[''][min(found[''])]} and columns by axis; expected one form")
-    axes = ("",) if "" in found else ("x", "y", "z")
+    if "" in by_axis and len(by_axis) > 1:
+        raise DataError(
+            f"{recording.name}: both {by_axis[''][min(by_axis[''])]} and columns by axis; expected one form"
+        )
+    axes = ("",) if "" in by_axis else ("x", "y", "z")
     stem = {axis: f"gyro_{axis}_" if axis else "gyro_" for axis in axes}
-    count = max(max(numbers) for numbers in found.values())
+    count = max(max(numbers) for numbers in by_axis.values())
     if count > MOST_ELEMENTS:
         raise DataError(f"{recording.name}: {count} elements; expected {MOST_ELEMENTS} at most")
     for axis in axes:
         for number in range(1, count + 1):
-            if number not in found.get(axis, {}):
+            if number not in by_axis.get(axis, {}):
                 raise DataError(
                     f"{recording.name}: no column {stem[axis]}{number}; expected {count} elements on each axis, "
                     "numbered from 1"
                 )
-    names = tuple(tuple(found[axis][i] for i in range(1, count + 1)) for axis in axes)
+    names = tuple(tuple(by_axis[axis][i] for i in range(1, count + 1)) for axis in axes)
     units = []
     for row in names:
         of_column = {name: parse_unit(recording.units[name]).symbol for name in row}
@@ -171,9 +173,9 @@ class ArrayCalibration:
 
 def feedback_notes(count: int, rate: float) -> list[str]:
     """Return what to know of the method `feedback` for so many gyros on each axis and this sampling rate, Hz."""
-    found: list[str] = []
+    notes: list[str] = []
     if count < FEWEST_ROBUST:
-        found.append(
+        notes.append(
             Note(
                 f"method feedback with {count} gyro{'s' * (count > 1)} on each axis: with fewer than {FEWEST_ROBUST} "
                 "no gyro stands out from the others, so that the weights mean little"
@@ -181,13 +183,13 @@ def feedback_notes(count: int, rate: float) -> list[str]:
         )
     low, high = SOURCE_RATES
     if not 0.99 * low <= rate <= 1.01 * high:
-        found.append(
+        notes.append(
             Note(
                 f"method feedback at {rate:.6g} Hz: its source states it for {low:g} to {high:g} Hz, and its memory "
                 "counts samples"
             )
         )
-    return found
+    return notes
 
 
 def check_calibration(record: Calibration, name: str = "the record") -> None:
@@ -341,12 +343,12 @@ class SampleClock:
 
 def own_clocks(recording: Recording) -> dict[int, str]:
     """Return the columns ``time_1 .. time_n`` in which elements have clocks of their own."""
-    found = {}
+    clocks = {}
     for name in recording.columns:
         number = name.removeprefix("time_")
         if number != name and number.isdecimal():
-            found[int(number)] = name
-    return found
+            clocks[int(number)] = name
+    return clocks
 
 
 def to_one_clock(blocks: Iterable[Recording]) -> Iterator[Recording]:
@@ -369,13 +371,13 @@ def to_one_clock(blocks: Iterable[Recording]) -> Iterator[Recording]:
         if "time" not in block:
             raise DataError(f"{block.name}: columns time_1 .. but no column time; expected the clock to interpolate to")
         joined = block if held is None else _join(held, block)
-        time, own = check_time(joined), _own_times(joined, clocks)
-        start, stop = max(t[0] for t in own.values()), min(t[-1] for t in own.values())
+        time, element_times = check_time(joined), _own_times(joined, clocks)
+        start, stop = max(t[0] for t in element_times.values()), min(t[-1] for t in element_times.values())
         ready = np.flatnonzero((time > until) & (time >= start) & (time <= stop))
         if ready.size:
             until = float(time[ready[-1]])
-            yield _interpolated(joined, time[ready], own, clocks, ready)
-        keep = min(int(np.searchsorted(t, until, side="right")) - 1 for t in (*own.values(), time))
+            yield _interpolated(joined, time[ready], element_times, clocks, ready)
+        keep = min(int(np.searchsorted(t, until, side="right")) - 1 for t in (*element_times.values(), time))
         held = _rows(joined, np.arange(max(keep, 0), len(time)))
 
 
@@ -398,34 +400,34 @@ def _join(first: Recording, second: Recording) -> Recording:
 
 
 def _own_times(recording: Recording, clocks: dict[int, str]) -> dict[int, Array]:
-    own: dict[int, Array] = {}
+    times: dict[int, Array] = {}
     time = recording.si("time")
     for number, name in clocks.items():
         check_finite(recording, [name])
-        own[number] = recording.si(name)
-        step = np.diff(own[number])
+        times[number] = recording.si(name)
+        step = np.diff(times[number])
         if step.size and step.min() <= 0:
             place = recording.place(int(np.argmax(step <= 0)) + 1)
             raise DataError(f"{recording.name}: {place}, column {name}: the clock runs backwards or stands still")
-        apart = np.abs(own[number] - time)
+        apart = np.abs(times[number] - time)
         if apart.max() > _MOST_OFFSET:
             index = int(np.argmax(apart))
             raise DataError(
                 f"{recording.name}: {recording.place(index)}, column {name}: the clocks disagree: "
-                f"{own[number][index]:.9g} s where time is {time[index]:.9g} s; expected less than {_MOST_OFFSET} s "
+                f"{times[number][index]:.9g} s where time is {time[index]:.9g} s; expected less than {_MOST_OFFSET} s "
                 "apart"
             )
-    return own
+    return times
 
 
 def _interpolated(
-    block: Recording, time: Array, own: dict[int, Array], clocks: dict[int, str], ready: np.ndarray
+    block: Recording, time: Array, element_times: dict[int, Array], clocks: dict[int, str], ready: np.ndarray
 ) -> Recording:
     columns = {name: values[ready] for name, values in block.columns.items() if name not in clocks.values()}
     for name in columns:
         stem, _, number = name.rpartition("_")
-        if stem.startswith("gyro") and number.isdecimal() and int(number) in own:
-            columns[name] = np.interp(time, own[int(number)], block.columns[name])
+        if stem.startswith("gyro") and number.isdecimal() and int(number) in element_times:
+            columns[name] = np.interp(time, element_times[int(number)], block.columns[name])
     units = {name: block.units[name] for name in columns}
     return replace(block, columns=columns, units=units, first_row=block.first_row + int(ready[0]))
 
@@ -501,7 +503,7 @@ class Health:
 
     def lines(self) -> list[str]:
         """Return one line per gyro that was excluded, stuck, jumped or non-finite, and one where all were lost."""
-        found = []
+        lines = []
         gyros = sorted({(a, i) for a, i, _ in self.events})
         for a, i in gyros:
             parts = [
@@ -509,14 +511,14 @@ class Health:
                 for _, kind in _KINDS
                 if (event := self.events.get((a, i, kind))) is not None
             ]
-            found.append(f"{self.names[a][i]}: {'; '.join(parts)} (of {_samples(self.total)})")
+            lines.append(f"{self.names[a][i]}: {'; '.join(parts)} (of {_samples(self.total)})")
         if self.few > 0:
-            found.append(
+            lines.append(
                 f"fewer than three gyros left in {_samples(self.few)}: nothing to compare with, equal weights there"
             )
         if self.lost:
-            found.append(f"no gyro left in {_samples(self.lost)}: the output is nan there")
-        return found
+            lines.append(f"no gyro left in {_samples(self.lost)}: the output is nan there")
+        return lines
 
 
 def _samples(count: int) -> str:
@@ -591,13 +593,13 @@ class Checks:
             self.pivot = part[0]  # moments about it: a constant has none, to the last bit
         part = part - self.pivot
         step[~np.isfinite(step).all(axis=1)] = 0.0
-        found = [
+        moments = [
             part.sum(axis=0).reshape(axes, n),
             np.einsum("mk,mk->k", part, part).reshape(axes, n),
             (part.T @ part[:, ::n]).reshape(axes, n, axes),
             np.einsum("mk,mk->k", step, step).reshape(axes, n),
         ]
-        self.moments = [a + b for a, b in zip(self.moments, found, strict=True)] if self.moments else found
+        self.moments = [a + b for a, b in zip(self.moments, moments, strict=True)] if self.moments else moments
         self.count += len(part)
 
     def _watch_still(self, flat: Array) -> None:
@@ -623,26 +625,26 @@ class Checks:
 
     def lines(self, *, turned: bool = True, known: Collection[str] = ()) -> list[str]:
         """Return what there is to say; of `turned` elements only if asked, and not of dead gyros `known` already."""
-        found = self.dead(known) + self.doubled() + self.units()
+        lines = self.dead(known) + self.doubled() + self.units()
         if turned:
-            found += [f"{line}: mounted the other way round? {_UNTURNED}" for line in self.turned()]
-        return found
+            lines += [f"{line}: mounted the other way round? {_UNTURNED}" for line in self.turned()]
+        return lines
 
     def dead(self, known: Collection[str] = ()) -> list[str]:
         """Return a line on gyros whose readings never change, and one on axes without any that do."""
         if self.still is None or self.first is None or self.seen < _FEWEST:
             return []
         still = (self.still & np.isfinite(self.first)).reshape(len(self.names), -1)
-        found: list[str] = []
+        messages: list[str] = []
         for row, dead in zip(self.names, still, strict=True):
             named = [name for name, gone in zip(row, dead, strict=True) if gone]
             if len(named) == len(row):
-                found.append(
+                messages.append(
                     Bad(f"{_listed(named)}: no reading ever changes: all gyros are dead, and so is the result")
                 )
             elif set(named) - set(known):
-                found.append(f"{' '.join(n for n in named if n not in known)}: no reading ever changes: a dead gyro")
-        return found
+                messages.append(f"{' '.join(n for n in named if n not in known)}: no reading ever changes: a dead gyro")
+        return messages
 
     def doubled(self) -> list[str]:
         """Return a line on gyros that read the same throughout: one that was logged twice counts twice."""
@@ -661,7 +663,7 @@ class Checks:
         if self.count < _FEWEST:
             return []
         spread, explained = self._spread()
-        found: list[str] = []
+        messages: list[str] = []
         for a, row in enumerate(self.names):
             if len(row) < 2:
                 continue
@@ -681,13 +683,13 @@ class Checks:
             smaller, larger = (" ".join(row[i] for i in sorted(part.tolist())) for part in (order[:cut], order[cut:]))
             what = "readings" if moves else "noise"
             kind = Bad if moves or min(cut, len(order) - cut) > 1 else str
-            found.append(
+            messages.append(
                 kind(
                     f"the {what} of {larger} is {ratio:.3g} times as large as that of {smaller}: another unit"
                     f"{f' ({likely[0]})' if likely else ''} or another kind of gyro? Unlike units must not be fused"
                 )
             )
-        return found
+        return messages
 
     def turned(self) -> list[str]:
         """Return a line for each way in which elements are mounted unlike the others, or wired."""
@@ -696,32 +698,34 @@ class Checks:
             return []
         axes = len(self.names)
         plain: Map = tuple((a, 1) for a in range(axes))
-        votes = Counter(found for found in maps if None not in found)
-        usual = max(votes, key=lambda found: (votes[found], found == plain), default=plain)
-        back = {found: (a, found[1]) for a, found in enumerate(usual) if found is not None}
+        votes = Counter(axis_map for axis_map in maps if None not in axis_map)
+        usual = max(votes, key=lambda axis_map: (votes[axis_map], axis_map == plain), default=plain)
+        back = {axis_map: (a, axis_map[1]) for a, axis_map in enumerate(usual) if axis_map is not None}
         origin = {axis: (a, sign) for (axis, sign), (a, _) in back.items()}
-        told: dict[Map, list[int]] = {}
-        for i, found in enumerate(maps):
-            seen: Map = tuple(None if one is None else (origin[one[0]][0], one[1] * origin[one[0]][1]) for one in found)
-            if any(one is not None and one != plain[a] for a, one in enumerate(seen)):
-                told.setdefault(seen, []).append(i)
+        by_map: dict[Map, list[int]] = {}
+        for i, axis_map in enumerate(maps):
+            mapping: Map = tuple(
+                None if pair is None else (origin[pair[0]][0], pair[1] * origin[pair[0]][1]) for pair in axis_map
+            )
+            if any(pair is not None and pair != plain[a] for a, pair in enumerate(mapping)):
+                by_map.setdefault(mapping, []).append(i)
         others = "first gyro of the axis" if usual == plain else "other gyros of the axis"
         lines = []
-        for seen, elements in told.items():
+        for mapping, elements in by_map.items():
             if axes == 1:
                 verb = "turns" if len(elements) == 1 else "turn"
                 lines.append(f"{' '.join(self.names[0][i] for i in elements)} {verb} against the {others}")
                 continue
             numbers = " ".join(str(i + 1) for i in elements)
             reads = ", ".join(
-                f"{'xyz'[a]} reads {'+' if one[1] > 0 else '-'}{'xyz'[one[0]]}"
-                for a, one in enumerate(seen)
-                if one is not None and one != plain[a]
+                f"{'xyz'[a]} reads {'+' if pair[1] > 0 else '-'}{'xyz'[pair[0]]}"
+                for a, pair in enumerate(mapping)
+                if pair is not None and pair != plain[a]
             )
             against = "the first" if usual == plain else "most elements"
             lines.append(
                 f"element{'s' * (len(elements) > 1)} {numbers} ({self.names[0][elements[0]]} ..): {reads} of {against}"
-                f"{_mirrored(seen)}"
+                f"{_mirrored(mapping)}"
             )
         return lines
 
@@ -730,39 +734,39 @@ class Checks:
         if self.count < _FEWEST or not np.isfinite(self.moments[1]).all():
             return []
         axes, n = self.moments[0].shape
-        own, cross = self._covariance()
-        inner = own[:, 0]
+        variance, cross = self._covariance()
+        inner = variance[:, 0]
         weights = np.linalg.lstsq(_regular(cross[:, 0]), np.moveaxis(cross, 2, 0).reshape(axes, -1), rcond=None)[0]
         weights = np.moveaxis(weights.reshape(axes, axes, n), 0, 2)
         explained = np.einsum("aib,aib->ai", weights, cross)
         shares = weights**2 * inner
-        found: list[Map] = []
+        axis_maps: list[Map] = []
         for i in range(n):
             row: list[tuple[int, int] | None] = []
             for a in range(axes):
                 axis = int(np.argmax(shares[a, i]))
                 sure = (
-                    own[a, i] > 0
-                    and explained[a, i] > _FOLLOWS * own[a, i]
+                    variance[a, i] > 0
+                    and explained[a, i] > _FOLLOWS * variance[a, i]
                     and shares[a, i, axis] > _ONE_AXIS * shares[a, i].sum()
                 )
                 row.append((axis, 1 if weights[a, i, axis] > 0 else -1) if sure else None)
-            read = [one[0] for one in row if one is not None]
-            found.append(tuple(row) if len(set(read)) == len(read) else (None,) * axes)
-        return found
+            read = [pair[0] for pair in row if pair is not None]
+            axis_maps.append(tuple(row) if len(set(read)) == len(read) else (None,) * axes)
+        return axis_maps
 
     def _covariance(self) -> tuple[Array, Array]:
         """Variance of each gyro, shape (axes, n), and covariance with the axes of element 1, (axes, n, axes)."""
         mean, square, product = (moment / self.count for moment in self.moments[:3])
-        own = np.maximum(square - mean * mean, 0.0)
-        return own, product - mean[:, :, None] * mean[None, None, :, 0]
+        variance = np.maximum(square - mean * mean, 0.0)
+        return variance, product - mean[:, :, None] * mean[None, None, :, 0]
 
     def _spread(self) -> tuple[Array, Array]:
         """Standard deviation of each gyro, (axes, n), and share of the others that goes with an axis of element 1."""
-        own, cross = self._covariance()
-        both = own[:, :, None] * own[None, None, :, 0]
+        variance, cross = self._covariance()
+        both = variance[:, :, None] * variance[None, None, :, 0]
         share = np.where(both > 0, cross**2 / np.where(both > 0, both, 1.0), 0.0).max(axis=2)
-        return np.sqrt(own), share[:, 1:]
+        return np.sqrt(variance), share[:, 1:]
 
 
 def _regular(matrix: Array) -> Array:
@@ -773,14 +777,14 @@ def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
 
 
-def _mirrored(seen: Map) -> str:
+def _mirrored(mapping: Map) -> str:
     """Say that a known map is left-handed."""
-    if any(one is None for one in seen):
+    if any(pair is None for pair in mapping):
         return ""
-    matrix = np.zeros((len(seen), len(seen)))
-    for a, one in enumerate(seen):
-        if one is not None:
-            matrix[a, one[0]] = one[1]
+    matrix = np.zeros((len(mapping), len(mapping)))
+    for a, pair in enumerate(mapping):
+        if pair is not None:
+            matrix[a, pair[0]] = pair[1]
     return (
         " (left-handed, which no mounting does: columns interchanged or reversed)" if np.linalg.det(matrix) < 0 else ""
     )
@@ -888,13 +892,13 @@ def common_motion(off: Array, noise: Array) -> tuple[float, float]:
     _, vectors = np.linalg.eigh(flat.T @ flat)
     shared = vectors[:, -axes:]
     common = flat @ shared @ shared.T
-    seen = np.sqrt(np.mean(((common * scale).reshape(count, axes, n)) ** 2, axis=0).sum(axis=0) / axes)
+    common_rms = np.sqrt(np.mean(((common * scale).reshape(count, axes, n)) ** 2, axis=0).sum(axis=0) / axes)
     apart = np.sqrt(np.mean((((flat - common) * scale).reshape(count, axes, n)) ** 2, axis=0).sum(axis=0) / axes)
-    low, high = np.quantile(seen, [0.25, 0.75])
+    low, high = np.quantile(common_rms, [0.25, 0.75])
     if high > _ALIKE * low:
-        return float(np.median(seen)), 0.0
-    ratio = np.sort(seen / np.maximum(apart, 1e-300))[(n - 1) // 4]
-    return float(np.median(seen)), float(ratio)
+        return float(np.median(common_rms)), 0.0
+    ratio = np.sort(common_rms / np.maximum(apart, 1e-300))[(n - 1) // 4]
+    return float(np.median(common_rms)), float(ratio)
 
 
 def _refuse_motion(
@@ -905,7 +909,7 @@ def _refuse_motion(
     part = readings[: min(len(readings), _MOST_SAMPLES) // size * size]
     blocks = part.reshape(-1, size, *part.shape[1:])
     fast = common_motion((blocks - blocks.mean(axis=1, keepdims=True)).reshape(part.shape), usual)
-    moves, ratio = max(slow, fast, key=lambda found: found[1])
+    moves, ratio = max(slow, fast, key=lambda pair: pair[1])
     if ratio > _TOGETHER:
         raise DataError(_motion_message(name, moves, ratio))
     steady = readings.mean(axis=0)

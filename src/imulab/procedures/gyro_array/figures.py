@@ -105,9 +105,9 @@ def exhibits_of_comparison(record: Calibration) -> Exhibits:
     """Return what a report on a comparison shows."""
     held = comparison_of(record)
     data, model = held.data, held.model
-    found = {method: rows for method, rows in data.figures.items() if not isinstance(rows, str)}
-    name = "robust" if "robust" in found else "mean"
-    best = found.get(name)
+    tables = {method: rows for method, rows in data.figures.items() if not isinstance(rows, str)}
+    name = "robust" if "robust" in tables else "mean"
+    best = tables.get(name)
     if best is None:
         raise RecordError("the record holds figures of neither robust nor mean")
     unit = model.units[0]
@@ -157,13 +157,13 @@ def _methods_table(record: ComparisonRecord, a: int) -> ReportTable:
     angle, factor = unit_of_angle(unit)
     halves = any(not isinstance(rows, str) and rows[a].split_half is not None for rows in data.figures.values())
     rows, highlight = [], None
-    for number, (method, found) in enumerate(data.figures.items()):
+    for number, (method, figures) in enumerate(data.figures.items()):
         if method == "robust":
             highlight = number
-        if isinstance(found, str):
+        if isinstance(figures, str):
             rows.append([method, *["–"] * (7 + halves)])
             continue
-        rows.append([method, *method_texts(found[a], factor, 3, halves=halves)])
+        rows.append([method, *method_texts(figures[a], factor, 3, halves=halves)])
     return ReportTable(
         title=f"Methods{of_axis(model.axes[a])}",
         caption=f"Rates in {unit}, angles in {angle}. Rate error (standard deviation with the mean removed) and angle "
@@ -333,9 +333,9 @@ def _deg(value: float) -> float:
 
 def _elements_table(record: ArrayRecord) -> ReportTable:
     rows = []
-    one = len(record.model.axes) == 1
+    single_axis = len(record.model.axes) == 1
     for element in record.elements:
-        scale = element.scale_factor if one else None
+        scale = element.scale_factor if single_axis else None
         for a, axis in enumerate(record.model.axes):
             rows.append(
                 [
@@ -347,7 +347,7 @@ def _elements_table(record: ArrayRecord) -> ReportTable:
                     _text(element.rate_random_walk, a, 3600 * 60 * 180 / math.pi),
                 ]
             )
-    scaled = one and record.model.aligned
+    scaled = single_axis and record.model.aligned
     return ReportTable(
         title="Elements",
         caption="Value ± standard uncertainty. Bias is the plain mean at rest, the part that all share (Earth rate "
@@ -366,9 +366,9 @@ def _elements_table(record: ArrayRecord) -> ReportTable:
     )
 
 
-def _text(found: PerGyro, a: int, factor: float) -> str:
+def _text(per_gyro: PerGyro, a: int, factor: float) -> str:
     """Value and standard uncertainty on an axis, in a unit that is so much smaller."""
-    value, u = float(found.values[a]) * factor, float(found.uncertainties[a]) * factor
+    value, u = float(per_gyro.values[a]) * factor, float(per_gyro.uncertainties[a]) * factor
     if math.isnan(value):
         return "not determined"
     return " ± ".join(format_uncertain(value, None if math.isnan(u) else u))

@@ -125,7 +125,7 @@ def calibrate_array(
             f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} s: "
             f"taken at {used:.3g} s"
         )
-    noises = {elements.names[a][i]: found for a, row in enumerate(rest.noise) for i, found in enumerate(row)}
+    noises = {elements.names[a][i]: gyro_noise for a, row in enumerate(rest.noise) for i, gyro_noise in enumerate(row)}
     warnings += [type(line)(f"{still.name}: {line}") for line in noise_lines(noises)]
     if noise is None:
         warnings += [Note(f"{still.name}: {line}") for line in unseen(noises, rest)]
@@ -172,21 +172,21 @@ def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[
     if len(still) < _FEWEST_SAMPLES:
         raise DataError(f"{still.name}: {len(still)} samples at rest are too few; expected {_FEWEST_SAMPLES} or more")
     rate, _ = sampling_rate(still)
-    found = find_rest(_si(still, elements), rate, elements.names, still.name)
-    left_out.check(found.start, found.stop, "the recording at rest")
-    if not found.moved:
+    rest = find_rest(_si(still, elements), rate, elements.names, still.name)
+    left_out.check(rest.start, rest.stop, "the recording at rest")
+    if not rest.moved:
         return still, []
     time = still.si("time")
-    columns = {name: values[found.start : found.stop] for name, values in still.columns.items()}
-    part = replace(still, columns=columns, first_row=still.first_row + found.start)
+    columns = {name: values[rest.start : rest.stop] for name, values in still.columns.items()}
+    part = replace(still, columns=columns, first_row=still.first_row + rest.start)
     if len(part) < _FEWEST_SAMPLES:
         raise DataError(
-            f"{still.name}: not at rest throughout ({found.moved}), and the longest stretch at rest has {len(part)} "
+            f"{still.name}: not at rest throughout ({rest.moved}), and the longest stretch at rest has {len(part)} "
             f"samples; expected {_FEWEST_SAMPLES} or more"
         )
-    first, last = time[found.start], time[found.stop - 1]
+    first, last = time[rest.start], time[rest.stop - 1]
     return part, [
-        f"{still.name}: not at rest throughout ({found.moved}): used is the longest stretch at rest, {first:.6g} to "
+        f"{still.name}: not at rest throughout ({rest.moved}): used is the longest stretch at rest, {first:.6g} to "
         f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval FROM:TO chooses another"
     ]
 
@@ -220,11 +220,11 @@ def _in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tuple[Ali
         raise DataError(f"{moving.name}: {len(kept)} usable samples in motion; expected {_FEWEST_SAMPLES} or more")
     try:
         time = check_time(moving) if "time" in moving else np.arange(len(moving)) / rest.rate
-        found = align_in_time(time[~clipped], kept, rest.white, truth)
+        alignment = align_in_time(time[~clipped], kept, rest.white, truth)
     except ObservabilityError as error:
         raise ObservabilityError(f"{moving.name}: {error}") from None
     names = its.names[0] if len(its.axes) == 1 else [f"element {i + 1}" for i in range(its.count)]
-    return found, [*notes, *(f"{moving.name}: {line}" for line in latency_notes(found, names))]
+    return alignment, [*notes, *(f"{moving.name}: {line}" for line in latency_notes(alignment, names))]
 
 
 def _clipped(readings: Array) -> np.ndarray:
@@ -263,17 +263,17 @@ def _elements(
     """The record's entry for each element, and the parameters in them."""
     axes = len(elements.axes)
     spread = rest.uncertainty
-    one = axes == 1
+    single_axis = axes == 1
 
     def scalar(values: Array) -> Any:
         """A number for one axis, a list over x, y, z for three."""
-        return float(values[0]) if one else values.tolist()
+        return float(values[0]) if single_axis else values.tolist()
 
     listed = []
     parameters: dict[str, Parameter] = {}
     for i in range(elements.count):
         entry: dict[str, Any] = {
-            "name": elements.names[0][i] if one else str(i + 1),
+            "name": elements.names[0][i] if single_axis else str(i + 1),
             "bias": _with_unit(scalar(rest.bias[:, i]), scalar(spread[:, i]), "rad/s"),
         }
         for a, axis in enumerate(elements.axes):
@@ -282,7 +282,7 @@ def _elements(
         if aligned is not None:
             inverse = np.linalg.inv(aligned.sensing[i])
             carried = np.sqrt((inverse**2) @ aligned.standard_uncertainty[i] ** 2 @ (inverse**2))
-            if one:
+            if single_axis:
                 value, u = float(aligned.sensing[i, 0, 0]), float(aligned.standard_uncertainty[i, 0, 0])
                 entry["scale_factor"] = _with_unit(value, u, "1")
                 parameters[f"scale_factor_{i + 1}"] = Parameter(value, u, "1")
@@ -293,7 +293,7 @@ def _elements(
                 entry["latency"] = _with_unit(float(aligned.latency[i]), float(aligned.latency_uncertainty[i]), "s")
         dicts = [coefficients_dict(rest.noise[a][i].coefficients, "rad/s") for a in range(axes)]
         for name in COEFFICIENTS:
-            entry[name] = dicts[0][name] if one else _over_axes([found[name] for found in dicts])
+            entry[name] = dicts[0][name] if single_axis else _over_axes([found[name] for found in dicts])
         listed.append(entry)
     return listed, parameters
 
@@ -376,11 +376,13 @@ def _correlation(
     }
 
 
-def _over_axes(found: list[dict[str, Any]]) -> dict[str, Any]:
+def _over_axes(coefficients: list[dict[str, Any]]) -> dict[str, Any]:
     """One entry with a list over x, y, z for three of one axis each."""
-    reasons = [one["reason"] for one in found if "reason" in one]
-    listed = {key: [one[key] for one in found] for key in ("value", "standard_uncertainty")}
-    return {**listed, "unit": found[0]["unit"], **({"reason": reasons[0]} if reasons else {})}
+    reasons = [axis_coefficient["reason"] for axis_coefficient in coefficients if "reason" in axis_coefficient]
+    listed = {
+        key: [axis_coefficient[key] for axis_coefficient in coefficients] for key in ("value", "standard_uncertainty")
+    }
+    return {**listed, "unit": coefficients[0]["unit"], **({"reason": reasons[0]} if reasons else {})}
 
 
 def _shared(correlation: Array) -> float:

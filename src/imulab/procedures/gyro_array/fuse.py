@@ -90,7 +90,7 @@ def noise_about_mean(readings: Array) -> Array:
     below 5 % of the mean variance. Rows with readings that are not finite are left out; ones where nothing is left.
     """
     _, axes, n = readings.shape
-    found = np.ones((axes, n))
+    sigma = np.ones((axes, n))
     for a in range(axes):
         rows = readings[np.isfinite(readings[:, a]).all(axis=1), a]
         if n < 3 or len(rows) < 50:
@@ -101,8 +101,8 @@ def noise_about_mean(readings: Array) -> Array:
         m = (MAD_TO_SIGMA * np.median(np.abs(np.diff(residual, axis=0)), axis=0)) ** 2 / 2
         variance = n / (n - 2) * (m - m.sum() / (n * (n - 1)))
         if variance.mean() > 0:
-            found[a] = np.sqrt(np.maximum(variance, _LOWEST * variance.mean()))
-    return found
+            sigma[a] = np.sqrt(np.maximum(variance, _LOWEST * variance.mean()))
+    return sigma
 
 
 def default_bias_walk(white: Array) -> Array:
@@ -375,23 +375,23 @@ class Fuser:
             self._drop_zeros(readings)
             if self.checks is not None:
                 self.checks.watch(readings)
-            seen = 0
+            fused_before = 0
             if not settled:
                 early = np.concatenate([early, time])
-                seen = 0 if head is None else len(head)
+                fused_before = 0 if head is None else len(head)
                 head = readings if head is None else np.concatenate([head, readings])
                 if stream is None or self.clock.rate != before:
                     # The times behind the settings are a different number of samples: start again from the first one.
                     stream = self._open(block, elements, head)
                     readings, time = head, early
                 else:
-                    seen = 0
+                    fused_before = 0
             still = self.options.still
             at_rest = None if still is None else (time >= still[0]) & (time < still[1])
             out = stream.process(np.ascontiguousarray(readings), weights=self.weights, still=at_rest)
             if not settled and self.clock.settled:
                 head = None
-            yield self._fused(block, out, seen, elements)
+            yield self._fused(block, out, fused_before, elements)
 
     def notes(self) -> list[str]:
         """Return what there is to say at the end: gaps, rows of zeros, and what the readings show (`Checks`)."""
@@ -399,11 +399,11 @@ class Fuser:
         if self.options.method == "feedback" and self.health is not None:
             more = feedback_notes(len(self.health.names[0]), self.clock.rate)
         known = self.health.stuck() if self.health is not None else ()
-        found = self.checks.lines(turned=not self._aligns(), known=known) if self.checks is not None else []
+        lines = self.checks.lines(turned=not self._aligns(), known=known) if self.checks is not None else []
         if self.lost:
             rows = f"{self.lost} row{'s' * (self.lost > 1)}"
-            found = [*found, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
-        return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in [*found, *more])]
+            lines = [*lines, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
+        return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in [*lines, *more])]
 
     def _drop_zeros(self, readings: Array) -> None:
         """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to not a number."""
@@ -418,16 +418,16 @@ class Fuser:
         record = self.options.calibration
         return isinstance(record, Blob) or (record is not None and model_of(record).aligned)
 
-    def _fused(self, block: Recording, out: Any, seen: int, elements: Elements) -> Fused:
-        time, rate = block.si("time"), out.rate[seen:]
-        flags = out.flags[seen:] if out.flags is not None else None
+    def _fused(self, block: Recording, out: Any, fused_before: int, elements: Elements) -> Fused:
+        time, rate = block.si("time"), out.rate[fused_before:]
+        flags = out.flags[fused_before:] if out.flags is not None else None
         if self.health is not None:
             for key in self.health.watch(time, flags, rate):
                 self.tell(self.health.first(key))
         return Fused(
             time=time,
             rate=rate,
-            weights=out.weights[seen:] if out.weights is not None else None,
+            weights=out.weights[fused_before:] if out.weights is not None else None,
             flags=flags,
             elements=elements,
             health=self.health or Health(elements.names),
@@ -436,10 +436,10 @@ class Fuser:
 
     def _check(self, block: Recording, elements: Elements) -> None:
         if self.options.method in _NEED_THREE and elements.count < FEWEST_ROBUST:
-            found = " ".join(name for row in elements.names for name in row)
+            known = " ".join(name for row in elements.names for name in row)
             raise DataError(
                 f"{block.name}: method {self.options.method} needs {FEWEST_ROBUST} gyros on each axis, "
-                f"found {elements.count} ({found}); --method mean fuses fewer"
+                f"found {elements.count} ({known}); --method mean fuses fewer"
             )
 
     def _open(self, block: Recording, elements: Elements, first: Array) -> Any:

@@ -180,6 +180,6 @@ def _table(fused: Fused) -> ReportTable:
     events, rows = fused.health.events, []
     for a, row in enumerate(fused.elements.names):
         for i, name in enumerate(row):
-            found = [events.get((a, i, label)) for label in labels]
-            rows.append([name, *("–" if event is None else str(event.samples) for event in found)])
+            row_events = [events.get((a, i, label)) for label in labels]
+            rows.append([name, *("–" if event is None else str(event.samples) for event in row_events)])
     return ReportTable("Samples in each state", "", ["gyro", *labels], rows)

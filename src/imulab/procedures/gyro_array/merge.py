@@ -68,14 +68,14 @@ def merge_recordings(
     _refuse_twice(recordings)
     names = [_gyro_columns(recording, axis, column) for recording in recordings]
     first = recordings[0]
-    for recording, own in zip(recordings, names, strict=True):
-        if len(own) != len(names[0]):
+    for recording, gyro_names in zip(recordings, names, strict=True):
+        if len(gyro_names) != len(names[0]):
             raise DataError(
-                f"{recording.name}: {_axes(own)}, but {first.name} has {_axes(names[0])}; "
+                f"{recording.name}: {_axes(gyro_names)}, but {first.name} has {_axes(names[0])}; "
                 "--axis x, y or z takes one axis of each"
             )
     times = [_time(recording) for recording in recordings]
-    values = [_in_unit_of(first, names[0], r, own) for r, own in zip(recordings, names, strict=True)]
+    values = [_in_unit_of(first, names[0], r, gyro_names) for r, gyro_names in zip(recordings, names, strict=True)]
     notes = []
     for i in range(1, len(recordings)):
         name, offset = recordings[i].name, _clock_offset(times[0], values[0], times[i], values[i])
@@ -130,13 +130,17 @@ def _head(recordings: Sequence[Recording]) -> dict[str, str]:
 
 
 def _refuse_twice(recordings: Sequence[Recording]) -> None:
-    seen: dict[str, str] = {}
+    name_of_digest: dict[str, str] = {}
     for recording in recordings:
         digest = recording.source.sha256 if recording.source else ""
-        if digest and digest in seen:
-            same = "given twice" if seen[digest] == recording.name else f"the same file as {seen[digest]}"
+        if digest and digest in name_of_digest:
+            same = (
+                "given twice"
+                if name_of_digest[digest] == recording.name
+                else f"the same file as {name_of_digest[digest]}"
+            )
             raise DataError(f"{recording.name}: {same}; expected a file for each gyroscope")
-        seen[digest] = recording.name
+        name_of_digest[digest] = recording.name
 
 
 def _gyro_columns(recording: Recording, axis: str | None, column: str | None) -> list[str]:
@@ -149,18 +153,18 @@ def _gyro_columns(recording: Recording, axis: str | None, column: str | None) ->
             raise UnitError(f"{recording.name}: column {name} is in {recording.units[name]}; expected a rate")
         return [name]
     axes = [name for name in triad("gyro") if name in recording]
-    found = axes or [name for name in recording.columns if kind_of(name) == "gyro"]
-    if not found:
+    gyros = axes or [name for name in recording.columns if kind_of(name) == "gyro"]
+    if not gyros:
         raise DataError(
             f"{recording.name}: no gyroscope; expected gyro_x gyro_y gyro_z or one column gyro, found "
             f"{' '.join(recording.columns)}; --column NAME says which column it is"
         )
-    if len(found) not in (1, 3) or (len(found) == 3 and not axes):
+    if len(gyros) not in (1, 3) or (len(gyros) == 3 and not axes):
         raise DataError(
-            f"{recording.name}: found {' '.join(found)}; expected one gyroscope in each file; "
+            f"{recording.name}: found {' '.join(gyros)}; expected one gyroscope in each file; "
             "--column NAME says which column it is"
         )
-    return found
+    return gyros
 
 
 def _axes(names: Sequence[str]) -> str:
@@ -190,10 +194,10 @@ def _in_unit_of(first: Recording, wanted: Sequence[str], recording: Recording, n
 
 def _interpolated(wanted: Array, time: Array, values: Array) -> Array:
     """Return readings at other times, shape (m, axes); NaN across gaps."""
-    found = np.column_stack([np.interp(wanted, time, column) for column in values.T])
+    values_wanted = np.column_stack([np.interp(wanted, time, column) for column in values.T])
     away, across = _distance_to_samples(wanted, time)
-    found[across & (away > 0)] = np.nan
-    return found
+    values_wanted[across & (away > 0)] = np.nan
+    return values_wanted
 
 
 def _distance_to_samples(wanted: Array, time: Array) -> tuple[Array, np.ndarray]:

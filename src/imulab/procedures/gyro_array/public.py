@@ -172,9 +172,9 @@ def fuse(
     hertz = None if rate is None else in_si(rate, "rate", "frequency", "Hz")
     rest = interval(still, "still") if isinstance(still, str) else still
     check_keywords(reading, fuse)
-    nominal, own = (hertz, None) if _has_time(data) else (None, hertz)
-    given: dict[str, Any] = {**reading, "window": window, "rate": own}
-    recording = _timed(as_recording(data, given, fuse, gyros_of), "fuse")
+    nominal, sampling = (hertz, None) if _has_time(data) else (None, hertz)
+    stated: dict[str, Any] = {**reading, "window": window, "rate": sampling}
+    recording = _timed(as_recording(data, stated, fuse, gyros_of), "fuse")
     named = (method, memory, calibration, rate_walk, rest, None if initial_bias == "first" else initial_bias, nominal)
     if options is None:
         options = _options(method, memory, initial_bias, calibration, rate_walk, rest)

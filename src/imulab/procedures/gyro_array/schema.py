@@ -207,20 +207,20 @@ def array_of(record: Calibration) -> ArrayRecord:
     RecordError
         Its elements have another number of axes than it says, or noise without size.
     """
-    found = part(record, ArrayRecord)
-    many = holds(found, "model") and holds(found.model, "axes") and len(found.model.axes) > 1
-    for number, element in enumerate(found.elements if holds(found, "elements") else ()):
+    array = part(record, ArrayRecord)
+    many = holds(array, "model") and holds(array.model, "axes") and len(array.model.axes) > 1
+    for number, element in enumerate(array.elements if holds(array, "elements") else ()):
         values = {name: getattr(element, name) for name in element.__struct_fields__ if holds(element, name)}
         for name, value in values.items():
             if isinstance(value, PerGyro) and holds(value, "value") and isinstance(value.value, list) is not many:
                 raise RecordError(
                     f"elements[{number}].{name}.value: expected {'a list over the axes' if many else 'a number'}"
                 )
-    known = holds(found, "correlation") and holds(found.correlation, "covariance")
-    for axis, matrix in enumerate(found.correlation.covariance if known else ()):
+    known = holds(array, "correlation") and holds(array.correlation, "covariance")
+    for axis, matrix in enumerate(array.correlation.covariance if known else ()):
         if not all(row[i] > 0 for i, row in enumerate(matrix)):
             raise RecordError(f"correlation.covariance[{axis}]: expected variances above 0")
-    return found
+    return array
 
 
 def check(record: Calibration) -> None:

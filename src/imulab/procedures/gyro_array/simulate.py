@@ -195,14 +195,14 @@ def _recording(time: Array, readings: Array, truth: Array, biases: Array, unit: 
     return Recording(columns=columns, units=units, metadata=metadata, name=f"simulated {head['experiment']} array")
 
 
-def _spread(given: tuple[float, float] | str) -> tuple[float, float]:
+def _spread(stated: tuple[float, float] | str) -> tuple[float, float]:
     """Return the range of a factor, given as LOW,HIGH or as one number for both."""
-    if not isinstance(given, str):
-        low, high = given
+    if not isinstance(stated, str):
+        low, high = stated
         return float(low), float(high)
-    first, _, second = given.partition(",")
+    first, _, second = stated.partition(",")
     if "," in second:
-        raise OptionError(f"spread {given!r}: expected LOW,HIGH, such as 0.6,1.6")
+        raise OptionError(f"spread {stated!r}: expected LOW,HIGH, such as 0.6,1.6")
     return quantity(first, "spread", "number", "1"), quantity(second or first, "spread", "number", "1")
 
 
@@ -213,7 +213,9 @@ def _fault(text: str) -> Fault:
         raise OptionError(f"fault {text!r}: expected KIND:GYRO[:START[:DURATION[:SIZE]]], such as stuck:3:40:20")
     units = (("start", "time", "s"), ("duration", "time", "s"), ("size", "rate", "deg/s"))
     values = {
-        name: quantity(part, "fault", of, unit) for (name, of, unit), part in zip(units, rest[1:], strict=False) if part
+        name: quantity(part, "fault", kind_of_unit, unit)
+        for (name, kind_of_unit, unit), part in zip(units, rest[1:], strict=False)
+        if part
     }
     return Fault(kind, whole(rest[0], "fault"), **values)
 

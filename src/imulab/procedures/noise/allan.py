@@ -145,17 +145,17 @@ def allan_deviation(
             if value is not None:
                 raise OptionError(f"allan_deviation: {name} does not go with such data: samples have their rate alone")
         return _of_samples(unmasked(data).astype(np.float64), rate, taus)
-    given: dict[str, Any] = {**reading, "rate": rate, "window": window}
+    stated: dict[str, Any] = {**reading, "rate": rate, "window": window}
     if isinstance(data, str | PathLike) and is_large(data):
-        recording = on_disk(as_blocks(data, given, allan_deviation)[0])
+        recording = on_disk(as_blocks(data, stated, allan_deviation)[0])
     else:
-        recording = as_recording(data, given, allan_deviation)
+        recording = as_recording(data, stated, allan_deviation)
     names = [name for name in recording.columns if name != "time"]
     chosen = column or (names[0] if len(names) == 1 else None)
     if chosen not in names:
-        found = "several columns" if column is None else f"no column {column!r}"
+        problem = "several columns" if column is None else f"no column {column!r}"
         raise OptionError(
-            f"allan_deviation: {recording.name}: {found}; expected column=, one of {listed(names, column)}"
+            f"allan_deviation: {recording.name}: {problem}; expected column=, one of {listed(names, column)}"
         )
     unit = si_unit(recording.units[chosen])
     if chosen in noise_columns(recording) and len(recording) >= FEWEST:
@@ -177,11 +177,11 @@ def _of_samples(samples: Array, rate: float, taus: str | Array) -> AllanCurve:
 def _is_line(data: object) -> bool:
     """Return whether data are numbers one after the other."""
     try:
-        found = np.asarray(data)
+        array = np.asarray(data)
     except ValueError:
         return False
-    if found.dtype.kind not in "iufb":
+    if array.dtype.kind not in "iufb":
         return False
-    if found.ndim == 0:
-        raise DataError(f"allan_deviation: data: expected samples, found the number {found}")
-    return found.ndim == 1
+    if array.ndim == 0:
+        raise DataError(f"allan_deviation: data: expected samples, found the number {array}")
+    return array.ndim == 1

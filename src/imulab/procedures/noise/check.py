@@ -358,19 +358,19 @@ def check_logs(
     recordings = [log.recording if isinstance(log, Rest) else log for log in logs]
     names, notes = _columns(record, fit, recordings)
     options = record.options
-    found = fit_recordings(
+    log_record = fit_recordings(
         logs, terms="auto", horizon=fit.columns[names[0]].interval.value, band=None,
         regress=options.get("regress"), columns=names, steps=options.get("steps"),
     ).calibration  # fmt: skip
-    rate = fit_of(found).sample_rate.value
+    rate = fit_of(log_record).sample_rate.value
     if abs(rate / fit.sample_rate.value - 1) > _SAME_RATE:
         raise DataError(
             f"{recordings[0].name}: {rate:.4g} samples in a second, but the record is of {fit.sample_rate.value:.4g}; "
             "expected a log of the record's rate"
         )
-    notes += [f"log: {reason}" for reason in found.verdict.reasons]
-    checked = {name: _checked(record, found, name, allowed) for name in names}
-    return NoiseCheck(checked, share, allowed, tuple(notes), found)
+    notes += [f"log: {reason}" for reason in log_record.verdict.reasons]
+    checked = {name: _checked(record, log_record, name, allowed) for name in names}
+    return NoiseCheck(checked, share, allowed, tuple(notes), log_record)
 
 
 def _columns(record: Calibration, fit: NoiseSummary, recordings: Sequence[Recording]) -> tuple[list[str], list[str]]:
@@ -405,8 +405,10 @@ def _checked(record: Calibration, log: Calibration, name: str, tolerance: float)
     before, after = ([_used(each, highest, off) for each in part] for part in (first, second))
     chosen = str(record.options.get("terms", "auto"))
     candidates = CANDIDATES if chosen == "auto" else (chosen,)
-    found = agreement(before, after, highest, tolerance=tolerance, candidates=candidates, full_band=column.full_band)
-    return ColumnCheck(name, column.unit, found, _changes((before, after), column))
+    comparison = agreement(
+        before, after, highest, tolerance=tolerance, candidates=candidates, full_band=column.full_band
+    )
+    return ColumnCheck(name, column.unit, comparison, _changes((before, after), column))
 
 
 def _spectra(record: Calibration, name: str) -> tuple[list[Spectrum], list[tuple[float, float]]]:
@@ -436,8 +438,8 @@ def _changes(sets: Sequence[Sequence[Spectrum]], column: Column) -> tuple[TermCh
     fitted: list[tuple[Array, Array]] = []
     for spectra in sets:
         bins = prepare(spectra)
-        found = fit(bins, model[None], time_limits(spectra), bins.power[None], bins.freedom[None])
-        fitted.append(edge_as_white(found.values[0], found.covariance[0], column.shortest_time.value))
+        refitted = fit(bins, model[None], time_limits(spectra), bins.power[None], bins.freedom[None])
+        fitted.append(edge_as_white(refitted.values[0], refitted.covariance[0], column.shortest_time.value))
     (before, covariance), (after, other) = fitted
     changes = []
     for k, term in enumerate(NAMES):

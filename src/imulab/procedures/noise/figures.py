@@ -197,14 +197,14 @@ def _curve(record: Calibration, fit: NoiseSummary, name: str) -> Figure:
     for k, title in enumerate(_PARTS):
         part = factor * parts[k]
         if (parts[k] > _SEEN * fitted).any() and np.count_nonzero(parts.any(axis=1)) > 1:
-            own = np.where(part > floor, part, np.nan)
+            visible = np.where(part > floor, part, np.nan)
             style = {"color": _COLOURS[k], "width": 1.2, "dash": "dash" if k % 2 else "dot"}
-            traces.append(scatter(rounded(tau, _DIGITS), rounded(own, _DIGITS), "lines", name=title, line=style))
-    seen = measured > 0
+            traces.append(scatter(rounded(tau, _DIGITS), rounded(visible, _DIGITS), "lines", name=title, line=style))
+    shown = measured > 0
     traces += [
         scatter(rounded(tau, _DIGITS), rounded(factor * fitted, _DIGITS), "lines", name=f"fitted, {column.chosen}",
                 line={"color": GOOD, "width": 2}),
-        scatter(rounded(tau[seen], _DIGITS), rounded(factor * measured[seen], _DIGITS), "markers", name="the record",
+        scatter(rounded(tau[shown], _DIGITS), rounded(factor * measured[shown], _DIGITS), "markers", name="the record",
                 marker={"color": INK, "size": 7, "symbol": "circle-open"},
                 hovertemplate=f"%{{x:.3g}} s: %{{y:.3g}} {unit}<extra></extra>"),
     ]  # fmt: skip

@@ -120,10 +120,10 @@ def read_log(
     read, source = blocks()
     first = next(read)
     names = choose(first)
-    found = long_rest(chain([first], read), names) if names else None
-    if found is None:
+    rest = long_rest(chain([first], read), names) if names else None
+    if rest is None:
         return replace(on_disk(blocks()[0]), source=source)
-    return replace(found, recording=replace(found.recording, source=source))
+    return replace(rest, recording=replace(rest.recording, source=source))
 
 
 # What a user of noise models must know, a sentence each.
@@ -137,25 +137,25 @@ _SLOW_FACTOR, _LEANS = 10.0, 0.005
 
 def findings(columns: Mapping[str, ColumnModel], rests: Sequence[Rest], horizon: float) -> tuple[str, ...]:
     """Return the findings on all columns, those that several have in one sentence."""
-    said: dict[tuple[type[str], str], list[str]] = {}
+    columns_by_text: dict[tuple[type[str], str], list[str]] = {}
     for name, column in columns.items():
         if rejected(p := column.analysis.test.probability, len(columns)):
             text = f"no model of these terms fits (p = {p:.1g}); the numbers tell the size of the noise alone"
-            said[(str, text)] = [name]
+            columns_by_text[(str, text)] = [name]
         for kind, text in _of_column(column):
-            said.setdefault((kind, text), []).append(name)
-    found = [note for rest in rests for note in rest.notes]
-    for (kind, text), names in said.items():
-        found.append(kind(f"{_named(names)}: {text}"))
+            columns_by_text.setdefault((kind, text), []).append(name)
+    messages = [note for rest in rests for note in rest.notes]
+    for (kind, text), names in columns_by_text.items():
+        messages.append(kind(f"{_named(names)}: {text}"))
     longest = max(column.analysis.length for column in columns.values())
     if horizon > longest / _SLOW_FACTOR:
-        found.append(
+        messages.append(
             Note(
                 f"horizon {horizon:g} s: more than a tenth of the record of {longest:.4g} s, whose slow noise is "
                 "hardly known over such times"
             )
         )
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(messages))
 
 
 def _named(names: Sequence[str]) -> str:
@@ -164,42 +164,42 @@ def _named(names: Sequence[str]) -> str:
 
 def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
     analysis = column.analysis
-    found: list[tuple[type[str], str]] = []
+    messages: list[tuple[type[str], str]] = []
     if not analysis.band.flat:
-        found.append((str, "the spectrum is level nowhere, so that white noise is not told apart from other noise"))
+        messages.append((str, "the spectrum is level nowhere, so that white noise is not told apart from other noise"))
     elif analysis.band.filtered(analysis.interval):
         highest, low = analysis.band.highest, 2 * analysis.band.roll_off
         lean = (
             f", which may leave the white noise up to {plain_number(100 * low, 1)} % too small" if low > _LEANS else ""
         )
         text = f"fitted up to {highest:.3g} Hz; from about {2 * highest:.3g} Hz on the spectrum is not level"
-        found.append((Note, text + lean))
+        messages.append((Note, text + lean))
     if at_band_edge(analysis.values, analysis.limits[0]).any():
-        found.append((Note, _edge(column)))
+        messages.append((Note, _edge(column)))
     samples = sum(each.count for each in analysis.stretches)
     if column.spikes:
         kind: type[str] = str if column.spikes > _MANY_SPIKES * samples else Note
-        found.append((kind, f"{column.spikes} spikes replaced, of {samples} samples"))
+        messages.append((kind, f"{column.spikes} spikes replaced, of {samples} samples"))
     if column.knocks:
         start, lost = column.knocks[0][0], sum(length for _, length in column.knocks)
         many = f"{len(column.knocks)} knocks or other parts" if len(column.knocks) > 1 else "a knock or other part"
         text = f"{many} unlike the noise around, {lost:.2g} s from {start:.5g} s on, bridged by straight lines"
-        found.append((str if lost > _MANY_SPIKES * samples * analysis.interval else Note, text))
+        messages.append((str if lost > _MANY_SPIKES * samples * analysis.interval else Note, text))
     if column.lines:
-        found.append((Note, _lines(column)))
+        messages.append((Note, _lines(column)))
     for low, high, factor in analysis.allowance.off[:_MOST_NAMED]:
-        found.append((Note, f"from {low:.3g} to {high:.3g} Hz the spectrum, left out, is {factor:.2g} of the model"))
+        messages.append((Note, f"from {low:.3g} to {high:.3g} Hz the spectrum, left out, is {factor:.2g} of the model"))
     for step in column.steps:
         text = f"the level changes by {_sized(step.size, column.unit)} at {step.time:.4g} s"
-        found.append((str, f"{text}, which slow noise does not make; --steps remove takes it out"))
-    found += [each for drift in column.drifts if (each := _drift_sentence(drift, column)) is not None]
+        messages.append((str, f"{text}, which slow noise does not make; --steps remove takes it out"))
+    messages += [each for drift in column.drifts if (each := _drift_sentence(drift, column)) is not None]
     choice, shortest = analysis.choice, analysis.limits[0]
     near = [analysis.index, *np.flatnonzero(choice.rivals[0]).tolist()]
     models = (letters_inside(choice.models[0, k], choice.values[0, k], shortest) for k in near)
     chosen, *rivals = dict.fromkeys(models)
     if rivals:
-        found.append((Note, f"{chosen} and {', '.join(rivals)} describe the record about equally well"))
-    return found
+        messages.append((Note, f"{chosen} and {', '.join(rivals)} describe the record about equally well"))
+    return messages
 
 
 def _edge(column: ColumnModel) -> str:
@@ -283,8 +283,8 @@ def make_record(
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
         model={
             "terms": {
-                name: letters_inside(found.model, found.values, found.limits[0])
-                for name, found in ((name, column.analysis) for name, column in columns.items())
+                name: letters_inside(analysis.model, analysis.values, analysis.limits[0])
+                for name, analysis in ((name, column.analysis) for name, column in columns.items())
             },
             "horizon": {"value": horizon, "unit": "s"},
         },
@@ -295,9 +295,9 @@ def make_record(
             "logs": len(rests),
             "band": {name: _value(column.analysis.band.highest, "Hz") for name, column in columns.items()},
             "test": {name: _number(column.analysis.test.probability) for name, column in columns.items()},
-            "filter_white": {name: one["white"] for name, one in use.items()},
-            "filter_walk": {name: one["walk"] for name, one in use.items()},
-            "bias_uncertainty": {name: one["bias"] for name, one in use.items()},
+            "filter_white": {name: column_use["white"] for name, column_use in use.items()},
+            "filter_walk": {name: column_use["walk"] for name, column_use in use.items()},
+            "bias_uncertainty": {name: column_use["bias"] for name, column_use in use.items()},
             "columns": {name: _column_section(column) for name, column in columns.items()},
         },
         options={key: value for key, value in options.items() if value is not None},
@@ -316,7 +316,7 @@ def _parameters(
     Intervals allow for the terms `more` beside those that were chosen. Of a short record the slow terms are limits
     alone.
     """
-    found: dict[str, Parameter] = {}
+    parameters: dict[str, Parameter] = {}
     names, blocks = [], []
     for name, column in columns.items():
         analysis, unit = column.analysis, column.unit
@@ -341,7 +341,9 @@ def _parameters(
             limit = value == 0 or (short and slow)
             u = None if limit else value * float(np.sqrt(covariance[k, k]))
             ends = (0.0 if limit else min(float(low[k]), value), max(float(high[k]), value))
-            found[f"{name}_{term}"] = Parameter(0.0 if limit else value, u, term_unit(term, unit), interval_95=ends)
+            parameters[f"{name}_{term}"] = Parameter(
+                0.0 if limit else value, u, term_unit(term, unit), interval_95=ends
+            )
             known += [] if limit else [k]
         names += [f"{name}_{NAMES[k]}" for k in known]
         size = values[known]
@@ -349,12 +351,12 @@ def _parameters(
         for drift in column.drifts:
             if drift.covariate == "time" and (drift.found.follows or drift.taken):
                 b, u = drift.slope, drift.standard_uncertainty
-                found[f"{name}_ramp"] = Parameter(
+                parameters[f"{name}_ramp"] = Parameter(
                     b, u, term_unit("ramp", unit), interval_95=(b - NORMAL_95 * u, b + NORMAL_95 * u)
                 )
                 names.append(f"{name}_ramp")
                 blocks.append(np.array([[u**2]]))
-    return found, names, blocks
+    return parameters, names, blocks
 
 
 def _level_nowhere(analysis: Analysis, white: float, covariance: Array, low: Array, high: Array) -> Array:
@@ -413,8 +415,8 @@ def durations(length: float) -> Array:
     return np.unique(np.append(decades[decades <= longest], longest))
 
 
-def _ends(found: Any) -> dict[str, Any]:
-    return {"interval_95": [_number(np.sqrt(found.quantile(tail)[0, 0])) for tail in _TAILS]}
+def _ends(averaged: Any) -> dict[str, Any]:
+    return {"interval_95": [_number(np.sqrt(averaged.quantile(tail)[0, 0])) for tail in _TAILS]}
 
 
 def _column_section(column: ColumnModel) -> dict[str, Any]:
@@ -708,10 +710,10 @@ def fit_recordings(
         raise DataError(f"{where}: regress temperature: expected a column temperature that changes, found none")
     horizon = min(HORIZON, longest) if horizon is None else horizon
     candidates = CANDIDATES if terms == "auto" else (terms,)
-    found = {name: _column(name, rests, temperatures, candidates, band, regress, steps == "remove") for name in names}
+    models = {name: _column(name, rests, temperatures, candidates, band, regress, steps == "remove") for name in names}
     options = {"terms": terms, "horizon": horizon, "band": band, "regress": regress, "steps": steps}
-    record = make_record(found, rests, {**options, "columns": None if columns is None else names}, tuple(sources))
-    return NoiseFit(record, found)
+    record = make_record(models, rests, {**options, "columns": None if columns is None else names}, tuple(sources))
+    return NoiseFit(record, models)
 
 
 def chosen_columns(recording: Recording, columns: Sequence[str] | None) -> list[str]:
@@ -732,12 +734,12 @@ def chosen_columns(recording: Recording, columns: Sequence[str] | None) -> list[
             if name not in names:
                 raise OptionError(f"{recording.name}: no column {name!r}; expected one of {listed(names, name)}")
         return list(columns)
-    found = list(noise_columns(recording))
-    if not found:
+    sensors = list(noise_columns(recording))
+    if not sensors:
         raise DataError(
             f"{recording.name}: no sensor column (gyro_.. accel_.. dtg_.. fog); found {several(recording.columns)}"
         )
-    return found
+    return sensors
 
 
 def read_rests(recordings: Iterable[Recording | Rest], columns: Sequence[str] | None) -> list[Rest]:
@@ -752,20 +754,20 @@ def read_rests(recordings: Iterable[Recording | Rest], columns: Sequence[str] | 
 
 
 def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> None:
-    name, one = other.recording.name, first.recording
+    name, first_log = other.recording.name, first.recording
     if abs(other.interval / first.interval - 1) > _SAME_RATE:
         raise DataError(
-            f"{name}: {1 / other.interval:.4g} samples in a second, but {one.name} has {1 / first.interval:.4g}; "
+            f"{name}: {1 / other.interval:.4g} samples in a second, but {first_log.name} has {1 / first.interval:.4g}; "
             "expected logs of one rate"
         )
-    names = chosen_columns(one, columns)
+    names = chosen_columns(first_log, columns)
     if chosen_columns(other.recording, columns) != names:
-        raise DataError(f"{name}: other columns than {one.name}; expected {several(names)}")
+        raise DataError(f"{name}: other columns than {first_log.name}; expected {several(names)}")
     for column in names:
-        unit, expected = (si_unit(each.units[column]) for each in (other.recording, one))
+        unit, expected = (si_unit(each.units[column]) for each in (other.recording, first_log))
         if unit != expected:
-            raise UnitError(f"{name}: column {column} in {unit}, but {one.name} has it in {expected}")
-    if differ := different_units((name, other.recording.metadata), (one.name, one.metadata)):
+            raise UnitError(f"{name}: column {column} in {unit}, but {first_log.name} has it in {expected}")
+    if differ := different_units((name, other.recording.metadata), (first_log.name, first_log.metadata)):
         raise DataError(f"{differ}; expected logs of one unit")
 
 
@@ -781,11 +783,11 @@ def _column(
     stretches = [each for rest in rests for each in rest.stretches(name)]
     spikes, lines = sum(each.spikes for each in stretches), _longest(stretches).lines
     analysis = analysed(stretches, candidates, band)
-    found = analysis.steps(stretches, LEVEL_STEP_PERHAPS.limit)
-    if any(found):  # by noise that has no step: fitted to one, the model takes some of it for random walk
-        without = analysed(without_steps(stretches, found), candidates, band)
-        found = without.steps(stretches)
-        analysis = analysed(without_steps(stretches, found), candidates, band) if flat and any(found) else analysis
+    steps = analysis.steps(stretches, LEVEL_STEP_PERHAPS.limit)
+    if any(steps):  # by noise that has no step: fitted to one, the model takes some of it for random walk
+        without = analysed(without_steps(stretches, steps), candidates, band)
+        steps = without.steps(stretches)
+        analysis = analysed(without_steps(stretches, steps), candidates, band) if flat and any(steps) else analysis
     drifts = []
     for covariate, slow in _covariates(temperatures, analysis.stretches).items():
         regression = analysis.regressed(slow)
@@ -804,7 +806,7 @@ def _column(
         spikes,
         tuple(knock for each in stretches for knock in each.knocks),
         lines,
-        tuple(step for each in found for step in each),
+        tuple(step for each in steps for step in each),
         tuple(drifts),
     )
 
@@ -815,8 +817,8 @@ def _longest(stretches: Sequence[Stretch]) -> Stretch:
 
 def _covariates(temperatures: Sequence[list[Array] | None], stretches: Sequence[Stretch]) -> dict[str, list[Array]]:
     """The slow coefficients of time, and of the temperature where all logs have one that changes, of each stretch."""
-    found = {"time": [ramp_coefficients(each)[None] for each in stretches]}
+    covariates = {"time": [ramp_coefficients(each)[None] for each in stretches]}
     known = [each for each in temperatures if each is not None]
     if len(known) == len(temperatures):
-        found["temperature"] = [each[None] for rest in known for each in rest]
-    return found
+        covariates["temperature"] = [each[None] for rest in known for each in rest]
+    return covariates

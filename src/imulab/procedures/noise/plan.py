@@ -208,8 +208,8 @@ def _row(each: PlannedTerm) -> list[str]:
     wanted = _percent(each.wanted) if each.wanted > 0 else "–"
     needs = "–" if not each.wanted > 0 else "no record" if math.isinf(each.length) else duration_text(each.length)
     value = plain_number(each.value * factor, 3)
-    told = f"{plain_number(100 * each.uncertainty, 2)} %" if each.uncertainty < 1 else "not told"
-    return [each.column, name, value, unit, told, wanted, needs]
+    predicted = f"{plain_number(100 * each.uncertainty, 2)} %" if each.uncertainty < 1 else "not told"
+    return [each.column, name, value, unit, predicted, wanted, needs]
 
 
 def plan_noise(
@@ -269,19 +269,19 @@ def plan_noise(
     if seconds is not None and not 0 < seconds < 1e9:
         raise OptionError(f"duration {seconds:g} s: expected more than 0")
     if from_ is None:
-        given = given_terms("rad/s", **terms)  # type: ignore[arg-type]
-        name = {"rad/s": "gyro", "m/s^2": "accel"}.get(given.unit, "output")
+        stated_terms = given_terms("rad/s", **terms)  # type: ignore[arg-type]
+        name = {"rad/s": "gyro", "m/s^2": "accel"}.get(stated_terms.unit, "output")
         hertz = in_si(RATE if rate is None else rate, "rate", "frequency", "Hz")
         if not 1e-3 <= hertz <= 1e6:
             raise OptionError(f"rate {hertz:g} Hz: expected 0.001 to 1e6")
-        noise = {name: _Column(given.values, given.unit, 1 / hertz, None, 0.0, {}, 0.0)}
-        own = None
+        noise = {name: _Column(stated_terms.values, stated_terms.unit, 1 / hertz, None, 0.0, {}, 0.0)}
+        record_length = None
     else:
         for name, value in {**terms, "rate": rate}.items():
             if value not in (None, (), []):
                 raise OptionError(f"{name}: the record says that already; expected either terms or a record")
-        noise, own = _of_record(as_record(from_, "plan_noise"), columns)
-    return _planned(noise, wanted, seconds or own)
+        noise, record_length = _of_record(as_record(from_, "plan_noise"), columns)
+    return _planned(noise, wanted, seconds or record_length)
 
 
 @dataclass(frozen=True)

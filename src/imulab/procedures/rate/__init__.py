@@ -37,12 +37,12 @@ def rates_of(text: str, option: str) -> tuple[float, ...]:
         It is no list of two different numbers or more.
     """
     try:
-        found = tuple(to_si(float(part), "deg/s") for part in text.split(","))
+        rates = tuple(to_si(float(part), "deg/s") for part in text.split(","))
     except ValueError:
-        found = ()
-    if len(set(found)) < 2 or not all(abs(rate) < 1e6 for rate in found):
+        rates = ()
+    if len(set(rates)) < 2 or not all(abs(rate) < 1e6 for rate in rates):
         raise OptionError(f"{option} {text!r}: expected rates of the table, deg/s, such as 0,10,100,-10,-100")
-    return found
+    return rates
 
 
 def part_of_one(value: float | str, option: str) -> float:
@@ -53,10 +53,10 @@ def part_of_one(value: float | str, option: str) -> float:
     OptionError
         It is none.
     """
-    found = fraction(value, option)
-    if not 0 <= found < 1:
+    share = fraction(value, option)
+    if not 0 <= share < 1:
         raise OptionError(f"{option} {value}: expected an uncertainty of 0 or more as a fraction, such as 20ppm")
-    return found
+    return share
 
 
 def gyros_of(samples: Array) -> Mapping[str, Array]:

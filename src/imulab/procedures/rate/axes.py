@@ -93,18 +93,18 @@ def find_axes(
     if "bias_x" not in accel.parameters:
         raise RecordError(f"accel: a {accel.procedure} record without accelerometers; expected one of tumble fit")
     pairs = zip(recordings, dwells, strict=True)
-    seen = [_seen(recording, found, test.place(k)) for k, (recording, found) in enumerate(pairs)]
+    runs_seen = [_seen(recording, axes, test.place(k)) for k, (recording, axes) in enumerate(pairs)]
     unit = recordings[0].triad_unit("accel")
-    outputs = np.vstack([each[0] for each in seen])
-    runs = np.repeat(np.arange(len(seen)), [len(each[0]) for each in seen])
+    outputs = np.vstack([each[0] for each in runs_seen])
+    runs = np.repeat(np.arange(len(runs_seen)), [len(each[0]) for each in runs_seen])
 
     def axes_by(record: Calibration) -> list[tuple[Array, Array, float]]:
         force = corrected_means(record, outputs, unit)
-        swept = [found.sweep is not None for found in dwells]
-        return [_intercept(force[runs == k], each[1], swept[k]) for k, each in enumerate(seen)]
+        swept = [axes.sweep is not None for axes in dwells]
+        return [_intercept(force[runs == k], each[1], swept[k]) for k, each in enumerate(runs_seen)]
 
-    found = axes_by(accel)
-    force = np.array([each[0] for each in found])
+    axes = axes_by(accel)
+    force = np.array([each[0] for each in axes])
     length = np.linalg.norm(force, axis=1)
     direction = force / length[:, None]
     for k, run in enumerate(test.runs):
@@ -112,11 +112,11 @@ def find_axes(
             raise DataError(f"{test.place(k)}: by the accelerometers {_up(direction[k])} points up: is mounting wrong?")
 
     shifts, correlation = moved_by_parameters(accel, lambda record: np.array([each[0] for each in axes_by(record)]))
-    spread = np.array([each[2] for each in found])
+    spread = np.array([each[2] for each in axes])
     return TableAxes(
         direction=direction,
         force=force,
-        arm=np.array([each[1] for each in found]),
+        arm=np.array([each[1] for each in axes]),
         spread=spread / length,
         changes=unit_vectors(force + shifts) - direction,
         correlation=correlation,
@@ -154,8 +154,8 @@ def moved_by_parameters(accel: Calibration, forces: Callable[[Calibration], Arra
     at = forces(accel)
     changes = []
     for name, u in zip(names, sigma.tolist(), strict=True):
-        one = accel.parameters[name]
-        other = replace(accel, parameters={**accel.parameters, name: replace(one, value=one.value + u)})
+        parameter = accel.parameters[name]
+        other = replace(accel, parameters={**accel.parameters, name: replace(parameter, value=parameter.value + u)})
         changes.append(forces(other) - at)
     known = np.maximum(sigma, 1e-300)
     return np.array(changes).reshape(len(names), len(at), 3), matrix / np.outer(known, known)
@@ -172,30 +172,30 @@ def _outputs(recording: Recording, place: str) -> tuple[Array, Array]:
     return time, outputs
 
 
-def _means(recording: Recording, found: Dwells, place: str) -> Array:
+def _means(recording: Recording, dwells: Dwells, place: str) -> Array:
     """Return the mean outputs of the accelerometers over each dwell, shape (n, 3)."""
     time, outputs = _outputs(recording, place)
-    first, last = np.searchsorted(time, found.start), np.searchsorted(time, found.stop, side="right")
+    first, last = np.searchsorted(time, dwells.start), np.searchsorted(time, dwells.stop, side="right")
     return np.array([outputs[a:b].mean(axis=0) for a, b in zip(first, last, strict=True)])
 
 
-def _seen(recording: Recording, found: Dwells, place: str) -> tuple[Array, Array]:
+def _seen(recording: Recording, dwells: Dwells, place: str) -> tuple[Array, Array]:
     """Return mean outputs of the accelerometers, shape (n, 3), and the columns that they are made of, (n, c).
 
     The columns are 1, w^2, and what else adds to them, all times the root of their weight.
     """
-    if found.sweep is not None:
+    if dwells.sweep is not None:
         return _seen_in_a_sweep(recording, place)
-    turns = np.abs(found.rate) * (found.stop - found.start) / (2 * np.pi)
+    turns = np.abs(dwells.rate) * (dwells.stop - dwells.start) / (2 * np.pi)
     which = turns >= 1
-    squares = found.rate[which] ** 2
+    squares = dwells.rate[which] ** 2
     if len(np.unique(np.round(squares, 6))) < 2:
         raise DataError(
             f"{place}: the table axis by accelerometers needs dwells of a whole turn or more at two sizes of rate; "
             f"expected longer dwells, found {int(which.sum())}"
         )
     root = np.sqrt(turns[which])[:, None]  # what is left of a tilt falls with the turns
-    return _means(recording, found, place)[which], np.column_stack([np.ones(len(squares)), squares]) * root
+    return _means(recording, dwells, place)[which], np.column_stack([np.ones(len(squares)), squares]) * root
 
 
 def _seen_in_a_sweep(recording: Recording, place: str) -> tuple[Array, Array]:
@@ -248,14 +248,14 @@ def _up(direction: Array) -> str:
 
 def faces_said(test: RateTest, recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> list[str]:
     """Return where accelerometers without a record see another face up than the manifest says."""
-    said = []
-    for k, (recording, found) in enumerate(zip(recordings, dwells, strict=True)):
+    messages = []
+    for k, (recording, run_dwells) in enumerate(zip(recordings, dwells, strict=True)):
         if all(name in recording for name in _TRIAD):
-            mean = _means(recording, found, test.place(k)).mean(axis=0)
+            mean = _means(recording, run_dwells, test.place(k)).mean(axis=0)
             if _up(mean) != test.runs[k].mounting:
                 place = test.place(k)
-                said.append(f"{place}: the accelerometers see {_up(mean)} up: is mounting wrong, or their sign?")
-    return said
+                messages.append(f"{place}: the accelerometers see {_up(mean)} up: is mounting wrong, or their sign?")
+    return messages
 
 
 def other_unit_said(record: Calibration, sensor: Mapping[str, str], option: str) -> list[str]:
@@ -278,12 +278,12 @@ def length_said(accel: Calibration, force: Array, uncertainty: Array, places: Se
     ]
 
 
-def with_accelerometers(accel: Calibration, record: Calibration, said: Sequence[str] = ()) -> Calibration:
+def with_accelerometers(accel: Calibration, record: Calibration, remarks: Sequence[str] = ()) -> Calibration:
     """Return the accelerometers' record with the gyroscopes of a rate record; those it had are replaced.
 
-    What the recordings state of the unit is the unit's, and `said` is what was found of the accelerometers.
+    What the recordings state of the unit is the unit's, and `remarks` is what was found of the accelerometers.
     """
-    own = {name: p for name, p in accel.parameters.items() if not name.startswith("gyro_")}
+    accel_parameters = {name: p for name, p in accel.parameters.items() if not name.startswith("gyro_")}
     names = [name for name in accel.covariance.names if not name.startswith("gyro_")]
     size = len(names) + len(record.covariance.names)
     joined = np.zeros((size, size))
@@ -293,14 +293,14 @@ def with_accelerometers(accel: Calibration, record: Calibration, said: Sequence[
     kept = ("gyro_order", "gyro_output_unit", "largest_rate")
     return replace(
         accel,
-        parameters=own | {name: _with_interval(name, p) for name, p in record.parameters.items()},
+        parameters=accel_parameters | {name: _with_interval(name, p) for name, p in record.parameters.items()},
         covariance=Covariance((*names, *record.covariance.names), tuple(map(tuple, joined.tolist()))),
         model={**accel.model, **{name: record.model[name] for name in kept if name in record.model}},
         fit={**{name: part for name, part in accel.fit.items() if name != "gyro"}, "rate": dict(record.fit)},
         data={**{name: part for name, part in accel.data.items() if name != "gyro"}, "rate": dict(record.data)},
         sensor={**accel.sensor, **record.sensor},
         sources=tuple(sources.values()),
-        warnings=(*(w for w in accel.warnings if not w.startswith("gyro")), *said, *record.warnings),
+        warnings=(*(w for w in accel.warnings if not w.startswith("gyro")), *remarks, *record.warnings),
         verdict=UNJUDGED,
     )
 
@@ -358,23 +358,23 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
         and not name.startswith("gyro_scale_factor_slope")
         and (alike or not name.startswith("gyro_misalignment"))
     ]
-    own = list(record.covariance.names)
-    common = [name for name in own if name in known and not name.startswith("gyro_bias")]
+    test_names = list(record.covariance.names)
+    common = [name for name in test_names if name in known and not name.startswith("gyro_bias")]
     if not common:
         raise RecordError("prior: it holds none of the parameters found here; expected gyroscopes of the same axes")
     # a record without misalignments of its own takes over what it lacks
-    further = [name for name in known if name not in own] if frame is None else []
+    further = [name for name in known if name not in test_names] if frame is None else []
     comparison = compared(_part(prior, common), _part(record, common))
-    values, matrix = _updated(record, prior, own, common, further)
+    values, matrix = _updated(record, prior, test_names, common, further)
     parameters: dict[str, Parameter] = {}
-    for name, value, u in zip(own + further, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), strict=True):
+    for name, value, u in zip(test_names + further, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), strict=True):
         source = record.parameters.get(name) or prior.parameters[name]
         parameters[name] = Parameter(value, u, source.unit, interval_95=_interval(source, value, u))
     axes = "".join(axis for axis in AXES if f"gyro_scale_factor_{axis}" in parameters)
-    found = replace(
+    updated = replace(
         record,
         parameters={**record.parameters, **parameters},
-        covariance=Covariance((*own, *further), tuple(map(tuple, matrix.tolist()))),
+        covariance=Covariance((*test_names, *further), tuple(map(tuple, matrix.tolist()))),
         model={
             **record.model,
             "gyro_order": _order(parameters),
@@ -389,7 +389,7 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
         ),
         verdict=UNJUDGED,
     )
-    return with_accelerometers(prior, found) if frame is None and "bias_x" in prior.parameters else found
+    return with_accelerometers(prior, updated) if frame is None and "bias_x" in prior.parameters else updated
 
 
 def prior_at(prior: Calibration, recordings: Sequence[Recording]) -> Calibration:
@@ -407,11 +407,11 @@ def prior_at(prior: Calibration, recordings: Sequence[Recording]) -> Calibration
     from imulab.procedures.thermal.device import gyros_at_temperature
 
     known = [
-        (float(np.nanmean(one.si("temperature"))), one.name)
-        for one in recordings
-        if "temperature" in one
-        and parse_unit(one.units["temperature"]).quantity == "temperature"
-        and np.isfinite(one.si("temperature")).any()
+        (float(np.nanmean(recording.si("temperature"))), recording.name)
+        for recording in recordings
+        if "temperature" in recording
+        and parse_unit(recording.units["temperature"]).quantity == "temperature"
+        and np.isfinite(recording.si("temperature")).any()
     ]
     (coldest, cold), (hottest, hot) = min(known, default=(0.0, "")), max(known, default=(0.0, ""))
     if hottest - coldest > _APART:
@@ -450,21 +450,21 @@ def _shared(record: Calibration) -> dict[str, float]:
 
 
 def _updated(
-    record: Calibration, prior: Calibration, own: list[str], common: list[str], further: list[str]
+    record: Calibration, prior: Calibration, test_names: list[str], common: list[str], further: list[str]
 ) -> tuple[Array, Array]:
-    """Return values and covariance of `own` and `further` parameters by both records as one fit."""
+    """Return values and covariance of `test_names` and `further` parameters by both records as one fit."""
     mine, its = record.covariance.array(), prior.covariance.block(common + further)
     both = {name: _shared(record).get(name, 0.0) * u for name, u in _shared(prior).items()}
     scales = [
-        np.array([one.parameters[name].value if name.startswith("gyro_scale_factor") else 0.0 for name in names])
-        for one, names in ((record, own), (prior, common + further))
+        np.array([source.parameters[name].value if name.startswith("gyro_scale_factor") else 0.0 for name in names])
+        for source, names in ((record, test_names), (prior, common + further))
     ]
     across = sum(both.values()) * np.outer(*scales)
-    k, n = len(common), len(own)
-    at = [own.index(name) for name in common]
+    k, n = len(common), len(test_names)
+    at = [test_names.index(name) for name in common]
     whole = np.block([[mine, across[:, k:]], [across[:, k:].T, its[k:, k:]]])
     values = np.array(
-        [record.parameters[name].value for name in own] + [prior.parameters[name].value for name in further]
+        [record.parameters[name].value for name in test_names] + [prior.parameters[name].value for name in further]
     )
     other = np.array([prior.value(name) for name in common])
     with_difference = np.vstack([mine[:, at] - across[:, :k], across[at, k:].T - its[k:, :k]])

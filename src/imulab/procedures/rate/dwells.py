@@ -157,15 +157,15 @@ class Moments:
         """Return the sum of squares that others leave of a column."""
         return float(self.whole[column, column] - self.whole[column, others] @ self._solved(others, column))
 
-    def covariance(self, columns: Sequence[int], fitted: Sequence[int], output: int, found: Array) -> Array:
-        """Return the covariance of coefficients of columns by what coefficients `found` of columns `fitted` leave.
+    def covariance(self, columns: Sequence[int], fitted: Sequence[int], output: int, coefficients: Array) -> Array:
+        """Return the covariance of coefficients of columns, by what `coefficients` of columns `fitted` leave.
 
         By the scores of parts of the run, so that what is left may be correlated; each score stands for what the fit
         took from its part, too. Source: Bell and McCaffrey, Survey Methodology 28 (2002) 169.
         """
         both = self.batches[:, columns]
         size, normal = self._normal(columns)
-        scores = (both[:, :, self.columns + output] - both[:, :, fitted] @ found) / size
+        scores = (both[:, :, self.columns + output] - both[:, :, fitted] @ coefficients) / size
         spread, turn = np.linalg.eigh(normal)
         half = turn * np.sqrt(np.maximum(spread, 0.0)) @ turn.T
         share, turn = np.linalg.eigh(half @ (both[:, :, columns] / np.outer(size, size)) @ half)
@@ -187,15 +187,15 @@ class Moments:
 
 def moments(count: int, columns: Callable[[slice], Sequence[Array] | Array], outputs: Sequence[Array]) -> Moments:
     """Return the sums of products of what `columns` returns for each part of `count` samples, and the outputs."""
-    found, number = None, 0
+    whole, number = None, 0
     for batch, part in blocks(count):
         made = columns(part)
         rows = np.array([*made, *(output[part] for output in outputs)])
-        found = np.zeros((_SWEEP_BATCHES, len(rows), len(rows))) if found is None else found
+        whole = np.zeros((_SWEEP_BATCHES, len(rows), len(rows))) if whole is None else whole
         number = len(made)
-        found[batch] += rows @ rows.T
-    assert found is not None
-    return Moments(found, number)
+        whole[batch] += rows @ rows.T
+    assert whole is not None
+    return Moments(whole, number)
 
 
 def regressors(samples: Samples, felt: Array | None = None) -> Moments:
@@ -230,10 +230,10 @@ def felt_rate(samples: Samples, weights: Array) -> Array:
     """Return the rate and its four derivatives, each times its weight (5,), at each of n samples, shape (n,)."""
     taps = (weights[1:] * samples.spacing ** -np.arange(1.0, 5.0)) @ KERNELS
     taps[4] += weights[0]
-    found = np.empty(len(samples.time))
-    for _, part in blocks(len(found)):
-        found[part] = taps @ samples.neighbours(part)
-    return found
+    rate = np.empty(len(samples.time))
+    for _, part in blocks(len(rate)):
+        rate[part] = taps @ samples.neighbours(part)
+    return rate
 
 
 # A run whose rate changes all the time: what the gyroscopes' delay and bandwidth do to it, and means by rate.
@@ -401,10 +401,10 @@ class _Curve:
 
     def left(self, k: int) -> Array:
         """Return what the curve of gyroscope number `k` leaves of its output, shape (n,)."""
-        found = np.empty(len(self.outputs[k]))
-        for _, part in blocks(len(found)):
-            found[part] = self.outputs[k][part] - self.fits[k] @ self.columns(part)
-        return found
+        residual = np.empty(len(self.outputs[k]))
+        for _, part in blocks(len(residual)):
+            residual[part] = self.outputs[k][part] - self.fits[k] @ self.columns(part)
+        return residual
 
     def by_drift(self, k: int) -> float:
         """Return what the error of the drift does to the scale factor, as far as the rate drifts, too, a fraction."""
@@ -445,8 +445,8 @@ def _spectrum(rate: Array, step: float) -> tuple[float, float | None]:
     top = float(frequency[min(int(np.searchsorted(share, _POWER)) + 1, len(frequency) - 1)])
     peak = int(np.argmax(power))
     beside = slice(max(0, peak - _BESIDE), peak + _BESIDE + 1)
-    one = power[beside].sum() > _SINE * power.sum() and peak > _BESIDE
-    return top, float(power[beside] @ frequency[beside] / power[beside].sum()) if one else None
+    single_line = power[beside].sum() > _SINE * power.sum() and peak > _BESIDE
+    return top, float(power[beside] @ frequency[beside] / power[beside].sum()) if single_line else None
 
 
 def _noise(time: Array, rate: Array, step: float, spacing: float) -> list[float]:
@@ -459,24 +459,24 @@ def _noise(time: Array, rate: Array, step: float, spacing: float) -> list[float]
     return [of_rate * float(kernel @ kernel) / spacing ** (2 * k) for k, kernel in enumerate(KERNELS, 1)]
 
 
-def _apart(found: Moments, noise: list[float]) -> int:
+def _apart(moments: Moments, noise: list[float]) -> int:
     """Return the number of derivatives of a rate before that, beyond the first, which those before it make up.
 
     Or which is the noise of the rate, by more than a hundredth.
     """
-    count = float(found.whole[ONE, ONE])
+    count = float(moments.whole[ONE, ONE])
     for number, column in enumerate(DERIVATIVES[1:], 1):
-        left = found.left_of(column, [ONE, TIME, RATE, *DERIVATIVES[:number]])
-        if left < max(_OWN * float(found.whole[column, column]), _CLEAR * noise[number] * count):
+        left = moments.left_of(column, [ONE, TIME, RATE, *DERIVATIVES[:number]])
+        if left < max(_OWN * float(moments.whole[column, column]), _CLEAR * noise[number] * count):
             return number
     return len(DERIVATIVES)
 
 
-def _loop_told(found: Moments, noise: float) -> bool:
+def _loop_told(moments: Moments, noise: float) -> bool:
     """Return whether w' differs from pass to pass at one rate, as no loop does; its noise does not count."""
-    slope, count = DERIVATIVES[0], float(found.whole[ONE, ONE])
-    left = found.left_of(slope, [ONE, TIME, RATE, TURN, BOW])
-    return left - noise * count > _TOLD * float(found.whole[slope, slope])
+    slope, count = DERIVATIVES[0], float(moments.whole[ONE, ONE])
+    left = moments.left_of(slope, [ONE, TIME, RATE, TURN, BOW])
+    return left - noise * count > _TOLD * float(moments.whole[slope, slope])
 
 
 def _regressed(
@@ -490,10 +490,10 @@ def _regressed(
     """Return what a gyroscope says of delay and bandwidth, and the weights of rate and derivatives in what it felt."""
     still = [RATE, *loop, ONE, TIME, SQUARE, *([] if frequency is not None else [CUBE])]
     columns = [RATE, *derivatives, *still[1:]]
-    found = moments.fitted(columns, main)
-    spread = moments.covariance(columns, columns, main, found)
-    scale, weights = float(found[0]), np.zeros(5)
-    known = moments.covariance(still, columns, main, found)
+    coefficients = moments.fitted(columns, main)
+    spread = moments.covariance(columns, columns, main, coefficients)
+    scale, weights = float(coefficients[0]), np.zeros(5)
+    known = moments.covariance(still, columns, main, coefficients)
     more = float(np.sqrt(max(float(spread[0, 0] - known[0, 0]), 0.0))) / abs(scale)
     of_loop = None
     if loop:
@@ -501,12 +501,12 @@ def _regressed(
         of_loop = 2 * float(np.sqrt(max(float(spread[at, at] - known[1, 1]), 0.0))) / abs(scale) / largest
     if frequency is not None:
         omega = 2 * np.pi * frequency
-        phase = float(np.arctan2(-found[1] * omega * np.sign(scale), abs(scale)))
+        phase = float(np.arctan2(-coefficients[1] * omega * np.sign(scale), abs(scale)))
         u = float(np.sqrt(spread[1, 1])) / abs(scale)
         weights[:2] = np.cos(phase), -np.sin(phase) / omega
         return Sweep((phase / omega, u), None, None, frequency, more, None, np.zeros(0), largest, 0), weights
-    tau, c = -found[1] / scale, found[2] / scale
-    lines = np.zeros((2, len(found)))
+    tau, c = -coefficients[1] / scale, coefficients[2] / scale
+    lines = np.zeros((2, len(coefficients)))
     lines[0, :2] = -tau / scale, -1 / scale
     lines[1, :3] = (-2 * c + 2 * tau**2) / scale, 2 * tau / scale, 2 / scale  # of 2 c - tau^2
     both = lines @ spread @ lines.T
@@ -517,7 +517,7 @@ def _regressed(
         bandwidth = (corner, corner * u_square / (2 * square))
     else:
         beyond = float(1 / (2 * np.pi * np.sqrt(max(square, 0.0) + 2 * u_square + 1e-300)))
-    weights[: len(derivatives) + 1] = [1.0, *(found[1 : len(derivatives) + 1] / scale)]
+    weights[: len(derivatives) + 1] = [1.0, *(coefficients[1 : len(derivatives) + 1] / scale)]
     delay = float(tau), float(np.sqrt(both[0, 0]))
     return Sweep(delay, bandwidth, beyond, None, more, of_loop, np.zeros(0), largest, 0), weights
 
@@ -675,7 +675,7 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
     check_finite(recording, names)
     time = check_time(recording)
     outputs = [recording.column(name) for name in names]
-    own = outputs[names.index(main)] if run.sign > 0 else -outputs[names.index(main)]
+    output = outputs[names.index(main)] if run.sign > 0 else -outputs[names.index(main)]
     column = recorded_rate(recording, time)
     if column is None and run.rates is None:
         raise SegmentError(
@@ -683,10 +683,10 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
             'manifest, --rates for one recording; in Python rates="0,10,-10")'
         )
     recorded = column is not None
-    signal = own if column is None else column
+    signal = output if column is None else column
     size = _block_size(time)
     blocks = _block_means(signal, size)
-    stretches = _stretches(blocks, size, None if recorded else _smallest_step(run.rates or (), own))
+    stretches = _stretches(blocks, size, None if recorded else _smallest_step(run.rates or (), output))
     if run.sweep and column is None:
         raise SegmentError(
             f"{place}: a sweep needs the table's rate at every sample: expected table_rate or table_angle"
@@ -702,7 +702,7 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
         )
     mean = np.array([[values[a:b].mean() for values in outputs] for a, b in stretches])
     reading = mean[:, names.index(main)] * run.sign
-    _check_ends(recording, main, own, stretches, reading, place)
+    _check_ends(recording, main, output, stretches, reading, place)
     _check_axis(names, mean, main, place)
     if column is None:
         rate, zero, scale = _listed_rates(reading, stretches, time, run.rates or (), recording, main, place)
@@ -735,25 +735,25 @@ def _swept(
     """Return the means by rate of a run whose rate changed all the time."""
     if np.ptp(rate) <= 0 or len(time) < _SWEEP:
         raise SegmentError(f"{place}: {len(time)} samples of a rate that does not change; expected a sweep, or steps")
-    own = names.index(main)
-    sweep, found = reduce_sweep(time, rate, outputs, own)
-    _check_axis(names, found.mean, main, place)
-    for end in (float(outputs[own].max()), float(outputs[own].min())):
-        still = outputs[own] == end
+    main_column = names.index(main)
+    sweep, reduced = reduce_sweep(time, rate, outputs, main_column)
+    _check_axis(names, reduced.mean, main, place)
+    for end in (float(outputs[main_column].max()), float(outputs[main_column].min())):
+        still = outputs[main_column] == end
         if still.sum() >= _LEAST and np.ptp(rate[still]) > _FLAT * np.ptp(rate):
             raise DataError(
                 f"{place}: {main} stands still at {end:.6g} {recording.units[main]} while the rate changes: its output "
                 "is saturated; expected rates within its range"
             )
-    half, size = found.duration / 2, _block_size(time)
+    half, size = reduced.duration / 2, _block_size(time)
     level = [part.mean() for part in _level(time, _block_means(rate, size), size)]
     return Dwells(
-        start=found.middle - half,
-        stop=found.middle + half,
-        rate=found.rate,
-        mean=found.mean,
-        variance=found.variance,
-        level=np.tile(level, (len(found.rate), 1)),
+        start=reduced.middle - half,
+        stop=reduced.middle + half,
+        rate=reduced.rate,
+        mean=reduced.mean,
+        variance=reduced.variance,
+        level=np.tile(level, (len(reduced.rate), 1)),
         recorded=True,
         sweep=sweep,
     )
@@ -772,10 +772,10 @@ def recorded_rate(recording: Recording, time: Array) -> Array | None:
     return None
 
 
-def _smallest_step(rates: tuple[float, ...], own: Array) -> float:
+def _smallest_step(rates: tuple[float, ...], output: Array) -> float:
     """Return the smallest step between listed rates, in units of the output."""
     listed = np.unique(rates)
-    return float(np.diff(listed).min() / (listed[-1] - listed[0]) * np.ptp(own))
+    return float(np.diff(listed).min() / (listed[-1] - listed[0]) * np.ptp(output))
 
 
 def _block_size(time: Array) -> int:
@@ -812,7 +812,7 @@ def _stretches(blocks: Array, size: int, step: float | None) -> list[tuple[int, 
     moving[k] = change > limit
     steady = ~(moving[:-1] | moving[1:])
     edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(int)))
-    found = []
+    stretches = []
     for a, b in edges.reshape(-1, 2).tolist():
         if b - a < 2:
             continue
@@ -825,8 +825,8 @@ def _stretches(blocks: Array, size: int, step: float | None) -> list[tuple[int, 
             last += 1
         first, last = first + _SETTLING, last - _SETTLING  # what moves within it is left out, too
         if last - first >= _LEAST:
-            found.append((first * size, last * size))
-    return found
+            stretches.append((first * size, last * size))
+    return stretches
 
 
 def _variance(values: Array) -> float:
@@ -836,21 +836,21 @@ def _variance(values: Array) -> float:
 
 
 def _check_ends(
-    recording: Recording, main: str, own: Array, stretches: list[tuple[int, int]], reading: Array, place: str
+    recording: Recording, main: str, output: Array, stretches: list[tuple[int, int]], reading: Array, place: str
 ) -> None:
     """Refuse a gyroscope whose output stands still at the largest rates while it is noisy at the others."""
-    spread = np.array([own[a:b].std() for a, b in stretches])
+    spread = np.array([output[a:b].std() for a, b in stretches])
     usual = float(np.median(spread))
     noisy = usual > _ROUNDING * float(np.abs(reading).max())
     if noisy:  # where a count is larger than the noise, outputs stand still at any rate
         first, last = stretches[int(np.argmin(np.abs(spread - usual)))]
-        noisy = usual > float(np.diff(np.unique(own[first:last])).min(initial=np.inf))
+        noisy = usual > float(np.diff(np.unique(output[first:last])).min(initial=np.inf))
     for end in (int(np.argmax(reading)), int(np.argmin(reading))):
         if noisy and spread[end] < _STANDS * usual:
             a, b = stretches[end]
-            found = float(recording.column(main)[a:b].mean())
+            reading_there = float(recording.column(main)[a:b].mean())
             raise DataError(
-                f"{place}: {main} stands still at {found:.6g} {recording.units[main]} in the dwell at "
+                f"{place}: {main} stands still at {reading_there:.6g} {recording.units[main]} in the dwell at "
                 f"{recording.si('time')[a]:.1f} s: its output is saturated; expected rates within its range"
             )
 
@@ -892,13 +892,13 @@ def _listed_rates(
         )
     gap = np.diff(listed).min()
     for _ in range(2):
-        seen = (reading - zero) / scale
-        nearest = listed[np.argmin(np.abs(seen[:, None] - listed), axis=1)]
+        read_rates = (reading - zero) / scale
+        nearest = listed[np.argmin(np.abs(read_rates[:, None] - listed), axis=1)]
         scale, zero = np.polyfit(nearest, reading, 1).tolist()
     off = np.abs((reading - zero) / scale - nearest)
     worst = int(np.argmax(off))
     if off[worst] <= _NEXT_TO * gap:  # what one listed rate was taken for is one rate
-        off = np.abs(seen - np.array([np.median(seen[nearest == rate]) for rate in nearest]))
+        off = np.abs(read_rates - np.array([np.median(read_rates[nearest == rate]) for rate in nearest]))
         worst, gap = int(np.argmax(off)), max(_ALIKE * np.abs(listed).max(), _OUT * float(np.median(off))) / _NEXT_TO
     if off[worst] > _NEXT_TO * gap:
         a, b = stretches[worst]
@@ -910,8 +910,8 @@ def _listed_rates(
             f"{by}, none of the listed rates {', '.join(map(_degrees, listed))} deg/s: did the table slip, is a listed "
             "rate missing or wrong, or the mounting's sign?"
         )
-    order, found = ([rate for rate, _ in groupby(each)] for each in (rates, nearest.tolist()))
-    if order == [-rate for rate in found] != found:
+    order, nearest_order = ([rate for rate, _ in groupby(each)] for each in (rates, nearest.tolist()))
+    if order == [-rate for rate in nearest_order] != nearest_order:
         raise SegmentError(
             f"{place}: {main} saw the listed rates in their order, each the other way round: is the sign of mounting "
             "wrong?"

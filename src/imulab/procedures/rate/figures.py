@@ -35,19 +35,19 @@ def exhibits(record: Calibration) -> Exhibits:
     """Return the figures and tables of a record."""
     if record.model.get("from") == "turns":
         return turns_exhibits(record)
-    found = rate_of(record)
-    axes = found.model.axes
-    largest = from_si(found.model.largest_rate.value, "deg/s")
+    rate_record = rate_of(record)
+    axes = rate_record.model.axes
+    largest = from_si(rate_record.model.largest_rate.value, "deg/s")
     worst = max(record.value(f"gyro_nonlinearity_{a}") for a in axes) * _PPM
     headline = (
         f"Gyroscopes {' '.join(axes)} over {largest:.4g} deg/s: a line leaves {plain_number(worst, 3)} ppm of the "
         "largest rate at most."
     )
-    common = found.fit.table_uncertainty
+    common = rate_record.fit.table_uncertainty
     facts = [
-        ("runs", str(found.fit.runs)),
-        ("dwells", str(found.fit.dwells)),
-        ("rates from", found.fit.rates_from),
+        ("runs", str(rate_record.fit.runs)),
+        ("dwells", str(rate_record.fit.dwells)),
+        ("rates from", rate_record.fit.rates_from),
         ("common to all rates", "not stated" if common is None else f"{plain_number(common * _PPM, 3)} ppm"),
     ]
     items: list[Figure | ReportTable] = [
@@ -56,11 +56,11 @@ def exhibits(record: Calibration) -> Exhibits:
             "Bias, scale factor and misalignment in the frame of the faces on which the unit was mounted; nonlinearity "
             "and hysteresis as parts of the largest rate.",
         ),
-        *([] if found.fit.prior is None else [prior_table(found.fit.prior, record)]),
-        *(_left(a, found.data.dwells) for a in axes),
-        _of_line(record, found),
-        *([] if found.fit.sweeps is None else [sweep_table(found.fit.sweeps)]),
-        _budget(record, found),
+        *([] if rate_record.fit.prior is None else [prior_table(rate_record.fit.prior, record)]),
+        *(_left(a, rate_record.data.dwells) for a in axes),
+        _of_line(record, rate_record),
+        *([] if rate_record.fit.sweeps is None else [sweep_table(rate_record.fit.sweeps)]),
+        _budget(record, rate_record),
     ]
     return Exhibits(headline, facts, items)
 
@@ -70,7 +70,7 @@ def exhibits_of_joined(record: Calibration) -> Exhibits:
     fit, data = record.fit["rate"], record.data["rate"]
     by_hand = "turns" in data
     axes = sorted(set(data["turns" if by_hand else "dwells"]["axis"]))
-    own = replace(
+    rate_part = replace(
         record,
         procedure="rate",
         parameters={name: p for name, p in record.parameters.items() if name.startswith("gyro_")},
@@ -78,16 +78,16 @@ def exhibits_of_joined(record: Calibration) -> Exhibits:
         fit=fit,
         data=data,
     )
-    found = exhibits(own)
-    return replace(found, items=found.items[1:])
+    exhibits_of_own = exhibits(rate_part)
+    return replace(exhibits_of_own, items=exhibits_of_own.items[1:])
 
 
-def _left(name: str, seen: DwellResiduals) -> Figure:
-    rate, left = (np.array(values) for values in (seen.rate, seen.residual))
-    u = np.array(seen.standard_uncertainty) * _PPM
+def _left(name: str, dwells: DwellResiduals) -> Figure:
+    rate, left = (np.array(values) for values in (dwells.rate, dwells.residual))
+    u = np.array(dwells.standard_uncertainty) * _PPM
     traces: list[dict[str, Any]] = []
     for label, symbol, colour in _LOOKS:
-        which = np.array([a == name and d == label for a, d in zip(seen.axis, seen.direction, strict=True)])
+        which = np.array([a == name and d == label for a, d in zip(dwells.axis, dwells.direction, strict=True)])
         if which.any():
             traces.append(
                 scatter(
@@ -109,21 +109,21 @@ def _left(name: str, seen: DwellResiduals) -> Figure:
     )
 
 
-def _of_line(record: Calibration, found: RateRecord) -> ReportTable:
+def _of_line(record: Calibration, rate_record: RateRecord) -> ReportTable:
     def ppm(value: float | None) -> str:
         return "–" if value is None else plain_number(value * _PPM, 3)
 
     rows = []
-    for name in found.model.axes:
-        of = found.fit.axes[name]
+    for name in rate_record.model.axes:
+        fit = rate_record.fit.axes[name]
         sizes = [
             record.value(f"gyro_{kind}_{name}") if f"gyro_{kind}_{name}" in record.parameters else None
             for kind in ("nonlinearity", "asymmetry", "hysteresis")
         ]
         rows.append(
-            [name, ppm(sizes[0]), ppm(of.by_noise), f"{of.probability:.3f}", *_of_powers(record, of, name),
-             ppm(sizes[1]), ppm(sizes[2]), *_of_loop(record, of, name),
-             "–" if of.loop is None else f"{of.loop:.3f}", ppm(of.repeatability), ppm(of.repeatability_by_noise)]
+            [name, ppm(sizes[0]), ppm(fit.by_noise), f"{fit.probability:.3f}", *_of_powers(record, fit, name),
+             ppm(sizes[1]), ppm(sizes[2]), *_of_loop(record, fit, name),
+             "–" if fit.loop is None else f"{fit.loop:.3f}", ppm(fit.repeatability), ppm(fit.repeatability_by_noise)]
         )  # fmt: skip
     return ReportTable(
         "What a line does not hold, ppm",
@@ -152,24 +152,24 @@ def _of_line(record: Calibration, found: RateRecord) -> ReportTable:
     )
 
 
-def _of_loop(record: Calibration, of: AxisFit, name: str) -> tuple[str, str]:
+def _of_loop(record: Calibration, axis_fit: AxisFit, name: str) -> tuple[str, str]:
     """Return the fitted loop and its uncertainty, ppm; records of before have none."""
-    if "fitted_loop" not in record.fit["axes"][name] or of.fitted_loop is None:
+    if "fitted_loop" not in record.fit["axes"][name] or axis_fit.fitted_loop is None:
         return "–", "–"
-    return format_uncertain(of.fitted_loop * _PPM, (of.fitted_loop_uncertainty or 0.0) * _PPM)
+    return format_uncertain(axis_fit.fitted_loop * _PPM, (axis_fit.fitted_loop_uncertainty or 0.0) * _PPM)
 
 
-def _of_powers(record: Calibration, of: AxisFit, name: str) -> tuple[str, str]:
+def _of_powers(record: Calibration, axis_fit: AxisFit, name: str) -> tuple[str, str]:
     """Return the order of a gyroscope, and what its powers leave, ppm; records of before have but one order."""
     if "order" not in record.fit["axes"][name]:
         return str(record.model["gyro_order"]), "–"
-    return str(of.order), plain_number(of.by_polynomial * _PPM, 3)
+    return str(axis_fit.order), plain_number(axis_fit.by_polynomial * _PPM, 3)
 
 
-def _budget(record: Calibration, found: RateRecord) -> ReportTable:
-    common = (found.fit.table_uncertainty or 0.0) * _PPM
+def _budget(record: Calibration, rate_record: RateRecord) -> ReportTable:
+    common = (rate_record.fit.table_uncertainty or 0.0) * _PPM
     rows = []
-    for name in found.model.axes:
+    for name in rate_record.model.axes:
         scale = record.parameter(f"gyro_scale_factor_{name}")
         whole = (scale.standard_uncertainty or 0.0) / abs(scale.value) * _PPM
         rest = float(np.sqrt(max(whole**2 - common**2, 0.0)))

@@ -155,15 +155,15 @@ def fit_rate(
         if isinstance(data, str | os.PathLike):
             refuse_folder(Path(os.fspath(data)), os.fspath(data))
         recordings = [as_recording(data, reading, fit_rate, gyros_of)]
-        given = rates_of(rates, "rates") if isinstance(rates, str) else None if rates is None else tuple(rates)
-        test = RateTest((Run(recordings[0].name, axis, given),), name=recordings[0].name)
+        stated_rates = rates_of(rates, "rates") if isinstance(rates, str) else None if rates is None else tuple(rates)
+        test = RateTest((Run(recordings[0].name, axis, stated_rates),), name=recordings[0].name)
     if place is not None:
         test = replace(test, latitude=place)
     if common is not None:
         test = replace(test, relative_uncertainty=common)
     held = [
-        None if one is None else as_record(one, f"fit_rate: {name}")
-        for name, one in (("accel", accel), ("prior", prior))
+        None if earlier is None else as_record(earlier, f"fit_rate: {name}")
+        for name, earlier in (("accel", accel), ("prior", prior))
     ]
     return fit_test(test, recordings, highest, *held)
 
@@ -204,14 +204,14 @@ def fit_test(
         record = with_prior(record, prior_at(prior, recordings), str(record.model["frame"]))
     if accel is not None and axes is not None:
         places = [test.place(k) for k in range(len(test.runs))]
-        said = length_said(accel, axes.force, axes.length_uncertainty, places)
-        record = with_accelerometers(accel, record, [*other_unit_said(accel, record.sensor, "accel"), *said])
+        remarks = length_said(accel, axes.force, axes.length_uncertainty, places)
+        record = with_accelerometers(accel, record, [*other_unit_said(accel, record.sensor, "accel"), *remarks])
     return RateFit(record, tuple(dwells), linearity)
 
 
 def _upright(problem: RateProblem, solution: RateSolution) -> RateProblem:
     """Return the problem without what the lean of the table axis adds about other axes."""
-    gains = [found[: len(problem.faces)] for found in solution.coefficients]
+    gains = [row[: len(problem.faces)] for row in solution.coefficients]
     return replace(problem, mean=without_lean(problem, gains))
 
 
@@ -235,15 +235,15 @@ def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], 
     heads = ((run.file, recording.metadata) for run, recording in zip(test.runs, recordings, strict=True))
     if apart := different_units(*heads, keys=("serial", "element")):
         raise DataError(f"{apart}; expected recordings of one unit")
-    seen: dict[str, int] = {}
+    run_of_digest: dict[str, int] = {}
     for index, recording in enumerate(recordings):
-        of = "" if recording.source is None else recording.source.sha256
-        if of in seen:
+        digest = "" if recording.source is None else recording.source.sha256
+        if digest in run_of_digest:
             raise DataError(
-                f"{test.place(index)}: run {index + 1} is the same recording as run {seen[of] + 1} "
-                f"({test.runs[seen[of]].file}), which would count twice"
+                f"{test.place(index)}: run {index + 1} is the same recording as run {run_of_digest[digest] + 1} "
+                f"({test.runs[run_of_digest[digest]].file}), which would count twice"
             )
-        seen |= {of: index} if of else {}
+        run_of_digest |= {digest: index} if digest else {}
         if gyro_columns(recording) != first:
             raise DataError(
                 f"{test.place(index)}: columns {' '.join(gyro_columns(recording)) or 'without gyroscopes'}, but "
@@ -256,12 +256,12 @@ def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], 
 
 
 def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> RateProblem:
-    counts = [len(found.rate) for found in dwells]
+    counts = [len(run_dwells.rate) for run_dwells in dwells]
     each: dict[str, Any] = {
         key: np.repeat([getattr(run, key) for run in test.runs], counts) for key in ("axis", "sign")
     }
     earth = 0.0 if test.latitude is None else EARTH * np.sin(test.latitude)
-    table = np.concatenate([found.rate for found in dwells])
+    table = np.concatenate([run_dwells.rate for run_dwells in dwells])
     return RateProblem(
         gyros=tuple(AXES.index(name[-1]) for name in names),
         run=np.repeat(np.arange(len(dwells)), counts),
@@ -269,39 +269,46 @@ def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> Rate
         sign=each["sign"],
         rate=each["sign"] * (table + earth),
         table=table,
-        mean=np.vstack([found.mean for found in dwells]),
-        variance=np.vstack([_pooled(found) for found in dwells]),
-        level=np.vstack([found.level for found in dwells]),
+        mean=np.vstack([run_dwells.mean for run_dwells in dwells]),
+        variance=np.vstack([_pooled(run_dwells) for run_dwells in dwells]),
+        level=np.vstack([run_dwells.level for run_dwells in dwells]),
         rate_uncertainty=test.spread_of(table),
-        scale_error=np.repeat([0.0 if found.sweep is None else found.sweep.scale_error for found in dwells], counts),
+        scale_error=np.repeat(
+            [0.0 if run_dwells.sweep is None else run_dwells.sweep.scale_error for run_dwells in dwells], counts
+        ),
         zero_error=np.repeat(
-            [np.zeros(len(names)) if found.sweep is None else found.sweep.zero_error for found in dwells],
+            [
+                np.zeros(len(names)) if run_dwells.sweep is None else run_dwells.sweep.zero_error
+                for run_dwells in dwells
+            ],
             counts,
             axis=0,
         ),
-        loop_error=np.repeat([_loop_error(found) for found in dwells], counts),
-        reach=np.repeat([0.0 if found.sweep is None else found.sweep.largest for found in dwells], counts),
-        branch=np.concatenate([_branch(found) for found in dwells]),
+        loop_error=np.repeat([_loop_error(run_dwells) for run_dwells in dwells], counts),
+        reach=np.repeat(
+            [0.0 if run_dwells.sweep is None else run_dwells.sweep.largest for run_dwells in dwells], counts
+        ),
+        branch=np.concatenate([_branch(run_dwells) for run_dwells in dwells]),
     )
 
 
-def _branch(found: Dwells) -> NDArray[np.int64]:
-    if found.sweep is None:
-        return np.zeros(len(found.rate), dtype=np.int64)
-    return np.where(np.arange(len(found.rate)) < found.sweep.rising, 1, -1)
+def _branch(dwells: Dwells) -> NDArray[np.int64]:
+    if dwells.sweep is None:
+        return np.zeros(len(dwells.rate), dtype=np.int64)
+    return np.where(np.arange(len(dwells.rate)) < dwells.sweep.rising, 1, -1)
 
 
-def _loop_error(found: Dwells) -> float:
+def _loop_error(dwells: Dwells) -> float:
     """Return what a run's delay adds to its loop; steps know none, and sweeps that do not tell it no loop."""
-    if found.sweep is None:
+    if dwells.sweep is None:
         return 0.0
-    return float(np.inf) if found.sweep.loop_error is None else found.sweep.loop_error
+    return float(np.inf) if dwells.sweep.loop_error is None else dwells.sweep.loop_error
 
 
-def _pooled(found: Dwells) -> Any:
+def _pooled(dwells: Dwells) -> Any:
     """Return the variances of the means, pooled over the dwells of a run in proportion to one over their length."""
-    length = (found.stop - found.start)[:, None]
-    return np.mean(found.variance * length, axis=0) / length
+    length = (dwells.stop - dwells.start)[:, None]
+    return np.mean(dwells.variance * length, axis=0) / length
 
 
 def _check_rates(test: RateTest, problem: RateProblem, order: int) -> None:

@@ -205,15 +205,15 @@ class RatePlan(PlannedTest):
             ("gyro_misalignment", "misalignments", reading_unit("rad")),
             ("gyro_bias", "biases", reading_unit("rad/s")),
         )
-        said = []
+        phrases = []
         for stem, label, read in kinds:
             most = max((u for name, u in self.predicted.items() if name.startswith(stem)), default=None)
             if most is not None:
-                said.append(f"{label} {plain_number(most * read.factor, 2)} {read.symbol}")
+                phrases.append(f"{label} {plain_number(most * read.factor, 2)} {read.symbol}")
         table = "what all rates of the table have in common (--table-uncertainty)"
         beside = [table] if self.test.relative_uncertainty is None else []
         beside += ["the mounting, in every misalignment"] * any("misalignment" in name for name in self.predicted)
-        return ", ".join(said) + (f"; on top come {' and '.join(beside)}" if beside else "")
+        return ", ".join(phrases) + (f"; on top come {' and '.join(beside)}" if beside else "")
 
     def content(self) -> dict[str, Any]:
         """Return the plan for scripts, in SI."""
@@ -345,8 +345,8 @@ def plan_rate(
     """
     if turn is not None:
         return plan_turns(fraction(turn, "turn"), in_si(fence, "fence", "angle", "deg"))
-    given = np.asarray(rates_of(rates, "rates") if isinstance(rates, str) else rates, dtype=np.float64)
-    sizes = np.unique(np.abs(given))
+    listed_rates = np.asarray(rates_of(rates, "rates") if isinstance(rates, str) else rates, dtype=np.float64)
+    sizes = np.unique(np.abs(listed_rates))
     if sizes.size < 2:
         raise OptionError(f"rates {rates!r}: expected two sizes of rates or more")
     words, count = faces.split(","), whole(cycles, "cycles")
@@ -405,10 +405,10 @@ def _noise(arw: float | str | None, instability: float | str | None, noise: Reco
     return walk, _FLOOR * level
 
 
-def _stay(rate: float, sizes: Array, share: float, of: str, walk: float, floor: float) -> PlannedRate:
+def _stay(rate: float, sizes: Array, share: float, basis: str, walk: float, floor: float) -> PlannedRate:
     """Return how long to stay at a rate, s."""
     reading = rate if rate > 0 else float(sizes[sizes > 0][0])  # a part of no rate cannot be reached
-    wanted = share * (float(sizes[-1]) if of == "full" else reading)
+    wanted = share * (float(sizes[-1]) if basis == "full" else reading)
     room = wanted**2 - floor**2
     length = min(max(_LEAST, walk**2 / room if room > 0 else _LONGEST), _LONGEST)
     turn = 2 * math.pi / rate if rate else math.inf
@@ -444,7 +444,7 @@ def _predicted(test: RateTest, planned: dict[float, PlannedRate], order: int) ->
 
 
 def _warnings(planned: Sequence[PlannedRate], floor: float, common: float | None, wanted: float) -> list[str]:
-    found, largest = [], planned[-1].rate
+    messages, largest = [], planned[-1].rate
     short = [each for each in planned if each.uncertainty > 1.001 * each.wanted]
     if short:
         at = ", ".join(f"{from_si(each.rate, 'deg/s'):.6g}" for each in short)
@@ -454,10 +454,12 @@ def _warnings(planned: Sequence[PlannedRate], floor: float, common: float | None
             if floor >= worst.wanted
             else f"it takes more than {_LONGEST / 60:.0f} min at a rate"
         )
-        found.append(f"out of reach at {at} deg/s: {why}; expected a larger --uncertainty, larger rates or --of full")
+        messages.append(
+            f"out of reach at {at} deg/s: {why}; expected a larger --uncertainty, larger rates or --of full"
+        )
     if common is not None and common > wanted:
-        found.append(
+        messages.append(
             f"every scale factor keeps the {1e6 * common:.3g} ppm that all rates of the table have in common, more "
             "than what is wanted; nonlinearity does not"
         )
-    return found
+    return messages

@@ -60,8 +60,8 @@ def _fit(
         test = replace(test, relative_uncertainty=values["table_uncertainty"])
     recordings = [access.recording(access.beside(name, run.file), values["layout"], **part) for run in test.runs]
     record = fit_test(test, recordings, str(values["order"]), accel, prior).calibration
-    own = source_of(access, name)
-    return record if own is None else replace(record, sources=(own, *record.sources))
+    manifest = source_of(access, name)
+    return record if manifest is None else replace(record, sources=(manifest, *record.sources))
 
 
 TASK = Task(

@@ -36,25 +36,27 @@ from imulab.units import from_si, parse_unit
 
 def dynamics_of(test: RateTest, dwells: Sequence[Dwells]) -> dict[str, Parameter]:
     """Return ``gyro_delay_i`` and ``gyro_bandwidth_i`` of the gyroscopes that were swept, runs by inverse variance."""
-    found: dict[str, Parameter] = {}
+    parameters: dict[str, Parameter] = {}
     for kind, unit in (("delay", "s"), ("bandwidth", "Hz")):
         for number, axis in enumerate(AXES):
             pairs = [
                 pair
-                for run, one in zip(test.runs, dwells, strict=True)
-                if run.axis == number and one.sweep is not None and (pair := getattr(one.sweep, kind)) is not None
+                for run, run_dwells in zip(test.runs, dwells, strict=True)
+                if run.axis == number
+                and run_dwells.sweep is not None
+                and (pair := getattr(run_dwells.sweep, kind)) is not None
             ]
             if pairs:
                 values, spread = np.array(pairs).T
                 weight = 1 / np.maximum(spread, 1e-12 * np.abs(values).max()) ** 2
                 value, u = float(weight @ values / weight.sum()), float(1 / np.sqrt(weight.sum()))
-                found[f"gyro_{kind}_{axis}"] = Parameter(value, u, unit)
-    return found
+                parameters[f"gyro_{kind}_{axis}"] = Parameter(value, u, unit)
+    return parameters
 
 
 def motion_of(dwells: Sequence[Dwells]) -> str:
     """Return how the table moved, ``model.from`` of the record."""
-    kinds = {one.sweep is None for one in dwells}
+    kinds = {run_dwells.sweep is None for run_dwells in dwells}
     return "steps" if kinds == {True} else "sweeps" if kinds == {False} else "steps and sweeps"
 
 
@@ -78,37 +80,37 @@ def swept(test: RateTest, dwells: Sequence[Dwells]) -> list[SweptRun]:
 
 def of_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
     """Say of each run at one frequency that its scale factor is the amplitude there, and which tell no hysteresis."""
-    said = []
-    for index, one in enumerate(dwells):
-        if one.sweep is None or one.sweep.loop_error is not None:
+    messages = []
+    for index, run in enumerate(dwells):
+        if run.sweep is None or run.sweep.loop_error is not None:
             continue
         place = test.place(index)
-        if one.sweep.frequency is None:
-            said.append(
+        if run.sweep.frequency is None:
+            messages.append(
                 f"{place}: the rate passes each value always equally fast: hysteresis cannot be told from the delay, "
                 "which holds it; a sweep of frequencies, or steps, tells it"
             )
         else:
-            said.append(
-                f"{place}: the rate is one sine of {one.sweep.frequency:.4g} Hz: the scale factor is the amplitude at "
+            messages.append(
+                f"{place}: the rate is one sine of {run.sweep.frequency:.4g} Hz: the scale factor is the amplitude at "
                 "that frequency, the delay holds hysteresis, and no bandwidth can be told from it; a sweep of "
                 "frequencies, or steps, shows that at rest, and the hysteresis"
             )
-    return [Note(line) for line in said]
+    return [Note(line) for line in messages]
 
 
 def sweep_table(sweeps: Sequence[SweptRun]) -> ReportTable:
     """Return the table of the sweeps of a record."""
     rows = []
-    for of in sweeps:
-        delay, u = format_uncertain(1e3 * of.delay, 1e3 * of.delay_uncertainty)
+    for sweep in sweeps:
+        delay, u = format_uncertain(1e3 * sweep.delay, 1e3 * sweep.delay_uncertainty)
         width, of_width = ("–", "–")
-        if of.bandwidth is not None:
-            width, of_width = format_uncertain(of.bandwidth, of.bandwidth_uncertainty)
-        elif of.bandwidth_beyond is not None:
-            width = f"> {plain_number(of.bandwidth_beyond, 2)}"
-        at = "–" if of.frequency is None else plain_number(of.frequency, 4)
-        rows.append([of.file, of.axis, at, delay, u, width, of_width])
+        if sweep.bandwidth is not None:
+            width, of_width = format_uncertain(sweep.bandwidth, sweep.bandwidth_uncertainty)
+        elif sweep.bandwidth_beyond is not None:
+            width = f"> {plain_number(sweep.bandwidth_beyond, 2)}"
+        at = "–" if sweep.frequency is None else plain_number(sweep.frequency, 4)
+        rows.append([sweep.file, sweep.axis, at, delay, u, width, of_width])
     return ReportTable(
         "Sweeps",
         "Delay of the gyroscope behind the table, and the frequency where a first-order lag with the same fall of "
@@ -142,9 +144,13 @@ def make_record(
         cycles = solution.cycle_freedom
         freedoms |= _of_cycles(test, cycles, names, values.tolist(), np.diag(matrix).tolist())
     parameters = {}
-    for name, value, u, of in zip(names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True):
+    for name, value, u, parameter_unit in zip(
+        names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True
+    ):
         wide = coverage_factor(freedoms[name]) * u if name in freedoms else None
-        parameters[name] = Parameter(value, u, of, interval_95=None if wide is None else (value - wide, value + wide))
+        parameters[name] = Parameter(
+            value, u, parameter_unit, interval_95=None if wide is None else (value - wide, value + wide)
+        )
     figures = _figures(linearity) | dynamics_of(test, dwells)
     figures |= temperature_slopes(recordings, dwells, problem, solution)
     joint = _with_figures(names, matrix, figures)
@@ -173,7 +179,7 @@ def make_record(
         warnings=(
             *_of_sensor(test, recordings),
             *_of_unit(parameters, unit),
-            *_of_table(test, parameters, axes is not None, any("table_angle" in one for one in recordings)),
+            *_of_table(test, parameters, axes is not None, any("table_angle" in source for source in recordings)),
             *_of_line(linearity, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True)), order),
             *_of_scatter(problem, solution),
             *(faces_said(test, recordings, dwells) if axes is None else lean_said(axes, test)),
@@ -208,20 +214,20 @@ def _of_cycles(
     freedoms = {}
     for name, value, variance in zip(names, values, variances, strict=True):
         if name.startswith("gyro_scale_factor"):
-            seen = 1 - (value * (test.relative_uncertainty or 0.0)) ** 2 / variance
-            freedoms[name] = freedom / max(seen, 1e-3) ** 2
+            scattered_share = 1 - (value * (test.relative_uncertainty or 0.0)) ** 2 / variance
+            freedoms[name] = freedom / max(scattered_share, 1e-3) ** 2
     return freedoms
 
 
 def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
     """Return the figures of each axis; the uncertainty of the largest of several is that of the one that is largest."""
-    found = {}
+    parameters = {}
     for kind, unit in (("nonlinearity", "1"), ("asymmetry", "1"), ("hysteresis", "1"), ("threshold", "rad/s")):
-        for axis, of in linearity.items():
-            pair = getattr(of, kind)
+        for axis, axis_linearity in linearity.items():
+            pair = getattr(axis_linearity, kind)
             if pair is not None:
-                found[f"gyro_{kind}_{axis}"] = Parameter(pair[0], pair[1], unit)
-    return found
+                parameters[f"gyro_{kind}_{axis}"] = Parameter(pair[0], pair[1], unit)
+    return parameters
 
 
 def _summary(
@@ -293,15 +299,15 @@ def _of_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
     off = {n[-1]: p.value * nominal.factor - 1 for n, p in parameters.items() if n.startswith("gyro_scale_factor")}
     if max(map(abs, off.values())) <= SCALE_OFF_UNIT:
         return []
-    said = " ".join(f"{axis} {100 * value:+.3g} %" for axis, value in off.items())
-    return [Bad(f"the scale factors are off by {said}: is the unit ({unit}) right, or that of the table's rates?")]
+    offs = " ".join(f"{axis} {100 * value:+.3g} %" for axis, value in off.items())
+    return [Bad(f"the scale factors are off by {offs}: is the unit ({unit}) right, or that of the table's rates?")]
 
 
 def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool, by_angle: bool) -> list[str]:
-    found: list[str] = []
+    messages: list[str] = []
     if test.relative_uncertainty is None:
         clock = ", with that of the recorder's clock by which table_angle became a rate," if by_angle else ""
-        found.append(
+        messages.append(
             Note(
                 f"the uncertainty that all rates of the table have in common{clock} was not stated, and is in no "
                 "uncertainty of a scale factor (relative_standard_uncertainty, or --table-uncertainty)"
@@ -310,7 +316,7 @@ def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool
     triad = any(name.startswith("gyro_misalignment") for name in parameters)
     if test.mounting_uncertainty is None and triad and not by_axes:
         most = max(p.standard_uncertainty or 0.0 for n, p in parameters.items() if n.startswith("gyro_misalignment"))
-        found.append(
+        messages.append(
             "the uncertainty of the mounting was not stated, and is in no uncertainty of a misalignment, of "
             f"{1e3 * most:.2g} mrad at most: state it (mounting in the manifest; 0.3 mrad across a face is usual), or "
             "take the table axis from accelerometers (--accel)"
@@ -318,55 +324,55 @@ def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool
     least = min(p.standard_uncertainty or 0.0 for n, p in parameters.items() if n.startswith("gyro_bias"))
     if test.latitude is None and _MATTERS * least < EARTH:
         hourly = from_si(EARTH, "deg/h")
-        found.append(
+        messages.append(
             f"the Earth's rate, up to {hourly:.0f} deg/h, stays in the biases: their uncertainty of "
             f"{from_si(least, 'deg/h'):.2g} deg/h does not hold it; state the latitude (--latitude)"
         )
-    return found
+    return messages
 
 
 def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], asked: str) -> list[str]:
-    found: list[str] = []
-    for axis, of in linearity.items():
-        if asked != "auto" and of.probability < LINE_BENDS.level and of.by_polynomial > of.by_noise:
-            found.append(
-                f"gyro_{axis}: the output bends by {1e6 * of.by_polynomial:.3g} ppm of the largest rate beyond order "
+    messages: list[str] = []
+    for axis, line in linearity.items():
+        if asked != "auto" and line.probability < LINE_BENDS.level and line.by_polynomial > line.by_noise:
+            messages.append(
+                f"gyro_{axis}: the output bends by {1e6 * line.by_polynomial:.3g} ppm of the largest rate beyond order "
                 f"{asked}, and beyond the noise of its dwells: is a higher order supported (--order auto)?"
             )
-        elif asked == "auto" and of.probability < LINE_BENDS.level and orders[axis] == 1:
-            found.append(
+        elif asked == "auto" and line.probability < LINE_BENDS.level and orders[axis] == 1:
+            messages.append(
                 Note(
-                    f"gyro_{axis}: the output bends by {1e6 * of.nonlinearity[0]:.3g} ppm of the largest rate, beyond "
-                    "the noise of its dwells, and no power of the rate predicts single rates better: may some of the "
-                    "table's be off? (--order 2 to 5 fits powers all the same)"
+                    f"gyro_{axis}: the output bends by {1e6 * line.nonlinearity[0]:.3g} ppm of the largest rate, "
+                    "beyond the noise of its dwells, and no power of the rate predicts single rates better: may some "
+                    "of the table's be off? (--order 2 to 5 fits powers all the same)"
                 )
             )
-        if of.kink is not None:
-            found.append(
-                f"gyro_{axis}: the slopes of positive and negative rates differ by {1e6 * of.kink:+.3g} ppm, with a "
-                f"kink at 0 that no power of the rate compensates: at most {1e6 * of.by_polynomial:.3g} ppm of the "
+        if line.kink is not None:
+            messages.append(
+                f"gyro_{axis}: the slopes of positive and negative rates differ by {1e6 * line.kink:+.3g} ppm, with a "
+                f"kink at 0 that no power of the rate compensates: at most {1e6 * line.by_polynomial:.3g} ppm of the "
                 "largest rate are left"
             )
-        if of.loop is not None and of.loop < HYSTERESIS.level and of.hysteresis is not None:
-            found.append(
-                f"gyro_{axis}: rising and falling rates differ by {1e6 * of.hysteresis[0]:+.3g} ppm of the largest "
+        if line.loop is not None and line.loop < HYSTERESIS.level and line.hysteresis is not None:
+            messages.append(
+                f"gyro_{axis}: rising and falling rates differ by {1e6 * line.hysteresis[0]:+.3g} ppm of the largest "
                 "rate (hysteresis), which no calibration removes"
             )
-    return found
+    return messages
 
 
 def _of_scatter(problem: RateProblem, solution: RateSolution) -> list[str]:
-    found: list[str] = []
+    messages: list[str] = []
     if chi_square_probability(solution.chi_square, solution.freedom) < DWELLS_SCATTER.level:
         ratio = solution.chi_square / max(solution.freedom, 1)
-        found.append(
+        messages.append(
             Note(
                 f"the dwells scatter more than their noise (reduced chi-square {ratio:.3g}); the uncertainties hold "
                 "what was added"
             )
         )
     if solution.cycle:
-        found.append(
+        messages.append(
             Note(f"the scale factors differ by {1e6 * solution.cycle:.3g} ppm from run to run, beyond their noise")
         )
-    return found
+    return messages

@@ -349,19 +349,19 @@ def refuse_folder(path: Path, name: str) -> None:
     ReadError
         See above; the message names the manifest.
     """
-    found = sorted(path.glob("*.toml")) if path.is_dir() else []
-    if found:
+    manifests = sorted(path.glob("*.toml")) if path.is_dir() else []
+    if manifests:
         raise ReadError(
             f"{name}: expected a manifest or one recording, found a folder; name its manifest: "
-            f"{' or '.join(str(Path(name) / one.name) for one in found)}"
+            f"{' or '.join(str(Path(name) / manifest.name) for manifest in manifests)}"
         )
 
 
 def _size(value: Any, place: str) -> float:
-    found = number_of(value, place)
-    if found < 0:
+    number = number_of(value, place)
+    if number < 0:
         raise ReadError(f"{place}: expected 0 or more, found {value!r}")
-    return found
+    return number
 
 
 def _mounting(entry: Any, place: str) -> float | None:
@@ -377,10 +377,10 @@ def _latitude(entry: Any, place: str) -> float | None:
     if entry is None:
         return None
     value, unit = value_and_unit(entry, place, 'latitude = { value = 48.1, unit = "deg" }')
-    found = to_si(value, unit_of(unit, "angle", place))
-    if abs(found) > math.pi / 2:
+    latitude = to_si(value, unit_of(unit, "angle", place))
+    if abs(latitude) > math.pi / 2:
         raise ReadError(f"{place}: expected -90 to 90 deg, found {value:g} {unit}")
-    return found
+    return latitude
 
 
 def _run(entry: Mapping[str, Any], place: str, unit: str) -> Run:

@@ -221,10 +221,10 @@ def _recording(time: Array, output: Array, name: str, table: Array | None) -> Re
 
 
 def _truth(scale: Array, zero: Array, turn: Array, k3: float, delay: float | None) -> dict[str, float]:
-    found = {f"gyro_bias_{a}": float(zero[i]) for i, a in enumerate(AXES)}
-    found |= {f"gyro_scale_factor_{a}": float(from_si(scale[i], "deg/s")) for i, a in enumerate(AXES)}
-    found |= {
+    parameters = {f"gyro_bias_{a}": float(zero[i]) for i, a in enumerate(AXES)}
+    parameters |= {f"gyro_scale_factor_{a}": float(from_si(scale[i], "deg/s")) for i, a in enumerate(AXES)}
+    parameters |= {
         f"gyro_misalignment_{a}{b}": float(turn[i, j]) for i, a in enumerate(AXES) for j, b in enumerate(AXES) if i != j
     }
-    found |= {} if delay is None else {f"gyro_delay_{a}": delay for a in AXES}
-    return found | {f"gyro_k3_{a}": float(k3) for a in AXES}
+    parameters |= {} if delay is None else {f"gyro_delay_{a}": delay for a in AXES}
+    return parameters | {f"gyro_k3_{a}": float(k3) for a in AXES}

@@ -156,13 +156,13 @@ class RateSolution:
 
 def design(problem: RateProblem, gyro: int, order: int) -> Array:
     """Return the columns of gyroscope number `gyro`: slopes by face, powers of its own axis's rate, zeros of runs."""
-    own = problem.axis == problem.gyros[gyro]
+    on_axis = problem.axis == problem.gyros[gyro]
     if problem.lean is None:
         columns = [np.where(problem.axis == face, problem.rate, 0.0) for face in problem.faces]
     else:
         columns = [problem.rate * problem.lean[:, face] for face in problem.faces]
-    if own.any():
-        columns += [np.where(own, problem.rate**power, 0.0) for power in range(2, order + 1)]
+    if on_axis.any():
+        columns += [np.where(on_axis, problem.rate**power, 0.0) for power in range(2, order + 1)]
     columns += [(problem.run == run).astype(np.float64) for run in range(problem.runs)]
     return np.column_stack(columns)
 
@@ -175,15 +175,15 @@ def solve(problem: RateProblem, orders: Sequence[int]) -> RateSolution:
     slopes = [
         _weighted(design(problem, i, orders[i]), problem.mean[:, i], problem.variance[:, i]) for i in range(count)
     ]
-    gains = [found[: len(problem.faces)] for found in slopes]
+    gains = [estimates[: len(problem.faces)] for estimates in slopes]
     blocks = _shared_blocks(problem, gains)
     variance = problem.variance + (EXACT * np.abs(problem.mean).max()) ** 2
     scatter, chi_square, freedom = np.zeros(count), 0.0, 0
     for i in range(count):
         columns = design(problem, i, most)
         base = np.diag(variance[:, i]) + blocks[i, i]
-        scatter[i], own = _scatter(columns, problem.mean[:, i], base)
-        chi_square, freedom = chi_square + own, freedom + len(columns) - columns.shape[1]
+        scatter[i], axis_chi_square = _scatter(columns, problem.mean[:, i], base)
+        chi_square, freedom = chi_square + axis_chi_square, freedom + len(columns) - columns.shape[1]
     variance = variance + scatter**2
     cycle, cycle_freedom = _cycles(problem, most, variance, gains)
     for i in range(count):
@@ -195,9 +195,9 @@ def solve(problem: RateProblem, orders: Sequence[int]) -> RateSolution:
             blocks[i, i] += same * np.outer(problem.zero_error[:, i], problem.zero_error[:, i])
     whole = np.block([[blocks[i, k] for k in range(count)] for i in range(count)])
     columns = _diagonal([design(problem, i, orders[i]) for i in range(count)])
-    found, matrix, _ = _general(columns, problem.mean.T.ravel(), whole)
+    estimates, matrix, _ = _general(columns, problem.mean.T.ravel(), whole)
     ends = np.cumsum([0, *(design(problem, i, orders[i]).shape[1] for i in range(count))])
-    coefficients = [found[a:b] for a, b in pairwise(ends)]
+    coefficients = [estimates[a:b] for a, b in pairwise(ends)]
     return RateSolution(coefficients, matrix, tuple(orders), scatter, cycle, cycle_freedom, chi_square, freedom)
 
 
@@ -205,13 +205,13 @@ def without_lean(problem: RateProblem, gains: Sequence[Array]) -> Array:
     """Return the means of runs about a gyroscope's own axis without what their table's lean adds, shape (n, g)."""
     if problem.lean is None:
         return problem.mean
-    found = problem.mean.copy()
+    means = problem.mean.copy()
     for i, axis in enumerate(problem.gyros):
-        own = problem.axis == axis
+        on_axis = problem.axis == axis
         for k, face in enumerate(problem.faces):
             if face != axis:
-                found[own, i] -= gains[i][k] * problem.rate[own] * problem.lean[own, face]
-    return found
+                means[on_axis, i] -= gains[i][k] * problem.rate[on_axis] * problem.lean[on_axis, face]
+    return means
 
 
 def _own(problem: RateProblem, gains: list[Array], gyro: int) -> float:
@@ -239,8 +239,8 @@ def _shared_blocks(problem: RateProblem, gains: list[Array]) -> dict[tuple[int, 
 def _weighted(columns: Array, values: Array, variance: Array) -> Array:
     weight = 1 / np.sqrt(variance + (EXACT * np.abs(values).max()) ** 2 + 1e-300)
     size = np.abs(columns).max(axis=0)
-    found = np.linalg.lstsq(columns / size * weight[:, None], values * weight, rcond=None)[0]
-    return np.asarray(found / size)
+    scaled = np.linalg.lstsq(columns / size * weight[:, None], values * weight, rcond=None)[0]
+    return np.asarray(scaled / size)
 
 
 def _general(columns: Array, values: Array, covariance: Array) -> tuple[Array, Array, float]:
@@ -250,10 +250,10 @@ def _general(columns: Array, values: Array, covariance: Array) -> tuple[Array, A
     size = np.abs(columns).max(axis=0)
     white = np.linalg.solve(lower, np.column_stack([columns / size, values]) / spread[:, None])
     q, r = np.linalg.qr(white[:, :-1])
-    found = np.linalg.solve(r, q.T @ white[:, -1])
-    left = white[:, -1] - white[:, :-1] @ found
+    estimate = np.linalg.solve(r, q.T @ white[:, -1])
+    left = white[:, -1] - white[:, :-1] @ estimate
     inverse = np.linalg.inv(r)
-    return found / size, inverse @ inverse.T / np.outer(size, size), float(left @ left)
+    return estimate / size, inverse @ inverse.T / np.outer(size, size), float(left @ left)
 
 
 def _scatter(columns: Array, values: Array, base: Array) -> tuple[float, float]:
@@ -283,7 +283,7 @@ def _cycles(problem: RateProblem, order: int, variance: Array, gains: list[Array
     groups, mean = [], without_lean(problem, gains)
     for i, axis in enumerate(problem.gyros):
         scale = _own(problem, gains, i)
-        own = []
+        by_run = []
         for run in sorted(set(problem.run[problem.axis == axis].tolist())):
             which = problem.run == run
             part = RateProblem(
@@ -293,10 +293,10 @@ def _cycles(problem: RateProblem, order: int, variance: Array, gains: list[Array
             )  # fmt: skip
             columns = design(part, 0, 1)
             if len(columns) > columns.shape[1]:
-                found, matrix, _ = _general(columns, part.mean[:, 0], np.diag(variance[which, i]))
-                own.append((found[0] / scale, matrix[0, 0] / scale**2))
-        if len(own) > 1:
-            groups.append(np.array(own))
+                estimate, matrix, _ = _general(columns, part.mean[:, 0], np.diag(variance[which, i]))
+                by_run.append((estimate[0] / scale, matrix[0, 0] / scale**2))
+        if len(by_run) > 1:
+            groups.append(np.array(by_run))
     freedom = sum(len(group) - 1 for group in groups)
     if not freedom:
         return 0.0, None
@@ -317,12 +317,12 @@ def _cycles(problem: RateProblem, order: int, variance: Array, gains: list[Array
 
 def _diagonal(blocks: list[Array]) -> Array:
     rows, columns = (sum(block.shape[k] for block in blocks) for k in (0, 1))
-    found = np.zeros((rows, columns))
+    joined = np.zeros((rows, columns))
     a = b = 0
     for block in blocks:
-        found[a : a + block.shape[0], b : b + block.shape[1]] = block
+        joined[a : a + block.shape[0], b : b + block.shape[1]] = block
         a, b = a + block.shape[0], b + block.shape[1]
-    return found
+    return joined
 
 
 # Which powers of the rate a gyroscope's output supports: by F-test, and by each rate predicted from the others.
@@ -342,19 +342,19 @@ def choose_orders(problem: RateProblem) -> tuple[int, ...]:
 
 
 def _order_of(problem: RateProblem, gyro: int) -> int:
-    own = problem.axis == problem.gyros[gyro]
-    if not own.any():
+    on_axis = problem.axis == problem.gyros[gyro]
+    if not on_axis.any():
         return 1
-    key = np.unique(np.round(problem.table[own] * problem.sign[own], 6), return_inverse=True)[1]
+    key = np.unique(np.round(problem.table[on_axis] * problem.sign[on_axis], 6), return_inverse=True)[1]
     count = int(key.max()) + 1
-    zeros = (problem.run[own][:, None] == np.unique(problem.run[own])).astype(np.float64)
-    rate = problem.rate[own] / np.abs(problem.rate[own]).max()
+    zeros = (problem.run[on_axis][:, None] == np.unique(problem.run[on_axis])).astype(np.float64)
+    rate = problem.rate[on_axis] / np.abs(problem.rate[on_axis]).max()
     powers = np.column_stack([rate**p for p in range(1, max(min(HIGHEST, count - 2), 1) + 1)])
-    values = problem.mean[own, gyro]
-    slope = float(np.ptp(values) / max(np.ptp(problem.rate[own]), 1e-300))
-    stated = problem.rate_uncertainty[own] * slope
+    values = problem.mean[on_axis, gyro]
+    slope = float(np.ptp(values) / max(np.ptp(problem.rate[on_axis]), 1e-300))
+    stated = problem.rate_uncertainty[on_axis] * slope
     of_rate = np.outer(stated, stated) * (key[:, None] == key)
-    noise = problem.variance[own, gyro] + (EXACT * np.abs(values).max()) ** 2
+    noise = problem.variance[on_axis, gyro] + (EXACT * np.abs(values).max()) ** 2
     lower = np.linalg.cholesky(np.diag(noise) + of_rate)
     visits = (key[:, None] == np.arange(count)).astype(np.float64)
 
@@ -365,13 +365,13 @@ def _order_of(problem: RateProblem, gyro: int) -> int:
 
     def predicted(columns: Array) -> Array:
         white = np.linalg.solve(lower, np.column_stack([columns, values]))
-        found = []
+        errors = []
         for k in range(count):
             rest, which = key != k, key == k
             fit = np.linalg.lstsq(white[rest, :-1], white[rest, -1], rcond=None)[0]
             spread = noise[which].sum() / which.sum() ** 2 + of_rate[which, which][0]
-            found.append(float((values[which] - columns[which] @ fit).mean() ** 2 / spread))
-        return np.array(found)
+            errors.append(float((values[which] - columns[which] @ fit).mean() ** 2 / spread))
+        return np.array(errors)
 
     within = cost(np.column_stack([zeros, visits]))
     models = {p: np.column_stack([powers[:, :p], zeros]) for p in range(1, powers.shape[1] + 1)}
@@ -458,14 +458,14 @@ class Linearity:
 
 def linearity_of(problem: RateProblem, gyro: int, scale: float, order: int) -> Linearity:
     """Return what a line, and powers up to `order`, leave of gyroscope number `gyro` over the rates about its axis."""
-    own = problem.axis == problem.gyros[gyro]
-    rate, runs = problem.rate[own], problem.run[own]
-    values = problem.mean[own, gyro] / scale
-    variance = problem.variance[own, gyro] / scale**2 + (EXACT * np.abs(rate).max()) ** 2
-    key = np.unique(np.round(problem.table[own] * problem.sign[own], 6), return_inverse=True)[1]
-    of_rate = problem.rate_uncertainty[own] ** 2
+    on_axis = problem.axis == problem.gyros[gyro]
+    rate, runs = problem.rate[on_axis], problem.run[on_axis]
+    values = problem.mean[on_axis, gyro] / scale
+    variance = problem.variance[on_axis, gyro] / scale**2 + (EXACT * np.abs(rate).max()) ** 2
+    key = np.unique(np.round(problem.table[on_axis] * problem.sign[on_axis], 6), return_inverse=True)[1]
+    of_rate = problem.rate_uncertainty[on_axis] ** 2
     zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
-    largest = max(float(np.abs(rate).max()), 0.0 if problem.reach is None else float(problem.reach[own].max()))
+    largest = max(float(np.abs(rate).max()), 0.0 if problem.reach is None else float(problem.reach[on_axis].max()))
     left, _ = _fitted(np.column_stack([rate, zeros]), values, variance)
     means = np.array(
         [
@@ -479,12 +479,16 @@ def linearity_of(problem: RateProblem, gyro: int, scale: float, order: int) -> L
     chi_square = float(np.sum((means[:, 0] / spread) ** 2))
     probability = chi_square_probability(chi_square, freedom) if freedom > 0 else 1.0
     reach = coverage_factor(None, 1 - 0.05 / len(means))
-    branch = np.zeros(len(rate), dtype=np.int64) if problem.branch is None else problem.branch[own] * problem.sign[own]
+    branch = (
+        np.zeros(len(rate), dtype=np.int64)
+        if problem.branch is None
+        else problem.branch[on_axis] * problem.sign[on_axis]
+    )
     direction = np.where(branch != 0, branch, _directions(rate, runs))
     powers = np.column_stack([*(rate**power for power in range(1, order + 1)), zeros])
     rest = _fitted(powers, values, variance)[0]
     beyond = _beyond_noise(key, direction, zeros, values, variance)
-    error = np.zeros(len(rate)) if problem.loop_error is None else problem.loop_error[own]
+    error = np.zeros(len(rate)) if problem.loop_error is None else problem.loop_error[on_axis]
     loop, fitted_loop, hysteresis = _hysteresis(
         left / largest, variance / largest**2, key, runs, direction, rate / largest, error, beyond
     )
@@ -501,7 +505,7 @@ def linearity_of(problem: RateProblem, gyro: int, scale: float, order: int) -> L
         loop=loop,
         fitted_loop=fitted_loop,
         repeatability=_repeatability(rate, values, variance, runs),
-        threshold=_threshold(rate, problem.table[own], left, variance, key),
+        threshold=_threshold(rate, problem.table[on_axis], left, variance, key),
         by_polynomial=max(abs(float(rest[key == k].mean())) for k in np.unique(key)) / largest,
         kink=_kink(rate / largest, values / largest, (variance + of_rate) / largest**2, zeros, len(means)),
     )
@@ -512,19 +516,19 @@ def _fitted(columns: Array, values: Array, variance: Array) -> tuple[Array, Arra
     weight, size = 1 / np.sqrt(variance), np.abs(columns).max(axis=0)
     scaled = columns / size * weight[:, None]
     inverse = np.linalg.pinv(scaled)
-    found = inverse @ (values * weight) / size
-    return values - columns @ found, np.column_stack([found, inverse @ inverse.T / np.outer(size, size)])
+    coefficients = inverse @ (values * weight) / size
+    return values - columns @ coefficients, np.column_stack([coefficients, inverse @ inverse.T / np.outer(size, size)])
 
 
 def _directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return whether the rate rose (1) or fell (-1) into and out of each dwell, 0 elsewhere."""
-    found = np.zeros(len(rate), dtype=np.int64)
+    directions = np.zeros(len(rate), dtype=np.int64)
     for run in np.unique(runs):
         which = np.flatnonzero(runs == run)
         step = np.sign(np.round(np.diff(rate[which]), 6))
         inner = np.where(step[:-1] == step[1:], step[1:], 0.0)
-        found[which[1:-1]] = inner.astype(np.int64)
-    return found
+        directions[which[1:-1]] = inner.astype(np.int64)
+    return directions
 
 
 def _asymmetry(
@@ -538,9 +542,9 @@ def _asymmetry(
     came = np.where(first, 0.0, np.sign(np.round(np.diff(rate, prepend=0.0), 6)))
     if direction.any():  # the branch of a loop that the first dwell of a run is on is not known
         columns += [came * (1 - (rate / np.abs(rate).max()) ** 2), first.astype(np.float64)]
-    found = _fitted(np.column_stack(columns), values, variance + of_rate)[1]
-    u = np.sqrt(max(found[0, 1] + found[1, 2] - 2 * found[0, 2], 0.0))
-    return float(found[0, 0] - found[1, 0]), float(u)
+    fitted = _fitted(np.column_stack(columns), values, variance + of_rate)[1]
+    u = np.sqrt(max(fitted[0, 1] + fitted[1, 2] - 2 * fitted[0, 2], 0.0))
+    return float(fitted[0, 0] - fitted[1, 0]), float(u)
 
 
 def _kink(rate: Array, values: Array, variance: Array, zeros: Array, count: int) -> float | None:
@@ -549,10 +553,10 @@ def _kink(rate: Array, values: Array, variance: Array, zeros: Array, count: int)
         return None
     powers = range(1, min(_POWERS, count - 3) + 1)
     columns = np.column_stack([np.abs(rate), *(rate**power for power in powers), zeros])
-    left, found = _fitted(columns, values, variance)
+    left, fitted = _fitted(columns, values, variance)
     freedom = len(values) - np.linalg.matrix_rank(columns)
     beyond = max(float(np.sum(left**2 / variance)) / freedom, 1.0) if freedom > 0 else 1.0
-    return 2 * float(found[0, 0]) if abs(found[0, 0]) > SLOPES_KINK.limit * np.sqrt(found[0, 1] * beyond) else None
+    return 2 * float(fitted[0, 0]) if abs(fitted[0, 0]) > SLOPES_KINK.limit * np.sqrt(fitted[0, 1] * beyond) else None
 
 
 def _beyond_noise(
@@ -607,28 +611,28 @@ def _hysteresis(
     slope = float(np.sum(loop * table[:, 1] / table[:, 2])) / spread
     chi_square = float(np.sum((table[:, 1] - slope * loop) ** 2 / table[:, 2]))
     t = float(abs(slope) / np.sqrt(1 / spread + table[:, 3].max()))
-    found = [2 * float(t_cdf(-t, _BY_PARTS) if table[:, 3].any() else normal_cdf(-t))]
+    chances = [2 * float(t_cdf(-t, _BY_PARTS) if table[:, 3].any() else normal_cdf(-t))]
     freedom, wide = len(rows) - 1, [1.0]
     if chi_square_probability(chi_square, freedom) < HYSTERESIS_SCATTERS.level:  # another shape, or dwells scatter more
         wide.append(chi_square / freedom)
-        found.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), freedom)))
+        chances.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), freedom)))
     if beyond:
         wide.append(beyond[0] / beyond[1])
-        found.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), beyond[1])))
-    return max(found), (slope, float(np.sqrt(max(wide) / spread + table[:, 3].max()))), size
+        chances.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), beyond[1])))
+    return max(chances), (slope, float(np.sqrt(max(wide) / spread + table[:, 3].max()))), size
 
 
 def _repeatability(rate: Array, values: Array, variance: Array, runs: NDArray[np.int64]) -> tuple[float, float] | None:
     """Return the standard deviation of the scale factor over runs, relative, and that which noise makes."""
-    found = []
+    rows = []
     for run in np.unique(runs):
         which = runs == run
         if which.sum() > 2:
             columns = np.column_stack([rate[which], np.ones(int(which.sum()))])
-            found.append(_fitted(columns, values[which], variance[which])[1][0, :2])
-    if len(found) < 2:
+            rows.append(_fitted(columns, values[which], variance[which])[1][0, :2])
+    if len(rows) < 2:
         return None
-    table = np.array(found)
+    table = np.array(rows)
     return float(table[:, 0].std(ddof=1)), float(np.sqrt(table[:, 1].mean()))
 
 
@@ -671,22 +675,26 @@ def temperature_slopes(
     temperature = _temperatures(recordings, dwells)
     if temperature is None:
         return {}
-    means = without_lean(problem, [found[: len(problem.faces)] for found in solution.coefficients])
+    means = without_lean(problem, [slopes[: len(problem.faces)] for slopes in solution.coefficients])
     time = np.arange(len(temperature), dtype=np.float64)  # of dwells in order: runs have clocks of their own
-    found = {}
+    slopes = {}
     for i, axis in enumerate(problem.gyros):
-        own = problem.axis == axis
-        if not own.any() or np.ptp(temperature[own]) < _SPAN or _explained(temperature[own], time[own]) > _FOLLOWS:
+        on_axis = problem.axis == axis
+        if (
+            not on_axis.any()
+            or np.ptp(temperature[on_axis]) < _SPAN
+            or _explained(temperature[on_axis], time[on_axis]) > _FOLLOWS
+        ):
             continue
-        warmer = temperature[own] - temperature[own].mean()
-        columns = design(problem, i, solution.orders[i])[own]
+        warmer = temperature[on_axis] - temperature[on_axis].mean()
+        columns = design(problem, i, solution.orders[i])[on_axis]
         columns = columns[:, np.abs(columns).max(axis=0) > 0]
-        columns = np.column_stack([problem.rate[own] * warmer, warmer, columns])
-        weight = 1 / np.sqrt(problem.variance[own, i] + (1e-10 * np.abs(means).max()) ** 2)
+        columns = np.column_stack([problem.rate[on_axis] * warmer, warmer, columns])
+        weight = 1 / np.sqrt(problem.variance[on_axis, i] + (1e-10 * np.abs(means).max()) ** 2)
         size = np.abs(columns).max(axis=0)
         scaled = columns / size * weight[:, None]
         inverse = np.linalg.pinv(scaled)
-        left = means[own, i] * weight
+        left = means[on_axis, i] * weight
         slope = inverse @ left
         freedom = len(left) - np.linalg.matrix_rank(scaled)
         if freedom < 1:
@@ -694,20 +702,20 @@ def temperature_slopes(
         beyond = max(float(np.sum((left - scaled @ slope) ** 2)) / freedom, 1.0)
         scale = float(solution.coefficients[i][problem.faces.index(axis)])
         u = float(np.sqrt((inverse @ inverse.T)[0, 0] * beyond)) / size[0] / abs(scale)
-        found[f"gyro_scale_factor_slope_{AXES[axis]}"] = Parameter(float(slope[0] / size[0]) / scale, u, "1/K")
-    return found
+        slopes[f"gyro_scale_factor_slope_{AXES[axis]}"] = Parameter(float(slope[0] / size[0]) / scale, u, "1/K")
+    return slopes
 
 
 def _temperatures(recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> Array | None:
     """Return the mean temperature of each dwell, degC; None where a recording has no column of it."""
-    found = []
-    for recording, of in zip(recordings, dwells, strict=True):
+    temperatures = []
+    for recording, run_dwells in zip(recordings, dwells, strict=True):
         if "temperature" not in recording or parse_unit(recording.units["temperature"]).quantity != "temperature":
             return None
         time, values = recording.si("time"), recording.si("temperature")
-        first, last = np.searchsorted(time, of.start), np.searchsorted(time, of.stop, side="right")
-        found += [float(values[a:b].mean()) for a, b in zip(first, last, strict=True)]
-    return np.array(found) if np.isfinite(found).all() else None
+        first, last = np.searchsorted(time, run_dwells.start), np.searchsorted(time, run_dwells.stop, side="right")
+        temperatures += [float(values[a:b].mean()) for a, b in zip(first, last, strict=True)]
+    return np.array(temperatures) if np.isfinite(temperatures).all() else None
 
 
 def _explained(values: Array, time: Array) -> float:
@@ -734,27 +742,27 @@ class _Entry:
 
 def _entries(problem: RateProblem, solution: RateSolution, i: int, unit: str) -> list[_Entry]:
     """Return the parameters of gyroscope number `i`: quotients of its coefficients by its scale factor."""
-    faces, size, found, order = problem.faces, len(problem.faces), solution.coefficients[i], solution.orders[i]
+    faces, size, coefficients, order = problem.faces, len(problem.faces), solution.coefficients[i], solution.orders[i]
     axis, first = AXES[problem.gyros[i]], sum(map(len, solution.coefficients[:i]))
-    own, count = faces.index(problem.gyros[i]), sum(map(len, solution.coefficients))
-    scale = float(found[own])
-    unity = np.eye(len(found))
+    on_axis, count = faces.index(problem.gyros[i]), sum(map(len, solution.coefficients))
+    scale = float(coefficients[on_axis])
+    unity = np.eye(len(coefficients))
     zeros = [np.concatenate([np.zeros(size + order - 1), row]) for row in _of_zeros(problem)[0]]
 
     def spread(part: Array) -> Array:
         return np.concatenate([np.zeros(first), part, np.zeros(count - first - len(part))])
 
-    def quotient(name: str, of: str, at: Array, mounted: float = 0.0) -> _Entry:
-        value = float(at @ found) / scale
-        return _Entry(name, of, value, spread((at - value * unity[own]) / scale), mounted=mounted)
+    def quotient(name: str, entry_unit: str, at: Array, mounted: float = 0.0) -> _Entry:
+        value = float(at @ coefficients) / scale
+        return _Entry(name, entry_unit, value, spread((at - value * unity[on_axis]) / scale), mounted=mounted)
 
     return [
         quotient(f"gyro_bias_{axis}", "rad/s", zeros[0]),
-        _Entry(f"gyro_scale_factor_{axis}", f"{unit}/(rad/s)", scale, spread(unity[own]), common=scale),
+        _Entry(f"gyro_scale_factor_{axis}", f"{unit}/(rad/s)", scale, spread(unity[on_axis]), common=scale),
         *(
             quotient(f"gyro_misalignment_{axis}{AXES[face]}", "rad", unity[k], 1.0)
             for k, face in enumerate(faces)
-            if k != own
+            if k != on_axis
         ),
         *(
             quotient(f"gyro_k{p}_{axis}", "1/(rad/s)" + (f"^{p - 1}" if p > 2 else ""), unity[size + p - 2])
@@ -775,50 +783,52 @@ def model_parameters(
     And the degrees of freedom of those whose uncertainty few faces show.
     """
     measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
-    found = [entry for i in measured for entry in _entries(problem, solution, i, unit)]
-    found.sort(key=lambda entry: _ORDER.index(entry.name.rpartition("_")[0]))
-    jacobian = np.array([entry.line for entry in found])
-    shared = np.array([entry.common for entry in found]) * (test.relative_uncertainty or 0.0)
+    entries = [entry for i in measured for entry in _entries(problem, solution, i, unit)]
+    entries.sort(key=lambda entry: _ORDER.index(entry.name.rpartition("_")[0]))
+    jacobian = np.array([entry.line for entry in entries])
+    shared = np.array([entry.common for entry in entries]) * (test.relative_uncertainty or 0.0)
     mounting = (test.mounting_uncertainty or 0.0) if axes is None else 0.0
-    own = np.array([entry.mounted for entry in found]) * mounting**2
-    names = [entry.name for entry in found]
+    added_variance = np.array([entry.mounted for entry in entries]) * mounting**2
+    names = [entry.name for entry in entries]
     few: dict[str, tuple[float, float]] = {}
     for i in measured:
         axis = AXES[problem.gyros[i]]
         added, freedom = _between_faces(problem, solution, problem.gyros[i])
         of_zeros = [f"gyro_bias_{axis}", *(f"gyro_g_sensitivity_{axis}{b}" for b in AXES)]
         for name, value in zip(of_zeros, added.tolist(), strict=False):
-            own[names.index(name)] = value
+            added_variance[names.index(name)] = value
             if value:
                 few[name] = (value, freedom)
-    matrix = np.asarray(jacobian @ solution.covariance @ jacobian.T + np.outer(shared, shared) + np.diag(own))
+    matrix = np.asarray(
+        jacobian @ solution.covariance @ jacobian.T + np.outer(shared, shared) + np.diag(added_variance)
+    )
     if axes is not None:
-        matrix += _by_axes(problem, found, axes)
-    values = np.array([entry.value for entry in found])
+        matrix += _by_axes(problem, entries, axes)
+    values = np.array([entry.value for entry in entries])
     # Welch and Satterthwaite: the share that few faces show has few degrees of freedom
     variance = dict(zip(names, np.diag(matrix).tolist(), strict=True))
     freedoms = {name: nu * (variance[name] / added) ** 2 for name, (added, nu) in few.items()}
-    return names, values, matrix, [entry.unit for entry in found], freedoms
+    return names, values, matrix, [entry.unit for entry in entries], freedoms
 
 
-def _by_axes(problem: RateProblem, found: Sequence[_Entry], axes: TableAxes) -> Array:
+def _by_axes(problem: RateProblem, entries: Sequence[_Entry], axes: TableAxes) -> Array:
     """Return the covariance that the table axes' own makes: ``dT = -T dA A^-1``, columns of A the axes of the faces."""
     groups = _faces_of_runs(problem)
     sides = {axis: sum(1 for other, _ in groups if other == axis) for axis, _ in groups}
 
-    def faces(of: Array) -> Array:
+    def faces(directions: Array) -> Array:
         matrix = np.zeros((3, 3))
         for (axis, sign), runs in groups.items():
-            matrix[:, axis] += sign * of[runs].mean(axis=0) / sides[axis]
+            matrix[:, axis] += sign * directions[runs].mean(axis=0) / sides[axis]
         return matrix
 
-    inverse, values = np.linalg.inv(faces(axes.direction)), {entry.name: entry.value for entry in found}
+    inverse, values = np.linalg.inv(faces(axes.direction)), {entry.name: entry.value for entry in entries}
     turn = np.array([[values[f"gyro_misalignment_{a}{b}"] if a != b else 1.0 for b in AXES] for a in AXES])
 
     def moved(change: Array) -> Array:
         x = -turn @ change @ inverse
         row = []
-        for entry in found:
+        for entry in entries:
             kind, _, pair = entry.name.rpartition("_")
             i = AXES.index(pair[0])
             if kind == "gyro_scale_factor":
@@ -829,7 +839,7 @@ def _by_axes(problem: RateProblem, found: Sequence[_Entry], axes: TableAxes) -> 
                 row.append(0.0)
         return np.array(row)
 
-    by_record = np.array([moved(faces(change)) for change in axes.changes]).reshape(-1, len(found))
+    by_record = np.array([moved(faces(change)) for change in axes.changes]).reshape(-1, len(entries))
     by_dwells = []
     for (axis, _), runs in groups.items():
         u = float(np.sqrt(np.sum(axes.spread[runs] ** 2))) / len(runs) / sides[axis]
@@ -848,11 +858,11 @@ _ORDER = ["gyro_bias", "gyro_scale_factor", "gyro_misalignment", *(f"gyro_k{powe
 
 def _faces_of_runs(problem: RateProblem) -> dict[tuple[int, int], list[int]]:
     """Return the runs of each face: body axis along the table's, and which way it points."""
-    found: dict[tuple[int, int], list[int]] = {}
+    by_face: dict[tuple[int, int], list[int]] = {}
     for run in range(problem.runs):
         first = int(np.argmax(problem.run == run))
-        found.setdefault((int(problem.axis[first]), int(problem.sign[first])), []).append(run)
-    return found
+        by_face.setdefault((int(problem.axis[first]), int(problem.sign[first])), []).append(run)
+    return by_face
 
 
 def _of_zeros(problem: RateProblem) -> tuple[Array, float]:
@@ -886,7 +896,7 @@ def g_sensitivity(problem: RateProblem, solution: RateSolution) -> Array | None:
     weights, _ = _of_zeros(problem)
     if len(weights) < 4:
         return None
-    return np.array([weights[1:] @ found[len(found) - problem.runs :] for found in solution.coefficients])
+    return np.array([weights[1:] @ row[len(row) - problem.runs :] for row in solution.coefficients])
 
 
 def _between_faces(problem: RateProblem, solution: RateSolution, axis: int) -> tuple[Array, float]:
@@ -895,10 +905,12 @@ def _between_faces(problem: RateProblem, solution: RateSolution, axis: int) -> t
     (rad/s)^2 .., shape (k,): the expected share of the noise is taken off, so that it does not count twice.
     """
     i = problem.gyros.index(axis)
-    found, first = solution.coefficients[i], sum(map(len, solution.coefficients[:i]))
-    scale, at = float(found[problem.faces.index(axis)]), len(found) - problem.runs
-    zeros = found[at:] / scale
-    noise = solution.covariance[first + at : first + len(found), first + at : first + len(found)] / scale**2
+    coefficients, first = solution.coefficients[i], sum(map(len, solution.coefficients[:i]))
+    scale, at = float(coefficients[problem.faces.index(axis)]), len(coefficients) - problem.runs
+    zeros = coefficients[at:] / scale
+    noise = (
+        solution.covariance[first + at : first + len(coefficients), first + at : first + len(coefficients)] / scale**2
+    )
     weights, freedom = _of_zeros(problem)
     groups = list(_faces_of_runs(problem).values())
     if freedom < 1:

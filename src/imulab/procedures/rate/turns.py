@@ -308,15 +308,15 @@ def composed(steps: Array) -> Array:
     """
     steps = steps + np.vstack([np.zeros(3), np.cross(steps[:-1], steps[1:]) / 12])
     size = np.linalg.norm(steps, axis=1, keepdims=True)
-    found = np.hstack([np.cos(size / 2), steps * np.sinc(size / 2 / np.pi) / 2])
-    while len(found) > 1:
-        if len(found) % 2:
-            found = np.vstack([found, [1.0, 0.0, 0.0, 0.0]])
-        a, b = found[::2], found[1::2]
+    quaternions = np.hstack([np.cos(size / 2), steps * np.sinc(size / 2 / np.pi) / 2])
+    while len(quaternions) > 1:
+        if len(quaternions) % 2:
+            quaternions = np.vstack([quaternions, [1.0, 0.0, 0.0, 0.0]])
+        a, b = quaternions[::2], quaternions[1::2]
         scalar = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(axis=1, keepdims=True)
         vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
-        found = np.hstack([scalar, vector])
-    return np.asarray(found[0] / np.linalg.norm(found[0]))
+        quaternions = np.hstack([scalar, vector])
+    return np.asarray(quaternions[0] / np.linalg.norm(quaternions[0]))
 
 
 def rotation_vector(quaternion: Array) -> Array:
@@ -358,7 +358,7 @@ def check_accel(accel: Calibration, recording: Recording) -> None:
 
 
 def with_axes(
-    record: Calibration, recording: Recording, motions: Motions, found: Mapping[str, AxisTurns], accel: Calibration
+    record: Calibration, recording: Recording, motions: Motions, axis_turns: Mapping[str, AxisTurns], accel: Calibration
 ) -> Calibration:
     """Return the record of turns with scale factors and misalignments in the frame of the accelerometers.
 
@@ -369,17 +369,17 @@ def with_axes(
     DataError
         The accelerometers see another axis upright than that of a turn.
     """
-    lacking = [axis for axis in AXES if axis not in found]
+    lacking = [axis for axis in AXES if axis not in axis_turns]
     if lacking:
         raise ObservabilityError(
             f"{recording.name}: no turns about {' '.join(lacking)}; accel tells misalignments from turns about x, y "
             "and z: lay the unit on three faces"
         )
-    turned = [(axis, k) for axis in range(3) for k in found[AXES[axis]].motion]
+    turned = [(axis, k) for axis in range(3) for k in axis_turns[AXES[axis]].motion]
     outputs = recording.triad("accel")
-    count = np.concatenate([found[axis].count for axis in AXES])
-    seen = [_upright(outputs, motions, k, axis, n) for (axis, k), n in zip(turned, count.tolist(), strict=True)]
-    force, spread = np.array([mean for mean, _ in seen]), np.array([u for _, u in seen])
+    count = np.concatenate([axis_turns[axis].count for axis in AXES])
+    rests = [_upright(outputs, motions, k, axis, n) for (axis, k), n in zip(turned, count.tolist(), strict=True)]
+    force, spread = np.array([mean for mean, _ in rests]), np.array([u for _, u in rests])
     unit = recording.triad_unit("accel")
 
     def corrected(by: Calibration) -> Array:
@@ -393,30 +393,32 @@ def with_axes(
     of_length = np.linalg.norm(seen_force, axis=1) * np.linalg.norm(spread, axis=1)
     of_length = np.hypot(of_length, length_uncertainty(seen_force, shifts, correlation))
     places = [f"the turn at {motions.start[k]:.1f} to {motions.stop[k]:.1f} s" for _, k in turned]
-    said = length_said(accel, seen_force, of_length, places)
-    scale = np.array([found[axis].scale for axis in AXES])
-    u_scale = np.array([found[axis].scale_uncertainty for axis in AXES])
+    remarks = length_said(accel, seen_force, of_length, places)
+    scale = np.array([axis_turns[axis].scale for axis in AXES])
+    u_scale = np.array([axis_turns[axis].scale_uncertainty for axis in AXES])
     across = np.array([motions.angle[k] for _, k in turned]) / _TURN
     noise = np.array([motions.zero[k] for _, k in turned]) / _TURN
     noise = np.hypot(noise, count[:, None] * spread * scale)
     groups = [np.array([axis == j for axis, _ in turned]) for j in range(3)]
 
-    def gains(of: Array, c: Array, y: Array) -> Array:
+    def gains(directions: Array, c: Array, y: Array) -> Array:
         """Return B from the axes, what the composed turns say along their own axis, and the integrals across."""
-        sides = np.column_stack([_by_count(of[own], count[own]) for own in groups])
+        sides = np.column_stack([_by_count(directions[members], count[members]) for members in groups])
         felt = y.copy()
         for j in range(3):
             felt[j, j] = np.sqrt(c[j] ** 2 - np.sum(np.delete(y[:, j], j) ** 2))
         return np.asarray(felt @ np.linalg.inv(sides))
 
-    crossed = np.column_stack([(count[own] @ across[own]) / (count[own] @ count[own]) for own in groups])
+    crossed = np.column_stack(
+        [(count[members] @ across[members]) / (count[members] @ count[members]) for members in groups]
+    )
     matrix = gains(direction, scale, crossed)
     u_crossed = np.zeros((3, 3))
-    for j, own in enumerate(groups):
-        left = across[own] - count[own][:, None] * (direction[own] @ matrix.T)
-        u_crossed[:, j] = _scattered(left, count[own], noise[own])
+    for j, members in enumerate(groups):
+        left = across[members] - count[members][:, None] * (direction[members] @ matrix.T)
+        u_crossed[:, j] = _scattered(left, count[members], noise[members])
     covariance = _covariance(gains, direction, scale, crossed, u_scale, u_crossed, changes, correlation)
-    return replace(_extended(record, matrix, covariance), warnings=(*record.warnings, *said), verdict=UNJUDGED)
+    return replace(_extended(record, matrix, covariance), warnings=(*record.warnings, *remarks), verdict=UNJUDGED)
 
 
 def _upright(outputs: Array, motions: Motions, k: int, axis: int, count: float) -> tuple[Array, Array]:
@@ -434,12 +436,12 @@ def _upright(outputs: Array, motions: Motions, k: int, axis: int, count: float) 
     values = (outputs[first + 1 : last + 1] + outputs[first:last]) / 2
     weight = np.sqrt(size / size.max())[:, None]
     normal = np.linalg.pinv((matrix * weight).T @ (matrix * weight))
-    found = normal @ (matrix * weight**2).T @ values
-    left = (values - matrix @ found) * weight**2
+    estimate = normal @ (matrix * weight**2).T @ values
+    left = (values - matrix @ estimate) * weight**2
     edges = np.linspace(0, len(left), _BATCHES + 1).astype(np.int64)[:-1]
     scores = np.add.reduceat(left[:, None, :] * matrix[:, :, None], edges, axis=0)
     shift = np.einsum("j,bjk->bk", normal[0], scores)
-    return found[0], np.sqrt(np.sum(shift**2, axis=0)) / float(np.linalg.norm(found[0]))
+    return estimate[0], np.sqrt(np.sum(shift**2, axis=0)) / float(np.linalg.norm(estimate[0]))
 
 
 def _axes(force: Array, turned: list[tuple[int, int]], motions: Motions, name: str) -> Array:
@@ -498,10 +500,10 @@ def _covariance(
                 other = crossed.copy()
                 other[i, j] += u_crossed[i, j]
                 rows.append(_values(gains(direction, scale, other)) - at)
-    own = np.array(rows)
+    by_scale = np.array(rows)
     of_record = np.array([_values(gains(direction + change, scale, crossed)) - at for change in changes])
     of_record = of_record.reshape(-1, len(at))
-    return np.asarray(own.T @ own + of_record.T @ correlation @ of_record)
+    return np.asarray(by_scale.T @ by_scale + of_record.T @ correlation @ of_record)
 
 
 def _extended(record: Calibration, matrix: Array, covariance: Array) -> Calibration:
@@ -542,27 +544,29 @@ _LOOKS = {"x": ("circle", INK), "y": ("diamond", GOOD), "z": ("square", BAD)}
 
 
 def turns_record(
-    recording: Recording, motions: Motions, found: Mapping[str, AxisTurns], fence: float, clock: float | None
+    recording: Recording, motions: Motions, axis_turns: Mapping[str, AxisTurns], fence: float, clock: float | None
 ) -> Calibration:
     """Turn the scale factors found into the record."""
     unit = recording.triad_unit("gyro")
     nominal = float(from_si(1.0, unit))
     parameters = {
         f"gyro_bias_{a}": Parameter(
-            float(motions.bias[AXES.index(a)]) / of.scale,
-            float(motions.bias_uncertainty[AXES.index(a)]) / of.scale,
+            float(motions.bias[AXES.index(a)]) / turned_axis.scale,
+            float(motions.bias_uncertainty[AXES.index(a)]) / turned_axis.scale,
             "rad/s",
         )
-        for a, of in found.items()
+        for a, turned_axis in axis_turns.items()
     }
-    for a, of in found.items():
-        u = float(np.hypot(of.scale_uncertainty, of.scale * (clock or 0.0)))
-        reach = None if of.freedom is None else coverage_factor(float(of.freedom)) * u
+    for a, turned_axis in axis_turns.items():
+        u = float(np.hypot(turned_axis.scale_uncertainty, turned_axis.scale * (clock or 0.0)))
+        reach = None if turned_axis.freedom is None else coverage_factor(float(turned_axis.freedom)) * u
         parameters[f"gyro_scale_factor_{a}"] = Parameter(
-            of.scale * nominal,
+            turned_axis.scale * nominal,
             u * nominal,
             f"{unit}/(rad/s)",
-            interval_95=None if reach is None else ((of.scale - reach) * nominal, (of.scale + reach) * nominal),
+            interval_95=None
+            if reach is None
+            else ((turned_axis.scale - reach) * nominal, (turned_axis.scale + reach) * nominal),
         )
     spread = np.array([p.standard_uncertainty or 0.0 for p in parameters.values()])
     matrix = np.diag(spread**2)
@@ -571,72 +575,78 @@ def turns_record(
         for k, b in enumerate(names):
             if i != k and a.startswith("gyro_scale") and b.startswith("gyro_scale"):
                 matrix[i, k] = parameters[a].value * parameters[b].value * (clock or 0.0) ** 2
-    turned = sorted((k, a, j) for a, of in found.items() for j, k in enumerate(of.motion))
+    turned = sorted((k, a, j) for a, turned_axis in axis_turns.items() for j, k in enumerate(turned_axis.motion))
     turns = WholeTurns(
         axis=[a for _, a, _ in turned],
         start=[float(motions.start[k]) for k, _, _ in turned],
         stop=[float(motions.stop[k]) for k, _, _ in turned],
-        count=[float(found[a].count[j]) for _, a, j in turned],
-        angle=[float(found[a].angle[j]) for _, a, j in turned],
-        residual=[float(found[a].residual[j]) for _, a, j in turned],
-        standard_uncertainty=[float(found[a].uncertainty[j]) for _, a, j in turned],
+        count=[float(axis_turns[a].count[j]) for _, a, j in turned],
+        angle=[float(axis_turns[a].angle[j]) for _, a, j in turned],
+        residual=[float(axis_turns[a].residual[j]) for _, a, j in turned],
+        standard_uncertainty=[float(axis_turns[a].uncertainty[j]) for _, a, j in turned],
     )
     return Calibration(
         procedure="rate",
         parameters=parameters,
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
-        model=entries(TurnsModel(gyro_order=1, gyro_output_unit=unit, axes="".join(found), from_="turns")),
+        model=entries(TurnsModel(gyro_order=1, gyro_output_unit=unit, axes="".join(axis_turns), from_="turns")),
         fit=entries(TurnsSummary(turns=len(turned), fence=Quantity(value=fence, unit="rad"), clock=clock)),
         options={"fence": fence},
         data=entries(TurnsEvidence(turns=turns)),
         sensor={key: text for key in ("serial", "model", "element") if (text := recording.metadata.get(key))},
         sources=() if recording.source is None else (recording.source,),
-        warnings=(*motions.notes, *_findings(found, clock)),
+        warnings=(*motions.notes, *_findings(axis_turns, clock)),
     )
 
 
-def _findings(found: Mapping[str, AxisTurns], clock: float | None) -> list[str]:
-    said: list[str] = []
-    for a, of in found.items():
-        if abs(of.scale - 1) > SCALE_OFF_UNIT:
-            said.append(Bad(f"gyro_{a}: the scale factor is off by {100 * (of.scale - 1):+.3g} %: is the unit right?"))
-        if of.freedom is not None:
-            said.append(Note(f"gyro_{a}: the turns scatter more than the fence; its interval is Student's t of them"))
-        if not ((of.count > 0).any() and (of.count < 0).any()):
-            said.append(
+def _findings(axis_turns: Mapping[str, AxisTurns], clock: float | None) -> list[str]:
+    messages: list[str] = []
+    for a, turned_axis in axis_turns.items():
+        if abs(turned_axis.scale - 1) > SCALE_OFF_UNIT:
+            messages.append(
+                Bad(f"gyro_{a}: the scale factor is off by {100 * (turned_axis.scale - 1):+.3g} %: is the unit right?")
+            )
+        if turned_axis.freedom is not None:
+            messages.append(
+                Note(f"gyro_{a}: the turns scatter more than the fence; its interval is Student's t of them")
+            )
+        if not ((turned_axis.count > 0).any() and (turned_axis.count < 0).any()):
+            messages.append(
                 Note(
                     f"gyro_{a} was turned one way round only: what is even in the rate, and an error of the zero, "
                     "is in its scale factor; turn as many back"
                 )
             )
     if clock is None:
-        said.append(
+        messages.append(
             Note(
                 "the scale factors are those per clock: a sample rate that is off is in them; state what it is known "
                 "to (--clock)"
             )
         )
-    return said
+    return messages
 
 
 def turns_exhibits(record: Calibration) -> Exhibits:
     """Return the figures and tables of a record of turns."""
-    found = turns_of(record)
-    seen = found.data.turns
+    turns_section = turns_of(record)
+    turn_rows = turns_section.data.turns
     worst = max(
         (p.standard_uncertainty or 0.0) / abs(p.value) for n, p in record.parameters.items() if "scale_factor" in n
     )
-    degrees = [[float(np.degrees(v)) for v in c] for c in (seen.angle, seen.residual, seen.standard_uncertainty)]
+    degrees = [
+        [float(np.degrees(v)) for v in c] for c in (turn_rows.angle, turn_rows.residual, turn_rows.standard_uncertainty)
+    ]
     table = [
         [a, f"{start:.1f}", f"{stop:.1f}", f"{count:+.0f}", f"{angle:.2f}", f"{left:+.3f}", f"{u:.2g}"]
         for a, start, stop, count, angle, left, u in zip(
-            seen.axis, seen.start, seen.stop, seen.count, *degrees, strict=True
+            turn_rows.axis, turn_rows.start, turn_rows.stop, turn_rows.count, *degrees, strict=True
         )
     ]
     number = list(range(1, len(table) + 1))
     traces: list[dict[str, Any]] = []
     for name, (symbol, colour) in _LOOKS.items():
-        which = [k for k, of in enumerate(seen.axis) if of == name]
+        which = [k for k, axis_name in enumerate(turn_rows.axis) if axis_name == name]
         if which:
             rest, bars = (rounded([degrees[k][j] for j in which]) for k in (1, 2))
             traces.append(
@@ -646,21 +656,21 @@ def turns_exhibits(record: Calibration) -> Exhibits:
                     error_y={"type": "data", "array": bars, "thickness": 1, "width": 2},
                 )
             )  # fmt: skip
-    several = len(table) > len(set(seen.axis))  # of one turn about each axis nothing is left
+    several = len(table) > len(set(turn_rows.axis))  # of one turn about each axis nothing is left
     figure = Figure(
         title="What is left of each turn",
         caption="By the scale factor of these turns. Bars: one standard uncertainty, of both stops and of the zero.",
         traces=traces,
         layout={"xaxis": figure_axis("turn", dtick=1), "yaxis": figure_axis("residual, deg"), "legend": LEGEND},
     )
-    fence = float(np.degrees(found.fit.fence.value))
+    fence = float(np.degrees(turns_section.fit.fence.value))
     return Exhibits(
-        f"{found.fit.turns} turns against a fence of {plain_number(fence, 2)} deg: scale factors are known to "
+        f"{turns_section.fit.turns} turns against a fence of {plain_number(fence, 2)} deg: scale factors are known to "
         f"{plain_number(1e6 * worst, 3)} ppm or better.",
-        [("turns", str(found.fit.turns)), ("fence", f"{plain_number(fence, 2)} deg")],
+        [("turns", str(turns_section.fit.turns)), ("fence", f"{plain_number(fence, 2)} deg")],
         [
             parameters_table(rows_of(record), "Per clock where no uncertainty of it was stated."),
-            *([] if found.fit.prior is None else [prior_table(found.fit.prior, record)]),
+            *([] if turns_section.fit.prior is None else [prior_table(turns_section.fit.prior, record)]),
             ReportTable(
                 "Turns",
                 "Stated angle of each, and what is left of it by the scale factor of these turns.",
@@ -784,34 +794,36 @@ def fit_turns(
     which = _turning(motions, recording.name)
     if stated is not None and len(stated) != len(which):
         raise OptionError(f"turns: {len(stated)} given, {len(which)} found in {recording.name}; expected one for each")
-    found = {}
+    axis_turns = {}
     for axis in range(3):
-        own = [k for k in which if np.argmax(np.abs(motions.angle[k])) == axis]
-        if own:
-            angle = np.array([_whole_angle(motions, k, axis) for k in own])
-            given = None if stated is None else np.array([stated[which.index(k)] for k in own], dtype=np.float64)
-            count = _numbered(angle, motions, own, recording.name) if given is None else given
-            _check_counts(angle / _TURN, count, motions, own, recording.name)
-            found[AXES[axis]] = _scale(motions, own, axis, angle, count, width)
-    record = turns_record(recording, motions, found, width, of_clock)
+        members = [k for k in which if np.argmax(np.abs(motions.angle[k])) == axis]
+        if members:
+            angle = np.array([_whole_angle(motions, k, axis) for k in members])
+            stated_counts = (
+                None if stated is None else np.array([stated[which.index(k)] for k in members], dtype=np.float64)
+            )
+            count = _numbered(angle, motions, members, recording.name) if stated_counts is None else stated_counts
+            _check_counts(angle / _TURN, count, motions, members, recording.name)
+            axis_turns[AXES[axis]] = _scale(motions, members, axis, angle, count, width)
+    record = turns_record(recording, motions, axis_turns, width, of_clock)
     if held is not None:
-        record = with_axes(record, recording, motions, found, held)
+        record = with_axes(record, recording, motions, axis_turns, held)
     if prior is not None:
         frame = None if held is None else BY_ACCELEROMETERS
         record = with_prior(record, prior_at(as_record(prior, "fit_turns: prior"), [recording]), frame)
     if held is not None:
         record = with_accelerometers(held, record, other_unit_said(held, record.sensor, "accel"))
-    return TurnsFit(record, found)
+    return TurnsFit(record, axis_turns)
 
 
 def _counts(turns: str | Sequence[int]) -> list[int]:
     try:
-        found = [int(part) for part in (turns.split(",") if isinstance(turns, str) else turns)]
+        counts = [int(part) for part in (turns.split(",") if isinstance(turns, str) else turns)]
     except ValueError:
-        found = []
-    if not found or not all(found):
+        counts = []
+    if not counts or not all(counts):
         raise OptionError(f"turns {turns!r}: expected whole numbers such as 1,5,-6")
-    return found
+    return counts
 
 
 def _tilt(motions: Motions, k: int) -> float:
@@ -849,7 +861,7 @@ def _check_sample_rate(motions: Motions, name: str) -> None:
 
 def _turning(motions: Motions, name: str) -> list[int]:
     """Return which motions are turns: from an attitude to the same, and far enough round."""
-    found = []
+    whole = []
     for k in range(len(motions.start)):
         part = float(np.abs(motions.angle[k]).max()) / _TURN
         if _tilt(motions, k) > _SAME or part < _PART:
@@ -868,10 +880,10 @@ def _turning(motions: Motions, name: str) -> list[int]:
                 f"{AXES[second]} together ({degrees[first]:.0f} and {degrees[second]:.0f} deg): was the unit lifted or "
                 "tipped, or do its axes lie askew? Expected turns about one axis"
             )
-        found.append(k)
-    if not found:
+        whole.append(k)
+    if not whole:
         raise DataError(f"{name}: no whole turn between two rests; expected one turn or more back to the same place")
-    return found
+    return whole
 
 
 def _whole_angle(motions: Motions, k: int, axis: int) -> float:
@@ -880,13 +892,13 @@ def _whole_angle(motions: Motions, k: int, axis: int) -> float:
     return closing + _TURN * round((rough - closing) / _TURN)
 
 
-def _numbered(angle: Array, motions: Motions, own: list[int], name: str) -> Array:
+def _numbered(angle: Array, motions: Motions, members: list[int], name: str) -> Array:
     """Return the number of turns of each angle, signed: the smaller ones tell the scale for the larger."""
     ratio, count, scale = angle / _TURN, np.zeros(len(angle)), 1.0
     done: list[int] = []
     for k in np.argsort(np.abs(ratio)).tolist():
         low, high = (int(f(abs(ratio[k]) / (1 + s * _OFF))) for f, s in ((np.ceil, 1), (np.floor, -1)))
-        where = f"{name}: the turn at {motions.start[own[k]]:.1f} to {motions.stop[own[k]]:.1f} s"
+        where = f"{name}: the turn at {motions.start[members[k]]:.1f} to {motions.stop[members[k]]:.1f} s"
         if not done and high > low:
             raise DataError(
                 f"{where} is of {360 * abs(ratio[k]):.0f} deg by the gyroscopes: {low} to {high} turns; begin with one "
@@ -911,31 +923,31 @@ def _numbered(angle: Array, motions: Motions, own: list[int], name: str) -> Arra
     return count
 
 
-def _check_counts(ratio: Array, count: Array, motions: Motions, own: list[int], name: str) -> None:
+def _check_counts(ratio: Array, count: Array, motions: Motions, members: list[int], name: str) -> None:
     """Refuse a stated number of turns that does not go with the others."""
     scale = float(np.median(ratio / count))
     off = np.abs(ratio / scale - count)
     k = int(np.argmax(off))
     if off[k] > 0.5:
         raise DataError(
-            f"{name}: the turn at {motions.start[own[k]]:.1f} to {motions.stop[own[k]]:.1f} s is of "
+            f"{name}: the turn at {motions.start[members[k]]:.1f} to {motions.stop[members[k]]:.1f} s is of "
             f"{360 * ratio[k]:.0f} deg, {count[k]:+.0f} turns as stated, but {ratio[k] / scale:+.2f} as the others go: "
             "is --turns right?"
         )
 
 
-def _scale(motions: Motions, own: list[int], axis: int, angle: Array, count: Array, fence: float) -> AxisTurns:
+def _scale(motions: Motions, members: list[int], axis: int, angle: Array, count: Array, fence: float) -> AxisTurns:
     """Return the scale factor: turns one after the other share a stop, whose error is opposite in both."""
-    covariance = np.diag(fence**2 + motions.zero[own, axis] ** 2)
-    for k in range(len(own) - 1):
-        if own[k + 1] == own[k] + 1:
+    covariance = np.diag(fence**2 + motions.zero[members, axis] ** 2)
+    for k in range(len(members) - 1):
+        if members[k + 1] == members[k] + 1:
             covariance[k, k + 1] = covariance[k + 1, k] = -(fence**2) / 2
     turned = _TURN * count
     weight = np.linalg.solve(covariance, turned)
     variance = 1 / float(turned @ weight)
     scale = variance * float(weight @ angle)
     left = angle - scale * turned
-    chi_square, freedom = float(left @ np.linalg.solve(covariance, left)), len(own) - 1
+    chi_square, freedom = float(left @ np.linalg.solve(covariance, left)), len(members) - 1
     beyond = freedom > 0 and chi_square_probability(chi_square, freedom) < TURNS_SCATTER.level
     wide = chi_square / freedom if beyond else 1.0
     return AxisTurns(
@@ -946,5 +958,5 @@ def _scale(motions: Motions, own: list[int], axis: int, angle: Array, count: Arr
         scale=scale,
         scale_uncertainty=float(np.sqrt(variance * wide)),
         freedom=freedom if beyond else None,
-        motion=tuple(own),
+        motion=tuple(members),
     )

@@ -27,7 +27,7 @@ STRETCHES, TURNS = 1e-4, 1e-5
 """What scale factors and misalignments of such sensors usually move by, 1/K and rad/K."""
 
 
-def further_of(given: str | Sequence[str], option: str) -> tuple[str, ...]:
+def further_of(text: str | Sequence[str], option: str) -> tuple[str, ...]:
     """Return the names of further triads, of which there is one, ``gyro``.
 
     Raises
@@ -35,7 +35,7 @@ def further_of(given: str | Sequence[str], option: str) -> tuple[str, ...]:
     OptionError
         There is another.
     """
-    names = tuple(name.strip() for name in given.split(",")) if isinstance(given, str) else tuple(given)
+    names = tuple(name.strip() for name in text.split(",")) if isinstance(text, str) else tuple(text)
     if not set(names) <= {"gyro"} or len(names) > 1:
         raise OptionError(f"{option} {','.join(names)!r}: expected gyro")
     return names
@@ -49,10 +49,10 @@ def degrees_of(text: str, option: str) -> str | tuple[int, int, int]:
     OptionError
         It is neither.
     """
-    found, spline = laws_of(text, option)
+    degrees, spline = laws_of(text, option)
     if spline:
         raise OptionError(f"{option} {text!r}: expected degrees such as 3,2,1; a spline is for a fit")
-    return found
+    return degrees
 
 
 def laws_of(text: str, option: str) -> tuple[str | tuple[int, int, int], bool]:

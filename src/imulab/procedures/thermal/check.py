@@ -90,9 +90,11 @@ def check_gyros(
     model = thermal_of(record).model
     if model.gyro is None:
         return None, []
-    lacking = [one.name for one in holds.recordings if any(name not in one for name in triad("gyro"))]
-    if lacking or any(one.time is None for one in holds.recordings):
-        which = lacking[0] if lacking else next(one.name for one in holds.recordings if one.time is None)
+    lacking = [recording.name for recording in holds.recordings if any(name not in recording for name in triad("gyro"))]
+    if lacking or any(recording.time is None for recording in holds.recordings):
+        which = (
+            lacking[0] if lacking else next(recording.name for recording in holds.recordings if recording.time is None)
+        )
         return None, [
             Note(f"{which}: no columns gyro_x gyro_y gyro_z over time, so the record's gyroscopes are not tested")
         ]
@@ -146,12 +148,12 @@ def _rates(record: Calibration, holds: Holds, force: Array) -> RatesAtRest:
     return replace(held, mean=held.mean * part, covariance=covariance)
 
 
-def _scatter(record: Calibration, given: float | str | None) -> tuple[float | None, int | None]:
+def _scatter(record: Calibration, stated: float | str | None) -> tuple[float | None, int | None]:
     """Return the scatter of biases between power cycles, rad/s, and the rank of what told it; None where unknown."""
-    if given is not None:
-        tau = in_si(given, "gyro_turn_on_scatter", "rate", "deg/s")
+    if stated is not None:
+        tau = in_si(stated, "gyro_turn_on_scatter", "rate", "deg/s")
         if not 0 <= tau < np.inf:
-            raise OptionError(f"gyro_turn_on_scatter {given!r}: expected 0 or more")
+            raise OptionError(f"gyro_turn_on_scatter {stated!r}: expected 0 or more")
         return tau, 0
     fit = thermal_of(record).fit.gyro
     assert fit is not None
@@ -454,13 +456,13 @@ def check_thermal(
         raise OptionError(f"limit {largest:g} m/s^2: expected more than 0")
     single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
     listed: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
-    given = [as_recording(one, reading, check_thermal) for one in listed]
-    if not given:
+    recordings = [as_recording(item, reading, check_thermal) for item in listed]
+    if not recordings:
         raise OptionError("check_thermal: data: expected one recording or more, found none")
     column = temperature_column or held.options.get("temperature_column")
-    given = prepared(
-        [_in_unit_of(held, one) for one in given],
-        column if column is not None and all(column in one for one in given) else temperature_column,
+    recordings = prepared(
+        [_in_unit_of(held, item) for item in recordings],
+        column if column is not None and all(column in item for item in recordings) else temperature_column,
         None if settle is None else in_si(settle, "settle", "time", "s"),
         span=0.0,
     )
@@ -468,8 +470,8 @@ def check_thermal(
     if gyro_turn_on_scatter is not None and not has_gyroscopes:
         raise OptionError("gyro_turn_on_scatter: the record holds no gyroscopes (thermal fit --with gyro)")
     earth = at_latitude(latitude) if has_gyroscopes else None
-    local = _gravity(held, at_place(gravity, latitude, height, beside=earth is not None), given[0])
-    holds, notes = _inside(held, find_holds(given))
+    local = _gravity(held, at_place(gravity, latitude, height, beside=earth is not None), recordings[0])
+    holds, notes = _inside(held, find_holds(recordings))
     unit = thermal_of(held).model.output_unit
     check_holds(holds, local.value, conversion_factor(unit, "m/s^2") if unit in ("m/s^2", "g", "mg") else None)
     leaning, tau = _sizes(tilt, turn_on_scatter, held, local.value)
@@ -480,33 +482,33 @@ def check_thermal(
             "the record does not say how far biases move from one power cycle to the next, so an offset that a whole "
             "recording has in common is not tested: state --turn-on-scatter"
         )
-    gyro, said = check_gyros(held, holds, force, gyro_turn_on_scatter, earth)
-    notes += said
-    notes += [*([local.note] if local.note else []), *_known(held, given)]
+    gyro, gyro_notes = check_gyros(held, holds, force, gyro_turn_on_scatter, earth)
+    notes += gyro_notes
+    notes += [*([local.note] if local.note else []), *_known(held, recordings)]
     return ThermalCheck(holds, *tested, local, largest, tuple(notes), gyro)
 
 
 def _in_unit_of(record: Calibration, recording: Recording) -> Recording:
-    unit, own = thermal_of(record).model.output_unit, recording.triad_unit("accel")
+    unit, present = thermal_of(record).model.output_unit, recording.triad_unit("accel")
     try:
-        factor = conversion_factor(own, unit)
+        factor = conversion_factor(present, unit)
     except UnitError:
         raise UnitError(
-            f"{recording.name}: columns accel_x accel_y accel_z are in {own}, but the record calibrates outputs "
+            f"{recording.name}: columns accel_x accel_y accel_z are in {present}, but the record calibrates outputs "
             f"in {unit}"
         ) from None
     names = triad("accel")
     return recording.with_columns({n: recording.column(n) * factor for n in names}, dict.fromkeys(names, unit))
 
 
-def _gravity(record: Calibration, given: float | str | Gravity | None, recording: Recording) -> Gravity:
+def _gravity(record: Calibration, gravity: float | str | Gravity | None, recording: Recording) -> Gravity:
     """Return what was given, else the head's, else that of the record."""
-    if given is None and "gravity" not in recording.metadata:
+    if gravity is None and "gravity" not in recording.metadata:
         stated = record.model["gravity"]
         note = f"gravity {stated['value']:.6g} m/s^2 was taken from the record, as if measured at the same place"
         uncertainty = float(stated.get("standard_uncertainty") or 0.0)
         return Gravity(float(stated["value"]), str(stated.get("from", "record")), uncertainty, Note(note))
-    return local_gravity(given, recording)
+    return local_gravity(gravity, recording)
 
 
 def _sizes(
@@ -601,15 +603,15 @@ def _tested(
     whole += common * np.outer(rows.magnitude, rows.magnitude)
     within, between = parted(rows, whole, noise, rows.jacobian[:, laws.size :], rank)
     order = np.argsort(rows.owner[rows.magnitude])
-    own = g * np.sqrt(np.diag(whole)[rows.magnitude])[order]
+    residual_u = g * np.sqrt(np.diag(whole)[rows.magnitude])[order]
     force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
-    return (g * rows.residual[rows.magnitude][order], own, within, between), force
+    return (g * rows.residual[rows.magnitude][order], residual_u, within, between), force
 
 
 def _directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
     """Mean direction of each unmoved group under the record, shape (G, 3)."""
     force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
     count = int(problem.group.max(initial=-1)) + 1
-    found = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
-    found /= np.linalg.norm(found, axis=1)[:, None]
-    return found
+    directions = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    return directions

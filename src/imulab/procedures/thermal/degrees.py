@@ -109,12 +109,12 @@ class ChosenLaws:
 def clusters_of(temperature: Array) -> NDArray[np.int64]:
     """Return the number of the temperature that each hold is at; those within 5 K of the first of a cluster are one."""
     order, number, first = np.argsort(temperature, kind="stable"), -1, -np.inf
-    found = np.empty(len(temperature), dtype=np.int64)
+    numbers = np.empty(len(temperature), dtype=np.int64)
     for index in order.tolist():
         if temperature[index] > first + APART:
             number, first = number + 1, temperature[index]
-        found[index] = number
-    return found
+        numbers[index] = number
+    return numbers
 
 
 def seen(solution: ThermalSolution) -> Observability:
@@ -142,19 +142,19 @@ class Split:
 
 def splits(solution: ThermalSolution, cluster: NDArray[np.int64]) -> list[Split]:
     """Return the split at each interior temperature: the factor of V is what takes time, and no choice changes it."""
-    rows, found = solution.rows, []
+    rows, parts = solution.rows, []
     whole = np.zeros(rows.jacobian.shape[1])
     whole[: len(solution.coefficients)] = solution.coefficients
     target = rows.jacobian @ whole - rows.residual
     at = np.where(rows.owner >= 0, cluster[rows.owner], -1)
     for number in range(1, int(cluster.max(initial=0))):
-        jacobian, untold = _without_knot(rows.jacobian, solution.laws, number)
+        jacobian, missing = _without_knot(rows.jacobian, solution.laws, number)
         train, test = at != number, (at == number) & rows.magnitude
         white = whitener(rows_where(rows, train), solution.excess**2, solution.scatter.tau)
-        own = together(rows_where(rows, test), solution.excess**2, solution.scatter.tau)
+        test_weight = together(rows_where(rows, test), solution.excess**2, solution.scatter.tau)
         rest = white(jacobian[train]), white(target[train])
-        found.append(Split(number, jacobian[test], target[test], own, *rest, untold))
-    return found
+        parts.append(Split(number, jacobian[test], target[test], test_weight, *rest, missing))
+    return parts
 
 
 def _without_knot(jacobian: Array, laws: Laws, number: int) -> tuple[Array, tuple[int, ...]]:
@@ -173,10 +173,10 @@ def _without_knot(jacobian: Array, laws: Laws, number: int) -> tuple[Array, tupl
     return changed, tuple(part.start + number for part in laws.parts[:3])
 
 
-def left_out(given: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOutCluster]:
+def left_out(splits: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOutCluster]:
     """Return the errors at each interior temperature under a fit, with these coefficients alone, to all others."""
-    found = []
-    for split in given:
+    errors = []
+    for split in splits:
         columns = np.ones(split.rest.shape[1], dtype=np.bool_)
         columns[: len(kept)] = kept
         columns[list(split.untold)] = False
@@ -189,8 +189,8 @@ def left_out(given: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOutClu
         carried = jacobian @ inverse
         scatter = split.covariance + carried @ carried.T
         chi_square = float(error @ np.linalg.solve(scatter, error)) / len(error)
-        found.append(LeftOutCluster(split.number, len(error), float(np.sqrt(np.mean(error**2))), chi_square))
-    return found
+        errors.append(LeftOutCluster(split.number, len(error), float(np.sqrt(np.mean(error**2))), chi_square))
+    return errors
 
 
 def rows_where(rows: Rows, which: NDArray[np.bool_]) -> Rows:
@@ -223,24 +223,24 @@ def choose(
     limit = max(len(knots) - 2, 0)
     highest = replace(laws, degrees=(min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit)))
 
-    def solved(own: Laws, known: float | None) -> ThermalSolution:
-        return solve(problem, own, tau=known)
+    def solved(form: Laws, known: float | None) -> ThermalSolution:
+        return solve(problem, form, tau=known)
 
     if wanted != "auto":
-        own = replace(laws, degrees=(int(wanted[0]), int(wanted[1]), int(wanted[2])), knots=knots if spline else ())
-        if max(own.degrees) >= len(knots) or (spline and len(knots) < LEAST_KNOTS):
+        form = replace(laws, degrees=(int(wanted[0]), int(wanted[1]), int(wanted[2])), knots=knots if spline else ())
+        if max(form.degrees) >= len(knots) or (spline and len(knots) < LEAST_KNOTS):
             needed = f"{LEAST_KNOTS} temperatures or more" if spline else "a degree below their number"
             raise ObservabilityError(
-                f"{name}: degrees {own.spelled} at {len(knots)} temperatures (5 K apart); expected {needed}: record at "
-                "more temperatures"
+                f"{name}: degrees {form.spelled} at {len(knots)} temperatures (5 K apart); expected {needed}: record "
+                "at more temperatures"
             )
-        solution, view = _observable(problem, own, tau, name)
+        solution, view = _observable(problem, form, tau, name)
         solution = bounded(solution, tau, solved)
-        held = left_out(splits(solution, cluster), np.ones(own.size, dtype=np.bool_))
+        held = left_out(splits(solution, cluster), np.ones(form.size, dtype=np.bool_))
         missed = _missed(problem, solution, highest, tau, name)
         return ChosenLaws(solution, [], _at(held, problem, cluster), view, missed)
-    found = _descended(problem, highest, cluster, tau, name)
-    steps = found.steps
+    chosen = _descended(problem, highest, cluster, tau, name)
+    steps = chosen.steps
     if len(knots) >= LEAST_KNOTS:
         try:
             bent = _descended(problem, replace(highest, knots=knots), cluster, tau, name)
@@ -248,32 +248,32 @@ def choose(
             pass  # the holds do not tell so many values of the bias
         else:
             steps = steps + bent.steps
-            if bends(bent.solution, tau) and predicts(bent.left_out, found.left_out):
+            if bends(bent.solution, tau) and predicts(bent.left_out, chosen.left_out):
                 solution = bounded(bent.solution, tau, solved)
                 held = left_out(splits(solution, cluster), np.ones(solution.laws.size, dtype=np.bool_))
-                found = replace(bent, solution=solution, left_out=held)
-    own = found.solution.laws
+                chosen = replace(bent, solution=solution, left_out=held)
+    form = chosen.solution.laws
     unique = {
-        (step.degrees, step.knots): replace(step, chosen=(step.degrees, step.knots) == (own.degrees, len(own.knots)))
+        (step.degrees, step.knots): replace(step, chosen=(step.degrees, step.knots) == (form.degrees, len(form.knots)))
         for step in steps
     }
-    return replace(found, steps=list(unique.values()), left_out=_at(found.left_out, problem, cluster))
+    return replace(chosen, steps=list(unique.values()), left_out=_at(chosen.left_out, problem, cluster))
 
 
 def _missed(
     problem: ThermalProblem, solution: ThermalSolution, highest: Laws, tau: float | None, name: str
 ) -> tuple[Degrees, float] | None:
     """Return the degrees that ``auto`` starts from, as far as the holds tell them, if stated ones are too low (1 %)."""
-    own = solution.laws
-    bias, scale, misalignment = (max(pair) for pair in zip(own.degrees, highest.degrees, strict=True))
-    larger = replace(own, degrees=(bias, scale, misalignment))
+    stated = solution.laws
+    bias, scale, misalignment = (max(pair) for pair in zip(stated.degrees, highest.degrees, strict=True))
+    larger = replace(stated, degrees=(bias, scale, misalignment))
     try:
         higher, _ = _highest(problem, larger, tau, name)
     except ObservabilityError:
         return None
     added = [
         place
-        for part, before in zip(higher.laws.parts, own.parts, strict=True)
+        for part, before in zip(higher.laws.parts, stated.parts, strict=True)
         for place in range(part.start + before.stop - before.start, part.stop)
     ]
     if not added:
@@ -310,20 +310,20 @@ def _descended(
 ) -> ChosenLaws:
     """Return the fit with the degrees to which steps down lead; a spline stays."""
     solution, view = _highest(problem, highest, tau, name)
-    given = splits(solution, cluster)
-    held = left_out(given, np.ones(solution.laws.size, dtype=np.bool_))
+    parts = splits(solution, cluster)
+    held = left_out(parts, np.ones(solution.laws.size, dtype=np.bool_))
     steps = [DegreesStep(solution.laws.degrees, rms_of(held), None, knots=len(highest.knots))]
     while True:
         free = [group for group in range(3) if solution.laws.degrees[group] and not (group == 0 and highest.knots)]
-        down = [step_down(solution, group, given) for group in free]
+        down = [step_down(solution, group, parts) for group in free]
         steps += down
         fine = [step for step in down if may_be_taken(step, rms_of(held))]
         if not fine:
             return ChosenLaws(solution, steps, held, view)
         best = max(fine, key=lambda step: step.probability or 0.0)
         solution, view = _observable(problem, replace(solution.laws, degrees=best.degrees), tau, name)
-        given = splits(solution, cluster)
-        held = left_out(given, np.ones(solution.laws.size, dtype=np.bool_))
+        parts = splits(solution, cluster)
+        held = left_out(parts, np.ones(solution.laws.size, dtype=np.bool_))
 
 
 def _highest(
@@ -361,7 +361,7 @@ def bends(solution: ThermalSolution, tau: float | None) -> bool:
 def predicts(bent: Sequence[LeftOutCluster], straight: Sequence[LeftOutCluster]) -> bool:
     """Return whether a spline predicts the temperatures that both could leave out well enough to be taken."""
     both = {each.temperature for each in bent} & {each.temperature for each in straight}
-    errors = [rms_of([each for each in given if each.temperature in both]) for given in (bent, straight)]
+    errors = [rms_of([each for each in predictions if each.temperature in both]) for predictions in (bent, straight)]
     return errors[0] is not None and errors[1] is not None and errors[0] <= _HANDICAP * errors[1]
 
 
@@ -389,7 +389,7 @@ def _help(problem: ThermalProblem, laws: Laws) -> str:
     return f"{more}, or lower --degrees," if max(laws.degrees) else more
 
 
-def step_down(solution: ThermalSolution, group: int, given: Sequence[Split]) -> DegreesStep:
+def step_down(solution: ThermalSolution, group: int, parts: Sequence[Split]) -> DegreesStep:
     """Return what is lost where the highest power of one kind is left out: Wald's test, and the prediction."""
     laws, degrees = solution.laws, list(solution.laws.degrees)
     gone = np.array([part.stop - 1 for part in laws.parts[3 * group : 3 * group + 3]])
@@ -398,7 +398,7 @@ def step_down(solution: ThermalSolution, group: int, given: Sequence[Split]) -> 
     kept[gone] = False
     degrees[group] -= 1
     lower = (degrees[0], degrees[1], degrees[2])
-    return DegreesStep(lower, rms_of(left_out(given, kept)), wald(solution, np.eye(size)[gone]), knots=len(laws.knots))
+    return DegreesStep(lower, rms_of(left_out(parts, kept)), wald(solution, np.eye(size)[gone]), knots=len(laws.knots))
 
 
 def wald(solution: ThermalSolution, weights: Array) -> float:
@@ -415,10 +415,10 @@ def tail(square: float, count: int, freedom: float) -> float:
     return float(f_tail(square, count, freedom) if np.isfinite(freedom) else chi_square_tail(count * square, count))
 
 
-def rms_of(found: Sequence[LeftOutCluster]) -> float | None:
+def rms_of(errors: Sequence[LeftOutCluster]) -> float | None:
     """Return the rms over all holds of the temperatures left out; None where there are none."""
-    total = sum(each.holds for each in found)
-    return float(np.sqrt(sum(each.holds * each.rms**2 for each in found) / total)) if total else None
+    total = sum(each.holds for each in errors)
+    return float(np.sqrt(sum(each.holds * each.rms**2 for each in errors) / total)) if total else None
 
 
 def may_be_taken(step: DegreesStep, before: float | None) -> bool:
@@ -426,19 +426,21 @@ def may_be_taken(step: DegreesStep, before: float | None) -> bool:
 
     `before` is their rms without the step: an F-test alone may lack all power.
     """
-    told = step.left_out is not None and before is not None and step.left_out <= _NO_WORSE * before
-    return told and (step.probability or 0) > THERMAL_POWER.level
+    no_worse = step.left_out is not None and before is not None and step.left_out <= _NO_WORSE * before
+    return no_worse and (step.probability or 0) > THERMAL_POWER.level
 
 
-def _at(found: Sequence[LeftOutCluster], problem: ThermalProblem, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
+def _at(errors: Sequence[LeftOutCluster], problem: ThermalProblem, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
     """Return them with the temperature instead of its number."""
-    return [replace(each, temperature=float(problem.temperature[cluster == each.temperature].mean())) for each in found]
+    return [
+        replace(each, temperature=float(problem.temperature[cluster == each.temperature].mean())) for each in errors
+    ]
 
 
 def spoken_degrees(degrees: Degrees, knots: int = 0) -> str:
     """Return degrees as messages say them: ``bias 3, scale factor 2, misalignment 1``, or a spline of the bias."""
-    said = [f"{kind.replace('_', ' ')} {degree}" for (kind, _), degree in zip(GROUPS, degrees, strict=True)]
-    return ", ".join([f"bias by a spline with {knots} knots", *said[1:]] if knots else said)
+    words = [f"{kind.replace('_', ' ')} {degree}" for (kind, _), degree in zip(GROUPS, degrees, strict=True)]
+    return ", ".join([f"bias by a spline with {knots} knots", *words[1:]] if knots else words)
 
 
 # Whether biases lag behind the thermometer, or differ between warming and cooling.
@@ -483,9 +485,9 @@ def moved(recording: NDArray[Any], temperature: Array, rate: Array) -> Array:
     """Return `moving` of holds by the recording, temperature, degC, and its change, K/s, of each."""
     rate = rate.copy()
     for each in np.unique(recording):
-        own = recording == each
-        soak = np.ptp(temperature[own]) < APART
-        rate[own & (np.abs(rate) < (np.inf if soak else _STILL * np.abs(rate[own]).max()))] = 0.0
+        of_recording = recording == each
+        soak = np.ptp(temperature[of_recording]) < APART
+        rate[of_recording & (np.abs(rate) < (np.inf if soak else _STILL * np.abs(rate[of_recording]).max()))] = 0.0
     return rate
 
 
@@ -507,10 +509,10 @@ def tested(whole: ThermalSolution, size: int) -> LagAndLoops:
     values, covariance = whole.coefficients[size:], whole.covariance[size:, size:]
     probability = []
     for part in (slice(0, 1), slice(1, 4)):
-        own = values[part]
-        square = float(own @ np.linalg.solve(covariance[part, part], own)) / len(own)
+        terms = values[part]
+        square = float(terms @ np.linalg.solve(covariance[part, part], terms)) / len(terms)
         freedom = min(whole.degrees_of_freedom(row) for row in np.eye(size + 4)[size:][part])
-        probability.append(tail(square, len(own), freedom))
+        probability.append(tail(square, len(terms), freedom))
     return LagAndLoops(values, covariance, (probability[0], probability[1]))
 
 
@@ -522,11 +524,11 @@ def _of_soaks(problem: ThermalProblem, solution: ThermalSolution, tau: float | N
     whole = solve(replace(problem, free=loops), solution.laws, tau=tau)
     if not whole.converged:
         return LagAndLoops(reason="the fit of loops beside the laws did not converge")
-    own, covariance = whole.coefficients[size:], np.full((4, 4), np.nan)
+    terms, covariance = whole.coefficients[size:], np.full((4, 4), np.nan)
     covariance[1:, 1:] = whole.covariance[size:, size:]
-    square = float(own @ np.linalg.solve(covariance[1:, 1:], own)) / len(own)
+    square = float(terms @ np.linalg.solve(covariance[1:, 1:], terms)) / len(terms)
     freedom = min(whole.degrees_of_freedom(row) for row in np.eye(size + 3)[size:])
-    return LagAndLoops(np.append(np.nan, own), covariance, (1.0, tail(square, len(own), freedom)))
+    return LagAndLoops(np.append(np.nan, terms), covariance, (1.0, tail(square, len(terms), freedom)))
 
 
 def why_lag_is_unobservable(
@@ -580,24 +582,24 @@ def findings(drift: LagAndLoops, solution: ThermalSolution, name: str) -> list[s
     if drift.values is None:
         return [Note(f"{name}: {drift.reason}")] if drift.reason else []
     assert drift.covariance is not None
-    found, u = [], np.sqrt(np.diag(drift.covariance))
+    messages, u = [], np.sqrt(np.diag(drift.covariance))
     if 0 in drift.free:
         laws = solution.laws
         slope = laws.slope(np.linspace(laws.low, laws.high, 81)) @ solution.coefficients[: laws.size]
         lag = float(drift.values[0])
         who = "biases lag the temperature" if lag > 0 else "the temperature lags the biases"
-        found.append(
+        messages.append(
             f"{name}: {who} by {abs(lag):.3g} s (u {u[0]:.2g} s); corrected outputs use none, and are off by up to "
             f"{1e3 * np.abs(slope[:, :3]).max() * abs(lag) / 60:.2g} mg where it changes by 1 K/min"
         )
     if 1 in drift.free:
         each = ", ".join(f"{axis} {1e3 * h:+.2f}" for axis, h in zip(AXES, drift.values[1:], strict=True))
-        found.append(
+        messages.append(
             f"{name}: biases differ between warming and cooling: in the middle of the range they are {each} mg "
             f"(u {1e3 * u[1:].max():.2g} mg) from their laws in warming, and as much the other way in cooling, which "
             "corrected outputs keep"
         )
-    return found
+    return messages
 
 
 def drift_effects(drift: LagAndLoops, scale: float, unit: str = "m/s^2") -> dict[str, TestedEffect | None]:
@@ -655,26 +657,26 @@ def bias_shift_from_unobserved(
         return float(np.sqrt(np.mean(np.einsum("tpa,ab,tpb->tp", moved, left, moved))))
 
     temperature = problem.temperature if problem.known is None else np.append(problem.temperature, problem.known[0])
-    place, found = laws.place(temperature)[rows.owner], []  # a prior's owner is -1
+    place, messages = laws.place(temperature)[rows.owner], []  # a prior's owner is -1
     for group in groups:
         slope, usual = _USUAL_SLOPES[group]
         constants = [part.start for part in laws.parts[3 * group : 3 * group + 3]]
         error = error_by(rows.jacobian[:, constants] * place[:, None] * slope * laws.half)
         if error > _WORTH * stated:
             kind = GROUPS[group][0].replace("_", " ")
-            found.append(
+            messages.append(
                 f"{name}: the holds do not tell whether {kind} follows the temperature, which is taken as constant: "
                 f"one that moves by {usual}, as is usual, errs biases by {1e3 * error:.2g} mg, where their uncertainty "
                 f"is {1e3 * stated:.2g} mg: another axis up while the temperature changes, or attitudes at another "
                 "temperature, would tell"
             )
     if drift.reason and (error := error_by(rows.drift[:, :1] * _LAG)) > stated:
-        found.append(
+        messages.append(
             f"{name}: the temperature changes fast, and the recordings do not tell a lag behind the thermometer: one "
             f"of {_LAG:g} s errs biases by {1e3 * error:.2g} mg, where their uncertainty is {1e3 * stated:.2g} mg: let "
             "it change more slowly, or record the way back too"
         )
-    return found
+    return messages
 
 
 # Residuals under a record parted in two: what a recording has in common, as power cycles have, and the rest.
@@ -699,8 +701,8 @@ def parted(
     factor = np.linalg.cholesky(whole)
 
     def white(columns: Array) -> Array:
-        found: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
-        return found
+        whitened: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
+        return whitened
 
     turns = _basis(white(unknown))
     offsets = white(rows.offsets[0])
@@ -724,8 +726,8 @@ def _basis(columns: Array) -> Array:
         return columns
     u, values, _ = np.linalg.svd(columns, full_matrices=False)
     kept: NDArray[np.bool_] = values > _SEEN * max(float(values[0]), 1e-300)
-    found: Array = u[:, kept]
-    return found
+    basis: Array = u[:, kept]
+    return basis
 
 
 # Do the recordings agree as those of one unit do? What no power cycle explains is said, with who stands apart.
@@ -767,29 +769,29 @@ def disagreements(holds: Holds, problem: ThermalProblem, solution: ThermalSoluti
         )
         if size > 1
     ]
-    rows, found = solution.rows, []
-    own = float(np.median(np.sqrt(np.diag(rows.noise)[rows.magnitude])))
-    scattered = solution.excess > max(_SCATTERS, _NOISE * own)
+    rows, messages = solution.rows, []
+    noise = float(np.median(np.sqrt(np.diag(rows.noise)[rows.magnitude])))
+    scattered = solution.excess > max(_SCATTERS, _NOISE * noise)
     apart = _apart(holds, problem, solution.laws) if differ or scattered else ""
     if differ and (apart or not solution.scatter.bound):  # a bound holds bends of the law, too
-        found.append(
+        messages.append(
             f"{name}: from one recording to the next {' and '.join(differ)} differ, which no power cycle does: are all "
             f"of one unit, its axes named alike, its temperatures by one thermometer?{apart}"
         )
     if scattered:
-        found.append(
+        messages.append(
             f"{name}: within recordings |f| scatters by {1e6 * solution.excess:.0f} ug, of which noise explains "
-            f"{1e6 * own:.0f} ug: is a recording of another unit, with axes swapped, or with a jump of its outputs?"
+            f"{1e6 * noise:.0f} ug: is a recording of another unit, with axes swapped, or with a jump of its outputs?"
             f"{'' if differ else apart}"
         )
     if not apart:
-        found += _off(holds, problem, solution)
+        messages += _off(holds, problem, solution)
     if solution.laws.high > _HOTTEST:
-        found.append(
+        messages.append(
             f"{name}: temperatures up to {solution.laws.high:.0f} degC, above what sensors are rated to: are these "
             "degrees Fahrenheit? expected degC or kelvins"
         )
-    return found
+    return messages
 
 
 def _apart(holds: Holds, problem: ThermalProblem, laws: Laws) -> str:
@@ -824,28 +826,30 @@ def _off(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> li
         others = rows_where(rows, whose != number)
         excess, freedom = excess_of(others, solution.excess**2)
         scatter, white = between(others, excess), whitener(others, excess, np.zeros(2))
-        own = np.s_[3 * number : 3 * number + 3]
-        stretch, told = max(float(scatter.tau[1]), _USUAL), freedom
+        of_recording = np.s_[3 * number : 3 * number + 3]
+        stretch, rank = max(float(scatter.tau[1]), _USUAL), freedom
         if stretch > _USUAL:  # few recordings told it
-            bias, scale = (white(given) for given in others.offsets)
-            told = float(len(offset_modes(np.hstack([white(others.jacobian), bias]), scale, white(others.residual))[0]))
-        tests = [(1, np.array([_BENDS, stretch]), told, _OFF_SCALE)]
+            bias, scale = (white(columns) for columns in others.offsets)
+            rank = float(len(offset_modes(np.hstack([white(others.jacobian), bias]), scale, white(others.residual))[0]))
+        tests = [(1, np.array([_BENDS, stretch]), rank, _OFF_SCALE)]
         if scatter.rank:
             tests.append((0, scatter.tau, float(scatter.rank), _OFF_BIAS))
-        for kind, tau, told, least in tests:
+        for kind, tau, rank, least in tests:
             white = whitener(rows, excess, tau)
-            s, force = offset_modes(white(rows.jacobian), white(rows.offsets[kind][:, own]), white(rows.residual))
+            s, force = offset_modes(
+                white(rows.jacobian), white(rows.offsets[kind][:, of_recording]), white(rows.residual)
+            )
             if not len(s):
                 continue
             size = float(np.sqrt(np.sum((force / s) ** 2) / 3))
-            chance = len(numbers) * tail(float(np.mean(force**2)), len(s), told)
+            chance = len(numbers) * tail(float(np.mean(force**2)), len(s), rank)
             if chance < RECORDING_DISAGREEMENT.level and size > least:
                 by = f"{1e6 * size:.0f} ppm in scale factors" if kind else f"{1e3 * size:.2g} mg in biases"
                 asked.append((chance, f"{holds.recordings[number].name}: lies off the other recordings by {by}"))
     return [
-        f"{said}, far more than they differ among themselves: is it of the same unit, at the temperature that it says, "
-        "or have the laws a bend there? come back to that temperature"
-        for _, said in sorted(asked)[:1]
+        f"{words}, far more than they differ among themselves: is it of the same unit, at the temperature that it "
+        "says, or have the laws a bend there? come back to that temperature"
+        for _, words in sorted(asked)[:1]
     ]
 
 
@@ -876,9 +880,9 @@ def _disagreement(problem: ThermalProblem, laws: Laws) -> float:
     degrees = (min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit))
     try:
         # As if biases moved by much, which a unit among others of its own would otherwise bend the laws by.
-        found = solve(problem, replace(laws, degrees=degrees, knots=()), tau=_BENDS)
+        free = solve(problem, replace(laws, degrees=degrees, knots=()), tau=_BENDS)
     except np.linalg.LinAlgError:
         return np.inf
-    if not found.converged:
+    if not free.converged:
         return np.inf
-    return float(np.hypot(found.excess, between(found.rows, found.excess**2).tau[0]))
+    return float(np.hypot(free.excess, between(free.rows, free.excess**2).tau[0]))

@@ -45,7 +45,7 @@ def gyro_laws_of(record: Calibration) -> Array:
     gyro = model.gyro
     assert gyro is not None
     laws, about = model.gyro_laws, model.reference_temperature.value
-    found = np.zeros((len(laws.edges) - 1, 6, max(laws.degrees) + 1))
+    coefficients = np.zeros((len(laws.edges) - 1, 6, max(laws.degrees) + 1))
     for i, axis in enumerate(AXES):
         for row, group, kind, unit in (
             (i, 0, "bias", "rad/s"),
@@ -56,14 +56,14 @@ def gyro_laws_of(record: Calibration) -> Array:
                     raise RecordError(
                         f"the record has outputs of gyroscopes in {gyro.output_unit}, and no scale factor"
                     )
-                found[:, row, 0] = from_si(1.0, gyro.output_unit)
+                coefficients[:, row, 0] = from_si(1.0, gyro.output_unit)
                 continue
             names, units = laws.named(group, f"gyro_{kind}_{axis}"), laws.measured(group, unit)
             values = [values_of(record, [name], per)[0] for name, per in zip(names, units, strict=True)]
             law = laws.in_pieces(group, np.array(values), about)
-            found[:, row, : law.shape[1]] = law
-    check_scale_factors(found)
-    return found
+            coefficients[:, row, : law.shape[1]] = law
+    check_scale_factors(coefficients)
+    return coefficients
 
 
 def check_scale_factors(laws: Array) -> None:
@@ -123,14 +123,14 @@ def golden_gyroscopes(table: DeviceTable, rng: np.random.Generator) -> dict[str,
     laws = field_of(table, "coefficient").reshape(-1, 6, int(field_of(table, "terms")))
     output = (rates + laws[0, :3, 0]) * laws[0, 3:6, 0]
     temperature[5], output[1, 1] = np.nan, np.nan
-    found, _ = DeviceUnit.of(table).thermal_gyro(temperature, list(output.T), list(force.T))
+    turn_rates, _ = DeviceUnit.of(table).thermal_gyro(temperature, list(output.T), list(force.T))
     return {
         "": VECTORS,
         "scale": 5.0,
         "temperature": temperature,
         "output": output,
         "force": force,
-        "rate": np.column_stack(found),
+        "rate": np.column_stack(turn_rates),
     }
 
 
@@ -150,12 +150,12 @@ def laws_of(record: Calibration) -> Array:
     model = thermal_of(record).model
     laws, units = model.laws, model.laws.units(model.output_unit)
     values = np.array([values_of(record, [name], unit)[0] for name, unit in zip(laws.names(), units, strict=True)])
-    found = np.zeros((len(laws.edges) - 1, 9, max(laws.degrees) + 1))
+    coefficients = np.zeros((len(laws.edges) - 1, 9, max(laws.degrees) + 1))
     for row, part in enumerate(laws.parts):
         law = laws.in_pieces(row // 3, values[part], model.reference_temperature.value)
-        found[:, row, : law.shape[1]] = law
-    check_scale_factors(found)
-    return found
+        coefficients[:, row, : law.shape[1]] = law
+    check_scale_factors(coefficients)
+    return coefficients
 
 
 def accelerometers(record: Calibration) -> AccelerometerLaws:
@@ -187,13 +187,13 @@ def golden_accelerometers(table: DeviceTable, rng: np.random.Generator) -> dict[
     laws = field_of(table, "coefficient").reshape(-1, 9, int(field_of(table, "terms")))
     output = (force + laws[0, :3, 0]) * laws[0, 3:6, 0]
     temperature[5], output[1, 1] = np.nan, np.nan
-    found, _ = DeviceUnit.of(table).thermal(temperature, list(output.T))
+    forces, _ = DeviceUnit.of(table).thermal(temperature, list(output.T))
     return {
         "": VECTORS,
         "scale": 2 * STANDARD_GRAVITY,
         "temperature": temperature,
         "output": output,
-        "force": np.column_stack(found),
+        "force": np.column_stack(forces),
     }
 
 
@@ -261,17 +261,19 @@ def _remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
     low, high = columns["range"]
     temperature = _temperature(columns, recording)
     lost, outside = ~np.isfinite(temperature), (temperature < low) | (temperature > high)
-    found: list[str] = []
+    messages: list[str] = []
     if lost.any():
-        found.append(f"{recording.name}: {lost.sum()} rows without a temperature are not corrected: not a number there")
+        messages.append(
+            f"{recording.name}: {lost.sum()} rows without a temperature are not corrected: not a number there"
+        )
     if outside.any():
         far = float(np.maximum(low - temperature[outside], temperature[outside] - high).max())
         text = (
             f"{recording.name}: {outside.sum()} of {len(recording)} rows lie outside the {low:g} to {high:g} degC that "
             f"were measured, by up to {far:.1f} K: corrected as at the end of the range"
         )
-        found.append(text if far > 1 else Note(text))
-    return found
+        messages.append(text if far > 1 else Note(text))
+    return messages
 
 
 # Two thermal records at temperatures of both, since each has coefficients of powers about a T0 of its own.
@@ -301,7 +303,7 @@ def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Cal
     both = all(model.gyro is not None for model in models)
     kinds = [_laws(model, both) for model in models]
     terms = [[laws.terms[group] for _, _, laws, group in each] for each in kinds]
-    counts = [max(of) for of in zip(*terms, strict=True)]
+    counts = [max(pair) for pair in zip(*terms, strict=True)]
     low, high = np.ceil(10 * low) / 10, np.floor(10 * high) / 10
     nodes = [np.linspace(low, high, count) if count > 1 else np.array([0.5 * (low + high)]) for count in counts]
     nodes = [np.round(places, 1) for places in nodes]
@@ -320,23 +322,23 @@ def on_line(record: Calibration) -> OnLine:
     freedom = [each for each in values.fit.get("degrees_of_freedom", {}).values() if each]
     named = tuple(f"{kind}_{axis}" for kind, axes, _, _ in laws for axis in axes)
     begun = tuple(f"{name}_" for name in named)  # powers, knots, and what a spline's value and slopes are at T0
-    own = frozenset(name for name in record.parameters if name in named or name.startswith(begun))
+    coefficients = frozenset(name for name in record.parameters if name in named or name.startswith(begun))
     knots = *(model.knots or ()), *((model.gyro and model.gyro.knots) or ())
     return OnLine(
         values.parameters,
         ("reference_temperature", about.unit),
         (about.value, *knots),
         _SAME,
-        own,
+        coefficients,
         min(freedom, default=None),
     )
 
 
 def _laws(model: ThermalModel, gyroscopes: bool) -> list[Kind]:
     """Return the kinds of parameters that follow the temperature: name, axes, laws, and which of these are its own."""
-    found: list[Kind] = []
-    found += [(kind, axes, model.laws, group) for group, (kind, axes) in enumerate(GROUPS)]
-    return [*found, ("gyro_bias", AXES, model.gyro_laws, 0)] if gyroscopes else found
+    kinds: list[Kind] = []
+    kinds += [(kind, axes, model.laws, group) for group, (kind, axes) in enumerate(GROUPS)]
+    return [*kinds, ("gyro_bias", AXES, model.gyro_laws, 0)] if gyroscopes else kinds
 
 
 def _at(record: Calibration, laws: list[Kind], nodes: list[Array]) -> Calibration:
@@ -349,20 +351,20 @@ def _at(record: Calibration, laws: list[Kind], nodes: list[Array]) -> Calibratio
     rows, values, labels, units = [], [], [], []
     known: dict[str, float | None] = {}
     about = sections.model.reference_temperature.value
-    for (kind, axes, law, group), own in zip(laws, nodes, strict=True):
-        functions = law.recorded(group, own, about)
+    for (kind, axes, law, group), places in zip(laws, nodes, strict=True):
+        functions = law.recorded(group, places, about)
         for axis in axes:
             used = law.named(group, f"{kind}_{axis}")
-            row = np.zeros((len(own), len(names)))
+            row = np.zeros((len(places), len(names)))
             row[:, [names.index(name) for name in used]] = functions
             rows.append(row)
             values.append(functions @ np.array([record.value(name) for name in used]))
-            labels += [f"{kind}_{axis} at {temperature:.1f} degC" for temperature in own]
-            units += [record.parameters[used[0]].unit] * len(own)
+            labels += [f"{kind}_{axis} at {temperature:.1f} degC" for temperature in places]
+            units += [record.parameters[used[0]].unit] * len(places)
         # What recordings scatter by is told by few of them, and is most of what these values are uncertain by.
         scatter, rank = scatters.get(kind, (None, 0))
         few = scatter is not None and scatter.value > 0 and rank > 0
-        known |= dict.fromkeys(labels[-len(axes) * len(own) :], rank if few else freedom)
+        known |= dict.fromkeys(labels[-len(axes) * len(places) :], rank if few else freedom)
     spread = np.vstack(rows)
     matrix = spread @ record.covariance.array() @ spread.T
     parameters = {
@@ -370,8 +372,8 @@ def _at(record: Calibration, laws: list[Kind], nodes: list[Array]) -> Calibratio
         for label, value, u, unit in zip(labels, np.concatenate(values), np.sqrt(np.diag(matrix)), units, strict=True)
     }
     covariance = Covariance(tuple(labels), tuple(map(tuple, matrix.tolist())))
-    said = {**record.fit, "degrees_of_freedom": known}
-    return replace(record, parameters=parameters, covariance=covariance, fit=said)
+    fit_section = {**record.fit, "degrees_of_freedom": known}
+    return replace(record, parameters=parameters, covariance=covariance, fit=fit_section)
 
 
 # A thermal record at one temperature, as prior knowledge of a tumble test or of turns there.
@@ -392,15 +394,15 @@ def at_temperature(record: Calibration, temperature: float | None, name: str) ->
         The recording has no temperature, or one outside the record's range; or the record does not know the scatter
         between power cycles.
     """
-    found = thermal_of(record)
-    between = found.fit.between_recordings
+    thermal = thermal_of(record)
+    between = thermal.fit.between_recordings
     temperature = _within(record, temperature, name)
     if between.from_ == "unknown":
         raise RecordError(
             "the thermal record does not know how far biases move from one power cycle to the next, and cannot be a "
             "prior: fit it with more recordings, or with --turn-on-scatter"
         )
-    laws, about = found.model.laws, found.model.reference_temperature.value
+    laws, about = thermal.model.laws, thermal.model.reference_temperature.value
     names, rows = list(record.covariance.names), []
     labels = [f"{kind}_{axis}" for kind, axes in GROUPS for axis in axes]
     for number, label in enumerate(labels):

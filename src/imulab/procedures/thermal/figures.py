@@ -127,9 +127,9 @@ def power_cycles(known_from: str) -> str:
 def values_at_middle(record: Calibration, names: Sequence[str]) -> str:
     """Return coefficients of a record in words: as those of powers of T - T0 they are values in the middle."""
     by_name = {row.name: row for row in rows_of(record)}
-    found = [by_name[name] for name in names]
-    each = (f"{row.name[-2:].lstrip('_')} {format_uncertain(row.value, row.standard_uncertainty)[0]}" for row in found)
-    return f"{', '.join(each)} {found[0].unit}"
+    rows = [by_name[name] for name in names]
+    each = (f"{row.name[-2:].lstrip('_')} {format_uncertain(row.value, row.standard_uncertainty)[0]}" for row in rows)
+    return f"{', '.join(each)} {rows[0].unit}"
 
 
 def own_points(temperature: Array, values: Array, reach: Array | None, axis: int, label: str) -> dict[str, Any]:
@@ -148,30 +148,30 @@ def own_points(temperature: Array, values: Array, reach: Array | None, axis: int
 
 def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[str, str]], list[Figure]]:
     """Return the facts and figures of the gyroscopes of a record over temperatures, degC."""
-    found = thermal_of(record)
-    fit, data = found.fit.gyro, found.data.gyro
+    thermal = thermal_of(record)
+    fit, data = thermal.fit.gyro, thermal.data.gyro
     assert fit is not None
     assert data is not None
     values, spread = (from_si(each, "deg/s") for each in gyro_predicted(record, temperature))
     tau = fit.between_recordings
-    told = f"{plain_number(_hourly(tau.bias.value), 2)} deg/h"
-    told = {"unknown": "not known", "polynomials": f"at most {told}"}.get(tau.from_, f"{told} ({tau.from_})")
+    words = f"{plain_number(_hourly(tau.bias.value), 2)} deg/h"
+    words = {"unknown": "not known", "polynomials": f"at most {words}"}.get(tau.from_, f"{words} ({tau.from_})")
     left = fit.left_out_temperature
     worst = f"{plain_number(_hourly(max(row.rms for row in left)), 2)} deg/h rms at worst" if left else "–"
     facts = [
         ("gyroscope biases", f"known to {plain_number(float(spread.max()) * 3600, 2)} deg/h or better"),
-        ("gyroscope biases, power cycle to power cycle", told),
+        ("gyroscope biases, power cycle to power cycle", words),
         ("gyroscope biases at left-out temperatures", worst),
     ]
     if fit.turns is not None:
         turns = f"{fit.turns.turns}, missed by {plain_number(np.degrees(fit.turns.rms.value), 2)} deg rms"
         facts.append(("turns", turns))
-        if not found.model.gyro_laws.degrees[1]:
+        if not thermal.model.gyro_laws.degrees[1]:
             # A law that nothing could bend is no figure over temperature.
             scale, u = gyro_scale_predicted(record, temperature)
             known = plain_number(1e6 * float((u / np.abs(scale)).max()), 2)
-            told = f"known to {known} ppm where the turns were, and taken as the same at all temperatures"
-            facts.append(("gyroscope scale factors", told))
+            words = f"known to {known} ppm where the turns were, and taken as the same at all temperatures"
+            facts.append(("gyroscope scale factors", words))
     residual = from_si(np.array(data.residual), "deg/h")
     points = [
         scatter(rounded(np.array(data.temperature)), rounded(residual[:, k], 4), "markers", name=name,
@@ -196,7 +196,7 @@ def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[s
             layout={"xaxis": place, "yaxis": figure_axis("law less output, deg/h"), "legend": LEGEND},
         ),
     ]
-    if fit.turns is not None and found.model.gyro_laws.degrees[1]:
+    if fit.turns is not None and thermal.model.gyro_laws.degrees[1]:
         figures.insert(1, _scale_factors(record, temperature, fit.turns.recordings))
     return facts, figures
 
@@ -251,13 +251,13 @@ _MICRO_G = 1e6 / STANDARD_GRAVITY  # to µg
 
 def exhibits(record: Calibration) -> Exhibits:
     """Return the figures and tables of a record."""
-    found = thermal_of(record)
-    low, high = found.model.range
+    thermal = thermal_of(record)
+    low, high = thermal.model.range
     temperature = np.linspace(low, high, _POINTS)
     _, spread = predicted(record, temperature)
-    fit = found.fit
+    fit = thermal.fit
     worst = float(spread[:3].max()) * _MICRO_G
-    laws, rms = found.model.laws, plain_number(fit.rms.value * _MICRO_G, 3)
+    laws, rms = thermal.model.laws, plain_number(fit.rms.value * _MICRO_G, 3)
     kind = "degrees " + ", ".join(map(str, laws.degrees))
     if laws.knots:
         kind = spoken_degrees(laws.degrees, len(laws.knots))
@@ -266,38 +266,38 @@ def exhibits(record: Calibration) -> Exhibits:
         f"biases are known to {plain_number(worst, 2)} µg or better."
     )
     tau = fit.between_recordings
-    told = f"{plain_number(tau.bias.value * _MICRO_G, 2)} µg"
-    told = {
+    words = f"{plain_number(tau.bias.value * _MICRO_G, 2)} µg"
+    words = {
         "unknown": "not known",
-        "polynomials": f"at most {told}",
-    }.get(tau.from_, f"{told} ({tau.from_})")
+        "polynomials": f"at most {words}",
+    }.get(tau.from_, f"{words} ({tau.from_})")
     facts = [
         ("recordings", str(fit.recordings)),
         ("temperatures", str(fit.temperatures)),
-        ("biases, power cycle to power cycle", told),
-        ("left-out temperatures", _left(found)),
-        *_drift(found),
+        ("biases, power cycle to power cycle", words),
+        ("left-out temperatures", _left(thermal)),
+        *_drift(thermal),
     ]
     items: list[Figure | ReportTable] = [
         _coefficients(record),
         *(_over_temperature(k, record, temperature) for k in range(3)),
-        _of_force(record, found, temperature),
-        _residuals(found),
+        _of_force(record, thermal, temperature),
+        _residuals(thermal),
     ]
-    if found.model.gyro is not None:
+    if thermal.model.gyro is not None:
         gyro_facts, gyro_items = gyro_exhibits(record, temperature)
         facts += gyro_facts
         items += gyro_items
     if fit.left_out_temperature:
-        items.append(_predicted(found))
+        items.append(_predicted(thermal))
     if fit.degrees:
-        items.append(_compared(found))
+        items.append(_compared(thermal))
     return Exhibits(headline, facts, items)
 
 
-def _drift(found: ThermalRecord) -> list[tuple[str, str]]:
+def _drift(thermal: ThermalRecord) -> list[tuple[str, str]]:
     """Return lag and loops as facts, where the recordings tell them."""
-    fit, facts = found.fit, []
+    fit, facts = thermal.fit, []
     for label, tested, factor, unit in (
         ("lag behind the thermometer", fit.lag, 1.0, "s"),
         *(
@@ -313,8 +313,8 @@ def _drift(found: ThermalRecord) -> list[tuple[str, str]]:
     return facts
 
 
-def _left(found: ThermalRecord) -> str:
-    rows = found.fit.left_out_temperature
+def _left(thermal: ThermalRecord) -> str:
+    rows = thermal.fit.left_out_temperature
     return f"{plain_number(max(row.rms for row in rows) * _MICRO_G, 2)} µg rms at worst" if rows else "–"
 
 
@@ -339,16 +339,18 @@ def _over_temperature(group: int, record: Calibration, temperature: Array) -> Fi
     name, factor, unit = _READ[group]
     kind, axes = GROUPS[group]
     part = slice(3 * group, 3 * group + 3)
-    found = thermal_of(record)
+    thermal = thermal_of(record)
     values, u = (each[part] for each in predicted(record, temperature))
     # Scale factors are read relative to those in the middle of the range.
     factors = factor / np.abs(values[:, [len(temperature) // 2]]) if group == 1 else np.full((3, 1), factor)
-    own, alone = found.data.calibrations, None
-    if own is not None:
-        at = np.array(own.temperature)
-        each, reach = (factors * np.array(of).T[part] for of in (own.values, own.standard_uncertainty))
+    calibrations, alone = thermal.data.calibrations, None
+    if calibrations is not None:
+        at = np.array(calibrations.temperature)
+        each, reach = (
+            factors * np.array(rows).T[part] for rows in (calibrations.values, calibrations.standard_uncertainty)
+        )
         alone = Alone(at, each, factors * predicted(record, at)[0][part], reach)
-    read = power_cycles(found.fit.between_recordings.from_)
+    read = power_cycles(thermal.fit.between_recordings.from_)
     if alone is not None:
         read += " Points: what each recording at a steady temperature gives alone, bars two of its own."
     at_middle = values_at_middle(record, [f"{kind}_{axis}" for axis in axes]) if group else ""

@@ -133,11 +133,11 @@ def fit_thermal(
     >>> fit.calibration.model["degrees"]["bias"]
     3
     """
-    given = _several(data)
+    items = _several(data)
     further = further_of(with_, "with_")
     wanted, spline = laws_of(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
     settling = None if settle is None else in_si(settle, "settle", "time", "s")
-    recordings = prepared([as_recording(one, reading, fit_thermal) for one in given], temperature_column, settling)
+    recordings = prepared([as_recording(item, reading, fit_thermal) for item in items], temperature_column, settling)
     if further:
         check_gyroscopes(recordings)
     earth = at_latitude(latitude) if further else None
@@ -155,11 +155,11 @@ def fit_thermal(
     problem = _problem(holds, scale, zero, leaning, known)
     laws = Laws(float(holds.temperature.min()), float(holds.temperature.max()), (0, 0, 0))
     name = recordings[0].name + (f" and {len(recordings) - 1} more" if len(recordings) > 1 else "")
-    found = choose(problem, laws, wanted, scatter, name, spline=spline)
-    drift = drift_of(problem, found.solution, scatter)
+    choice = choose(problem, laws, wanted, scatter, name, spline=spline)
+    drift = drift_of(problem, choice.solution, scatter)
     if drift.free:
         problem = replace(problem, free=drift.free)
-        found = choose(problem, laws, wanted, scatter, name, spline=spline)
+        choice = choose(problem, laws, wanted, scatter, name, spline=spline)
     options = {
         "degrees": wanted if isinstance(wanted, str) else ["spline", *wanted[1:]] if spline else list(wanted),
         "gravity": local.value,
@@ -172,19 +172,19 @@ def fit_thermal(
         "settle": settling,
     }
     options = {key: value for key, value in options.items() if value is not None}
-    record = make_record(holds, problem, found, drift, local, scale, options, name)
+    record = make_record(holds, problem, choice, drift, local, scale, options, name)
     if further:
-        record = _with_gyroscopes(record, holds, problem, found.solution, scale, wanted, spline, rates, name, earth)
-    return ThermalFit(record, found.view, tuple(found.steps), tuple(found.left_out))
+        record = _with_gyroscopes(record, holds, problem, choice.solution, scale, wanted, spline, rates, name, earth)
+    return ThermalFit(record, choice.view, tuple(choice.steps), tuple(choice.left_out))
 
 
 def _several(data: Data | Sequence[Data]) -> list[Any]:
     """Return the recordings as a list."""
     single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
-    given: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
-    if not given:
+    items: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
+    if not items:
         raise OptionError("fit_thermal: data: expected one recording or more, found none")
-    return given
+    return items
 
 
 def _with_gyroscopes(
@@ -211,17 +211,17 @@ def _with_gyroscopes(
 
 def _leaning(tilt: float | str) -> float:
     """Return how far a hold tips, rad."""
-    found = in_si(tilt, "tilt", "angle", "mrad")
-    if not 0 < found < np.inf:
-        raise OptionError(f"tilt {found:g}: expected a size above 0")
-    return found
+    angle = in_si(tilt, "tilt", "angle", "mrad")
+    if not 0 < angle < np.inf:
+        raise OptionError(f"tilt {angle:g}: expected a size above 0")
+    return angle
 
 
-def _scatter(given: float | str | None, name: str, quantity: str, unit: str, size: float = 1.0) -> float | None:
+def _scatter(stated: float | str | None, name: str, quantity: str, unit: str, size: float = 1.0) -> float | None:
     """Return a stated scatter between power cycles, in units of `size`, SI."""
-    if given is None:
+    if stated is None:
         return None
-    value = in_si(given, name, quantity, unit)
+    value = in_si(stated, name, quantity, unit)
     if not 0 <= value < np.inf:
         raise OptionError(f"{name} {value:g}: expected a size of 0 or above")
     return value / size

@@ -93,8 +93,8 @@ def new_in_each(up: Array, earth: EarthRate | None) -> Array:
     """Return columns of unit variance for what each attitude has of its own, rad/s, shape (n, 3, 3); `up` is (n, 3)."""
     along = up[:, :, None] * up[:, None, :]
     level = VERTICAL if earth is None else earth.level / np.sqrt(2)
-    found: Array = level * (np.eye(3) - along) + _ASKEW_SHARE * EARTH * along
-    return found
+    columns: Array = level * (np.eye(3) - along) + _ASKEW_SHARE * EARTH * along
+    return columns
 
 
 def earth_at_rest(force: Array, attitude: NDArray[np.int64], earth: EarthRate | None) -> tuple[Array, Array]:
@@ -103,10 +103,10 @@ def earth_at_rest(force: Array, attitude: NDArray[np.int64], earth: EarthRate | 
     Under specific forces (n, 3); `attitude` is the number of the attitude of each hold, (n,).
     """
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
-    own = np.einsum("nk,nij->nikj", one_hot(attitude), new_in_each(up, earth)).reshape(up.size, -1)
+    by_attitude = np.einsum("nk,nij->nikj", one_hot(attitude), new_in_each(up, earth)).reshape(up.size, -1)
     if earth is None:
-        return np.zeros(up.size), np.hstack([own, VERTICAL * up.reshape(-1, 1)])
-    return (earth.vertical * up).ravel(), own
+        return np.zeros(up.size), np.hstack([by_attitude, VERTICAL * up.reshape(-1, 1)])
+    return (earth.vertical * up).ravel(), by_attitude
 
 
 # The gyroscopes in the holds of the accelerometers: mean outputs while they, too, were still.
@@ -226,10 +226,10 @@ def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
         check_finite(recording, _COLUMNS)
         left_out = leave_out(recording, _COLUMNS)
         output = output_in(left_out.recording, size)
-        own = np.flatnonzero(holds.recording == number)
-        rest, found, moved = _still_cuts(holds, own, output, recording)
+        members = np.flatnonzero(holds.recording == number)
+        rest, hold_averages, moved = _still_cuts(holds, members, output, recording)
         notes += [f"gyro: {recording.name}: {note}" for note in left_out.notes(rest)] + moved
-        for index, cut in zip(own.tolist(), found, strict=True):
+        for index, cut in zip(members.tolist(), hold_averages, strict=True):
             cuts[index] = cut
     kept = np.array([cut is not None for cut in cuts])
     averages = [cut for cut in cuts if cut is not None]
@@ -252,13 +252,13 @@ def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
 
 
 def _still_cuts(
-    holds: Holds, own: NDArray[np.intp], output: Array, recording: Recording
+    holds: Holds, members: NDArray[np.intp], output: Array, recording: Recording
 ) -> tuple[NDArray[np.bool_], list[Cut | None], list[str]]:
     """Return the samples at rest, the average of each hold of a recording or None where it turned, and what is said."""
     time, temperature = recording.time, recording.si("temperature")
     assert time is not None
-    first = np.searchsorted(time, holds.start[own])
-    last = np.searchsorted(time, holds.stop[own], side="right")
+    first = np.searchsorted(time, holds.start[members])
+    last = np.searchsorted(time, holds.stop[members], side="right")
     rest = np.zeros(len(time), dtype=np.bool_)
     pieces = [slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
     for piece in pieces:
@@ -270,17 +270,17 @@ def _still_cuts(
     spread = [np.median(np.abs(output[piece] - m), axis=0) for piece, m in zip(pieces, median, strict=True)]
     steps = [np.diff(np.unique(column)) for column in output[rest].T]
     sigma = np.maximum(MAD_TO_SIGMA * np.median(spread, axis=0), [step.min() for step in steps])
-    found: list[Cut | None] = []
+    cuts: list[Cut | None] = []
     notes = []
-    for index, piece, m in zip(own.tolist(), pieces, median, strict=True):
+    for index, piece, m in zip(members.tolist(), pieces, median, strict=True):
         still = (np.abs(output[piece] - m) <= STILL_SIGMAS * sigma).all(axis=1)
         if still.sum() < max(QUIET_SHARE * len(still), _FEWEST):
             notes.append(f"gyro: {holds.label(index)} left out: the gyroscopes turn, which accelerometers do not see")
-            found.append(None)
+            cuts.append(None)
             continue
         kept = np.flatnonzero(still) + piece.start
-        found.append(averaged(output[kept], temperature[kept], time[kept], 0, len(kept), index))
-    return rest, found, notes
+        cuts.append(averaged(output[kept], temperature[kept], time[kept], 0, len(kept), index))
+    return rest, cuts, notes
 
 
 # The gyroscopes over temperature: the bias from all holds at rest, linear, with the accelerometers' nuisances.
@@ -369,20 +369,20 @@ def fit_gyroscopes(
     laws = Laws(low, high, (degree, 0, 0))
     held, aside = without_turns(held, laws)
     cluster = clusters_of(held.temperature)
-    found = _Search(held, cluster, tau).chosen(laws, auto=wanted == "auto", spline=spline)
-    solution = found.solution
+    choice = _Search(held, cluster, tau).chosen(laws, auto=wanted == "auto", spline=spline)
+    solution = choice.solution
     if solution.scatter.bound:
         tau = float(solution.scatter.tau[0])
-    drift = _drift(held, solution, found.sensitivity, tau)
+    drift = _drift(held, solution, choice.sensitivity, tau)
     if drift.free:
-        solution = solve(held, solution.laws, tau, sensitivity=found.sensitivity, free=drift.free) or solution
-        if found.solution.scatter.bound:
-            solution = replace(solution, scatter=found.solution.scatter)
+        solution = solve(held, solution.laws, tau, sensitivity=choice.sensitivity, free=drift.free) or solution
+        if choice.solution.scatter.bound:
+            solution = replace(solution, scatter=choice.solution.scatter)
     places = [
         replace(e, temperature=float(held.temperature[cluster == e.temperature].mean()), holds=e.holds // 3)
         for e in _left_out(solution, cluster)
     ]
-    return ThermalGyroscopes(held, solution, found.sensitivity, found.probability, tuple(places), aside, drift)
+    return ThermalGyroscopes(held, solution, choice.sensitivity, choice.probability, tuple(places), aside, drift)
 
 
 @dataclass(frozen=True)
@@ -408,28 +408,28 @@ class _Search:
         bent = replace(laws, degrees=(DEGREES[0], 0, 0), knots=knots)
         if spline:
             return self._bounded(_solved(self.held, bent, self.tau))
-        found = _solved(self.held, laws, self.tau)
-        while auto and found.solution.laws.degrees[0]:
-            lower = _lower(found.solution, self.cluster)
+        straight = _solved(self.held, laws, self.tau)
+        while auto and straight.solution.laws.degrees[0]:
+            lower = _lower(straight.solution, self.cluster)
             if lower is None:
                 break
-            found = _solved(self.held, lower, self.tau)
+            straight = _solved(self.held, lower, self.tau)
         if not auto or len(knots) < LEAST_KNOTS:
-            return found
+            return straight
         try:
             by_knots = _solved(self.held, bent, self.tau)
         except ObservabilityError:
-            return found  # the holds do not tell so many values of the bias
-        errors = (_left_out(each.solution, self.cluster) for each in (by_knots, found))
-        return self._bounded(by_knots) if bends(by_knots.solution, self.tau) and predicts(*errors) else found
+            return straight  # the holds do not tell so many values of the bias
+        errors = (_left_out(each.solution, self.cluster) for each in (by_knots, straight))
+        return self._bounded(by_knots) if bends(by_knots.solution, self.tau) and predicts(*errors) else straight
 
-    def _bounded(self, found: _Solved) -> _Solved:
+    def _bounded(self, solved_laws: _Solved) -> _Solved:
         def solved(laws: Laws, tau: float | None) -> ThermalSolution:
-            solution = solve(self.held, laws, tau, sensitivity=found.sensitivity)
+            solution = solve(self.held, laws, tau, sensitivity=solved_laws.sensitivity)
             assert solution is not None
             return solution
 
-        return replace(found, solution=bounded(found.solution, self.tau, solved))
+        return replace(solved_laws, solution=bounded(solved_laws.solution, self.tau, solved))
 
 
 def _left_out(solution: ThermalSolution, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
@@ -452,9 +452,9 @@ def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> _Solved:
 
 def _lower(solution: ThermalSolution, cluster: NDArray[np.int64]) -> Laws | None:
     """Return laws of a degree less, or None where that step may not be taken."""
-    given = splits(solution, cluster)
-    before = rms_of(left_out(given, np.ones(len(solution.coefficients), dtype=np.bool_)))
-    step = step_down(solution, 0, given)
+    parts = splits(solution, cluster)
+    before = rms_of(left_out(parts, np.ones(len(solution.coefficients), dtype=np.bool_)))
+    step = step_down(solution, 0, parts)
     return replace(solution.laws, degrees=step.degrees) if may_be_taken(step, before) else None
 
 
@@ -533,8 +533,8 @@ def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int,
 
 def _by_axis(number: NDArray[np.int64]) -> Array:
     """Return a column for each axis of each number, shape (3 n, 3 k)."""
-    found: Array = np.asarray(np.kron(one_hot(number), np.eye(3)), dtype=np.float64)
-    return found
+    columns: Array = np.asarray(np.kron(one_hot(number), np.eye(3)), dtype=np.float64)
+    return columns
 
 
 def _spread(number: NDArray[np.int64]) -> Array:
@@ -554,15 +554,17 @@ def without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[n
     weight: Array = np.ones(n)
     for _ in range(_PASSES):
         root = np.repeat(np.sqrt(weight), 3)
-        found = np.linalg.lstsq(columns * root[:, None], held.mean.ravel() * root, rcond=1e-9)[0]
-        left = (held.mean.ravel() - columns @ found).reshape(n, 3)
+        coefficients = np.linalg.lstsq(columns * root[:, None], held.mean.ravel() * root, rcond=1e-9)[0]
+        left = (held.mean.ravel() - columns @ coefficients).reshape(n, 3)
         sigma = MAD_TO_SIGMA * float(np.median(np.abs(left))) + 1e-12
         far = np.abs(left).max(axis=1) / sigma
         weight = 1 / (1 + (far / 2) ** 2)
     many = np.bincount(held.recording)[held.recording] >= _TELL
-    own = np.sqrt(np.einsum("nii->ni", held.covariance)).max(axis=1)
+    noise = np.sqrt(np.einsum("nii->ni", held.covariance)).max(axis=1)
     out = (
-        (far > TURNED_IN_HOLD.limit) & many & (np.abs(left).max(axis=1) > np.maximum(TURNED_IN_HOLD.limit * own, EARTH))
+        (far > TURNED_IN_HOLD.limit)
+        & many
+        & (np.abs(left).max(axis=1) > np.maximum(TURNED_IN_HOLD.limit * noise, EARTH))
     )
     return held.part(~out), held.index[out]
 
@@ -630,8 +632,8 @@ class ScaleLaws:
     def scale_at(self, temperature: Array) -> Array:
         """Return the scale factors, shape (n, 3)."""
         rows = self.coefficients[:-6].reshape(3, -1)
-        found: Array = self.functions(temperature) @ rows.T
-        return found
+        scale: Array = self.functions(temperature) @ rows.T
+        return scale
 
 
 def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
@@ -644,7 +646,7 @@ def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
     """
     if parse_unit(unit).quantity == "rate":
         return np.ones(3)
-    found, why = [], "no recording has nine attitudes"
+    scales, why = [], "no recording has nine attitudes"
     for number, attitudes in enumerate(holds.attitudes):
         if not _turns(attitudes):
             continue
@@ -653,13 +655,13 @@ def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
         except SegmentError as error:
             why = str(error)
             continue
-        found.append(solved.scale * (1 + solved.theta[:3]))
-    if not found:
+        scales.append(solved.scale * (1 + solved.theta[:3]))
+    if not scales:
         raise DataError(
             f"{holds.recordings[0].name}: columns gyro_x gyro_y gyro_z are in {unit}, of which turns between attitudes "
             f"tell the scale; expected a tumble of {TURNED} attitudes or more: {why}"
         )
-    return np.asarray(np.mean(found, axis=0), dtype=np.float64)
+    return np.asarray(np.mean(scales, axis=0), dtype=np.float64)
 
 
 def _turns(attitudes: Attitudes) -> bool:
@@ -691,7 +693,7 @@ def scale_from_turns(
     reading
         Output of the accelerometers per unit of `problem`, shape (3,).
     """
-    found: list[Turned] = []
+    turned: list[Turned] = []
     notes: list[str] = []
     for number, attitudes in enumerate(holds.attitudes):
         if not _turns(attitudes):
@@ -708,10 +710,10 @@ def scale_from_turns(
             notes.append(Note(f"gyro: {case.name}: its turns do not tell scale factors and misalignment apart"))
             continue
         temperature = _temperature(holds, number, attitudes)
-        found.append(
+        turned.append(
             _turned(solved, _directions(problem, solution, attitudes, reading, temperature), temperature, freedom)
         )
-    if not found:
+    if not turned:
         return None
     known = block_diagonal(
         solution.covariance[: solution.laws.size, : solution.laws.size],
@@ -719,14 +721,14 @@ def scale_from_turns(
         if gyros.sensitivity
         else np.zeros((9, 9)),
     )
-    return _laws(found, known, solution.laws, notes)
+    return _laws(turned, known, solution.laws, notes)
 
 
 def _turned(solved: Solved, directions: tuple[Array, Array], temperature: Array, freedom: int) -> Turned:
     """Return what the turns of one recording say; `directions` as of `_directions`."""
-    own, moved = directions
+    across, moved = directions
     segments, jacobian = solved.segments, solved.jacobian
-    shared = shared_covariance(segments, solved.scale, solved.theta, own, solved.rest.zero_uncertainty)
+    shared = shared_covariance(segments, solved.scale, solved.theta, across, solved.rest.zero_uncertainty)
     size = np.concatenate([solved.scale, np.ones(6)])
     values = solved.theta * size
     values[:3] += solved.scale
@@ -752,32 +754,32 @@ def _by_sensitivity(solved: Solved) -> Array:
     return np.asarray(felt.reshape(3 * m, 9), dtype=np.float64)
 
 
-def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> ScaleLaws:
+def _laws(turned: list[Turned], known: Array, over: Laws, notes: list[str]) -> ScaleLaws:
     """Return the polynomials through what each recording says; `known` is the covariance of what all share."""
-    temperature = np.array([each.temperature for each in found])
+    temperature = np.array([each.temperature for each in turned])
     degree = 1 if clusters_of(temperature).max() + 1 >= FOLLOWED else 0
     laws = Laws(over.low, over.high, (0, degree, 0))
     functions = np.polynomial.chebyshev.chebvander(laws.place(temperature), degree)
-    size, n = 3 * (degree + 1), len(found)
+    size, n = 3 * (degree + 1), len(turned)
     design = np.zeros((n, 9, size + 6))
     design[:, :3, :size] = np.einsum("ij,nk->nijk", np.eye(3), functions).reshape(n, 3, size)
     design[:, 3:, size:] = np.eye(6)
     rows: Array = design.reshape(9 * n, size + 6)
-    values = np.concatenate([each.values for each in found])
-    by_coefficients = np.vstack([each.by_shared for each in found])
+    values = np.concatenate([each.values for each in turned])
+    by_coefficients = np.vstack([each.by_shared for each in turned])
     whole = by_coefficients @ known @ by_coefficients.T
-    for k, each in enumerate(found):
-        own = slice(9 * k, 9 * k + 9)
-        whole[own, own] += each.covariance
+    for k, each in enumerate(turned):
+        block = slice(9 * k, 9 * k + 9)
+        whole[block, block] += each.covariance
     weight = np.linalg.inv(whole)
     matrix = np.linalg.inv(rows.T @ weight @ rows)
     coefficients = matrix @ (rows.T @ weight @ values)
     left = values - rows @ coefficients
     square = float(left @ weight @ left)
-    freedom = 9 * len(found) - len(coefficients)
+    freedom = 9 * len(turned) - len(coefficients)
     if freedom and chi_square_probability(square, freedom) < SCALE_LAW_SCATTERS.level:
         notes.append(
-            f"gyro: the scale factors of {len(found)} recordings differ by more than their uncertainties explain "
+            f"gyro: the scale factors of {len(turned)} recordings differ by more than their uncertainties explain "
             f"(chi-square {square:.0f} of {freedom}), which are widened: turn at more temperatures, and further"
         )
         matrix = matrix * square / freedom
@@ -791,8 +793,8 @@ def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> Sc
         notes.append(
             Bad(f"gyro: the scale factors are off by {off} % (x y z): is the unit, or the sample rate, wrong?")
         )
-    turns = sum(each.turns for each in found)
-    miss = float(np.sqrt(sum(each.cost for each in found) / turns))
+    turns = sum(each.turns for each in turned)
+    miss = float(np.sqrt(sum(each.cost for each in turned) / turns))
     if np.degrees(miss) > _LARGE_MISS or np.abs(coefficients[size:]).max() > _ASKEW:
         notes.append(
             Bad(
@@ -800,7 +802,7 @@ def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> Sc
                 f"askew by up to {1e3 * np.abs(coefficients[size:]).max():.0f} mrad: swapped or reversed axes?"
             )
         )
-    return ScaleLaws(laws, coefficients, matrix, len(found), turns, miss, square, freedom, tuple(notes))
+    return ScaleLaws(laws, coefficients, matrix, len(turned), turns, miss, square, freedom, tuple(notes))
 
 
 def _constant(temperature: float, over: Laws, stated: float) -> list[str]:
@@ -823,8 +825,8 @@ def _temperature(holds: Holds, number: int, attitudes: Attitudes) -> Array:
     time, temperature = recording.si("time"), recording.si("temperature")
     total = np.concatenate([[0.0], np.cumsum(temperature)])
     first, last = np.searchsorted(time, attitudes.start), np.searchsorted(time, attitudes.stop, side="right")
-    found: Array = (total[last] - total[first]) / (last - first)
-    return found
+    means: Array = (total[last] - total[first]) / (last - first)
+    return means
 
 
 def _case(
@@ -836,16 +838,16 @@ def _case(
     time, temperature = recording.si("time"), recording.si("temperature")
     unit_of = DeviceUnit.of(tables_of(record)[0])
     force = np.column_stack(unit_of.thermal(_temperature(holds, number, attitudes), list(attitudes.mean.T))[0])
-    own = np.column_stack(unit_of.thermal(temperature, list(recording.triad("accel").T))[0])
+    force_at_samples = np.column_stack(unit_of.thermal(temperature, list(recording.triad("accel").T))[0])
     output = output_in(kept, size)
     if gyros is not None:
         clipped = beyond_range(output)
         output = output - gyros.at_rest(temperature)
         if gyros.sensitivity:
-            output = output - own @ gyros.sensitivities(record.model["gravity"]["value"]).T
+            output = output - force_at_samples @ gyros.sensitivities(record.model["gravity"]["value"]).T
         output[clipped] = 2 * np.abs(output).max()  # what was cut off stays so, and is left out with its turn
     knocked: NDArray[np.bool_] = np.zeros(len(attitudes), dtype=np.bool_)
-    case = Case(recording.name, attitudes, force, time, own, output, unit, fit_bias=False, knocked=knocked)
+    case = Case(recording.name, attitudes, force, time, force_at_samples, output, unit, fit_bias=False, knocked=knocked)
     return case, time
 
 
@@ -865,13 +867,13 @@ def _directions(
     joint = (offset @ offset.T).reshape(n, 3, n, 3)
     if attitudes.covariance is not None:
         sensed = -change[:, :, :3] / parameters[:, None, 3:6]
-        own = np.einsum("nij,njk,nlk->nil", sensed, attitudes.covariance / np.outer(reading, reading), sensed)
-        joint[range(n), :, range(n), :] += own + solution.excess**2 * np.eye(3)
+        noise = np.einsum("nij,njk,nlk->nil", sensed, attitudes.covariance / np.outer(reading, reading), sensed)
+        joint[range(n), :, range(n), :] += noise + solution.excess**2 * np.eye(3)
     length = np.linalg.norm(force, axis=1)
     up = force / length[:, None]
     across = (np.eye(3) - up[:, :, None] * up[:, None, :]) / length[:, None, None]
-    found: Array = np.einsum("nij,njmk,mlk->niml", across, joint, across, optimize=True).reshape(3 * n, 3 * n)
-    return found, (across @ moved).reshape(3 * n, size)
+    covariance: Array = np.einsum("nij,njmk,mlk->niml", across, joint, across, optimize=True).reshape(3 * n, 3 * n)
+    return covariance, (across @ moved).reshape(3 * n, size)
 
 
 def rescaled(gyros: ThermalGyroscopes, scale: ScaleLaws) -> ThermalGyroscopes:

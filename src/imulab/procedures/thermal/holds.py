@@ -201,21 +201,21 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
     owner: list[int] = []
     steps: list[float] = []
     attitudes: list[Attitudes] = []
-    for number, given in enumerate(recordings):
-        temperature = given.si("temperature")
-        found = find_attitudes(given)
-        if found.trace is None:
-            own = _of_rows(found, temperature)
+    for number, item in enumerate(recordings):
+        temperature = item.si("temperature")
+        at_rest = find_attitudes(item)
+        if at_rest.trace is None:
+            stretches = _of_rows(at_rest, temperature)
         else:
             columns = triad("accel")
-            read = leave_out(given, columns).recording
+            read = leave_out(item, columns).recording
             outputs = np.column_stack([read.column(name) for name in columns])
-            found = _at_rest(found, outputs)
-            own = _of_time(found, outputs, temperature)
-        attitudes.append(found)
-        cuts += own
-        owner += [number] * len(own)
-        steps += [_step(temperature)] * len(own)
+            at_rest = _at_rest(at_rest, outputs)
+            stretches = _of_time(at_rest, outputs, temperature)
+        attitudes.append(at_rest)
+        cuts += stretches
+        owner += [number] * len(stretches)
+        steps += [_step(temperature)] * len(stretches)
     recording = np.array(owner)
     attitude = np.array([cut.attitude for cut in cuts])
     group, shared = np.full(len(cuts), -1), np.ones(len(cuts), dtype=np.bool_)
@@ -225,7 +225,7 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
             if len(members) > 1:
                 group[members] = group.max() + 1
                 shared[members] = False
-    wander, said = _wander(cuts, group, [recordings[number].name for number in owner])
+    wander, drift_notes = _wander(cuts, group, [recordings[number].name for number in owner])
     return Holds(
         mean=np.array([cut.mean for cut in cuts]),
         covariance=pooled(cuts),
@@ -243,11 +243,11 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
         wander=wander,
         notes=(
             *(
-                (Note if isinstance(note, Note) else str)(f"{found.recording.name}: {note}")
-                for found in attitudes
-                for note in found.notes
+                (Note if isinstance(note, Note) else str)(f"{at_rest.recording.name}: {note}")
+                for at_rest in attitudes
+                for note in at_rest.notes
             ),
-            *said,
+            *drift_notes,
         ),
     )
 
@@ -257,10 +257,13 @@ def _wander(cuts: Sequence[Cut], group: NDArray[np.int64], names: Sequence[str])
     covariance, notes = np.zeros((len(cuts), len(cuts))), []
     for number in range(int(group.max(initial=-1)) + 1):
         members = np.flatnonzero(group == number)
-        own = [cuts[k] for k in members.tolist()]
-        mean, time = np.array([cut.mean for cut in own]), np.array([(cut.start + cut.stop) / 2 for cut in own])
+        members_cuts = [cuts[k] for k in members.tolist()]
+        mean, time = (
+            np.array([cut.mean for cut in members_cuts]),
+            np.array([(cut.start + cut.stop) / 2 for cut in members_cuts]),
+        )
         direction = mean / np.linalg.norm(mean, axis=1).mean()
-        density = wandering(direction, np.array([cut.temperature for cut in own]), time)
+        density = wandering(direction, np.array([cut.temperature for cut in members_cuts]), time)
         if not density:
             continue
         begun = time - time[0]
@@ -274,46 +277,48 @@ def _wander(cuts: Sequence[Cut], group: NDArray[np.int64], names: Sequence[str])
     return covariance, notes
 
 
-def _at_rest(found: Attitudes, outputs: Array) -> Attitudes:
+def _at_rest(attitudes: Attitudes, outputs: Array) -> Attitudes:
     """Return one hold where the unit rests throughout: drift must not cut it, nor do knocks, which are left out."""
-    time = found.recording.time
+    time = attitudes.recording.time
     assert time is not None
     edges = stretches_at_rest(outputs, time)
     if edges is None:
-        return found
-    notes = found.notes
+        return attitudes
+    notes = attitudes.notes
     if len(edges) > 1:
         first, lost = time[edges[0, 1]], 100 * (1 - np.diff(edges).sum() / len(time))
-        said = f"knocked while it rested, {len(edges) - 1} times, first at {first:.0f} s: {lost:.2g} % of its samples"
-        notes = (*notes, f"{said} left out")
-    return replace(found, pieces=np.column_stack([edges, np.zeros(len(edges), dtype=np.int64)]), notes=notes)
+        sentence = (
+            f"knocked while it rested, {len(edges) - 1} times, first at {first:.0f} s: {lost:.2g} % of its samples"
+        )
+        notes = (*notes, f"{sentence} left out")
+    return replace(attitudes, pieces=np.column_stack([edges, np.zeros(len(edges), dtype=np.int64)]), notes=notes)
 
 
-def _of_rows(found: Attitudes, temperature: Array) -> list[Cut]:
+def _of_rows(rests: Attitudes, temperature: Array) -> list[Cut]:
     """Rows of a table of attitudes, whose noise its columns std_* state."""
-    if found.covariance is None:
+    if rests.covariance is None:
         raise DataError(
-            f"{found.recording.name}: a table of attitudes without columns std_accel_x, std_accel_y and std_accel_z; "
+            f"{rests.recording.name}: a table of attitudes without columns std_accel_x, std_accel_y and std_accel_z; "
             "expected them, or a recording with a column time, since attitudes at several temperatures are weighed"
         )
     return [
-        Cut(found.mean[k], found.covariance[k], np.inf, float(temperature[k]), 0.0, float(k), float(k), k)
-        for k in range(len(found))
+        Cut(rests.mean[k], rests.covariance[k], np.inf, float(temperature[k]), 0.0, float(k), float(k), k)
+        for k in range(len(rests))
     ]
 
 
-def _of_time(found: Attitudes, outputs: Array, temperature: Array) -> list[Cut]:
+def _of_time(attitudes: Attitudes, outputs: Array, temperature: Array) -> list[Cut]:
     """Stretches of each attitude, what interrupted it left out, in which the temperature moves by 1 K at most."""
-    whole = found.recording.time
+    whole = attitudes.recording.time
     assert whole is not None
-    assert found.pieces is not None
+    assert attitudes.pieces is not None
     cuts = []
-    for attitude in np.unique(found.pieces[:, 2]).tolist():
-        own = np.concatenate([np.arange(a, b) for a, b, number in found.pieces.tolist() if number == attitude])
-        time, read, output = whole[own], temperature[own], outputs[own]
+    for attitude in np.unique(attitudes.pieces[:, 2]).tolist():
+        samples = np.concatenate([np.arange(a, b) for a, b, number in attitudes.pieces.tolist() if number == attitude])
+        time, read, output = whole[samples], temperature[samples], outputs[samples]
         drift = abs(np.polyfit(time, read, 1)[0]) * (time[-1] - time[0])
-        count = int(max(1, min(np.ceil(drift / _CUT), len(own) // _FEWEST)))
-        edges = np.linspace(0, len(own), count + 1).astype(np.int64)
+        count = int(max(1, min(np.ceil(drift / _CUT), len(samples) // _FEWEST)))
+        edges = np.linspace(0, len(samples), count + 1).astype(np.int64)
         cuts += [averaged(output, read, time, a, b, attitude) for a, b in pairwise(edges.tolist())]
     return cuts
 
@@ -348,8 +353,8 @@ def pooled(cuts: Sequence[Cut]) -> Array:
     usual = level <= 3 * np.median(level)
     common = np.einsum("n,nij->ij", freedom[usual], density[usual]) / freedom[usual].sum()
     common += 1e-3 * np.trace(common) * np.eye(3)
-    own = freedom[:, None, None]
-    shrunk: Array = (own * density + POOL_DEGREES * common) / (own + POOL_DEGREES)
+    weights = freedom[:, None, None]
+    shrunk: Array = (weights * density + POOL_DEGREES * common) / (weights + POOL_DEGREES)
     shrunk /= length[:, None, None]
     return shrunk
 
@@ -370,13 +375,13 @@ def sides(holds: Holds) -> Array:
     DataError
         A head says something else.
     """
-    found = []
+    signs = []
     for recording in holds.recordings:
-        said = recording.metadata.get("reached_by", "").strip()
-        if said not in ("", *_SIDES):
-            raise DataError(f"{recording.name}: reached_by {said!r} in the head: expected warming or cooling")
-        found.append(_SIDES.get(said, 0.0))
-    which: Array = np.array(found)[holds.recording]
+        word = recording.metadata.get("reached_by", "").strip()
+        if word not in ("", *_SIDES):
+            raise DataError(f"{recording.name}: reached_by {word!r} in the head: expected warming or cooling")
+        signs.append(_SIDES.get(word, 0.0))
+    which: Array = np.array(signs)[holds.recording]
     return which
 
 
@@ -408,20 +413,24 @@ def prepared(
     OptionError
         The settling time is less than 0.
     """
-    given = [_with_temperature(recording, column) for recording in recordings]
-    _check_together(given)
-    for recording in given:
+    with_temperature = [_with_temperature(recording, column) for recording in recordings]
+    _check_together(with_temperature)
+    for recording in with_temperature:
         _check_temperature(recording)
-    given = _with_constant_named(given)
-    low = min(float(recording.si("temperature").min()) for recording in given)
-    high = max(float(recording.si("temperature").max()) for recording in given)
+    with_temperature = _with_constant_named(with_temperature)
+    low = min(float(recording.si("temperature").min()) for recording in with_temperature)
+    high = max(float(recording.si("temperature").max()) for recording in with_temperature)
     if high - low < span:
-        where = given[0].name if len(given) == 1 else f"{given[0].name} and {len(given) - 1} more"
+        where = (
+            with_temperature[0].name
+            if len(with_temperature) == 1
+            else f"{with_temperature[0].name} and {len(with_temperature) - 1} more"
+        )
         raise DataError(
             f"{where}: column temperature: spans {high - low:.1f} K ({low:.1f} to {high:.1f} degC); expected at least "
             f"{span:g} K: imulab tumble fit calibrates at one temperature"
         )
-    return [_settled(recording, settle) for recording in given]
+    return [_settled(recording, settle) for recording in with_temperature]
 
 
 def _with_temperature(recording: Recording, column: str | None) -> Recording:
@@ -461,7 +470,7 @@ def _check_together(recordings: Sequence[Recording]) -> None:
     first = recordings[0]
     if apart := different_units(*((r.name, r.metadata) for r in recordings), keys=("serial", "element")):
         raise DataError(f"{apart}; expected recordings of one unit")
-    seen: list[tuple[str, NDArray[np.uint64]]] = []
+    earlier: list[tuple[str, NDArray[np.uint64]]] = []
     for recording in recordings:
         unit, other = first.triad_unit("accel"), recording.triad_unit("accel")
         if unit != other:
@@ -469,35 +478,35 @@ def _check_together(recordings: Sequence[Recording]) -> None:
                 f"{recording.name}: columns accel_x accel_y accel_z are in {other}, but in {unit} in {first.name}; "
                 "expected one unit"
             )
-        own = np.sort(_marks(recording))
-        for before, marks in seen:
-            if np.array_equal(own, marks):
+        row_marks = np.sort(_marks(recording))
+        for before, marks in earlier:
+            if np.array_equal(row_marks, marks):
                 raise DataError(f"{recording.name}: the same recording as {before}, which would count twice")
-            shared = _share(own, marks)
-            if shared > _SHARED and min(len(np.unique(each)) / len(each) for each in (own, marks)) > _DISTINCT:
+            shared = _share(row_marks, marks)
+            if shared > _SHARED and min(len(np.unique(each)) / len(each) for each in (row_marks, marks)) > _DISTINCT:
                 raise DataError(
                     f"{recording.name}: {100 * shared:.0f} % of its rows are in {before}, too, and would count twice; "
                     "expected recordings of their own"
                 )
-        seen.append((recording.name, own))
+        earlier.append((recording.name, row_marks))
 
 
-def _share(own: NDArray[np.uint64], other: NDArray[np.uint64]) -> float:
+def _share(marks: NDArray[np.uint64], other: NDArray[np.uint64]) -> float:
     """Return the share of rows that are in another recording, from a few thousand of them, both in order."""
-    if not (len(own) and len(other)):
+    if not (len(marks) and len(other)):
         return 0.0
-    few = own[:: max(1, len(own) // 4000)]
+    few = marks[:: max(1, len(marks) // 4000)]
     return float((other[np.searchsorted(other, few).clip(max=len(other) - 1)] == few).mean())
 
 
 def _marks(recording: Recording) -> NDArray[np.uint64]:
     """Return a number for each row of outputs, shape (n,), the same for the same row alone."""
-    found = np.zeros(len(recording), dtype=np.uint64)
+    hashes = np.zeros(len(recording), dtype=np.uint64)
     for name in triad("accel"):
         bits = np.ascontiguousarray(recording.column(name), dtype=np.float64).view(np.uint64)
-        found = (found ^ bits ^ (bits >> np.uint64(29))) * _MIX
-        found ^= found >> np.uint64(32)
-    return found
+        hashes = (hashes ^ bits ^ (bits >> np.uint64(29))) * _MIX
+        hashes ^= hashes >> np.uint64(32)
+    return hashes
 
 
 def _check_temperature(recording: Recording) -> None:

@@ -103,8 +103,8 @@ class Laws:
 
     def cardinal(self, temperature: Array, derivative: int = 0) -> Array:
         """Return the splines that are 1 at one knot and 0 at all others, or a derivative of them, shape (n, knots)."""
-        found: Array = cardinal_spline(self.knots)(np.clip(temperature, self.low, self.high), derivative)
-        return found
+        splines: Array = cardinal_spline(self.knots)(np.clip(temperature, self.low, self.high), derivative)
+        return splines
 
     def _spread(self, functions: Array, of_bias: Array) -> Array:
         design = np.zeros((len(functions), 9, self.size))
@@ -114,11 +114,11 @@ class Laws:
 
     def constant(self, parameters: Array) -> Array:
         """Return the coefficients of laws that keep these nine parameters at every temperature."""
-        found = np.zeros(self.size)
+        coefficients = np.zeros(self.size)
         for law, part in enumerate(self.parts):
             of_spline = law < 3 and self.knots
-            found[part if of_spline else part.start] = parameters[law]
-        return found
+            coefficients[part if of_spline else part.start] = parameters[law]
+        return coefficients
 
     def to_powers(self) -> Array:
         """Return the matrix from the fit's coefficients to a record's, shape (size, size).
@@ -146,8 +146,8 @@ class Laws:
         if group == 0 and self.knots:
             return self.cardinal(temperature)
         offset = np.clip(temperature, self.low, self.high) - about
-        found: Array = offset[:, None] ** np.arange(self.degrees[group] + 1)
-        return found
+        functions: Array = offset[:, None] ** np.arange(self.degrees[group] + 1)
+        return functions
 
     @property
     def edges(self) -> Array:
@@ -160,13 +160,13 @@ class Laws:
         `about` is the record's reference temperature, degC.
         """
         edges, of_spline = self.edges.tolist(), bool(group == 0 and self.knots)
-        found = np.zeros((len(edges) - 1, self.degrees[group] + 1))
+        pieces = np.zeros((len(edges) - 1, self.degrees[group] + 1))
         for piece, (start, stop) in enumerate(pairwise(edges)):
             middle, half = 0.5 * (start + stop), 0.5 * (stop - start)
             cubic = cardinal_spline(self.knots).c[::-1, piece] @ coefficients if of_spline else coefficients
             law = Polynomial(cubic)(Polynomial([middle - (start if of_spline else about), half])).coef
-            found[piece, : len(law)] = law
-        return found
+            pieces[piece, : len(law)] = law
+        return pieces
 
     def names(self) -> list[str]:
         """Return the names of the coefficients in a record: ``bias_x``, ``bias_x_t1`` (per K), ``bias_x_t2`` ...
@@ -186,14 +186,14 @@ class Laws:
     def spoken(self) -> list[str]:
         """Return what messages call the coefficients."""
         changes = ("", "change of {} with temperature", "curvature of {} with temperature")
-        found = []
+        words = []
         for group, (kind, axes) in enumerate(GROUPS):
             for name in (f"{kind}_{axis}" for axis in axes):
                 if group == 0 and self.knots:
-                    found += [f"{name} at {knot:.0f} degC" for knot in self.knots]
+                    words += [f"{name} at {knot:.0f} degC" for knot in self.knots]
                 else:
-                    found += [name, *(changes[min(k, 2)].format(name) for k in range(1, self.degrees[group] + 1))]
-        return found
+                    words += [name, *(changes[min(k, 2)].format(name) for k in range(1, self.degrees[group] + 1))]
+        return words
 
     def units(self, output: str) -> list[str]:
         """Return the units of the coefficients in a record."""

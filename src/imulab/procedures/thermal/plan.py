@@ -68,15 +68,15 @@ def way(count: int, soaks: int) -> list[int]:
 
     The way back takes inner temperatures first, spread over the range: they are what can be reached from either side.
     """
-    found, last = list(range(min(count, soaks))), count - 1
-    while len(found) < soaks:
-        left = soaks - len(found)
+    order, last = list(range(min(count, soaks))), count - 1
+    while len(order) < soaks:
+        left = soaks - len(order)
         if left > count - 2:
             leg = list(range(1, count))
         else:
             leg = np.round(np.linspace(1, count - 2, left) if left > 1 else [(count - 1) / 2]).astype(int).tolist()
-        found += [last - k if found[-1] == last else k for k in leg]
-    return found
+        order += [last - k if order[-1] == last else k for k in leg]
+    return order
 
 
 @dataclass(frozen=True)
@@ -92,12 +92,12 @@ class Design:
     def carried(self) -> Array:
         """Derivatives of the nine parameters in each soak by coefficients and offsets, shape (K, 9, c + 3 K)."""
         design, count = self.laws.design(self.temperatures), len(self.temperatures)
-        found = np.zeros((count, 9, self.laws.size + 3 * count))
-        found[:, :, : self.laws.size] = design
+        derivatives = np.zeros((count, 9, self.laws.size + 3 * count))
+        derivatives[:, :, : self.laws.size] = design
         for k in range(count):
             at = self.laws.size + 3 * k
-            found[k, :3, at : at + 3] = self.tau * np.eye(3)
-        return found
+            derivatives[k, :3, at : at + 3] = self.tau * np.eye(3)
+        return derivatives
 
     @cached_property
     def places(self) -> Array:
@@ -111,20 +111,20 @@ class Design:
         Over all directions: that of the bias, and a third of those of scale factor and misalignment.
         """
         design = self.laws.design(self.places)
-        found: Array = np.einsum("p,tpa,tpb->tab", SHARES, design, design)
-        return found
+        matrices: Array = np.einsum("p,tpa,tpb->tab", SHARES, design, design)
+        return matrices
 
     @cached_property
     def weight(self) -> Array:
         """Mean of `weights`."""
-        found: Array = self.weights.mean(axis=0)
-        return found
+        mean: Array = self.weights.mean(axis=0)
+        return mean
 
     def covariance(self, sets: Sequence[Array]) -> Array:
         """Covariance of coefficients and offsets with these attitudes, in units of the noise of an attitude squared."""
         information = np.diag(np.append(np.full(self.laws.size, _RIDGE), np.ones(3 * len(self.temperatures))))
-        for own, directions in zip(self.carried, sets, strict=True):
-            rows = gradients(directions) @ own
+        for by_soak, directions in zip(self.carried, sets, strict=True):
+            rows = gradients(directions) @ by_soak
             information += rows.T @ rows / self.variance
         return np.asarray(np.linalg.inv(information), dtype=np.float64)
 

@@ -547,23 +547,23 @@ def _gyro_findings(
 
 def _drifts(gyros: ThermalGyroscopes, name: str) -> list[str]:
     """Return what lag and loop mean for corrected outputs, where they are significant."""
-    drift, found = gyros.drift, []
+    drift, messages = gyros.drift, []
     if drift.values is None or drift.covariance is None:
         return []
     hourly, u = np.degrees(3600 * drift.values[1:]), np.sqrt(np.diag(drift.covariance))
     if 0 in drift.free:
-        found.append(
+        messages.append(
             f"gyro: {name}: biases differ from their laws by those of {drift.values[0]:.3g} s before (u {u[0]:.2g} s); "
             "corrected outputs keep that"
         )
     if 1 in drift.free:
         each = ", ".join(f"{axis} {h:+.3g}" for axis, h in zip(AXES, hourly, strict=True))
-        found.append(
+        messages.append(
             f"gyro: {name}: biases differ between warming and cooling: in the middle of the range they are {each} "
             f"deg/h (u {np.degrees(3600 * u[1:].max()):.2g}) from their laws in warming, and as much the other way in "
             "cooling, which corrected outputs keep"
         )
-    return found
+    return messages
 
 
 def gyro_scale_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
@@ -571,8 +571,8 @@ def gyro_scale_predicted(record: Calibration, temperature: Array) -> tuple[Array
     model = thermal_of(record).model
     laws = model.gyro_laws
     powers = laws.recorded(1, temperature, model.reference_temperature.value)
-    found = [law_at(record, laws.named(1, f"gyro_scale_factor_{axis}"), powers) for axis in AXES]
-    return np.array([values for values, _ in found]), np.array([spread for _, spread in found])
+    by_axis = [law_at(record, laws.named(1, f"gyro_scale_factor_{axis}"), powers) for axis in AXES]
+    return np.array([values for values, _ in by_axis]), np.array([spread for _, spread in by_axis])
 
 
 def gyro_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
@@ -580,5 +580,5 @@ def gyro_predicted(record: Calibration, temperature: Array) -> tuple[Array, Arra
     model = thermal_of(record).model
     laws = model.gyro_laws
     powers = laws.recorded(0, temperature, model.reference_temperature.value)
-    found = [law_at(record, laws.named(0, f"gyro_bias_{axis}"), powers) for axis in AXES]
-    return np.array([values for values, _ in found]), np.array([spread for _, spread in found])
+    by_axis = [law_at(record, laws.named(0, f"gyro_bias_{axis}"), powers) for axis in AXES]
+    return np.array([values for values, _ in by_axis]), np.array([spread for _, spread in by_axis])

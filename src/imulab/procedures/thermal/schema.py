@@ -235,18 +235,18 @@ class ThermalRecord(Part):
 
 def check(record: Calibration) -> None:
     """Check the sections of a record as it is read from its file; raises RecordError."""
-    found = part(record, ThermalRecord)
-    low, high = found.model.range
+    thermal = part(record, ThermalRecord)
+    low, high = thermal.model.range
     if not low < high:
         raise RecordError(f"model.range: expected two temperatures in rising order, found {low:g} and {high:g}")
-    _check_knots(found.model, found.model, "model")
-    if found.model.gyro is not None:
-        _check_knots(found.model, found.model.gyro, "model.gyro")
+    _check_knots(thermal.model, thermal.model, "model")
+    if thermal.model.gyro is not None:
+        _check_knots(thermal.model, thermal.model.gyro, "model.gyro")
 
 
-def _check_knots(model: ThermalModel, own: ThermalModel | ThermalGyroModel, where: str) -> None:
+def _check_knots(model: ThermalModel, triad: ThermalModel | ThermalGyroModel, where: str) -> None:
     """Check the knots of the biases of a triad, if they have any."""
-    (low, high), knots = model.range, own.knots
+    (low, high), knots = model.range, triad.knots
     if knots is None:
         return
     if not (len(knots) > 2 and [low, high] == [knots[0], knots[-1]] and sorted(set(knots)) == knots):
@@ -254,8 +254,8 @@ def _check_knots(model: ThermalModel, own: ThermalModel | ThermalGyroModel, wher
             f"{where}.knots: expected three temperatures or more in rising order, from {low:g} to {high:g}, the ends "
             f"of the range; found {' '.join(f'{knot:g}' for knot in knots)}"
         )
-    if own.degrees.bias != 3:
-        raise RecordError(f"{where}.degrees.bias: expected 3 of a spline, found {own.degrees.bias}")
+    if triad.degrees.bias != 3:
+        raise RecordError(f"{where}.degrees.bias: expected 3 of a spline, found {triad.degrees.bias}")
 
 
 def thermal_of(record: Calibration) -> ThermalRecord:

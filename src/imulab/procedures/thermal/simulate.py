@@ -187,7 +187,7 @@ class ThermalRecordings(Shown, Sequence[Recording]):
 def thermal_truth(temperature: Array, law: str = "cubic", seed: int = 1) -> dict[str, Array]:
     """Return the true parameters of the simulated unit at temperatures, SI, by the names of a record."""
     rng = np.random.default_rng([seed, 0])
-    t, found = temperature - _ZERO, {}
+    t, parameters = temperature - _ZERO, {}
     for kind, sizes in _SIZES.items():
         for axis in _AXES[kind]:
             draws = rng.standard_normal(4) * sizes
@@ -196,8 +196,8 @@ def thermal_truth(temperature: Array, law: str = "cubic", seed: int = 1) -> dict
                 phase = rng.uniform(0, 2 * np.pi)
                 bend = _ROUGH * np.sin(t / 8.0 + phase) * rng.uniform(0.3, 1.0) if law == "rough" else 0.0
                 value = STANDARD_GRAVITY * (value + bend)
-            found[f"{kind}_{axis}"] = value + (1.0 if kind == "scale_factor" else 0.0)
-    return found
+            parameters[f"{kind}_{axis}"] = value + (1.0 if kind == "scale_factor" else 0.0)
+    return parameters
 
 
 def _recording(made: ThermalRecordings, index: int) -> Recording:
@@ -226,8 +226,8 @@ def _recording(made: ThermalRecordings, index: int) -> Recording:
     offset = made.turn_on * rng.standard_normal(3)
     columns = {"time": time}
     for k, axis in enumerate("xyz"):
-        seen = sensed[k] + sensor[f"bias_{axis}"] + offset[k] + made.noise * rng.standard_normal(len(time))
-        columns[f"accel_{axis}"] = sensor[f"scale_factor_{axis}"] * seen
+        sensed_force = sensed[k] + sensor[f"bias_{axis}"] + offset[k] + made.noise * rng.standard_normal(len(time))
+        columns[f"accel_{axis}"] = sensor[f"scale_factor_{axis}"] * sensed_force
     columns["temperature"] = np.round(temperature + _THERMOMETER * rng.standard_normal(len(time)), 2)
     if made.gyro:
         columns |= _gyroscopes(made, index, temperature, turning, force)
@@ -248,7 +248,7 @@ def _gyroscopes(
     rng = np.random.default_rng([made.seed, 2, index])
     truth = thermal_gyro_truth(temperature, made.seed)
     offset = made.gyro_turn_on * rng.standard_normal(3)
-    found = {}
+    columns = {}
     for k, axis in enumerate("xyz"):
         sensed = turning[:, k] + sum(
             truth[f"gyro_misalignment_{axis}{b}"] * turning[:, j] for j, b in enumerate("xyz") if j != k
@@ -256,24 +256,24 @@ def _gyroscopes(
         felt = sum(truth[f"gyro_g_sensitivity_{axis}{b}"] * force[:, j] for j, b in enumerate("xyz"))
         noise = _GYRO_NOISE * rng.standard_normal(len(temperature))
         output = truth[f"gyro_scale_factor_{axis}"] * (sensed + truth[f"gyro_bias_{axis}"] + offset[k] + felt + noise)
-        found[f"gyro_{axis}"] = np.degrees(output)
-    return found
+        columns[f"gyro_{axis}"] = np.degrees(output)
+    return columns
 
 
 def thermal_gyro_truth(temperature: Array, seed: int = 1) -> dict[str, Array]:
     """Return the true parameters of the simulated gyroscopes, SI, by a record's names; scale factors as if in rad/s."""
     rng = np.random.default_rng([seed, 3])
-    t, found = temperature - _ZERO, {}
+    t, parameters = temperature - _ZERO, {}
     for axis in "xyz":
         b, s = rng.standard_normal(4) * _GYRO_BIAS, rng.standard_normal(2) * _GYRO_SCALE
-        found[f"gyro_bias_{axis}"] = np.radians(b[0] + b[1] * t + b[2] * t**2 + b[3] * t**3)
-        found[f"gyro_scale_factor_{axis}"] = 1 + s[0] + s[1] * t
+        parameters[f"gyro_bias_{axis}"] = np.radians(b[0] + b[1] * t + b[2] * t**2 + b[3] * t**3)
+        parameters[f"gyro_scale_factor_{axis}"] = 1 + s[0] + s[1] * t
         for other in "xyz":
             sensitivity = np.radians(_GYRO_G) / STANDARD_GRAVITY * rng.standard_normal()
-            found[f"gyro_g_sensitivity_{axis}{other}"] = np.full(len(t), sensitivity)
+            parameters[f"gyro_g_sensitivity_{axis}{other}"] = np.full(len(t), sensitivity)
             if other != axis:
-                found[f"gyro_misalignment_{axis}{other}"] = np.full(len(t), 0.01 * rng.standard_normal())
-    return found
+                parameters[f"gyro_misalignment_{axis}{other}"] = np.full(len(t), 0.01 * rng.standard_normal())
+    return parameters
 
 
 def _tumble(made: ThermalRecordings, rng: np.random.Generator) -> tuple[Array, Array, Array]:
@@ -291,8 +291,8 @@ def _tumble(made: ThermalRecordings, rng: np.random.Generator) -> tuple[Array, A
         share = np.clip((phase - resting + later * made.rate) / moving, 0.0, 1.0)
         share = (share**2 * (3 - 2 * share))[:, None]
         between = points[number] * (1 - share) + after * share
-        found: Array = between / np.maximum(np.linalg.norm(between, axis=1), 1e-3)[:, None]
-        return found
+        direction: Array = between / np.maximum(np.linalg.norm(between, axis=1), 1e-3)[:, None]
+        return direction
 
     up = upward(0.0)
     # The least turn that moves the upward direction so, as the body sees it: du/dt = u x w.

@@ -95,10 +95,10 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directio
     full = np.einsum("nai,nij,nbj->nab", basis, noise, basis)
     full[:, 1, 1] += problem.tilt**2
     full[:, 2, 2] += problem.tilt**2
-    own = np.where(owner[:, None] == owner, full[owner[:, None], kind[:, None], kind[None, :]], 0.0)
+    row_noise = np.where(owner[:, None] == owner, full[owner[:, None], kind[:, None], kind[None, :]], 0.0)
     if problem.wander is not None and problem.wander.any():
         tipped = np.where((kind[:, None] == kind) & (kind > 0), problem.wander[owner[:, None], owner], 0.0)
-        own = own + tipped
+        row_noise = row_noise + tipped
     jacobian = np.einsum("Ni,Nij,Njc->Nc", pick, change[owner], design[owner])
     turns = np.zeros((len(rows), 2 * len(directions)))
     side = kind > 0
@@ -112,8 +112,14 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directio
     errors = _errors(heat, owner, problem, count)
     by_drift = np.einsum("Nj,Njk->Nk", felt, drift[owner])
     jacobian = np.hstack([jacobian, by_drift[:, list(problem.free)], turns])
-    found = Rows(residual, jacobian, own, (offsets[0], offsets[1]), errors, by_drift, owner.astype(np.int64), ~side)
-    return found if problem.known is None else _with_prior(found, problem.known, laws, coefficients, problem.step.max())
+    linearised = Rows(
+        residual, jacobian, row_noise, (offsets[0], offsets[1]), errors, by_drift, owner.astype(np.int64), ~side
+    )
+    return (
+        linearised
+        if problem.known is None
+        else _with_prior(linearised, problem.known, laws, coefficients, problem.step.max())
+    )
 
 
 def parameters_of(problem: ThermalProblem, laws: Laws, coefficients: Array) -> tuple[Array, Array, Array, Array]:
@@ -122,8 +128,8 @@ def parameters_of(problem: ThermalProblem, laws: Laws, coefficients: Array) -> t
     ``p(T - L dT/dt)`` is taken to first order, which leaves p'' (L dT/dt)^2 / 2: a microgram at 20 s and 1 K/min; the
     loop of a bias is ``h sign(dT/dt) (1 - theta^2)``, none at the ends, where the temperature turns.
     """
-    size, own = laws.size, np.zeros(4)
-    own[list(problem.free)] = coefficients[size:]
+    size, lag_and_loops = laws.size, np.zeros(4)
+    lag_and_loops[list(problem.free)] = coefficients[size:]
     design, slopes = laws.design(problem.temperature), laws.slope(problem.temperature)
     slope = slopes @ coefficients[:size]
     drift = np.zeros((len(slope), 9, 4))
@@ -133,8 +139,8 @@ def parameters_of(problem: ThermalProblem, laws: Laws, coefficients: Array) -> t
         way = np.where(way == 0, problem.side, way)
     turn = way * (1 - laws.place(problem.temperature) ** 2)
     drift[:, range(3), range(1, 4)] = turn[:, None]
-    parameters = design @ coefficients[:size] + drift @ own
-    return parameters, design - own[0] * problem.rate[:, None, None] * slopes, drift, slope
+    parameters = design @ coefficients[:size] + drift @ lag_and_loops
+    return parameters, design - lag_and_loops[0] * problem.rate[:, None, None] * slopes, drift, slope
 
 
 def _frames(unit: Array, directions: Array, group: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -162,9 +168,9 @@ def _errors(heat: Array, owner: NDArray[np.int64], problem: ThermalProblem, coun
 def one_hot(number: NDArray[np.int64]) -> Array:
     """Return a column for each of the numbers (n,), 1 where it stands and 0 elsewhere, shape (n, k)."""
     which, index = np.unique(number, return_inverse=True)
-    found = np.zeros((len(number), len(which)))
-    found[np.arange(len(number)), index] = 1.0
-    return found
+    columns = np.zeros((len(number), len(which)))
+    columns[np.arange(len(number)), index] = 1.0
+    return columns
 
 
 def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coefficients: Array, step: float) -> Rows:
@@ -176,11 +182,11 @@ def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coeff
     noise = np.zeros((n + 9, n + 9))
     noise[:n, :n], noise[n:, n:] = rows.noise, covariance
     offsets = []
-    for k, given in enumerate(rows.offsets):
-        own = np.zeros((n + 9, given.shape[1] + 3))
-        own[:n, :-3] = given
-        own[n + 3 * k : n + 3 * k + 3, -3:] = np.eye(3)
-        offsets.append(own)
+    for k, columns in enumerate(rows.offsets):
+        extended = np.zeros((n + 9, columns.shape[1] + 3))
+        extended[:n, :-3] = columns
+        extended[n + 3 * k : n + 3 * k + 3, -3:] = np.eye(3)
+        offsets.append(extended)
     return Rows(
         np.append(rows.residual, design @ coefficients[: laws.size] - values),
         np.vstack([rows.jacobian, np.hstack([design, np.zeros((9, extra))])]),
@@ -210,8 +216,8 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
     factor = np.linalg.cholesky(together(rows, excess, tau))
 
     def white(columns: Array) -> Array:
-        found: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
-        return found
+        whitened: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
+        return whitened
 
     return white
 
@@ -341,9 +347,9 @@ def _directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Arr
     """Mean direction of each unmoved group at these coefficients."""
     count = int(problem.group.max(initial=-1)) + 1
     force, _ = forces(parameters_of(problem, laws, coefficients)[0], problem.reading)
-    found = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
-    found /= np.linalg.norm(found, axis=1)[:, None]
-    return found
+    directions = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    return directions
 
 
 def _iterate(
@@ -376,21 +382,21 @@ def excess_of(rows: Rows, excess: float) -> tuple[float, float]:
     columns = white(np.hstack([rows.jacobian, rows.offsets[0]]))
     u, values, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
     u = u[:, values > _SEEN * values[0]]
-    given = white(rows.residual)
-    left = given - u @ (u.T @ given)
-    own = np.diag(rows.noise)
+    whitened = white(rows.residual)
+    left = whitened - u @ (u.T @ whitened)
+    noise = np.diag(rows.noise)
     spare = 1 - (u**2).sum(axis=1)
     used = rows.magnitude & (rows.owner >= 0)
-    residual = left[used] * np.sqrt(own[used] + excess)
-    found, freedom = plausible_excess(residual[None], own[used][None], spare[used][None])
-    return float(found[0]), float(freedom[0])
+    residual = left[used] * np.sqrt(noise[used] + excess)
+    variance, freedom = plausible_excess(residual[None], noise[used][None], spare[used][None])
+    return float(variance[0]), float(freedom[0])
 
 
 def between(rows: Rows, excess: float) -> Scatter:
     """Return the scatter of biases between power cycles, and of scale factors where that is significant at 5 %."""
     white = whitener(rows, excess, np.zeros(2))
     residual, laws = white(rows.residual), white(rows.jacobian)
-    bias, scale = (white(given) for given in rows.offsets)
+    bias, scale = (white(columns) for columns in rows.offsets)
     s, force = offset_modes(np.hstack([laws, bias]), scale, residual)
     second, probability = 0.0, None
     if len(s):
@@ -414,8 +420,8 @@ def offset_modes(laws: Array, offsets: Array, residual: Array) -> tuple[Array, A
     u = u[:, values > _SEEN * values[0]]
     beside = offsets - u @ (u.T @ offsets)
     v, s, _ = np.linalg.svd(beside, full_matrices=False)
-    seen = s > _TELLS * np.linalg.norm(offsets, axis=0).max()
-    return s[seen], v[:, seen].T @ (residual - u @ (u.T @ residual))
+    observable = s > _TELLS * np.linalg.norm(offsets, axis=0).max()
+    return s[observable], v[:, observable].T @ (residual - u @ (u.T @ residual))
 
 
 def _moments(s: Array, force: Array) -> float:
@@ -467,21 +473,21 @@ def own_calibrations(problem: ThermalProblem, solution: ThermalSolution) -> list
     used = used[np.argsort(rows.owner[used])]
     residual = rows.residual[used]
     weight = 1 / np.sqrt(np.diag(rows.noise)[used] + solution.excess**2)
-    found = []
+    calibrations = []
     for number in np.unique(problem.recording).tolist():
-        own = (problem.recording == number) & problem.shared
-        if own.sum() < _FEWEST:
+        members = (problem.recording == number) & problem.shared
+        if members.sum() < _FEWEST:
             continue
-        matrix = columns[own] * weight[own, None]
+        matrix = columns[members] * weight[members, None]
         size = np.linalg.norm(matrix, axis=0)
         if np.linalg.cond(matrix / size) > _CONDITION:
             continue
         inverse = np.linalg.pinv(matrix)
-        values = parameters[own].mean(axis=0) - inverse @ (weight[own] * residual[own])
-        by_heat = (slope[own] * problem.step[own, None]).mean(axis=0)
+        values = parameters[members].mean(axis=0) - inverse @ (weight[members] * residual[members])
+        by_heat = (slope[members] * problem.step[members, None]).mean(axis=0)
         u = np.sqrt((inverse**2).sum(axis=1) + by_heat**2)
-        found.append(OwnCalibration(number, float(problem.temperature[own].mean()), values, u))
+        calibrations.append(OwnCalibration(number, float(problem.temperature[members].mean()), values, u))
     if problem.known is not None:
         temperature, values, covariance = problem.known
-        found.append(OwnCalibration(-1, temperature, values, np.sqrt(np.diag(covariance))))
-    return found
+        calibrations.append(OwnCalibration(-1, temperature, values, np.sqrt(np.diag(covariance))))
+    return calibrations

@@ -66,10 +66,10 @@ def threshold(text: str, name: str) -> tuple[float, ...]:
             f"{name} {text!r}: expected three changes, of scale factors, biases and misalignments, such as "
             "5ppm,2ug,3arcsec"
         )
-    found = tuple(quantity(part.strip(), name, *kind) for part, kind in zip(parts, _CHANGES, strict=True))
-    if not all(0 < value < math.inf for value in found):
+    changes = tuple(quantity(part.strip(), name, *kind) for part, kind in zip(parts, _CHANGES, strict=True))
+    if not all(0 < value < math.inf for value in changes):
         raise OptionError(f"{name} {text!r}: expected three finite changes above 0")
-    return found
+    return changes
 
 
 def nonlinearity(text: str, name: str) -> tuple[float, float]:

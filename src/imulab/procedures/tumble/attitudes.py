@@ -405,8 +405,8 @@ def _pooled(covariance: Array, freedom: Array, share: Array) -> Array:
     level = np.trace(scatter, axis1=1, axis2=2)
     usual = level <= 3 * median(level)
     pooled = np.einsum("n,nij->ij", freedom[usual], scatter[usual]) / max(float(freedom[usual].sum()), 1.0)
-    own = freedom[:, None, None]
-    shrunk: Array = (own * scatter + POOL_DEGREES * pooled) / (own + POOL_DEGREES)
+    weight = freedom[:, None, None]
+    shrunk: Array = (weight * scatter + POOL_DEGREES * pooled) / (weight + POOL_DEGREES)
     return shrunk * share[:, None, None]
 
 
@@ -455,13 +455,13 @@ def resolutions(recording: Recording, names: list[str], part: int | None = None)
 
     0 for a channel of one value, but infinite for a part of one.
     """
-    found = np.full(len(names), 0.0 if part is None else np.inf)
+    steps = np.full(len(names), 0.0 if part is None else np.inf)
     for axis, name in enumerate(names):
         samples = recording.column(name)
         values = distinct(samples[:: max(1, len(samples) // 100_000)][:part])
         if len(values) > 1:
-            found[axis] = np.diff(values).min()
-    return found
+            steps[axis] = np.diff(values).min()
+    return steps
 
 
 # A continuous recording to static attitudes.
@@ -567,11 +567,11 @@ def find_attitudes(
     temperature = recording.mean_temperature()
     if "time" not in recording:
         check_clipped_rows(recording, names)
-        found = attitude_table(recording, sensor, names, unit, temperature)
-        return replace(found, notes=(*_corrected_notes(recording), *found.notes))
+        attitudes = attitude_table(recording, sensor, names, unit, temperature)
+        return replace(attitudes, notes=(*_corrected_notes(recording), *attitudes.notes))
     time = check_time(recording)
     left_out = leave_out(recording, names)
-    given, recording = recording, left_out.recording
+    original, recording = recording, left_out.recording
     blocks = _form_blocks(recording, names, time, window)
     width = _window_width(blocks, recording, time, window)
     variance = _window_variance(blocks, width)
@@ -594,7 +594,7 @@ def find_attitudes(
         start=time[stretches[first, 0]],
         stop=time[stretches[np.append(first[1:], len(stretches)) - 1, 1] - 1],
         unit=unit,
-        recording=given,
+        recording=original,
         temperature=temperature,
         trace=trace,
         pieces=stretches,
@@ -701,11 +701,11 @@ def _candidates(variance: Array, quiet: float, blocks: _Blocks, width: int, trim
     before = None
     for limit in (_THRESHOLDS * quiet).tolist():
         count = _segment.stretches(variance, limit, width, trim, fewest, start, stop)
-        found = start[:count].tobytes(), stop[:count].tobytes()
+        edges = start[:count].tobytes(), stop[:count].tobytes()
         candidates.append(
-            candidates[-1] if found == before else _merge(start[:count].copy(), stop[:count].copy(), blocks)
+            candidates[-1] if edges == before else _merge(start[:count].copy(), stop[:count].copy(), blocks)
         )
-        before = found
+        before = edges
     return candidates
 
 
@@ -798,26 +798,26 @@ def as_attitudes(
         for key, value in reading.items():
             if value is not None:
                 raise OptionError(f"{called}: {key} does not go with attitudes, which were found already")
-        found = data
+        attitudes = data
     else:
-        found = find_attitudes(as_recording(data, reading, function))
+        attitudes = find_attitudes(as_recording(data, reading, function))
     if covariance is None:
-        return found
-    if found.covariance is not None:
-        why = "std_* columns state it" if found.trace is None else "the recording itself says how certain they are"
+        return attitudes
+    if attitudes.covariance is not None:
+        why = "std_* columns state it" if attitudes.trace is None else "the recording itself says how certain they are"
         raise OptionError(f"{called}: covariance: {why}; expected means of attitudes without")
-    return replace(found, covariance=_checked(covariance, len(found), called))
+    return replace(attitudes, covariance=_checked(covariance, len(attitudes), called))
 
 
 def _checked(covariance: ArrayLike, count: int, called: str) -> Array:
     """Return covariances of shape (n, 3, 3)."""
     try:
-        given = np.asarray(covariance, dtype=np.float64)
+        values = np.asarray(covariance, dtype=np.float64)
     except (TypeError, ValueError):
         raise DataError(f"{called}: covariance: expected numbers") from None
-    if given.shape not in ((3, 3), (count, 3, 3)):
-        raise DataError(f"{called}: covariance: expected the shape (3, 3) or ({count}, 3, 3), found {given.shape}")
-    matrices = np.array(np.broadcast_to(given, (count, 3, 3)))
+    if values.shape not in ((3, 3), (count, 3, 3)):
+        raise DataError(f"{called}: covariance: expected the shape (3, 3) or ({count}, 3, 3), found {values.shape}")
+    matrices = np.array(np.broadcast_to(values, (count, 3, 3)))
     largest = np.abs(matrices).max(axis=(1, 2), initial=0.0)[:, None, None]
     if not np.isfinite(matrices).all() or (np.abs(matrices - matrices.swapaxes(1, 2)) > _SYMMETRIC * largest).any():
         raise DataError(f"{called}: covariance: expected symmetric matrices of finite numbers")

@@ -420,9 +420,9 @@ def check_tumble(
     norm, jacobian, _, _ = norm_and_jacobian(theta[None], (attitudes.mean / scaling.scale)[None], order)
     covariance, of_noise = _noise(record, attitudes, scaling)
     motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
-    lengthening, own = length_noise(theta[None], jacobian, covariance[None], motion)
-    seen, rows = (norm - 1 - lengthening)[0], jacobian[0]
-    residuals = g * (norm[0] - 1 if motion is None else seen)
+    lengthening, noise_variance = length_noise(theta[None], jacobian, covariance[None], motion)
+    relative_residuals, rows = (norm - 1 - lengthening)[0], jacobian[0]
+    residuals = g * (norm[0] - 1 if motion is None else relative_residuals)
     check_fresh(residuals, g, attitudes.recording.name)
     notes = [*([local.note] if local.note else []), *of_noise]
     if made_from(record, attitudes.recording):
@@ -433,8 +433,8 @@ def check_tumble(
     from imulab.procedures.tumble.prior import scatter as prior_scatter
 
     mag = _mag(record, attitudes, notes)
-    own_variance = np.maximum(own[0] + _excess(record, g), 1e-24)  # data without noise leave rounding
-    more = prior_scatter(rows, seen, own_variance)
+    own_variance = np.maximum(noise_variance[0] + _excess(record, g), 1e-24)  # data without noise leave rounding
+    more = prior_scatter(rows, relative_residuals, own_variance)
     if more > 0:
         notes.append(
             f"the attitudes scatter by {1e6 * np.sqrt(more):.3g} µg beyond their noise, which no change of the record "
@@ -443,10 +443,10 @@ def check_tumble(
     known = known_of(record, scaling, local, attitudes.unit)
     common = 0.0 if known.shared else (local.standard_uncertainty / g) ** 2
     noise = np.diag(own_variance + more) + common
-    value, probability = contradiction(seen, rows, known.covariance, noise)
+    value, probability = contradiction(relative_residuals, rows, known.covariance, noise)
     freedom = _freedom(record)
     if freedom is not None:
-        probability = float(f_tail(value / len(seen), len(seen), freedom))
+        probability = float(f_tail(value / len(relative_residuals), len(relative_residuals), freedom))
     total = g * np.sqrt(np.diag(rows @ known.covariance @ rows.T + noise))
     return Check(residuals, total, value, probability, local, limit, tuple(notes), attitudes, mag)
 
@@ -467,14 +467,14 @@ def _mag(record: Calibration, attitudes: Attitudes, notes: list[str]) -> MagChec
     return None
 
 
-def _gravity(record: Calibration, given: float | str | Gravity | None, attitudes: Attitudes) -> Gravity:
+def _gravity(record: Calibration, requested: float | str | Gravity | None, attitudes: Attitudes) -> Gravity:
     """What was given, else the head's, else that of the record."""
-    if given is None and "gravity" not in attitudes.recording.metadata:
+    if requested is None and "gravity" not in attitudes.recording.metadata:
         stated = model_of(record).gravity
         value, uncertainty = float(stated.value), float(stated.standard_uncertainty or 0.0)
         sentence = f"gravity {value:.6g} m/s^2 was taken from the record, as if measured at the same place"
         return Gravity(value, stated.from_, uncertainty, Note(sentence))
-    return local_gravity(given, attitudes.recording)
+    return local_gravity(requested, attitudes.recording)
 
 
 def _in_unit_of(record: Calibration, attitudes: Attitudes) -> Attitudes:

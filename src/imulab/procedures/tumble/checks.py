@@ -82,11 +82,11 @@ def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
     if unit.quantity != "acceleration":
         return
     lengths = to_si(np.linalg.norm(attitudes.mean, axis=1), unit.symbol)
-    found = median(lengths)
-    if not gravity / 2 <= found <= 2 * gravity:
+    force = median(lengths)
+    if not gravity / 2 <= force <= 2 * gravity:
         raise DataError(
             f"{attitudes.recording.name}: columns accel_x accel_y accel_z: the specific force at rest is about "
-            f"{from_si(found, unit.symbol):.4g} {unit.symbol}, expected {from_si(gravity, unit.symbol):.4g} "
+            f"{from_si(force, unit.symbol):.4g} {unit.symbol}, expected {from_si(gravity, unit.symbol):.4g} "
             f"{unit.symbol}: is the unit wrong?"
         )
     magnitude = lengths / gravity
@@ -145,10 +145,10 @@ def check_fresh(residuals: Array, gravity: float, name: str) -> None:
     DataError
         The magnitudes are nowhere near gravity.
     """
-    found = median(residuals) + gravity
-    if not gravity / 2 <= found <= 2 * gravity:
+    force = median(residuals) + gravity
+    if not gravity / 2 <= force <= 2 * gravity:
         raise DataError(
-            f"{name}: columns accel_x accel_y accel_z: the specific force at rest is about {found:.4g} m/s^2 under the "
+            f"{name}: columns accel_x accel_y accel_z: the specific force at rest is about {force:.4g} m/s^2 under the "
             f"record, expected {gravity:.4g} m/s^2: a wrong unit, or a record of another unit?"
         )
 

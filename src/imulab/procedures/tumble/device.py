@@ -294,7 +294,7 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
     reading = (np.array(held.mean)[kept] / (nominal * g))[None]
     lengthening = np.array(held.lengthening or np.zeros(len(kept)))[kept] / g
     stated = held.standard_uncertainty
-    own: Array = np.ones((1, n)) if stated is None else (np.array(stated)[kept] / g)[None] ** 2
+    noise_variance: Array = np.ones((1, n)) if stated is None else (np.array(stated)[kept] / g)[None] ** 2
 
     def model(parameters: Array) -> tuple[Array, Array]:
         theta = np.zeros((1, 9))
@@ -303,18 +303,18 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
         return norm[0] - 1 - lengthening, jacobian[0][:, free]
 
     start: Array = np.concatenate([[record.value(name) / g for name in names[:3]], np.ones(3), np.zeros(3)])[free]
-    variance: Array = own
+    variance: Array = noise_variance
     for _ in range(_WEIGHED):
         fit = least_squares(model, start, 1 / variance[0])
         start = fit.parameters[0]
         if stated is not None:
             spare = 1 - leverage(fit.jacobian, 1 / variance)
-            variance = own + plausible_excess(fit.residuals, own, spare)[0][:, None]
+            variance = noise_variance + plausible_excess(fit.residuals, noise_variance, spare)[0][:, None]
     square = float((fit.residuals**2 / variance).sum()) / (n - len(free))
     # Where nothing was stated of the noise, the residuals tell it.
     factor = square if stated is None else 1.0
-    seen = observability(fit.jacobian[0], 1 / (variance[0] * max(factor, np.finfo(float).tiny)))
-    if seen.rank < len(free) or not fit.converged[0]:
+    conditioning = observability(fit.jacobian[0], 1 / (variance[0] * max(factor, np.finfo(float).tiny)))
+    if conditioning.rank < len(free) or not fit.converged[0]:
         return None
     theta = np.zeros(9)
     theta[free] = start

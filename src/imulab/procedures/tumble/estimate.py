@@ -151,7 +151,7 @@ def _check_threshold(threshold: Sequence[float], method: str) -> None:
         )
 
 
-def further_triads(given: str | Sequence[str], called: str) -> tuple[str, ...]:
+def further_triads(triads: str | Sequence[str], called: str) -> tuple[str, ...]:
     """Return the names of further triads, given as a text such as ``"gyro,mag"`` or one by one.
 
     Raises
@@ -159,7 +159,7 @@ def further_triads(given: str | Sequence[str], called: str) -> tuple[str, ...]:
     OptionError
         There is no such triad, or one is named twice.
     """
-    names = tuple(name.strip() for name in given.split(",")) if isinstance(given, str) else tuple(given)
+    names = tuple(name.strip() for name in triads.split(",")) if isinstance(triads, str) else tuple(triads)
     for name in names:
         if name not in FURTHER:
             raise OptionError(f"{called} {name!r}: expected gyro, mag or both, as in gyro,mag")
@@ -238,7 +238,7 @@ def estimate_triad(
         known = known_of(prior, scaling, gravity, attitudes.unit)
     aside, fitted = NONE_ASIDE, dict[int, TumbleSolution]()
     if loss == "auto" and rest is None and not cross:
-        aside, fitted = set_aside(every, lambda of: _fits(of, order))
+        aside, fitted = set_aside(every, lambda subset: _fits(subset, order))
     used, kept = every, attitudes
     if aside.index:
         used, kept = every.only(aside.others(len(attitudes))), attitudes.only(aside.others(len(attitudes)))
@@ -250,16 +250,18 @@ def estimate_triad(
     if known is not None:
         aged = put_together(problem, known, gravity, _scaled_ageing(ageing, gravity.value))
         problem = aged.problem
-    solution, seen = _solve(problem, kept, rest, choice, aged.solution if aged else fitted.get(problem.order))
-    given = Stated(aged.covariance, aged.freedom) if aged else _given_order(problem, solution)
-    stated = given
-    if choice is not None and given is not None:
+    solution, conditioning = _solve(problem, kept, rest, choice, aged.solution if aged else fitted.get(problem.order))
+    given_order = Stated(aged.covariance, aged.freedom) if aged else _given_order(problem, solution)
+    stated = given_order
+    if choice is not None and given_order is not None:
         blended = with_known_spread(used, choice, nonlinearity) if nonlinearity else blend_orders(used, choice)
-        problem, solution, stated = _whatever_the_order(used, problem, solution, given, blended, order == "blend")
-    found = _found(attitudes, replace(every, order=problem.order, cross=cross), solution, aside)
+        problem, solution, stated = _whatever_the_order(used, problem, solution, given_order, blended, order == "blend")
+    complete = _found(attitudes, replace(every, order=problem.order, cross=cross), solution, aside)
     check_residuals(kept, solution, gravity.value)
-    check_axes(attitudes, forces(found.problem, found.solution)[0])
-    estimate = Estimate(kept, problem, solution, given, stated, found, seen, choice.rows if choice else ())
+    check_axes(attitudes, forces(complete.problem, complete.solution)[0])
+    estimate = Estimate(
+        kept, problem, solution, given_order, stated, complete, conditioning, choice.rows if choice else ()
+    )
     if prior is None or known is None or aged is None:
         return estimate
     return replace(
@@ -297,18 +299,18 @@ def _whatever_the_order(
     used: TumbleProblem,
     problem: TumbleProblem,
     solution: TumbleSolution,
-    given: Stated,
+    given_order: Stated,
     blended: Blended,
     at_blend: bool,
 ) -> tuple[TumbleProblem, TumbleSolution, Stated]:
     """Return problem, solution and an uncertainty that holds whatever the order; the blend's own values if asked."""
     if not at_blend:
         about = blended.about(solution.theta[0])
-        return problem, solution, Stated(about, blended.freedom, given.covariance, given.freedom, blended)
+        return problem, solution, Stated(about, blended.freedom, given_order.covariance, given_order.freedom, blended)
     problem = replace(used, order=blended.order)
-    own = evaluate(problem, replace(solution, theta=blended.theta[None]))
-    own = replace(own, down_weights=solution.down_weights)
-    return problem, own, Stated(blended.covariance, blended.freedom, blended=blended)
+    blend_solution = evaluate(problem, replace(solution, theta=blended.theta[None]))
+    blend_solution = replace(blend_solution, down_weights=solution.down_weights)
+    return problem, blend_solution, Stated(blended.covariance, blended.freedom, blended=blended)
 
 
 def _scaled_ageing(ageing: Sequence[float], gravity: float) -> tuple[float | None, ...]:
@@ -339,28 +341,28 @@ def _solve(
     """
     n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     if linearised is None and choice is not None:
-        solution, seen = choice.solution, choice.observability
+        solution, ranks = choice.solution, choice.observability
     else:
         solution = solved or _solved(problem, attitudes, linearised)
-        seen = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
-    if seen.rank < size:
+        ranks = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
+    if ranks.rank < size:
         names = parameter_names(problem.order, problem.cross)
-        confused = seen.confused(names)
+        confused = ranks.confused(names)
         shown = first_of(confused, 8, " ")
         help_from = helpful_attitudes(problem.order, solution, count=2)
-        found = f" (found at {attitudes.times()})" if attitudes.trace is not None and n < size else ""
+        times = f" (found at {attitudes.times()})" if attitudes.trace is not None and n < size else ""
         trace = f"; {attitudes.trace.describe()}" if attitudes.trace is not None and n < size else ""
         raise ObservabilityError(
-            f"{attitudes.recording.name}: {n} attitudes{found} determine {seen.rank} of the {size} parameters of "
+            f"{attitudes.recording.name}: {n} attitudes{times} determine {ranks.rank} of the {size} parameters of "
             f"order {problem.order}; they cannot separate {shown}; attitudes with the upward direction near "
             f"{help_from} would help most{trace}"
         )
     if not solution.converged[0]:
         raise DataError(
             f"{attitudes.recording.name}: the fit of order {problem.order} does not converge on these {n} attitudes "
-            f"(condition number {seen.condition:.0f}); use a lower order or more attitudes"
+            f"(condition number {ranks.condition:.0f}); use a lower order or more attitudes"
         )
-    return solution, seen
+    return solution, ranks
 
 
 def _solved(problem: TumbleProblem, attitudes: Attitudes, linearised: Threshold | None) -> TumbleSolution:

@@ -201,8 +201,8 @@ def parameters_table(record: Calibration) -> ReportTable:
             half = factor * row.standard_uncertainty
             interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
         order_known = "–" if row.given_order is None else format_uncertain(row.value, row.given_order)[1]
-        given = [] if fit.blend is None else [order_known]
-        rows.append([row.name, value, uncertainty, *given, interval, row.unit])
+        order_cells = [] if fit.blend is None else [order_known]
+        rows.append([row.name, value, uncertainty, *order_cells, interval, row.unit])
     basis = _basis(record)
     if fit.blend is not None:
         basis += (
@@ -383,8 +383,10 @@ def _held_back(record: Calibration) -> str:
 
 
 def _worst_scale_uncertainty(record: Calibration) -> float | None:
-    found = [record.parameter(f"scale_factor_{axis}") for axis in AXES]
-    relative = [1e6 * p.standard_uncertainty / abs(p.value) for p in found if p.standard_uncertainty and p.value]
+    scale_factors = [record.parameter(f"scale_factor_{axis}") for axis in AXES]
+    relative = [
+        1e6 * p.standard_uncertainty / abs(p.value) for p in scale_factors if p.standard_uncertainty and p.value
+    ]
     return max(relative) if relative else None
 
 
@@ -552,7 +554,7 @@ def _correlation(record: Calibration) -> Figure:
     together = np.abs(correlation - np.eye(len(sigma))).max(axis=0) > 1e-12
     shown = together if together.any() else ~together  # those that go with no other would only take room
     correlation = correlation[np.ix_(shown, shown)]
-    names = [name for name, one in zip(record.covariance.names, shown.tolist(), strict=True) if one]
+    names = [name for name, is_shown in zip(record.covariance.names, shown.tolist(), strict=True) if is_shown]
     return Figure(
         title="Correlation of the parameters",
         message=f"The pair that is told apart least: {strongest_pair(correlation, names)}." if len(names) > 1 else "",

@@ -275,14 +275,14 @@ def _with_further(
         from imulab.procedures.tumble.gyro.fit import fit_gyro_triad, with_gyro
 
         recording = attitudes.recording
-        found = fit_gyro_triad(record, attitudes, recording, earth=at_latitude(latitude))
-        record = with_gyro(record, found, recording, recording)
+        gyro_fit = fit_gyro_triad(record, attitudes, recording, earth=at_latitude(latitude))
+        record = with_gyro(record, gyro_fit, recording, recording)
     return record
 
 
-def _threshold(given: Sequence[float] | None, gravity: float) -> Threshold:
+def _threshold(changes: Sequence[float] | None, gravity: float) -> Threshold:
     """Return the changes at which method linearised rests, biases in g."""
-    return SOURCE_THRESHOLD if given is None else Threshold(given[0], given[1] / gravity, given[2])
+    return SOURCE_THRESHOLD if changes is None else Threshold(changes[0], changes[1] / gravity, changes[2])
 
 
 def _propagated(estimate: Estimate, trials: int, progress: Callable[[int], None]) -> MonteCarlo:
@@ -317,7 +317,7 @@ def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> 
             f"{attitudes.recording.name}: a prior needs the noise of the attitudes, to be weighed against: a "
             "recording, or std_* columns"
         )
-    own = model_of(prior).order
-    if order not in ("auto", own):
-        raise OptionError(f"order {order} with a prior of order {own}: expected order {own} or auto")
-    return own
+    prior_order = model_of(prior).order
+    if order not in ("auto", prior_order):
+        raise OptionError(f"order {order} with a prior of order {prior_order}: expected order {prior_order} or auto")
+    return prior_order

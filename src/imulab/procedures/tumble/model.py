@@ -191,14 +191,16 @@ def length_noise(theta: Array, jacobian: Array, covariance: Array, motion: Motio
         return _lengthening(theta, jacobian, covariance)
     lengthening = _lengthening(theta, jacobian, motion.lengthening)[0]
     expected = _lengthening(theta, jacobian, motion.usual)[1]
-    own = np.empty(jacobian.shape[:2])
-    _model.noise(np.ascontiguousarray(theta), np.ascontiguousarray(jacobian), motion.moments, np.empty(0), own)
+    attitude_variance = np.empty(jacobian.shape[:2])
+    _model.noise(
+        np.ascontiguousarray(theta), np.ascontiguousarray(jacobian), motion.moments, np.empty(0), attitude_variance
+    )
     # An attitude that was knocked, or moved in other ways, says nothing of the others' noise.
-    ratio = own / expected
+    ratio = attitude_variance / expected
     counts = motion.freedom * (ratio <= _UNUSUAL * medians(ratio)[:, None])
-    level = (counts * own).sum(axis=1) / np.maximum((counts * expected).sum(axis=1), np.finfo(float).tiny)
+    level = (counts * attitude_variance).sum(axis=1) / np.maximum((counts * expected).sum(axis=1), np.finfo(float).tiny)
     usual = level[:, None] * expected
-    return lengthening, (motion.freedom * own + POOL_DEGREES * usual) / (motion.freedom + POOL_DEGREES)
+    return lengthening, (motion.freedom * attitude_variance + POOL_DEGREES * usual) / (motion.freedom + POOL_DEGREES)
 
 
 def _lengthening(theta: Array, jacobian: Array, covariance: Array) -> tuple[Array, Array]:

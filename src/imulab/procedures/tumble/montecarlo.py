@@ -83,7 +83,7 @@ def propagate(
     covariance = _noise(problem, solution)
     root = np.linalg.cholesky(covariance)
     n = problem.reading.shape[1]
-    found, failed, done = [], 0, 0
+    parameters, failed, done = [], 0, 0
     while done < trials:
         count = min(_AT_ONCE, trials - done)
         factor = np.ones(count) if freedom is None else np.sqrt(freedom / rng.chisquare(freedom, count))
@@ -91,11 +91,11 @@ def propagate(
         known = None if problem.covariance is None else covariance[None]
         batch = replace(problem, reading=problem.reading + noise, covariance=known, excess=False)
         fit = solve_norm(batch, np.repeat(solution.theta, count, axis=0))
-        found.append(fit.theta[fit.converged])
+        parameters.append(fit.theta[fit.converged])
         failed += int(count - np.count_nonzero(fit.converged))
         done += count
         progress(done)
-    return MonteCarlo(np.vstack(found), failed)
+    return MonteCarlo(np.vstack(parameters), failed)
 
 
 def _noise(problem: TumbleProblem, solution: TumbleSolution) -> Array:

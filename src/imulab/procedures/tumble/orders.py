@@ -140,7 +140,7 @@ def choose_order(problem: TumbleProblem, gravity: float, solutions: Mapping[int,
     n = problem.reading.shape[1]
     smallest = min((fit.excess[0] for order, fit in solutions.items() if order <= 2), default=0.0)
     trials = {order: replace(problem, order=order) for order in solutions}
-    seen = {
+    conditioning = {
         order: observability(fit.jacobian[0], absolute_weights(trials[order], fit)) for order, fit in solutions.items()
     }
     rows: list[OrderRow] = []
@@ -150,7 +150,7 @@ def choose_order(problem: TumbleProblem, gravity: float, solutions: Mapping[int,
         common = 1 / (fit.own_variance[0] + smallest**2)
         costs[order] = float((fit.down_weights[0] * common * fit.residuals[0] ** 2).sum())
         squares = _left_out_squares(trials[order], fit)
-        row = _row(trials[order], fit, seen[order], costs, squares, gravity)
+        row = _row(trials[order], fit, conditioning[order], costs, squares, gravity)
         rows.append(row)
         if not row.observable or squares is None:
             continue
@@ -160,7 +160,7 @@ def choose_order(problem: TumbleProblem, gravity: float, solutions: Mapping[int,
             and (row.largest_uncertainty or 0.0) <= _BLIND_SPOT * rows[0].scatter
         ):
             chosen, best = order, squares
-    return OrderChoice(chosen, tuple(rows), solutions, seen[chosen])
+    return OrderChoice(chosen, tuple(rows), solutions, conditioning[chosen])
 
 
 def _left_out_squares(problem: TumbleProblem, fit: TumbleSolution) -> Array | None:
@@ -191,7 +191,7 @@ def _significant(costs: Mapping[int, float], chosen: int, order: int, n: int) ->
 def _row(
     problem: TumbleProblem,
     fit: TumbleSolution,
-    seen: Observability,
+    conditioning: Observability,
     costs: Mapping[int, float],
     squares: Array | None,
     gravity: float,
@@ -199,7 +199,7 @@ def _row(
     order = problem.order
     size, n = parameter_count(order), problem.reading.shape[1]
     below = order - 1
-    observable = seen.rank == size and bool(fit.converged[0])
+    observable = conditioning.rank == size and bool(fit.converged[0])
     return OrderRow(
         order=order,
         parameters=size,
@@ -208,8 +208,8 @@ def _row(
         leave_one_out=None if squares is None else gravity * float(np.sqrt(squares.mean())),
         f_probability=f_test(costs[below], parameter_count(below), costs[order], size, n) if below else None,
         bic=bayesian_information(costs[order], size, n),
-        condition_number=seen.condition,
-        rank=seen.rank,
+        condition_number=conditioning.condition,
+        rank=conditioning.rank,
         observable=observable,
         largest_uncertainty=gravity * _largest_uncertainty(problem, fit) if observable and n > size else None,
     )
@@ -317,8 +317,10 @@ def direction_findings(problem: TumbleProblem, solution: TumbleSolution, *, orde
         groups["order"] = np.column_stack(alike)
     if problem.cross:
         del groups["cross"]
-    found = {name: find_pattern(columns, solution) for name, columns in groups.items()}
-    patterns = {name: pattern for name, pattern in found.items() if pattern is not None and pattern.size > _TINY}
+    fitted_patterns = {name: find_pattern(columns, solution) for name, columns in groups.items()}
+    patterns = {
+        name: pattern for name, pattern in fitted_patterns.items() if pattern is not None and pattern.size > _TINY
+    }
     if not patterns:
         return []
     likeliest = min(patterns, key=lambda name: patterns[name].probability)
@@ -444,7 +446,7 @@ def set_aside(
         if not aside.index:
             return aside, plain
         solutions = fits(problem.only(aside.others(problem.reading.shape[1])))
-        about = {order: evaluate(replace(problem, order=order), found) for order, found in solutions.items()}
+        about = {order: evaluate(replace(problem, order=order), solution) for order, solution in solutions.items()}
         # What even the best order leaves unexplained is noise of the others, and no sign of a knock.
         excess = min(float(about[order].excess[0]) for order in _tested(about))
         before, aside = aside, standing_out(about, known=known, excess=excess)
@@ -470,9 +472,9 @@ def standing_out(solutions: Mapping[int, TumbleSolution], *, known: bool, excess
         white = _whitened(solutions[order], excess)
         if white is None:
             continue
-        for found, criterion in _candidates(white, known):
+        for candidate, criterion in _candidates(white, known):
             if criterion < least:
-                best, least = found, criterion
+                best, least = candidate, criterion
     return best
 
 
@@ -504,10 +506,10 @@ def _candidates(white: _Whitened, known: bool) -> Iterator[tuple[Aside, float]]:
         freedom = n - size - m
         if freedom < FREEDOM[known]:
             return
-        found = _best_subset(white, m) if n <= _EXHAUSTIVE else _extended(white, chosen)
-        if found is None:
+        subset = _best_subset(white, m) if n <= _EXHAUSTIVE else _extended(white, chosen)
+        if subset is None:
             return
-        chosen = found
+        chosen = subset
         shift, spread, gain = _shifts(white, chosen)
         rss = max(white.squares - gain, 1e-12 * white.squares, 1e-300)
         z = shift / spread
@@ -701,13 +703,13 @@ def blend_orders(problem: TumbleProblem, choice: OrderChoice) -> Blended:
         values[order - 1, :p] = fit.parameters[0]
         covariances[order - 1, :p, :p] = covariance(jacobian[:, :, :p], weights)[0]
     gains = [costs[order - 1] - costs[order] for order in range(2, top + 1)]
-    found = blend(values, covariances, gains, [3] * (top - 1), scale=scale, freedom=freedom)
+    mixture = blend(values, covariances, gains, [3] * (top - 1), scale=scale, freedom=freedom)
     return Blended(
-        found.values,
-        found.covariance,
+        mixture.values,
+        mixture.covariance,
         top,
         freedom,
-        dict(zip(range(2, top + 1), found.noise.tolist(), strict=True)),
+        dict(zip(range(2, top + 1), mixture.noise.tolist(), strict=True)),
         {order: _effect_of_left_out(problem, solution, order) for order in range(top + 1, HIGHEST_BLENDED + 1)},
     )
 

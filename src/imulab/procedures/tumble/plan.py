@@ -168,21 +168,21 @@ def plan_attitudes(
     best = np.vstack(rounds)
     everything = np.vstack([before, best])
     jacobian = information_rows(everything, order)
-    seen = observability(jacobian, np.full(len(everything), 1e16))
-    if seen.rank < size:
-        confused = " ".join(seen.confused(parameter_names(order)))
+    conditioning = observability(jacobian, np.full(len(everything), 1e16))
+    if conditioning.rank < size:
+        confused = " ".join(conditioning.confused(parameter_names(order)))
         raise ObservabilityError(f"{source}: the candidate attitudes cannot separate {confused} of order {order}")
     paths = np.vstack([shortest_path(each) for each in rounds if len(each)])
-    return Plan(paths, order, inverse(jacobian.T @ jacobian), seen.condition, len(before))
+    return Plan(paths, order, inverse(jacobian.T @ jacobian), conditioning.condition, len(before))
 
 
 def _without_repeats(search: Search, points: Array) -> Array:
     """Candidates that repeat neither one another nor an attitude already there, in their order, shape (k, 3)."""
-    found = np.empty((0, 3))
+    kept = np.empty((0, 3))
     for point in points:
-        if not search.taken(point[None], found)[0]:
-            found = np.vstack([found, point])
-    return found
+        if not search.taken(point[None], kept)[0]:
+            kept = np.vstack([kept, point])
+    return kept
 
 
 def _repeated(search: Search, points: Array, best: Array, attitudes: int) -> list[Array]:
@@ -400,9 +400,9 @@ def _arrow() -> str:
 
 def _narrowest(outline: Array) -> float:
     """Distance between the nearer pair of sides of a parallelogram, shape (4, 2)."""
-    one, two = outline[1] - outline[0], outline[3] - outline[0]
-    area = abs(float(one[0] * two[1] - one[1] * two[0]))
-    return area / max(float(np.linalg.norm(one)), float(np.linalg.norm(two)))
+    first, second = outline[1] - outline[0], outline[3] - outline[0]
+    area = abs(float(first[0] * second[1] - first[1] * second[0]))
+    return area / max(float(np.linalg.norm(first)), float(np.linalg.norm(second)))
 
 
 def _to_level(up: Array) -> Array:
@@ -471,7 +471,7 @@ class TumblePlan(PlannedAttitudes, Plan):
         if self.order == 3:
             lead += " Order 3 because attitudes for a lower one cannot show what that would leave in the scale factors."
         if self.again:
-            pairs = ", ".join(f"{one} and {other}" for one, other in self.again)
+            pairs = ", ".join(f"{attitude} and {other}" for attitude, other in self.again)
             lead += (
                 f" Put down twice: {pairs}. No more candidates lie 3 deg apart; the second time, after the others, "
                 "lowers the noise and shows what drifts, but no new direction."
@@ -646,7 +646,7 @@ def plan_tumble(
         raise OptionError(f"with_ {with_!r}: expected mag: only magnetometers ask for headings")
     sigma, source = noise_of(noise)
     distinct = method == "linearised" if distinct_verticals is None else distinct_verticals
-    found = plan_attitudes(
+    chosen = plan_attitudes(
         order=number,
         attitudes=whole(attitudes, "attitudes"),
         criterion=criterion,
@@ -659,9 +659,9 @@ def plan_tumble(
     if with_ is not None:
         from imulab.procedures.tumble.mag.heading import plan_headings
 
-        headings = plan_headings(found.directions, before=None if add is None else _measured_headings(add))
+        headings = plan_headings(chosen.directions, before=None if add is None else _measured_headings(add))
     return TumblePlan(
-        **vars(found), criterion=criterion, noise=sigma, noise_from=source, distinct_verticals=distinct,
+        **vars(chosen), criterion=criterion, noise=sigma, noise_from=source, distinct_verticals=distinct,
         headings=headings,
     )  # fmt: skip
 
@@ -678,31 +678,31 @@ def _record(data: object) -> Calibration | None:
     return data
 
 
-def noise_of(given: Any) -> tuple[float, str]:
+def noise_of(source: Any) -> tuple[float, str]:
     """Noise of |f| in one attitude, g: a quantity, or what the attitudes of a recording or record have; and whose."""
-    if given is None:
+    if source is None:
         raise OptionError(
             "noise: expected the noise of |f| in one attitude, such as 20ug, or a recording or record that has it"
         )
-    if isinstance(given, float | int) or (isinstance(given, str) and not Path(given).is_file()):
-        sigma = from_si(in_si(given, "noise", "acceleration", "ug"), "g")
+    if isinstance(source, float | int) or (isinstance(source, str) and not Path(source).is_file()):
+        sigma = from_si(in_si(source, "noise", "acceleration", "ug"), "g")
         if not sigma > 0:
-            raise OptionError(f"noise {given!r}: expected more than 0")
+            raise OptionError(f"noise {source!r}: expected more than 0")
         return sigma, ""
-    record = _record(given)
+    record = _record(source)
     if record is not None:
-        whose = os.fspath(given) if isinstance(given, str | PathLike) else "the record"
+        whose = os.fspath(source) if isinstance(source, str | PathLike) else "the record"
         return _noise_of(record), f" (that of {whose})"
-    found = find_attitudes(as_recording(given, {}, plan_tumble, name="noise"))
-    whose = f" (that of {os.fspath(given) if isinstance(given, str | PathLike) else found.recording.name})"
-    if found.covariance is None:
-        name = found.recording.name
+    attitudes = find_attitudes(as_recording(source, {}, plan_tumble, name="noise"))
+    whose = f" (that of {os.fspath(source) if isinstance(source, str | PathLike) else attitudes.recording.name})"
+    if attitudes.covariance is None:
+        name = attitudes.recording.name
         raise OptionError(f"{name}: a table without std_* columns does not say what noise its attitudes have")
     try:
-        return _noise_of(fit_tumble(found).calibration), whose
+        return _noise_of(fit_tumble(attitudes).calibration), whose
     except ImulabError:  # too few for a fit: any direction and length are good enough for a noise
-        up = found.mean / np.linalg.norm(found.mean, axis=1, keepdims=True)
-        variance = np.einsum("ni,nij,nj->n", up, found.covariance, up) / (found.mean**2).sum(axis=1)
+        up = attitudes.mean / np.linalg.norm(attitudes.mean, axis=1, keepdims=True)
+        variance = np.einsum("ni,nij,nj->n", up, attitudes.covariance, up) / (attitudes.mean**2).sum(axis=1)
         return float(np.sqrt(np.median(variance))), whose
 
 
@@ -717,73 +717,73 @@ def _noise_of(record: Calibration) -> float:
     return float(np.sqrt(reduced)) / g
 
 
-def candidates_of(given: Any) -> Array | None:
+def candidates_of(source: Any) -> Array | None:
     """Return the upward directions among which a plan chooses, as ``--from`` names them; None for the whole sphere."""
-    if isinstance(given, str):
-        if given == STARTS[0]:
+    if isinstance(source, str):
+        if source == STARTS[0]:
             return None
-        kind, colon, step = given.partition(":")
+        kind, colon, step = source.partition(":")
         if colon and kind in ("fixture", "head"):
             angle = quantity(step, f"from_ {kind}", "angle", "deg")
             return fixture_candidates(angle) if kind == "fixture" else head_candidates(angle)
-        if colon and not Path(given).exists():
-            raise OptionError(f"from_ {given!r}: expected {', '.join(STARTS)} (steps in deg) or a file of directions")
-    if isinstance(given, np.ndarray | list | tuple):
-        return _unit_vectors(given, "from_")
-    recording = as_recording(given, {}, plan_tumble, name="from_")
-    found = directions_of(recording)
-    if found is None:
+        if colon and not Path(source).exists():
+            raise OptionError(f"from_ {source!r}: expected {', '.join(STARTS)} (steps in deg) or a file of directions")
+    if isinstance(source, np.ndarray | list | tuple):
+        return _unit_vectors(source, "from_")
+    recording = as_recording(source, {}, plan_tumble, name="from_")
+    directions = directions_of(recording)
+    if directions is None:
         raise OptionError(f"{recording.name}: expected columns up_x up_y up_z, or roll [deg] and pitch [deg]")
-    return found
+    return directions
 
 
-def _unit_vectors(given: object, name: str) -> Array:
+def _unit_vectors(values: object, name: str) -> Array:
     """Return directions as unit vectors, shape (n, 3)."""
     try:
-        found = np.asarray(given, dtype=np.float64)
+        vectors = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        found = np.empty(0)
-    length = np.linalg.norm(found, axis=-1, keepdims=True)
-    if found.ndim != 2 or found.shape[1] != 3 or not (np.isfinite(length) & (length > 0)).all():
-        raise OptionError(f"{name}: expected upward directions, shape (n, 3), found the shape {found.shape}")
-    units: Array = found / length
+        vectors = np.empty(0)
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if vectors.ndim != 2 or vectors.shape[1] != 3 or not (np.isfinite(length) & (length > 0)).all():
+        raise OptionError(f"{name}: expected upward directions, shape (n, 3), found the shape {vectors.shape}")
+    units: Array = vectors / length
     return units
 
 
-def _measured_directions(given: Any) -> Array:
+def _measured_directions(source: Any) -> Array:
     """Upward directions of a plan, of a record's attitudes, or of a recording's under an order-1 fit."""
-    if isinstance(given, Plan):
-        return given.directions
-    if isinstance(given, np.ndarray | list | tuple):
-        return _unit_vectors(given, "add")
-    record = _record(given)
+    if isinstance(source, Plan):
+        return source.directions
+    if isinstance(source, np.ndarray | list | tuple):
+        return _unit_vectors(source, "add")
+    record = _record(source)
     if record is not None:
         held = attitudes_of(record)
         force = np.array(held.force)[np.array(held.down_weight) > 0]
     else:
-        recording = as_recording(given, {}, plan_tumble, name="add")
+        recording = as_recording(source, {}, plan_tumble, name="add")
         listed = directions_of(recording)
         if listed is not None:
             return listed
-        found = find_attitudes(recording)
+        attitudes = find_attitudes(recording)
         # The directions need no better than a percent, and too few attitudes for a fit are no reason to refuse.
         try:
-            force = np.array(attitudes_of(fit_tumble(found, order=1).calibration).force)
+            force = np.array(attitudes_of(fit_tumble(attitudes, order=1).calibration).force)
         except ImulabError:
-            force = found.mean
+            force = attitudes.mean
     directions: Array = force / np.linalg.norm(force, axis=1, keepdims=True)
     return directions
 
 
-def _measured_headings(given: Any) -> tuple[Array, Array] | None:
+def _measured_headings(source: Any) -> tuple[Array, Array] | None:
     """Upward directions and those of north of a plan with headings or a record with magnetometers; None of others."""
-    if isinstance(given, TumblePlan):
-        return None if given.headings is None else (given.directions, given.headings.north)
-    if isinstance(given, Plan | np.ndarray | list | tuple):
+    if isinstance(source, TumblePlan):
+        return None if source.headings is None else (source.directions, source.headings.north)
+    if isinstance(source, Plan | np.ndarray | list | tuple):
         return None
-    record = _record(given)
+    record = _record(source)
     if record is None:
-        recording = as_recording(given, {}, plan_tumble, name="add")
+        recording = as_recording(source, {}, plan_tumble, name="add")
         up, north = directions_of(recording), norths_of(recording)
         return None if up is None or north is None else (up, north)
     held = data_of(record).mag

@@ -149,18 +149,18 @@ def put_together(
     probability, excess, freedom, passes, rests = 1.0, 0.0, np.inf, 0, False
     while True:
         norm, jacobian, _, _ = norm_and_jacobian(theta[None], problem.reading, problem.order)
-        lengthening, own = length_noise(theta[None], jacobian, problem.covariance, problem.motion)
+        lengthening, noise_variance = length_noise(theta[None], jacobian, problem.covariance, problem.motion)
         residuals = norm - 1 - lengthening
         if rests or passes == _PASSES:
             break
-        rows, found = jacobian[0], residuals[0]
-        seen = rows @ (theta - known.mean) - found
-        excess, freedom = unexplained(rows, seen, own[0])
-        noise = np.diag(own[0] + excess) + common
+        rows, residual = jacobian[0], residuals[0]
+        innovation = rows @ (theta - known.mean) - residual
+        excess, freedom = unexplained(rows, innovation, noise_variance[0])
+        noise = np.diag(noise_variance[0] + excess) + common
         if not passes:
-            doubtful = np.diag(own[0] + scatter(rows, found, own[0])) + common
-            probability = contradiction(found, rows, known.covariance, doubtful)[1]
-        mixed = _mixture(rows, seen, noise, known.covariance, ageing)
+            doubtful = np.diag(noise_variance[0] + scatter(rows, residual, noise_variance[0])) + common
+            probability = contradiction(residual, rows, known.covariance, doubtful)[1]
+        mixed = _mixture(rows, innovation, noise, known.covariance, ageing)
         change = known.mean + mixed.mean - theta
         theta = theta + change
         rests = bool((np.abs(change) < _AT_REST * np.sqrt(np.diag(mixed.covariance))).all())
@@ -173,8 +173,8 @@ def put_together(
         deviations=residuals if problem.motion is not None else norm - 1,
         lengthening=lengthening,
         jacobian=jacobian,
-        variance=own + excess,
-        own_variance=own,
+        variance=noise_variance + excess,
+        own_variance=noise_variance,
         down_weights=np.ones((1, n)),
         scale=np.ones(1),
         excess=np.array([np.sqrt(excess)]),
@@ -194,35 +194,35 @@ def put_together(
     )
 
 
-def scatter(jacobian: Array, seen: Array, own: Array) -> float:
+def scatter(jacobian: Array, values: Array, variance: Array) -> float:
     """Variance of the attitudes beyond their own that a test must allow for: 0 unless it is seen at 1 %.
 
     A disturbed hold is no change of the unit. Allowing for scatter that is not there would hide changes.
     """
-    missed, left = _left_of(jacobian, seen, own)
-    freedom = len(own) - left.shape[1]
-    if freedom < 1 or chi_square_probability(float((missed**2 / own).sum()), freedom) > ATTITUDES_DISTURBED.level:
+    missed, left = _left_of(jacobian, values, variance)
+    freedom = len(variance) - left.shape[1]
+    if freedom < 1 or chi_square_probability(float((missed**2 / variance).sum()), freedom) > ATTITUDES_DISTURBED.level:
         return 0.0
-    return unexplained(jacobian, seen, own)[0]
+    return unexplained(jacobian, values, variance)[0]
 
 
-def unexplained(jacobian: Array, seen: Array, own: Array) -> tuple[float, float]:
+def unexplained(jacobian: Array, values: Array, variance: Array) -> tuple[float, float]:
     """Variance of the attitudes beyond their own that no parameters explain, and its effective degrees of freedom.
 
     Residuals are those of a fit to the attitudes alone, whatever a record says (`estimate.plausible_excess`).
     """
-    missed, left = _left_of(jacobian, seen, own)
-    excess, freedom = plausible_excess(missed[None], own[None], 1 - (left**2).sum(axis=1)[None])
+    missed, left = _left_of(jacobian, values, variance)
+    excess, freedom = plausible_excess(missed[None], variance[None], 1 - (left**2).sum(axis=1)[None])
     return float(excess[0]), float(freedom[0])
 
 
-def _left_of(jacobian: Array, seen: Array, own: Array) -> tuple[Array, Array]:
-    """What a weighted fit to the attitudes alone leaves of `seen`, and a basis of what it takes, (n, rank)."""
-    white = jacobian / np.sqrt(own)[:, None]
+def _left_of(jacobian: Array, values: Array, variance: Array) -> tuple[Array, Array]:
+    """What a weighted fit to the attitudes alone leaves of `values`, and a basis of what it takes, (n, rank)."""
+    white = jacobian / np.sqrt(variance)[:, None]
     scale = np.maximum(np.linalg.norm(white, axis=0), np.finfo(float).tiny)
     left, size, _ = np.linalg.svd(white / scale, full_matrices=False)
     left = left[:, size > _DETERMINED * size[0]]
-    return seen - np.sqrt(own) * (left @ (left.T @ (seen / np.sqrt(own)))), left
+    return values - np.sqrt(variance) * (left @ (left.T @ (values / np.sqrt(variance)))), left
 
 
 @dataclass(frozen=True)
@@ -233,11 +233,13 @@ class _Mixture:
     ageing: tuple[float, ...]
 
 
-def _mixture(jacobian: Array, seen: Array, noise: Array, known: Array, ageing: tuple[float | None, ...]) -> _Mixture:
+def _mixture(
+    jacobian: Array, innovation: Array, noise: Array, known: Array, ageing: tuple[float | None, ...]
+) -> _Mixture:
     """Mean and covariance of the changes of the parameters, given ``seen = J change + N(0, noise)``."""
     white = np.linalg.inv(np.linalg.cholesky(noise))
     q, r = np.linalg.qr(white @ jacobian)
-    data = q.T @ (white @ seen)
+    data = q.T @ (white @ innovation)
     sigma = float(np.sqrt(np.median(np.diag(noise))))
     groups = [part for part in GROUPS.values() if part.start < jacobian.shape[1]]
     grids = [sigma * _STEPS if tau is None else np.array([tau]) for tau in ageing[: len(groups)]]
@@ -305,16 +307,16 @@ def prior_shares(
 
 def findings(record: Calibration, aged: AgedPrior, recording: Recording, count: int) -> list[str]:
     """Return what a user must know of a prior, a sentence each."""
-    found = []
+    messages = []
     if other := different_units(("the prior", record.sensor), ("the recording", recording.metadata)):
-        found.append(other)
+        messages.append(other)
     if aged.probability < PRIOR_CONTRADICTED.level:
         sizes = [f"{1e6 * tau:.3g} {unit}" for tau, unit in zip(aged.ageing, ("µg", "ppm", "µrad"), strict=False)]
         few = (
             f"; with {count} attitudes intervals may be too narrow where several parameters changed at once, "
             f"{_ASKED} or more are asked for"
         )
-        found.append(
+        messages.append(
             f"prior and attitudes contradict each other (p = {aged.probability:.2g}): the unit has changed since the "
             "prior was made, or attitudes were disturbed; the prior was widened as far as they ask (bias, scale factor"
             f"{', misalignment' if len(sizes) > 2 else ''}: {', '.join(sizes)}){few if count < _ASKED else ''}"
@@ -322,10 +324,10 @@ def findings(record: Calibration, aged: AgedPrior, recording: Recording, count: 
     residuals, variance = aged.solution.residuals[0], aged.solution.variance[0]
     rms, times = float(np.sqrt(np.mean(residuals**2))), float(np.sqrt(np.mean(residuals**2 / variance)))
     if chi_square_probability(float((residuals**2 / variance).sum()), len(residuals)) < PRIOR_EXPLAINS_NOTHING.level:
-        found.append(
+        messages.append(
             Bad(
                 "no ageing of bias, scale factor and misalignment explains these attitudes: they miss the result by "
                 f"{1e6 * rms:.3g} µg rms, {times:.0f} times their uncertainty; fit without the prior"
             )
         )
-    return found
+    return messages

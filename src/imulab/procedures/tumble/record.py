@@ -119,14 +119,14 @@ class Estimate:
 
 def aside_of(record: Calibration, attitudes: Attitudes) -> NDArray[np.bool_]:
     """Return which of the attitudes a record set aside, if it was made from these, shape (n,)."""
-    found = np.zeros(len(attitudes), dtype=np.bool_)
+    aside = np.zeros(len(attitudes), dtype=np.bool_)
     held = data_of(record).attitudes
     if held is not None and np.array_equal(held.mean, attitudes.mean):
-        found[[number - 1 for number in fit_of(record).set_aside]] = True
-    return found
+        aside[[number - 1 for number in fit_of(record).set_aside]] = True
+    return aside
 
 
-def aside_warnings(found: FittedAttitudes, options: Mapping[str, Any]) -> list[str]:
+def aside_warnings(complete: FittedAttitudes, options: Mapping[str, Any]) -> list[str]:
     """Name the attitudes that were set aside, or say why a knocked one may not have been."""
     if options["loss"] != "auto":
         return []
@@ -138,16 +138,16 @@ def aside_warnings(found: FittedAttitudes, options: Mapping[str, Any]) -> list[s
                 "with cross terms every attitude is kept: a knocked one is not looked for (fit without --cross to see)"
             )
         ]
-    aside = found.aside
+    aside = complete.aside
     named = [
-        f"{found.attitudes.label(index)} set aside: {1e3 * found.solution.residuals[0, index]:+.3f} mg "
+        f"{complete.attitudes.label(index)} set aside: {1e3 * complete.solution.residuals[0, index]:+.3f} mg "
         f"({abs(deviations):.0f} standard uncertainties) from what the others give, as if it had been knocked or had "
         "not settled; --loss square keeps it"
         for index, deviations in zip(aside.index, aside.deviations, strict=True)
     ]
-    n = len(found.attitudes)
+    n = len(complete.attitudes)
     lowest, highest = (options["order"],) * 2 if isinstance(options["order"], int) else (1, HIGHEST_TESTED)
-    enough = parameter_count(lowest) + 1 + FREEDOM[found.problem.covariance is not None]
+    enough = parameter_count(lowest) + 1 + FREEDOM[complete.problem.covariance is not None]
     if n < enough:
         named.append(Note(f"{n} attitudes are too few to tell a knocked one from the others: {enough} or more can"))
     elif n - parameter_count(highest) < _SELDOM_MISSED:
@@ -172,16 +172,16 @@ def freedom_finding(attitudes: int, size: int, order: int) -> str | None:
     )
 
 
-def vertical_warnings(found: FittedAttitudes, method: str) -> list[str]:
+def vertical_warnings(complete: FittedAttitudes, method: str) -> list[str]:
     """Name the axes that are vertical, up or down, in more than one attitude, which the linearised's source forbids."""
     if method != "linearised":
         return []
-    vertical = near_vertical(forces(found.problem, found.solution)[0], CLOSEST)
+    vertical = near_vertical(forces(complete.problem, complete.solution)[0], CLOSEST)
     warnings = []
     for axis, column in zip(AXES, vertical.T, strict=True):
         which = np.flatnonzero(column).tolist()
         if len(which) > 1:
-            named = first_of([found.attitudes.label(index) for index in which], _MOST_NAMED)
+            named = first_of([complete.attitudes.label(index) for index in which], _MOST_NAMED)
             warnings.append(
                 f"axis {axis} is vertical within {np.degrees(CLOSEST):.0f} deg in {len(which)} attitudes ("
                 f"{named}): the source of method linearised has no axis vertical in two; "
@@ -192,19 +192,19 @@ def vertical_warnings(found: FittedAttitudes, method: str) -> list[str]:
 
 def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
     """Errors that no accelerometer in physical units has: more likely the columns are not what they are said to be."""
-    theta, found = solution.theta[0], []
+    theta, messages = solution.theta[0], []
     if parse_unit(attitudes.unit).quantity == "acceleration":
-        found += [
+        messages += [
             f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?"
             for axis, value in zip(AXES, theta[3:6], strict=True)
             if abs(value - 1) > SCALE_OFF_UNIT
         ]
-    found += [
+    messages += [
         f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?"
         for pair, value in zip(MISALIGNMENTS, theta[6:9], strict=False)  # order 0 has none
         if abs(value) > _WORST_MISALIGNMENT
     ]
-    return found
+    return messages
 
 
 def assumption_notes(stated: Stated | None) -> list[str]:
@@ -215,8 +215,8 @@ def assumption_notes(stated: Stated | None) -> list[str]:
     for order, (bias, scale) in stated.blended.assumed.items():
         unit = f"µg/g{'⁰¹²³'[order]}"
         moved = [
-            f"{value:.2g} {of}"
-            for value, of in ((bias, "µg of bias"), (scale, "ppm of scale factor"))
+            f"{value:.2g} {quantity}"
+            for value, quantity in ((bias, "µg of bias"), (scale, "ppm of scale factor"))
             if value > _NEGLIGIBLE
         ]
         notes.append(
@@ -262,7 +262,7 @@ def make_record(
     ``S = scale sigma / g``, ``b = (zero + scale z) / S``, ``k_j = theta_j / g^(j-1)``; covariances are carried along by
     their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share.
     """
-    attitudes, problem, solution, found = estimate.attitudes, estimate.problem, estimate.solution, estimate.found
+    attitudes, problem, solution, complete = estimate.attitudes, estimate.problem, estimate.solution, estimate.found
     g, recording = gravity.value, attitudes.recording
     parameters, matrix, shared = _parameters(estimate, gravity, scaling)
     freedom = data_freedom(problem, solution.jacobian[0], 1 / solution.variance[0])
@@ -288,7 +288,7 @@ def make_record(
             )
         ),
         options=dict(options),
-        data=entries(_evidence(found.attitudes, scaling, found.problem, found.solution, g)),
+        data=entries(_evidence(complete.attitudes, scaling, complete.problem, complete.solution, g)),
         sensor={key: recording.metadata[key] for key in ("serial", "model", "element") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
         warnings=(
@@ -296,8 +296,8 @@ def make_record(
             *_scatter_warnings(problem, solution, chi_square, freedom),
             *shake_warnings(problem.motion, solution),
             *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(estimate.orders)),
-            *vertical_warnings(found, str(options["method"])),
-            *aside_warnings(found, options),
+            *vertical_warnings(complete, str(options["method"])),
+            *aside_warnings(complete, options),
             *assumption_notes(estimate.stated),
             *estimate.notes,
         ),
@@ -314,12 +314,12 @@ def _parameters(
     shared = (not estimate.with_gravity) * gravity.standard_uncertainty / g * gravity_slope(values, order)
     matrix = None if stated is None else derivative @ stated.covariance @ derivative.T + np.outer(shared, shared)
     uncertainty: list[float | None] = [None] * len(names)
-    given: list[float | None] = [None] * len(names)
+    given_order: list[float | None] = [None] * len(names)
     if matrix is not None:
         uncertainty = np.sqrt(np.diag(matrix)).tolist()
     if stated is not None and stated.given_order is not None:
-        given = np.sqrt(np.diag(derivative @ stated.given_order @ derivative.T) + shared**2).tolist()
-    columns = zip(names, values.tolist(), uncertainty, units, given, strict=True)
+        given_order = np.sqrt(np.diag(derivative @ stated.given_order @ derivative.T) + shared**2).tolist()
+    columns = zip(names, values.tolist(), uncertainty, units, given_order, strict=True)
     return (
         {name: Parameter(v, u, unit, standard_uncertainty_given_order=o) for name, v, u, unit, o in columns},
         matrix,
@@ -394,7 +394,7 @@ def _blend(stated: Stated | None) -> OrderBlend | None:
 
 def zero_outputs(record: Calibration) -> dict[str, Parameter]:
     """Return what each axis puts out at zero specific force, S b, with its uncertainty, in the output's unit."""
-    found = {}
+    outputs = {}
     for axis in AXES:
         b, s = record.parameter(f"bias_{axis}"), record.parameter(f"scale_factor_{axis}")
         uncertainty = None
@@ -402,8 +402,8 @@ def zero_outputs(record: Calibration) -> dict[str, Parameter]:
             block = record.covariance.block([f"bias_{axis}", f"scale_factor_{axis}"])
             gradient = np.array([s.value, b.value])
             uncertainty = float(np.sqrt(max(gradient @ block @ gradient, 0.0)))
-        found[axis] = Parameter(s.value * b.value, uncertainty, model_of(record).output_unit)
-    return found
+        outputs[axis] = Parameter(s.value * b.value, uncertainty, model_of(record).output_unit)
+    return outputs
 
 
 def _propagated(trials: MonteCarlo, scaling: Scaling, gravity: Gravity, order: int) -> Trials:
@@ -587,20 +587,20 @@ def _attitude_warnings(
 
 def _freedom_warnings(problem: TumbleProblem, solution: TumbleSolution, observability: Observability) -> list[str]:
     n, size = problem.reading.shape[1], solution.theta.shape[1]
-    found = []
+    messages = []
     if observability.condition > _HIGH_CONDITION:
         confused = observability.confused(parameter_names(problem.order, problem.cross))
-        found.append(
+        messages.append(
             f"condition number {observability.condition:.0f}: these attitudes hardly separate {' '.join(confused[:6])}"
         )
     if n == size and problem.covariance is None:
-        found.append(
+        messages.append(
             f"{n} attitudes for {size} parameters leave nothing to estimate the noise from: no uncertainty is stated"
         )
     few = freedom_finding(n, size, problem.order)
     if few is not None and problem.prior is None:
-        found.append(few)
-    return found
+        messages.append(few)
+    return messages
 
 
 def _outliers(problem: TumbleProblem, solution: TumbleSolution) -> dict[int, float]:

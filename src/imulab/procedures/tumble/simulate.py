@@ -154,10 +154,10 @@ def simulate_tumble(
         sensor |= gyro_truth
         _put(columns, units, "gyro", rates, "deg/s")
     if field is not None:
-        seen = simulate_field(path.turns, directions[0], field, dip, sensor, seed)
-        sensor |= seen.truth
-        _put(columns, units, "mag", seen.outputs, "uT")
-        _put(columns, units, "truth_mag", seen.field, "uT")
+        magnetometers = simulate_field(path.turns, directions[0], field, dip, sensor, seed)
+        sensor |= magnetometers.truth
+        _put(columns, units, "mag", magnetometers.outputs, "uT")
+        _put(columns, units, "truth_mag", magnetometers.field, "uT")
     columns["temperature"] = np.round(temperature + 0.05 * rng.standard_normal(len(path.time)), 2)
     units["temperature"] = "degC"
     _put(columns, units, "truth_accel", force, "m/s^2")
@@ -166,11 +166,11 @@ def simulate_tumble(
     return Recording(columns=columns, units=units, metadata=metadata, name="simulated tumble")
 
 
-def _directions(given: int | str | Array, rng: np.random.Generator) -> Array:
+def _directions(attitudes: int | str | Array, rng: np.random.Generator) -> Array:
     """Return the upward directions that were given, or so many spread evenly, shape (n, 3)."""
-    if isinstance(given, int | str):
-        return _spread(whole(given, "attitudes"), rng)
-    directions = np.asarray(given, dtype=np.float64)
+    if isinstance(attitudes, int | str):
+        return _spread(whole(attitudes, "attitudes"), rng)
+    directions = np.asarray(attitudes, dtype=np.float64)
     if directions.ndim != 2 or directions.shape[1] != 3 or not np.isfinite(directions).all():
         raise OptionError(f"attitudes: expected upward directions, shape (n, 3), found shape {directions.shape}")
     return directions

@@ -198,8 +198,8 @@ def solve_norm(problem: TumbleProblem, start: Array | None = None) -> TumbleSolu
     count, n, _ = problem.reading.shape
     theta = start_parameters(problem.order, count, problem.cross) if start is None else start
     size = theta.shape[1]
-    lengthening, own = magnitude_noise(problem, theta)
-    variance, down, scale = own, np.ones((count, n)), np.ones(count)
+    lengthening, noise_variance = magnitude_noise(problem, theta)
+    variance, down, scale = noise_variance, np.ones((count, n)), np.ones(count)
     excess, freedom = np.zeros(count), np.full(count, np.inf)
     iterations = np.zeros(count, dtype=np.int64)
     repeat = problem.robust or problem.covariance is not None
@@ -208,11 +208,11 @@ def solve_norm(problem: TumbleProblem, start: Array | None = None) -> TumbleSolu
         fit = _least_squares(problem, theta, down / variance, lengthening, 1e-9 if number or not repeat else 1e-4)
         iterations += fit.iterations
         theta, before = fit.parameters, down / variance
-        lengthening, own = magnitude_noise(problem, theta, fit.jacobian)
+        lengthening, noise_variance = magnitude_noise(problem, theta, fit.jacobian)
         residuals = fit.residuals
         if problem.covariance is not None and problem.excess and not problem.robust:
-            excess, freedom = plausible_excess(residuals, own, 1 - leverage(fit.jacobian, 1 / variance))
-        variance = own + excess[:, None]
+            excess, freedom = plausible_excess(residuals, noise_variance, 1 - leverage(fit.jacobian, 1 / variance))
+        variance = noise_variance + excess[:, None]
         if problem.robust:
             standard = residuals / np.sqrt(variance * np.maximum(1 - leverage(fit.jacobian, down / variance), 0.05))
             measured = robust_scale(residuals / np.sqrt(variance), size)
@@ -231,7 +231,7 @@ def solve_norm(problem: TumbleProblem, start: Array | None = None) -> TumbleSolu
         lengthening=lengthening,
         jacobian=fit.jacobian,
         variance=variance,
-        own_variance=own,
+        own_variance=noise_variance,
         down_weights=down,
         scale=scale,
         excess=np.sqrt(excess),
@@ -288,7 +288,7 @@ def evaluate(problem: TumbleProblem, solution: TumbleSolution) -> TumbleSolution
     The excess variance is the solution's; down-weights are ones.
     """
     norm, jacobian, _, _ = norm_and_jacobian(solution.theta, problem.reading, problem.order)
-    lengthening, own = magnitude_noise(problem, solution.theta, jacobian)
+    lengthening, noise_variance = magnitude_noise(problem, solution.theta, jacobian)
     if problem.covariance is None:
         lengthening = lengthening + solution.lengthening[:, :1]
     residuals = norm - 1 - lengthening
@@ -298,8 +298,8 @@ def evaluate(problem: TumbleProblem, solution: TumbleSolution) -> TumbleSolution
         deviations=residuals if problem.motion is not None else norm - 1,
         lengthening=lengthening,
         jacobian=jacobian,
-        variance=own + solution.excess[:, None] ** 2,
-        own_variance=own,
+        variance=noise_variance + solution.excess[:, None] ** 2,
+        own_variance=noise_variance,
         down_weights=np.ones(norm.shape),
     )
 
@@ -364,8 +364,8 @@ def solve_linearised(problem: TumbleProblem, name: str, threshold: Threshold = S
     DataError
         The iteration does not converge, or ends where the model cannot be inverted.
     """
-    lengthening, own = magnitude_noise(problem, start_parameters(problem.order))
-    theta, passes = _linearised_iteration(problem, lengthening[0], own[0], name, threshold)
+    lengthening, noise_variance = magnitude_noise(problem, start_parameters(problem.order))
+    theta, passes = _linearised_iteration(problem, lengthening[0], noise_variance[0], name, threshold)
     solution = _evaluated(problem, theta, passes, name)
     if problem.covariance is None:
         return solution
@@ -432,7 +432,7 @@ def _evaluated(problem: TumbleProblem, theta: Array, iterations: int, name: str)
             f"{name}: method linearised ends at a nonlinearity under which no specific force leads to some of these "
             "attitudes; use --method norm"
         )
-    lengthening, own = magnitude_noise(problem, theta, jacobian)
+    lengthening, noise_variance = magnitude_noise(problem, theta, jacobian)
     n = norm.shape[1]
     return TumbleSolution(
         theta=theta,
@@ -440,8 +440,8 @@ def _evaluated(problem: TumbleProblem, theta: Array, iterations: int, name: str)
         deviations=norm - 1 - (lengthening if problem.motion is not None else 0.0),
         lengthening=lengthening,
         jacobian=jacobian,
-        variance=own,
-        own_variance=own,
+        variance=noise_variance,
+        own_variance=noise_variance,
         down_weights=np.ones((1, n)),
         scale=np.ones(1),
         excess=np.zeros(1),
@@ -567,7 +567,9 @@ def optimal_set(search: Search, points: Array, count: int, seed: int, *, free: b
     polished = [_polish(search, directions, rng, _POLISH_RADII) for directions in starts[:_BALANCED]]
     if search.criterion == "D":
         return _most_alike(search, polished)
-    return _most_alike(search, polished + [each for one in polished for each in _balance(search, one, rng)])
+    return _most_alike(
+        search, polished + [each for polished_set in polished for each in _balance(search, polished_set, rng)]
+    )
 
 
 def quick_set(

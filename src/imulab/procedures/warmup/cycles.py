@@ -216,8 +216,8 @@ def _axes(recording: Recording) -> tuple[str, ...]:
     for kind in ("gyro", "accel"):
         units = {name: recording.units[name] for name in axes if name.startswith(kind)}
         if len({parse_unit(unit).symbol for unit in units.values()}) > 1:
-            found = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
-            raise UnitError(f"{recording.name}: the axes of one kind must share one unit, found {found}")
+            described = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
+            raise UnitError(f"{recording.name}: the axes of one kind must share one unit, found {described}")
     return axes
 
 
@@ -227,8 +227,8 @@ def _power_on(recording: Recording, from_column: bool, reading: float | None) ->
         return stated
     if from_column and reading is not None:
         return reading
-    found = "no power_on_temperature in the head of the file" if stated is None else "power_on_temperature is nan"
-    raise DataError(f"{recording.name}: {found}; expected a line such as '# power_on_temperature: -20'")
+    problem = "no power_on_temperature in the head of the file" if stated is None else "power_on_temperature is nan"
+    raise DataError(f"{recording.name}: {problem}; expected a line such as '# power_on_temperature: -20'")
 
 
 def _chamber(recording: Recording) -> float | None:
@@ -365,15 +365,17 @@ def common_axes(cycles: list[Cycle]) -> tuple[str, ...]:
     """
     first = cycles[0]
     for cycle in cycles[1:]:
-        for one, other in ((cycle, first), (first, cycle)):
-            missing = [axis for axis in other.axes if axis not in one.axes]
+        for lacking, other in ((cycle, first), (first, cycle)):
+            missing = [axis for axis in other.axes if axis not in lacking.axes]
             if missing:
-                raise DataError(f"{one.name}: no column {missing[0]}, which {other.name} has; --axes chooses columns")
+                raise DataError(
+                    f"{lacking.name}: no column {missing[0]}, which {other.name} has; --axes chooses columns"
+                )
         for axis, unit in zip(first.axes, first.file_units, strict=True):
-            found = cycle.file_units[cycle.axes.index(axis)]
-            if found != unit:
+            cycle_unit = cycle.file_units[cycle.axes.index(axis)]
+            if cycle_unit != unit:
                 raise UnitError(
-                    f"{cycle.name}: column {axis} is in {found}, but in {unit} in {first.name}: "
+                    f"{cycle.name}: column {axis} is in {cycle_unit}, but in {unit} in {first.name}: "
                     "all files must share one unit"
                 )
     hashes: dict[str, str] = {}
@@ -497,9 +499,9 @@ class Curves:
     def kinds(self) -> dict[str, list[int]]:
         """Return the indices of the axes of each kind: gyro, accel."""
         return {
-            kind: found
+            kind: places
             for kind in ("gyro", "accel")
-            if (found := [i for i, axis in enumerate(self.axes) if axis.startswith(kind)])
+            if (places := [i for i, axis in enumerate(self.axes) if axis.startswith(kind)])
         }
 
     def expected_noise(self) -> Array:
@@ -653,11 +655,11 @@ def quiet_levels(cycles: Sequence[Cycle]) -> list[Array]:
     Of each cycle the quietest minute (a vehicle may fly for most of its log); if the cycles of the same sample rate
     are mostly quieter than that, theirs (a cycle may move throughout).
     """
-    own = np.array([_quietest(cycle.bins.variance) for cycle in cycles])
+    quietest = np.array([_quietest(cycle.bins.variance) for cycle in cycles])
     rate = np.array([np.median(cycle.bins.count) for cycle in cycles])
     levels = []
-    for level, mine in zip(own, rate, strict=True):
-        usual = np.median(own[np.abs(rate / mine - 1) < 0.1], axis=0)
+    for level, mine in zip(quietest, rate, strict=True):
+        usual = np.median(quietest[np.abs(rate / mine - 1) < 0.1], axis=0)
         levels.append(np.where(usual > 0, np.minimum(level, usual), level))
     return levels
 
@@ -688,11 +690,11 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
     while not moved.all():
         # The curve's range is that of the bins at rest: in motion it would hide the motion.
         spread = np.subtract(*np.quantile(bins.mean[~moved], [0.95, 0.05], axis=0))
-        found = (excess > noise + (_MOVED_RANGE * spread) ** 2).any(axis=1) & (bins.count > 2)
-        found |= (away > alone + (_APART_RANGE * spread) ** 2).any(axis=1)
-        if not (found & ~moved).any():
+        moved_now = (excess > noise + (_MOVED_RANGE * spread) ** 2).any(axis=1) & (bins.count > 2)
+        moved_now |= (away > alone + (_APART_RANGE * spread) ** 2).any(axis=1)
+        if not (moved_now & ~moved).any():
             break
-        moved |= found
+        moved |= moved_now
     if not moved.any():
         return bins, (0.0, 0.0)
     near = np.convolve(moved, [1, 1, 1], mode="same") > 0
@@ -770,7 +772,7 @@ def _choose_settling_time(
     curve = total / np.maximum(weight, 1e-300)
     margin = 2 * np.sqrt(noise / np.maximum(weight, 1.0))
     chosen = 0.75 * shortest
-    found = True
+    reached = True
     for _ in range(5):
         late = edges[:-1] >= min(chosen, latest) - _NEARLY
         z = curve - (curve[:, late] * weight[:, late]).sum(axis=1, keepdims=True) / weight[:, late].sum(
@@ -778,17 +780,17 @@ def _choose_settling_time(
         )
         z = np.where(weight > 0, z, 0.0)
         over = np.zeros(len(edges) - 1, dtype=np.bool_)
-        for kind, given in limit.items():
+        for kind, stated in limit.items():
             index = [i for i, axis in enumerate(axes) if axis.startswith(kind)]
             if index:
-                threshold = given if given > 0 else -given * np.abs(z[:, :, index]).max()
+                threshold = stated if stated > 0 else -stated * np.abs(z[:, :, index]).max()
                 over |= (np.abs(z[:, :, index]) - margin[:, :, index] > threshold).any(axis=(0, 2))
         above = edges[1:][over & (edges[:-1] < latest)]
         first = 10.0 * np.ceil((above[-1] if above.size else edges[1]) / 10)
         first = max(first, 3.0 * _FEWEST)
-        found = first < latest and not (over & (edges[:-1] >= latest)).any()
+        reached = first < latest and not (over & (edges[:-1] >= latest)).any()
         first = min(first, latest)
         if abs(first - chosen) < 1:
             break
         chosen = first
-    return float(min(chosen, latest)), found
+    return float(min(chosen, latest)), reached

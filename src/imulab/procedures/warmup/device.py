@@ -182,18 +182,18 @@ def apply_warmup(unit: DeviceUnit, columns: Mapping[str, Any], recording: Record
     if temperature is None or unchanged(columns, recording) is not None:
         return recording
     tick = _TICK if columns["end"] < _LONG else _LONG_TICK
-    given = [recording.columns[axis] if axis in there else None for axis in columns["axes"]]
-    corrected = [None if column is None else np.empty(len(recording)) for column in given]
+    outputs = [recording.columns[axis] if axis in there else None for axis in columns["axes"]]
+    corrected = [None if column is None else np.empty(len(recording)) for column in outputs]
     buffer = np.empty(min(_PIECE, len(recording)))
     for start in range(0, len(recording), _PIECE):
         piece = slice(start, start + _PIECE)
         ticks = _ticks(time[piece], tick, buffer)
         into = _parts(corrected, piece)
-        _, active = unit.warmup(temperature, tick, ticks, _parts(given, piece), factors=factors, into=into)
+        _, active = unit.warmup(temperature, tick, ticks, _parts(outputs, piece), factors=factors, into=into)
         if not active:
             return recording
-    found = zip(columns["axes"], corrected, strict=True)
-    return recording.with_columns({axis: column for axis, column in found if column is not None}, {})
+    pairs = zip(columns["axes"], corrected, strict=True)
+    return recording.with_columns({axis: column for axis, column in pairs if column is not None}, {})
 
 
 def present_axes(columns: Mapping[str, Any], recording: Recording) -> list[str]:

@@ -180,16 +180,16 @@ def units_table(
     fit: WarmupSummary, table: WarmupTable, kinds: dict[str, list[int]], units: list[float | None]
 ) -> ReportTable:
     """Return whether one table for the type is enough, axis by axis."""
-    found = fit.repeatability
+    spread = fit.repeatability
     rows = []
     for index in kinds.values():
         for i in index:
             label, factor = small_unit(table.units[i]).scale
-            unit, cycle, uncertainty = units[i], found.cycle[i], found.standard_uncertainty[i]
+            unit, cycle, uncertainty = units[i], spread.cycle[i], spread.standard_uncertainty[i]
             verdict = "–"
             if unit is not None and cycle is not None and uncertainty is not None:
                 verdict = "each unit" if unit > cycle + 2 * uncertainty else "one per type"
-            shown = [rms_text(values, [i], factor) for values in (units, found.cycle)]
+            shown = [rms_text(values, [i], factor) for values in (units, spread.cycle)]
             rows.append([table.axes[i], *shown, verdict, label])
     return ReportTable(
         title=f"Spread between {fit.units} units",
@@ -234,10 +234,10 @@ def tests_table(drawn: WarmupRecord, table: WarmupTable) -> ReportTable:
 
 def axes_by_kind(table: WarmupTable) -> dict[str, list[int]]:
     """Return the numbers of the gyroscopes' axes, and of the accelerometers'."""
-    found: dict[str, list[int]] = {}
+    kinds: dict[str, list[int]] = {}
     for i, axis in enumerate(table.axes):
-        found.setdefault("gyroscopes" if axis.startswith("gyro") else "accelerometers", []).append(i)
-    return found
+        kinds.setdefault("gyroscopes" if axis.startswith("gyro") else "accelerometers", []).append(i)
+    return kinds
 
 
 def rms_of(values: list[float | None] | None, index: list[int]) -> float:
@@ -437,11 +437,11 @@ def _mean_residual(table: WarmupTable, members: list[CycleCurve]) -> tuple[Array
     size = min(len(cycle.time) for cycle in members)
     total, time = np.zeros((len(table.axes), size)), np.zeros(size)
     for cycle in members:
-        own = np.array(cycle.time[:size])
-        z = evaluate(table, own, _inside(table, cycle.power_on_temperature))
+        cycle_time = np.array(cycle.time[:size])
+        z = evaluate(table, cycle_time, _inside(table, cycle.power_on_temperature))
         curve = np.array(cycle.curve, dtype=np.float64)[:, :size]
         total += curve - (0.0 if z is None else z)
-        time += own
+        time += cycle_time
     return time / len(members), total / len(members)
 
 

@@ -156,17 +156,17 @@ def fit_warmup(
     settling_time = None if settling_time is None else in_si(settling_time, "settling_time", "time", "s")
     taper_time = in_si(taper_time, "taper_time", "time", "s")
     at = check_options(model, temperatures, tolerance, settling_time, exit, taper_time, pool, beyond)
-    found = _cycles(cycles, reading, in_si(latest_start, "latest_start", "time", "s"), from_column=temperature_column)
+    used = _cycles(cycles, reading, in_si(latest_start, "latest_start", "time", "s"), from_column=temperature_column)
     if axes is not None:
-        found = [with_axes(cycle, _names(axes)) for cycle in found]
-    order = common_axes(found)
-    found = [with_axes(cycle, order) for cycle in found]
-    _check_together(found, pool)
+        used = [with_axes(cycle, _names(axes)) for cycle in used]
+    order = common_axes(used)
+    used = [with_axes(cycle, order) for cycle in used]
+    _check_together(used, pool)
     limits = _limits(settling_limit)
-    curves, settled = make_curves(found, at, tolerance=tolerance, settling_time=settling_time, limit=limits)
+    curves, settled = make_curves(used, at, tolerance=tolerance, settling_time=settling_time, limit=limits)
     spread = repeatability(curves)
     by_unit = pool == "type" and np.unique(curves.unit).size > 1
-    weights = cycle_weights(curves, spread) if by_unit else np.ones(len(found))
+    weights = cycle_weights(curves, spread) if by_unit else np.ones(len(used))
     rows = [judge_none(curves)] + [
         judge(curves, name, count, weights, by_unit=by_unit) for name, count in CANDIDATES if model in ("auto", name)
     ]
@@ -200,9 +200,9 @@ def _names(axes: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(names_of_columns(axes, "axes") if isinstance(axes, str) else axes)
 
 
-def _limits(given: Mapping[str, float] | str) -> dict[str, float]:
+def _limits(stated: Mapping[str, float] | str) -> dict[str, float]:
     """Return kind to the size of Z that counts as settled, in SI, or less its share of the largest."""
-    named = settling_size(given, "settling_limit") if isinstance(given, str) else given
+    named = settling_size(stated, "settling_limit") if isinstance(stated, str) else stated
     limits = dict.fromkeys(("gyro", "accel"), -SETTLING_SHARE)
     for kind in named:
         if kind not in limits:
@@ -211,16 +211,16 @@ def _limits(given: Mapping[str, float] | str) -> dict[str, float]:
 
 
 def _cycles(
-    given: Sequence[Cycle | Data], reading: Mapping[str, Any], latest_start: float, *, from_column: bool
+    items: Sequence[Cycle | Data], reading: Mapping[str, Any], latest_start: float, *, from_column: bool
 ) -> list[Cycle]:
     """Return power cycles, those that are not yet averaged over bins of a second."""
-    found = [
+    averaged = [
         item if isinstance(item, Cycle) else _averaged(item, reading, latest_start, from_column=from_column)
-        for item in given
+        for item in items
     ]
-    if not found:
+    if not averaged:
         raise DataError("no power cycles: expected at least one file for each calibration temperature")
-    return found
+    return averaged
 
 
 def _averaged(data: Data, reading: Mapping[str, Any], latest_start: float, *, from_column: bool) -> Cycle:
@@ -290,5 +290,5 @@ def _check_together(cycles: Sequence[Cycle], pool: str) -> None:
                 f"{unnamed[0]}: no serial in the head of the file; --pool type needs it to tell units apart"
             )
         return
-    if other := different_units(*((cycle.name, {"serial": cycle.serial or ""}) for cycle in cycles)):
-        raise DataError(f"{other}; expected power cycles of one unit (--pool type fits one table to several)")
+    if second_name := different_units(*((cycle.name, {"serial": cycle.serial or ""}) for cycle in cycles)):
+        raise DataError(f"{second_name}; expected power cycles of one unit (--pool type fits one table to several)")

@@ -122,8 +122,8 @@ class WarmupTable:
         row = min(int(np.searchsorted(edges, temperature, side="right")) - 1, len(edges) - 2)
         c = self.coefficients
         if self.model == "interval-cubic":
-            found: Array = c[row]
-            return found
+            coefficients: Array = c[row]
+            return coefficients
         width = edges[row + 1] - edges[row]
         s = (temperature - edges[row]) / width
         if self.slopes is None:
@@ -278,8 +278,8 @@ def edge_jumps(table: WarmupTable, times: Array) -> Array:
 def exit_jump(table: WarmupTable) -> Array:
     """Return Z(T_M) at each interval or knot, shape (r, axes): what is dropped at T_M under exit ``zero``."""
     last = basis(table.model, np.array(table.settling_time), table.settling_time, table.scales)
-    found: Array = table.coefficients @ last
-    return found
+    jump: Array = table.coefficients @ last
+    return jump
 
 
 def record_table(record: Calibration) -> WarmupTable:
@@ -338,9 +338,9 @@ class Statistics:
     def mean_square(self, coefficients: Array) -> Array:
         """Return the mean squared residual of each cycle for its coefficients (c, axes, p): shape (c, axes)."""
         cross = np.einsum("cap,cpa->ca", coefficients, self.moment)
-        own = np.einsum("cap,cpq,caq->ca", coefficients, self.normal, coefficients)
-        found: Array = np.maximum(self.square - 2 * cross + own, 0.0) / self.weight[:, None]
-        return found
+        fitted = np.einsum("cap,cpq,caq->ca", coefficients, self.normal, coefficients)
+        square: Array = np.maximum(self.square - 2 * cross + fitted, 0.0) / self.weight[:, None]
+        return square
 
 
 def statistics(curves: Curves, model: str, scales: Sequence[float]) -> Statistics:
@@ -445,15 +445,15 @@ def _knots(sums: Statistics, hat: Array, used: Array) -> Array:
     normal = knot_normal(sums, hat, used)
     moment = np.einsum("c,ck,cpa->kpa", used, hat, sums.moment)
     k, p, a = moment.shape
-    found: Array = np.linalg.solve(normal, moment.reshape(k * p, a)).reshape(k, p, a).transpose(0, 2, 1)
-    return found
+    coefficients: Array = np.linalg.solve(normal, moment.reshape(k * p, a)).reshape(k, p, a).transpose(0, 2, 1)
+    return coefficients
 
 
 def knot_normal(sums: Statistics, hat: Array, used: Array) -> Array:
     """Return the normal matrix of all knots' coefficients, shape (k p, k p)."""
     size = hat.shape[1] * sums.normal.shape[1]
-    found: Array = np.einsum("c,cj,ck,cpq->jpkq", used, hat, hat, sums.normal, optimize=True).reshape(size, size)
-    return found
+    normal: Array = np.einsum("c,cj,ck,cpq->jpkq", used, hat, hat, sums.normal, optimize=True).reshape(size, size)
+    return normal
 
 
 def _amplitudes(
@@ -542,13 +542,13 @@ def find_scales(
     else:
         first, step, tolerance = np.log(np.array(start)), 0.1, 3e-3
     simplex = np.vstack([first, first + step * np.eye(count)])
-    found = minimize(
+    minimum = minimize(
         cost,
         first,
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": tolerance, "fatol": 1e-9 * abs(cost(first)), "maxiter": 200},
     )
-    return tuple(np.exp(np.sort(found.x)).tolist())
+    return tuple(np.exp(np.sort(minimum.x)).tolist())
 
 
 def coefficients_of(curves: Curves, table: WarmupTable) -> Array:
@@ -588,12 +588,14 @@ def _taken(normal: Array, both: Array, hat: Array, weights: Array) -> Array:
     """What a fit takes of the noise in each cycle, shape (c,): of variances of one second's mean."""
     size = hat.shape[1] * normal.shape[1]
     spread = np.einsum("cj,ck->cjk", hat, hat)
-    own = np.einsum("cjk,cpq->cjpkq", spread, normal).reshape(-1, size, size)
+    normals = np.einsum("cjk,cpq->cjpkq", spread, normal).reshape(-1, size, size)
     noisy = np.einsum("cjk,cpq->cjpkq", spread, both).reshape(-1, size, size)
-    inverse = np.linalg.inv(np.einsum("c,cxy->xy", weights, own))
-    seen = inverse @ np.einsum("c,cxy->xy", weights**2, noisy) @ inverse
-    found: Array = 2 * weights * np.einsum("cxy,yx->c", noisy, inverse) - np.einsum("cxy,yx->c", own, seen)
-    return found
+    inverse = np.linalg.inv(np.einsum("c,cxy->xy", weights, normals))
+    spread_of_noise = inverse @ np.einsum("c,cxy->xy", weights**2, noisy) @ inverse
+    share: Array = 2 * weights * np.einsum("cxy,yx->c", noisy, inverse) - np.einsum(
+        "cxy,yx->c", normals, spread_of_noise
+    )
+    return share
 
 
 def scatter(curves: Curves, sums: Statistics, cluster: Index) -> tuple[Array, Array, float]:
@@ -606,12 +608,12 @@ def scatter(curves: Curves, sums: Statistics, cluster: Index) -> tuple[Array, Ar
     """
     groups = len(curves.temperatures)
     owners = np.unique(cluster)
-    own = np.array([np.linalg.solve(*_sum(sums, cluster == o)) for o in owners])  # (o, p, axes)
+    by_owner = np.array([np.linalg.solve(*_sum(sums, cluster == o)) for o in owners])  # (o, p, axes)
     place = np.array([curves.group[cluster == o][0] for o in owners])
-    p, a = own.shape[1:]
+    p, a = by_owner.shape[1:]
     total, freedom = np.zeros((groups, a, p, p)), np.zeros(groups)
     for k in range(groups):
-        rows = own[place == k]
+        rows = by_owner[place == k]
         deviation = rows - rows.mean(axis=0) if len(rows) else rows
         total[k] = np.einsum("opa,oqa->apq", deviation, deviation)
         freedom[k] = max(len(rows) - 1, 0)

@@ -169,17 +169,17 @@ def _leave_temperatures(
     if groups < 3:
         return None, []
     errors = np.full((len(curves.cycles), len(curves.axes)), np.nan)
-    found = []
+    all_scales = []
     for k in range(groups):
         out = curves.group == k
         kept = weights * ~out
-        own = find_scales(curves, model, len(scales), kept, scales) if scales else ()
-        found.append(own)
+        kept_scales = find_scales(curves, model, len(scales), kept, scales) if scales else ()
+        all_scales.append(kept_scales)
         if 0 < k < groups - 1:
-            sums = statistics(curves, model, own)
-            table = solve(curves, model, own, sums, kept, np.delete(np.arange(groups), k)).table
+            sums = statistics(curves, model, kept_scales)
+            table = solve(curves, model, kept_scales, sums, kept, np.delete(np.arange(groups), k)).table
             errors[out] = (sums.mean_square(coefficients_of(curves, table)) - noise)[out]
-    return errors, found
+    return errors, all_scales
 
 
 @dataclass(frozen=True)
@@ -211,9 +211,9 @@ def worst_between(curves: Curves, chosen: Judged, spread: CycleSpread) -> Worst 
         return None
     gap = np.diff(t)
     repeated = np.nan_to_num(spread.cycle)
-    own = np.sqrt(np.maximum(left[1:-1] ** 2 - repeated**2, 0.0))
+    interpolation = np.sqrt(np.maximum(left[1:-1] ** 2 - repeated**2, 0.0))
     bend = np.zeros_like(left)
-    bend[1:-1] = own / (gap[:-1] * gap[1:])[:, None]
+    bend[1:-1] = interpolation / (gap[:-1] * gap[1:])[:, None]
     between = np.maximum(bend[:-1], bend[1:]) * (gap**2 / 4)[:, None]
     total = np.sqrt(between**2 + np.nan_to_num(chosen.training) ** 2 + repeated**2)
     size = np.sqrt(np.mean(curves.mean**2, axis=(0, 1)))
@@ -295,9 +295,9 @@ def repeatability(curves: Curves) -> CycleSpread:
     """
     scales = (_SMOOTH_SCALE,)
     sums = statistics(curves, "knot-log-cubic", scales)
-    own = np.linalg.solve(sums.normal, sums.moment)
+    coefficients = np.linalg.solve(sums.normal, sums.moment)
     metric = sums.normal.sum(axis=0) / sums.weight.sum()
-    size = own.shape[1]
+    size = coefficients.shape[1]
     noise = curves.noise * (size / sums.weight + 1 / curves.reference_seconds)[:, None]
     groups, a = len(curves.temperatures), len(curves.axes)
     within, freedom = np.zeros((groups, a)), np.zeros(groups)
@@ -307,8 +307,8 @@ def repeatability(curves: Curves) -> CycleSpread:
         for u in np.unique(curves.unit[curves.group == k]):
             chosen = (curves.group == k) & (curves.unit == u)
             n = int(chosen.sum())
-            mean = own[chosen].mean(axis=0)
-            within[k] += _squares(own[chosen] - mean, metric) - (n - 1) * noise[chosen].mean(axis=0)
+            mean = coefficients[chosen].mean(axis=0)
+            within[k] += _squares(coefficients[chosen] - mean, metric) - (n - 1) * noise[chosen].mean(axis=0)
             freedom[k] += n - 1
             means.append(mean)
             members += 1 / n
@@ -324,15 +324,15 @@ def repeatability(curves: Curves) -> CycleSpread:
     unit = None
     if units:
         pairs = len(set(zip(curves.unit.tolist(), curves.group.tolist(), strict=True)))
-        one = np.where(np.isfinite(cycle), cycle, 0.0) ** 2 + noise.mean(axis=0)
-        unit = np.sqrt(np.maximum(between / units - one * members / pairs, 0.0))
+        cycle_variance = np.where(np.isfinite(cycle), cycle, 0.0) ** 2 + noise.mean(axis=0)
+        unit = np.sqrt(np.maximum(between / units - cycle_variance * members / pairs, 0.0))
     return CycleSpread(cycle, uncertainty, total, each, unit)
 
 
 def _squares(deviations: Array, metric: Array) -> Array:
     """Sum over curves of their mean squares, for coefficients (n, p, axes): shape (axes,)."""
-    found: Array = np.einsum("npa,pq,nqa->a", deviations, metric, deviations)
-    return found
+    squares: Array = np.einsum("npa,pq,nqa->a", deviations, metric, deviations)
+    return squares
 
 
 def cycle_weights(curves: Curves, spread: CycleSpread) -> Array:
@@ -343,8 +343,8 @@ def cycle_weights(curves: Curves, spread: CycleSpread) -> Array:
     """
     if spread.unit is None:
         return np.ones(len(curves.cycles))
-    own = np.where(np.isfinite(spread.cycle), spread.cycle, 0.0) ** 2 + curves.expected_noise().mean(axis=0)
-    rho = float(np.mean(spread.unit**2 / np.maximum(own, 1e-300)))
+    cycle_variance = np.where(np.isfinite(spread.cycle), spread.cycle, 0.0) ** 2 + curves.expected_noise().mean(axis=0)
+    rho = float(np.mean(spread.unit**2 / np.maximum(cycle_variance, 1e-300)))
     same = (curves.unit[:, None] == curves.unit) & (curves.group[:, None] == curves.group)
     weights: Array = 1 / (1 + rho * same.sum(axis=1))
     return np.asarray(weights / weights.max())
@@ -388,25 +388,25 @@ def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]
 
 def expectations(curves: Curves, chosen: Judged, worst: Worst | None) -> list[str]:
     """Return what a unit in use has to expect of a table, beyond what the tests show of it."""
-    found: list[str] = []
+    messages: list[str] = []
     stated = chosen.left_temperature
     if worst is not None and stated is not None and (worst.error > _MORE * stated + _ROUNDING).any():
-        said = [
+        sizes = [
             f"{small_text(max(worst.error[i] for i in index), curves.units[index[0]])} ({kind})"
             for kind, index in curves.kinds().items()
         ]
-        found.append(
+        messages.append(
             Note(
-                f"at the worst power-on temperature, near {worst.temperature:.3g} degC, expect {' and '.join(said)} "
+                f"at the worst power-on temperature, near {worst.temperature:.3g} degC, expect {' and '.join(sizes)} "
                 "rms, more than the temperatures left out of the fit show: measure there"
             )
         )
-    return found
+    return messages
 
 
 def _dead_columns(curves: Curves) -> list[str]:
     """Columns that never change while others do, for a cycle or for a while, and rows of zeros."""
-    found: list[str] = []
+    messages: list[str] = []
     stuck: dict[str, list[str]] = {}
     paused: dict[str, list[str]] = {}
     for cycle in curves.cycles:
@@ -418,13 +418,13 @@ def _dead_columns(curves: Curves) -> list[str]:
             elif (longest := _longest(still[:, i])) >= _PAUSE and still[:, i].mean() < _MOSTLY:
                 paused.setdefault(axis, []).append(f"{cycle.name} ({longest} s)")
     for axis, names in stuck.items():
-        found.append(Bad(f"{axis} never changes in {_named(names)}: is it connected? --axes leaves a column out"))
+        messages.append(Bad(f"{axis} never changes in {_named(names)}: is it connected? --axes leaves a column out"))
     for axis, names in paused.items():
-        found.append(Bad(f"{axis} is stuck for a while in {_named(names)}: its samples repeat exactly"))
+        messages.append(Bad(f"{axis} is stuck for a while in {_named(names)}: its samples repeat exactly"))
     empty = [f"{cycle.name} ({cycle.zeros})" for cycle in curves.cycles if cycle.zeros]
     if empty:
-        found.append(f"rows in which every axis is exactly zero were left out: {_named(empty)}")
-    return found
+        messages.append(f"rows in which every axis is exactly zero were left out: {_named(empty)}")
+    return messages
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:
@@ -438,16 +438,16 @@ def _named(names: list[str]) -> str:
 
 
 def _ends(curves: Curves, settled: bool) -> list[str]:
-    found = []
+    messages = []
     if not settled:
-        found.append(
+        messages.append(
             f"not settled: the curves still change when the recordings end; T_M = {curves.settling_time:g} s leaves "
             f"{SETTLED:g} s for the reference: record longer"
         )
     reached = np.array([curves.end[curves.group == k].max() for k in range(len(curves.temperatures))])
     beyond = [f"{t:g}" for t, e in zip(curves.temperatures, reached, strict=True) if e < curves.settling_time - 1]
     if beyond:
-        found.append(
+        messages.append(
             f"no cycle at {' '.join(beyond)} degC lasts to T_M = {curves.settling_time:g} s: the table goes on from "
             f"{reached.min():g} s without data, and a cubic may go anywhere there"
         )
@@ -455,11 +455,11 @@ def _ends(curves: Curves, settled: bool) -> list[str]:
         f"{c.name} ({end:.6g} s)" for c, end, half in zip(curves.cycles, curves.end, curves.halved, strict=True) if half
     ]
     if short:
-        found.append(
+        messages.append(
             f"not settled: ends before T_M + {SETTLED:g} s = {curves.settling_time + SETTLED:g} s, so that the second "
             f"half of the cycle is its reference: {_named(short)}"
         )
-    return found
+    return messages
 
 
 def _starts(curves: Curves) -> list[str]:
@@ -491,19 +491,19 @@ def _drifts(curves: Curves, chosen: Judged) -> list[str]:
     clear = np.abs(curves.drift) > STILL_DRIFTS.limit * curves.drift_uncertainty
     largest = np.sqrt((curves.mean**2).mean(axis=(0, 1)))
     big = np.abs(curves.drift) > np.maximum(_DRIFT_SHARE * chosen.training, 0.05 * largest)
-    found = []
+    messages = []
     for kind, index in curves.kinds().items():
         share = (clear & big)[:, index]
         if share.any():
             row, column = np.unravel_index(np.argmax(np.abs(curves.drift[:, index]) * share), share.shape)
             axis = index[column]
-            found.append(
+            messages.append(
                 f"not settled: {kind} still drifts in the settled part of {int(share.any(axis=1).sum())} of "
                 f"{len(curves.cycles)} cycles, most in {curves.cycles[row].name} ({curves.axes[axis]}, "
                 f"{small_text(curves.drift[row, axis], curves.units[axis])} from T_M to its end); Z is relative to "
                 "the mean of that part"
             )
-    return found
+    return messages
 
 
 def _temperatures(curves: Curves) -> list[str]:
@@ -515,15 +515,15 @@ def _temperatures(curves: Curves) -> list[str]:
             warm.append(f"{cycle.name} ({reading - chamber:+.2g} K)")
         elif abs(cycle.temperature - nominal) > _OFF_SET_POINT:
             far.append(f"{cycle.name} ({cycle.temperature - nominal:+.2g} K)")
-    found = []
+    messages = []
     if warm:
-        found.append(
+        messages.append(
             "not cold: at power-on warmer than the chamber, so that the curve starts half-way (soak longer): "
             f"{_named(warm)}"
         )
     if far:
-        found.append(f"power-on temperature more than {_OFF_SET_POINT:g} K from the set point: {_named(far)}")
-    return found
+        messages.append(f"power-on temperature more than {_OFF_SET_POINT:g} K from the set point: {_named(far)}")
+    return messages
 
 
 def _single(curves: Curves) -> list[str]:
@@ -600,12 +600,14 @@ def after_of(cycles: Sequence[Cycle]) -> str | None:
     """
     first = cycles[0]
     sensors = {axis.partition("_")[0] for axis in first.axes}
-    found = [next((t.hashes[0] for t in thermals_of(c.corrected_by) if t.sensor in sensors), None) for c in cycles]
-    for cycle, after in zip(cycles, found, strict=True):
-        if after != found[0]:
-            mine, its = (f"the thermal record sha256:{one[:12]}" if one else "none" for one in (after, found[0]))
+    digests = [next((t.hashes[0] for t in thermals_of(c.corrected_by) if t.sensor in sensors), None) for c in cycles]
+    for cycle, after in zip(cycles, digests, strict=True):
+        if after != digests[0]:
+            mine, its = (
+                f"the thermal record sha256:{digest[:12]}" if digest else "none" for digest in (after, digests[0])
+            )
             raise DataError(
                 f"{cycle.name}: corrected over temperature by {mine}, but {first.name} by {its}; expected all cycles "
                 "as the unit put them out, or all corrected by the same thermal record"
             )
-    return found[0]
+    return digests[0]

@@ -83,25 +83,25 @@ def _parameters(
     curves: Curves, chosen: Judged, spread: CycleSpread, worst: Worst | None
 ) -> tuple[dict[str, Parameter], tuple[str, ...], Array]:
     """Return T_M, time scales, and per axis what cycles repeat to and the model leaves; names and covariance."""
-    found = {"settling_time": Parameter(curves.settling_time, None, "s")}
+    parameters = {"settling_time": Parameter(curves.settling_time, None, "s")}
     blocks: list[tuple[tuple[str, ...], Array]] = []
     scales = chosen.solution.scales if chosen.solution else ()
     known = chosen.scales_covariance
     if scales:
-        one = chosen.model == "knot-log-cubic"
-        names = ("time_scale",) if one else tuple(f"time_constant_{j + 1}" for j in range(len(scales)))
+        single_scale = chosen.model == "knot-log-cubic"
+        names = ("time_scale",) if single_scale else tuple(f"time_constant_{j + 1}" for j in range(len(scales)))
         for j, (name, value) in enumerate(zip(names, scales, strict=True)):
-            found[name] = Parameter(value, None if known is None else float(np.sqrt(known[j, j])), "s")
+            parameters[name] = Parameter(value, None if known is None else float(np.sqrt(known[j, j])), "s")
         if known is not None:
             blocks.append((names, known))
     for i, (axis, unit) in enumerate(zip(curves.axes, curves.units, strict=True)):
         if spread.freedom:
             uncertainty = float(spread.uncertainty[i])
             name = f"repeatability_{axis}"
-            found[name] = Parameter(float(spread.cycle[i]), uncertainty, unit)
+            parameters[name] = Parameter(float(spread.cycle[i]), uncertainty, unit)
             blocks.append(((name,), np.array([[uncertainty**2]])))
         if spread.unit is not None:
-            found[f"unit_spread_{axis}"] = Parameter(float(spread.unit[i]), None, unit)
+            parameters[f"unit_spread_{axis}"] = Parameter(float(spread.unit[i]), None, unit)
         for key, values in (
             ("training_error", chosen.training),
             ("left_cycle_error", chosen.left_cycle),
@@ -111,14 +111,14 @@ def _parameters(
             ("exit_jump", chosen.exit_jump),
         ):
             if values is not None:
-                found[f"{key}_{axis}"] = Parameter(float(values[i]), None, unit)
+                parameters[f"{key}_{axis}"] = Parameter(float(values[i]), None, unit)
     names = tuple(name for block, _ in blocks for name in block)
     matrix, start = np.zeros((len(names), len(names))), 0
     for block, part in blocks:
         stop = start + len(block)
         matrix[start:stop, start:stop] = part
         start = stop
-    return found, names, matrix
+    return parameters, names, matrix
 
 
 def _row(row: Judged, chosen: bool) -> dict[str, Any]:
@@ -174,8 +174,8 @@ def misfit(curves: Curves, table: WarmupTable) -> dict[str, Any]:
     inside = middle < table.settling_time
     total = np.zeros((int(inside.sum()), len(curves.axes)))
     for k, at in enumerate(curves.temperatures):
-        own = np.clip(curves.power_on[curves.group == k].mean(), *curves.temperatures[[0, -1]])
-        z = evaluate(table, middle[inside], float(own))
+        column = np.clip(curves.power_on[curves.group == k].mean(), *curves.temperatures[[0, -1]])
+        z = evaluate(table, middle[inside], float(column))
         assert z is not None, at
         white = curves.noise / np.maximum(seconds[k, inside], 1.0)[:, None]
         total += ((mean[k, inside] - z.T) ** 2 - white) * (seconds[k, inside] > 0)[:, None]
@@ -183,8 +183,8 @@ def misfit(curves: Curves, table: WarmupTable) -> dict[str, Any]:
     return {
         "time": {"value": _numbers(middle[inside]), "unit": "s"},
         "rms": {
-            axis: {"value": _numbers(own), "unit": unit}
-            for axis, own, unit in zip(curves.axes, rms.T, curves.units, strict=True)
+            axis: {"value": _numbers(column), "unit": unit}
+            for axis, column, unit in zip(curves.axes, rms.T, curves.units, strict=True)
         },
     }
 

@@ -148,11 +148,11 @@ def drawn_of(record: Calibration) -> WarmupRecord:
     RecordError
         Its curves do not fit their times, or its rows by temperature the temperatures of its cycles.
     """
-    found = part(record, WarmupRecord)
-    for number, cycle in enumerate(found.data.cycles):
+    warmup = part(record, WarmupRecord)
+    for number, cycle in enumerate(warmup.data.cycles):
         if any(len(row) != len(cycle.time) for row in cycle.curve):
             raise RecordError(f"data.cycles[{number}].curve: expected {len(cycle.time)} values an axis, as of time")
-    rows, knots = len(found.fit.repeatability.by_temperature), len(found.data.knots)
+    rows, knots = len(warmup.fit.repeatability.by_temperature), len(warmup.data.knots)
     if rows != knots:
         raise RecordError(f"fit.repeatability.by_temperature: expected {knots} rows, one a temperature, found {rows}")
-    return found
+    return warmup

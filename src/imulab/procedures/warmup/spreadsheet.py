@@ -212,8 +212,8 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
     per_second = model in _CUBIC and titles == _titles(model, size, True)
     if titles != expected and not per_second:
         raise ReadError(f"{path}: line {number}: expected the titles {','.join(expected)}, found {','.join(titles)}")
-    units, found = _read_rows(path, rows[1:], lead, size)
-    order = sorted(found)
+    units, blocks = _read_rows(path, rows[1:], lead, size)
+    order = sorted(blocks)
     if interval:
         for left, right in pairwise(order):
             if left[1] != right[0]:
@@ -221,7 +221,7 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
         temperatures = np.array([order[0][0], *(at[1] for at in order)])
     else:
         temperatures = np.array([at[0] for at in order])
-    values = np.array([[found[at][axis] for axis in units] for at in order])
+    values = np.array([[blocks[at][axis] for axis in units] for at in order])
     settling_time = _seconds(path, settings, "settling_time")[0]
     if per_second:
         values = values * settling_time ** np.arange(4)
@@ -250,7 +250,7 @@ def _read_rows(
 ) -> tuple[dict[str, str], dict[tuple[float, ...], dict[str, list[float]]]]:
     """Return the SI unit of each axis, and the coefficients in SI of each interval or knot and axis."""
     units: dict[str, str] = {}
-    found: dict[tuple[float, ...], dict[str, list[float]]] = {}
+    blocks: dict[tuple[float, ...], dict[str, list[float]]] = {}
     for number, cells in rows:
         place = f"{path}: line {number}"
         if len(cells) != lead + 2 + size:
@@ -264,15 +264,15 @@ def _read_rows(
             raise ReadError(f"{place}: {error}") from None
         if units.setdefault(axis, si) != si:
             raise ReadError(f"{place}: {axis} in {unit}, but in {units[axis]} above")
-        block = found.setdefault(at, {})
+        block = blocks.setdefault(at, {})
         if axis in block:
             raise ReadError(f"{place}: {axis} at {' to '.join(f'{t:g}' for t in at)} degC appears twice")
         block[axis] = [_value(place, cell) * factor for cell in cells[lead + 2 :]]
-    for at in sorted(found):
-        missing = [axis for axis in units if axis not in found[at]]
+    for at in sorted(blocks):
+        missing = [axis for axis in units if axis not in blocks[at]]
         if missing:
             raise ReadError(f"{path}: no row for {missing[0]} at {' to '.join(f'{t:g}' for t in at)} degC")
-    return units, found
+    return units, blocks
 
 
 def _seconds(path: str, settings: dict[str, str], key: str) -> list[float]:

@@ -168,47 +168,49 @@ def fit_gyro_triad(
     time, output = check_time(recording), left_out.recording.triad("gyro")
     factor = output_factor(attitudes.recording.name, triad("accel"), attitudes.unit, model_of(record).output_unit)
     means = attitudes.mean * factor
-    own = attitudes.recording.si("time")
+    accel_time = attitudes.recording.si("time")
     moving = leave_out(attitudes.recording, triad("accel")).recording
-    own_force = specific_force(record, moving.triad("accel") * factor)
+    accel_force = specific_force(record, moving.triad("accel") * factor)
     force, knocked = specific_force(record, means), aside_of(record, attitudes)
-    case = Case(recording.name, attitudes, force, own, own_force, output, unit, fit_bias, knocked)
-    case, found = _begun(case, time, sensitivity, earth)
-    time, found, said = _with_even_stamps(case, time, sensitivity, found)
+    case = Case(recording.name, attitudes, force, accel_time, accel_force, output, unit, fit_bias, knocked)
+    case, solved = _begun(case, time, sensitivity, earth)
+    time, solved, stamp_notes = _with_even_stamps(case, time, sensitivity, solved)
     apart = attitudes.recording is not recording
-    comparison = compare_clocks(own, own_force, time, found.rate(output), found.segments, search=apart)
+    comparison = compare_clocks(accel_time, accel_force, time, solved.rate(output), solved.segments, search=apart)
     if clock_of == "accel":
         if comparison is None:
             raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
         time = comparison.on_other(time)
-        found = solve_turns(case, time, sensitivity)
-    said_of_noise: list[str] = []
+        solved = solve_turns(case, time, sensitivity)
+    noise_notes: list[str] = []
     if noise is not None:
-        found, said_of_noise = _with_noise(found, noise, attitudes, recording)
+        solved, noise_notes = _with_noise(solved, noise, attitudes, recording)
     known = clock_of_scale(comparison, clock, clock_of, counted=counted(check_time(recording)))
     notes = [
         *(f"gyro: {note}" for note in left_out.notes(_at_rest(attitudes, time, left_out))),
-        *said,
-        *said_of_noise,
-        *found.notes,
+        *stamp_notes,
+        *noise_notes,
+        *solved.notes,
         *_record_notes(record, attitudes, case.force),
         *known.notes(apart=apart),
     ]
     if apart and clock_of == "gyro":
         notes += clock_notes(find_holds(attitudes, time, output, recording.name), attitudes, time)
-    segments, residual, jacobian = found.segments, found.residual, found.jacobian
-    miss, size = np.linalg.norm(residual.reshape(-1, 3), axis=1), found.theta.size
+    segments, residual, jacobian = solved.segments, solved.residual, solved.jacobian
+    miss, size = np.linalg.norm(residual.reshape(-1, 3), axis=1), solved.theta.size
     # Each turn fixes two angles: how far about its own direction it went, gravity cannot see.
     freedom = max(2 * len(miss) - size, 1)
-    seen = _observability_of_turns(found, freedom, recording.name)
+    conditioning = _observability_of_turns(solved, freedom, recording.name)
     directions = direction_covariance(record, attitudes, means, case.force)
-    zero = None if fit_bias else found.rest.zero_uncertainty
-    shared = shared_covariance(segments, found.scale, found.theta, directions, zero)
-    matrix, variance = turn_covariance(found, shared, freedom)
-    linearity = test_linearity(segments, found.scale, found.theta, jacobian, residual, shared, variance)
+    zero = None if fit_bias else solved.rest.zero_uncertainty
+    shared = shared_covariance(segments, solved.scale, solved.theta, directions, zero)
+    matrix, variance = turn_covariance(solved, shared, freedom)
+    linearity = test_linearity(segments, solved.scale, solved.theta, jacobian, residual, shared, variance)
     if linearity is not None:
         notes += linearity.notes()
-    return _on_earth(_result(found, matrix, miss, unit, fit_bias, seen, known, linearity, tuple(notes)), case, earth)
+    return _on_earth(
+        _result(solved, matrix, miss, unit, fit_bias, conditioning, known, linearity, tuple(notes)), case, earth
+    )
 
 
 def _on_earth(fit: GyroFit, case: Case, earth: EarthRate | None) -> GyroFit:
@@ -225,14 +227,14 @@ def _on_earth(fit: GyroFit, case: Case, earth: EarthRate | None) -> GyroFit:
 
 def _begun(case: Case, time: Array, sensitivity: str, earth: EarthRate | None) -> tuple[Case, Solved]:
     """Return the case, with what is known of the Earth's rate, as output, or how large it may be, and the solution."""
-    found = solve_turns(case, time, sensitivity)
+    solved = solve_turns(case, time, sensitivity)
     up = case.force / np.linalg.norm(case.force, axis=1, keepdims=True)
     if earth is not None:
-        case = replace(case, earth=found.output_of(earth.vertical * up))
-    elif sensitivity == "auto" and found.rest.slope is not None:
-        case = replace(case, vertical=found.output_of(EARTH * up))
+        case = replace(case, earth=solved.output_of(earth.vertical * up))
+    elif sensitivity == "auto" and solved.rest.slope is not None:
+        case = replace(case, vertical=solved.output_of(EARTH * up))
     else:
-        return case, found
+        return case, solved
     return case, solve_turns(case, time, sensitivity)
 
 
@@ -260,61 +262,63 @@ def _at_rest(attitudes: Attitudes, time: Array, left_out: LeftOut) -> NDArray[np
 
 
 def _with_noise(
-    found: Solved, noise: Calibration, attitudes: Attitudes, recording: Recording
+    solved: Solved, noise: Calibration, attitudes: Attitudes, recording: Recording
 ) -> tuple[Solved, list[str]]:
     """The zero with the uncertainty that a noise record tells of the time at rest, where the holds scatter by less."""
     unit = recording.triad_unit("gyro")
     rate = parse_unit(unit).quantity == "rate"
     duration = float((attitudes.stop - attitudes.start).sum())
-    u, said = mean_uncertainties(noise, triad("gyro"), duration, "rad/s" if rate else unit, recording.metadata)
+    u, noise_notes = mean_uncertainties(noise, triad("gyro"), duration, "rad/s" if rate else unit, recording.metadata)
     least = from_si(u, unit) if rate else u
-    rest = replace(found.rest, zero_uncertainty=np.maximum(found.rest.zero_uncertainty, least))
-    return replace(found, rest=rest), said
+    rest = replace(solved.rest, zero_uncertainty=np.maximum(solved.rest.zero_uncertainty, least))
+    return replace(solved, rest=rest), noise_notes
 
 
-def _with_even_stamps(case: Case, time: Array, sensitivity: str, found: Solved) -> tuple[Array, Solved, list[Note]]:
+def _with_even_stamps(case: Case, time: Array, sensitivity: str, solved: Solved) -> tuple[Array, Solved, list[Note]]:
     """Return time, solution and a note with evened time stamps, where the turns miss clearly less with them."""
     even = evened(time)
     if even is not None:
         # Only the turns can tell stamps that jitter from samples that do.
         other = solve_turns(case, even[0], sensitivity)
-        if other.typical_miss < _EVENER * found.typical_miss:
-            said = Note(
+        if other.typical_miss < _EVENER * solved.typical_miss:
+            note = Note(
                 f"gyro: the time stamps jitter by {1e3 * even[1]:.2g} ms rms: replaced by even ones, with which "
                 f"the turns miss by {np.degrees(other.typical_miss):.2g} deg instead of "
-                f"{np.degrees(found.typical_miss):.2g} deg (median)"
+                f"{np.degrees(solved.typical_miss):.2g} deg (median)"
             )
-            return even[0], other, [said]
-    return time, found, []
+            return even[0], other, [note]
+    return time, solved, []
 
 
-def _observability_of_turns(found: Solved, freedom: int, name: str) -> Observability:
+def _observability_of_turns(solved: Solved, freedom: int, name: str) -> Observability:
     """Return what the turns determine; refuse those that cannot separate the parameters or do not converge."""
-    residual, size, turns = found.residual, found.theta.size, len(found.residual) // 3
-    seen = observability(found.jacobian, np.full(len(residual), freedom / max(float(residual @ residual), 1e-30)))
-    if seen.rank < size:
-        confused = " ".join(seen.confused(gyro_names()[:size]))
+    residual, size, turns = solved.residual, solved.theta.size, len(solved.residual) // 3
+    conditioning = observability(
+        solved.jacobian, np.full(len(residual), freedom / max(float(residual @ residual), 1e-30))
+    )
+    if conditioning.rank < size:
+        confused = " ".join(conditioning.confused(gyro_names()[:size]))
         raise ObservabilityError(f"{name}: {turns} turns cannot separate {confused}")
-    if not found.converged:
+    if not solved.converged:
         raise DataError(
             f"{name}: the fit of the gyroscopes does not converge on these {turns} turns "
-            f"(condition number {seen.condition:.0f}); use more turns, about more directions"
+            f"(condition number {conditioning.condition:.0f}); use more turns, about more directions"
         )
-    return seen
+    return conditioning
 
 
 def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
     """Say if the accelerometers' record is hardly of this unit."""
     other = different_units(("the record", record.sensor), ("the recording", attitudes.recording.metadata))
-    found = [f"gyro: {other}"] if other else []
+    messages = [f"gyro: {other}"] if other else []
     length = np.linalg.norm(force, axis=1)
     scatter, usual = float(length.std()), fit_of(record).rms.value
     if scatter > _FOREIGN * usual + _TOUCHED:
-        found.append(
+        messages.append(
             f"gyro: under the record |f| scatters by {from_si(scatter, 'mg'):.3g} mg from attitude to attitude, by "
             f"{from_si(usual, 'mg'):.3g} mg when it was made: is it of this unit?"
         )
-    return found
+    return messages
 
 
 def gyro_names() -> list[str]:
@@ -327,18 +331,18 @@ def gyro_names() -> list[str]:
 
 
 def _result(
-    found: Solved,
+    solved: Solved,
     matrix: Array,
     miss: Array,
     unit: str,
     fit_bias: bool,
-    seen: Observability,
+    conditioning: Observability,
     clock: Clock,
     linearity: Nonlinearity | None,
     notes: tuple[str, ...],
 ) -> GyroFit:
     """Turn scaled parameters into the triad."""
-    theta, scale, rest = found.theta, found.scale, found.rest
+    theta, scale, rest = solved.theta, solved.scale, solved.rest
     scale_factor = scale * (1 + theta[:3])
     misalignment = np.eye(3)
     misalignment[ROWS, COLUMNS] = theta[3:9]
@@ -364,14 +368,14 @@ def _result(
             else np.diag((rest.slope_uncertainty / scale_factor[:, None]).ravel() ** 2)
         ),
         residuals=miss,
-        start=found.segments.start,
-        stop=found.segments.stop,
+        start=solved.segments.start,
+        stop=solved.segments.stop,
         unit=unit,
         fit_bias=fit_bias,
-        observability=seen,
+        observability=conditioning,
         clock=clock,
         nonlinearity=linearity,
-        aside=found.aside,
+        aside=solved.aside,
         notes=notes,
     )
 
@@ -467,25 +471,29 @@ def with_gyro_of(record: Calibration, known: Calibration) -> Calibration:
 
 def _parameters(fit: GyroFit) -> dict[str, Parameter]:
     sigma = np.sqrt(np.diag(fit.covariance))
-    found = {f"gyro_bias_{a}": Parameter(float(fit.bias[i]), float(sigma[9 + i]), "rad/s") for i, a in enumerate(_AXES)}
-    found |= {
+    parameters = {
+        f"gyro_bias_{a}": Parameter(float(fit.bias[i]), float(sigma[9 + i]), "rad/s") for i, a in enumerate(_AXES)
+    }
+    parameters |= {
         f"gyro_scale_factor_{a}": Parameter(float(fit.scale_factor[i]), float(sigma[i]), f"{fit.unit}/(rad/s)")
         for i, a in enumerate(_AXES)
     }
-    found |= {
+    parameters |= {
         f"gyro_misalignment_{p}": Parameter(
             float(fit.misalignment[_AXES.index(p[0]), _AXES.index(p[1])]), float(sigma[3 + k]), "rad"
         )
         for k, p in enumerate(PAIRS)
     }
     if fit.sensitivity is not None and fit.sensitivity_covariance is not None:
-        own = np.sqrt(np.diag(fit.sensitivity_covariance)).reshape(3, 3)
-        found |= {
-            f"gyro_g_sensitivity_{a}{b}": Parameter(float(fit.sensitivity[i, j]), float(own[i, j]), "rad/s/(m/s^2)")
+        sensitivity_sigma = np.sqrt(np.diag(fit.sensitivity_covariance)).reshape(3, 3)
+        parameters |= {
+            f"gyro_g_sensitivity_{a}{b}": Parameter(
+                float(fit.sensitivity[i, j]), float(sensitivity_sigma[i, j]), "rad/s/(m/s^2)"
+            )
             for i, a in enumerate(_AXES)
             for j, b in enumerate(_AXES)
         }
-    return found
+    return parameters
 
 
 def _covariance_names(fit: GyroFit) -> list[str]:
@@ -546,7 +554,7 @@ def _off_nominal(fit: GyroFit) -> list[str]:
     listed = " ".join(f"{value:+.3g}" for value in error.tolist())
     if np.abs(error).max() > 100 * SCALE_OFF_UNIT:
         middle = float(np.exp(np.mean(np.log(np.abs(ratio)))))
-        guess = next((f": {says}" for of, says in _USUAL if abs(middle / of - 1) < SCALE_OFF_UNIT), "")
+        guess = next((f": {says}" for factor, says in _USUAL if abs(middle / factor - 1) < SCALE_OFF_UNIT), "")
         return [
             Bad(
                 f"gyro: the scale factors are off by {listed} % (x y z){guess or ': is the unit right?'}; check the "
@@ -554,8 +562,8 @@ def _off_nominal(fit: GyroFit) -> list[str]:
             )
         ]
     mean, spread = float(error.mean()), float(error.std(ddof=1))
-    own = 100 * float(np.sqrt(np.diag(fit.covariance)[:3]).max() / fit.scale_factor.mean())
-    if abs(mean) > max(_ALIKE * spread, SCALES_OFF_ALIKE.limit * own, _SMALLEST_ALIKE):
+    largest_uncertainty = 100 * float(np.sqrt(np.diag(fit.covariance)[:3]).max() / fit.scale_factor.mean())
+    if abs(mean) > max(_ALIKE * spread, SCALES_OFF_ALIKE.limit * largest_uncertainty, _SMALLEST_ALIKE):
         return [
             f"gyro: the scale factors are off by {listed} % (x y z), all by the same: a sample rate or a clock that is "
             "off by as much does that; compare the time stamps with a clock"
@@ -564,10 +572,10 @@ def _off_nominal(fit: GyroFit) -> list[str]:
 
 
 def _warnings(fit: GyroFit) -> list[str]:
-    found = [*fit.notes, *([] if fit.earth is None else [fit.earth.note()])]
-    found += _off_nominal(fit)
+    messages = [*fit.notes, *([] if fit.earth is None else [fit.earth.note()])]
+    messages += _off_nominal(fit)
     if fit.clock.counted and fit.clock.of == "gyro" and fit.clock.assumed == CRYSTAL:
-        found.append(
+        messages.append(
             Note(
                 "gyro: the time stamps are counted in even steps: the scale factors are true to the "
                 f"{1e6 * CRYSTAL:.0f} ppm of a crystal only if a crystal sets the sample rate; a sensor's own "
@@ -576,8 +584,8 @@ def _warnings(fit: GyroFit) -> list[str]:
         )
     rms = float(np.degrees(np.sqrt(np.mean(fit.residuals**2))))
     if rms > _LARGE_MISS:
-        found.append(f"gyro: the turns miss the change of gravity's direction by {rms:.2g} deg rms")
-    return found
+        messages.append(f"gyro: the turns miss the change of gravity's direction by {rms:.2g} deg rms")
+    return messages
 
 
 # The gyroscope triad from what people have: data to a record of both triads.
@@ -660,14 +668,14 @@ def fit_gyro(
     """
     known = as_record(accel, "fit_gyro: accel")
     recording = as_recording(data, reading, fit_gyro, lambda samples: {"gyro": samples})
-    own = recording
+    accel_recording = recording
     if accel_data is not None:
         named = isinstance(accel_data, str | PathLike)
-        given: dict[str, Any] = {key: reading.get(key) for key in ("layout", "element") if named}
-        own = as_recording(accel_data, given, fit_gyro, name="accel_data")
-    found = fit_gyro_triad(
-        known, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
+        accel_reading: dict[str, Any] = {key: reading.get(key) for key in ("layout", "element") if named}
+        accel_recording = as_recording(accel_data, accel_reading, fit_gyro, name="accel_data")
+    gyro_fit = fit_gyro_triad(
+        known, find_attitudes(accel_recording), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
         clock=in_si(clock, "clock", "number", "ppm"), clock_of=clock_of,
         noise=None if noise is None else as_record(noise, "fit_gyro: noise"), earth=at_latitude(latitude),
     )  # fmt: skip
-    return BothTriads(with_gyro(known, found, recording, own), found)
+    return BothTriads(with_gyro(known, gyro_fit, recording, accel_recording), gyro_fit)

@@ -214,8 +214,8 @@ def direction_covariance(record: Calibration, attitudes: Attitudes, output: Arra
         size = unit * np.sqrt(np.einsum("nii->n", attitudes.covariance).mean() / 3)
         columns = [_slope(record, output, size * np.eye(3)[axis]) / size for axis in range(3)]
         slope = np.stack(columns, axis=2)
-        own = slope @ (attitudes.covariance * unit**2) @ np.swapaxes(slope, 1, 2)
-        joint[range(n), :, range(n), :] = own + fit_of(record).excess.value ** 2 * np.eye(3)
+        force_covariance = slope @ (attitudes.covariance * unit**2) @ np.swapaxes(slope, 1, 2)
+        joint[range(n), :, range(n), :] = force_covariance + fit_of(record).excess.value ** 2 * np.eye(3)
     names = [name for name in record.covariance.names if not name.startswith("gyro_")]
     if names:
         matrix = record.covariance.block(names)
@@ -231,8 +231,8 @@ def direction_covariance(record: Calibration, attitudes: Attitudes, output: Arra
     length = np.linalg.norm(force, axis=1)
     up = force / length[:, None]
     across = (np.eye(3) - up[:, :, None] * up[:, None, :]) / length[:, None, None]
-    found: Array = np.einsum("nij,njmk,mlk->niml", across, joint, across, optimize=True).reshape(3 * n, 3 * n)
-    return found
+    angular: Array = np.einsum("nij,njmk,mlk->niml", across, joint, across, optimize=True).reshape(3 * n, 3 * n)
+    return angular
 
 
 def _slope(record: Calibration, output: Array, step: Array) -> Array:

@@ -191,11 +191,11 @@ def _median_miss(turn: Array, before: Array, after: Array) -> float:
 
 def _signed_permutations() -> dict[str, Array]:
     """All 48 ways to name three axes: text such as ``y x -z`` to matrix."""
-    found = {}
+    matrices = {}
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))
             matrix[range(3), order] = signs
             text = " ".join(("" if sign > 0 else "-") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
-            found[text] = matrix
-    return found
+            matrices[text] = matrix
+    return matrices

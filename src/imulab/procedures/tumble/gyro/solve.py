@@ -76,7 +76,7 @@ class Nonlinearity:
         """Say what changes with the rate, if it is beyond chance."""
         if not self.probability < SCALE_CHANGES_WITH_RATE.level:
             return []
-        found = []
+        phrases = []
         for i, axis in enumerate("xyz"):
             for what, value, u in (
                 ("from slow turns to", self.odd[i], self.odd_uncertainty[i]),
@@ -84,8 +84,8 @@ class Nonlinearity:
             ):
                 if abs(value) > SCALE_CHANGE.limit * u:
                     rate = np.degrees(self.largest[i])
-                    found.append(f"of {axis} by {100 * value:+.2g} % (u {100 * u:.1g} %) {what} {rate:.0f} deg/s")
-        changes = "; ".join(found) or "of which axis, they do not tell"
+                    phrases.append(f"of {axis} by {100 * value:+.2g} % (u {100 * u:.1g} %) {what} {rate:.0f} deg/s")
+        changes = "; ".join(phrases) or "of which axis, they do not tell"
         return [
             f"gyro: what the turns miss depends on the rate (p {self.probability:.1g}): the scale factor changes "
             f"{changes}: the record holds for turns as fast as these; measure at the rates of use, or on a rate table"
@@ -209,29 +209,29 @@ class Clock:
 
     def notes(self, *, apart: bool) -> list[str]:
         """Say what a user should know; `apart`: the two triads come from two recordings."""
-        found = self.comparison
-        if found is None:
+        drift = self.comparison
+        if drift is None:
             return []
-        if self.of == "gyro" and found.clear(self.assumed):
+        if self.of == "gyro" and drift.clear(self.assumed):
             return [
-                f"gyro: the accelerometers' clock runs {1e6 * found.rate:+.0f} ppm (u "
-                f"{1e6 * found.rate_uncertainty:.0f} ppm) against the gyroscopes': if the gyroscopes' is wrong, so are "
+                f"gyro: the accelerometers' clock runs {1e6 * drift.rate:+.0f} ppm (u "
+                f"{1e6 * drift.rate_uncertainty:.0f} ppm) against the gyroscopes': if the gyroscopes' is wrong, so are "
                 "all their scale factors, by as much; their uncertainty covers it. If the accelerometers' clock is the "
                 "true one, use --clock-of accel"
             ]
-        late = -found.delay
-        if not apart and abs(late) > max(_LATENCY, SAMPLES_COME_LATE.limit * found.delay_uncertainty):
+        late = -drift.delay
+        if not apart and abs(late) > max(_LATENCY, SAMPLES_COME_LATE.limit * drift.delay_uncertainty):
             return [
                 Note(
                     f"gyro: its samples come {1e3 * late:+.1f} ms after the accelerometers' of the same time (u "
-                    f"{1e3 * found.delay_uncertainty:.1f} ms): harmless here, where turns go from hold to hold, not in "
+                    f"{1e3 * drift.delay_uncertainty:.1f} ms): harmless here, where turns go from hold to hold, not in "
                     "a filter that uses both"
                 )
             ]
         return []
 
 
-def clock_of_scale(comparison: ClockComparison | None, clock: float, of: str, *, counted: bool) -> Clock:
+def clock_of_scale(comparison: ClockComparison | None, clock: float, triad: str, *, counted: bool) -> Clock:
     """Return what is known of the clock that the scale factors are referred to.
 
     Parameters
@@ -239,17 +239,17 @@ def clock_of_scale(comparison: ClockComparison | None, clock: float, of: str, *,
     comparison
         Of the two clocks, or None.
     clock
-        Relative standard uncertainty of the rate of the clock that `of` names.
-    of
+        Relative standard uncertainty of the rate of the clock that `triad` names.
+    triad
         ``gyro``: the gyroscopes' own stamps count; what two such clocks leave of the difference is added to it.
         ``accel``: they were carried over to the accelerometers' clock.
     """
     more = 0.0
-    if comparison is not None and of == "accel":
+    if comparison is not None and triad == "accel":
         more = comparison.rate_uncertainty**2
     elif comparison is not None:
         more = max(comparison.rate**2 - comparison.variance(clock), 0.0)
-    return Clock((clock**2 + more) ** 0.5, clock, of, comparison, counted)
+    return Clock((clock**2 + more) ** 0.5, clock, triad, comparison, counted)
 
 
 def counted(time: Array) -> bool:
@@ -279,7 +279,7 @@ def evened(time: Array) -> tuple[Array, float] | None:
 
 
 def compare_clocks(
-    own: Array, force: Array, time: Array, rate: Array, segments: Segments, *, search: bool
+    accel_time: Array, force: Array, time: Array, rate: Array, segments: Segments, *, search: bool
 ) -> ClockComparison | None:
     """Compare the clocks of the two triads; None where fewer than six turns tell.
 
@@ -294,22 +294,27 @@ def compare_clocks(
     search
         Whether delays up to two seconds are to be expected.
     """
-    step = max(_KNOT, 2 * float(np.median(np.diff(own))))
-    knots, seen = _carried_gravity(time, rate, segments, step)
-    moved = np.gradient(seen, axis=1)
+    step = max(_KNOT, 2 * float(np.median(np.diff(accel_time))))
+    knots, carried = _carried_gravity(time, rate, segments, step)
+    moved = np.gradient(carried, axis=1)
     spacing = np.gradient(knots, axis=1)
     speed = moved / np.where(spacing > 0, spacing, np.inf)[:, :, None]
-    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (force[1:] + force[:-1]) * np.diff(own)[:, None], axis=0)])
+    sums = np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(0.5 * (force[1:] + force[:-1]) * np.diff(accel_time)[:, None], axis=0)]
+    )
 
     def missing(delay: Array) -> Array:
         """Direction that the accelerometers see, later by `delay` (m,), less what the gyroscopes carry."""
         at = knots + delay[:, None]
-        parts = [np.interp(at + step / 2, own, column) - np.interp(at - step / 2, own, column) for column in sums.T]
+        parts = [
+            np.interp(at + step / 2, accel_time, column) - np.interp(at - step / 2, accel_time, column)
+            for column in sums.T
+        ]
         vector = np.stack(parts, axis=2)
         length = np.linalg.norm(vector, axis=2, keepdims=True)
-        return np.asarray(vector / np.maximum(length, 1e-300) - seen, dtype=np.float64)
+        return np.asarray(vector / np.maximum(length, 1e-300) - carried, dtype=np.float64)
 
-    delay = np.zeros(len(seen))
+    delay = np.zeros(len(carried))
     if search:
         costs = np.array([(missing(delay + lag) ** 2).sum(axis=(1, 2)) for lag in _LAGS.tolist()])
         delay = _LAGS[np.argmin(costs, axis=0)]
@@ -451,12 +456,12 @@ def solve_turns(case: Case, time: Array, sensitivity: str) -> Solved:
             segments, notes = segments.part(~beside), [*notes, Note(left_out)]
         return _solve(case, segments, rest, notes)
 
-    found = solved(sensitivity)
-    if sensitivity != "auto" or found.rest.slope is None:
-        return found
+    with_slope = solved(sensitivity)
+    if sensitivity != "auto" or with_slope.rest.slope is None:
+        return with_slope
     without = solved("no")
-    both = np.intersect1d(found.segments.attitude, without.segments.attitude)
-    return found if found.cost(both) < without.cost(both) else without
+    both = np.intersect1d(with_slope.segments.attitude, without.segments.attitude)
+    return with_slope if with_slope.cost(both) < without.cost(both) else without
 
 
 def _solve(case: Case, segments: Segments, rest: GyroRest, notes: list[str]) -> Solved:
@@ -537,12 +542,12 @@ def _outliers(segments: Segments, scale: Array, fit: Fit) -> tuple[NDArray[np.bo
     return out, np.linalg.norm(residual, axis=1)
 
 
-def turn_covariance(found: Solved, shared: Array, freedom: int) -> tuple[Array, float]:
+def turn_covariance(solved: Solved, shared: Array, freedom: int) -> tuple[Array, float]:
     """Return the covariance of the parameters, (p, p), and the variance that each residual has of its own.
 
     `shared`, (3 m, 3 m), is what the residuals have in common; what they scatter beyond it is taken to be alike in all.
     """
-    residual, jacobian = found.residual, found.jacobian
+    residual, jacobian = solved.residual, solved.jacobian
     bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]
     pulled = jacobian.T @ shared @ jacobian
     left = float(residual @ residual) - float(np.trace(shared)) + float(np.trace(bread @ pulled))

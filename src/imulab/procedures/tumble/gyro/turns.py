@@ -94,11 +94,11 @@ def find_turns(
         )
     if broken.any():
         longest = float(step[wide].max())
-        said = (
+        sentence = (
             f"gyro: {count(broken)} left out, samples are missing during them: gaps of up to {longest:.3g} s "
             f"(turns from {times(broken)} s)"
         )
-        notes.append(Note(said) if broken.sum() <= _FEW_BROKEN * turns.sum() else said)
+        notes.append(Note(sentence) if broken.sum() <= _FEW_BROKEN * turns.sum() else sentence)
     if len(chosen) < _FEWEST_TURNS:
         aside = f" ({int(clipped.any(axis=1).sum())} more are clipped)" if clipped.any() else ""
         aside += f" ({int(broken.sum())} more have gaps)" if broken.any() else ""
@@ -153,12 +153,12 @@ def shared_covariance(segments: Segments, scale: Array, theta: Array, known: Arr
         Standard uncertainty of the output at rest, shape (3,), or None where the biases are fitted.
     """
     flat = by_directions(segments, scale, theta, len(known) // 3)
-    found: Array = flat @ known @ flat.T
+    shared: Array = flat @ known @ flat.T
     if zero is not None:
         moved = model(segments, scale, np.concatenate([theta[:9], np.zeros(3)]), fit_bias=True)[1][:, 9:]
         moved = moved * (zero / scale)
-        found += moved @ moved.T
-    return found
+        shared += moved @ moved.T
+    return shared
 
 
 def by_directions(segments: Segments, scale: Array, theta: Array, holds: int) -> Array:
@@ -193,13 +193,13 @@ def model(segments: Segments, scale: Array, theta: Array, fit_bias: bool) -> tup
     rate = scaled @ inverse.T
     weights = np.concatenate([scaled, rate, np.ones((*rate.shape[:2], 1))], axis=2)
     turns: Turns = weighted_turns(rate, segments.step, weights)
-    found = np.einsum("mij,mj->mi", turns.matrix, segments.before)
+    carried_up = np.einsum("mij,mj->mi", turns.matrix, segments.before)
     columns = [(k, -inverse[:, k] * (scale / s)[k]) for k in range(3)]
     columns += [(3 + j, -inverse[:, i]) for i, j in zip(ROWS, COLUMNS, strict=True)]
     if fit_bias:
         columns += [(6, -inverse[:, k] * (scale / s)[k]) for k in range(3)]
-    jacobian = np.empty((len(found), 3, len(columns)))
+    jacobian = np.empty((len(carried_up), 3, len(columns)))
     for column, (which, direction) in enumerate(columns):
         moved = np.cross(segments.before, turns.weighted[:, which] @ direction)
         jacobian[:, :, column] = np.einsum("mij,mj->mi", turns.matrix, moved)
-    return (found - segments.after).ravel(), jacobian.reshape(-1, len(columns))
+    return (carried_up - segments.after).ravel(), jacobian.reshape(-1, len(columns))

@@ -122,7 +122,7 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
     noise, freedom = _noise(record, n)
     total = slopes @ law.covariance @ slopes.T + np.diag(noise)
     common: Array = np.kron(np.eye(2), np.ones((n, 1))).astype(np.float64)
-    found, left, value, of_common = _fitted(_off(force, field, length, dip), common, total)
+    offsets, left, value, of_common = _fitted(_off(force, field, length, dip), common, total)
     moved, after = np.zeros(3), value
     for _ in range(_PASSES):  # |m| is not linear in a hard iron that moved far
         there = field - moved @ np.linalg.inv(law.mag.turn).T
@@ -131,7 +131,7 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
         moved = moved - step[2:]
     sigma = np.sqrt(np.diag(total))
     return MagCheck(
-        left[:n], left[n:], sigma[:n], sigma[n:], found, np.sqrt(np.diag(of_common)),
+        left[:n], left[n:], sigma[:n], sigma[n:], offsets, np.sqrt(np.diag(of_common)),
         float(f_tail(value / (2 * n - 2), 2.0 * n - 2, freedom)),
         moved,
         float(f_tail(after / (2 * n - 5), 2.0 * n - 5, freedom)),
@@ -164,8 +164,10 @@ def _noise(record: Calibration, count: int) -> tuple[Array, float]:
     """
     fit = fit_of(record).mag
     assert fit is not None
-    scatter = [of.rms * of.leave_one_out for of in (fit.magnitude, fit.dip)]
-    free = [max(fit.attitudes * of.rms / of.leave_one_out, _LEAST_FREE) for of in (fit.magnitude, fit.dip)]
+    scatter = [residual.rms * residual.leave_one_out for residual in (fit.magnitude, fit.dip)]
+    free = [
+        max(fit.attitudes * residual.rms / residual.leave_one_out, _LEAST_FREE) for residual in (fit.magnitude, fit.dip)
+    ]
     mean = sum(each / (each - 2) for each in free) / 2
     return np.repeat(scatter, count), 2 * mean / (mean - 1)
 
@@ -175,7 +177,7 @@ def _fitted(values: Array, design: Array, covariance: Array) -> tuple[Array, Arr
     root = np.linalg.cholesky(covariance)
     rows, whitened = np.linalg.solve(root, design), np.linalg.solve(root, values)
     size = np.linalg.norm(rows, axis=0)
-    found = np.linalg.lstsq(rows / size, whitened, rcond=None)[0] / size
+    parameters = np.linalg.lstsq(rows / size, whitened, rcond=None)[0] / size
     spread = np.linalg.inv((rows / size).T @ (rows / size)) / np.outer(size, size)
-    left = whitened - rows @ found
-    return found, values - design[:, :2] @ found[:2], float(left @ left), spread
+    left = whitened - rows @ parameters
+    return parameters, values - design[:, :2] @ parameters[:2], float(left @ left), spread

@@ -50,8 +50,8 @@ def _fit(record: Calibration) -> MagSummary:
 def _residuals(record: Calibration, data: MagFields) -> Figure:
     magnitude, dip = 100 * np.array(data.magnitude), np.degrees(data.dip)
     used = np.array(data.used)
-    colours = [GOOD if one else BAD for one in data.used]
-    shapes = ["circle" if one else "diamond" for one in data.used]
+    colours = [GOOD if was_used else BAD for was_used in data.used]
+    shapes = ["circle" if was_used else "diamond" for was_used in data.used]
     worst = int(np.argmax(np.where(used, np.abs(dip), -1.0)))
     disturbed = [label for label, kept in zip(data.label, data.used, strict=True) if not kept]
     aside = f" Red diamonds were set aside as disturbed: {', '.join(disturbed)}." if disturbed else ""

@@ -68,7 +68,7 @@ _BUILDING = 1.4
 
 
 def with_mag(
-    ready: Ready, joint: Joint, seen: Seen, aside: Sequence[Disturbed], options: Mapping[str, Any]
+    ready: Ready, joint: Joint, observability: Seen, aside: Sequence[Disturbed], options: Mapping[str, Any]
 ) -> Calibration:
     """Return the record of both triads: parameters, covariance, and residuals of |m| and dip of each attitude."""
     accel = make_record(
@@ -79,15 +79,15 @@ def with_mag(
     heading = heading_uncertainty(joint, known)
     names, values, matrix, units = _values(ready, joint, known)
     parameters = _parameters(names, values, matrix, units, joint.freedom[: len(names)])
-    own = accel.parameters
+    accel_parameters = accel.parameters
     moved = {
-        name: (parameters[name].value - own[name].value) / u
+        name: (parameters[name].value - accel_parameters[name].value) / u
         for name in parameter_names(ready.estimate.problem.order)
-        if (u := own[name].standard_uncertainty)
+        if (u := accel_parameters[name].standard_uncertainty)
     }
     kept = {
-        name: replace(parameters[name], standard_uncertainty_given_order=of_own.standard_uncertainty_given_order)
-        for name, of_own in own.items()
+        name: replace(parameters[name], standard_uncertainty_given_order=parameter.standard_uncertainty_given_order)
+        for name, parameter in accel_parameters.items()
     }
     return replace(
         accel,
@@ -96,7 +96,9 @@ def with_mag(
         model={**accel.model, **entries(_model(ready, joint))},
         fit={
             **accel.fit,
-            "mag": entries(_summary(ready, joint, seen, aside, moved, heading, _of_one_sample(ready, parameters))),
+            "mag": entries(
+                _summary(ready, joint, observability, aside, moved, heading, _of_one_sample(ready, parameters))
+            ),
         },
         options={
             **accel.options,
@@ -107,7 +109,7 @@ def with_mag(
             *accel.warnings,
             *ready.means.notes,
             *ready.notes,
-            *_warnings(ready, joint, seen, aside, moved, options, heading[0]),
+            *_warnings(ready, joint, observability, aside, moved, options, heading[0]),
             *_stated_dip(parameters["dip"], options.get("dip")),
         ),
         verdict=UNJUDGED,
@@ -159,13 +161,13 @@ def _parameters(
     names: list[str], values: Array, matrix: Array, units: list[str], freedom: Array
 ) -> dict[str, Parameter]:
     """Parameters with intervals of Student's t, of the degrees of freedom that each variance has."""
-    found = {}
+    parameters = {}
     for name, value, u, unit, nu in zip(
         names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, freedom.tolist(), strict=True
     ):
         half = coverage_factor(nu if np.isfinite(nu) else None) * u
-        found[name] = Parameter(value, u, unit, interval_95=(value - half, value + half))
-    return found
+        parameters[name] = Parameter(value, u, unit, interval_95=(value - half, value + half))
+    return parameters
 
 
 def _model(ready: Ready, joint: Joint) -> MagModel:
@@ -186,7 +188,7 @@ def _model(ready: Ready, joint: Joint) -> MagModel:
 def _summary(
     ready: Ready,
     joint: Joint,
-    seen: Seen,
+    observability: Seen,
     aside: Sequence[Disturbed],
     moved: Mapping[str, float],
     heading: tuple[float, float],
@@ -203,7 +205,7 @@ def _summary(
         sigma_magnitude=float(joint.sigma[0]),
         sigma_dip=Length(value=float(joint.sigma[1]), unit="rad"),
         sigma_direction=Length(value=float(joint.sigma[2]), unit="rad") if directed else None,
-        condition_number=seen.condition,
+        condition_number=observability.condition,
         set_aside=[int(ready.kept[disturbed.index]) + 1 for disturbed in aside],
         heading=Heading(
             standard_uncertainty=Length(value=heading[0], unit="rad"),
@@ -273,75 +275,75 @@ def _step(joint: Joint, labels: Sequence[str]) -> list[str]:
     ]
 
 
-def _stated_dip(found: Parameter, stated: Sequence[float] | None) -> list[str]:
+def _stated_dip(dip: Parameter, stated: Sequence[float] | None) -> list[str]:
     """Say if the dip is off what was stated, beyond the uncertainty of both."""
     if stated is None:
         return []
-    off, sigma = found.value - stated[0], float(np.hypot(found.standard_uncertainty or 0.0, stated[1]))
+    off, sigma = dip.value - stated[0], float(np.hypot(dip.standard_uncertainty or 0.0, stated[1]))
     if abs(off) <= DIP_OFF_STATED.limit * sigma:
         return []
     return [
-        f"mag: the dip of {np.degrees(found.value):.2f} deg is {np.degrees(abs(off)):.2g} deg "
+        f"mag: the dip of {np.degrees(dip.value):.2f} deg is {np.degrees(abs(off)):.2g} deg "
         f"{'more' if off > 0 else 'less'} than the {np.degrees(stated[0]):.2f} deg stated, {abs(off) / sigma:.1f} "
         "standard uncertainties: is iron near, or is the stated dip of another place?"
     ]
 
 
-def _note_set_aside(label: str, one: Disturbed) -> str:
+def _note_set_aside(label: str, off: Disturbed) -> str:
     return (
-        f"mag: {label} set aside: |m| {100 * abs(one.magnitude):.2g} % "
-        f"{'high' if one.magnitude > 0 else 'low'}, dip {np.degrees(abs(one.dip)):.2g} deg "
-        f"{'high' if one.dip > 0 else 'low'} against the others (p {one.probability:.1g}): iron or a vehicle near?"
+        f"mag: {label} set aside: |m| {100 * abs(off.magnitude):.2g} % "
+        f"{'high' if off.magnitude > 0 else 'low'}, dip {np.degrees(abs(off.dip)):.2g} deg "
+        f"{'high' if off.dip > 0 else 'low'} against the others (p {off.probability:.1g}): iron or a vehicle near?"
     )
 
 
 def _warnings(
     ready: Ready,
     joint: Joint,
-    seen: Seen,
+    observability: Seen,
     aside: Sequence[Disturbed],
     moved: Mapping[str, float],
     options: Mapping[str, Any],
     heading: float,
 ) -> list[str]:
     attitudes = ready.estimate.attitudes
-    found = [_note_set_aside(attitudes.label(one.index), one) for one in aside]
+    messages = [_note_set_aside(attitudes.label(disturbed.index), disturbed) for disturbed in aside]
     n = len(joint.pair.mag)
     if n < _ATTITUDES_ASKED:
-        found.append(
+        messages.append(
             f"mag: {n} attitudes leave little to tell the noise from; {_ATTITUDES_ASKED} or more are asked for"
         )
     if not joint.converged:
-        found.append(
+        messages.append(
             "mag: the fit of both triads did not come to rest: more attitudes, at several headings, would help"
         )
-    if seen.condition > _ONE_WAY:
-        left = np.delete(ready.kept, [one.index for one in aside])
-        which = " ".join(str(int(left[i]) + 1) for i in sorted(seen.heading))
-        found.append(
-            f"mag: the attitudes face nearly one way (condition {seen.condition:.0f}): heading is known to "
+    if observability.condition > _ONE_WAY:
+        left = np.delete(ready.kept, [disturbed.index for disturbed in aside])
+        which = " ".join(str(int(left[i]) + 1) for i in sorted(observability.heading))
+        messages.append(
+            f"mag: the attitudes face nearly one way (condition {observability.condition:.0f}): heading is known to "
             f"{np.degrees(heading):.2g} deg only; attitudes {which} once more, facing a quarter turn away, would help "
             "most"
         )
     far = {name: value for name, value in moved.items() if abs(value) > DIP_MOVES_ACCELEROMETERS.limit}
     if far:
         name, value = max(far.items(), key=lambda item: abs(item[1]))
-        found.append(
+        messages.append(
             f"mag: the dip moves the accelerometers' {name} by {abs(value):.1f} standard uncertainties: field and "
             "gravity contradict each other; was iron near, or did the unit move?"
         )
-    left = np.delete(ready.kept, [one.index for one in aside])
+    left = np.delete(ready.kept, [disturbed.index for disturbed in aside])
     labels = [attitudes.label(int(np.searchsorted(ready.kept, i))) for i in left]
-    found += [*_scatter(joint, ready.means, left), *_step(joint, labels)]
+    messages += [*_scatter(joint, ready.means, left), *_step(joint, labels)]
     if joint.pair.held is not None and joint.sigma[2] > _POINTING:
-        found.append(
+        messages.append(
             f"mag: the attitudes of --same-direction scatter by {np.degrees(joint.sigma[2]):.2g} deg about their "
             "directions: does one axis of the body point the same way in them?"
         )
     if "hemisphere" not in options:
         dip = float(np.degrees(joint.theta[joint.pair.layout.dip_at]))
         where, other = ("northern", "southern") if dip > 0 else ("southern", "northern")
-        found.append(
+        messages.append(
             Note(
                 f"mag: the dip of {dip:+.1f} deg is one of the {where} hemisphere; if this is the {other}, a "
                 "magnetometer axis is reversed, two are exchanged, or the accelerometers read minus the specific force "
@@ -349,8 +351,8 @@ def _warnings(
             )
         )
     if ready.mag.field is None and parse_unit(ready.means.unit).quantity == "magnetic field":
-        found.append(_unstated(ready.mag.size * parse_unit(ready.means.unit).factor, ready.means.unit))
-    return found
+        messages.append(_unstated(ready.mag.size * parse_unit(ready.means.unit).factor, ready.means.unit))
+    return messages
 
 
 def _unstated(field: float, unit: str) -> str:
@@ -522,8 +524,8 @@ def fit_mag(
         "drop": list(map(str, drop)),
         "same_direction": [group if isinstance(group, str) else list(group) for group in same_direction],
     }  # fmt: skip
-    given = {name: value for name, value in options.items() if value not in (None, [])}
-    record = with_mag(ready, joint, what, aside, given)
+    set_options = {name: value for name, value in options.items() if value not in (None, [])}
+    record = with_mag(ready, joint, what, aside, set_options)
     if known is not None and not ready.notes:
         record = with_gyro_of(record, known)
     return MagFit(record, joint, what, aside)
@@ -573,11 +575,11 @@ def _order_two(joint: Joint, asked: str, *, robust: bool) -> Joint:
     second = solve(pair, np.insert(joint.theta, [at] * 3, 0.0), robust=robust)
     if asked == "2":
         return second
-    one, two = leave_one_out(joint), leave_one_out(second)
-    better = two.rms(1) * two.rms(2) < _GAIN * one.rms(1) * one.rms(2)
+    linear_errors, quadratic_errors = leave_one_out(joint), leave_one_out(second)
+    better = quadratic_errors.rms(1) * quadratic_errors.rms(2) < _GAIN * linear_errors.rms(1) * linear_errors.rms(2)
     cost = [
-        float(np.einsum("ni,nij,nj->", of.found.residuals, joint.information, of.found.residuals))
-        for of in (joint, second)
+        float(np.einsum("ni,nij,nj->", fit.found.residuals, joint.information, fit.found.residuals))
+        for fit in (joint, second)
     ]
     size = len(joint.theta)
     p = f_test(cost[0], size, cost[1], size + 3, joint.found.residuals.size)
@@ -596,9 +598,9 @@ def _check_result(joint: Joint, ready: Ready, place: Place) -> None:
             "headings cannot be told, and the alignment about the vertical is blind"
         )
     if hemisphere is not None and (dip > 0) != (hemisphere == "north"):
-        found = "south" if hemisphere == "north" else "north"
+        fitted_side = "south" if hemisphere == "north" else "north"
         raise DataError(
-            f"{name}: the dip is {np.degrees(dip):+.1f} deg, that of the {found}ern hemisphere: an odd number of "
+            f"{name}: the dip is {np.degrees(dip):+.1f} deg, that of the {fitted_side}ern hemisphere: an odd number of "
             "magnetometer axes is reversed, or the accelerometers read minus the specific force (gravity): change the "
             "signs of the three accelerometer columns, or of one or three magnetometer columns"
         )

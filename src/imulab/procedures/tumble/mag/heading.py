@@ -114,15 +114,15 @@ class Law:
         f_length, m_length = np.linalg.norm(force, axis=1), np.linalg.norm(field, axis=1)
         inner = np.einsum("ni,ni->n", field, force)
         (fx, fy, fz), (mx, my, mz) = force.T, field.T
-        zero, one = np.zeros_like(fx), np.eye(3)[0]
+        zero, x_axis = np.zeros_like(fx), np.eye(3)[0]
         a_x, n_x = my * fz - mz * fy, mx * f_length**2 - fx * inner
         by_field = (
             (f_length * np.stack([zero, fz, -fy]) * n_x).T
-            - (f_length * a_x)[:, None] * (np.outer(f_length**2, one) - fx[:, None] * force)
+            - (f_length * a_x)[:, None] * (np.outer(f_length**2, x_axis) - fx[:, None] * force)
         )  # fmt: skip
         by_force = (
             ((f_length * np.stack([zero, -mz, my]) + a_x * force.T / f_length) * n_x).T
-            - (f_length * a_x)[:, None] * (2 * mx[:, None] * force - np.outer(inner, one) - fx[:, None] * field)
+            - (f_length * a_x)[:, None] * (2 * mx[:, None] * force - np.outer(inner, x_axis) - fx[:, None] * field)
         )  # fmt: skip
         squared = (n_x**2 + (f_length * a_x) ** 2)[:, None]
         heading = np.arctan2(f_length * a_x, n_x) % (2 * np.pi)
@@ -215,10 +215,10 @@ def heading_of(record: Calibration) -> Callable[[Recording], Recording]:
         force = np.column_stack([recording.si(name) for name in triad("accel")])
         field = np.column_stack([recording.si(name) for name in triad("mag")])
         # A table of attitudes has no time: its rows are means.
-        found = (of_each if "time" in recording else of_means).angles(force, field)
+        angles = (of_each if "time" in recording else of_means).angles(force, field)
         columns = {
-            "heading": found.heading, "std_heading": found.heading_uncertainty,
-            "dip": found.dip, "std_dip": found.dip_uncertainty,
+            "heading": angles.heading, "std_heading": angles.heading_uncertainty,
+            "dip": angles.dip, "std_dip": angles.dip_uncertainty,
         }  # fmt: skip
         return recording.with_columns(
             {name: from_si(values, "deg") for name, values in columns.items()}, dict.fromkeys(columns, "deg")
@@ -292,11 +292,11 @@ class Headings:
             "mag_scale_factor": (100.0, "%"),
             "mag_misalignment": (1e3, "mrad"),
         }
-        found = []
+        table = []
         for name, value in self.uncertainties().items():
             factor, unit = kinds.get(name.rpartition("_")[0], (np.degrees(1.0), "deg"))
-            found.append((name, plain_number(value * factor, 2), unit))
-        return found
+            table.append((name, plain_number(value * factor, 2), unit))
+        return table
 
     @property
     def lead(self) -> str:
@@ -374,10 +374,10 @@ def _rows(up: Array, north: Array) -> tuple[Array, Array]:
     theta[3:6] = 1.0
     theta[_LAYOUT.of_accel] = np.repeat([0.0, 1.0, 0.0], 3)
     theta[_LAYOUT.dip_at] = _DIP
-    found = invariants(theta, up, field, _LAYOUT)
+    evaluated = invariants(theta, up, field, _LAYOUT)
     east = world_axes(field, up)[:, 0]
-    of_heading = np.einsum("ni,nip->np", east, found.field.by_parameters) / np.cos(_DIP)
-    return found.by_parameters[:, 1:3, : _LAYOUT.mag + 1], of_heading
+    of_heading = np.einsum("ni,nip->np", east, evaluated.field.by_parameters) / np.cos(_DIP)
+    return evaluated.by_parameters[:, 1:3, : _LAYOUT.mag + 1], of_heading
 
 
 def _exchange(rows: Array, base: Array, rng: np.random.Generator) -> NDArray[np.int64]:

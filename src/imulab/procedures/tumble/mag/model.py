@@ -168,7 +168,7 @@ def invariants(theta: Array, accel: Array, mag: Array, layout: ParameterLayout) 
     """
     m = triad(theta[: layout.mag], mag, MAGNETOMETERS)
     f = triad(theta[layout.of_accel], accel, ACCELEROMETERS)
-    m_length, f_length = (np.sqrt((of.vector**2).sum(axis=1)) for of in (m, f))
+    m_length, f_length = (np.sqrt((sensed.vector**2).sum(axis=1)) for sensed in (m, f))
     u, e = m.vector / m_length[:, None], f.vector / f_length[:, None]
     dip = dips(m.vector, f.vector)
     sine, cosine = np.sin(dip)[:, None], np.cos(dip)[:, None]
@@ -236,10 +236,10 @@ def field_means(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
     OptionError, UnitError
         As for `outputs_of`.
     """
-    found = outputs_of(attitudes, kept)
-    _check(replace(found, mean=found.mean[kept]), attitudes.recording.name, triad_of_columns("mag"))
-    _check_far(found.mean[kept], [attitudes.label(i) for i in kept], kept, attitudes.recording.name)
-    return found
+    means = outputs_of(attitudes, kept)
+    _check(replace(means, mean=means.mean[kept]), attitudes.recording.name, triad_of_columns("mag"))
+    _check_far(means.mean[kept], [attitudes.label(i) for i in kept], kept, attitudes.recording.name)
+    return means
 
 
 def outputs_of(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
@@ -292,7 +292,7 @@ def _of_stretches(
     samples = left_out.recording.triad("mag")
     pieces = attitudes.pieces
     assert pieces is not None
-    mean, own = np.full((len(attitudes), 3), np.nan), np.full((len(attitudes), 3, 3), np.nan)
+    mean, batch_covariance = np.full((len(attitudes), 3), np.nan), np.full((len(attitudes), 3, 3), np.nan)
     freedom = np.ones(len(attitudes))
     rest = np.zeros(len(samples), dtype=np.bool_)
     force, scatter = recording.triad("accel"), np.empty((len(kept), 2))
@@ -310,11 +310,13 @@ def _of_stretches(
         scatter[place, 1] = samples[index].var(axis=0, ddof=1).mean()
         parts = np.array_split(index, min(_BATCHES, len(index)))
         batches = np.array([samples[part].mean(axis=0) for part in parts])
-        own[number], freedom[number] = np.cov(batches.T) / len(batches), len(batches) - 1.0
-    level = np.trace(own, axis1=1, axis2=2)
+        batch_covariance[number], freedom[number] = np.cov(batches.T) / len(batches), len(batches) - 1.0
+    level = np.trace(batch_covariance, axis1=1, axis2=2)
     usual = level <= 3 * np.median(level[kept])
     weight = freedom[:, None, None]
-    covariance = (weight * own + POOL_DEGREES * own[usual].mean(axis=0)) / (weight + POOL_DEGREES)
+    covariance = (weight * batch_covariance + POOL_DEGREES * batch_covariance[usual].mean(axis=0)) / (
+        weight + POOL_DEGREES
+    )
     step = np.array([_step(samples[rest, axis]) for axis in range(3)])
     covariance[:, range(3), range(3)] += np.where(
         covariance[kept][:, range(3), range(3)].mean(axis=0) < 1e-3 * step**2, step**2 / 12, 0.0
@@ -330,14 +332,14 @@ def _readings(recording: Recording, names: list[str]) -> tuple[LeftOut, NDArray[
     check_finite(recording.with_columns(filled, {}), names)
     if there.all():
         return leave_out(recording, names), there
-    found = leave_out(replace(recording, columns={name: recording.column(name)[there] for name in names}), names)
+    left_out = leave_out(replace(recording, columns={name: recording.column(name)[there] for name in names}), names)
     columns = {name: np.array(recording.column(name)) for name in names}
-    kinds = {kind: np.zeros(len(recording), dtype=np.bool_) for kind in found.kinds}
+    kinds = {kind: np.zeros(len(recording), dtype=np.bool_) for kind in left_out.kinds}
     for name in names:
-        columns[name][there] = found.recording.column(name)
-    for kind, rows in found.kinds.items():
+        columns[name][there] = left_out.recording.column(name)
+    for kind, rows in left_out.kinds.items():
         kinds[kind][there] = rows
-    return LeftOut(recording.with_columns(columns, {}), found.names, kinds), there
+    return LeftOut(recording.with_columns(columns, {}), left_out.names, kinds), there
 
 
 def _step(values: Array) -> float:
@@ -346,25 +348,25 @@ def _step(values: Array) -> float:
     return float(np.diff(different).min()) if len(different) > 1 else 0.0
 
 
-def _check(found: FieldMeans, name: str, names: list[str]) -> None:
-    n = len(found.mean)
+def _check(means: FieldMeans, name: str, names: list[str]) -> None:
+    n = len(means.mean)
     if n < FEWEST:
         raise DataError(f"{name}: {n} attitudes; a magnetometer needs {FEWEST} or more, better 16, at several headings")
-    span = np.ptp(found.mean, axis=0)
+    span = np.ptp(means.mean, axis=0)
     for axis, column in enumerate(names):
         if span[axis] <= _DEAD * span.max():
             raise DataError(
-                f"{name}: column {column}: the output changes by {span[axis]:.3g} {found.unit} over the {n} attitudes, "
-                f"other axes by {span.max():.3g} {found.unit}: a dead axis?"
+                f"{name}: column {column}: the output changes by {span[axis]:.3g} {means.unit} over the {n} attitudes, "
+                f"other axes by {span.max():.3g} {means.unit}: a dead axis?"
             )
-    count, axis, extreme = most_at_an_extreme(found.mean)
+    count, axis, extreme = most_at_an_extreme(means.mean)
     if count > max(2, _CLIPPED * n):
-        word = "largest" if extreme > found.mean[:, axis].mean() else "smallest"
+        word = "largest" if extreme > means.mean[:, axis].mean() else "smallest"
         raise DataError(
             f"{name}: column {names[axis]}: {count} of {n} attitudes have the {word} output, {extreme:.6g} "
-            f"{found.unit}: the axis is saturated; expected a wider range, or less iron near"
+            f"{means.unit}: the axis is saturated; expected a wider range, or less iron near"
         )
-    flat = np.linalg.svd(found.mean - found.mean.mean(axis=0), compute_uv=False)
+    flat = np.linalg.svd(means.mean - means.mean.mean(axis=0), compute_uv=False)
     if flat[2] < _FLAT * flat[0]:
         raise DataError(
             f"{name}: the outputs of {' '.join(names)} lie in one plane over the {n} attitudes (spread across it "
@@ -402,11 +404,11 @@ def check_magnitude(length: float, unit: str, name: str, field: float | None) ->
     known = parse_unit(unit)
     if known.quantity != "magnetic field":
         return
-    found = length * known.factor
+    tesla = length * known.factor
     low, high = (field / 2, 2 * field) if field is not None else _FIELDS
-    if not low <= found <= high:
+    if not low <= tesla <= high:
         expected = f"{1e6 * field:.4g} uT" if field is not None else "25 to 65 uT on Earth"
         raise DataError(
-            f"{name}: columns mag_x mag_y mag_z: the field turns through {length:.4g} {unit} ({1e6 * found:.4g} uT), "
+            f"{name}: columns mag_x mag_y mag_z: the field turns through {length:.4g} {unit} ({1e6 * tesla:.4g} uT), "
             f"expected {expected}: is the unit wrong?"
         )

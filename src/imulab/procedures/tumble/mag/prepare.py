@@ -76,8 +76,8 @@ def leave_one_out(joint: Joint) -> Predicted:
     q = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0][: n * k].reshape(n, k, -1)[:, :3]
     hat = np.einsum("nip,njp->nij", q, q)
     root = np.linalg.cholesky(joint.information[:, :3, :3]).transpose(0, 2, 1)
-    own = np.einsum("nij,nj->ni", root, joint.found.residuals[:, :3])
-    free = np.linalg.solve(np.eye(3) - hat + 1e-12 * np.eye(3), own[:, :, None])
+    whitened = np.einsum("nij,nj->ni", root, joint.found.residuals[:, :3])
+    free = np.linalg.solve(np.eye(3) - hat + 1e-12 * np.eye(3), whitened[:, :, None])
     return Predicted(np.linalg.solve(root, free)[:, :, 0], hat)
 
 
@@ -182,22 +182,22 @@ class Seen:
 def seen(pair: Pair, theta: Array) -> Seen:
     """Judge what the attitudes can tell, at start parameters or at the solution."""
     layout = pair.layout
-    found = pair.evaluate(theta)
-    jacobian = found.by_parameters[:, 1:3, : layout.mag + 1]
+    evaluated = pair.evaluate(theta)
+    jacobian = evaluated.by_parameters[:, 1:3, : layout.mag + 1]
     if pair.held is not None:
-        jacobian = np.concatenate([jacobian, found.by_parameters[:, 3:, : layout.mag + 1]], axis=1)
+        jacobian = np.concatenate([jacobian, evaluated.by_parameters[:, 3:, : layout.mag + 1]], axis=1)
     rows = jacobian.reshape(-1, layout.mag + 1)
     scaled = rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
     values = np.linalg.svd(scaled, compute_uv=False)
     values = np.append(values, np.zeros(max(0, scaled.shape[1] - len(values))))
-    east = world_axes(found.field.vector, found.force.vector)[:, 0]
+    east = world_axes(evaluated.field.vector, evaluated.force.vector)[:, 0]
     # A rotation of the magnetometers changes the dip by its part along magnetic east.
     spread, axes = np.linalg.eigh(east.T @ east / len(east))
     blind = axes[:, spread < _HELPS].T
     rank = int((values > _BLIND * values[0]).sum())
     lacking = axes[:, 0]
     order = np.argsort(np.abs(east @ lacking), kind="stable")
-    up = found.force.vector / np.linalg.norm(found.force.vector, axis=1)[:, None]
+    up = evaluated.force.vector / np.linalg.norm(evaluated.force.vector, axis=1)[:, None]
     # Turned by a quarter the east of an attitude becomes its north: those gain whose north lies along what is lacking.
     gain = np.abs(np.cross(up, east) @ lacking)
     heading = tuple(int(i) for i in order[np.argsort(-gain[order], kind="stable")][:4])
@@ -212,19 +212,19 @@ def heading_uncertainty(joint: Joint, covariance: Array) -> tuple[float, float]:
     An error dm of the field turns its horizontal part by ``east . dm / |m| cos(dip)``, one df of the specific force the
     vertical.
     """
-    layout, found = joint.pair.layout, joint.found
-    m, f = found.field.vector, found.force.vector
+    layout, evaluated = joint.pair.layout, joint.found
+    m, f = evaluated.field.vector, evaluated.force.vector
     axes = world_axes(m, f)
     east, north = axes[:, 0], axes[:, 1]
     horizontal = np.einsum("ni,ni->n", north, m)
     slope = np.zeros((len(m), layout.size))
-    slope[:, : layout.mag] = np.einsum("ni,nip->np", east, found.field.by_parameters) / horizontal[:, None]
+    slope[:, : layout.mag] = np.einsum("ni,nip->np", east, evaluated.field.by_parameters) / horizontal[:, None]
     vertical = np.einsum("ni,ni->n", axes[:, 2], m) / np.linalg.norm(f, axis=1) / horizontal
-    slope[:, layout.of_accel] = -np.einsum("ni,nip->np", east, found.force.by_parameters) * vertical[:, None]
+    slope[:, layout.of_accel] = -np.einsum("ni,nip->np", east, evaluated.force.by_parameters) * vertical[:, None]
     known = np.einsum("np,pq,nq->n", slope, covariance, slope)
     # V of |m| is that of one component of the field, whatever the direction.
-    own = np.linalg.inv(joint.information[:, :3, :3])[:, 1, 1]
-    reading = float(np.median(own)) / np.cos(joint.theta[layout.dip_at]) ** 2
+    reading_variance = np.linalg.inv(joint.information[:, :3, :3])[:, 1, 1]
+    reading = float(np.median(reading_variance)) / np.cos(joint.theta[layout.dip_at]) ** 2
     return float(np.sqrt(np.mean(known))), float(np.sqrt(reading))
 
 
@@ -281,15 +281,15 @@ def _as_before(known: Calibration | None, order: int | str, attitudes: Attitudes
     """Return order and loss of the accelerometers' own fit: as asked, or as their record says that they were fitted."""
     if known is None:
         return order if order == "auto" else int(order), "auto"
-    own = model_of(known).order
-    if own < 1:
-        raise OptionError(f"accel: a record of order {own}; magnetometers need one of 1 or more")
-    if str(order) not in ("auto", str(own)):
-        raise OptionError(f"order {order} with a record of order {own}: expected that or auto")
+    record_order = model_of(known).order
+    if record_order < 1:
+        raise OptionError(f"accel: a record of order {record_order}; magnetometers need one of 1 or more")
+    if str(order) not in ("auto", str(record_order)):
+        raise OptionError(f"order {order} with a record of order {record_order}: expected that or auto")
     if not made_of(known, attitudes):
-        return own, "auto"
+        return record_order, "auto"
     asked, loss = known.options.get("order"), known.options.get("loss")
-    return "auto" if asked == "auto" else own, "square" if loss == "square" else "auto"
+    return "auto" if asked == "auto" else record_order, "square" if loss == "square" else "auto"
 
 
 def made_of(known: Calibration, attitudes: Attitudes) -> bool:
@@ -299,10 +299,10 @@ def made_of(known: Calibration, attitudes: Attitudes) -> bool:
     return same or made_from(known, attitudes.recording)
 
 
-def _numbers(given: str | Sequence[int | str], count: int, option: str) -> NDArray[np.intp]:
+def _numbers(numbers: str | Sequence[int | str], count: int, option: str) -> NDArray[np.intp]:
     """Attitudes by their numbers from 1, or texts such as ``"8"``, ``"9-16"``, ``"3,9-16"``, as places from 0."""
-    found: list[int] = []
-    for entry in [given] if isinstance(given, str) else given:
+    indices: list[int] = []
+    for entry in [numbers] if isinstance(numbers, str) else numbers:
         for part in str(entry).split(","):
             first, dash, last = part.strip().partition("-")
             ends = (first, last if dash else first)
@@ -312,8 +312,8 @@ def _numbers(given: str | Sequence[int | str], count: int, option: str) -> NDArr
                 raise OptionError(
                     f"{option} {quoted(entry)}: expected the number of an attitude, 1 to {count}, or a range as 9-16"
                 )
-            found += range(int(ends[0]) - 1, int(ends[1]))
-    return np.unique(np.array(found, dtype=np.intp))
+            indices += range(int(ends[0]) - 1, int(ends[1]))
+    return np.unique(np.array(indices, dtype=np.intp))
 
 
 def _check_groups(places: Sequence[Sequence[int]], name: str) -> None:
@@ -328,10 +328,10 @@ def _check_groups(places: Sequence[Sequence[int]], name: str) -> None:
         )
 
 
-def _gravity(given: float | str | Gravity | None, known: Calibration | None, attitudes: Attitudes) -> Gravity:
+def _gravity(requested: float | str | Gravity | None, known: Calibration | None, attitudes: Attitudes) -> Gravity:
     """Gravity as given, else that of the accelerometers' record, else as for the accelerometers."""
-    local = local_gravity(given, attitudes.recording)
-    if given is not None or known is None:
+    local = local_gravity(requested, attitudes.recording)
+    if requested is not None or known is None:
         return local
     stated = model_of(known).gravity
     if made_of(known, attitudes) and stated.value == local.value:
@@ -351,10 +351,10 @@ def _prior(
             f"{attitudes.unit}"
         )
     held = known_of(known, scaling, local, attitudes.unit)
-    own = estimate.given_order or estimate.stated
-    if own is not None:
+    accel_alone = estimate.given_order or estimate.stated
+    if accel_alone is not None:
         off = estimate.solution.theta[0] - held.mean
-        distance = float(off @ np.linalg.solve(own.covariance + held.covariance, off))
+        distance = float(off @ np.linalg.solve(accel_alone.covariance + held.covariance, off))
         p = chi_square_probability(distance, len(off))
         if p < ACCELEROMETERS_CONTRADICT_RECORD.level:
             gyroscopes = "; its gyroscopes were left out" if "gyro_output_unit" in known.model else ""

@@ -83,15 +83,15 @@ def stated_place(hemisphere: str | None, latitude: float | str | None, dip: Dip 
     sides = {"hemisphere": hemisphere, "latitude": hemisphere_at(latitude)}
     if known is not None and abs(known[0]) > HEMISPHERE_OF_DIP.limit * known[1]:
         sides["dip"] = "north" if known[0] > 0 else "south"
-    given = {name: side for name, side in sides.items() if side is not None}
-    first = next(iter(given), "")
-    for name, side in given.items():
-        if side != given[first]:
+    stated = {name: side for name, side in sides.items() if side is not None}
+    first = next(iter(stated), "")
+    for name, side in stated.items():
+        if side != stated[first]:
             raise OptionError(
-                f"{name} of the {side}ern hemisphere, {first} of the {given[first]}ern: expected both of one; the dip "
+                f"{name} of the {side}ern hemisphere, {first} of the {stated[first]}ern: expected both of one; the dip "
                 "is positive where the field points down, in the north"
             )
-    return Place(given.get(first), known)
+    return Place(stated.get(first), known)
 
 
 def stated_dip(dip: Dip) -> tuple[float, float]:
@@ -167,18 +167,18 @@ def _ellipsoid(points: Array) -> tuple[Array, Array] | None:
 def _sphere(points: Array) -> tuple[Array, Array]:
     """Return U and h of the sphere ``|x - h| = r`` through the points, by algebraic least squares."""
     design = np.column_stack([2 * points, np.ones(len(points))])
-    found = np.linalg.lstsq(design, (points**2).sum(axis=1), rcond=None)[0]
-    radius = np.sqrt(max(found[3] + found[:3] @ found[:3], 1e-12))
-    return np.eye(3) / radius, found[:3]
+    coefficients = np.linalg.lstsq(design, (points**2).sum(axis=1), rcond=None)[0]
+    radius = np.sqrt(max(coefficients[3] + coefficients[:3] @ coefficients[:3], 1e-12))
+    return np.eye(3) / radius, coefficients[:3]
 
 
 def _alignment(field: Array, direction: Array) -> tuple[Array, float]:
     """Return the rotation and the sine of the dip that make ``e' R u + sin(dip)`` least; R is right-handed."""
     rows = np.column_stack([(direction[:, :, None] * field[:, None, :]).reshape(len(field), 9), np.ones(len(field))])
-    found = np.linalg.svd(rows, full_matrices=False)[2][-1]
-    matrix = found[:9].reshape(3, 3)
+    coefficients = np.linalg.svd(rows, full_matrices=False)[2][-1]
+    matrix = coefficients[:9].reshape(3, 3)
     if np.linalg.det(matrix) < 0:
-        matrix, found = -matrix, -found
+        matrix, coefficients = -matrix, -coefficients
     left, _, right = np.linalg.svd(matrix)
     rotation: Array = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     return rotation, float(-np.mean(np.einsum("ni,ij,nj->n", direction, rotation, field)))
@@ -276,44 +276,46 @@ def world_axes(field: Array, force: Array) -> Array:
     return np.stack([east, np.cross(up, east), up], axis=1)
 
 
-def with_held(found: Invariants, theta: Array, layout: ParameterLayout, held: HeldDirections) -> Invariants:
+def with_held(evaluated: Invariants, theta: Array, layout: ParameterLayout, held: HeldDirections) -> Invariants:
     """Return the invariants with two more residuals of each attitude, ``B (C x - d)``; nil outside of the groups."""
-    own = theta[layout.of_directions]
-    longer = held.axis + own[:2] @ held.axis_across
+    held_parameters = theta[layout.of_directions]
+    longer = held.axis + held_parameters[:2] @ held.axis_across
     length = np.linalg.norm(longer)
     x = longer / length
-    by_own = (held.axis_across - np.outer(held.axis_across @ x, x)) / length  # dx by its two parameters, (2, 3)
-    axes = world_axes(found.field.vector, found.force.vector)
-    turned = _change(found, axes, x, layout)
+    by_tilt = (held.axis_across - np.outer(held.axis_across @ x, x)) / length  # dx by its two parameters, (2, 3)
+    axes = world_axes(evaluated.field.vector, evaluated.force.vector)
+    turned = _change(evaluated, axes, x, layout)
     member = held.group >= 0
     across = np.where(member[:, None, None], held.across[held.group], 0.0)
     residuals = np.einsum("nki,nij,j->nk", across, axes, x)
     slope = np.einsum("nki,nip->nkp", across, turned)
     first = layout.of_directions.start
-    slope[:, :, first : first + 2] = np.einsum("nki,nij,lj->nkl", across, axes, by_own)
+    slope[:, :, first : first + 2] = np.einsum("nki,nij,lj->nkl", across, axes, by_tilt)
     for index in range(len(held.across)):
         inside = held.group == index
         at = first + 2 + 2 * index
-        residuals[inside] -= own[2 + 2 * index : 4 + 2 * index]
+        residuals[inside] -= held_parameters[2 + 2 * index : 4 + 2 * index]
         slope[inside, :, at : at + 2] = -np.eye(2)
     return replace(
-        found,
-        residuals=np.hstack([found.residuals, residuals]),
-        by_parameters=np.concatenate([found.by_parameters, slope], axis=1),
+        evaluated,
+        residuals=np.hstack([evaluated.residuals, residuals]),
+        by_parameters=np.concatenate([evaluated.by_parameters, slope], axis=1),
     )
 
 
-def _change(found: Invariants, axes: Array, x: Array, layout: ParameterLayout) -> Array:
+def _change(evaluated: Invariants, axes: Array, x: Array, layout: ParameterLayout) -> Array:
     """Return how ``C x`` changes with the triads' parameters, shape (n, 3, p)."""
     n = len(axes)
     du, de = np.zeros((n, 3, layout.size)), np.zeros((n, 3, layout.size))
-    du[:, :, : layout.mag] = found.field.by_parameters
-    de[:, :, layout.of_accel] = found.force.by_parameters / np.linalg.norm(found.force.vector, axis=1)[:, None, None]
+    du[:, :, : layout.mag] = evaluated.field.by_parameters
+    de[:, :, layout.of_accel] = (
+        evaluated.force.by_parameters / np.linalg.norm(evaluated.force.vector, axis=1)[:, None, None]
+    )
     east, _, up = axes.transpose(1, 0, 2)
     de -= up[:, :, None] * np.einsum("ni,nip->np", up, de)[:, None, :]
-    cross = np.cross(found.field.vector, up)
+    cross = np.cross(evaluated.field.vector, up)
     length = np.linalg.norm(cross, axis=1)[:, None, None]
-    da = (np.cross(du, up[:, :, None], axis=1) + np.cross(found.field.vector[:, :, None], de, axis=1)) / length
+    da = (np.cross(du, up[:, :, None], axis=1) + np.cross(evaluated.field.vector[:, :, None], de, axis=1)) / length
     d_east = da - east[:, :, None] * np.einsum("ni,nip->np", east, da)[:, None, :]
     d_north = np.cross(de, east[:, :, None], axis=1) + np.cross(up[:, :, None], d_east, axis=1)
     return np.stack([np.einsum("i,nip->np", x, part) for part in (d_east, d_north, de)], axis=1)
@@ -399,9 +401,9 @@ class Pair:
 
     def evaluate(self, theta: Array) -> Invariants:
         """Return residuals, less the lengthening of |f|, and derivatives."""
-        found = invariants(theta, self.accel, self.mag, self.layout)
-        found.residuals[:, 0] -= self.lengthening
-        return found if self.held is None else with_held(found, theta, self.layout, self.held)
+        evaluated = invariants(theta, self.accel, self.mag, self.layout)
+        evaluated.residuals[:, 0] -= self.lengthening
+        return evaluated if self.held is None else with_held(evaluated, theta, self.layout, self.held)
 
 
 @dataclass(frozen=True)
@@ -458,37 +460,37 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
     extra = np.array([first if unknown else 0.0] * 2 + [first])
     free = np.array([unknown, unknown, pair.held is not None])
     rested = False
-    found = pair.evaluate(theta)
+    evaluated = pair.evaluate(theta)
     for number in range(_PASSES):
-        weigh = _root(_information(pair, _known(pair, found), extra, down))
-        theta, found, settled = _minimise(pair, weigh, theta, found, _NEAR if number else _DAMPING, _CLOSE)
-        known = _known(pair, found)
+        weigh = _root(_information(pair, _known(pair, evaluated), extra, down))
+        theta, evaluated, settled = _minimise(pair, weigh, theta, evaluated, _NEAR if number else _DAMPING, _CLOSE)
+        known = _known(pair, evaluated)
         before, weights_before = extra, down
         if number == 0 and not unknown:
-            free[:2] = _scatters_beyond(found, known)
+            free[:2] = _scatters_beyond(evaluated, known)
         if free.any():
-            extra = _likelihood_pass(pair, found, _information(pair, known, extra, down), extra, down, free)
+            extra = _likelihood_pass(pair, evaluated, _information(pair, known, extra, down), extra, down, free)
         if robust:
-            down = _huber(found, known, extra)
+            down = _huber(evaluated, known, extra)
         rests = np.abs(extra - before) <= _RESTS * extra + _LEAST
         if settled and rests.all() and np.abs(down - weights_before).max() < _RESTS:
             rested = True
             break
     weigh = _root(_information(pair, known, extra, down))
-    theta, found, settled = _minimise(pair, weigh, theta, found)
-    known = _known(pair, found)
+    theta, evaluated, settled = _minimise(pair, weigh, theta, evaluated)
+    known = _known(pair, evaluated)
     information = _information(pair, known, extra, np.ones(len(down)))
-    covariance, freedom = _uncertainty(pair, found, _information(pair, known, extra, down), extra, free)
+    covariance, freedom = _uncertainty(pair, evaluated, _information(pair, known, extra, down), extra, free)
     if not (np.diag(covariance) > 0).all():
         raise np.linalg.LinAlgError("the fit ends where parameters are not determined")
-    return Joint(pair, theta, found, information, covariance, freedom, np.sqrt(extra), down, rested and settled)
+    return Joint(pair, theta, evaluated, information, covariance, freedom, np.sqrt(extra), down, rested and settled)
 
 
-def _known(pair: Pair, found: Invariants) -> Array:
+def _known(pair: Pair, evaluated: Invariants) -> Array:
     """V_0 of |f|, |m| and dip, shape (n, 3, 3): ``B C B'``, and of |f| at least what its own fit says."""
     v = np.zeros((len(pair.mag), 3, 3))
     if pair.noise is not None:
-        v = found.by_outputs @ pair.noise @ found.by_outputs.transpose(0, 2, 1)
+        v = evaluated.by_outputs @ pair.noise @ evaluated.by_outputs.transpose(0, 2, 1)
     v[:, 0, 0] = np.maximum(v[:, 0, 0], pair.accel_variance) + _LEAST
     return v
 
@@ -517,20 +519,20 @@ def _root(information: Array) -> Array:
     return upper
 
 
-def _rows(pair: Pair, found: Invariants, theta: Array, weigh: Array) -> tuple[Array, Array]:
+def _rows(pair: Pair, evaluated: Invariants, theta: Array, weigh: Array) -> tuple[Array, Array]:
     """Whitened residuals and Jacobian of all attitudes, one after the other, with the rows of the prior."""
-    residuals = np.einsum("nij,nj->ni", weigh, found.residuals).ravel()
-    jacobian = (weigh @ found.by_parameters).reshape(-1, len(theta))
+    residuals = np.einsum("nij,nj->ni", weigh, evaluated.residuals).ravel()
+    jacobian = (weigh @ evaluated.by_parameters).reshape(-1, len(theta))
     if pair.prior is None:
         return residuals, jacobian
     mean, rows = pair.prior
-    own = np.zeros((len(rows), len(theta)))
-    own[:, pair.layout.of_accel] = rows
-    return np.concatenate([residuals, rows @ (theta[pair.layout.of_accel] - mean)]), np.vstack([jacobian, own])
+    prior_rows = np.zeros((len(rows), len(theta)))
+    prior_rows[:, pair.layout.of_accel] = rows
+    return np.concatenate([residuals, rows @ (theta[pair.layout.of_accel] - mean)]), np.vstack([jacobian, prior_rows])
 
 
 def _minimise(
-    pair: Pair, weigh: Array, theta: Array, found: Invariants, damping: float = _NEAR, close: float = 0.0
+    pair: Pair, weigh: Array, theta: Array, evaluated: Invariants, damping: float = _NEAR, close: float = 0.0
 ) -> tuple[Array, Invariants, bool]:
     """Levenberg-Marquardt with columns scaled to length 1, until a step is below the tolerance.
 
@@ -542,7 +544,7 @@ def _minimise(
     numpy.linalg.LinAlgError
         The parameters run away.
     """
-    residuals, jacobian = _rows(pair, found, theta, weigh)
+    residuals, jacobian = _rows(pair, evaluated, theta, weigh)
     cost = float(residuals @ residuals)
     for _ in range(_STEPS):
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
@@ -556,13 +558,13 @@ def _minimise(
         reached = float(new @ new)
         small = np.abs(step).max() < _TOLERANCE or np.linalg.norm(jacobian @ step) < close
         if reached <= cost * (1 + 1e-12):
-            theta, found, residuals, jacobian = theta + step, there, new, slope
+            theta, evaluated, residuals, jacobian = theta + step, there, new, slope
             cost, damping = reached, damping / 10
         else:
             damping *= 10
         if small or damping > 1e12:
-            return theta, found, bool(small)
-    return theta, found, False
+            return theta, evaluated, bool(small)
+    return theta, evaluated, False
 
 
 def weighted_jacobian(joint: Joint) -> Array:
@@ -570,24 +572,24 @@ def weighted_jacobian(joint: Joint) -> Array:
     return _rows(joint.pair, joint.found, joint.theta, _root(joint.information))[1]
 
 
-def _covariance(pair: Pair, found: Invariants, information: Array) -> Array:
+def _covariance(pair: Pair, evaluated: Invariants, information: Array) -> Array:
     """Return ``(J' V^-1 J)^-1``, shape (p, p)."""
-    size = found.by_parameters.shape[2]
-    carried = information @ found.by_parameters
-    normal = found.by_parameters.reshape(-1, size).T @ carried.reshape(-1, size)
+    size = evaluated.by_parameters.shape[2]
+    carried = information @ evaluated.by_parameters
+    normal = evaluated.by_parameters.reshape(-1, size).T @ carried.reshape(-1, size)
     if pair.prior is not None:
-        own = np.zeros((size, size))
-        own[pair.layout.of_accel, pair.layout.of_accel] = pair.prior[1].T @ pair.prior[1]
-        normal = normal + own
+        prior_information = np.zeros((size, size))
+        prior_information[pair.layout.of_accel, pair.layout.of_accel] = pair.prior[1].T @ pair.prior[1]
+        normal = normal + prior_information
     scale = np.sqrt(np.diag(normal))
     inverse: Array = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
     return inverse
 
 
-def _blocks(information: Array, found: Invariants, covariance: Array) -> tuple[Array, Array]:
+def _blocks(information: Array, evaluated: Invariants, covariance: Array) -> tuple[Array, Array]:
     """Return ``tr_k P``, shape (4,), and S, shape (4, 4), without forming P."""
-    k = found.residuals.shape[1]
-    carried = information @ found.by_parameters  # V^-1 J
+    k = evaluated.residuals.shape[1]
+    carried = information @ evaluated.by_parameters  # V^-1 J
     inside = carried @ covariance @ carried.transpose(0, 2, 1)
     gram = np.zeros((4, *covariance.shape))
     trace, squares = np.zeros(4), np.zeros((4, 4))
@@ -602,14 +604,14 @@ def _blocks(information: Array, found: Invariants, covariance: Array) -> tuple[A
 
 
 def _likelihood_pass(
-    pair: Pair, found: Invariants, information: Array, extra: Array, down: Array, free: Array
+    pair: Pair, evaluated: Invariants, information: Array, extra: Array, down: Array, free: Array
 ) -> Array:
     """One pass of restricted maximum likelihood for the variances of |m|, dip and directions held."""
-    covariance = _covariance(pair, found, information)
-    trace, squares = _blocks(information, found, covariance)
-    carried = information @ found.by_parameters
-    weighted = (information @ found.residuals[:, :, None])[:, :, 0]
-    felt = weighted - carried @ (covariance @ np.tensordot(carried, found.residuals, ((0, 1), (0, 1))))
+    covariance = _covariance(pair, evaluated, information)
+    trace, squares = _blocks(information, evaluated, covariance)
+    carried = information @ evaluated.by_parameters
+    weighted = (information @ evaluated.residuals[:, :, None])[:, :, 0]
+    felt = weighted - carried @ (covariance @ np.tensordot(carried, evaluated.residuals, ((0, 1), (0, 1))))
     weights = np.ones_like(felt)
     weights[:, 1:3] = 1 / np.maximum(down, 1e-12)[:, None]
     square = np.bincount(_BLOCKS[: felt.shape[1]], (weights * felt**2).sum(axis=0), 4)
@@ -625,27 +627,29 @@ def _likelihood_pass(
     return new
 
 
-def _scatters_beyond(found: Invariants, known: Array) -> Array:
+def _scatters_beyond(evaluated: Invariants, known: Array) -> Array:
     """Whether |m|, and the dip, scatter beyond their known noise; each has about half of the parameters they have."""
-    n, size = len(known), found.by_parameters.shape[2]
-    chi = (found.residuals[:, :3] ** 2 / (np.einsum("nii->ni", known) + _LEAST))[:, 1:].sum(axis=0)
+    n, size = len(known), evaluated.by_parameters.shape[2]
+    chi = (evaluated.residuals[:, :3] ** 2 / (np.einsum("nii->ni", known) + _LEAST))[:, 1:].sum(axis=0)
     freedom = max(n - size / 3, 1.0)
     return np.array([chi_square_probability(float(value), freedom) < FIELD_SCATTERS.level for value in chi])
 
 
-def _huber(found: Invariants, known: Array, extra: Array) -> Array:
+def _huber(evaluated: Invariants, known: Array, extra: Array) -> Array:
     """``min(1, 2/d)`` with ``d^2 = r1^2/sigma_m^2 + r2^2/sigma_delta^2``, shape (n,)."""
     variance = np.einsum("nii->ni", known)[:, 1:] + extra[:2] + _LEAST
-    d = np.sqrt((found.residuals[:, 1:3] ** 2 / variance).sum(axis=1))
+    d = np.sqrt((evaluated.residuals[:, 1:3] ** 2 / variance).sum(axis=1))
     weights: Array = np.minimum(1.0, _HUBER / np.maximum(d, 1e-300))
     return weights
 
 
-def _uncertainty(pair: Pair, found: Invariants, information: Array, extra: Array, free: Array) -> tuple[Array, Array]:
+def _uncertainty(
+    pair: Pair, evaluated: Invariants, information: Array, extra: Array, free: Array
+) -> tuple[Array, Array]:
     """Covariance of theta, and the degrees of freedom of each variance in it."""
-    covariance = _covariance(pair, found, information)
-    squares = _blocks(information, found, covariance)[1]
-    carried = (information @ found.by_parameters) @ covariance
+    covariance = _covariance(pair, evaluated, information)
+    squares = _blocks(information, evaluated, covariance)[1]
+    carried = (information @ evaluated.by_parameters) @ covariance
     each = (carried**2).sum(axis=0)
     by_block = np.zeros((4, len(covariance)))
     np.add.at(by_block, _BLOCKS[: len(each)], each)  # dv/dsigma_k^2
