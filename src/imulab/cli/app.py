@@ -38,9 +38,8 @@ _WHERE = {
 
 def commands(first: str = "") -> list[Command]:
     """Return all commands, or those that begin with a word."""
-    modules = dict.fromkeys([_WHERE[first]] if first else _WHERE.values())
-    found = [command for name in modules for command in _module(name).COMMANDS]
-    return [command for command in found if not first or command.path.split()[0] == first]
+    names = [first] if first else _WHERE
+    return [each for name in names for each in _module(_WHERE[name]).COMMANDS if each.path.split()[0] == name]
 
 
 def find(words: Sequence[str]) -> Command | str:

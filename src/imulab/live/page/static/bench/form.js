@@ -31,14 +31,14 @@ export function form(definition, { files, values = {}, run }) {
     ? h("details", { class: "more" }, h("summary", {}, title), h("div", { class: "fields" }, found.map(each => each.element))) : null;
   const main = fields.filter(({ of }) => !of.flag || of.required || of.kind === "output");
   const of = (...groups) => fields.filter(each => !main.includes(each) && groups.includes(each.of.group));
-  const own = of("model", "gravity");
+  const own = of("model");
   const few = own.length <= 8;
   const element = h("form", { class: "form", novalidate: true, onsubmit: event => {
     event.preventDefault();
     run(read()).catch(say);
   } },
     h("p", { class: "caption" }, definition.help),
-    h("div", { class: "fields" }, main.filter(({ of }) => of.kind !== "output").map(each => each.element), few ? own.map(each => each.element) : own.slice(0, 7).map(each => each.element)),
+    h("div", { class: "fields" }, main.filter(({ of }) => of.kind !== "output").map(each => each.element), of("gravity").map(each => each.element), (few ? own : own.slice(0, 7)).map(each => each.element)),
     few ? null : group(own.slice(7), "More options"),
     group(of("further triads"), "Further triads"),
     group(of("reading", "output", "all commands"), "Reading the file, and what is said"),
