@@ -5,25 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from math import inf, nan
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from imulab.cli.options import call, check_outputs, coloured, note, warn
 from imulab.display import SENTENCES, Verdict, aligned, printable
 from imulab.errors import OptionError, ReadError
 from imulab.files import replacing
 from imulab.procedures.plan import PlannedAttitudes, PlannedTest
-from imulab.procedures.tumble.plan import plan_tumble
-from imulab.procedures.views import TITLES, change_rows, exhibits_of, verdict
-from imulab.recording import Array, Recording
-from imulab.records.calibration import Calibration, json_text
-from imulab.records.comparison import RecordComparison
-from imulab.report.traces import ReportTable
 
 if TYPE_CHECKING:
     from imulab.device.unit import Blob
     from imulab.procedures.checking import RecordCheck
+    from imulab.recording import Array, Recording
+    from imulab.records.calibration import Calibration
+    from imulab.records.comparison import RecordComparison
 
 
 # What every fit does with its result: write it, print it, say what a user must know.
@@ -69,6 +65,8 @@ def finish(
 
 def run(*, output: str | None, report: str | None, json: bool, **options: Any) -> None:
     """Plan, print the prediction, and write what was asked for."""
+    from imulab.procedures.tumble.plan import plan_tumble
+
     check_plan_outputs(output, report, [name for name in (options["add"], options["from_"]) if name])
     finish_plan(call(plan_tumble, **options), output, report, json=json)
 
@@ -82,6 +80,8 @@ def check_plan_outputs(output: str | None, report: str | None, inputs: list[str]
 
 def finish_plan(plan: PlannedTest, output: str | None, report: str | None = None, *, json: bool) -> None:
     """Write a plan and its sheet, both or neither, print it, and say what was written and what is wrong with it."""
+    from imulab.records.calibration import json_text
+
     with ExitStack() as stack:
         to_sheet = stack.enter_context(replacing(report)) if report else None
         if output:
@@ -127,6 +127,8 @@ def finish_check(
     json: bool,
 ) -> int:
     """Write the report, print the result and the notes; return the exit status, 0: pass, 1: fail."""
+    from imulab.records.calibration import json_text
+
     notes = [*notes, *check.notes]
     if report:
         from imulab.files import write_text
@@ -151,6 +153,9 @@ _GAP = 1.5  # of the usual step: a longer one is counted as a gap, as where reco
 
 def describe_record(record: Calibration, *, provenance: bool = True) -> str:
     """Return what a record holds: its verdict, its headline, its tables, and where it comes from."""
+    from imulab.procedures.views import exhibits_of
+    from imulab.report.traces import ReportTable
+
     exhibits = exhibits_of(record)
     serial = record.sensor.get("serial", "unit without serial number")
     lines = [verdict_line(record.verdict)]
@@ -195,6 +200,8 @@ def _joined(value: object) -> str:
 
 def describe_changes(first: str, second: str, comparison: RecordComparison, record: Calibration) -> str:
     """Return what changed from one record to the other, which is of the procedure and units of `record`."""
+    from imulab.procedures.views import TITLES, change_rows, verdict
+
     lines = [f"{second} less {first}: {verdict(comparison)}", "", *aligned(TITLES, change_rows(comparison))]
     if comparison.probability is not None:
         lines += ["", f"all together: probability {comparison.probability:.2g} if nothing had changed"]
@@ -214,13 +221,15 @@ def describe_changes(first: str, second: str, comparison: RecordComparison, reco
 class _Column:
     """Range of a column, as its blocks pass by."""
 
-    low: float = np.inf
-    high: float = -np.inf
+    low: float = inf
+    high: float = -inf
     total: float = 0.0
     finite: int = 0
     missing: int = 0
 
     def add(self, values: Array) -> None:
+        import numpy as np
+
         finite = values[np.isfinite(values)]
         self.missing += len(values) - finite.size
         self.finite += finite.size
@@ -248,13 +257,15 @@ class _Clock:
 
     first: float | None = None
     last: float = 0.0
-    usual: float = np.nan
+    usual: float = nan
     gaps: int = 0
     widest: float = 0.0
     backwards: int = 0
     broken: bool = False
 
     def add(self, time: Array) -> None:
+        import numpy as np
+
         self.broken = self.broken or not np.isfinite(time).all()
         step = np.diff(time) if self.first is None else np.diff(time, prepend=self.last)
         if np.isnan(self.usual) and step.size:
@@ -267,6 +278,8 @@ class _Clock:
         self.last = float(time[-1])
 
     def text(self) -> list[str]:
+        import numpy as np
+
         if self.broken or self.first is None:
             return []
         if np.isnan(self.usual):
@@ -322,6 +335,8 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
 
 def recording_json(blocks: Iterable[Recording]) -> str:
     """Return the same as JSON, each column in its own unit; null where there is nothing to tell."""
+    from imulab.records.calibration import json_text
+
     found = _contents(blocks)
     last, clock = found.last, found.clock
     duration = rate = None

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from imulab.errors import OptionError
 from imulab.options import Option, options_of
-from imulab.records.triads import NOT_FITTED
 
 if TYPE_CHECKING:
     import numpy as np
@@ -289,6 +288,8 @@ class Procedure:
 
     def linear_fit(self, record: Calibration, *, misalignment: bool) -> LinearFit:
         """Return the accelerometers fitted anew without nonlinearity (and misalignment), for programs without."""
+        from imulab.records.triads import NOT_FITTED
+
         return NOT_FITTED
 
     def laws(self, record: Calibration) -> AccelerometerLaws:

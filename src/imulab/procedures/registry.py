@@ -24,7 +24,6 @@ from imulab.procedures.thermal.procedure import ThermalProcedure
 from imulab.procedures.tumble.procedure import TumbleProcedure
 from imulab.procedures.warmup.procedure import WarmupProcedure
 from imulab.records.calibration import Calibration
-from imulab.records.reading import parsed
 
 if TYPE_CHECKING:
     from imulab.device.unit import Blob
@@ -122,6 +121,8 @@ def load_any(path: str | Path) -> Calibration | Blob:
 
 def loads_sealed(data: bytes, name: str) -> tuple[Calibration, str]:
     """Return a record from the bytes of its file, and its ``content_sha256``; errors as for `load`."""
+    from imulab.records.reading import parsed
+
     record, seal = parsed(data, name)
     try:
         for procedure in PROCEDURES.values():

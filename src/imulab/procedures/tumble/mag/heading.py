@@ -35,7 +35,6 @@ from imulab.procedures.tumble.mag.model import (
     invariants,
     mag_names,
 )
-from imulab.procedures.tumble.mag.prepare import WORST_CONDITION
 from imulab.procedures.tumble.mag.solve import world_axes
 from imulab.procedures.tumble.model import parameter_names
 from imulab.procedures.tumble.schema import fit_of, mag_model_of, model_of
@@ -334,6 +333,8 @@ def plan_headings(
     ObservabilityError
         No headings of these attitudes determine the parameters.
     """
+    from imulab.procedures.tumble.mag.prepare import WORST_CONDITION
+
     count = len(directions) + (0 if before is None else len(before[0]))
     if count < FEWEST:
         raise OptionError(f"with_ mag: {count} attitudes; a magnetometer needs {FEWEST} or more, better 16")
