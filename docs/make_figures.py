@@ -11,7 +11,7 @@ from pathlib import Path
 
 import imulab as il
 from imulab.cli import main as commands
-from imulab.demo import run
+from imulab.cli.demo import run
 from imulab.procedures.centrifuge.manifest import make_manifest
 from imulab.procedures.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Truth
 from imulab.procedures.views import exhibits_of

@@ -12,8 +12,7 @@ import pytest
 from conftest import some_of
 from imulab.device.unit import array_stream
 from imulab.procedures.gyro_array.elements import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK
-from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
-from imulab.procedures.gyro_array.fused import Fused
+from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse
 from test_gyro_array_fuse import array_recording, dynamic
 
 SEEDS = some_of(2, (1, 2, 3, 4))

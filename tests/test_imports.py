@@ -9,7 +9,7 @@ import pytest
 
 SOURCE = Path(__file__).resolve().parents[1] / "src"
 ROOMS = [
-    {"cli", "demo", "__main__"},
+    {"cli", "__main__"},
     {"fleet", "live"},
     {"procedures", "readers", "exporters", "report", "writers"},
     {"estimation", "device", "records"},
@@ -101,7 +101,6 @@ def test_procedures_do_not_import_each_other():
 def test_only_the_registry_reaches_into_procedures():
     free = {
         "cli",
-        "demo",
         "live",
         "",
     }  # commands, simulated instruments, tumble with a person in the loop, public names
@@ -124,7 +123,7 @@ def _names_procedures(tree: ast.Module) -> bool:
 
 
 def test_nobody_outside_tells_procedures_apart_by_name():
-    outside = {name for name, tree in source_modules().items() if _room(name) not in {"cli", "demo", "procedures"}}
+    outside = {name for name, tree in source_modules().items() if _room(name) not in {"cli", "procedures"}}
     assert {name for name in outside if _names_procedures(source_modules()[name])} == KNOWN_NAMES
 
 

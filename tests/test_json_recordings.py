@@ -8,7 +8,7 @@ import pytest
 
 from imulab.errors import ReadError
 from imulab.readers import read, read_blocks
-from imulab.reading import Layout, LayoutColumn
+from imulab.recording import Layout, LayoutColumn
 
 
 @pytest.fixture

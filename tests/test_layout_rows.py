@@ -11,7 +11,7 @@ import pytest
 
 from imulab.errors import ReadError
 from imulab.readers import _text, read, read_blocks
-from imulab.reading import Layout, LayoutColumn
+from imulab.recording import Layout, LayoutColumn
 
 SIZES = [1, 3, 16, 61, 1 << 21]
 

@@ -16,7 +16,7 @@ import imulab as il
 from imulab import readers
 from imulab.errors import ReadError, UnitError
 from imulab.readers import Layout, _text, load_layout, read, read_blocks
-from imulab.reading import LayoutColumn
+from imulab.recording import LayoutColumn
 
 FIXED = settings(derandomize=True, database=None, deadline=None, max_examples=150)
 HEAD = b"time [s],accel_x [m/s^2],temperature [degC]\n"

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from imulab.procedures.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
     from imulab.procedures.exporting import export as export
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
+    from imulab.procedures.gyro_array.fuse import Fused as Fused
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
-    from imulab.procedures.gyro_array.fused import Fused as Fused
     from imulab.procedures.gyro_array.public import calibrate_array as calibrate_array
     from imulab.procedures.gyro_array.public import compare_methods as compare_methods
     from imulab.procedures.gyro_array.public import fuse as fuse
@@ -98,7 +98,7 @@ if TYPE_CHECKING:
 _HOME = {
     "ArrayFit": "procedures.gyro_array.fit",
     "FuseOptions": "procedures.gyro_array.fuse",
-    "Fused": "procedures.gyro_array.fused",
+    "Fused": "procedures.gyro_array.fuse",
     "allan_deviation": "procedures.noise.allan",
     "calibrate_array": "procedures.gyro_array.public",
     "check_noise": "procedures.noise.check",

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from imulab import docstrings
+from imulab import options
 from imulab._version import VERSION
 from imulab.cli.command import ALIKE, HELP, Command, values_of
 from imulab.errors import OptionError, listed, meant
@@ -63,7 +63,7 @@ def listed_commands(group: str = "") -> Iterator[tuple[str, str]]:
         return
     for name in _WHERE:
         first = commands(name)[0]
-        yield name, first.summary if first.path == name else docstrings.summary(_module(_WHERE[name]))
+        yield name, first.summary if first.path == name else options.summary(_module(_WHERE[name]))
 
 
 def run(words: Sequence[str]) -> int | None:
@@ -129,7 +129,7 @@ def _group_help(group: str) -> str:
     from imulab.cli.help import group_help
 
     if group:
-        text = docstrings.summary(_module(_WHERE[group]))
+        text = options.summary(_module(_WHERE[group]))
         return group_help(f"imulab {group}", text, (), listed_commands(group))
     return f"{group_help('imulab', TITLE, ROOT_OPTIONS, listed_commands())}\n{EXAMPLES}"
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple
 
-from imulab import arguments, docstrings
+from imulab import arguments
+from imulab import options as docstrings
 from imulab.errors import OptionError, meant
 from imulab.options import COMMON, READING, Option, Reads, options_of
 

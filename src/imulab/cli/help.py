@@ -1,4 +1,4 @@
-"""The help of commands, and the lists of them."""
+"""Help texts of commands, apart from the commands since only `--help` needs them."""
 
 from __future__ import annotations
 

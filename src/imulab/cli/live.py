@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from imulab.live.page.bench import Workbench
     from imulab.live.page.files import FolderFiles
     from imulab.live.runner import Runner
-    from imulab.reading import Layout
+    from imulab.recording import Layout
     from imulab.records.calibration import Calibration
 
 

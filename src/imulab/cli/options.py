@@ -207,7 +207,7 @@ def call(function: Callable[..., Result], *given: Any, **options: Any) -> Result
 
 def how_to_read() -> Any:
     """Return what says how a recording is read; it is not imported for lists of commands."""
-    from imulab.reading import Reading
+    from imulab.recording import Reading
 
     return Reading
 

@@ -309,7 +309,7 @@ def demo(folder: Annotated[str, Argument("[DIR]", "Folder to write to.")] = "dem
     from functools import partial
 
     from imulab.cli import main
-    from imulab.demo import run
+    from imulab.cli.demo import run
 
     print(run(folder, partial(main, project=False)))
 

@@ -12,11 +12,11 @@ from imulab.cli.options import call, check_outputs, coloured, note, warn
 from imulab.display import SENTENCES, Verdict, aligned, printable
 from imulab.errors import OptionError, ReadError
 from imulab.files import replacing
-from imulab.procedures.plan import PlannedAttitudes, PlannedTest
+from imulab.procedures.result import PlannedAttitudes, PlannedTest
 
 if TYPE_CHECKING:
     from imulab.device.unit import Blob
-    from imulab.procedures.checking import RecordCheck
+    from imulab.procedures.result import RecordCheck
     from imulab.recording import Array, Recording
     from imulab.records.calibration import Calibration
     from imulab.records.comparison import RecordComparison

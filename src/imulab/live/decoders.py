@@ -20,8 +20,7 @@ import numpy as np
 from imulab.columns import parse_column_title, triad
 from imulab.errors import OptionError, ReadError, UnitError, quoted
 from imulab.live.stamps import Counts
-from imulab.reading import Layout
-from imulab.recording import Array
+from imulab.recording import Array, Layout
 
 # Streams of lines of text: native titles, MotionCal, x-IMU3, and layouts of delimited text or JSON.
 

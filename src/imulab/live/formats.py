@@ -29,8 +29,7 @@ from imulab.live.decoders import (
 )
 from imulab.live.stamps import ArrivalClock, Counts, DeviceClock
 from imulab.readers.text import is_number
-from imulab.reading import Layout
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Layout, Recording
 from imulab.units import STANDARD_GRAVITY
 
 # A layout to start from for a stream of numbers that nobody has described: offered, never taken.

@@ -18,8 +18,7 @@ from imulab.live.session import Event, Session
 from imulab.live.sources import LiveSource
 from imulab.live.view import FurtherFits, further_of
 from imulab.readers import read_blocks
-from imulab.reading import Layout
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Layout, Recording
 from imulab.units import from_si
 from imulab.writers import decimal_rows, write_csv_to
 

@@ -21,8 +21,7 @@ from imulab.procedures.procedure import Procedure, Section
 from imulab.procedures.registry import joined_of, load_any, procedure_of, section
 from imulab.procedures.result import Record, as_record, as_recording
 from imulab.quantities import in_si
-from imulab.reading import Data, Reading
-from imulab.recording import Recording, with_power_on_temperature
+from imulab.recording import Data, Reading, Recording, with_power_on_temperature
 from imulab.records.calibration import Calibration
 
 # The tables of a unit: the numbers of its records in the order of the C core's structs, and of their application.

@@ -1,11 +1,16 @@
-"""What a fit is given, as people have it, and what every fit returns."""
+"""What fits, checks and plans return and what they are given.
+
+Results that show themselves, files, arrays and data frames as recordings, a recording held against a record, and a
+planned test as text and JSON.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import inspect
+import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias, overload
@@ -13,17 +18,20 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias, 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imulab._version import VERSION
 from imulab.arguments import check, checked, described, types_of
-from imulab.display import Shown
+from imulab.display import Bad, Note, Shown, aligned, verdict_of
 from imulab.errors import DataError, OptionError, listed
+from imulab.files import write_page
 from imulab.frames import columns_of_arrays, is_frame, unmasked
 from imulab.options import file
 from imulab.readers import read, read_blocks
 from imulab.readers.selection import Selection
-from imulab.reading import Data, Reading, Sampling, Window
-from imulab.recording import Recording, Source
+from imulab.recording import Data, Reading, Recording, Sampling, Source, Window
 from imulab.records.calibration import Calibration
+from imulab.report import render_page, render_plan
 from imulab.report.traces import Exhibits, Figure, ReportTable
+from imulab.writers import write_csv
 
 if TYPE_CHECKING:
     from typing import Unpack
@@ -34,6 +42,9 @@ if TYPE_CHECKING:
     from imulab.recording import Array
     from imulab.report.plots import Plot, Plots
     from imulab.views import AnyPlot, AnyPlots
+
+
+# What a fit is given, as people have it, and what every fit returns.
 
 
 # What every fit returns, whatever the procedure: its record, and what a person does with it next.
@@ -282,3 +293,191 @@ def _refuse(stated: Mapping[str, Any], keys: Iterable[str], called: str, reason:
 
 def _only(stated: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     return {key: stated[key] for key in keys if key in stated}
+
+
+# A plan of a test, and what every procedure's command prints, writes and says of it.
+
+
+def amount(value: float | None, unit: str) -> dict[str, Any]:
+    """Return a value with its unit for scripts, null where it is none or not finite."""
+    return {"value": finite(value), "unit": unit}
+
+
+def finite(value: float | None) -> float | None:
+    """Return a number, None where it is none or not finite."""
+    return value if value is not None and math.isfinite(value) else None
+
+
+class PlannedTest(Shown):
+    """A plan: `shown` gives it in a sentence and a table; text, JSON and warnings of all commands are made here."""
+
+    def tables(self) -> list[tuple[list[str], list[list[str]]]]:
+        """Return further tables, titles and rows of each."""
+        return []
+
+    def remarks(self) -> list[str]:
+        """Return what is said below the tables."""
+        return []
+
+    def content(self) -> dict[str, Any]:
+        """Return the plan for scripts, in SI."""
+        raise NotImplementedError
+
+    def findings(self) -> Sequence[str]:
+        """Return what is wrong with the plan, with what to do."""
+        return ()
+
+    def text(self) -> str:
+        """Return the plan as a command prints it."""
+        lead, titles, rows = self.shown()
+        lines = [lead, *aligned(titles, rows)]
+        for more, cells in self.tables():
+            lines += ["", *aligned(more, cells)]
+        return "\n".join([*lines, *self.remarks()])
+
+    def save(self, path: str | Path) -> None:
+        """Write the plan.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written.
+        """
+        raise NotImplementedError
+
+
+class PlannedAttitudes(PlannedTest):
+    """A plan of attitudes to measure by hand: its table as CSV, and a sheet to print with a picture of each."""
+
+    sheet_title: ClassVar[str]
+
+    @property
+    def lead(self) -> str:
+        """What the plan is and predicts, in a few sentences."""
+        raise NotImplementedError
+
+    @property
+    def predicted(self) -> list[tuple[str, str, str]]:
+        """What the test will give, as people read it: name, text and unit."""
+        raise NotImplementedError
+
+    def recording(self) -> Recording:
+        """Return the attitudes as a table."""
+        raise NotImplementedError
+
+    def pictures(self) -> list[dict[str, Any]]:
+        """Return what the sheet shows of each attitude."""
+        raise NotImplementedError
+
+    def save(self, path: str | Path) -> None:
+        """Write the attitudes as CSV, the columns of `recording`.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written.
+        """
+        write_csv(self.recording(), path)
+
+    def sheet(self) -> str:
+        """Return the sheet to print, a picture for each attitude, as HTML text."""
+        return render_plan(self.sheet_title, self.lead, self.pictures(), self.predicted)
+
+    def report(self, path: str | Path) -> None:
+        """Write the sheet to print as an HTML file; errors as for `save`."""
+        write_page(path, self.sheet())
+
+
+# A test of a record by new data: what it means, what to do next, and what was measured, as text, JSON and report.
+
+
+def probability_text(probability: float | None, least: float = 1e-12) -> str:
+    """Return a probability for a sentence: ``p = 0.031``; below `least` it is told as such."""
+    if probability is None:
+        return "not tested"
+    return f"p = {probability:.2g}" if probability >= least else f"p below {least:g}"
+
+
+def probability_fact(probability: float | None, least: float = 1e-12) -> str:
+    """Return a probability as a value beside its label: ``0.031``."""
+    return probability_text(probability, least).removeprefix("p ").removeprefix("= ")
+
+
+def columns_as_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:
+    """Return columns of equal length as rows of plain values, for JSON."""
+    plain = [np.asarray(list(values)).tolist() for values in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*plain, strict=True)]
+
+
+class RecordCheck(Drawn):
+    """A test of a record by new data.
+
+    A procedure's says whether it `passed`, what that means, what was measured, and what the report shows; this class
+    makes text, JSON and page of it. `data` is what the page calls a file that was tested.
+    """
+
+    data: ClassVar[str]
+    notes: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the data agree with the record."""
+        raise NotImplementedError
+
+    @property
+    def verdict(self) -> str:
+        """``pass`` or ``fail``."""
+        return "pass" if self.passed else "fail"
+
+    def meaning(self) -> str:
+        """Return what the test says, in words."""
+        raise NotImplementedError
+
+    def next_step(self, record: str, files: Sequence[str]) -> str:
+        """Return what to do, or to know, where the test failed."""
+        raise NotImplementedError
+
+    def measured(self) -> list[str]:
+        """Return what was measured, as lines of text."""
+        raise NotImplementedError
+
+    def content(self) -> dict[str, Any]:
+        """Return what was measured, for scripts, in SI."""
+        raise NotImplementedError
+
+    def stated(self) -> list[tuple[str, str]]:
+        """Return what was stated beside record and files, as label and value."""
+        return []
+
+    def text(self, record: str, files: Sequence[str], verdict: str) -> str:
+        """Return the verdict, what to do next, and what was measured; `verdict` may be coloured."""
+        step = [] if self.passed else [self.next_step(record, files)]
+        return "\n".join([f"{verdict}: {self.meaning()}", *step, *self.measured()])
+
+    def to_json(self, notes: Sequence[str] | None = None) -> dict[str, Any]:
+        """Return the same for scripts; `notes` are those of a command instead of its own."""
+        kept = self.notes if notes is None else notes
+        return {"verdict": self.verdict, **self.content(), "notes": [str(note) for note in kept]}
+
+    def exhibits_with(
+        self, facts: list[tuple[str, str]], items: Sequence[Figure | ReportTable], more: str = ""
+    ) -> Exhibits:
+        """Return exhibits under the headline that all tests have; `more` ends it."""
+        return Exhibits(f"{self.verdict.capitalize()}: {self.meaning()}{more}.", facts, list(items))
+
+    def page(self, held: Calibration, record: str, files: Sequence[str], notes: Sequence[str]) -> str:
+        """Return the report; `held` is the record in the file `record`, `notes` are those of the command."""
+        failed = [] if self.passed else [Bad(self.meaning()), self.next_step(record, files)]
+        return render_page(
+            f"{self.subject}: {self.verdict}",
+            held.sensor.get("serial", "unit without serial number"),
+            self.exhibits(),
+            verdict=verdict_of([*failed, *notes]),
+            notes=[note for note in notes if isinstance(note, Note)],
+            provenance=[
+                ("record", f"{record}, created {held.created}"),
+                *((self.data, file) for file in files),
+                *self.stated(),
+                ("software", f"imulab {VERSION}"),
+            ],
+        )

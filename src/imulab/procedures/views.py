@@ -21,8 +21,7 @@ from imulab.files import write_page
 from imulab.procedures.registry import joined_of, procedure_of
 from imulab.procedures.registry import load as load
 from imulab.procedures.result import Drawn, Record, as_record, as_recording
-from imulab.reading import Reading
-from imulab.recording import Recording
+from imulab.recording import Reading, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import RecordComparison, compared
 from imulab.report.parameters import Row, reading_unit

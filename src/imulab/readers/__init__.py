@@ -23,8 +23,7 @@ from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import IfNeeded, load_layout
 from imulab.readers.selection import Selection
 from imulab.readers.text import TextFile
-from imulab.reading import Layout, Window
-from imulab.recording import Array, Recording, Source
+from imulab.recording import Array, Layout, Recording, Source, Window
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 

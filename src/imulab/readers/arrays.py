@@ -10,8 +10,7 @@ import numpy as np
 
 from imulab.errors import ReadError
 from imulab.readers.layout import Readings
-from imulab.reading import Layout
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Layout, Recording
 
 ROWS = 1 << 16  # of a block of a table held in memory
 _INDEXED = re.compile(r"(.*?)\[(\d{1,9})\]")

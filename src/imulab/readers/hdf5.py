@@ -11,8 +11,7 @@ from typing import Any
 from imulab.errors import ReadError
 from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
 from imulab.readers.formats import Budget, library
-from imulab.reading import Layout
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Layout, Recording
 
 _LISTED = 20  # names that a message lists
 

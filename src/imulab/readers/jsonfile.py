@@ -19,8 +19,7 @@ from imulab.display import Note
 from imulab.errors import ReadError, meant
 from imulab.readers.arrays import origins, recordings
 from imulab.readers.text import _DATE
-from imulab.reading import Layout
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Layout, Recording
 from imulab.records.calibration import FORMAT
 
 LARGEST = 20_000_000

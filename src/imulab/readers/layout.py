@@ -16,8 +16,7 @@ import numpy as np
 from imulab.columns import check_unit, expected_quantities
 from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.files import check_keys, load_toml, number_of, scale_factor_of, unit_of, value_and_unit
-from imulab.reading import Layout, LayoutColumn
-from imulab.recording import Array
+from imulab.recording import Array, Layout, LayoutColumn
 from imulab.units import Unit, conversion_factor, parse_unit, to_si
 
 # Layout files: where the columns of a foreign file are, and in which units; `EXAMPLE` has every key.

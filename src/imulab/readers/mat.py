@@ -20,8 +20,7 @@ import numpy as np
 from imulab.errors import ReadError
 from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
 from imulab.readers.formats import Budget, unpack
-from imulab.reading import Layout
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Layout, Recording
 
 _HEAD = 128  # bytes of the head of a MAT-file, level 5
 _MATRIX, _COMPRESSED = 14, 15  # miMATRIX and miCOMPRESSED of the MAT-file format

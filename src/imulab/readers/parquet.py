@@ -15,8 +15,7 @@ from imulab.errors import ReadError
 from imulab.readers.arrays import ROWS, origins, to_floats
 from imulab.readers.formats import library
 from imulab.readers.layout import Readings
-from imulab.reading import Layout
-from imulab.recording import CORRECTED_BY, Array, Recording
+from imulab.recording import CORRECTED_BY, Array, Layout, Recording
 
 _NOT_OURS = ("ARROW:", "org.apache.")
 _OTHERS_JSON = ("pandas", "huggingface", "geo")  # what other writers leave under these names begins with a brace

@@ -11,8 +11,7 @@ from imulab.arguments import check_fields
 from imulab.columns import element_number
 from imulab.errors import OptionError
 from imulab.quantities import span
-from imulab.reading import Ends, Window
-from imulab.recording import Recording
+from imulab.recording import Ends, Recording, Window
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from imulab.readers.layout import load_layout, shipped_file, shipped_names
 from imulab.readers.text import titles_of
-from imulab.reading import Layout
+from imulab.recording import Layout
 
 _MOST_LINES = 200  # of a head by which a known logger is told
 

@@ -25,8 +25,7 @@ from imulab.columns import parse_column_title
 from imulab.display import Note
 from imulab.errors import ReadError, several
 from imulab.readers.layout import BackwardsError, Readings
-from imulab.reading import Layout
-from imulab.recording import CORRECTED_BY, Recording
+from imulab.recording import CORRECTED_BY, Layout, Recording
 from imulab.writers import powers_of_five
 
 # The bytes of a text file as lines: one by one for the head, whole blocks of them below.

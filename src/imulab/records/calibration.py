@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     import pandas
     import polars
 
-    from imulab.reading import Data, Reading
-    from imulab.recording import Recording
+    from imulab.recording import Data, Reading, Recording
 
 
 # Plain JSON values as text: with an indent as a file, without spaces and with sorted keys to be hashed.

@@ -31,7 +31,7 @@ from imulab.live.page.files import FolderFiles, Opening, Openings
 from imulab.live.page.jobs import Form, Jobs, PageJob
 from imulab.live.page.server import Hub, Message, PagePart, receive_file, report_response, to_json
 from imulab.options import options_of
-from imulab.reading import Reading
+from imulab.recording import Reading
 
 _WIDEST = 4000  # pixels of a drawing that a page asks for
 _LONGEST = 1 << 20

@@ -20,8 +20,7 @@ from imulab.columns import triad
 from imulab.errors import ImulabError
 from imulab.live.page.curves import Head, Writer
 from imulab.options import options_of, part_of, read_options
-from imulab.reading import Reading
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Reading, Recording
 
 _EVERY = 0.15  # s between two messages of progress
 

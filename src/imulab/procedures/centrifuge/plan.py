@@ -23,7 +23,7 @@ from imulab.options import measure, text
 from imulab.procedures.centrifuge.levels import Measured, RunLine, arm_rate_off, delays, mismatch, tilted, weighted
 from imulab.procedures.centrifuge.manifest import Manifest, make_manifest, manifest_text
 from imulab.procedures.centrifuge.run import LoadedRun
-from imulab.procedures.plan import PlannedTest, amount
+from imulab.procedures.result import PlannedTest, amount
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
 from imulab.report.plots import Plot
 from imulab.report.traces import BAD, GOOD, LEGEND, Figure, log_axis, short_log_axis

@@ -37,8 +37,7 @@ from imulab.procedures.gyro_array.elements import (
 )
 from imulab.procedures.gyro_array.figures import exhibits_of_comparison
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.gyro_array.fuse import FuseOptions, fuse, memory_text, open_stream
-from imulab.procedures.gyro_array.fused import Fused
+from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, memory_text, open_stream
 from imulab.procedures.gyro_array.schema import MethodRow
 from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
 from imulab.procedures.result import Drawn

@@ -1,4 +1,4 @@
-"""An array calibration as the table that the C core runs, and the vectors by which an exported unit tests itself."""
+"""What a unit computes of an array, apart since exports need it without the estimators."""
 
 from __future__ import annotations
 

@@ -16,14 +16,12 @@ from imulab.options import PROGRAM, READING, file, measure, parsed, text
 from imulab.procedures.gyro_array import compare, fit
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.fit import ArrayFit
-from imulab.procedures.gyro_array.fuse import RATE_WALK, FuseOptions, carried, fusion_text
+from imulab.procedures.gyro_array.fuse import RATE_WALK, Fused, FuseOptions, carried, fusion_text
 from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
-from imulab.procedures.gyro_array.fused import Fused
 from imulab.procedures.gyro_array.merge import Merged, merge_recordings
 from imulab.procedures.result import Record, as_record, as_recording, check_keywords
 from imulab.quantities import in_si, interval, span
-from imulab.reading import Data, Part, Reading, Window
-from imulab.recording import Recording
+from imulab.recording import Data, Part, Reading, Recording, Window
 from imulab.records.calibration import Calibration
 
 _LABEL = "array: {}"

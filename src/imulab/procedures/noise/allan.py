@@ -18,8 +18,7 @@ from imulab.frames import is_frame, unmasked
 from imulab.options import PROGRAM, READING, choice, parsed
 from imulab.procedures.result import Drawn, as_blocks, as_recording
 from imulab.quantities import span
-from imulab.reading import Data, Part, Window
-from imulab.recording import Array, Recording, check_finite, is_large, on_disk
+from imulab.recording import Array, Data, Part, Recording, Window, check_finite, is_large, on_disk
 from imulab.report.traces import Exhibits, Figure, ReportTable, format_uncertain
 from imulab.units import si_unit
 

@@ -21,18 +21,15 @@ from imulab.estimation.noise.spectrum import Spectrum, frequencies
 from imulab.estimation.noise.terms import NAMES, edge_as_white, prepare
 from imulab.estimation.rows import NORMAL_95
 from imulab.options import text
-from imulab.procedures.checking import RecordCheck, probability_fact, probability_text
 from imulab.procedures.noise.fit import fit_recordings, given_log
 from imulab.procedures.noise.schema import Column, NoiseSummary, drawn_of, fit_of, label
-from imulab.procedures.result import as_record
+from imulab.procedures.result import RecordCheck, as_record, probability_fact, probability_text
 from imulab.quantities import fraction
-from imulab.reading import Data, Reading
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Data, Reading, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import different_units
 from imulab.report import traces as panels
-from imulab.report.builders import table
-from imulab.report.traces import BAD, GOOD, Exhibits, Figure, rounded, scatter
+from imulab.report.traces import BAD, GOOD, Exhibits, Figure, rounded, scatter, table
 from imulab.units import si_unit
 
 # The result of a test of a noise record by a log: verdict, what changed by how much, the octaves of both spectra.

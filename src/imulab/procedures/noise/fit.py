@@ -1,4 +1,6 @@
-"""Logs at rest, short or long, to noise models, column by column, and their record.
+"""Noise models of sensors at rest, from logs to a record.
+
+What is found of each column, the model, and what its user must know.
 
 Parameters with intervals, what filters want, and what a user must know, a sentence each.
 """
@@ -10,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Unpack
+from typing import Annotated, Any, NoReturn, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +25,13 @@ from imulab.estimation.decisions import LEVEL_STEP_PERHAPS
 from imulab.estimation.noise.analysis import (
     CANDIDATES,
     Analysis,
+    Regression,
     allan_of_bins,
     analysed,
     ramp_coefficients,
     without_steps,
 )
-from imulab.estimation.noise.cleaning import LevelChange
+from imulab.estimation.noise.cleaning import LevelChange, Line
 from imulab.estimation.noise.likelihood import Flags
 from imulab.estimation.noise.rest import Rest, at_rest, long_rest
 from imulab.estimation.noise.spectrum import Stretch
@@ -59,20 +62,72 @@ from imulab.procedures.noise import (
     check_terms,
     rejected,
 )
-from imulab.procedures.noise.model import ColumnModel, CovariateDrift
 from imulab.procedures.noise.schema import term_unit
 from imulab.procedures.result import Result, as_blocks, as_recording
 from imulab.quantities import in_si
-from imulab.reading import Data, Reading
-from imulab.recording import Array, Recording, Source, is_large, on_disk
+from imulab.recording import Array, Data, Reading, Recording, Source, is_large, on_disk
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
 from imulab.report.parameters import density_unit, small_unit
 from imulab.report.traces import plain_number
 from imulab.units import parse_unit, si_unit
 
-if TYPE_CHECKING:
-    pass
+# What is found of one column of a log at rest: its noise, its lines and steps, and what it drifts with.
+
+
+_COVARIATE_UNITS = {"time": "s", "temperature": "K"}
+
+
+@dataclass(frozen=True)
+class CovariateDrift:
+    """How a column follows time or temperature: slope and its uncertainty in SI, with the models without and with it.
+
+    `taken` says whether the model is that of what is left.
+    """
+
+    covariate: str
+    found: Regression
+    letters: tuple[str, str]
+    taken: bool
+
+    @property
+    def slope(self) -> float:
+        """Unit of the column over that of the covariate."""
+        return float(self.found.slope[0])
+
+    @property
+    def standard_uncertainty(self) -> float:
+        """Of the slope."""
+        return float(self.found.standard_uncertainty[0])
+
+
+@dataclass(frozen=True)
+class ColumnModel:
+    """The noise of a column.
+
+    Attributes
+    ----------
+    name, unit
+        Of the column; the unit in SI.
+    analysis
+        Spectrum, candidates, chosen model.
+    spikes, knocks, lines, steps
+        What was found that is no noise; of knocks start and length, s.
+    drifts
+        How it follows time and temperature.
+    """
+
+    name: str
+    unit: str
+    analysis: Analysis
+    spikes: int
+    knocks: tuple[tuple[float, float], ...]
+    lines: tuple[Line, ...]
+    steps: tuple[LevelChange, ...]
+    drifts: tuple[CovariateDrift, ...]
+
+
+# Logs at rest, short or long, to noise models, column by column, and their record.
 
 
 # Logs at rest as they are given: short ones as recordings, large files block by block or with columns on disk.

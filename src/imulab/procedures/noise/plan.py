@@ -17,8 +17,7 @@ from imulab.estimation.noise.terms import NAMES, edge_as_white
 from imulab.options import measure, repeated, text
 from imulab.procedures.noise.schema import Markov, fit_of, given_terms, label, term_reading, term_unit
 from imulab.procedures.noise.simulate import RATE, names_given, terms_of
-from imulab.procedures.plan import PlannedTest, amount, finite
-from imulab.procedures.result import Record, as_record
+from imulab.procedures.result import PlannedTest, Record, amount, as_record, finite
 from imulab.quantities import fraction, in_si
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration

@@ -1,4 +1,4 @@
-"""A rate record as the table that the C core runs, and as the correction of recordings, of one axis too."""
+"""The table of a unit's gyroscopes from a rate record, apart since exports need it without the estimators."""
 
 from __future__ import annotations
 

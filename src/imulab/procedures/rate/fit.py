@@ -40,8 +40,7 @@ from imulab.procedures.rate.solve import (
 )
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.quantities import in_si
-from imulab.reading import Data, Reading
-from imulab.recording import Recording
+from imulab.recording import Data, Reading, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import different_units
 

@@ -20,11 +20,10 @@ from imulab.errors import ObservabilityError, OptionError, RecordError, listed
 from imulab.files import write_text
 from imulab.gravity import EARTH, checked_latitude
 from imulab.options import measure, parsed, text
-from imulab.procedures.plan import PlannedTest, amount
 from imulab.procedures.rate import FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
 from imulab.procedures.rate.schema import RateTest, Run, manifest_text
 from imulab.procedures.rate.solve import RateProblem, model_parameters, solve
-from imulab.procedures.result import Record, as_record
+from imulab.procedures.result import PlannedTest, Record, amount, as_record
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole, whole_number
 from imulab.recording import Array
 from imulab.report.parameters import ReadingUnit, reading_unit

@@ -41,8 +41,7 @@ from imulab.procedures.rate.axes import (
 from imulab.procedures.rate.schema import TurnsEvidence, TurnsModel, TurnsSummary, WholeTurns, prior_table, turns_of
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.quantities import in_si
-from imulab.reading import Data, Reading
-from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.recording import Array, Data, Reading, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Quantity, entries
 from imulab.report.parameters import parameters_table, rows_of

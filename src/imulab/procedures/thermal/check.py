@@ -16,8 +16,15 @@ from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.estimation.decisions import THERMAL_CHECK
 from imulab.gravity import EarthRate, Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
 from imulab.options import FURTHER_TRIADS, measure, text
-from imulab.procedures.checking import RecordCheck, columns_as_rows, probability_fact, probability_text
-from imulab.procedures.result import Record, as_record, as_recording
+from imulab.procedures.result import (
+    Record,
+    RecordCheck,
+    as_record,
+    as_recording,
+    columns_as_rows,
+    probability_fact,
+    probability_text,
+)
 from imulab.procedures.thermal.degrees import parted
 from imulab.procedures.thermal.figures import own_points
 from imulab.procedures.thermal.gyro import RatesAtRest, notes_on_turns, rates_at_rest, rows_of, without_turns
@@ -27,12 +34,10 @@ from imulab.procedures.thermal.record import gyro_scale_predicted, names_and_uni
 from imulab.procedures.thermal.schema import thermal_of
 from imulab.procedures.thermal.solve import ThermalProblem, linearise, together
 from imulab.quantities import in_si
-from imulab.reading import Data, Reading
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Data, Reading, Recording
 from imulab.records.calibration import Calibration
-from imulab.report.builders import points, table, within_and_beyond
 from imulab.report.parameters import micro_g
-from imulab.report.traces import LEGEND, Exhibits, Figure, figure_axis
+from imulab.report.traces import LEGEND, Exhibits, Figure, figure_axis, points, table, within_and_beyond
 from imulab.units import conversion_factor, from_si, parse_unit, to_si
 
 # The gyroscopes of new recordings against a record over temperature: their outputs at rest under its laws.

@@ -28,8 +28,7 @@ from imulab.procedures.thermal.model import GROUPS, Laws, forces
 from imulab.procedures.thermal.record import make_record, with_gyroscopes
 from imulab.procedures.thermal.solve import ThermalProblem, ThermalSolution
 from imulab.quantities import in_si
-from imulab.reading import Data, Reading
-from imulab.recording import Array
+from imulab.recording import Array, Data, Reading
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, parse_unit
 

@@ -22,7 +22,7 @@ from numpy.polynomial import legendre
 
 from imulab.errors import ObservabilityError, OptionError
 from imulab.options import FURTHER_TRIADS, measure, parsed, text
-from imulab.procedures.plan import PlannedAttitudes, amount
+from imulab.procedures.result import PlannedAttitudes, amount
 from imulab.procedures.thermal import APART, DEGREES, FOLLOWED, LEAST_SPAN, TURNED, degrees_of, further_of
 from imulab.procedures.thermal.degrees import spoken_degrees
 from imulab.procedures.thermal.gyro import VERTICAL, new_in_each
@@ -38,8 +38,7 @@ from imulab.procedures.tumble.plan import (
     sphere_candidates,
 )
 from imulab.quantities import RANDOM_WALK, in_si, of_units, temperature_list
-from imulab.reading import Data
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Data, Recording
 from imulab.report.plots import Plot
 from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis
 from imulab.units import STANDARD_GRAVITY, from_si

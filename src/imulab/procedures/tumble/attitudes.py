@@ -25,8 +25,7 @@ from imulab.columns import triad
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
 from imulab.procedures.result import as_recording
-from imulab.reading import Data, Reading, Sampling
-from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time
 from imulab.units import conversion_factor
 
 # Attitudes: what segmentation hands to a tumble fit.

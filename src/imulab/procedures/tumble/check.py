@@ -19,18 +19,15 @@ from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import median
 from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_place, local_gravity
 from imulab.options import measure
-from imulab.procedures.checking import RecordCheck, columns_as_rows, probability_fact, probability_text
-from imulab.procedures.result import Record, as_record
+from imulab.procedures.result import Record, RecordCheck, as_record, columns_as_rows, probability_fact, probability_text
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.record import Scaling, scaled_parameters
 from imulab.procedures.tumble.schema import attitudes_of, fit_of, model_of
 from imulab.quantities import in_si
-from imulab.reading import Reading
-from imulab.recording import Array
+from imulab.recording import Array, Reading
 from imulab.records.calibration import Calibration
-from imulab.report.builders import table
 from imulab.report.parameters import micro_g, reading_unit, small_g
 from imulab.report.traces import (
     BAD,
@@ -47,6 +44,7 @@ from imulab.report.traces import (
     number_axis,
     rounded,
     scatter,
+    table,
 )
 from imulab.units import from_si
 

@@ -29,8 +29,7 @@ from imulab.procedures.tumble.record import Estimate, make_record
 from imulab.procedures.tumble.schema import OrderRow, model_of
 from imulab.procedures.tumble.solve import SOURCE_THRESHOLD, Threshold
 from imulab.quantities import in_si, whole
-from imulab.reading import Reading
-from imulab.recording import Array
+from imulab.recording import Array, Reading
 from imulab.records.calibration import Calibration
 
 if TYPE_CHECKING:

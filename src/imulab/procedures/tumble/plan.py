@@ -19,9 +19,8 @@ from imulab.columns import triad
 from imulab.errors import DataError, ImulabError, ObservabilityError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.least_squares import observability
 from imulab.options import choice, either, file, parsed, text
-from imulab.procedures.plan import PlannedAttitudes, amount
 from imulab.procedures.registry import load
-from imulab.procedures.result import as_recording
+from imulab.procedures.result import PlannedAttitudes, amount, as_recording
 from imulab.procedures.tumble import CRITERIA, HIGHEST_ORDER, METHODS
 from imulab.procedures.tumble.attitudes import find_attitudes
 from imulab.procedures.tumble.estimate import check_method
@@ -31,8 +30,7 @@ from imulab.procedures.tumble.record import freedom_finding, predicted_rows
 from imulab.procedures.tumble.schema import attitudes_of, data_of, fit_of, model_of
 from imulab.procedures.tumble.solve import CLOSEST, Search, information_rows, inverse, optimal_set, sphere_points
 from imulab.quantities import in_si, quantity, whole, whole_number
-from imulab.reading import Data
-from imulab.recording import Array, Recording, check_finite
+from imulab.recording import Array, Data, Recording, check_finite
 from imulab.records import is_json
 from imulab.records.calibration import Calibration
 from imulab.report.traces import GOOD, Figure, figure_axis

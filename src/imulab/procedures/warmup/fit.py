@@ -28,8 +28,7 @@ from imulab.procedures.warmup.quality import (
 )
 from imulab.procedures.warmup.record import make_record
 from imulab.quantities import in_si, number, temperature_list
-from imulab.reading import Data, Reading
-from imulab.recording import Array
+from imulab.recording import Array, Data, Reading
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import different_units
 

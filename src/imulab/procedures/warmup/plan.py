@@ -13,7 +13,7 @@ import numpy as np
 
 from imulab.errors import OptionError
 from imulab.options import measure, parsed, text
-from imulab.procedures.plan import PlannedTest, amount
+from imulab.procedures.result import PlannedTest, amount
 from imulab.procedures.warmup import TEMPERATURES
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, temperature_list, whole
 from imulab.recording import Recording

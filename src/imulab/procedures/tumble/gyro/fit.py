@@ -63,8 +63,7 @@ from imulab.procedures.tumble.schema import (
     model_of,
 )
 from imulab.quantities import in_si
-from imulab.reading import Data, Reading
-from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.recording import Array, Data, Reading, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
 from imulab.records.mean_noise import mean_uncertainties

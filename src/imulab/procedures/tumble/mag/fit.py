@@ -45,8 +45,7 @@ from imulab.procedures.tumble.model import gravity_slope, parameter_names, param
 from imulab.procedures.tumble.record import make_record, si_parameters
 from imulab.procedures.tumble.schema import FieldAgreement, Heading, MagFields, MagModel, MagSummary, OneSample
 from imulab.quantities import in_si
-from imulab.reading import Reading
-from imulab.recording import Array
+from imulab.recording import Array, Reading
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, entries
 from imulab.units import parse_unit
