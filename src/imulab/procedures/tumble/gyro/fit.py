@@ -181,9 +181,7 @@ def fit_gyro_triad(
             raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
         time = comparison.on_other(time)
         solved = solve_turns(case, time, sensitivity)
-    noise_notes: list[str] = []
-    if noise is not None:
-        solved, noise_notes = _with_noise(solved, noise, attitudes, recording)
+    solved, noise_notes = (solved, []) if noise is None else _with_noise(solved, noise, attitudes, recording)
     known = clock_of_scale(comparison, clock, clock_of, counted=counted(check_time(recording)))
     notes = [
         *(f"gyro: {note}" for note in left_out.notes(_at_rest(attitudes, time, left_out))),
