@@ -73,7 +73,7 @@ from imulab.procedures.thermal.solve import (
 )
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.gyro.rest import QUIET_SHARE, STILL_SIGMAS, beyond_range
-from imulab.procedures.tumble.gyro.solve import Case, Solved, solve_turns, turn_covariance
+from imulab.procedures.tumble.gyro.solve import TurnProblem, TurnSolution, solve_turns, turn_covariance
 from imulab.procedures.tumble.gyro.turns import by_directions, model, shared_covariance
 from imulab.recording import Array, Recording, check_finite
 from imulab.records.calibration import Calibration
@@ -724,7 +724,7 @@ def scale_from_turns(
     return _laws(turned, known, solution.laws, notes)
 
 
-def _turned(solved: Solved, directions: tuple[Array, Array], temperature: Array, freedom: int) -> Turned:
+def _turned(solved: TurnSolution, directions: tuple[Array, Array], temperature: Array, freedom: int) -> Turned:
     """Return what the turns of one recording say; `directions` as of `_directions`."""
     across, moved = directions
     segments, jacobian = solved.segments, solved.jacobian
@@ -741,7 +741,7 @@ def _turned(solved: Solved, directions: tuple[Array, Array], temperature: Array,
     return Turned(values, matrix, by_coefficients, float(temperature.mean()), turns, cost)
 
 
-def _by_sensitivity(solved: Solved) -> Array:
+def _by_sensitivity(solved: TurnSolution) -> Array:
     """Return the derivatives of the residuals by the g-sensitivities that were taken off, rad per rad/s/g, (3 m, 9).
 
     They act as a zero that is theirs times the force: half-way in a turn, less its mean over the holds, which is in the
@@ -831,7 +831,7 @@ def _temperature(holds: Holds, number: int, attitudes: Attitudes) -> Array:
 
 def _case(
     holds: Holds, number: int, record: Calibration, size: Array, gyros: ThermalGyroscopes | None, unit: str
-) -> tuple[Case, Array]:
+) -> tuple[TurnProblem, Array]:
     """Return the turns of one recording, its biases and g-sensitivities taken off, and the times of its samples."""
     recording, attitudes = holds.recordings[number], holds.attitudes[number]
     kept = leave_out(recording, triad("gyro")).recording
@@ -847,7 +847,9 @@ def _case(
             output = output - force_at_samples @ gyros.sensitivities(record.model["gravity"]["value"]).T
         output[clipped] = 2 * np.abs(output).max()  # what was cut off stays so, and is left out with its turn
     knocked: NDArray[np.bool_] = np.zeros(len(attitudes), dtype=np.bool_)
-    case = Case(recording.name, attitudes, force, time, force_at_samples, output, unit, fit_bias=False, knocked=knocked)
+    case = TurnProblem(
+        recording.name, attitudes, force, time, force_at_samples, output, unit, fit_bias=False, knocked=knocked
+    )
     return case, time
 
 

@@ -59,7 +59,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Motion:
-    """How each attitude moved while it was held, as far as the mean magnitude of f in it depends on that.
+    """Motion of the unit during each hold, as far as it changes the mean magnitude of f.
 
     The mean of the magnitudes differs from the magnitude of the mean by the motion, and their scatter is the noise.
     Both follow from the blocks of a hold through df/dM, which is known only when the fit is done.
@@ -339,7 +339,7 @@ def _largest_share(values: Array) -> float:
 
 
 SMALLEST_BLOCK = 4
-"""Samples of a block whose scatter is told."""
+"""Least number of samples in a block whose scatter is estimated."""
 _TREMOR_SECONDS = 0.125
 """A period of a hand's tremor: the magnitudes of shorter blocks rectify it, longer ones hide the motion of the hand."""
 _BATCHES = 10
@@ -398,8 +398,8 @@ def _statistics(held: HeldStill) -> tuple[Array, Array, Array]:
     return moments, freedom, share
 
 
-def _pooled(covariance: Array, freedom: Array, share: Array) -> Array:
-    """Covariance of each mean, shrunk towards the noise common to all: a few batches alone make poor weights."""
+def _shrink_covariance(covariance: Array, freedom: Array, share: Array) -> Array:
+    """Return the covariance of each mean, shrunk towards the pooled one: a few batches alone give poor weights."""
     scatter = covariance / share[:, None, None]
     level = np.trace(scatter, axis1=1, axis2=2)
     usual = level <= 3 * median(level)
@@ -443,7 +443,7 @@ def covariance_and_motion(
         resolution = resolutions(recording, names)
     # Noise below half a step of the output does not average its rounding away.
     rounding = np.where(noise < resolution / 2, resolution**2 / 12, 0.0)
-    covariance = _pooled(moments[:, :3, :3], freedom, share)
+    covariance = _shrink_covariance(moments[:, :3, :3], freedom, share)
     for matrices in (moments, covariance):
         matrices[:, range(3), range(3)] += rounding
     return covariance, _motion(held, moments, freedom, share)
@@ -473,8 +473,8 @@ _SLOW = 5.0  # Hz: of slower samples too few fall into a hold
 _MUCH_LOST = 0.05  # share of the time that gaps may take without a warning
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)
 _DRIFT, _AS_GOOD = 1.0, 1.1
-"""K by which the temperature moves where the ellipsoid moves with it, and the share of the least error that then tells
-thresholds apart no more."""
+"""Temperature change, K, from which one ellipsoid no longer fits; thresholds whose error is within this factor of the
+least then count as equally good."""
 _SAME_ATTITUDE = 2e-3
 """Pieces of one hold whose means differ by less than this fraction of g (rad) are one attitude: averaging them
 shortens the vector by less than 0.5 ug."""
@@ -691,9 +691,9 @@ def _sweep(
 
 
 def _candidates(variance: Array, quiet: float, blocks: _Blocks, width: int, trim: int, fewest: int) -> list[_Pieces]:
-    """Return the attitudes under each threshold; the same object where two thresholds find the same stretches.
+    """Return the attitudes under each threshold; neighbouring thresholds with the same stretches share one object.
 
-    Those are neighbours: what is quiet under one threshold is so under the next.
+    A window below one threshold is also below every higher one.
     """
     candidates: list[_Pieces] = []
     start, stop = np.empty((2, len(variance)), dtype=np.int64)
@@ -716,7 +716,7 @@ def _merge(start: NDArray[np.int64], stop: NDArray[np.int64], blocks: _Blocks) -
 
 
 def _drifts(recording: Recording) -> bool:
-    """Return whether the temperature moves so much that the outputs at rest lie on no one ellipsoid."""
+    """Return whether the temperature changes too much for one ellipsoid to fit all outputs at rest."""
     if "temperature" not in recording:
         return False
     read = recording.column("temperature")
@@ -805,10 +805,10 @@ def as_attitudes(
     if attitudes.covariance is not None:
         why = "std_* columns state it" if attitudes.trace is None else "the recording itself says how certain they are"
         raise OptionError(f"{called}: covariance: {why}; expected means of attitudes without")
-    return replace(attitudes, covariance=_checked(covariance, len(attitudes), called))
+    return replace(attitudes, covariance=_check_covariance(covariance, len(attitudes), called))
 
 
-def _checked(covariance: ArrayLike, count: int, called: str) -> Array:
+def _check_covariance(covariance: ArrayLike, count: int, called: str) -> Array:
     """Return covariances of shape (n, 3, 3)."""
     try:
         values = np.asarray(covariance, dtype=np.float64)

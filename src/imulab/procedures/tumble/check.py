@@ -410,7 +410,7 @@ def check_tumble(
     if limit is None and not record.covariance.names:
         raise RecordError("the record states no uncertainties to test against; expected a fixed limit (--limit 1mg)")
     local = _gravity(record, at_place(gravity, latitude, height), attitudes)
-    attitudes = _in_unit_of(record, attitudes)
+    attitudes = _convert_attitudes(record, attitudes)
     g, order = local.value, model_of(record).order
     scale = g * np.array([record.value(f"scale_factor_{axis}") for axis in "xyz"])
     scaling = Scaling(np.zeros(3), np.abs(scale))
@@ -428,7 +428,7 @@ def check_tumble(
     if not record.covariance.names:
         return Check(residuals, None, None, None, local, limit, tuple(notes), attitudes)
     from imulab.procedures.tumble.prior import contradiction, known_of
-    from imulab.procedures.tumble.prior import scatter as prior_scatter
+    from imulab.procedures.tumble.prior import scatter_beyond_noise as prior_scatter
 
     mag = _mag(record, attitudes, notes)
     own_variance = np.maximum(noise_variance[0] + _excess(record, g), 1e-24)  # data without noise leave rounding
@@ -475,7 +475,7 @@ def _gravity(record: Calibration, requested: float | str | Gravity | None, attit
     return local_gravity(requested, attitudes.recording)
 
 
-def _in_unit_of(record: Calibration, attitudes: Attitudes) -> Attitudes:
+def _convert_attitudes(record: Calibration, attitudes: Attitudes) -> Attitudes:
     unit = model_of(record).output_unit
     factor = output_factor(attitudes.recording.name, triad("accel"), attitudes.unit, unit)
     return replace(
@@ -502,7 +502,7 @@ def _noise(record: Calibration, attitudes: Attitudes, scaling: Scaling) -> tuple
 
 
 def _excess(record: Calibration, g: float) -> float:
-    """Variance of the record's own attitudes beyond their noise, if that was seen: fresh ones will have it too."""
+    """Return the excess variance of the record's own attitudes, if significant: fresh ones are taken to have it too."""
     fit = fit_of(record)
     freedom, reduced = fit.degrees_of_freedom, fit.reduced_chi_square
     if fit.noise != "known" or not reduced or freedom < 1:

@@ -28,11 +28,11 @@ from imulab.procedures.tumble.orders import (
     absolute_weights,
     blend_orders,
     choose_order,
-    set_aside,
+    find_disturbed,
     solve_orders,
     with_known_spread,
 )
-from imulab.procedures.tumble.record import Estimate, FittedAttitudes, Scaling, Stated
+from imulab.procedures.tumble.record import Estimate, FittedAttitudes, Scaling, StatedUncertainty
 from imulab.procedures.tumble.solve import (
     Threshold,
     TumbleProblem,
@@ -126,7 +126,7 @@ def check_options(
             cross=cross or None, prior=with_prior or None, nonlinearity=nonlinearity, monte_carlo=monte_carlo,
         )  # fmt: skip
     check_field(field)
-    _check_of_mag("mag" in further, field=field, hemisphere=hemisphere, dip=dip)
+    _check_mag_options("mag" in further, field=field, hemisphere=hemisphere, dip=dip)
     if monte_carlo is not None:
         _check_monte_carlo(monte_carlo, method, with_prior=with_prior)
 
@@ -179,7 +179,7 @@ def _check_with_mag(**others: object) -> None:
             )
 
 
-def _check_of_mag(asked: bool, **stated: object) -> None:
+def _check_mag_options(asked: bool, **stated: object) -> None:
     """Refuse what is stated of a field where no magnetometers are asked for."""
     for name, value in stated.items():
         if value is not None and not asked:
@@ -233,12 +233,12 @@ def estimate_triad(
     every = _problem(attitudes, scaling, robust=loss == "huber")
     known = None
     if prior is not None:
-        from imulab.procedures.tumble.prior import findings, known_of, prior_shares, put_together
+        from imulab.procedures.tumble.prior import combine_with_prior, known_of, prior_shares, prior_warnings
 
         known = known_of(prior, scaling, gravity, attitudes.unit)
     aside, fitted = NONE_ASIDE, dict[int, TumbleSolution]()
     if loss == "auto" and rest is None and not cross:
-        aside, fitted = set_aside(every, lambda subset: _fits(subset, order))
+        aside, fitted = find_disturbed(every, lambda subset: _fits(subset, order))
     used, kept = every, attitudes
     if aside.index:
         used, kept = every.only(aside.others(len(attitudes))), attitudes.only(aside.others(len(attitudes)))
@@ -248,15 +248,19 @@ def estimate_triad(
     problem = replace(used, order=choice.order if choice else 1 if order in FROM_DATA else int(order), cross=cross)
     aged = None
     if known is not None:
-        aged = put_together(problem, known, gravity, _scaled_ageing(ageing, gravity.value))
+        aged = combine_with_prior(problem, known, gravity, _scaled_ageing(ageing, gravity.value))
         problem = aged.problem
     solution, conditioning = _solve(problem, kept, rest, choice, aged.solution if aged else fitted.get(problem.order))
-    given_order = Stated(aged.covariance, aged.freedom) if aged else _given_order(problem, solution)
+    given_order = (
+        StatedUncertainty(aged.covariance, aged.freedom) if aged else _uncertainty_given_order(problem, solution)
+    )
     stated = given_order
     if choice is not None and given_order is not None:
         blended = with_known_spread(used, choice, nonlinearity) if nonlinearity else blend_orders(used, choice)
-        problem, solution, stated = _whatever_the_order(used, problem, solution, given_order, blended, order == "blend")
-    complete = _found(attitudes, replace(every, order=problem.order, cross=cross), solution, aside)
+        problem, solution, stated = _with_order_uncertainty(
+            used, problem, solution, given_order, blended, order == "blend"
+        )
+    complete = _with_aside(attitudes, replace(every, order=problem.order, cross=cross), solution, aside)
     check_residuals(kept, solution, gravity.value)
     check_axes(attitudes, forces(complete.problem, complete.solution)[0])
     estimate = Estimate(
@@ -268,7 +272,7 @@ def estimate_triad(
         estimate,
         with_gravity=aged.with_gravity,
         prior=prior_shares(prior, known, aged, scaling, gravity),
-        notes=findings(prior, aged, attitudes.recording, len(kept)),
+        notes=prior_warnings(prior, aged, attitudes.recording, len(kept)),
     )
 
 
@@ -286,7 +290,9 @@ def _fits(problem: TumbleProblem, order: int | str) -> dict[int, TumbleSolution]
     return solve_orders(problem) if order in FROM_DATA else {int(order): solve_norm(replace(problem, order=int(order)))}
 
 
-def _found(attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution, aside: Aside) -> FittedAttitudes:
+def _with_aside(
+    attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution, aside: Aside
+) -> FittedAttitudes:
     """Return all attitudes under the solution, those set aside with the down-weight 0."""
     if not aside.index:
         return FittedAttitudes(attitudes, problem, solution, aside)
@@ -295,22 +301,26 @@ def _found(attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolutio
     return FittedAttitudes(attitudes, problem, every, aside)
 
 
-def _whatever_the_order(
+def _with_order_uncertainty(
     used: TumbleProblem,
     problem: TumbleProblem,
     solution: TumbleSolution,
-    given_order: Stated,
+    given_order: StatedUncertainty,
     blended: Blended,
     at_blend: bool,
-) -> tuple[TumbleProblem, TumbleSolution, Stated]:
-    """Return problem, solution and an uncertainty that holds whatever the order; the blend's own values if asked."""
+) -> tuple[TumbleProblem, TumbleSolution, StatedUncertainty]:
+    """Return problem, solution and covariance with the uncertainty of the order; the blended values if asked."""
     if not at_blend:
         about = blended.about(solution.theta[0])
-        return problem, solution, Stated(about, blended.freedom, given_order.covariance, given_order.freedom, blended)
+        return (
+            problem,
+            solution,
+            StatedUncertainty(about, blended.freedom, given_order.covariance, given_order.freedom, blended),
+        )
     problem = replace(used, order=blended.order)
     blend_solution = evaluate(problem, replace(solution, theta=blended.theta[None]))
     blend_solution = replace(blend_solution, down_weights=solution.down_weights)
-    return problem, blend_solution, Stated(blended.covariance, blended.freedom, blended=blended)
+    return problem, blend_solution, StatedUncertainty(blended.covariance, blended.freedom, blended=blended)
 
 
 def _scaled_ageing(ageing: Sequence[float], gravity: float) -> tuple[float | None, ...]:
@@ -335,7 +345,7 @@ def _solve(
     choice: OrderChoice | None,
     solved: TumbleSolution | None,
 ) -> tuple[TumbleSolution, Observability]:
-    """Solve the problem, unless that has been done by norm, and see what it determines.
+    """Return the solution and its observability; a solution by norm that exists already is used.
 
     `linearised` is where method linearised rests, None for method norm.
     """
@@ -372,18 +382,18 @@ def _solved(problem: TumbleProblem, attitudes: Attitudes, linearised: Threshold 
     return solve_norm(problem)
 
 
-def _given_order(problem: TumbleProblem, solution: TumbleSolution) -> Stated | None:
-    """Return what is known of theta if the order is right; None where nothing tells the noise."""
+def _uncertainty_given_order(problem: TumbleProblem, solution: TumbleSolution) -> StatedUncertainty | None:
+    """Return the covariance of theta given the order; None where the noise cannot be estimated."""
     n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     freedom = n - size
     base = covariance(solution.jacobian, 1 / solution.variance)[0]
     if problem.robust and freedom > 0:
         factor = huber_inflation(solution.standardised(), size)[0] * solution.scale[0] ** 2
-        return Stated(base * factor, float(freedom))
+        return StatedUncertainty(base * factor, float(freedom))
     if problem.covariance is not None:
         known = float(solution.freedom[0])
-        return Stated(base, known if np.isfinite(known) else None)
+        return StatedUncertainty(base, known if np.isfinite(known) else None)
     if freedom == 0:
         return None
     chi_square = float((solution.residuals[0] ** 2 / solution.variance[0]).sum())
-    return Stated(base * (chi_square / freedom), float(freedom))
+    return StatedUncertainty(base * (chi_square / freedom), float(freedom))

@@ -356,7 +356,7 @@ def exhibits(record: Calibration) -> Exhibits:
 
         items[1:1] = mag_figures(record)
         facts += mag_facts(record)
-    aside = f"; {bad} more {'was' if bad == 1 else 'were'} {_held_back(record)}" if bad else ""
+    aside = f"; {bad} more {'was' if bad == 1 else 'were'} {_exclusion_word(record)}" if bad else ""
     if fit.gyro is not None:
         aside += f"; {gyro_headline(record)}"
     if fit.mag is not None:
@@ -378,7 +378,7 @@ def gyro_headline(record: Calibration) -> str:
     return f"{fit.turns} turns of the gyroscopes carry gravity's direction within {missed:.2g} deg rms"
 
 
-def _held_back(record: Calibration) -> str:
+def _exclusion_word(record: Calibration) -> str:
     return "set aside" if fit_of(record).set_aside else "down-weighted"
 
 
@@ -411,7 +411,7 @@ def _residuals(record: Calibration) -> Figure:
         caption="Above, grey bars: with the nominal sensor (for counts and volts: the span of each axis). Below, "
         "points: calibrated"
         + ("; bars are one standard uncertainty of |f|" if bars else "")
-        + (f"; {bad} {_held_back(record)} in red, as diamonds" if bad else "")
+        + (f"; {bad} {_exclusion_word(record)} in red, as diamonds" if bad else "")
         + ". f is the specific force, g local gravity, 1 µg = 9.8 µm/s². A pattern in the lower plot is an error that "
         "the model does not know." + edge_note(0 if beyond is None else int(beyond.beyond.sum())),
         traces=[

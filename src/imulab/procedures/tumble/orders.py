@@ -155,7 +155,7 @@ def choose_order(problem: TumbleProblem, gravity: float, solutions: Mapping[int,
         if not row.observable or squares is None:
             continue
         if best is None or (
-            _smaller(squares, best, 1 - leverage(fit.jacobian, fit.weights)[0])
+            _is_clearly_smaller(squares, best, 1 - leverage(fit.jacobian, fit.weights)[0])
             and _significant(costs, chosen, order, n)
             and (row.largest_uncertainty or 0.0) <= _BLIND_SPOT * rows[0].scatter
         ):
@@ -164,9 +164,9 @@ def choose_order(problem: TumbleProblem, gravity: float, solutions: Mapping[int,
 
 
 def _left_out_squares(problem: TumbleProblem, fit: TumbleSolution) -> Array | None:
-    """Squared error of each attitude predicted from the others, shape (n,); None where there is nothing to tell.
+    """Return the squared leave-one-out error of each attitude, shape (n,); None without degrees of freedom.
 
-    What counts is psi, not the residual: a knocked attitude cannot be predicted by any order.
+    Huber's psi replaces the residual: no order can predict an attitude that was knocked.
     """
     if problem.reading.shape[1] <= parameter_count(problem.order):
         return None
@@ -174,7 +174,7 @@ def _left_out_squares(problem: TumbleProblem, fit: TumbleSolution) -> Array | No
     return squares if np.isfinite(squares).all() else None
 
 
-def _smaller(squares: Array, best: Array, weights: Array) -> bool:
+def _is_clearly_smaller(squares: Array, best: Array, weights: Array) -> bool:
     """Whether one mean of paired squares is below the other by more than the standard error of the difference."""
     gain = weights * (best - squares)
     return bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
@@ -211,11 +211,11 @@ def _row(
         condition_number=conditioning.condition,
         rank=conditioning.rank,
         observable=observable,
-        largest_uncertainty=gravity * _largest_uncertainty(problem, fit) if observable and n > size else None,
+        largest_uncertainty=gravity * _worst_direction_uncertainty(problem, fit) if observable and n > size else None,
     )
 
 
-def _largest_uncertainty(problem: TumbleProblem, fit: TumbleSolution) -> float:
+def _worst_direction_uncertainty(problem: TumbleProblem, fit: TumbleSolution) -> float:
     """Predicted standard uncertainty of |f|, in g, in the direction where it is largest."""
     points = sphere_points(_DIRECTIONS)[None]
     rows = norm_and_jacobian(start_parameters(problem.order), points, problem.order)[1][0]
@@ -224,7 +224,7 @@ def _largest_uncertainty(problem: TumbleProblem, fit: TumbleSolution) -> float:
 
 
 def absolute_weights(problem: TumbleProblem, fit: TumbleSolution) -> Array:
-    """Weights in true inverse variances, shape (n,): where noise is unknown, its level comes from the residuals."""
+    """Return weights as inverse variances, shape (n,); an unknown noise level is estimated from the residuals."""
     weights: Array = fit.weights[0] / max(fit.scale[0] ** 2, _ROUNDING)  # as many attitudes as parameters leave nothing
     n, size = problem.reading.shape[1], fit.theta.shape[1]
     if problem.covariance is None and n > size and not problem.robust:
@@ -235,7 +235,7 @@ def absolute_weights(problem: TumbleProblem, fit: TumbleSolution) -> Array:
     return weights
 
 
-# Residuals that are no scatter: a function of the direction of gravity, or of time.
+# Systematic residuals: functions of the direction of gravity, or of time.
 
 
 _FEWEST = 4  # degrees of freedom that must be left beside a pattern
@@ -424,7 +424,7 @@ class _Whitened:
         return float(self.residual @ self.residual)
 
 
-def set_aside(
+def find_disturbed(
     problem: TumbleProblem, fits: Callable[[TumbleProblem], dict[int, TumbleSolution]]
 ) -> tuple[Aside, dict[int, TumbleSolution]]:
     """Find the attitudes that no order explains; return them and the fits of the others, by order.
@@ -441,7 +441,7 @@ def set_aside(
     """
     known = problem.covariance is not None
     plain = solutions = fits(problem)
-    aside = standing_out(plain, known=known)
+    aside = find_outliers(plain, known=known)
     for _ in range(_SEARCHES):
         if not aside.index:
             return aside, plain
@@ -449,13 +449,13 @@ def set_aside(
         about = {order: evaluate(replace(problem, order=order), solution) for order, solution in solutions.items()}
         # What even the best order leaves unexplained is noise of the others, and no sign of a knock.
         excess = min(float(about[order].excess[0]) for order in _tested(about))
-        before, aside = aside, standing_out(about, known=known, excess=excess)
+        before, aside = aside, find_outliers(about, known=known, excess=excess)
         if aside.index == before.index:
             break
     return before, solutions
 
 
-def standing_out(solutions: Mapping[int, TumbleSolution], *, known: bool, excess: float = 0.0) -> Aside:
+def find_outliers(solutions: Mapping[int, TumbleSolution], *, known: bool, excess: float = 0.0) -> Aside:
     """Find the attitudes that stand out.
 
     Parameters
@@ -533,7 +533,7 @@ def _shifts(white: _Whitened, chosen: Index) -> tuple[Array, Array, float]:
 
 
 def _admissible(z: Array, gain: float, rss: float, n: int, freedom: int, known: bool) -> bool:
-    """Whether chance hardly gives the weakest member of a set, nor the set."""
+    """Return whether both the weakest member of a set and the whole set are significant."""
     m, least = len(z), float(np.abs(z).min())
     tests = n - m + 1
     return bool(
@@ -649,7 +649,7 @@ _TINY_WEIGHT = 1e-300  # stands for a variance of 0
 
 @dataclass(frozen=True)
 class Blended:
-    """What the orders say together, in units of g.
+    """Blend of the fits of all orders, in units of g.
 
     Attributes
     ----------
@@ -715,7 +715,7 @@ def blend_orders(problem: TumbleProblem, choice: OrderChoice) -> Blended:
 
 
 def with_known_spread(problem: TumbleProblem, choice: OrderChoice, spread: tuple[float, float]) -> Blended:
-    """Return what all orders say where k2 and k3 are normal about 0 with known standard deviations.
+    """Return the blend of all orders where k2 and k3 are normal about 0 with known standard deviations.
 
     ``theta = (J' W J / s^2 + P)^-1 J' W y / s^2`` with ``P = diag(0 .., tau_2^-2, tau_3^-2)``; s^2 is 1, or where noise
     is unknown estimated from ``n - tr(V J' W J / s^2)`` degrees of freedom.

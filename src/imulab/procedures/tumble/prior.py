@@ -53,12 +53,12 @@ class PriorNormal:
 
 @dataclass(frozen=True)
 class AgedPrior:
-    """A record and attitudes, put together.
+    """Posterior of a record, widened by its ageing, and new attitudes.
 
     Attributes
     ----------
     problem
-        With the prior as the attitudes leave it: widened by what it probably aged.
+        With the prior widened by its estimated ageing.
     solution
         Mean of the parameters, and residuals there.
     covariance
@@ -121,13 +121,13 @@ def contradiction(residuals: Array, jacobian: Array, known: Array, noise: Array)
     total = jacobian @ known @ jacobian.T + noise
     scale = np.sqrt(np.diag(total))
     white = residuals / scale
-    # attitudes without noise that are alike say one thing twice
+    # equal attitudes without noise make the matrix singular
     correlation = total / np.outer(scale, scale) + _ALIKE * np.eye(len(scale))
     value = float(white @ np.linalg.solve(correlation, white))
     return value, chi_square_probability(value, len(residuals))
 
 
-def put_together(
+def combine_with_prior(
     problem: TumbleProblem, known: PriorNormal, gravity: Gravity, ageing: tuple[float | None, ...]
 ) -> AgedPrior:
     """Combine a record with attitudes of known noise.
@@ -155,10 +155,10 @@ def put_together(
             break
         rows, residual = jacobian[0], residuals[0]
         innovation = rows @ (theta - known.mean) - residual
-        excess, freedom = unexplained(rows, innovation, noise_variance[0])
+        excess, freedom = unexplained_variance(rows, innovation, noise_variance[0])
         noise = np.diag(noise_variance[0] + excess) + common
         if not passes:
-            doubtful = np.diag(noise_variance[0] + scatter(rows, residual, noise_variance[0])) + common
+            doubtful = np.diag(noise_variance[0] + scatter_beyond_noise(rows, residual, noise_variance[0])) + common
             probability = contradiction(residual, rows, known.covariance, doubtful)[1]
         mixed = _mixture(rows, innovation, noise, known.covariance, ageing)
         change = known.mean + mixed.mean - theta
@@ -194,30 +194,30 @@ def put_together(
     )
 
 
-def scatter(jacobian: Array, values: Array, variance: Array) -> float:
-    """Variance of the attitudes beyond their own that a test must allow for: 0 unless it is seen at 1 %.
+def scatter_beyond_noise(jacobian: Array, values: Array, variance: Array) -> float:
+    """Return the excess variance of the attitudes that a test must allow for: 0 unless significant at 1 %.
 
     A disturbed hold is no change of the unit. Allowing for scatter that is not there would hide changes.
     """
-    missed, left = _left_of(jacobian, values, variance)
+    missed, left = _residuals_of_fit(jacobian, values, variance)
     freedom = len(variance) - left.shape[1]
     if freedom < 1 or chi_square_probability(float((missed**2 / variance).sum()), freedom) > ATTITUDES_DISTURBED.level:
         return 0.0
-    return unexplained(jacobian, values, variance)[0]
+    return unexplained_variance(jacobian, values, variance)[0]
 
 
-def unexplained(jacobian: Array, values: Array, variance: Array) -> tuple[float, float]:
-    """Variance of the attitudes beyond their own that no parameters explain, and its effective degrees of freedom.
+def unexplained_variance(jacobian: Array, values: Array, variance: Array) -> tuple[float, float]:
+    """Return the excess variance of the attitudes that no parameters explain, and its effective degrees of freedom.
 
     Residuals are those of a fit to the attitudes alone, whatever a record says (`estimate.plausible_excess`).
     """
-    missed, left = _left_of(jacobian, values, variance)
+    missed, left = _residuals_of_fit(jacobian, values, variance)
     excess, freedom = plausible_excess(missed[None], variance[None], 1 - (left**2).sum(axis=1)[None])
     return float(excess[0]), float(freedom[0])
 
 
-def _left_of(jacobian: Array, values: Array, variance: Array) -> tuple[Array, Array]:
-    """What a weighted fit to the attitudes alone leaves of `values`, and a basis of what it takes, (n, rank)."""
+def _residuals_of_fit(jacobian: Array, values: Array, variance: Array) -> tuple[Array, Array]:
+    """Return the residuals that a weighted fit leaves of `values`, and a basis of the fitted space, (n, rank)."""
     white = jacobian / np.sqrt(variance)[:, None]
     scale = np.maximum(np.linalg.norm(white, axis=0), np.finfo(float).tiny)
     left, size, _ = np.linalg.svd(white / scale, full_matrices=False)
@@ -305,7 +305,7 @@ def prior_shares(
     )
 
 
-def findings(record: Calibration, aged: AgedPrior, recording: Recording, count: int) -> list[str]:
+def prior_warnings(record: Calibration, aged: AgedPrior, recording: Recording, count: int) -> list[str]:
     """Return what a user must know of a prior, a sentence each."""
     messages = []
     if other := different_units(("the prior", record.sensor), ("the recording", recording.metadata)):

@@ -86,8 +86,8 @@ class FittedAttitudes:
 
 
 @dataclass(frozen=True)
-class Stated:
-    """Covariance in units of g and its degrees of freedom (None: noise known), as stated, and if the order is right."""
+class StatedUncertainty:
+    """Stated covariance, in units of g, and its degrees of freedom (None: noise known); both also given the order."""
 
     covariance: Array
     freedom: float | None
@@ -98,7 +98,7 @@ class Stated:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the attitudes that were not set aside say of the unit, in units of g.
+    """Estimate from the attitudes that were not set aside, in units of g.
 
     `with_gravity` says that the covariance holds gravity's own uncertainty already; `prior` is the record's entry on an
     earlier record, and `notes` are findings about that.
@@ -107,8 +107,8 @@ class Estimate:
     attitudes: Attitudes
     problem: TumbleProblem
     solution: TumbleSolution
-    given_order: Stated | None
-    stated: Stated | None
+    given_order: StatedUncertainty | None
+    stated: StatedUncertainty | None
     found: FittedAttitudes
     observability: Observability
     orders: tuple[OrderRow, ...]
@@ -191,7 +191,7 @@ def vertical_warnings(complete: FittedAttitudes, method: str) -> list[str]:
 
 
 def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
-    """Errors that no accelerometer in physical units has: more likely the columns are not what they are said to be."""
+    """Return warnings of errors too large for an accelerometer: unit or columns are probably stated wrongly."""
     theta, messages = solution.theta[0], []
     if parse_unit(attitudes.unit).quantity == "acceleration":
         messages += [
@@ -207,7 +207,7 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
     return messages
 
 
-def assumption_notes(stated: Stated | None) -> list[str]:
+def assumption_notes(stated: StatedUncertainty | None) -> list[str]:
     """Say which nonlinearity the attitudes do not show, and what it would move."""
     if stated is None or stated.blended is None:
         return []
@@ -377,14 +377,14 @@ def _summary(
     )
 
 
-def _coverage_factor_given_order(stated: Stated | None) -> float | None:
+def _coverage_factor_given_order(stated: StatedUncertainty | None) -> float | None:
     """Return the coverage factor if the order were known to be right, None where it was not chosen from the data."""
     if stated is None or stated.blended is None or stated.given_order is None:
         return None
     return coverage_factor(stated.freedom_given_order)
 
 
-def _blend(stated: Stated | None) -> OrderBlend | None:
+def _blend(stated: StatedUncertainty | None) -> OrderBlend | None:
     """Return up to which order the stated uncertainty holds, and the noise that each order takes."""
     if stated is None or stated.blended is None:
         return None
@@ -553,11 +553,11 @@ def _scatter_warnings(problem: TumbleProblem, solution: TumbleSolution, chi_squa
 def _pattern_warnings(
     attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution, *, order_chosen: bool
 ) -> list[str]:
-    """Say what the residuals follow, of the attitudes that do not stand out; with a prior they follow that too."""
+    """Warn of residuals that depend on direction or time, outliers left out; not with a prior, which bends them too."""
     if problem.prior is not None:
         return []
     kept = np.where(solution.down_weights < _DOWN_WEIGHTED, 0.0, solution.down_weights)
-    kept[0, list(_outliers(problem, solution))] = 0.0
+    kept[0, list(_find_outliers(problem, solution))] = 0.0
     regular = replace(solution, down_weights=kept)
     return [
         *direction_findings(problem, regular, order_chosen=order_chosen),
@@ -579,7 +579,7 @@ def _attitude_warnings(
         single = [
             f"{attitudes.label(i)} stands out by {standard:.0f} standard deviations "
             f"(residual {deviation[i]:+.3f} mg); {_REMEDIES[options['method'], options['loss']]}"
-            for i, standard in _outliers(problem, solution).items()
+            for i, standard in _find_outliers(problem, solution).items()
         ]
     more = [f"and {len(single) - _MOST_NAMED} more attitudes like these"] if len(single) > _MOST_NAMED else []
     return single[:_MOST_NAMED] + more
@@ -603,7 +603,7 @@ def _freedom_warnings(problem: TumbleProblem, solution: TumbleSolution, observab
     return messages
 
 
-def _outliers(problem: TumbleProblem, solution: TumbleSolution) -> dict[int, float]:
+def _find_outliers(problem: TumbleProblem, solution: TumbleSolution) -> dict[int, float]:
     """Return the attitudes that stand out, and by how many standard deviations.
 
     Each residual is held against the scatter of the others, with itself left out (externally studentised; Belsley, Kuh

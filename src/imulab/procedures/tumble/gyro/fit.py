@@ -36,14 +36,14 @@ from imulab.procedures.tumble.device import specific_force
 from imulab.procedures.tumble.gyro.rest import clock_notes, direction_covariance, find_holds
 from imulab.procedures.tumble.gyro.solve import (
     CRYSTAL,
-    Case,
     Clock,
     Nonlinearity,
-    Solved,
+    TurnProblem,
+    TurnSolution,
     clock_of_scale,
     compare_clocks,
-    counted,
-    evened,
+    even_stamps,
+    is_counted,
     solve_turns,
     test_linearity,
     turn_covariance,
@@ -171,8 +171,8 @@ def fit_gyro_triad(
     moving = leave_out(attitudes.recording, triad("accel")).recording
     accel_force = specific_force(record, moving.triad("accel") * factor)
     force, knocked = specific_force(record, means), aside_of(record, attitudes)
-    case = Case(recording.name, attitudes, force, accel_time, accel_force, output, unit, fit_bias, knocked)
-    case, solved = _begun(case, time, sensitivity, earth)
+    case = TurnProblem(recording.name, attitudes, force, accel_time, accel_force, output, unit, fit_bias, knocked)
+    case, solved = _solve_with_earth(case, time, sensitivity, earth)
     time, solved, stamp_notes = _with_even_stamps(case, time, sensitivity, solved)
     apart = attitudes.recording is not recording
     comparison = compare_clocks(accel_time, accel_force, time, solved.rate(output), solved.segments, search=apart)
@@ -181,21 +181,21 @@ def fit_gyro_triad(
             raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
         time = comparison.on_other(time)
         solved = solve_turns(case, time, sensitivity)
-    solved, noise_notes = (solved, []) if noise is None else _with_noise(solved, noise, attitudes, recording)
-    known = clock_of_scale(comparison, clock, clock_of, counted=counted(check_time(recording)))
+    solved, noise_notes = (solved, []) if noise is None else _with_noise_record(solved, noise, attitudes, recording)
+    known = clock_of_scale(comparison, clock, clock_of, counted=is_counted(check_time(recording)))
     notes = [
         *(f"gyro: {note}" for note in left_out.notes(_at_rest(attitudes, time, left_out))),
         *stamp_notes,
         *noise_notes,
         *solved.notes,
-        *_record_notes(record, attitudes, case.force),
+        *_warn_foreign_record(record, attitudes, case.force),
         *known.notes(apart=apart),
     ]
     if apart and clock_of == "gyro":
         notes += clock_notes(find_holds(attitudes, time, output, recording.name), attitudes, time)
     segments, residual, jacobian = solved.segments, solved.residual, solved.jacobian
     miss, size = np.linalg.norm(residual.reshape(-1, 3), axis=1), solved.theta.size
-    # Each turn fixes two angles: how far about its own direction it went, gravity cannot see.
+    # Each turn fixes two angles: gravity does not show a rotation about its own direction.
     freedom = max(2 * len(miss) - size, 1)
     conditioning = _observability_of_turns(solved, freedom, recording.name)
     directions = direction_covariance(record, attitudes, means, case.force)
@@ -206,11 +206,13 @@ def fit_gyro_triad(
     if linearity is not None:
         notes += linearity.notes()
     return _on_earth(
-        _result(solved, matrix, miss, unit, fit_bias, conditioning, known, linearity, tuple(notes)), case, earth
+        _triad_of_solution(solved, matrix, miss, unit, fit_bias, conditioning, known, linearity, tuple(notes)),
+        case,
+        earth,
     )
 
 
-def _on_earth(fit: GyroFit, case: Case, earth: EarthRate | None) -> GyroFit:
+def _on_earth(fit: GyroFit, case: TurnProblem, earth: EarthRate | None) -> GyroFit:
     """Return the fit with the Earth's rate; where nobody knows its vertical part v, T v / g is in all sensitivities.
 
     The variance of v is EARTH^2 / 3 then, the mean over all directions of the Earth's axis.
@@ -222,8 +224,10 @@ def _on_earth(fit: GyroFit, case: Case, earth: EarthRate | None) -> GyroFit:
     return replace(fit, sensitivity_covariance=fit.sensitivity_covariance + np.outer(common, common))
 
 
-def _begun(case: Case, time: Array, sensitivity: str, earth: EarthRate | None) -> tuple[Case, Solved]:
-    """Return the case, with what is known of the Earth's rate, as output, or how large it may be, and the solution."""
+def _solve_with_earth(
+    case: TurnProblem, time: Array, sensitivity: str, earth: EarthRate | None
+) -> tuple[TurnProblem, TurnSolution]:
+    """Return the problem, with the Earth's rate (known, or its largest possible value) as output, and the solution."""
     solved = solve_turns(case, time, sensitivity)
     up = case.force / np.linalg.norm(case.force, axis=1, keepdims=True)
     if earth is not None:
@@ -258,10 +262,10 @@ def _at_rest(attitudes: Attitudes, time: Array, left_out: LeftOut) -> NDArray[np
     return rest
 
 
-def _with_noise(
-    solved: Solved, noise: Calibration, attitudes: Attitudes, recording: Recording
-) -> tuple[Solved, list[str]]:
-    """The zero with the uncertainty that a noise record tells of the time at rest, where the holds scatter by less."""
+def _with_noise_record(
+    solved: TurnSolution, noise: Calibration, attitudes: Attitudes, recording: Recording
+) -> tuple[TurnSolution, list[str]]:
+    """Return the solution, its zero at least as uncertain as a noise record predicts for that time, and notes."""
     unit = recording.triad_unit("gyro")
     rate = parse_unit(unit).quantity == "rate"
     duration = float((attitudes.stop - attitudes.start).sum())
@@ -271,9 +275,11 @@ def _with_noise(
     return replace(solved, rest=rest), noise_notes
 
 
-def _with_even_stamps(case: Case, time: Array, sensitivity: str, solved: Solved) -> tuple[Array, Solved, list[Note]]:
+def _with_even_stamps(
+    case: TurnProblem, time: Array, sensitivity: str, solved: TurnSolution
+) -> tuple[Array, TurnSolution, list[Note]]:
     """Return time, solution and a note with evened time stamps, where the turns miss clearly less with them."""
-    even = evened(time)
+    even = even_stamps(time)
     if even is not None:
         # Only the turns can tell stamps that jitter from samples that do.
         other = solve_turns(case, even[0], sensitivity)
@@ -287,7 +293,7 @@ def _with_even_stamps(case: Case, time: Array, sensitivity: str, solved: Solved)
     return time, solved, []
 
 
-def _observability_of_turns(solved: Solved, freedom: int, name: str) -> Observability:
+def _observability_of_turns(solved: TurnSolution, freedom: int, name: str) -> Observability:
     """Return what the turns determine; refuse those that cannot separate the parameters or do not converge."""
     residual, size, turns = solved.residual, solved.theta.size, len(solved.residual) // 3
     conditioning = observability(
@@ -304,7 +310,7 @@ def _observability_of_turns(solved: Solved, freedom: int, name: str) -> Observab
     return conditioning
 
 
-def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
+def _warn_foreign_record(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
     """Say if the accelerometers' record is hardly of this unit."""
     other = different_units(("the record", record.sensor), ("the recording", attitudes.recording.metadata))
     messages = [f"gyro: {other}"] if other else []
@@ -327,8 +333,8 @@ def gyro_names() -> list[str]:
     ]
 
 
-def _result(
-    solved: Solved,
+def _triad_of_solution(
+    solved: TurnSolution,
     matrix: Array,
     miss: Array,
     unit: str,
@@ -387,7 +393,7 @@ _USUAL = (
     (2.0, "is the sample rate twice what the time stamps say?"),
     (0.5, "is the sample rate half what the time stamps say?"),
 )
-"""Factors by which scale factors are off, and what makes them so."""
+"""Factors by which scale factors are typically off, and their causes."""
 _ALIKE = 5.7  # Student's t of three at 1 %, over root 3
 _SMALLEST_ALIKE = 0.05  # %
 _LARGE_MISS = 2.0  # deg
@@ -434,8 +440,8 @@ def _summary(fit: GyroFit, freedom: int) -> GyroSummary:
         bias="fitted to the turns" if fit.fit_bias else "from the outputs at rest",
         g_sensitivity="none" if fit.sensitivity is None else "from the outputs at rest",
         latitude=None if fit.earth is None else fit.earth.latitude,
-        clock=_clock(fit.clock),
-        nonlinearity=_nonlinearity(fit.nonlinearity),
+        clock=_clock_state(fit.clock),
+        nonlinearity=_rate_test(fit.nonlinearity),
         set_aside=[
             TurnAside(start=start, stop=stop, miss=Length(value=miss, unit="rad"))
             for start, stop, miss in fit.aside.tolist()
@@ -512,7 +518,7 @@ def _diagonal_blocks(first: Array, second: Array) -> Array:
     return joined
 
 
-def _clock(clock: Clock) -> ClockState:
+def _clock_state(clock: Clock) -> ClockState:
     """Return what the record says of the clock."""
     other = clock.comparison
     if other is None:
@@ -525,7 +531,7 @@ def _clock(clock: Clock) -> ClockState:
     )
 
 
-def _nonlinearity(test: Nonlinearity | None) -> RateTest | None:
+def _rate_test(test: Nonlinearity | None) -> RateTest | None:
     """Return what the record says of scale factors that change with the rate."""
     if test is None:
         return None
@@ -541,7 +547,7 @@ def _with_uncertainty(value: Array, uncertainty: Array) -> RateValues:
     return RateValues(value=value.tolist(), standard_uncertainty=uncertainty.tolist(), unit="1")
 
 
-def _off_nominal(fit: GyroFit) -> list[str]:
+def _warn_scale_factors(fit: GyroFit) -> list[str]:
     """Say if the scale factors are far from the stated unit, or all three by the same."""
     known = parse_unit(fit.unit)
     if known.quantity != "rate":
@@ -570,7 +576,7 @@ def _off_nominal(fit: GyroFit) -> list[str]:
 
 def _warnings(fit: GyroFit) -> list[str]:
     messages = [*fit.notes, *([] if fit.earth is None else [fit.earth.note()])]
-    messages += _off_nominal(fit)
+    messages += _warn_scale_factors(fit)
     if fit.clock.counted and fit.clock.of == "gyro" and fit.clock.assumed == CRYSTAL:
         messages.append(
             Note(

@@ -187,7 +187,7 @@ class ClockComparison:
 
 @dataclass(frozen=True)
 class Clock:
-    """What the time is known by that the scale factors are referred to.
+    """Clock that the scale factors of the gyroscopes refer to.
 
     Attributes
     ----------
@@ -252,16 +252,16 @@ def clock_of_scale(comparison: ClockComparison | None, clock: float, triad: str,
     return Clock((clock**2 + more) ** 0.5, clock, triad, comparison, counted)
 
 
-def counted(time: Array) -> bool:
+def is_counted(time: Array) -> bool:
     """Whether time stamps are a count times a step, to rounding."""
     step = np.diff(time)
     return bool(np.ptp(step) < _COUNTED * float(step.mean()) + 8 * np.spacing(np.abs(time).max()))
 
 
-def evened(time: Array) -> tuple[Array, float] | None:
-    """Return even time stamps in place of some that jitter, and by how much they do, rms, s; None where they do not.
+def even_stamps(time: Array) -> tuple[Array, float] | None:
+    """Return evenly spaced time stamps and the rms jitter of the original ones, s; None where they do not jitter.
 
-    Samples of a sensor that runs by itself come evenly, while a host stamps them when it gets to it. Stamps are
+    A sensor with its own clock samples evenly, but the host stamps each sample when it arrives. Stamps are
     replaced by a line through them, between gaps.
     """
     step = np.diff(time)
@@ -321,7 +321,7 @@ def compare_clocks(
     power = (speed**2).sum(axis=(1, 2))
     for _ in range(_STEPS):
         delay = delay - np.clip((missing(delay) * speed).sum(axis=(1, 2)) / np.maximum(power, 1e-300), -0.3, 0.3)
-    return _line((segments.start + segments.stop) / 2, delay)
+    return _fit_delay_line((segments.start + segments.stop) / 2, delay)
 
 
 def _carried_gravity(time: Array, rate: Array, segments: Segments, step: float) -> tuple[Array, Array]:
@@ -344,7 +344,7 @@ def _carried_gravity(time: Array, rate: Array, segments: Segments, step: float) 
     return time[index], up + share[:, :, None] * (segments.after - up[:, -1])[:, None, :]
 
 
-def _line(when: Array, delay: Array) -> ClockComparison | None:
+def _fit_delay_line(when: Array, delay: Array) -> ClockComparison | None:
     """Line through the delays, those left out that stand out from it (by the median slope of all pairs)."""
     if len(when) < _FEWEST:
         return None
@@ -375,8 +375,8 @@ _TOO_MANY_OUT = 3  # one turn in so many
 
 
 @dataclass(frozen=True)
-class Case:
-    """What does not change when the time, or the choice of the sensitivity, does."""
+class TurnProblem:
+    """Data of the fit that depend neither on the time base nor on the choice of the sensitivity."""
 
     name: str
     attitudes: Attitudes
@@ -401,7 +401,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Solved:
+class TurnSolution:
     """Scaled parameters (p,) that fit the turns, residuals (3 m,), Jacobian (3 m, p), and what was set aside."""
 
     segments: Segments
@@ -439,11 +439,11 @@ class Solved:
         return float((self.residual.reshape(-1, 3)[chosen] ** 2).sum())
 
 
-def solve_turns(case: Case, time: Array, sensitivity: str) -> Solved:
-    """Solve with what the outputs at rest say; a sensitivity with which the turns miss more is not taken by itself."""
+def solve_turns(case: TurnProblem, time: Array, sensitivity: str) -> TurnSolution:
+    """Return the fit of the turns with zero and g-sensitivity from rest; ``auto`` drops a slope that fits worse."""
     holds = find_holds(case.attitudes, time, case.output, case.name)
 
-    def solved(wanted: str) -> Solved:
+    def solved(wanted: str) -> TurnSolution:
         rest = at_rest(holds, case.output, case.force, wanted, case.earth, case.vertical)
         moving = None if rest.slope is None else case.force_at(time)
         segments, notes = find_turns(holds, time, case.output, case.force, rest, moving, case.name)
@@ -464,7 +464,7 @@ def solve_turns(case: Case, time: Array, sensitivity: str) -> Solved:
     return with_slope if with_slope.cost(both) < without.cost(both) else without
 
 
-def _solve(case: Case, segments: Segments, rest: GyroRest, notes: list[str]) -> Solved:
+def _solve(case: TurnProblem, segments: Segments, rest: GyroRest, notes: list[str]) -> TurnSolution:
     """Fit the turns; those that stand out from all others are set aside one by one."""
     known = parse_unit(case.unit)
     scale = np.full(3, 1 / to_si(1.0, known.symbol)) if known.quantity == "rate" else start_scale(segments)
@@ -500,7 +500,7 @@ def _solve(case: Case, segments: Segments, rest: GyroRest, notes: list[str]) -> 
                 "right; record again, without knocks and without lost samples"
             )
         )
-    return Solved(kept, rest, scale, theta, residual, jacobian, bool(fit.converged[0]), aside, tuple(notes))
+    return TurnSolution(kept, rest, scale, theta, residual, jacobian, bool(fit.converged[0]), aside, tuple(notes))
 
 
 def _fitted(segments: Segments, scale: Array, theta: Array, weights: Array) -> Fit:
@@ -542,10 +542,10 @@ def _outliers(segments: Segments, scale: Array, fit: Fit) -> tuple[NDArray[np.bo
     return out, np.linalg.norm(residual, axis=1)
 
 
-def turn_covariance(solved: Solved, shared: Array, freedom: int) -> tuple[Array, float]:
-    """Return the covariance of the parameters, (p, p), and the variance that each residual has of its own.
+def turn_covariance(solved: TurnSolution, shared: Array, freedom: int) -> tuple[Array, float]:
+    """Return the covariance of the parameters, (p, p), and the independent variance of each residual.
 
-    `shared`, (3 m, 3 m), is what the residuals have in common; what they scatter beyond it is taken to be alike in all.
+    `shared`, (3 m, 3 m), is the covariance that the residuals share; their independent variance is taken as equal.
     """
     residual, jacobian = solved.residual, solved.jacobian
     bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]

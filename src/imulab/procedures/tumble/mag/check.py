@@ -44,7 +44,7 @@ class MagCheck:
     magnitude_uncertainty, dip_uncertainty
         Of each, from the record's covariance and scatter, shape (n,).
     common
-        By what |m| and the dip are off the record's in all attitudes, as a part of the field and rad: another place.
+        Deviations of |m| (part of the field) and dip (rad) from the record that all attitudes share: another place.
     common_uncertainty
         Of both.
     probability
@@ -52,7 +52,7 @@ class MagCheck:
     hard_iron
         Change of hard iron that would explain the attitudes best, in the unit of the record's biases, shape (3,).
     explained
-        Probability of what such a change leaves.
+        Probability of residuals as large as those that remain after such a change.
     unit
         Of the record's biases: T, or 1 where they are parts of the field.
     """
@@ -122,12 +122,12 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
     noise, freedom = _noise(record, n)
     total = slopes @ law.covariance @ slopes.T + np.diag(noise)
     common: Array = np.kron(np.eye(2), np.ones((n, 1))).astype(np.float64)
-    offsets, left, value, of_common = _fitted(_off(force, field, length, dip), common, total)
+    offsets, left, value, of_common = _fit_generalised(_deviations(force, field, length, dip), common, total)
     moved, after = np.zeros(3), value
     for _ in range(_PASSES):  # |m| is not linear in a hard iron that moved far
         there = field - moved @ np.linalg.inv(law.mag.turn).T
         design = np.hstack([common, _slopes(law, force, there, length)[1]])
-        step, _, after, _ = _fitted(_off(force, there, length, dip), design, total)
+        step, _, after, _ = _fit_generalised(_deviations(force, there, length, dip), design, total)
         moved = moved - step[2:]
     sigma = np.sqrt(np.diag(total))
     return MagCheck(
@@ -139,7 +139,7 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
     )  # fmt: skip
 
 
-def _off(force: Array, field: Array, length: float, dip: float) -> Array:
+def _deviations(force: Array, field: Array, length: float, dip: float) -> Array:
     """Return |m| over the record's less 1, and then the dips less the record's, shape (2n,)."""
     return np.concatenate([np.linalg.norm(field, axis=1) / length - 1, dips(field, force) - dip])
 
@@ -172,8 +172,8 @@ def _noise(record: Calibration, count: int) -> tuple[Array, float]:
     return np.repeat(scatter, count), 2 * mean / (mean - 1)
 
 
-def _fitted(values: Array, design: Array, covariance: Array) -> tuple[Array, Array, float, Array]:
-    """Generalised least squares: parameters, what is left, its weighted square, and the parameters' covariance."""
+def _fit_generalised(values: Array, design: Array, covariance: Array) -> tuple[Array, Array, float, Array]:
+    """Return parameters, residuals, their weighted sum of squares and the parameters' covariance, by GLS."""
     root = np.linalg.cholesky(covariance)
     rows, whitened = np.linalg.solve(root, design), np.linalg.solve(root, values)
     size = np.linalg.norm(rows, axis=0)

@@ -31,14 +31,14 @@ from imulab.procedures.tumble.gyro.fit import with_gyro_of
 from imulab.procedures.tumble.mag.model import FEWEST, FieldMeans, mag_names, most_at_an_extreme
 from imulab.procedures.tumble.mag.prepare import (
     Disturbed,
-    Seen,
+    MagObservability,
     check_seen,
     heading_uncertainty,
+    judge_observability,
     leave_one_out,
     likeliest_step,
     most_disturbed,
     prepare,
-    seen,
 )
 from imulab.procedures.tumble.mag.solve import Joint, Place, Ready, solve, stated_place
 from imulab.procedures.tumble.model import gravity_slope, parameter_names, parameter_units
@@ -67,7 +67,7 @@ _BUILDING = 1.4
 
 
 def with_mag(
-    ready: Ready, joint: Joint, observability: Seen, aside: Sequence[Disturbed], options: Mapping[str, Any]
+    ready: Ready, joint: Joint, observability: MagObservability, aside: Sequence[Disturbed], options: Mapping[str, Any]
 ) -> Calibration:
     """Return the record of both triads: parameters, covariance, and residuals of |m| and dip of each attitude."""
     accel = make_record(
@@ -96,7 +96,7 @@ def with_mag(
         fit={
             **accel.fit,
             "mag": entries(
-                _summary(ready, joint, observability, aside, moved, heading, _of_one_sample(ready, parameters))
+                _summary(ready, joint, observability, aside, moved, heading, _sample_noise(ready, parameters))
             ),
         },
         options={
@@ -109,7 +109,7 @@ def with_mag(
             *ready.means.notes,
             *ready.notes,
             *_warnings(ready, joint, observability, aside, moved, options, heading[0]),
-            *_stated_dip(parameters["dip"], options.get("dip")),
+            *_warn_stated_dip(parameters["dip"], options.get("dip")),
         ),
         verdict=UNJUDGED,
     )
@@ -118,7 +118,7 @@ def with_mag(
 def _covariance(ready: Ready, joint: Joint) -> Array:
     """Covariance of the scaled parameters, the accelerometers' whatever their order is, shape (p, p)."""
     covariance = joint.covariance.copy()
-    covariance[joint.pair.layout.of_accel, joint.pair.layout.of_accel] += _whatever_the_order(ready)
+    covariance[joint.pair.layout.of_accel, joint.pair.layout.of_accel] += _order_covariance(ready)
     return covariance
 
 
@@ -145,8 +145,8 @@ def _values(ready: Ready, joint: Joint, known: Array) -> tuple[list[str], Array,
     return names, values, matrix + np.outer(shared, shared), units
 
 
-def _whatever_the_order(ready: Ready) -> Array:
-    """What the accelerometers' covariance gains where their order was chosen from the data, shape (p, p)."""
+def _order_covariance(ready: Ready) -> Array:
+    """Return the covariance to add for an order of the accelerometers that was chosen from the data, shape (p, p)."""
     stated = ready.estimate.stated
     size = ready.estimate.solution.theta.shape[1]
     if stated is None or stated.given_order is None:
@@ -187,7 +187,7 @@ def _model(ready: Ready, joint: Joint) -> MagModel:
 def _summary(
     ready: Ready,
     joint: Joint,
-    observability: Seen,
+    observability: MagObservability,
     aside: Sequence[Disturbed],
     moved: Mapping[str, float],
     heading: tuple[float, float],
@@ -215,7 +215,7 @@ def _summary(
     )
 
 
-def _of_one_sample(ready: Ready, parameters: Mapping[str, Parameter]) -> OneSample | None:
+def _sample_noise(ready: Ready, parameters: Mapping[str, Parameter]) -> OneSample | None:
     """Return the noise of one axis of one sample, m/s^2 and parts of the field; None of a table of means."""
     if ready.means.of_one_sample is None:
         return None
@@ -244,7 +244,7 @@ def _fields(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> MagFields
     )
 
 
-def _scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> list[str]:
+def _warn_scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> list[str]:
     """Say if |m| or dip scatter so much that the triads do not belong together, or the field was not steady."""
     magnitude, dip = rms(joint.found.residuals[:, 1]), rms(joint.found.residuals[:, 2])
     worst = max(magnitude / _LARGE_RMS, dip / _LARGE_DIP)
@@ -261,8 +261,8 @@ def _scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> list[st
     ]
 
 
-def _step(joint: Joint, labels: Sequence[str]) -> list[str]:
-    """Say if |m| and dip are others from some attitude on."""
+def _warn_step(joint: Joint, labels: Sequence[str]) -> list[str]:
+    """Warn of a step of |m| and dip from some attitude on."""
     step = likeliest_step(joint)
     if step is None or step.probability > FIELD_STEP.level:
         return []
@@ -274,7 +274,7 @@ def _step(joint: Joint, labels: Sequence[str]) -> list[str]:
     ]
 
 
-def _stated_dip(dip: Parameter, stated: Sequence[float] | None) -> list[str]:
+def _warn_stated_dip(dip: Parameter, stated: Sequence[float] | None) -> list[str]:
     """Say if the dip is off what was stated, beyond the uncertainty of both."""
     if stated is None:
         return []
@@ -299,7 +299,7 @@ def _note_set_aside(label: str, off: Disturbed) -> str:
 def _warnings(
     ready: Ready,
     joint: Joint,
-    observability: Seen,
+    observability: MagObservability,
     aside: Sequence[Disturbed],
     moved: Mapping[str, float],
     options: Mapping[str, Any],
@@ -333,7 +333,7 @@ def _warnings(
         )
     left = np.delete(ready.kept, [disturbed.index for disturbed in aside])
     labels = [attitudes.label(int(np.searchsorted(ready.kept, i))) for i in left]
-    messages += [*_scatter(joint, ready.means, left), *_step(joint, labels)]
+    messages += [*_warn_scatter(joint, ready.means, left), *_warn_step(joint, labels)]
     if joint.pair.held is not None and joint.sigma[2] > _POINTING:
         messages.append(
             f"mag: the attitudes of --same-direction scatter by {np.degrees(joint.sigma[2]):.2g} deg about their "
@@ -350,12 +350,12 @@ def _warnings(
             )
         )
     if ready.mag.field is None and parse_unit(ready.means.unit).quantity == "magnetic field":
-        messages.append(_unstated(ready.mag.size * parse_unit(ready.means.unit).factor, ready.means.unit))
+        messages.append(_warn_field_size(ready.mag.size * parse_unit(ready.means.unit).factor, ready.means.unit))
     return messages
 
 
-def _unstated(field: float, unit: str) -> str:
-    """Say that |m| is none of the Earth's [T], or else that the field's magnitude was not stated."""
+def _warn_field_size(field: float, unit: str) -> str:
+    """Return a warning that |m|, T, is not that of the Earth's field, or else that its magnitude was not stated."""
     low, high = _OF_THE_EARTH
     if not low / _BUILDING < field < high * _BUILDING:
         return (
@@ -406,7 +406,7 @@ class MagFit(Result):
 
     calibration: Calibration
     joint: Joint
-    seen: Seen
+    seen: MagObservability
     set_aside: tuple[Disturbed, ...]
 
 
@@ -506,8 +506,8 @@ def fit_mag(
     name = attitudes.recording.name
     try:
         with np.errstate(all="ignore"):  # what runs away ends in no solution
-            joint, aside = _solved(ready, loss, str(mag_order))
-            what = seen(joint.pair, joint.theta)
+            joint, aside = _solve_pair(ready, loss, str(mag_order))
+            what = judge_observability(joint.pair, joint.theta)
         if same_direction and not what.enough:  # it was where the fit began
             raise np.linalg.LinAlgError
     except np.linalg.LinAlgError:
@@ -539,7 +539,7 @@ def _check_options(loss: str, mag_order: int | str, order: int | str, field: flo
     check_field(field)
 
 
-def _solved(ready: Ready, loss: str, mag_order: str) -> tuple[Joint, tuple[Disturbed, ...]]:
+def _solve_pair(ready: Ready, loss: str, mag_order: str) -> tuple[Joint, tuple[Disturbed, ...]]:
     """Fit both triads, leave disturbed attitudes out, and take the order that is asked for."""
     robust = loss == "huber"
     joint, aside = solve(ready.pair, ready.start, robust=robust), tuple[Disturbed, ...]()
@@ -560,7 +560,7 @@ def _leave_out_disturbed(joint: Joint, ready: Ready) -> tuple[Joint, tuple[Distu
             break
         without = np.delete(left, worst.index)
         fewer = ready.pair.only(without)
-        if seen(fewer, joint.theta).rank < joint.pair.layout.mag + 1:
+        if judge_observability(fewer, joint.theta).rank < joint.pair.layout.mag + 1:
             break
         aside.append(replace(worst, index=int(left[worst.index])))
         left, joint = without, solve(fewer, joint.theta)

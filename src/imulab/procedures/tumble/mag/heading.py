@@ -183,7 +183,7 @@ def law_of(record: Calibration) -> Law:
     )
 
 
-def of_samples(law: Law, record: Calibration) -> Law:
+def law_of_samples(law: Law, record: Calibration) -> Law:
     """Return the law for samples of a recording, which are noisier than the means of attitudes."""
     mag = fit_of(record).mag
     if mag is None or mag.of_one_sample is None:
@@ -205,7 +205,7 @@ def heading_of(record: Calibration) -> Callable[[Recording], Recording]:
         As for `law_of`.
     """
     of_means = law_of(record)
-    of_each = of_samples(of_means, record)
+    of_each = law_of_samples(of_means, record)
 
     def with_heading(recording: Recording) -> Recording:
         for name in (*triad("accel"), *triad("mag")):
@@ -340,9 +340,9 @@ def plan_headings(
         raise OptionError(f"with_ mag: {count} attitudes; a magnetometer needs {FEWEST} or more, better 16")
     axis = np.argmin(np.abs(np.round(directions, 6)), axis=1)
     norths = np.stack([_north(directions, axis, 2 * np.pi * step / steps) for step in range(steps)], axis=1)
-    known, of_heading = _rows(np.repeat(directions, steps, axis=0), norths.reshape(-1, 3))
+    known, of_heading = _derivatives(np.repeat(directions, steps, axis=0), norths.reshape(-1, 3))
     rows = known.reshape(len(directions), steps, 2, -1)
-    base = np.zeros((0, rows.shape[-1])) if before is None else _rows(*before)[0].reshape(-1, rows.shape[-1])
+    base = np.zeros((0, rows.shape[-1])) if before is None else _derivatives(*before)[0].reshape(-1, rows.shape[-1])
     chosen = _exchange(rows, base, np.random.default_rng(seed))
     place = np.arange(len(directions))
     every = np.vstack([base, rows[place, chosen].reshape(-1, rows.shape[-1])])
@@ -368,7 +368,7 @@ def _north(up: Array, axis: NDArray[np.int64], heading: float) -> Array:
     return north
 
 
-def _rows(up: Array, north: Array) -> tuple[Array, Array]:
+def _derivatives(up: Array, north: Array) -> tuple[Array, Array]:
     """Return the derivatives of |m| and dip, (n, 2, 13), and of heading, (n, 12), for nominal magnetometers."""
     field = np.cos(_DIP) * north - np.sin(_DIP) * up
     theta = np.zeros(_LAYOUT.size)

@@ -271,20 +271,20 @@ def outputs_of(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
             f"count, found {unit!r}"
         )
     if attitudes.pieces is not None:
-        return _of_stretches(attitudes, kept, recording, names, unit)
+        return _means_of_stretches(attitudes, kept, recording, names, unit)
     if attitudes.trace is None:
-        return _of_table(attitudes, recording, names, unit)
+        return _means_of_table(attitudes, recording, names, unit)
     raise OptionError(f"{recording.name}: expected all attitudes that were found; drop says which to leave out")
 
 
-def _of_table(attitudes: Attitudes, recording: Recording, names: list[str], unit: str) -> FieldMeans:
+def _means_of_table(attitudes: Attitudes, recording: Recording, names: list[str], unit: str) -> FieldMeans:
     check_finite(recording, names)
     rows = attitudes.start.astype(np.int64) - recording.first_row
     covariance = stated_covariance(recording, names, unit)
     return FieldMeans(recording.triad("mag")[rows], None if covariance is None else covariance[rows], unit)
 
 
-def _of_stretches(
+def _means_of_stretches(
     attitudes: Attitudes, kept: NDArray[np.intp], recording: Recording, names: list[str], unit: str
 ) -> FieldMeans:
     """Means over the stretches at rest, and their covariance from batches, shrunk towards what all have in common."""

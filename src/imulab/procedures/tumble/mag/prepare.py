@@ -30,7 +30,7 @@ from imulab.procedures.tumble.mag.solve import (
     MagScaling,
     Pair,
     Ready,
-    find_held,
+    find_held_directions,
     find_start,
     nominal_mag,
     weighted_jacobian,
@@ -113,7 +113,7 @@ def most_disturbed(joint: Joint) -> Disturbed:
 
 @dataclass(frozen=True)
 class FieldStep:
-    """From which attitude on |m| and dip are others than before, by how much, and how improbable that is by chance."""
+    """First attitude after a step of |m| and dip, the size of the step, and its probability by chance."""
 
     first: int
     magnitude: float
@@ -152,7 +152,7 @@ def likeliest_step(joint: Joint) -> FieldStep | None:
 
 
 @dataclass(frozen=True)
-class Seen:
+class MagObservability:
     """What |m| and the dip determine of the magnetometers' parameters and the dip.
 
     Attributes
@@ -179,8 +179,8 @@ class Seen:
         return self.rank == self.size and self.condition < WORST_CONDITION
 
 
-def seen(pair: Pair, theta: Array) -> Seen:
-    """Judge what the attitudes can tell, at start parameters or at the solution."""
+def judge_observability(pair: Pair, theta: Array) -> MagObservability:
+    """Return what the attitudes determine, at the start parameters or at the solution."""
     layout = pair.layout
     evaluated = pair.evaluate(theta)
     jacobian = evaluated.by_parameters[:, 1:3, : layout.mag + 1]
@@ -198,10 +198,10 @@ def seen(pair: Pair, theta: Array) -> Seen:
     lacking = axes[:, 0]
     order = np.argsort(np.abs(east @ lacking), kind="stable")
     up = evaluated.force.vector / np.linalg.norm(evaluated.force.vector, axis=1)[:, None]
-    # Turned by a quarter the east of an attitude becomes its north: those gain whose north lies along what is lacking.
+    # A quarter turn of heading moves an attitude's east to its north: most gains where north is along the weak axis.
     gain = np.abs(np.cross(up, east) @ lacking)
     heading = tuple(int(i) for i in order[np.argsort(-gain[order], kind="stable")][:4])
-    return Seen(rank, layout.mag + 1, float(values[0] / max(values[-1], 1e-300)), blind, heading)
+    return MagObservability(rank, layout.mag + 1, float(values[0] / max(values[-1], 1e-300)), blind, heading)
 
 
 def heading_uncertainty(joint: Joint, covariance: Array) -> tuple[float, float]:
@@ -243,14 +243,14 @@ def prepare(
 ) -> Ready:
     """Fit the accelerometers by themselves, find where the joint fit starts, and refuse what it cannot see."""
     name, count = attitudes.recording.name, len(attitudes)
-    dropped = _numbers(drop, count, "drop")
+    dropped = _parse_numbers(drop, count, "drop")
     kept = np.setdiff1d(np.arange(count), dropped)
     means = field_means(attitudes, kept)
-    groups = [_numbers(group, count, "same-direction") for group in same_direction]
+    groups = [_parse_numbers(group, count, "same-direction") for group in same_direction]
     if known is not None:
         check_prior(known)
     local = _gravity(gravity, known, attitudes)
-    order, loss = _as_before(known, order, attitudes)
+    order, loss = _order_and_loss(known, order, attitudes)
     used = attitudes.only(kept) if dropped.size else attitudes
     check_attitudes(used, local.value)
     scaling = nominal_scaling(used, local.value)
@@ -268,16 +268,16 @@ def prepare(
     if groups:
         places = [np.flatnonzero(np.isin(kept, group)).tolist() for group in groups]
         _check_groups(places, name)
-        held, more = find_held(triad(first, pair.mag, MAGNETOMETERS).vector, force, places)
+        held, more = find_held_directions(triad(first, pair.mag, MAGNETOMETERS).vector, force, places)
         pair, start = replace(pair, held=held), np.concatenate([start, more])
     try:
-        check_seen(seen(pair, start), kept, name)
+        check_seen(judge_observability(pair, start), kept, name)
     except np.linalg.LinAlgError:
         raise DataError(f"{name}: the attitudes determine no field: are both triads of the same attitudes?") from None
     return Ready(estimate, scaling, local, means, kept, mag, pair, start, order, loss, notes)
 
 
-def _as_before(known: Calibration | None, order: int | str, attitudes: Attitudes) -> tuple[int | str, str]:
+def _order_and_loss(known: Calibration | None, order: int | str, attitudes: Attitudes) -> tuple[int | str, str]:
     """Return order and loss of the accelerometers' own fit: as asked, or as their record says that they were fitted."""
     if known is None:
         return order if order == "auto" else int(order), "auto"
@@ -299,7 +299,7 @@ def made_of(known: Calibration, attitudes: Attitudes) -> bool:
     return same or made_from(known, attitudes.recording)
 
 
-def _numbers(numbers: str | Sequence[int | str], count: int, option: str) -> NDArray[np.intp]:
+def _parse_numbers(numbers: str | Sequence[int | str], count: int, option: str) -> NDArray[np.intp]:
     """Attitudes by their numbers from 1, or texts such as ``"8"``, ``"9-16"``, ``"3,9-16"``, as places from 0."""
     indices: list[int] = []
     for entry in [numbers] if isinstance(numbers, str) else numbers:
@@ -396,7 +396,7 @@ def _pair(
     )
 
 
-def check_seen(what: Seen, kept: NDArray[np.intp], name: str) -> None:
+def check_seen(what: MagObservability, kept: NDArray[np.intp], name: str) -> None:
     """Refuse attitudes that leave something blind, and say what would help."""
     if what.enough:
         return

@@ -217,7 +217,7 @@ def axes_of(matrix: Array) -> Array:
 
 @dataclass(frozen=True)
 class HeldDirections:
-    """Groups of attitudes that point one way, relative to where the axis and the directions were at the start.
+    """Groups of attitudes with one common direction of a body axis, relative to the start of axis and directions.
 
     Attributes
     ----------
@@ -244,7 +244,7 @@ class HeldDirections:
         return replace(self, group=self.group[kept])
 
 
-def find_held(field: Array, force: Array, groups: Sequence[Sequence[int]]) -> tuple[HeldDirections, Array]:
+def find_held_directions(field: Array, force: Array, groups: Sequence[Sequence[int]]) -> tuple[HeldDirections, Array]:
     """Return the groups, relative to the axis that keeps its directions best, and the start of their parameters.
 
     Parameters
@@ -263,9 +263,9 @@ def find_held(field: Array, force: Array, groups: Sequence[Sequence[int]]) -> tu
         scatter += np.einsum("nij,nik->jk", off, off)
     axis = np.linalg.eigh(scatter)[1][:, 0]
     means = [axes[list(group)].mean(axis=0) @ axis for group in groups]
-    across = np.array([_across(mean / np.linalg.norm(mean)) for mean in means])
+    across = np.array([_perpendicular_pair(mean / np.linalg.norm(mean)) for mean in means])
     start = np.concatenate([np.zeros(2), *(b @ mean for b, mean in zip(across, means, strict=True))])
-    return HeldDirections(number, axis, _across(axis), across), start
+    return HeldDirections(number, axis, _perpendicular_pair(axis), across), start
 
 
 def world_axes(field: Array, force: Array) -> Array:
@@ -276,7 +276,9 @@ def world_axes(field: Array, force: Array) -> Array:
     return np.stack([east, np.cross(up, east), up], axis=1)
 
 
-def with_held(evaluated: Invariants, theta: Array, layout: ParameterLayout, held: HeldDirections) -> Invariants:
+def with_held_directions(
+    evaluated: Invariants, theta: Array, layout: ParameterLayout, held: HeldDirections
+) -> Invariants:
     """Return the invariants with two more residuals of each attitude, ``B (C x - d)``; nil outside of the groups."""
     held_parameters = theta[layout.of_directions]
     longer = held.axis + held_parameters[:2] @ held.axis_across
@@ -284,7 +286,7 @@ def with_held(evaluated: Invariants, theta: Array, layout: ParameterLayout, held
     x = longer / length
     by_tilt = (held.axis_across - np.outer(held.axis_across @ x, x)) / length  # dx by its two parameters, (2, 3)
     axes = world_axes(evaluated.field.vector, evaluated.force.vector)
-    turned = _change(evaluated, axes, x, layout)
+    turned = _direction_derivatives(evaluated, axes, x, layout)
     member = held.group >= 0
     across = np.where(member[:, None, None], held.across[held.group], 0.0)
     residuals = np.einsum("nki,nij,j->nk", across, axes, x)
@@ -303,7 +305,7 @@ def with_held(evaluated: Invariants, theta: Array, layout: ParameterLayout, held
     )
 
 
-def _change(evaluated: Invariants, axes: Array, x: Array, layout: ParameterLayout) -> Array:
+def _direction_derivatives(evaluated: Invariants, axes: Array, x: Array, layout: ParameterLayout) -> Array:
     """Return how ``C x`` changes with the triads' parameters, shape (n, 3, p)."""
     n = len(axes)
     du, de = np.zeros((n, 3, layout.size)), np.zeros((n, 3, layout.size))
@@ -321,7 +323,7 @@ def _change(evaluated: Invariants, axes: Array, x: Array, layout: ParameterLayou
     return np.stack([np.einsum("i,nip->np", x, part) for part in (d_east, d_north, de)], axis=1)
 
 
-def _across(direction: Array) -> Array:
+def _perpendicular_pair(direction: Array) -> Array:
     """Return two unit vectors across a unit vector and each other, shape (2, 3)."""
     basis: Array = np.linalg.svd(direction[None])[2][1:]
     return basis
@@ -338,7 +340,7 @@ _DAMPING, _NEAR = 1e-4, 1e-9
 """Where a minimisation starts, and where one that was near."""
 _PASSES = 50  # in which noise and solution agree
 _RESTS = 1e-3
-"""Probability of chi-square below which attitudes whose noise is known scatter beyond it."""
+"""Chi-square probability below which attitudes scatter beyond their known noise."""
 _HUBER = 2.0  # standard deviations of |m| and dip together from which the pull of an attitude is bounded
 _LEAST = 1e-24  # variance that exact data leave, or rounding in them
 _BLOCKS = np.array([0, 1, 2, 3, 3])
@@ -403,7 +405,7 @@ class Pair:
         """Return residuals, less the lengthening of |f|, and derivatives."""
         evaluated = invariants(theta, self.accel, self.mag, self.layout)
         evaluated.residuals[:, 0] -= self.lengthening
-        return evaluated if self.held is None else with_held(evaluated, theta, self.layout, self.held)
+        return evaluated if self.held is None else with_held_directions(evaluated, theta, self.layout, self.held)
 
 
 @dataclass(frozen=True)
@@ -462,12 +464,12 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
     rested = False
     evaluated = pair.evaluate(theta)
     for number in range(_PASSES):
-        weigh = _root(_information(pair, _known(pair, evaluated), extra, down))
+        weigh = _root(_information(pair, _known_covariance(pair, evaluated), extra, down))
         theta, evaluated, settled = _minimise(pair, weigh, theta, evaluated, _NEAR if number else _DAMPING, _CLOSE)
-        known = _known(pair, evaluated)
+        known = _known_covariance(pair, evaluated)
         before, weights_before = extra, down
         if number == 0 and not unknown:
-            free[:2] = _scatters_beyond(evaluated, known)
+            free[:2] = _exceeds_known_noise(evaluated, known)
         if free.any():
             extra = _likelihood_pass(pair, evaluated, _information(pair, known, extra, down), extra, down, free)
         if robust:
@@ -478,7 +480,7 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
             break
     weigh = _root(_information(pair, known, extra, down))
     theta, evaluated, settled = _minimise(pair, weigh, theta, evaluated)
-    known = _known(pair, evaluated)
+    known = _known_covariance(pair, evaluated)
     information = _information(pair, known, extra, np.ones(len(down)))
     covariance, freedom = _uncertainty(pair, evaluated, _information(pair, known, extra, down), extra, free)
     if not (np.diag(covariance) > 0).all():
@@ -486,7 +488,7 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
     return Joint(pair, theta, evaluated, information, covariance, freedom, np.sqrt(extra), down, rested and settled)
 
 
-def _known(pair: Pair, evaluated: Invariants) -> Array:
+def _known_covariance(pair: Pair, evaluated: Invariants) -> Array:
     """V_0 of |f|, |m| and dip, shape (n, 3, 3): ``B C B'``, and of |f| at least what its own fit says."""
     v = np.zeros((len(pair.mag), 3, 3))
     if pair.noise is not None:
@@ -627,8 +629,8 @@ def _likelihood_pass(
     return new
 
 
-def _scatters_beyond(evaluated: Invariants, known: Array) -> Array:
-    """Whether |m|, and the dip, scatter beyond their known noise; each has about half of the parameters they have."""
+def _exceeds_known_noise(evaluated: Invariants, known: Array) -> Array:
+    """Return whether |m|, and the dip, scatter beyond their known noise; each is charged a third of the parameters."""
     n, size = len(known), evaluated.by_parameters.shape[2]
     chi = (evaluated.residuals[:, :3] ** 2 / (np.einsum("nii->ni", known) + _LEAST))[:, 1:].sum(axis=0)
     freedom = max(n - size / 3, 1.0)
