@@ -56,15 +56,15 @@ def parameters(owner: Any) -> dict[str, str]:
 
     A ``TypedDict`` says of its further fields alone; those of the ones that it extends are theirs.
     """
-    said: dict[str, str] = {}
+    descriptions: dict[str, str] = {}
     for each in _extended(owner):
         section = re.search(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?:\n\n\S|\Z)", docstring(each), re.M | re.S)
         for names, text in _ENTRY.findall(f"{section[1]}\n" if section else ""):
             text = " ".join(text.split())
             first = _SENTENCE.match(text)
             plain = _MARKS.sub(r"\1\2", first[0] if first else text)
-            said |= dict.fromkeys((name.strip() for name in names.split(",")), plain)
-    return said
+            descriptions |= dict.fromkeys((name.strip() for name in names.split(",")), plain)
+    return descriptions
 
 
 def _extended(owner: Any) -> list[Any]:
@@ -149,10 +149,10 @@ def text(shows: str = "TEXT", words: Sequence[str] | Callable[[], Sequence[str]]
 def choice(words: Sequence[str], **more: Any) -> Reads:
     """Return how one of a few words is read."""
 
-    def read(given: str, called: str) -> str:
-        if given not in words:
-            raise OptionError(f"{called} {given!r}: expected one of {listed(words, given)}")
-        return given
+    def read(word: str, called: str) -> str:
+        if word not in words:
+            raise OptionError(f"{called} {word!r}: expected one of {listed(words, word)}")
+        return word
 
     return Reads(read, "|".join(words), tuple(words), other=False, **more)
 
@@ -273,7 +273,7 @@ class Option:
         """The words that complete it."""
         return tuple(self.reads.words() if callable(self.reads.words) else self.reads.words)
 
-    def value(self, given: str, called: str) -> Any:
+    def value(self, typed: str, called: str) -> Any:
         """Return what a text says.
 
         Raises
@@ -282,10 +282,10 @@ class Option:
             It is none that the option takes; the message calls the option `called`.
         """
         if self.kind == "switch":
-            if given.lower() not in _SWITCH:
-                raise OptionError(f"{called} {given!r}: expected yes or no")
-            return _SWITCH[given.lower()]
-        return given if self.reads.read is None else self.reads.read(given, called)
+            if typed.lower() not in _SWITCH:
+                raise OptionError(f"{called} {typed!r}: expected yes or no")
+            return _SWITCH[typed.lower()]
+        return typed if self.reads.read is None else self.reads.read(typed, called)
 
 
 @cache
@@ -313,11 +313,11 @@ def _reads(kind: Any) -> Reads | None:
 
 def _option(owner: Any, name: str, kind: Any, default: Any) -> Option | None:
     """Return a parameter as an option; None where it is for programs alone."""
-    said, kinds = arguments.metadata(kind), arguments.members(kind)
+    markers, kinds = arguments.metadata(kind), arguments.members(kind)
     reads, switch = _reads(kind), kinds == (bool,)
-    if PROGRAM in said or (reads is None and not switch and str not in kinds):
+    if PROGRAM in markers or (reads is None and not switch and str not in kinds):
         return None
-    group = next((each.name for each in said if isinstance(each, Group)), GROUPS[0])
+    group = next((each.name for each in markers if isinstance(each, Group)), GROUPS[0])
     reads = _by_type(kinds) if reads is None else reads
     shape = "either" if reads.off else "switch" if switch else "texts" if reads.repeated else "text"
     return Option(name, owner, reads, _text(default), default is inspect.Parameter.empty, shape, group)
@@ -355,14 +355,14 @@ def read_options(options: Sequence[Option], texts: Mapping[str, str | None], lab
     """
     values: dict[str, Any] = {}
     for option in options:
-        given = texts.get(option.name)
-        words = option.default if given is None else given
+        typed = texts.get(option.name)
+        words = option.default if typed is None else typed
         called = label.format(option.name.replace("_", "-") if label.startswith("--") else option.name)
         values[option.name] = None if words is None else option.value(words, called)
     return values
 
 
-def names_of_columns(given: str, called: str) -> list[str]:
+def names_of_columns(typed: str, called: str) -> list[str]:
     """Return ``gyro_x,gyro_y`` as names.
 
     Raises
@@ -370,9 +370,9 @@ def names_of_columns(given: str, called: str) -> list[str]:
     OptionError
         It is no such list.
     """
-    names = [name.strip() for name in given.split(",")]
+    names = [name.strip() for name in typed.split(",")]
     if not all(names) or len(set(names)) < len(names):
-        raise OptionError(f"{called} {given!r}: expected names of columns, each once, such as gyro_x,gyro_y")
+        raise OptionError(f"{called} {typed!r}: expected names of columns, each once, such as gyro_x,gyro_y")
     return names
 
 

@@ -82,19 +82,19 @@ def run(words: Sequence[str]) -> int | None:
     group = words.pop(0)
     if group not in _WHERE:
         raise _no_command(group, "")
-    found = find([group, *words])
-    if not isinstance(found, Command):
+    command = find([group, *words])
+    if not isinstance(command, Command):
         if _answered(group, words):
             return None
-        found = find([group, *words])
-    if not isinstance(found, Command):
+        command = find([group, *words])
+    if not isinstance(command, Command):
         raise _no_command(words[0], group)
-    given = values_of(found, words[found.path.count(" ") :])
-    if given is not None:
-        return run_command(found, *given)
+    values = values_of(command, words[command.path.count(" ") :])
+    if values is not None:
+        return run_command(command, *values)
     from imulab.cli.help import command_help
 
-    print(command_help(found))
+    print(command_help(command))
     return None
 
 

@@ -69,27 +69,29 @@ def experiment_json(name: str, seeds: int, rows: list[ExperimentRow]) -> str:
     return dumps({"experiment": name, "seeds": seeds, "rows": [asdict(row) for row in rows]}, indent=1)
 
 
-def describe_comparison(found: Comparison) -> str:
+def describe_comparison(comparison: Comparison) -> str:
     """Return a table of all seven methods for each axis."""
     from imulab.procedures.gyro_array.elements import unit_of_angle
     from imulab.procedures.gyro_array.figures import method_texts
     from imulab.report.traces import plain_number
 
-    model, data = found.record.model, found.record.data
+    model, data = comparison.record.model, comparison.record.data
     lines = [
-        f"{found.elements.count} gyros on each axis, {found.record.fit['samples']} samples at "
-        f"{found.record.fit['sample_rate']['value']:.6g} Hz; truth: {model['truth']}"
+        f"{comparison.elements.count} gyros on each axis, {comparison.record.fit['samples']} samples at "
+        f"{comparison.record.fit['sample_rate']['value']:.6g} Hz; truth: {model['truth']}"
     ]
-    for a, axis in enumerate(found.elements.axes):
-        unit = found.elements.units[a]
+    for a, axis in enumerate(comparison.elements.axes):
+        unit = comparison.elements.units[a]
         angle, factor = unit_of_angle(unit)
-        halves = any(not isinstance(rows, str) and rows[a].split_half is not None for rows in found.figures.values())
+        halves = any(
+            not isinstance(rows, str) and rows[a].split_half is not None for rows in comparison.figures.values()
+        )
         titles = [
             "method", f"rate std {unit}", f"rate max {unit}", f"angle std {angle}", f"angle max {angle}", "reduction",
             "noise/limit", "bandwidth Hz", *([f"split-half {unit}"] if halves else []),
         ]  # fmt: skip
         body, reasons = [], []
-        for method, rows in found.figures.items():
+        for method, rows in comparison.figures.items():
             if isinstance(rows, str):
                 body.append([method, *["–"] * (len(titles) - 1)])
                 reasons.append(f"({method} cannot run: {rows})")
@@ -97,7 +99,7 @@ def describe_comparison(found: Comparison) -> str:
             body.append([method, *method_texts(rows[a], factor, 4, halves=halves)])
         lines += ["", *([f"axis {axis}"] if axis else []), *aligned(titles, body), *reasons]
         lines.append(
-            f"single gyro, mean of {_gyros_of_mean(found.elements.names[a], data['working'][a])}: "
+            f"single gyro, mean of {_gyros_of_mean(comparison.elements.names[a], data['working'][a])}: "
             f"{plain_number(data['single'][a], 4)} {unit}; limit of one sample {plain_number(data['limit'][a], 4)} "
             f"{unit}"
         )

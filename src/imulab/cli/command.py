@@ -99,22 +99,26 @@ class Command:
     @cached_property
     def arguments(self) -> tuple[Positional, ...]:
         """What is given without an option, in order."""
-        types, found = arguments.types_of(self.function), []
+        types, positionals = arguments.types_of(self.function), []
         for name, parameter in inspect.signature(self.function).parameters.items():
-            for said in arguments.metadata(types[name]):
-                if isinstance(said, Argument):
+            for marker in arguments.metadata(types[name]):
+                if isinstance(marker, Argument):
                     many, required = list[str] in arguments.members(types[name]), parameter.default is parameter.empty
                     default = None if required else parameter.default
-                    found.append(Positional(name, said.shows, said.help, many, required, default))
-        return tuple(found)
+                    positionals.append(Positional(name, marker.shows, marker.help, many, required, default))
+        return tuple(positionals)
 
     @cached_property
     def options(self) -> tuple[Option, ...]:
         """Its options, in the order of help."""
-        own = options_of(self.function)
-        taken = {*self.without, *(each.keyword for each in own), *(each.keyword for each in self.arguments)}
+        function_options = options_of(self.function)
+        taken = {
+            *self.without,
+            *(each.keyword for each in function_options),
+            *(each.keyword for each in self.arguments),
+        }
         more = [x for owner in self.owners() for x in options_of(owner) if x.keyword not in taken]
-        chosen = [*own, *(x for x in more if not self.only or x.keyword in self.only)]
+        chosen = [*function_options, *(x for x in more if not self.only or x.keyword in self.only)]
         names = {each.keyword for each in chosen}
         left_out = {*([] if names & {*KEYS} else ["no_project"]), *([] if "layout" in names else ["unpack_limit"])}
         chosen += [each for each in options_of(_common) if each.keyword not in left_out]

@@ -46,7 +46,7 @@ def load(path: Path, shown: str) -> dict[str, str]:
         It cannot be read, or has a key or value that it cannot have.
     """
     table = load_toml(path, shown, "project")
-    found: dict[str, str] = {}
+    settings: dict[str, str] = {}
     for key, value in table.items():
         if key not in KEYS:
             raise OptionError(f"{shown}: unknown key {quoted(key)}; known keys: {listed(KEYS, key)}")
@@ -54,13 +54,13 @@ def load(path: Path, shown: str) -> dict[str, str]:
             raise OptionError(f"{shown}: {key} = {quoted(value)}: expected a text or a number, as --{key} takes it")
         if key in _PATHS and not isinstance(value, str):
             raise OptionError(f"{shown}: {key} = {quoted(value)}: expected the name of a file")
-        found[key] = _file(key, str(value), shown) if key in _PATHS else str(value)
-    if "gravity" in found and len(found.keys() & set(_GRAVITY)) > 1:
+        settings[key] = _file(key, str(value), shown) if key in _PATHS else str(value)
+    if "gravity" in settings and len(settings.keys() & set(_GRAVITY)) > 1:
         raise OptionError(f"{shown}: gravity together with latitude or height: expected one or the other")
-    if "height" in found and "latitude" not in found:
+    if "height" in settings and "latitude" not in settings:
         raise OptionError(f"{shown}: height without latitude: expected both")
-    _check_values(found, shown)
-    return found
+    _check_values(settings, shown)
+    return settings
 
 
 def _file(key: str, value: str, shown: str) -> str:
@@ -77,15 +77,15 @@ def _file(key: str, value: str, shown: str) -> str:
     return f"./{path}" if key == "layout" and shipped_file(str(path)) else str(path)
 
 
-def _check_values(found: Mapping[str, str], shown: str) -> None:
+def _check_values(settings: Mapping[str, str], shown: str) -> None:
     """Check gravity and limit as if they were typed, whether or not this command takes them."""
     from imulab.gravity import gravity_option
     from imulab.quantities import quantity
 
     try:
-        gravity_option(found.get("gravity"), found.get("latitude"), found.get("height"), "{}")
-        if "limit" in found and not quantity(found["limit"], "limit", "acceleration", "mg") > 0:
-            raise OptionError(f"limit {found['limit']!r}: expected more than 0")
+        gravity_option(settings.get("gravity"), settings.get("latitude"), settings.get("height"), "{}")
+        if "limit" in settings and not quantity(settings["limit"], "limit", "acceleration", "mg") > 0:
+            raise OptionError(f"limit {settings['limit']!r}: expected more than 0")
     except OptionError as error:
         raise OptionError(f"{shown}: {error}") from None
 
@@ -97,16 +97,16 @@ def additions(settings: Mapping[str, str], typed: Mapping[str, object], files: S
     together: one that is typed leaves out those of the file. A layout is left out where all files say themselves what
     their columns are; else it is for those that do not.
     """
-    found = {key: text for key, text in settings.items() if key in typed and typed[key] is None}
+    added = {key: text for key, text in settings.items() if key in typed and typed[key] is None}
     if any(typed.get(key) is not None for key in _GRAVITY):
-        found = {key: text for key, text in found.items() if key not in _GRAVITY}
-    if "layout" in found and files and all(map(_describes_itself, files)):
-        del found["layout"]
-    elif "layout" in found:
+        added = {key: text for key, text in added.items() if key not in _GRAVITY}
+    if "layout" in added and files and all(map(_describes_itself, files)):
+        del added["layout"]
+    elif "layout" in added:
         from imulab.readers.layout import IfNeeded
 
-        found["layout"] = IfNeeded(found["layout"])
-    return found
+        added["layout"] = IfNeeded(added["layout"])
+    return added
 
 
 def _describes_itself(file: str) -> bool:

@@ -140,20 +140,20 @@ def answer(
         completions = (each for each in known if each[0].startswith(incomplete))
     else:
         completions = (each for each in listed(place) if each[0].startswith(incomplete))
-    found = [(word, " ".join(text.split())) for word, text in completions]
+    matching = [(word, " ".join(text.split())) for word, text in completions]
     if shell == "fish" and os.environ.get("_TYPER_COMPLETE_FISH_ACTION") != "get-args":
-        return "", 0 if found else 1
+        return "", 0 if matching else 1
     if shell == "zsh":
-        rows = [f'"{_escaped(word)}"' + (f':"{_escaped(text)}"' if text else "") for word, text in found]
+        rows = [f'"{_escaped(word)}"' + (f':"{_escaped(text)}"' if text else "") for word, text in matching]
         return ("_arguments '*: :((" + "\n".join(rows) + "))'" if rows else "_files"), 0
     separator = {"bash": None, "fish": "\t"}.get(shell, ":::")
-    rows = [word if separator is None or not text else f"{word}{separator}{text}" for word, text in found]
+    rows = [word if separator is None or not text else f"{word}{separator}{text}" for word, text in matching]
     return "\n".join(rows if shell in ("bash", "fish") else [row if ":::" in row else f"{row}::: " for row in rows]), 0
 
 
 def _escaped(text: str) -> str:
-    for one, other in (('"', '""'), ("'", "''"), ("$", "\\$"), ("`", "\\`"), (":", r"\\:")):
-        text = text.replace(one, other)
+    for character, escaped in (('"', '""'), ("'", "''"), ("$", "\\$"), ("`", "\\`"), (":", r"\\:")):
+        text = text.replace(character, escaped)
     return text
 
 

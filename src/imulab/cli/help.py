@@ -19,10 +19,10 @@ def command_help(command: Command) -> str:
     """Return what ``--help`` prints of a command: usage, what it does, and its options in their groups."""
     usage = " ".join([f"Usage: imulab {command.path} [OPTIONS]", *(each.shows for each in command.arguments)])
     lines = [*_wrapped(usage, " " * 7, first=""), "", *_paragraphs(command.help)]
-    given = [(each.shows, f"{each.help}{' [required]' if each.required else ''}") for each in command.arguments]
+    argument_rows = [(each.shows, f"{each.help}{' [required]' if each.required else ''}") for each in command.arguments]
     rows = [(each.group, each.spelling, f"{each.help}{_remarks(each)}") for each in (*command.options, HELP)]
-    column = _column([term for term, _ in given] + [term for _, term, _ in rows])
-    lines += _list("Arguments", given, column)
+    column = _column([term for term, _ in argument_rows] + [term for _, term, _ in rows])
+    lines += _list("Arguments", argument_rows, column)
     for group in GROUPS:
         lines += _list(_TITLES.get(group, group.capitalize()), [row[1:] for row in rows if row[0] == group], column)
     return "\n".join(lines)

@@ -58,8 +58,8 @@ def checked_host(text: str | None) -> str | None:
 def checked_page(page: bool, port: str | None, host: str | None, *, no_browser: bool, plain: bool) -> int | None:
     """Return the port of the page, None where there is to be none."""
     if not page:
-        for given, name in ((port, "--port"), (host, "--host"), (no_browser or None, "--no-browser")):
-            if given is not None:
+        for value, name in ((port, "--port"), (host, "--host"), (no_browser or None, "--no-browser")):
+            if value is not None:
                 raise OptionError(f"{name}: expected --page with it")
         return None
     if plain:
@@ -74,10 +74,10 @@ def again(save: str, texts: Mapping[str, str | None], output: str | None, record
     """Return the command that makes the same record from the recording."""
     from imulab.live.view import FURTHER
 
-    given = [word for key, text in texts.items() if text is not None for word in (f"--{key}", text)]
+    typed = [word for key, text in texts.items() if text is not None for word in (f"--{key}", text)]
     further = [name for name in FURTHER if f"{name}_bias_x" in record.parameters]
     others = ["--with", ",".join(further)] if further else []
-    return shlex.join(["imulab", "tumble", "fit", save, *given, *others, *(["-o", output] if output else [])])
+    return shlex.join(["imulab", "tumble", "fit", save, *typed, *others, *(["-o", output] if output else [])])
 
 
 def workbench(given: Sequence[str] = (), later: Sequence[str] = ()) -> tuple[Workbench, FolderFiles]:
@@ -225,8 +225,8 @@ def live(
     with _offering(), closing(runner):
         try:
             if listened is not None:
-                said = partial(again, save, fitted, output)
-                on_page(runner, made, said, (output, report), port=listened, host=host, browser=not no_browser)
+                command_again = partial(again, save, fitted, output)
+                on_page(runner, made, command_again, (output, report), port=listened, host=host, browser=not no_browser)
             else:
                 _in_terminal(runner, made, plain=plain, typed=source != "-")
         except KeyboardInterrupt:

@@ -47,39 +47,42 @@ def allan(file: RecordingFile, *, report: ReportFile = None, json: AsJson = Fals
     how = reading(options)
     recording = on_disk(read_blocks(file, **how)) if is_large(file) else read(file, **how)
     with labelled("--{}", ["taus"]):
-        found = analyse(recording, options["taus"])
+        analysis = analyse(recording, options["taus"])
     if report:
         from imulab.files import write_text
         from imulab.report.noise_figures import noise_page
 
-        write_text(report, noise_page(found, recording))
+        write_text(report, noise_page(analysis, recording))
     if json:
         from json import dumps
 
-        print(dumps(found, indent=1, ensure_ascii=False, allow_nan=False))
+        print(dumps(analysis, indent=1, ensure_ascii=False, allow_nan=False))
     else:
-        print(describe(found))
+        print(describe(analysis))
         if report:
             print(f"report: {report}")
-    for message in found["warnings"]:
+    for message in analysis["warnings"]:
         warn(message)
 
 
-def describe(found: dict[str, Any]) -> str:
+def describe(analysis: dict[str, Any]) -> str:
     """Return coefficients and curves as tables."""
     from imulab.display import aligned
     from imulab.report.noise_figures import coefficient_rows
     from imulab.report.parameters import small_unit
     from imulab.report.traces import plain_number
 
-    lines = [f"{printable(found['file'])}: {found['samples']} samples at {found['sample_rate']['value']:.6g} Hz", ""]
-    lines += aligned(["column", "coefficient", "value", "u", "unit"], coefficient_rows(found))
-    names = list(found["columns"])
-    units = {name: small_unit(found["columns"][name]["unit"]).scale for name in names}
+    lines = [
+        f"{printable(analysis['file'])}: {analysis['samples']} samples at {analysis['sample_rate']['value']:.6g} Hz",
+        "",
+    ]
+    lines += aligned(["column", "coefficient", "value", "u", "unit"], coefficient_rows(analysis))
+    names = list(analysis["columns"])
+    units = {name: small_unit(analysis["columns"][name]["unit"]).scale for name in names}
     lines += ["", "Allan deviation"]
-    tau = found["columns"][names[0]]["tau"]
+    tau = analysis["columns"][names[0]]["tau"]
     body = [
-        [plain_number(t, 4), *(plain_number(found["columns"][n]["deviation"][k] * units[n][1], 4) for n in names)]
+        [plain_number(t, 4), *(plain_number(analysis["columns"][n]["deviation"][k] * units[n][1], 4) for n in names)]
         for k, t in enumerate(tau)
     ]
     lines += aligned(["tau s", *(f"{n} {units[n][0]}" for n in names)], body)

@@ -86,13 +86,13 @@ def _listen() -> Callable[[], None]:
         def emit(self, record: logging.LogRecord) -> None:
             tell(record.getMessage())
 
-    logger, told = logging.getLogger("imulab"), Told()
+    logger, handler = logging.getLogger("imulab"), Told()
     level = logger.level
-    logger.addHandler(told)
+    logger.addHandler(handler)
     logger.setLevel(logging.INFO)
 
     def stop() -> None:
-        logger.removeHandler(told)
+        logger.removeHandler(handler)
         logger.setLevel(level)
 
     return stop
@@ -140,9 +140,9 @@ def explained(message: str) -> str:
     """Return a refusal with what is held about the file that it speaks of, so that one mistake makes one line."""
     held = speech().held
     about = [name for name in held if name in message] or (list(held) if len(held) == 1 else [])
-    found = "; ".join(held[name] if name in message else f"{name}: {held[name]}" for name in about)
+    notes = "; ".join(held[name] if name in message else f"{name}: {held[name]}" for name in about)
     held.clear()
-    return f"{message} ({found})" if found else message
+    return f"{message} ({notes})" if notes else message
 
 
 def coloured(word: str, stream: TextIO | None = None) -> str:
@@ -199,10 +199,10 @@ def read_recording(file: str, **how: Any) -> Recording:
     return recording
 
 
-def call(function: Callable[..., Result], *given: Any, **options: Any) -> Result:
+def call(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
     """Call a public function with a command's options; a refusal names them as the command line does."""
     with labelled("--{}", options):
-        return function(*given, **options)
+        return function(*arguments, **options)
 
 
 def how_to_read() -> Any:

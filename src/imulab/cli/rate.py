@@ -100,8 +100,8 @@ def turn(
     check_outputs(
         [output, report], [name for name in (file, how["layout"], options["accel"], options["prior"]) if name]
     )
-    found = call(il.fit_turns, read_recording(file, **how), **options)
-    finish(found.calibration, output, report, json=json)
+    result = call(il.fit_turns, read_recording(file, **how), **options)
+    finish(result.calibration, output, report, json=json)
 
 
 COMMANDS = (

@@ -321,15 +321,15 @@ def _contents(blocks: Iterable[Recording]) -> _Contents:
 
 def describe_recording(blocks: Iterable[Recording]) -> str:
     """Return what a recording holds: samples, rate, gaps, duration, and each column's range."""
-    found = _contents(blocks)
-    last = found.last
-    lines = [f"{printable(last.name)}: {found.samples} samples"]
-    lines += found.clock.text() if "time" in last else ["no time column: a table of attitudes, a row each"]
-    rows = [[name, last.units[name], *column.texts()] for name, column in found.columns.items()]
+    contents = _contents(blocks)
+    last = contents.last
+    lines = [f"{printable(last.name)}: {contents.samples} samples"]
+    lines += contents.clock.text() if "time" in last else ["no time column: a table of attitudes, a row each"]
+    rows = [[name, last.units[name], *column.texts()] for name, column in contents.columns.items()]
     lines += ["", *aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]
     if last.metadata:
         lines += ["", *(f"{key}: {value}" for key, value in last.metadata.items())]
-    lines += [f"{'warning' if note.startswith('truncated') else 'note'}: {note}" for note in found.notes]
+    lines += [f"{'warning' if note.startswith('truncated') else 'note'}: {note}" for note in contents.notes]
     return "\n".join(lines)
 
 
@@ -337,8 +337,8 @@ def recording_json(blocks: Iterable[Recording]) -> str:
     """Return the same as JSON, each column in its own unit; null where there is nothing to tell."""
     from imulab.records.calibration import json_text
 
-    found = _contents(blocks)
-    last, clock = found.last, found.clock
+    contents = _contents(blocks)
+    last, clock = contents.last, contents.clock
     duration = rate = None
     if clock.first is not None and not clock.broken:
         duration = clock.last - clock.first
@@ -346,12 +346,14 @@ def recording_json(blocks: Iterable[Recording]) -> str:
     return json_text(
         {
             "file": last.name,
-            "samples": found.samples,
+            "samples": contents.samples,
             "duration": {"value": duration, "unit": "s"},
             "sample_rate": {"value": rate, "unit": "Hz"},
             "gaps": clock.gaps,
-            "columns": {name: {"unit": last.units[name], **column.values()} for name, column in found.columns.items()},
+            "columns": {
+                name: {"unit": last.units[name], **column.values()} for name, column in contents.columns.items()
+            },
             "metadata": dict(last.metadata),
-            "notes": found.notes,
+            "notes": contents.notes,
         }
     ).rstrip()

@@ -70,8 +70,8 @@ def fit(
     from imulab.cli.show import finish
     from imulab.procedures.registry import run_task
 
-    given = [name for name in (options["layout"], options["prior"]) if name]
-    check_outputs([output, report], [*files, *given])
+    inputs = [name for name in (options["layout"], options["prior"]) if name]
+    check_outputs([output, report], [*files, *inputs])
     finish(run_task("thermal", files, options, GivenFiles()), output, report, json=json)
 
 
@@ -95,13 +95,13 @@ def check(
     check_outputs([report], [name for name in (record, *files, options["layout"]) if name])
     held = load(record)
     how = reading(options)
-    given = [read_recording(file, **how) for file in files]
+    recordings = [read_recording(file, **how) for file in files]
     chosen = {name: value for name, value in options.items() if value is not None}
     try:
-        found = call(il.check_thermal, held, given, **chosen)
+        result = call(il.check_thermal, held, recordings, **chosen)
     except RecordError as error:
         raise RecordError(f"{record}: {error}") from None
-    return finish_check(found, held, record, files, notes_on_data(held, given), report, json=json)
+    return finish_check(result, held, record, files, notes_on_data(held, recordings), report, json=json)
 
 
 COMMANDS = (

@@ -107,10 +107,10 @@ def gyro(
     check_outputs([output, report], inputs)
     record = load(accel)
     recording = read_recording(file, **how)
-    own = recording
+    accel_recording = recording
     if accel_file is not None:
-        own = read_recording(accel_file, layout=accel_layout or how["layout"], element=how["element"])
-    both = call(il.fit_gyro, record, recording, accel_data=own, **options)
+        accel_recording = read_recording(accel_file, layout=accel_layout or how["layout"], element=how["element"])
+    both = call(il.fit_gyro, record, recording, accel_data=accel_recording, **options)
     finish(
         both.calibration,
         output,
@@ -163,11 +163,11 @@ def mag(
     local = gravity_option(gravity, latitude, height, FLAG)
     place = call(stated_place, hemisphere=options.pop("hemisphere"), latitude=latitude, dip=options.pop("dip"))
     several = {name: tuple(options.pop(name) or ()) for name in ("same_direction", "drop")}
-    found = call(
+    result = call(
         fit_mag, read_recording(file, **how), accel=known, gravity=local, hemisphere=place.hemisphere, dip=place.dip,
         **several, **options,
     )  # fmt: skip
-    finish(found.calibration, output, report, json=json)
+    finish(result.calibration, output, report, json=json)
 
 
 def check(

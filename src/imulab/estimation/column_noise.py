@@ -68,12 +68,12 @@ class ColumnNoise:
 
         That of the model; where it is not that of the record, at least the Allan deviation at the far end of the curve.
         """
-        own = 0.0 if self.model is None else mean_uncertainty(self.model, duration)
+        by_model = 0.0 if self.model is None else mean_uncertainty(self.model, duration)
         if self.fits:
-            return own
+            return by_model
         known = (self.curve.freedom >= _LEAST_FREEDOM) & (self.curve.deviation > 0)
         upper = (self.curve.deviation * np.sqrt(1 + 2 * np.sqrt(2 / self.curve.freedom)))[known]
-        return max(own, float(upper[-3:].max(initial=0.0)))
+        return max(by_model, float(upper[-3:].max(initial=0.0)))
 
     def unseen(self, duration: float) -> float:
         """Return how many times as large noise that the record cannot show could make it, from 2 on; else 1."""
@@ -84,8 +84,8 @@ class ColumnNoise:
         if self.model is None or not self.fits:
             return None
         interval = self.model.interval
-        found = average(self.model.choice, lambda values: allan_variance(values, tau, interval)).mean[0]
-        return np.where(tau * self.coefficients.highest >= _FITTED, np.sqrt(found), np.nan)
+        variance = average(self.model.choice, lambda values: allan_variance(values, tau, interval)).mean[0]
+        return np.where(tau * self.coefficients.highest >= _FITTED, np.sqrt(variance), np.nan)
 
 
 def noise_columns(recording: Recording) -> Iterator[str]:
@@ -241,8 +241,8 @@ def columns_noise(
         stretches += [] if why[-1] else [[transformed(samples, 1 / rate)]]
         del samples  # before the next is made
     fit = [k for k, reason in enumerate(why) if not reason]
-    found = analyses(stretches, candidates) if fit else []
-    models = dict(zip(fit, zip(read_coefficients(found), found, strict=True), strict=True))
+    analysed_columns = analyses(stretches, candidates) if fit else []
+    models = dict(zip(fit, zip(read_coefficients(analysed_columns), analysed_columns, strict=True), strict=True))
     return [
         ColumnNoise(curve, *(models[k] if k in models else (undetermined(why[k]),))) for k, curve in enumerate(curves)
     ]
@@ -276,14 +276,14 @@ def _step_line(recording: Recording, name: str, step: Step) -> str:
 
 def noise_lines(noises: Mapping[str, ColumnNoise]) -> list[str]:
     """Return what is to say of columns by name: filters and lines, and coefficients that are not determined."""
-    told: dict[str, list[str]] = {}
+    by_reason: dict[str, list[str]] = {}
     for name, noise in noises.items():
         its = noise.coefficients
         reason = its.angle_random_walk.reason or its.bias_instability.reason
         if reason:
-            told.setdefault(reason, []).append(name)
+            by_reason.setdefault(reason, []).append(name)
     messages = []
-    for reason, names in told.items():
+    for reason, names in by_reason.items():
         alone = not noises[names[0]].coefficients.angle_random_walk.reason
         which = "bias instability and random walk of the zero" if alone else "noise coefficients"
         messages.append((Note if alone else str)(f"{_columns(names)}: {which} not determined: {reason}"))
@@ -299,7 +299,8 @@ def noise_lines(noises: Mapping[str, ColumnNoise]) -> list[str]:
     with_lines = {n: f.lines[:_MOST_NAMED] for n, f in noises.items() if f.lines}
     if with_lines:
         each = "; ".join(
-            f"{n} {' '.join(f'{f:.4g}' for f in found)}" for n, found in list(with_lines.items())[:_MOST_COLUMNS]
+            f"{n} {' '.join(f'{f:.4g}' for f in frequencies)}"
+            for n, frequencies in list(with_lines.items())[:_MOST_COLUMNS]
         )
         more = len(with_lines) - _MOST_COLUMNS
         each += f"; and in {more} more columns" if more > 0 else ""

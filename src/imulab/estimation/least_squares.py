@@ -101,7 +101,7 @@ def least_squares(
     solution, evaluations, converged = np.asarray(start), 1, False
     if np.isfinite(root * model(start)[0]).all():
         with np.errstate(all="ignore"):
-            found = optimize.least_squares(
+            minimum = optimize.least_squares(
                 lambda p: root * model(p)[0],
                 start,
                 lambda p: root[:, None] * model(p)[1],
@@ -111,7 +111,7 @@ def least_squares(
                 gtol=None,
                 max_nfev=max_evaluations,
             )
-        solution, evaluations, converged = found.x, int(found.nfev), bool(found.status > 0)
+        solution, evaluations, converged = minimum.x, int(minimum.nfev), bool(minimum.status > 0)
     residuals, jacobian = model(solution)
     return Fit(
         solution[None], residuals[None], jacobian[None], np.asarray(weights)[None], np.array([evaluations]),
@@ -266,7 +266,7 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
         tau^2, shape (b,), and the degrees of freedom, shape (b,): infinite where nothing is left to tell.
     """
     squares, freedom = residuals**2, spare.sum(axis=1)
-    told, freedom = freedom >= _TOLD, np.maximum(freedom, _TOLD)
+    enough, freedom = freedom >= _TOLD, np.maximum(freedom, _TOLD)
     peak = np.minimum(_PEAK, np.minimum(freedom / _PER_DEGREE, (freedom / _PER_SQUARE) ** 2))[:, None]
     reach = _REACH * np.sqrt(2 * freedom)
     typical = medians(variance)[:, None]
@@ -284,8 +284,8 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
     kappa = typical / (typical + grid)
     mean = (share * kappa).sum(axis=1)
     scatter = (share * (kappa - mean[:, None]) ** 2).sum(axis=1)
-    excess: Array = np.where(told, typical[:, 0] * (1 / mean - 1), 0.0)
-    return excess, np.where(told, 2 * mean**2 / np.maximum(scatter, np.finfo(float).tiny), np.inf)
+    excess: Array = np.where(enough, typical[:, 0] * (1 / mean - 1), 0.0)
+    return excess, np.where(enough, 2 * mean**2 / np.maximum(scatter, np.finfo(float).tiny), np.inf)
 
 
 def robust_scale(standardised: Array, size: int) -> Array:

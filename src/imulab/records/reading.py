@@ -70,8 +70,8 @@ def _as_sealed(data: bytes) -> tuple[dict[str, Any], str] | None:
         content = msgspec.json.decode(data)
     except (ValueError, RecursionError):
         return None
-    found = None if text is None else hashlib.sha256(text).hexdigest()
-    return (content, found) if found is not None and content.get("content_sha256") == found else None
+    computed = None if text is None else hashlib.sha256(text).hexdigest()
+    return (content, computed) if computed is not None and content.get("content_sha256") == computed else None
 
 
 def _content(data: bytes, name: str) -> Any:

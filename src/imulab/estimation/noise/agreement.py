@@ -123,17 +123,17 @@ def agreement(
     """
     spectra = [*first, *second]
     bins, limits = prepare(spectra), time_limits(spectra)
-    own = np.arange(len(bins.freedom)) < sum(len(each.power) for each in first)
+    of_first = np.arange(len(bins.freedom)) < sum(len(each.power) for each in first)
     choice = choose(bins, limits, bins.power[None], bins.freedom[None], candidates, full_band)
     best = int(choice.chosen[0])
     values, model = choice.values[0, best], choice.models[0, best]
     variance = bins.variances(values[None])[0]
     used = np.maximum(bins.freedom, 1e-9)
     drawn = variance * np.random.default_rng(1).chisquare(used, (_DRAWS, len(used))) / used
-    octaves = _octaves(spectra, own, np.concatenate([bins.power[None], drawn]) / variance, highest)
+    octaves = _octaves(spectra, of_first, np.concatenate([bins.power[None], drawn]) / variance, highest)
     held = replace(octaves, ratio=octaves.ratio[0], tolerance=tolerance)
-    eased = np.where(own, bins.power, bins.power / _allowed(spectra, held, highest))
-    ratios = _likelihood_ratios(bins, own, values, limits, np.concatenate([eased[None], drawn]))
+    eased = np.where(of_first, bins.power, bins.power / _allowed(spectra, held, highest))
+    ratios = _likelihood_ratios(bins, of_first, values, limits, np.concatenate([eased[None], drawn]))
     count = int(np.count_nonzero(values > 0))
     by_terms = chi_square_tail(count * ratios / max(float(ratios[1:].mean()), 1e-9), count)
     scores = normal_quantile(np.clip([by_terms[1:], octaves.probability[1:]], _SMALLEST, _LARGEST))
@@ -156,22 +156,22 @@ def _either(least: float, correlation: float) -> float:
     return float(np.clip(2 * least - (both.sum() - (both[0] + both[-1]) / 2) * (x[1] - x[0]), 0, 1))
 
 
-def _likelihood_ratios(bins: Bins, own: Flags, values: Array, limits: tuple[float, float], power: Array) -> Array:
+def _likelihood_ratios(bins: Bins, of_first: Flags, values: Array, limits: tuple[float, float], power: Array) -> Array:
     """Of powers, shape (r, b), from the values of the common model on, shape (r,)."""
     start = np.broadcast_to(values, (len(power), len(values)))
     deviances = []
-    for part in (own | ~own, own, ~own):
+    for part in (of_first | ~of_first, of_first, ~of_first):
         counted = np.broadcast_to(np.where(part, bins.freedom, 0.0), power.shape)
         deviances.append(score(bins, start, start > 0, limits, power, counted).deviance)
     return np.maximum(deviances[0] - deviances[1] - deviances[2], 0.0)
 
 
-def _octaves(spectra: Sequence[Spectrum], own: Flags, relative: Array, highest: float) -> Octaves:
+def _octaves(spectra: Sequence[Spectrum], of_first: Flags, relative: Array, highest: float) -> Octaves:
     """Octaves below `highest` that both sets have, of powers over the model, shape (r, b)."""
     below = np.concatenate([_octave(each, highest) for each in spectra])
     inside = below == np.arange(int(below.max()) + 1)[:, None]
     freedom = np.concatenate([each.freedom for each in spectra])
-    counts = [(inside & part) * freedom for part in (own, ~own)]
+    counts = [(inside & part) * freedom for part in (of_first, ~of_first)]
     total = np.array([each.sum(axis=1) for each in counts])
     kept = np.flatnonzero((total >= 1).all(axis=0))[::-1]
     mean = [relative @ each[kept].T / many[kept] for each, many in zip(counts, total, strict=True)]

@@ -118,10 +118,10 @@ def _slopes(
 ) -> tuple[Array, Array]:
     size, start = len(np.atleast_2d(covariates[0])), 0
     normal, right = np.zeros((size, size)), np.zeros(size)
-    for stretch, given in zip(stretches, covariates, strict=True):
+    for stretch, covariate in zip(stretches, covariates, strict=True):
         stop = start + len(stretch.spectra)
         weight = counted(stretch) / variances_of_coefficients(variances[start:stop], stretch)
-        x = np.atleast_2d(given)
+        x = np.atleast_2d(covariate)
         normal += x * weight @ x.T
         right += x * weight @ stretch.slow
         start = stop
@@ -219,12 +219,12 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> M
     predicted = variance @ (weight * counted).T
     slope = ((predicted[1:] - predicted[0]) / _STEP).T
     spread = weight * counted * variance[0] * np.sqrt(2 / np.where(kept, bins.freedom, np.inf))
-    found = weight @ (counted * bins.power)
+    observed = weight @ (counted * bins.power)
     scale = 1 / predicted[0]
     root = np.linalg.cholesky((spread * scale[:, None]) @ (spread * scale[:, None]).T)
     # The cube root of what is distributed as chi-square over its freedom is nearly normal, about 1 - 2/(9 freedom).
     square = np.sum((spread * scale[:, None]) ** 2, axis=1)
-    ratio = 3 * (np.cbrt(np.maximum(found * scale, 0.0)) - (1 - square / 9))
+    ratio = 3 * (np.cbrt(np.maximum(observed * scale, 0.0)) - (1 - square / 9))
     r = np.linalg.solve(root, ratio)
     basis = np.linalg.solve(root, slope * scale[:, None])
     step, _, rank, _ = np.linalg.lstsq(basis, r, rcond=1e-6)
@@ -233,7 +233,7 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> M
     better = values.copy()
     better[present] *= np.exp(np.clip(step, -2, 2))
     probability = float(chi_square_tail(statistic, freedom)) if freedom else 1.0
-    return MomentsFit(statistic, freedom, probability, tau, found, predicted[0], better)
+    return MomentsFit(statistic, freedom, probability, tau, observed, predicted[0], better)
 
 
 def allan_of_bins(records: Sequence[Sequence[Spectrum]]) -> tuple[Array, Array]:
@@ -348,32 +348,32 @@ def choose(
         Whether the spectra reach up to half the sampling rate.
     """
     models = np.array([terms(each) for each in candidates])
-    found = _fitted(bins, models, limits, power, freedom)
+    choice = _fitted(bins, models, limits, power, freedom)
     if not full_band or len(candidates) == 1:
-        return found
-    best = found.chosen
+        return choice
+    best = choice.chosen
     with_q = models | terms("Q")
     joins = np.zeros(len(power), dtype=np.bool_)
     for index in sorted(set(best.tolist())):
         columns = np.flatnonzero(best == index)
         tried = fit(bins, with_q[index : index + 1], limits, power[columns], freedom[columns])
-        joins[columns] = found.deviance[columns, index] - tried.deviance >= _QUANTISATION
+        joins[columns] = choice.deviance[columns, index] - tried.deviance >= _QUANTISATION
     if not joins.any():
-        return found
+        return choice
     again = _fitted(bins, with_q, limits, power[joins], freedom[joins])
     for name in Choice.__annotations__:
-        getattr(found, name)[joins] = getattr(again, name)
-    return found
+        getattr(choice, name)[joins] = getattr(again, name)
+    return choice
 
 
 def _fitted(bins: Bins, models: Flags, limits: tuple[float, float], power: Array, freedom: Array) -> Choice:
-    found: Fits = fit(bins, models, limits, power, freedom)
+    fits: Fits = fit(bins, models, limits, power, freedom)
     shape = (len(power), len(models))
     return Choice(
         np.repeat(models[None], len(power), axis=0),
-        found.values.reshape(*shape, -1),
-        found.deviance.reshape(shape),
-        found.covariance.reshape(*shape, len(NAMES), len(NAMES)),
+        fits.values.reshape(*shape, -1),
+        fits.deviance.reshape(shape),
+        fits.covariance.reshape(*shape, len(NAMES), len(NAMES)),
     )
 
 
@@ -537,14 +537,14 @@ class Analysis:
 
     def steps(self, stretches: Sequence[Stretch], limit: float = LEVEL_STEP.limit) -> list[tuple[LevelChange, ...]]:
         """Return the changes of level of stretches, its own or these before something was taken out, by its noise."""
-        found, start = [], 0
+        steps, start = [], 0
         variances = self.variances()
         for each in stretches:
             stop = start + len(each.spectra)
             level = variances_of_coefficients(variances[start:stop], each)
-            found.append(find_steps(each.slow, level, each.count, each.interval, limit))
+            steps.append(find_steps(each.slow, level, each.count, each.interval, limit))
             start = stop
-        return found
+        return steps
 
     def regressed(self, covariates: Sequence[Array]) -> Regression:
         """Return how the column follows covariates: of each stretch their slow coefficients, shape (k, J)."""
@@ -558,8 +558,8 @@ class Analysis:
                 for s, mine in zip(spectra, self.spectra, strict=True)
             ]
         )
-        found = fit(bins, self.model[None], self.limits, bins.power[None], bins.freedom[None])
-        return _split(bins.variances(found.values)[0], self.spectra), float(found.deviance[0])
+        refitted = fit(bins, self.model[None], self.limits, bins.power[None], bins.freedom[None])
+        return _split(bins.variances(refitted.values)[0], self.spectra), float(refitted.deviance[0])
 
 
 def analysed(
@@ -588,12 +588,12 @@ def analyses(
     bands = [
         usable_band(each) if highest is None else Band(min(highest, nyquist), highest >= nyquist) for each in spectra
     ]
-    found: dict[int, Analysis] = {}
+    by_column: dict[int, Analysis] = {}
     for band in dict.fromkeys(bands):
         alike = [k for k, its in enumerate(bands) if its == band]
         fitted = _of_one_band([spectra[k] for k in alike], band, candidates)
-        found |= {k: Analysis(tuple(columns[k]), band, *its) for k, its in zip(alike, fitted, strict=True)}
-    return [found[k] for k in range(len(columns))]
+        by_column |= {k: Analysis(tuple(columns[k]), band, *its) for k, its in zip(alike, fitted, strict=True)}
+    return [by_column[k] for k in range(len(columns))]
 
 
 def _of_one_band(
@@ -612,19 +612,20 @@ def _of_one_band(
     return [(allowance, limits, part) for allowance, part in zip(allowances, parts, strict=True)]
 
 
-def intervals_of(found: Sequence[Analysis], index: Sequence[int]) -> list[tuple[Array, Array]]:
+def intervals_of(analysed_columns: Sequence[Analysis], index: Sequence[int]) -> list[tuple[Array, Array]]:
     """Return the ends of 95 % intervals, shapes (8,), of one candidate of each column, columns as in `analyses`."""
     ends: dict[int, tuple[Array, Array]] = {}
-    for limits in dict.fromkeys(each.limits for each in found):
-        alike = [k for k, each in enumerate(found) if each.limits == limits]
-        bins = [found[k].bins for k in alike]
+    for limits in dict.fromkeys(each.limits for each in analysed_columns):
+        alike = [k for k, each in enumerate(analysed_columns) if each.limits == limits]
+        bins = [analysed_columns[k].bins for k in alike]
         values, models = (
-            np.array([getattr(found[k].choice, name)[0, index[k]] for k in alike]) for name in ("values", "models")
+            np.array([getattr(analysed_columns[k].choice, name)[0, index[k]] for k in alike])
+            for name in ("values", "models")
         )
         power, freedom = np.array([each.power for each in bins]), np.array([each.freedom for each in bins])
         parts = profile(bins[0], values, models, limits, power, freedom)
         ends |= dict(zip(alike, zip(*parts, strict=True), strict=True))
-    return [ends[k] for k in range(len(found))]
+    return [ends[k] for k in range(len(analysed_columns))]
 
 
 def without_steps(stretches: Sequence[Stretch], steps: Sequence[Sequence[LevelChange]]) -> list[Stretch]:

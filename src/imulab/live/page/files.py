@@ -70,17 +70,17 @@ class FolderFiles:
         A file is not there.
     """
 
-    def __init__(self, folder: Path, given: Sequence[str] = (), later: Sequence[str] = ()) -> None:
+    def __init__(self, folder: Path, named: Sequence[str] = (), later: Sequence[str] = ()) -> None:
         self.folder = folder
         self._kinds: dict[tuple[str, int, int], str] = {}
-        for name in given:
+        for name in named:
             if not _plain(name):
                 raise OptionError(f"{quoted(name)}: expected a file name without control characters")
             if not Path(name).exists():
                 raise OptionError(f"{name}: no such file")
-        self._first = frozenset(given)
+        self._first = frozenset(named)
         self._given = [
-            f"./{name}" if name.startswith("-") else name for name in dict.fromkeys([*given, *filter(_plain, later)])
+            f"./{name}" if name.startswith("-") else name for name in dict.fromkeys([*named, *filter(_plain, later)])
         ]
 
     def make(self) -> None:
@@ -101,9 +101,9 @@ class FolderFiles:
     def entries(self) -> list[FileEntry]:
         """Return the files there are now, those of the command line first, then by name."""
         there = self.folder.iterdir() if self.folder.is_dir() else ()  # another program may have removed it
-        own = sorted(str(path) for path in there if _plain(path.name) and path.name[0] != ".")
-        found = (self._entry(name) for name in dict.fromkeys([*self._given, *own]))
-        return [entry for entry in found if entry is not None]
+        inside = sorted(str(path) for path in there if _plain(path.name) and path.name[0] != ".")
+        entries = (self._entry(name) for name in dict.fromkeys([*self._given, *inside]))
+        return [entry for entry in entries if entry is not None]
 
     def path(self, name: str) -> str:
         """Return the path of a file of the session, relative to the working folder.
@@ -113,8 +113,10 @@ class FolderFiles:
         OptionError
             The session has no such file.
         """
-        own = name.removeprefix(f"{self.folder}{os.sep}")
-        if name not in self._given and (own == name or own.startswith(".") or not inside(self.folder, own).exists()):
+        short = name.removeprefix(f"{self.folder}{os.sep}")
+        if name not in self._given and (
+            short == name or short.startswith(".") or not inside(self.folder, short).exists()
+        ):
             raise OptionError(f"{quoted(name)}: not among the files of this session")
         return name
 

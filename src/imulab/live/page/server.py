@@ -338,10 +338,10 @@ class TextLine:
         """Return what waits, once there is something."""
         await self._some.wait()
         self._some.clear()
-        found = [*self._waiting, *self._latest.values()]
+        messages = [*self._waiting, *self._latest.values()]
         self._waiting.clear()
         self._latest.clear()
-        return found
+        return messages
 
 
 def to_json(message: object) -> str:

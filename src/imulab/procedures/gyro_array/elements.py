@@ -333,12 +333,12 @@ class SampleClock:
 
     def lines(self, name: str) -> list[str]:
         """Return what there is to say of gaps."""
-        found = [f"{name}: {gap}" for gap in self.gaps]
+        messages = [f"{name}: {gap}" for gap in self.gaps]
         if self.count > len(self.gaps):
-            found.append(
+            messages.append(
                 f"{name}: {self.count - len(self.gaps)} more gaps; {self.total:.6g} s in all {self.count} together"
             )
-        return found
+        return messages
 
 
 def own_clocks(recording: Recording) -> dict[int, str]:

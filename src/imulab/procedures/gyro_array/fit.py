@@ -293,7 +293,7 @@ def _elements(
                 entry["latency"] = _with_unit(float(aligned.latency[i]), float(aligned.latency_uncertainty[i]), "s")
         dicts = [coefficients_dict(rest.noise[a][i].coefficients, "rad/s") for a in range(axes)]
         for name in COEFFICIENTS:
-            entry[name] = dicts[0][name] if single_axis else _over_axes([found[name] for found in dicts])
+            entry[name] = dicts[0][name] if single_axis else _over_axes([coefficients[name] for coefficients in dicts])
         listed.append(entry)
     return listed, parameters
 

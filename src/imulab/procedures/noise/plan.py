@@ -299,7 +299,7 @@ class _Column:
 def _of_record(record: Calibration, columns: str | Sequence[str] | None) -> tuple[dict[str, _Column], float]:
     values, units, _ = terms_of(record, names_given(columns))
     fit = fit_of(record)
-    found = {}
+    by_column = {}
     for name in values:
         column = fit.columns[name]
         unseen = {
@@ -309,8 +309,8 @@ def _of_record(record: Calibration, columns: str | Sequence[str] | None) -> tupl
         }
         inside = edge_as_white(values[name], np.eye(len(NAMES)), column.shortest_time.value)[0]
         dt, band, length = column.interval.value, fit.band[name].value, column.length.value
-        found[name] = _Column(inside, units[name], dt, band, column.ripple, unseen, length)
-    return found, max(fit.columns[name].length.value for name in values)
+        by_column[name] = _Column(inside, units[name], dt, band, column.ripple, unseen, length)
+    return by_column, max(fit.columns[name].length.value for name in values)
 
 
 def _planned(noise: Mapping[str, _Column], wanted: Mapping[str, float], length: float | None) -> NoisePlan:
@@ -354,15 +354,15 @@ def _terms(
     wanted: Mapping[str, float],
     lengths: Mapping[tuple[str, str], float],
     at: float,
-    given: float | None,
+    duration: float | None,
 ) -> list[PlannedTerm]:
     """The terms of a column and what a record of length `at` tells of each; limits anew where it is another length."""
     u = accuracy(column.values, column.interval, at, column.highest, column.ripple)
     limits = dict(column.limits)
-    if limits and given is not None and not math.isclose(given, column.length, rel_tol=1e-3):
+    if limits and duration is not None and not math.isclose(duration, column.length, rel_tol=1e-3):
         more = np.array([name in limits or value > 0 for name, value in zip(NAMES, column.values, strict=True)])
-        found = visible(column.values, more, column.interval, at, column.highest, _DRAWS)
-        limits = {term: float(found[NAMES.index(term)]) for term in limits}
+        smallest = visible(column.values, more, column.interval, at, column.highest, _DRAWS)
+        limits = {term: float(smallest[NAMES.index(term)]) for term in limits}
     terms = []
     for k, term in enumerate(NAMES):
         value, want = float(column.values[k]), _wanted(wanted, term)
@@ -378,22 +378,22 @@ def _wanted(wanted: Mapping[str, float], term: str) -> float:
     return wanted.get(term, math.nan if term.endswith("_time") else wanted.get(_ANY, math.nan))
 
 
-def _read_wanted(given: float | str | Mapping[str, float | str]) -> dict[str, float]:
+def _read_wanted(stated: float | str | Mapping[str, float | str]) -> dict[str, float]:
     """Wanted relative uncertainties by the name of a term; by '' that of all terms."""
     pairs: Mapping[str, float | str]
-    if isinstance(given, Mapping):
-        pairs = given
-    elif isinstance(given, str) and "=" in given:
-        parts = [part.partition("=") for part in given.split(",")]
+    if isinstance(stated, Mapping):
+        pairs = stated
+    elif isinstance(stated, str) and "=" in stated:
+        parts = [part.partition("=") for part in stated.split(",")]
         names = [name.strip() for name, _, _ in parts]
         if "" in names:
-            raise OptionError(f"for_ {given!r}: expected the name of a term before each =, such as walk=10%")
+            raise OptionError(f"for_ {stated!r}: expected the name of a term before each =, such as walk=10%")
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
-            raise OptionError(f"for_ {given!r}: {twice} twice; expected each term once")
+            raise OptionError(f"for_ {stated!r}: {twice} twice; expected each term once")
         pairs = dict(zip(names, (value for _, _, value in parts), strict=True))
     else:
-        pairs = {_ANY: given}
+        pairs = {_ANY: stated}
     wanted = {}
     for name, value in pairs.items():
         wanted[name] = fraction(value, f"for_ {name}".strip())

@@ -265,11 +265,11 @@ def given_terms(
         A coefficient cannot be read, is not above 0, or is of another kind of sensor; or there is none.
     """
     values = np.zeros(len(NAMES))
-    given: dict[str, float | str | None] = {
+    stated: dict[str, float | str | None] = {
         "white": white, "flicker": flicker, "walk": walk, "quantisation": quantisation,
     }  # fmt: skip
     levels: dict[str, str] = {}
-    for name, value in given.items():
+    for name, value in stated.items():
         if value is not None:
             values[NAMES.index(name)], level = coefficient(value, name, name)
             levels |= {} if level is None else {name: level}
@@ -279,14 +279,14 @@ def given_terms(
         levels |= {} if level is None else {"gm": level}
         if not 0 < values[TIME[k]] < math.inf:
             raise OptionError(f"gm {time}: expected a correlation time above 0")
-    found = next(iter(levels.values()), unit)
+    common = next(iter(levels.values()), unit)
     for name, level in levels.items():
-        if level != found:
-            raise OptionError(f"{name}: noise of an output in {level}; expected that of one in {found}")
+        if level != common:
+            raise OptionError(f"{name}: noise of an output in {level}; expected that of one in {common}")
     if not values.any():
         options = " ".join(f"--{name}" for name in EXAMPLES)
         raise OptionError(f'no noise is given: expected one of {options}, such as --white "{EXAMPLES["white"]}"')
-    return GivenTerms(values, found)
+    return GivenTerms(values, common)
 
 
 def coefficient(value: float | str, option: str, term: str) -> tuple[float, str | None]:
@@ -317,8 +317,8 @@ def _unit(text: str, term: str, called: str) -> tuple[float, str]:
         text = pattern.sub(instead, text)
     for endings, read in ((_OF_LEVEL, _level), (_OF_INTEGRAL, _integral)):
         for ending, factor in endings.get(term, {}).items():
-            if text.endswith(ending) and (found := read(text[: len(text) - len(ending)])):
-                return factor * found[0], found[1]
+            if text.endswith(ending) and (level := read(text[: len(text) - len(ending)])):
+                return factor * level[0], level[1]
     raise OptionError(f"{called}: expected a number with a unit such as {EXAMPLES[term]}")
 
 

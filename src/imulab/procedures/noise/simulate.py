@@ -81,22 +81,22 @@ def noise_log(
     sensor: Mapping[str, str] = {}
     if from_ is None:
         unit = next((u for u, sensor in _SENSORS.items() if names and names[0].startswith(sensor)), None)
-        given = given_terms(unit or "rad/s", **terms)  # type: ignore[arg-type]
-        if unit and given.unit in _SENSORS and given.unit != unit:
+        stated = given_terms(unit or "rad/s", **terms)  # type: ignore[arg-type]
+        if unit and stated.unit in _SENSORS and stated.unit != unit:
             raise OptionError(
-                f"columns {' '.join(names or ())}: noise of an output in {given.unit} is of no such sensor"
+                f"columns {' '.join(names or ())}: noise of an output in {stated.unit} is of no such sensor"
             )
-        names = names or [f"{_SENSORS.get(given.unit, 'gyro')}_{axis}" for axis in "xyz"]
-        values, units = dict.fromkeys(names, given.values), dict.fromkeys(names, given.unit)
+        names = names or [f"{_SENSORS.get(stated.unit, 'gyro')}_{axis}" for axis in "xyz"]
+        values, units = dict.fromkeys(names, stated.values), dict.fromkeys(names, stated.unit)
         hertz = in_si(RATE if rate is None else rate, "rate", "frequency", "Hz")
     else:
         for name, value in terms.items():
             if value not in (None, (), []):
                 raise OptionError(f"{name}: the record says that already; expected either terms or a record")
         record = as_record(from_, "simulate_noise")
-        values, units, own = terms_of(record, names)
+        values, units, record_rate = terms_of(record, names)
         sensor = {key: str(record.sensor[key]) for key in ("serial",) if key in record.sensor}
-        hertz = own if rate is None else in_si(rate, "rate", "frequency", "Hz")
+        hertz = record_rate if rate is None else in_si(rate, "rate", "frequency", "Hz")
     seconds, number = in_si(duration, "duration", "time", "s"), whole(seed, "seed")
     if not 1e-3 <= hertz <= 1e6:
         raise OptionError(f"rate {hertz:g} Hz: expected 0.001 to 1e6")

@@ -120,7 +120,7 @@ def noise_for(
     RecordError
         The record holds no gyroscope and no accelerometer in SI.
     """
-    found = PROGRAMS[check_program(program)]
+    keys_of_program = PROGRAMS[check_program(program)]
     fit = fit_of(record)
     for name, value, unit in (("rate", rate, "Hz"), ("step", step, "s")):
         if value is not None and not value > 0:
@@ -130,7 +130,7 @@ def noise_for(
     for unit, gyro in (("rad/s", True), ("m/s^2", False)):
         names = [name for name, column in fit.columns.items() if column.unit == unit]
         if names:
-            keys |= found(_largest(record, fit, names), gyro, f, d)
+            keys |= keys_of_program(_largest(record, fit, names), gyro, f, d)
     if not keys:
         units = " ".join(dict.fromkeys(column.unit for column in fit.columns.values()))
         raise RecordError(

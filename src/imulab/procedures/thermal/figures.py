@@ -359,9 +359,9 @@ def _over_temperature(group: int, record: Calibration, temperature: Array) -> Fi
     return law_figure(title, name, unit, curves, alone, read=read, at_middle=at_middle)
 
 
-def _of_force(record: Calibration, found: ThermalRecord, temperature: Any) -> Figure:
-    laws, between = deviation_of_force(record, temperature), found.fit.between_recordings
-    cycle = np.hypot(between.bias.value, found.model.gravity.value * between.scale_factor.value / np.sqrt(3))
+def _of_force(record: Calibration, thermal: ThermalRecord, temperature: Any) -> Figure:
+    laws, between = deviation_of_force(record, temperature), thermal.fit.between_recordings
+    cycle = np.hypot(between.bias.value, thermal.model.gravity.value * between.scale_factor.value / np.sqrt(3))
     known = between.from_ != "unknown"
     traces = [
         scatter(
@@ -389,8 +389,8 @@ def _of_force(record: Calibration, found: ThermalRecord, temperature: Any) -> Fi
     )
 
 
-def _residuals(found: ThermalRecord) -> Figure:
-    held = found.data.holds
+def _residuals(thermal: ThermalRecord) -> Figure:
+    held = thermal.data.holds
     temperature, residual, u = (np.array(each) for each in (held.temperature, held.residual, held.standard_uncertainty))
     rate = moved(np.array(held.recording), temperature, np.array(held.rate))
     many, edges = len(residual) > _POINTS_DRAWN_ALONE, np.linspace(temperature.min(), temperature.max(), _PARTS + 1)
@@ -429,22 +429,22 @@ def _means(temperature: Array, values: Array, edges: Array, label: str, marker: 
     """Return the means of points between edges, with twice their standard uncertainty by the scatter."""
     number = np.searchsorted(edges[1:-1], temperature)
     count = np.bincount(number, minlength=_PARTS)
-    told = count >= _FEWEST
+    enough = count >= _FEWEST
     at, mean, square = (
-        np.bincount(number, weights=each, minlength=_PARTS)[told] / count[told]
+        np.bincount(number, weights=each, minlength=_PARTS)[enough] / count[enough]
         for each in (temperature, values, values**2)
     )
-    u = np.sqrt(np.maximum(square - mean**2, 0) / (count[told] - 1))
+    u = np.sqrt(np.maximum(square - mean**2, 0) / (count[enough] - 1))
     bars = {"type": "data", "array": rounded(2 * u, 3), "thickness": 2}
     marker = marker | {"size": 11, "opacity": 1}
     name = f"{label}, means"
     return scatter(rounded(at), rounded(mean, 4), "markers", name=name, marker=marker, error_y=bars)
 
 
-def _predicted(found: ThermalRecord) -> ReportTable:
+def _predicted(thermal: ThermalRecord) -> ReportTable:
     rows = [
         [f"{row.temperature:.1f}", str(row.holds), plain_number(row.rms * _MICRO_G, 3), f"{row.chi_square:.2f}"]
-        for row in found.fit.left_out_temperature
+        for row in thermal.fit.left_out_temperature
     ]
     return ReportTable(
         "Temperatures left out",
@@ -455,9 +455,9 @@ def _predicted(found: ThermalRecord) -> ReportTable:
     )
 
 
-def _compared(found: ThermalRecord) -> ReportTable:
+def _compared(thermal: ThermalRecord) -> ReportTable:
     rows, chosen = [], None
-    for number, row in enumerate(found.fit.degrees):
+    for number, row in enumerate(thermal.fit.degrees):
         chosen = number if row.chosen else chosen
         rows.append(
             [

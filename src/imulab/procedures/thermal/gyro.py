@@ -312,8 +312,8 @@ class ThermalGyroscopes:
         """Return the biases at temperatures (n,), rad/s, shape (n, 3)."""
         laws = self.solution.laws
         rows = self.solution.coefficients[: self.size].reshape(3, -1)
-        found: Array = laws.of_bias(temperature) @ rows.T
-        return found
+        biases: Array = laws.of_bias(temperature) @ rows.T
+        return biases
 
     def sensitivities(self, gravity: float) -> Array:
         """Return G, rad/s per m/s^2, shape (3, 3)."""
@@ -322,9 +322,9 @@ class ThermalGyroscopes:
     def again(self, held: RatesAtRest) -> ThermalGyroscopes:
         """Return the same terms fitted to other means of the same holds, with the scatter that was found."""
         laws, scatter = self.solution.laws, self.solution.scatter
-        found = solve(held, laws, float(scatter.tau[0]), sensitivity=self.sensitivity, free=self.drift.free)
-        assert found is not None
-        return replace(self, held=held, solution=replace(found, scatter=scatter))
+        refitted = solve(held, laws, float(scatter.tau[0]), sensitivity=self.sensitivity, free=self.drift.free)
+        assert refitted is not None
+        return replace(self, held=held, solution=replace(refitted, scatter=scatter))
 
     @property
     def count(self) -> int:

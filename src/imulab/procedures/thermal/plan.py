@@ -129,22 +129,26 @@ class Design:
 
     def cost(self, covariance: Array) -> float:
         """Mean variance of a component of the corrected force; infinite where attitudes do not determine the laws."""
-        own = covariance[: self.laws.size, : self.laws.size]
-        return np.inf if np.diag(own).max() > _UNDETERMINED * (1 + self.tau**2) else float(np.trace(self.weight @ own))
+        of_laws = covariance[: self.laws.size, : self.laws.size]
+        return (
+            np.inf
+            if np.diag(of_laws).max() > _UNDETERMINED * (1 + self.tau**2)
+            else float(np.trace(self.weight @ of_laws))
+        )
 
     def deviations(self, covariance: Array) -> Array:
         """Standard deviation of a component of the corrected force at each place, its mean over directions."""
-        own = covariance[: self.laws.size, : self.laws.size]
-        found: Array = np.sqrt(np.einsum("tab,ba->t", self.weights, own))
-        return found
+        of_laws = covariance[: self.laws.size, : self.laws.size]
+        sd: Array = np.sqrt(np.einsum("tab,ba->t", self.weights, of_laws))
+        return sd
 
 
 def gradients(directions: Array) -> Array:
     """Return the derivatives of ``|f|`` / g by the nine parameters of a nominal sensor, shape (n, 9)."""
     nominal = np.tile(np.repeat([0.0, 1.0, 0.0], 3), (len(directions), 1))
     force, change = forces(nominal, directions)
-    found: Array = np.einsum("ni,nij->nj", force, change)
-    return found
+    rows: Array = np.einsum("ni,nij->nj", force, change)
+    return rows
 
 
 def exchange(design: Design, points: Array, counts: Sequence[int], seed: int) -> tuple[list[Array], Array]:
@@ -153,38 +157,38 @@ def exchange(design: Design, points: Array, counts: Sequence[int], seed: int) ->
     rows = gradients(points)
     products = (rows[:, :, None] * rows[:, None, :]).reshape(len(points), 81)
     chosen = [rng.choice(len(points), count, replace=False) for count in counts]
-    covariance = design.covariance([points[own] for own in chosen])
+    covariance = design.covariance([points[selected] for selected in chosen])
     for _ in range(_SWEEPS):
         moved = False
-        for soak, own in enumerate(chosen):
+        for soak, selected in enumerate(chosen):
             carried = design.carried[soak] / np.sqrt(design.variance)
-            taken = (points @ points[own].T > _CLOSEST).sum(axis=1)
-            for place in range(len(own)):
-                old = int(own[place])
+            taken = (points @ points[selected].T > _CLOSEST).sum(axis=1)
+            for place in range(len(selected)):
+                old = int(selected[place])
                 covariance = _added(covariance, rows[old] @ carried, -1.0)
                 taken -= points @ points[old] > _CLOSEST
-                seen = carried @ covariance
-                known = seen[:, : design.laws.size]
+                by_point = carried @ covariance
+                known = by_point[:, : design.laws.size]
                 drop = products @ (known @ design.weight @ known.T).ravel()
-                gain = drop / (1 + products @ (seen @ carried.T).ravel())
+                gain = drop / (1 + products @ (by_point @ carried.T).ravel())
                 gain[taken > 0] = -np.inf
                 best = int(np.argmax(gain))
                 best = best if gain[best] > gain[old] * (1 + 1e-9) else old
                 moved |= best != old
-                own[place] = best
+                selected[place] = best
                 covariance = _added(covariance, rows[best] @ carried, 1.0)
                 taken += points @ points[best] > _CLOSEST
         if not moved:
             break
-    sets = [points[own] for own in chosen]
+    sets = [points[selected] for selected in chosen]
     return sets, design.covariance(sets)
 
 
 def _added(covariance: Array, row: Array, sign: float) -> Array:
     """Return the covariance with one row of information more, or less."""
     carried = covariance @ row
-    found: Array = covariance - np.outer(carried, carried) / (sign + row @ carried)
-    return found
+    updated: Array = covariance - np.outer(carried, carried) / (sign + row @ carried)
+    return updated
 
 
 # What a schedule over temperature gives of the gyroscopes: rates at rest, and the turns that scale factors take.
@@ -314,8 +318,8 @@ def plan_gyroscopes(
     for temperature, up in soaks:
         law = np.tile(laws.design(np.array([temperature]))[0, 0, :size], (len(up), 1))
         rows = np.einsum("nc,ij->nijc", np.hstack([law, up]), np.eye(3)).reshape(len(up), 3, -1)
-        own = new_in_each(up, None)
-        weight = np.linalg.inv(walked + own @ np.swapaxes(own, 1, 2))
+        new_columns = new_in_each(up, None)
+        weight = np.linalg.inv(walked + new_columns @ np.swapaxes(new_columns, 1, 2))
         common = np.einsum("nij,njc->ic", weight, rows)  # by an offset of the power cycle
         share = tau**2 * np.linalg.inv(np.eye(3) + tau**2 * weight.sum(axis=0))
         information += np.einsum("nia,nij,njb->ab", rows, weight, rows) - common.T @ share @ common
@@ -452,11 +456,11 @@ class ThermalPlan(PlannedAttitudes):
         """Standard deviation of the corrected force, and rate, at temperatures over the range: name, text and unit."""
         places = np.linspace(0, len(self.temperature) - 1, _ROWS).round().astype(int).tolist()
         at = [f"at {self.temperature[k]:.0f} degC" for k in places]
-        found = [(f"corrected force {one}", _ug(self.deviation[k]), "ug") for one, k in zip(at, places, strict=True)]
+        rows = [(f"corrected force {place}", _ug(self.deviation[k]), "ug") for place, k in zip(at, places, strict=True)]
         if self.gyro is not None:
             rates = self.gyro.deviation[places].tolist()
-            found += [(f"corrected rate {one}", hourly(u), "deg/h") for one, u in zip(at, rates, strict=True)]
-        return found
+            rows += [(f"corrected rate {place}", hourly(u), "deg/h") for place, u in zip(at, rates, strict=True)]
+        return rows
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
         """Return the plan in a few sentences, and the schedule."""
@@ -555,9 +559,9 @@ class ThermalPlan(PlannedAttitudes):
         }
         if self.gyro is not None:
             traces[0]["name"] = "force"
-            own = [float(hourly(value)) for value in self.gyro.deviation]
+            rate_sd = [float(hourly(value)) for value in self.gyro.deviation]
             line = {"color": _RATE, "width": 2, "dash": "dash"}
-            traces.insert(1, {**traces[0], "name": "rate at rest", "y": own, "yaxis": "y2", "line": line})
+            traces.insert(1, {**traces[0], "name": "rate at rest", "y": rate_sd, "yaxis": "y2", "line": line})
             right = figure_axis("sd of the rate at rest, deg/h", rangemode="tozero", overlaying="y", side="right")
             layout |= {"yaxis2": {**right, "showgrid": False}, "margin": {"r": 75}}
         caption = "Of a component, root mean square over directions, without the turn-on offset of the day."
@@ -662,18 +666,18 @@ def plan_thermal(
     if not 0 <= tau < 1:
         raise OptionError(f"turn_on_scatter {turn_on_scatter!r}: expected 0 or more, less than 1 g")
     further = noise_and_scatter(gyro_noise, gyro_turn_on_scatter, asked=bool(further_of(with_, "with_")))
-    given = candidates_of(from_)
-    points = sphere_candidates() if given is None else given
+    stated = candidates_of(from_)
+    points = sphere_candidates() if stated is None else stated
     options = _allowed(count, **sizes)
-    found = [(each, _scan(laws, count, each, tau / sigma, points)) for each in options]
-    if not np.isfinite([cost for _, (cost, _) in found]).any():
+    best = [(each, _scan(laws, count, each, tau / sigma, points)) for each in options]
+    if not np.isfinite([cost for _, (cost, _) in best]).any():
         where = from_ if isinstance(from_, str) else "from_"
         raise ObservabilityError(
             f"{where}: {len(points)} candidate attitudes, {options[-1][1]} in each soak, cannot separate the "
             f"coefficients of degrees {','.join(map(str, laws.degrees))}; expected more time, lower degrees or other "
             "candidates"
         )
-    (soaks, _), _ = min(found, key=lambda each: each[1][0])
+    (soaks, _), _ = min(best, key=lambda each: each[1][0])
     design = _design(laws, count, soaks, tau / sigma)
     covariance, sets = _best(design, points, _counts(design, **sizes))
     deviation = sigma * STANDARD_GRAVITY * design.deviations(covariance)
@@ -694,7 +698,7 @@ def plan_thermal(
         turn_on_scatter=tau * STANDARD_GRAVITY,
         time=sizes["time"],
         tried=tuple(
-            Tried(k, n, unit * float(np.sqrt(cost)), unit * worst) for (k, n), (cost, worst) in found if cost < np.inf
+            Tried(k, n, unit * float(np.sqrt(cost)), unit * worst) for (k, n), (cost, worst) in best if cost < np.inf
         ),
         gyro=gyro,
     )
@@ -757,26 +761,26 @@ def _counts(design: Design, time: float, soak: float, attitude: float) -> list[i
     soaks = len(design.temperatures)
     whole = min(int((time + 1e-6 - soaks * soak) // attitude), soaks * _MOST)
     far = np.argsort(-np.abs(design.laws.place(design.temperatures)), kind="stable")
-    found = np.full(soaks, whole // soaks)
-    found[far[: whole % soaks]] += 1
-    return [int(n) for n in found]
+    counts = np.full(soaks, whole // soaks)
+    counts[far[: whole % soaks]] += 1
+    return [int(n) for n in counts]
 
 
 def _best(design: Design, points: Array, counts: Sequence[int]) -> tuple[Array, list[Array]]:
     """Return covariance and attitudes of several starts: the least at its worst of those as good in the mean."""
     counts = [min(count, len(points)) for count in counts]
-    found = [exchange(design, points, counts, seed) for seed in range(1, _STARTS + 1)]
-    least = min(design.cost(covariance) for _, covariance in found)
-    good = [each for each in found if design.cost(each[1]) <= _AS_GOOD * least]
+    best = [exchange(design, points, counts, seed) for seed in range(1, _STARTS + 1)]
+    least = min(design.cost(covariance) for _, covariance in best)
+    good = [each for each in best if design.cost(each[1]) <= _AS_GOOD * least]
     sets, covariance = min(good, key=lambda each: float(design.deviations(each[1]).max()))
     return covariance, sets
 
 
 def _scheduled(design: Design, sets: Sequence[Array], soak: float, attitude: float) -> list[PlannedSoak]:
     """Return the soaks in their order, with the side that each temperature is reached from."""
-    found, start, before = list[PlannedSoak](), 0.0, _ROOM
+    soaks, start, before = list[PlannedSoak](), 0.0, _ROOM
     for temperature, directions in zip(design.temperatures.tolist(), sets, strict=True):
         duration = soak + len(directions) * attitude
-        found.append(PlannedSoak(temperature, temperature > before, shortest_path(directions), start, duration))
+        soaks.append(PlannedSoak(temperature, temperature > before, shortest_path(directions), start, duration))
         start, before = start + duration, temperature
-    return found
+    return soaks

@@ -75,7 +75,7 @@ _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every
 def make_record(
     holds: Holds,
     problem: ThermalProblem,
-    found: ChosenLaws,
+    chosen: ChosenLaws,
     drift: LagAndLoops,
     gravity: Gravity,
     scale: Array,
@@ -83,7 +83,7 @@ def make_record(
     name: str,
 ) -> Calibration:
     """Turn a solution in units of g into the record."""
-    solution, g = found.solution, gravity.value
+    solution, g = chosen.solution, gravity.value
     laws = solution.laws
     values, matrix = in_si_powers(solution, gravity, scale)
     names, units = laws.names(), laws.units(holds.unit)
@@ -115,7 +115,7 @@ def make_record(
                 gauge=_GAUGE,
             )
         ),
-        fit=entries(_summary(holds, residual, found, drift, options, g)),
+        fit=entries(_summary(holds, residual, chosen, drift, options, g)),
         options=dict(options),
         data=entries(
             ThermalEvidence(
@@ -125,7 +125,7 @@ def make_record(
         ),
         sensor=sensor,
         sources=sources,
-        warnings=tuple(_findings(holds, problem, found, drift, gravity, options, name)),
+        warnings=tuple(_findings(holds, problem, chosen, drift, gravity, options, name)),
     )
 
 
@@ -139,10 +139,10 @@ def at_reference(laws: Laws, values: Array, covariance: Array, kind: str, unit: 
 
 
 def _summary(
-    holds: Holds, residual: Array, found: ChosenLaws, drift: LagAndLoops, options: Mapping[str, Any], g: float
+    holds: Holds, residual: Array, chosen: ChosenLaws, drift: LagAndLoops, options: Mapping[str, Any], g: float
 ) -> ThermalSummary:
     """Return how the laws were chosen, and how well they fit."""
-    solution, effects = found.solution, drift_effects(drift, g)
+    solution, effects = chosen.solution, drift_effects(drift, g)
     return ThermalSummary(
         recordings=len(holds.recordings),
         holds=len(holds),
@@ -151,13 +151,13 @@ def _summary(
         excess=Length(value=g * solution.excess, unit="m/s^2"),
         chi_square=solution.chi_square,
         degrees_of_freedom=solution.freedom,
-        condition_number=found.view.condition,
+        condition_number=chosen.view.condition,
         between_recordings=_turn_on(solution, options, g),
         left_out_temperature=[
             LeftOutTemperature(
                 temperature=each.temperature, holds=each.holds, rms=g * each.rms, chi_square=each.chi_square
             )
-            for each in found.left_out
+            for each in chosen.left_out
         ],
         degrees=[
             DegreesTried(
@@ -167,7 +167,7 @@ def _summary(
                 chosen=step.chosen,
                 knots=step.knots,
             )
-            for step in found.steps
+            for step in chosen.steps
         ],
         lag=effects["lag"],
         loop_x=effects["loop_x"],
@@ -291,15 +291,15 @@ def _findings(
     name: str,
 ) -> list[str]:
     solution = fitted.solution
-    found = [*(note for r in holds.recordings for note in r.notes), *holds.notes]
-    found += gravity_findings(gravity, holds.recordings[0])
+    messages = [*(note for r in holds.recordings for note in r.notes), *holds.notes]
+    messages += gravity_findings(gravity, holds.recordings[0])
     if not solution.scatter.rank and "turn_on_scatter" not in options:
-        found.append(
+        messages.append(
             f"{name}: too few recordings to tell how far biases move from one power cycle to the next, so no "
             "uncertainty holds that: record more temperatures or come back to some, or state --turn-on-scatter"
         )
     if solution.scatter.bound:
-        found.append(
+        messages.append(
             Note(
                 f"{name}: a spline cannot tell the offset of a power cycle from the law where a temperature has one "
                 f"recording; {1e3 * solution.scatter.tau[0]:.2g} mg, what polynomials of degree 3 leave, counts as the "
@@ -308,39 +308,39 @@ def _findings(
         )
     if fitted.missed:
         higher, probability = fitted.missed
-        found.append(
+        messages.append(
             f"{name}: degrees {solution.laws.spelled} are too low: what {','.join(map(str, higher))} add has a "
             f"probability of {probability:.1g} by chance, and no uncertainty holds what is missing: state higher "
             "ones, or leave --degrees out"
         )
     else:
-        found += disagreements(holds, problem, solution, name)
+        messages += disagreements(holds, problem, solution, name)
     if options["degrees"] == "auto" and not solution.laws.degrees[0] and solution.scatter.tau[0] > 0:
-        found.append(
+        messages.append(
             f"{name}: the recordings' biases differ by {1e3 * solution.scatter.tau[0]:.2g} mg (standard deviation); so "
             "few recordings do not tell whether by their temperature or from power cycle to power cycle: record five "
             "temperatures or more, or state --degrees"
         )
-    found += bias_shift_from_unobserved(problem, solution, drift, name)
+    messages += bias_shift_from_unobserved(problem, solution, drift, name)
     if options["degrees"] == "auto":
-        found.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
+        messages.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
     far = [each for each in fitted.left_out if each.chi_square > TEMPERATURE_MISSED.limit**2]
-    found += [
+    messages += [
         f"{each.temperature:.0f} degC, left out, is missed by {1e6 * each.rms:.0f} ug rms, more than its uncertainty "
         "explains: the unit's law has a bend between the temperatures; record one more there"
         for each in far
     ]
-    found += findings(drift, solution, name)
+    messages += findings(drift, solution, name)
     rows = solution.rows
     # What recordings have in common is expected of power cycles, and no hold's own.
-    whole, own = (together(rows, solution.excess**2, tau) for tau in (solution.scatter.tau, np.zeros(2)))
-    left = own @ np.linalg.solve(whole, rows.residual)
+    whole, noise = (together(rows, solution.excess**2, tau) for tau in (solution.scatter.tau, np.zeros(2)))
+    left = noise @ np.linalg.solve(whole, rows.residual)
     standard = np.abs(left) / np.sqrt(np.diag(rows.noise) + solution.excess**2)
     out = np.flatnonzero((standard > HOLD_DISAGREEMENT.limit) & (rows.owner >= 0))
     for index in out[np.argsort(-standard[out], kind="stable")][:_MOST_NAMED].tolist():
         what = "its magnitude" if rows.magnitude[index] else "its direction, although nothing was to move: a knock?"
-        found.append(f"{holds.label(int(rows.owner[index]))} stands out by {standard[index]:.0f} u in {what}")
-    return found
+        messages.append(f"{holds.label(int(rows.owner[index]))} stands out by {standard[index]:.0f} u in {what}")
+    return messages
 
 
 def law_at(record: Calibration, names: Sequence[str], functions: Array) -> tuple[Array, Array]:
@@ -353,12 +353,12 @@ def predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
     """Return the nine parameters over temperature and their standard uncertainties, SI, shapes (9, n)."""
     model = thermal_of(record).model
     laws, about = model.laws, model.reference_temperature.value
-    found = [
+    by_group = [
         law_at(record, laws.named(group, f"{kind}_{axis}"), laws.recorded(group, temperature, about))
         for group, (kind, axes) in enumerate(GROUPS)
         for axis in axes
     ]
-    return np.array([values for values, _ in found]), np.array([spread for _, spread in found])
+    return np.array([values for values, _ in by_group]), np.array([spread for _, spread in by_group])
 
 
 def deviation_of_force(record: Calibration, temperature: Array) -> Array:
@@ -370,8 +370,8 @@ def deviation_of_force(record: Calibration, temperature: Array) -> Array:
     values, spread = predicted(record, temperature)
     g = thermal_of(record).model.gravity.value
     relative = np.concatenate([spread[:3] / g, spread[3:6] / np.abs(values[3:6]), spread[6:]])
-    found: Array = g * np.sqrt(SHARES @ relative**2)
-    return found
+    sd: Array = g * np.sqrt(SHARES @ relative**2)
+    return sd
 
 
 # The gyroscopes' part of a thermal record.
@@ -388,9 +388,9 @@ def with_gyroscopes(
     coefficients, covariance = gyros.solution.coefficients[:n], gyros.solution.covariance[:n, :n]
     freedom = [gyros.solution.degrees_of_freedom(row) for row in matrix]
     if turned is not None:
-        own, more, their_units = scale_to_si(turned, gyros.held.size, gyros.held.unit)
+        accel_names, more, their_units = scale_to_si(turned, gyros.held.size, gyros.held.unit)
         names, units, freedom = names + more, units + their_units, freedom + [np.inf] * len(more)
-        matrix = block_diagonal(matrix, own)
+        matrix = block_diagonal(matrix, accel_names)
         coefficients = np.concatenate([coefficients, turned.coefficients])
         covariance = joint_covariance(gyros, turned)
     values, covariance = matrix @ coefficients, matrix @ covariance @ matrix.T
@@ -442,8 +442,8 @@ def scale_to_si(turned: ScaleLaws, size: Array, output: str) -> tuple[Array, lis
     names: list[str] = []
     units: list[str] = []
     for k, axis in enumerate(AXES):
-        own = slice(k * width, (k + 1) * width)
-        matrix[own, own] = powers * size[k] * unit
+        factor = slice(k * width, (k + 1) * width)
+        matrix[factor, factor] = powers * size[k] * unit
         law = law_names(f"gyro_scale_factor_{axis}", f"{output}/(rad/s)", turned.degree)
         names, units = names + law[0], units + law[1]
     return matrix, names + list(MISALIGNMENTS), units + ["rad"] * len(MISALIGNMENTS)
@@ -513,15 +513,15 @@ def _gyro_hold_residuals(holds: Holds, gyros: ThermalGyroscopes) -> GyroHoldResi
 def _gyro_findings(
     record: Calibration, holds: Holds, gyros: ThermalGyroscopes, turned: ScaleLaws | None, name: str
 ) -> list[str]:
-    found = [*gyros.held.notes, *([] if gyros.held.earth is None else [gyros.held.earth.note()])]
-    found += notes_on_turns(holds, gyros.aside)
+    messages = [*gyros.held.notes, *([] if gyros.held.earth is None else [gyros.held.earth.note()])]
+    messages += notes_on_turns(holds, gyros.aside)
     scatter = gyros.solution.scatter
     if not scatter.rank and "gyro_turn_on_scatter" not in record.options:
-        found.append(
+        messages.append(
             f"gyro: {name}: too few recordings to tell how far biases move from one power cycle to the next, so no "
             "uncertainty holds that: record more temperatures or come back to some, or state --gyro-turn-on-scatter"
         )
-    found += [
+    messages += [
         f"gyro: {each.temperature:.0f} degC, left out, is missed by {np.degrees(each.rms):.2g} deg/s rms, more than "
         "its uncertainty explains: the law has a bend between the temperatures; record one more there"
         for each in gyros.left_out
@@ -529,20 +529,20 @@ def _gyro_findings(
     ]
     if scatter.bound:
         left = np.degrees(3600 * scatter.tau[0])
-        found.append(
+        messages.append(
             Note(
                 f"gyro: {name}: a spline cannot tell the offset of a power cycle from the law where a temperature has "
                 f"one recording; {left:.3g} deg/h, what polynomials of degree 3 leave, counts as the scatter between "
                 "power cycles, an upper bound: come back to temperatures to learn more"
             )
         )
-    found += _drifts(gyros, name)
+    messages += _drifts(gyros, name)
     laws = gyros.solution.laws
     bias = f"bias by a spline with {len(laws.knots)} knots" if laws.knots else f"bias of degree {laws.degrees[0]}"
     if turned is None:
-        return [*found, Note(f"gyro: {bias}; no turns tell the scale factors, which are as stated")]
-    said = f"gyro: {bias}, scale factor of degree {turned.degree} from {turned.turns} turns"
-    return [*found, *turned.notes, Note(said)]
+        return [*messages, Note(f"gyro: {bias}; no turns tell the scale factors, which are as stated")]
+    summary = f"gyro: {bias}, scale factor of degree {turned.degree} from {turned.turns} turns"
+    return [*messages, *turned.notes, Note(summary)]
 
 
 def _drifts(gyros: ThermalGyroscopes, name: str) -> list[str]:

@@ -278,11 +278,11 @@ class ThermalSolution:
         """Return Satterthwaite's degrees of freedom of ``weights . coefficients``, which may be the first ones only."""
         n = len(weights)
         whole = float(weights @ self.covariance[:n, :n] @ weights)
-        own = 1 / self.excess_freedom if np.isfinite(self.excess_freedom) else 0.0
+        reciprocal = 1 / self.excess_freedom if np.isfinite(self.excess_freedom) else 0.0
         if self.scatter.rank:
             share = float(weights @ self.by_tau[:n, :n] @ weights) * self.scatter.spread[0] / max(whole, 1e-300)
-            own += min(share, 1.0) ** 2 / self.scatter.rank
-        return 1 / own if own > 0 else np.inf
+            reciprocal += min(share, 1.0) ** 2 / self.scatter.rank
+        return 1 / reciprocal if reciprocal > 0 else np.inf
 
 
 def solve(problem: ThermalProblem, laws: Laws, *, tau: float | None = None) -> ThermalSolution:

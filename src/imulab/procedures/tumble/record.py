@@ -663,9 +663,9 @@ def predicted_rows(uncertainties: dict[str, float]) -> list[tuple[str, str, str]
 def rows(record: Calibration) -> list[Row]:
     """Return the parameters as they are read, the outputs at zero specific force included for counts and volts."""
     output = model_of(record).output_unit
-    found = rows_of(record)
+    table = rows_of(record)
     if parse_unit(output).quantity == "acceleration":
-        return found
+        return table
     zeros = [Row(f"zero_output_{a}", z.value, z.standard_uncertainty, output) for a, z in zero_outputs(record).items()]
-    after = next((number for number, row in enumerate(found, start=1) if row.name == "bias_z"), len(found))
-    return found[:after] + zeros + found[after:]
+    after = next((number for number, row in enumerate(table, start=1) if row.name == "bias_z"), len(table))
+    return table[:after] + zeros + table[after:]
