@@ -138,7 +138,7 @@ def test_a_quantity_that_is_reported_from_the_second_chunk_on_is_there(tmp_path,
     path = official(tmp_path / "a.mcap", (stamps, accel, gyro))
     recording = il.read(path)
     np.testing.assert_array_equal(recording.triad("gyro"), gyro)
-    monkeypatch.setattr("imulab.readers.rosbag._ENOUGH", 60)
+    monkeypatch.setattr("imulab.readers.rosbag._SAMPLES_LOOKED_AT", 60)
     assert "gyro_x" not in il.read(path)
 
 

@@ -303,7 +303,7 @@ BAD_MANIFESTS = {
     "standard input": ("serial,procedure,file\nA,tumble,-\n", ["expected names of files, found '-'"]),
     "option of another": (
         "serial,procedure,file,order\nA,tumble,a.csv,1\nB,array,b.csv,1\n",
-        ["row 2 (line 3), column order: not an option of array; its options: interval"],
+        ["row 2 (line 3), column order: not an option of array; its options: averaging method memory"],
     ),
     "bad option": (
         "serial,procedure,file,order\nA,tumble,a.csv,9\n",

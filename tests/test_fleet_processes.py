@@ -2,7 +2,6 @@
 
 import os
 import platform
-import resource
 import signal
 import subprocess
 import sys
@@ -116,22 +115,7 @@ def test_no_more_processes_than_this_one_may_use(monkeypatch):
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "1\n"
 
 
-def faults_of_a_second_use() -> int:
-    before = 0
-    for _ in range(2):
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        parts = [b"x" * (3 << 20) for _ in range(5)]
-        del parts
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's")
-def test_memory_that_one_unit_has_used_is_kept_for_the_next():
-    (kept,) = engine.run(faults_of_a_second_use, [()], 1)
-    pages = 5 * (3 << 20) // resource.getpagesize()
-    assert kept < 0.05 * pages
-
-
 def test_what_is_ended_in_vain_ends_without_a_word(capfd):
     """As joblib's thread does now and then, which looks for work that has just been dropped."""
 

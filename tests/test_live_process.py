@@ -209,5 +209,5 @@ def test_the_view_has_gyroscopes_and_magnetometers_while_the_session_lasts(tmp_p
     assert abs(rows["dip"].value - 67) < 6 * rows["dip"].standard_uncertainty
     for axis in "xyz":
         bias, truth = rows[f"gyro_bias_{axis}"], float(recording.metadata[f"truth_gyro_bias_{axis}"])
-        assert abs(bias.value - np.degrees(truth)) < 6 * bias.standard_uncertainty
+        assert abs(bias.value - 3600 * np.degrees(truth)) < 6 * bias.standard_uncertainty
         assert rows[f"gyro_scale_factor_{axis}"].standard_uncertainty is not None

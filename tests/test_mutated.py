@@ -110,7 +110,7 @@ def tried(do, *arguments, **options):
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("procedure", ["tumble", "gyro_array", "warmup", "centrifuge"])
 def test_a_mutated_record_works_or_is_refused_in_words(procedure, real, tmp_path, reduced):
-    trials = 12 if reduced else 60
+    trials = 24 if reduced else 60
     record, recording = real[procedure]
     content, rng, loaded = json.loads(record.to_json()), random.Random(f"{procedure} 1"), 0
     for _ in range(trials):

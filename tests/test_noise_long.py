@@ -117,7 +117,7 @@ def test_a_faulty_log_is_looked_at_as_a_whole(kind):
 def test_a_large_file_gives_the_record_of_a_small_one(tmp_path, monkeypatch, kind):
     file = tmp_path / "log.csv"
     il.write_csv(Recording(holes(faulty(kind)), UNITS, {"serial": "7"}), file)
-    options = {option.name: None for option in procedure.OPTIONS} | {"regress": "temperature"}
+    options = {option.name: None for option in procedure.TASK.options} | {"regress": "temperature"}
 
     def outcome():
         try:

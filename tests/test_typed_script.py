@@ -13,17 +13,17 @@ import polars
 from numpy.typing import NDArray
 
 import imulab as il
-from imulab.report.plots import Plot, Plots
+from imulab.views import AnyPlot, AnyPlots
 
 recording: il.Recording = il.Recording.from_arrays(accel=np.ones((9, 3)), rate=100.0, unit="g")
 fit: il.TumbleFit = il.fit_tumble(recording, order=1, gravity=9.81, window=(1, 9))
 fit.save("sn42.json")
-every: Plots = fit.plot()
-one: Plot = fit.plot("residual")
+every: AnyPlots = fit.plot()
+one: AnyPlot = fit.plot("residual")
 one.save("residuals.html")
 layout: dict[str, object] = one.to_dict()
 first: Plot = every["sphere"]
-drawn: Plots = recording.plot()
+drawn: AnyPlots = recording.plot()
 covariance: NDArray[np.float64] = fit.cov("bias_x", "bias_y")
 rows: int = fit.to_frame("polars").height
 samples: polars.DataFrame = recording.to_frame("polars")

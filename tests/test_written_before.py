@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,11 +52,22 @@ def correct(record: Path, name: str, out: Path) -> il.Recording:
     return il.read(out)
 
 
-def assert_same_columns(actual: il.Recording, expected: il.Recording) -> None:
+def assert_same_columns(actual: il.Recording, expected: il.Recording, left_alone: Sequence[str] = ()) -> None:
+    """Compare recordings; the columns `left_alone` must be those that were to be corrected."""
     assert actual.units == expected.units
     assert list(actual.columns) == list(expected.columns)
     for title, values in expected.columns.items():
-        np.testing.assert_allclose(actual.columns[title], values, rtol=1e-13, atol=1e-13, err_msg=title)
+        if title not in left_alone:
+            np.testing.assert_allclose(actual.columns[title], values, rtol=1e-13, atol=1e-13, err_msg=title)
+    recording = il.read(WRITTEN / "recordings" / "turns.csv")
+    for title in left_alone:
+        np.testing.assert_array_equal(actual.columns[title], recording.columns[title])
+
+
+def not_held(name: str, kind: str) -> list[str]:
+    """Gyroscopes that a blob of turns does not hold: 0.2.0 passed them through the core all the same, as floats."""
+    axes = json.loads((WRITTEN / "0.2.0" / f"{name}.json").read_text())["model"].get("axes", "xyz")
+    return [f"gyro_{axis}" for axis in "xyz" if axis not in axes] if name == "turns" and kind == "blob" else []
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -86,7 +99,7 @@ def test_a_record_is_shown_drawn_and_written_again(version, name, tmp_path, caps
 def test_a_record_and_its_blob_correct_as_before(version, name, kind, tmp_path):
     expected = il.read(WRITTEN / version / f"{name}.{kind}.applied.csv")
     actual = correct(WRITTEN / version / f"{name}.{kind}", name, tmp_path / "out.csv")
-    assert_same_columns(actual, expected)
+    assert_same_columns(actual, expected, not_held(name, kind))
     hashes = [[text.rpartition("sha256:")[2] for text in file.corrected_by] for file in (actual, expected)]
     assert hashes[0] == hashes[1]
 
@@ -95,7 +108,9 @@ def test_a_record_and_its_blob_correct_as_before(version, name, kind, tmp_path):
 def test_firmware_exported_today_corrects_as_the_blob_that_was_written(version, name, tmp_path):
     assert main(["export", str(WRITTEN / version / f"{name}.json"), "--to", "c", "-o", str(tmp_path / "c")]) == 0
     expected = il.read(WRITTEN / version / f"{name}.blob.applied.csv")
-    assert_same_columns(correct(tmp_path / "c" / "unit.blob", name, tmp_path / "out.csv"), expected)
+    assert_same_columns(
+        correct(tmp_path / "c" / "unit.blob", name, tmp_path / "out.csv"), expected, not_held(name, "blob")
+    )
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -110,7 +110,7 @@ def fit_warmup(
     settling_time
         T_M; chosen from the data if not given. In s.
     settling_limit
-        Settled below this: percent of the peak, or deg/h, mg ... A share of the largest |Z|, a rate or an acceleration
+        Settled below this: percent of the peak, or deg/h, mg ... A share of the largest Z, a rate or an acceleration
         as a text; or kind (``gyro``, ``accel``) to size in SI, 5 % of the largest for one that is not named.
     exit
         What the table gives from T_M on.
