@@ -22,7 +22,7 @@ every: AnyPlots = fit.plot()
 one: AnyPlot = fit.plot("residual")
 one.save("residuals.html")
 layout: dict[str, object] = one.to_dict()
-first: Plot = every["sphere"]
+first: AnyPlot = every["sphere"]
 drawn: AnyPlots = recording.plot()
 covariance: NDArray[np.float64] = fit.cov("bias_x", "bias_y")
 rows: int = fit.to_frame("polars").height
