@@ -671,11 +671,15 @@ _FOLLOWS = 0.9
 def temperature_slopes(
     recordings: Sequence[Recording], dwells: Sequence[Dwells], problem: RateProblem, solution: RateSolution
 ) -> dict[str, Parameter]:
-    """Return ``gyro_scale_factor_slope_i``, 1/K, of each gyroscope whose runs tell it from a drift over time."""
+    """Return ``gyro_scale_factor_slope_i``, 1/K, of each gyroscope whose runs tell it from a drift over time.
+
+    It is c of ``mean output = S (1 + c dT) w + d dT + ...``, w the rate, dT the temperature less its mean, and the dots
+    the columns of `design`; by least squares over the dwells, weighted by their noise.
+    """
     temperature = _temperatures(recordings, dwells)
     if temperature is None:
         return {}
-    means = without_lean(problem, [slopes[: len(problem.faces)] for slopes in solution.coefficients])
+    means = without_lean(problem, [row[: len(problem.faces)] for row in solution.coefficients])
     time = np.arange(len(temperature), dtype=np.float64)  # of dwells in order: runs have clocks of their own
     slopes = {}
     for i, axis in enumerate(problem.gyros):
