@@ -205,11 +205,8 @@ def fit_gyro_triad(
     linearity = test_linearity(segments, solved.scale, solved.theta, jacobian, residual, shared, variance)
     if linearity is not None:
         notes += linearity.notes()
-    return _on_earth(
-        _triad_of_solution(solved, matrix, miss, unit, fit_bias, conditioning, known, linearity, tuple(notes)),
-        case,
-        earth,
-    )
+    fit = _triad_of_solution(solved, matrix, miss, unit, fit_bias, conditioning, known, linearity, tuple(notes))
+    return _on_earth(fit, case, earth)
 
 
 def _on_earth(fit: GyroFit, case: TurnProblem, earth: EarthRate | None) -> GyroFit:
