@@ -64,8 +64,8 @@ def moved(group, axis, power, by):
     ],
 )
 def test_a_record_that_holds_fails_once_in_twenty(at, count, unit, reduced):
-    """At most 5 %, within what trials tell: a binomial of 5 % lies below 9 % of 200, up to 20 % of 20, with 99 %."""
-    trials, most = (20, 0.2) if reduced else (200, 0.09)
+    """At most 5 %, within what trials tell: a binomial of 5 % lies below 9 % of 200, below 15 % of 50, with 99 %."""
+    trials, most = (50, 0.15) if reduced else (200, 0.09)
     assert share_of_alarms(trials, at, count, **unit) < most
 
 
