@@ -1,11 +1,145 @@
-"""Normal gravity against published values and against the exact field of the ellipsoid."""
+"""What is known of local gravity, and what is not: its value, its uncertainty, and what they do to a record."""
 
 import math
 
+import numpy as np
 import pytest
 
+import imulab as il
+from conftest import table
 from imulab.errors import OptionError
-from imulab.gravity import normal_gravity
+from imulab.gravity import ANOMALY, gravity_option, normal_gravity, stated_gravity
+from imulab.procedures.views import compare_records
+from reference import tumble as reference
+
+G = 9.81362
+
+
+SIGMA = 1e-4
+
+
+def recording_of(truth, order=3, seed=1, unit="m/s^2", head=None):
+    rng = np.random.default_rng(seed)
+    ups = reference.random_attitudes(rng, 40)
+    data = np.array([reference.forward(G * u, truth, order) for u in ups])
+    found = table(data + SIGMA * truth["scale_factor_x"] * rng.standard_normal(data.shape), unit)
+    return found if head is None else il.Recording(found.columns, found.units, metadata={"gravity": head}, name="t.csv")
+
+
+def fit(recording, gravity, order=3, **options):
+    return il.fit_tumble(il.find_attitudes(recording), order=order, gravity=gravity, **options).calibration
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "uncertainty"),
+    [
+        ("9.81362+-0.00002", 9.81362, 2e-5),
+        ("9.81362 ± 0.00002", 9.81362, 2e-5),
+        ("9.81362+/-20ug", 9.81362, 20e-6 * 9.80665),
+        ("981.362e-2 m/s^2 +- 0", 9.81362, 0.0),
+        ("9.81362", 9.81362, 0.0),
+        ("9.8136", 9.8136, 0.5e-4 / np.sqrt(3)),
+        ("9.81", 9.81, 0.5e-2 / np.sqrt(3)),
+        ("9.8 m/s^2", 9.8, 0.5e-1 / np.sqrt(3)),
+        ("1.0007 g", 1.0007 * 9.80665, 0.5e-4 * 9.80665 / np.sqrt(3)),
+    ],
+)
+def test_a_stated_gravity_has_the_uncertainty_that_is_said_or_that_its_digits_say(text, value, uncertainty):
+    found = stated_gravity(text, "--gravity")
+    assert found.value == pytest.approx(value, rel=1e-15)
+    assert found.standard_uncertainty == pytest.approx(uncertainty, rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize("text", ["9.8+-", "9.8+--0.1", "9.8+-2", "9.8+-soft", "9.8+-1e-5+-1e-6", "9.8+-0.1 s"])
+def test_an_uncertainty_that_is_none_is_refused(imulab, text):
+    with pytest.raises(OptionError, match=r"^--gravity '9\.8"):
+        stated_gravity(text, "--gravity")
+    done = imulab("tumble", "fit", "nothing.csv", "--gravity", text)
+    assert done.returncode == 2
+    assert done.stderr.startswith("imulab: --gravity '9.8")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["0", "0.000000", "-9.81", "981", "0+-0"])
+def test_a_gravity_of_no_place_is_refused(imulab, text):
+    with pytest.raises(OptionError, match=rf"^gravity {float(text.split('+')[0]):g}: expected the local value"):
+        stated_gravity(text, "--gravity")
+    done = imulab("tumble", "fit", "nothing.csv", "--gravity", text)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    truth = reference.random_truth(np.random.default_rng(3), 3)
+    silent = fit(recording_of(truth, head=text), None)
+    assert silent.model["gravity"]["from"] == "standard gravity, none given"
+
+
+def test_normal_gravity_has_the_uncertainty_of_the_anomaly_and_of_a_height_that_is_not_given():
+    known, guessed = (gravity_option(None, "48.137", height, "--{}") for height in ("520", None))
+    assert known.standard_uncertainty == pytest.approx(ANOMALY, rel=0.01)
+    assert 9e-6 < ANOMALY / G < 51e-6
+    assert guessed.standard_uncertainty == pytest.approx(np.hypot(ANOMALY, 400 * 3.086e-6), rel=0.01)
+    assert "--height lowers it" in guessed.note
+    coarse = gravity_option(None, "48", "520", "--{}").standard_uncertainty
+    slope = 9.7803 * 0.0053 * np.sin(2 * np.radians(48))  # of normal gravity, m/s^2/rad, to a percent
+    assert np.sqrt(coarse**2 - ANOMALY**2) == pytest.approx(slope * np.radians(0.5) / np.sqrt(3), rel=0.02)
+    assert gravity_option(None, "90", "0", "--{}").standard_uncertainty == pytest.approx(ANOMALY)
+
+
+@pytest.mark.parametrize("unit", ["m/s^2", "count"])
+def test_what_gravity_does_to_the_parameters_is_what_another_gravity_does_to_a_fit(unit):
+    truth = reference.random_truth(np.random.default_rng(2), 3, 1.0 if unit == "m/s^2" else 400.0)
+    recording, u = recording_of(truth, unit=unit), 1e-3
+    record = fit(recording, f"{G}+-{u}")
+    exact, low, high = (fit(recording, g) for g in (G, G - u, G + u))
+    shared = record.fit["shared"][f"gravity {G!r} +- {u!r} m/s^2"]
+    for name in record.parameters:
+        moved = (high.value(name) - low.value(name)) / 2
+        assert shared[name] == pytest.approx(moved, rel=1e-3, abs=1e-6 * abs(record.value(name))), name
+        own = exact.parameters[name].standard_uncertainty
+        assert record.parameters[name].standard_uncertainty == pytest.approx(np.hypot(own, moved), rel=1e-3), name
+        assert record.value(name) == exact.value(name)
+    block = record.covariance.block([f"scale_factor_{axis}" for axis in "xyz"])
+    sigma = np.sqrt(np.diag(block))
+    assert (block / np.outer(sigma, sigma)).min() > 0.9
+    assert record.model["gravity"] == {"value": G, "unit": "m/s^2", "standard_uncertainty": u, "from": "argument"}
+    assert "shared" not in exact.fit
+
+
+def test_trials_draw_gravity_too():
+    truth = reference.random_truth(np.random.default_rng(2), 1)
+    trials = fit(recording_of(truth, 1), f"{G}+-0.001", 1, monte_carlo=2000)
+    for name, found in trials.fit["monte_carlo"]["parameters"].items():
+        expected = trials.parameters[name].standard_uncertainty
+        assert found["standard_deviation"] == pytest.approx(expected, rel=0.1), name
+
+
+def test_two_records_of_one_place_have_its_gravity_in_common():
+    truth = reference.random_truth(np.random.default_rng(2), 1)
+    moved = truth | {"scale_factor_x": truth["scale_factor_x"] * (1 + 1e-4)}
+    pairs = {g: [fit(recording_of(t, 1, s), g, 1) for s, t in ((1, truth), (2, moved))] for g in (G, f"{G}+-0.01")}
+    exact, known = (compare_records(*pair) for pair in pairs.values())
+    for one, other in zip(exact.changes, known.changes, strict=True):
+        assert other.standard_uncertainty == pytest.approx(one.standard_uncertainty, rel=1e-3)
+    assert known.probability == pytest.approx(exact.probability, rel=1e-2)
+    assert [change.name for change in known.changes if change.significant] == ["scale_factor_x"]
+    elsewhere = compare_records(pairs[f"{G}+-0.01"][0], fit(recording_of(moved, 1, 2), f"{G}+-0.011", 1))
+    assert not any(change.significant for change in elsewhere.changes)
+
+
+def test_the_head_of_a_file_is_believed_and_named():
+    truth = reference.random_truth(np.random.default_rng(2), 1)
+    record = fit(recording_of(truth, 1, head="9.81362+-0.00002 m/s^2"), None, 1)
+    assert record.model["gravity"]["value"] == G
+    assert record.model["gravity"]["standard_uncertainty"] == 2e-5
+    assert record.model["gravity"]["from"] == "head of t.csv"
+    assert any("(± 2.04 ppm) was taken from the head of t.csv" in w for w in record.warnings)
+    assert record.verdict.state == "good"
+    silent = fit(recording_of(truth, 1, head="unknown"), None, 1)
+    assert silent.model["gravity"]["value"] == 9.80665
+    assert silent.verdict.state == "look"
+    expected = 0.0265 / np.sqrt(3) / 9.80665
+    for axis in "xyz":
+        scale = silent.parameters[f"scale_factor_{axis}"]
+        assert scale.standard_uncertainty / scale.value == pytest.approx(expected, rel=0.01)
+        assert abs(scale.value / truth[f"scale_factor_{axis}"] - 1) < 2 * expected
 
 
 # NIMA TR8350.2 (3rd edition): gravity at the equator and at the pole of WGS 84, m/s^2; 45 deg as printed by the usual
@@ -26,6 +160,8 @@ def test_the_first_metres_cost_the_usual_free_air_gradient():
 
 
 A, F = 6378137.0, 1 / 298.257223563  # m; TR8350.2 tables 3.1 to 3.4
+
+
 GM, OMEGA = 3986004.418e8, 7292115e-11  # m^3/s^2, rad/s
 
 

@@ -10,7 +10,7 @@ from imulab.cli import main
 from imulab.cli.app import commands
 from imulab.errors import DataError, OptionError
 from imulab.readers import read_blocks
-from test_flight_logs import low_rate_log
+from test_readers_logs import low_rate_log
 
 PART = {"layout", "topic", "instance", "window"}
 NOT_BY_ELEMENT = {"array merge", "array calibrate", "array fuse", "array compare"}

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import imulab as il
 from conftest import table
@@ -11,6 +12,8 @@ from imulab.errors import DataError, ObservabilityError, OptionError
 from reference import tumble as reference
 
 G = 9.80665
+
+
 NATURAL = {"b": 0.05 * G, "s": 1.0, "m": 0.03, "2": 5e-3 / G, "3": 2e-3 / G**2, "4": 1e-3 / G**3, "5": 5e-4 / G**4}
 
 
@@ -208,7 +211,11 @@ def test_exactly_as_many_attitudes_as_parameters_state_no_uncertainty():
 
 
 FACES = np.vstack([np.eye(3), -np.eye(3)])
+
+
 EDGES = np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]) / np.sqrt(2)
+
+
 EIGHTEEN = np.vstack([FACES, EDGES, np.roll(EDGES, 1, axis=1), np.roll(EDGES, 2, axis=1)])
 
 
@@ -293,3 +300,260 @@ def test_without_gravity_the_standard_value_is_used_and_warned_of():
     found = fit(data, 1, gravity=None).calibration
     assert found.model["gravity"]["value"] == 9.80665
     assert any("no local gravity" in w and "scale factor" in w for w in found.warnings)
+
+
+G_LINEARISED = 9.81362
+
+
+ARCSECOND = np.pi / 180 / 3600
+
+
+SOURCE = (5e-6, 2e-6 * G_LINEARISED, 3 * ARCSECOND)
+
+
+def outputs_linearised(directions, *, seed=3, part=0.5):
+    """Outputs of a MEMS triad whose errors are scaled by `part`."""
+    truth = reference.random_truth(np.random.default_rng(seed), 2)
+    nominal = {name: float(name[0] == "s") for name in truth}
+    truth = {name: nominal[name] + part * (value - nominal[name]) for name, value in truth.items()}
+    return np.array([reference.forward(G_LINEARISED * up, truth, 2) for up in directions])
+
+
+def fit_linearised(data, **options):
+    return il.fit_tumble(
+        il.find_attitudes(table(data, "m/s^2", None)), order=2, gravity=G_LINEARISED, method="linearised", **options
+    ).calibration
+
+
+def test_each_error_of_the_model_is_its_own_unknown_of_the_sources_equation():
+    """The signs and the pairing of products that docs/tumble_method.md states, from the forward model alone."""
+    names, size = reference.names(2), 1e-6
+    ups = reference.random_attitudes(np.random.default_rng(1), 40)
+    for place, name in enumerate(names):
+        truth = {each: float(each[0] == "s") for each in names}
+        truth[name] += size * {"b": G_LINEARISED, "k": 1 / G_LINEARISED}.get(name[0], 1.0)
+        x, y, z = a = np.array([reference.forward(G_LINEARISED * up, truth, 2) for up in ups]).T / G_LINEARISED
+        products = [x * y, z * x, y * z]  # for m_yx, m_zx and m_zy
+        design = np.array([*a, *a**2, *products, *a**3]).T
+        unknowns = np.linalg.lstsq(design, ((a**2).sum(axis=0) - 1) / 2, rcond=None)[0]
+        np.testing.assert_allclose(unknowns / size, np.eye(len(names))[place], rtol=0, atol=1e-4)
+
+
+def test_the_threshold_decides_how_many_passes_are_made():
+    """As many as in the transcription of the source, which knows nothing of this one."""
+    data = outputs_linearised(reference.random_attitudes(np.random.default_rng(1), 30))
+    start = {f"scale_factor_{axis}": 1.0 for axis in "xyz"}
+    passes = []
+    for factor in (1e4, 1.0, 1e-4, 1e-7):
+        limits = tuple(factor * value for value in SOURCE)
+        found = fit_linearised(data, threshold=limits)
+        expected = reference.linearised_passes(
+            data, 2, G_LINEARISED, start, (limits[0], limits[1] / G_LINEARISED, limits[2])
+        )[1]
+        assert found.fit["iterations"] == expected
+        assert found.options["threshold"] == pytest.approx(limits, rel=1e-12)
+        passes.append(expected)
+    assert passes == sorted(set(passes))
+    default = fit_linearised(data)
+    assert default.fit["iterations"] == passes[1]
+    assert default.options["threshold"] == pytest.approx(SOURCE, rel=1e-12)
+
+
+@pytest.mark.parametrize("alone", [0, 1, 2])
+def test_each_of_the_three_changes_counts(alone):
+    data = outputs_linearised(reference.random_attitudes(np.random.default_rng(1), 30))
+    loose = [1.0, G_LINEARISED, 1.0]
+    limits = [1e-9 * value if index == alone else value for index, value in enumerate(loose)]
+    assert (
+        fit_linearised(data, threshold=limits).fit["iterations"]
+        > fit_linearised(data, threshold=loose).fit["iterations"]
+    )
+
+
+def test_a_threshold_below_rounding_is_refused_with_what_the_last_pass_changed():
+    data = outputs_linearised(reference.random_attitudes(np.random.default_rng(1), 30))
+    with pytest.raises(DataError, match=r"not at rest after 50 passes: .* the threshold is 1e-14 ppm, "):
+        fit_linearised(data, threshold=(1e-20, 1e-20 * G_LINEARISED, 1e-20))
+
+
+@pytest.mark.parametrize(
+    ("threshold", "message"),
+    [
+        ((1e-6, 1e-6), "expected three changes above 0"),
+        ((1e-6, 0.0, 1e-6), "expected three changes above 0"),
+        ((1e-6, np.nan, 1e-6), "threshold: expected numbers or a text, found"),
+        ((1e-6, np.inf, 1e-6), "expected three changes above 0"),
+    ],
+)
+def test_thresholds_that_are_none_are_refused(threshold, message):
+    with pytest.raises(OptionError, match=message):
+        fit_linearised(outputs_linearised(np.eye(3)), threshold=threshold)
+
+
+def test_the_command_and_the_fleet_take_a_threshold(imulab, tmp_path):
+    il.write(il.simulate_tumble(attitudes=24, order=1, hold=2.0, gravity=G_LINEARISED, seed=4), tmp_path / "t.csv")
+    fit_it = ["tumble", "fit", "t.csv", "--gravity", str(G_LINEARISED), "--order", "1"]
+    text = "1e-3 ppm, 1e-3 ug, 0.001 arcsec"
+    done = imulab(*fit_it, "--method", "linearised", "--threshold", text, "-o", "t.json")
+    assert done.returncode == 0, done.stderr
+    held = il.load(tmp_path / "t.json")
+    assert held.options["threshold"] == pytest.approx([1e-9, 1e-9 * 9.80665, 1e-3 * ARCSECOND])
+    assert imulab(*fit_it, "--method", "linearised", "-o", "d.json").returncode == 0
+    assert held.fit["iterations"] > il.load(tmp_path / "d.json").fit["iterations"]
+    (tmp_path / "m.csv").write_text(
+        f'serial,procedure,file,gravity,order,method,threshold\nSN1,tumble,t.csv,{G_LINEARISED},1,linearised,"{text}"\n'
+    )
+    done = imulab("fleet", "run", "m.csv", "-o", "out")
+    assert done.returncode == 0, done.stderr
+    assert il.load(tmp_path / "out" / "SN1.json").options["threshold"] == held.options["threshold"]
+    for arguments, message in (
+        (["--threshold", text], "--threshold needs method linearised, found method norm"),
+        (["--method", "linearised", "--threshold", "5 ppm"], "--threshold '5 ppm': expected three changes, of scale"),
+        (["--method", "linearised", "--threshold", "2 ug,5 ppm,3 arcsec"], "--threshold '2 ug': expected a number, or"),
+        (["--method", "linearised", "--threshold", "5 ppm,0 ug,3 arcsec"], "--threshold '5 ppm,0 ug,3 arcsec': exp"),
+        (["--method", "linearised", "--threshold", "1e999,2,3"], "--threshold '1e999,2,3': expected three finite"),
+    ):
+        refused = imulab(*fit_it, *arguments, "-o", "no.json")
+        assert refused.returncode == 2
+        assert refused.stderr.startswith(f"imulab: {message}"), refused.stderr
+        assert refused.stderr.count("\n") == 1
+        assert not (tmp_path / "no.json").exists()
+
+
+def test_an_axis_vertical_in_two_attitudes_is_warned_of_by_name():
+    apart = [
+        up
+        for up in reference.random_attitudes(np.random.default_rng(1), 40)
+        if np.abs(up).max() < np.cos(np.radians(8))
+    ]
+    once = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], *apart])
+    assert not [warning for warning in fit_linearised(outputs_linearised(once)).warnings if "vertical" in warning]
+    tilted = [0.0, np.sin(np.radians(2)), -np.cos(np.radians(2))]
+    twice = np.array([*once, tilted])
+    (warning,) = [warning for warning in fit_linearised(outputs_linearised(twice)).warnings if "vertical" in warning]
+    last = len(twice)
+    where = f"row 1 (line 2), row {last} (line {last + 1})"
+    assert warning.startswith(f"axis z is vertical within 3 deg in 2 attitudes ({where}): the source of method")
+    norm = il.fit_tumble(
+        il.find_attitudes(table(outputs_linearised(twice), "m/s^2", None)), order=2, gravity=G_LINEARISED
+    ).calibration
+    assert not [warning for warning in norm.warnings if "vertical" in warning]
+    assert "threshold" not in norm.options
+
+
+def problem(order, count, sigma, seed=1):
+    rng = np.random.default_rng(seed)
+    truth = reference.random_truth(rng, order)
+    directions = reference.random_attitudes(rng, count)
+    data = np.array([reference.forward(G * u, truth, order) for u in directions])
+    return truth, directions, data + sigma * rng.standard_normal(data.shape)
+
+
+def propagated(data, order, trials, **options):
+    stated = options.pop("stated", None)
+    attitudes = il.find_attitudes(table(data, sigma=stated))
+    return il.fit_tumble(attitudes, order=order, gravity=G, monte_carlo=trials, **options).calibration
+
+
+@pytest.mark.parametrize("order", [1, 2, 4])
+def test_trials_scatter_as_the_bound_says_where_noise_is_known(order, noise_as_stated):
+    sigma = 1e-4
+    truth, directions, data = problem(order, 36, sigma)
+    found = propagated(data, order, 20_000, stated=sigma).fit["monte_carlo"]
+    bound = np.sqrt(np.diag(reference.bound(directions, truth, order, G, np.full((36, 3), sigma))))
+    assert (found["trials"], found["failed"]) == (20_000, 0)
+    for name, limit in zip(truth, bound, strict=True):
+        entry = found["parameters"][name]
+        # The standard deviation of 20,000 trials is known to 0.5 %, one standard deviation.
+        assert entry["standard_deviation"] == pytest.approx(limit, rel=0.025), name
+        low, high = entry["interval_95"]
+        assert (high - low) / (2 * 1.959964) == pytest.approx(limit, rel=0.03), name
+        assert entry["mean"] == pytest.approx(truth[name], abs=5 * limit), name
+
+
+def test_an_estimated_noise_gives_students_t():
+    _, _, data = problem(1, 14, 1e-4)
+    record = propagated(data, 1, 40_000)
+    assert record.fit["degrees_of_freedom"] == 5
+    for name, parameter in record.parameters.items():
+        low, high = record.fit["monte_carlo"]["parameters"][name]["interval_95"]
+        linear = 2 * stats.t.ppf(0.975, 5) * parameter.standard_uncertainty
+        assert (high - low) / linear == pytest.approx(1.0, abs=0.03), name
+
+
+def test_an_excess_is_propagated_as_well():
+    _, _, data = problem(1, 40, 1e-3)
+    record = propagated(data, 1, 20_000, stated=1e-4)
+    assert record.fit["excess"]["value"] > 0
+    for name, parameter in record.parameters.items():
+        deviation = record.fit["monte_carlo"]["parameters"][name]["standard_deviation"]
+        t = np.sqrt(31 / 29)  # standard deviation of Student's t with 31 degrees of freedom
+        assert deviation == pytest.approx(t * parameter.standard_uncertainty, rel=0.04), name
+
+
+def test_the_same_seed_gives_the_same_trials_and_progress_is_told():
+    _, _, data = problem(1, 20, 1e-4)
+    attitudes = il.find_attitudes(table(data))
+    told: list[int] = []
+    fits = [
+        il.fit_tumble(attitudes, order=1, gravity=G, monte_carlo=5000, progress=told.append).calibration
+        for _ in range(2)
+    ]
+    assert fits[0].fit["monte_carlo"] == fits[1].fit["monte_carlo"]
+    assert told == [2000, 4000, 5000] * 2
+    assert fits[0].options["monte_carlo"] == 5000
+
+
+@pytest.mark.parametrize(
+    ("options", "count", "message"),
+    [
+        ({"trials": 10}, 20, "monte-carlo 10: expected 1000 to 10000000 trials"),
+        ({"trials": 1000, "method": "linearised"}, 20, "needs method norm"),
+        ({"trials": 1000}, 9, "more attitudes than parameters"),
+    ],
+)
+def test_trials_that_cannot_be_are_refused(options, count, message):
+    _, _, data = problem(1, count, 1e-4)
+    with pytest.raises(OptionError, match=message):
+        propagated(data, 1, **options)
+
+
+def test_the_command_and_its_report(imulab, tmp_path):
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
+    done = imulab(
+        "tumble",
+        "fit",
+        "t.csv",
+        "--gravity",
+        str(G),
+        "--order",
+        "1",
+        "--monte-carlo",
+        "2000",
+        "-o",
+        "t.json",
+        "--report",
+        "t.html",
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""  # no progress bar where standard error is no terminal
+    assert "Monte Carlo" in done.stdout
+    assert "ratio of widths" in (tmp_path / "t.html").read_text()
+    refused = imulab("tumble", "fit", "t.csv", "--gravity", str(G), "--monte-carlo", "many", "-o", "u.json")
+    assert refused.returncode == 2
+    assert refused.stderr == "imulab: --monte-carlo 'many': expected a whole number\n"
+    assert not (tmp_path / "u.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--monte-carlo", "0"], "monte-carlo 0: expected 1000 to 10000000 trials"),
+        (["--monte-carlo", "2000", "--method", "linearised"], "monte-carlo needs method norm, found method linearised"),
+        (["--monte-carlo", "2000", "--prior", "p.json"], "monte-carlo draws the attitudes anew, not a prior"),
+    ],
+)
+def test_trials_that_cannot_be_are_refused_before_the_recording_is_read(imulab, options, words):
+    refused = imulab("tumble", "fit", "there_is_no_such_file.csv", *options)
+    assert refused.returncode == 2
+    assert words in refused.stderr

@@ -123,7 +123,7 @@ class Robust:
     from running mean squares, memory growing up to a cap, a variance floor, a weight cap. The document leaves the
     numbers open; these are those that docs/gyro_array_method.md states ("robust"). For gyros that are lost, gated,
     stuck, late, or have jumped the document has rules and bounds, but no equations: there `step` raises
-    `UndeterminedError`, and the core is held to the bounds (test_gyro_array_faults.py, runtime/tests/test_robust.c).
+    `UndeterminedError`, and the core is held to the bounds (test_gyro_array_fused.py, runtime/tests/test_robust.c).
 
     `rate` in Hz, at most 100; `reliability` are relative variances from a calibration, or None.
     """

@@ -1,0 +1,354 @@
+"""Records applied to recordings: the transcribed forward model undone, units, missing readings, blocks, warnings."""
+
+import re
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import imulab as il
+import madeup
+from imulab.cli import main
+from imulab.device.unit import load_blob
+from imulab.errors import DataError, RecordError, UnitError
+from imulab.procedures.apply import apply, apply_blocks, loaded, warnings_of
+from imulab.recording import Recording
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.writers import write
+from reference import tumble as reference
+
+G = 9.80665
+
+
+PER_SI = {"m/s^2": 1.0, "g": 1 / G, "mg": 1000 / G, "ug": 1e6 / G, "count": 4096 / G, "V": 0.1}  # output per m/s^2
+
+
+AXES = ["accel_x", "accel_y", "accel_z"]
+
+
+def record(truth, order: int, unit: str, **model) -> Calibration:
+    units = {"b": "m/s^2", "s": f"{unit}/(m/s^2)", "m": "rad", "2": "1/(m/s^2)"}
+    units |= {str(power): f"1/(m/s^2)^{power - 1}" for power in (3, 4, 5)}
+    parameters = {n: Parameter(value, None, units[n[1] if n[0] == "k" else n[0]]) for n, value in truth.items()}
+    return Calibration("tumble", parameters, Covariance((), ()), {"order": order, "output_unit": unit, **model}, {})
+
+
+def recording(outputs, unit: str, **columns) -> Recording:
+    made = {name: np.array(outputs[:, i]) for i, name in enumerate(AXES)}
+    extra = {name: np.asarray(values, dtype=float) for name, (values, _) in columns.items()}
+    units = dict.fromkeys(AXES, unit) | {name: unit for name, (_, unit) in columns.items()}
+    return Recording({**made, **extra}, units, name="flight.csv", metadata={"serial": "SN42"}, lines_before=2)
+
+
+def simulated(order: int, unit: str, count: int = 200):
+    """Specific forces within +-2 g, m/s^2, and what a random unit of MEMS size makes of them."""
+    rng = np.random.default_rng(100 * order + len(unit))
+    truth = reference.random_truth(rng, order, PER_SI[unit])
+    forces = rng.uniform(-2 * G, 2 * G, (count, 3))
+    return truth, forces, np.array([reference.forward(force, truth, order) for force in forces])
+
+
+@pytest.mark.parametrize("unit", ["m/s^2", "g", "mg", "count", "V"])
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_applying_a_record_undoes_the_forward_model(order, unit):
+    truth, forces, outputs = simulated(order, unit)
+    corrected = apply(record(truth, order, unit), recording(outputs, unit))
+    assert [corrected.units[name] for name in AXES] == ["m/s^2"] * 3
+    np.testing.assert_allclose(corrected.triad("accel"), forces, rtol=0, atol=1e-12 * 2 * G)
+
+
+def test_strong_forces_far_from_the_linear_range_are_found_as_well():
+    truth, forces, _ = simulated(2, "g")
+    truth |= {f"k2_{axis}": -1e-2 / G for axis in "xyz"}  # 10 mg/g^2: 16 % at 16 g
+    outputs = np.array([reference.forward(8 * force, truth, 2) for force in forces])
+    corrected = apply(record(truth, 2, "g"), recording(outputs, "g"))
+    np.testing.assert_allclose(corrected.triad("accel"), 8 * forces, rtol=0, atol=1e-12 * 16 * G)
+
+
+@pytest.mark.parametrize("made_in", ["m/s^2", "g", "mg"])
+@pytest.mark.parametrize("logged_in", ["m/s^2", "g", "mg", "ug"])
+def test_a_recording_in_another_unit_of_acceleration_is_converted(made_in, logged_in):
+    truth, forces, outputs = simulated(3, made_in)
+    logged = outputs * (PER_SI[logged_in] / PER_SI[made_in])
+    corrected = apply(record(truth, 3, made_in), recording(logged, logged_in))
+    np.testing.assert_allclose(corrected.triad("accel"), forces, rtol=0, atol=1e-12 * 2 * G)
+
+
+@pytest.mark.parametrize(("made_in", "logged_in"), [("count", "m/s^2"), ("g", "count"), ("V", "count"), ("m/s^2", "V")])
+def test_a_unit_that_cannot_be_converted_is_refused_naming_both(made_in, logged_in):
+    truth, _, outputs = simulated(1, made_in)
+    with pytest.raises(UnitError) as caught:
+        apply(record(truth, 1, made_in), recording(outputs, logged_in))
+    message = str(caught.value)
+    assert message.startswith("flight.csv: ")
+    assert f"are in {logged_in}," in message
+    assert message.endswith(f"outputs in {made_in}")
+
+
+def test_axes_in_different_units_are_refused():
+    truth, _, outputs = simulated(1, "g")
+    mixed = recording(outputs, "g").with_columns({}, {"accel_y": "mg"})
+    with pytest.raises(UnitError, match=r"share one unit, found accel_x \[g\], accel_y \[mg\], accel_z \[g\]"):
+        apply(record(truth, 1, "g"), mixed)
+
+
+def test_a_recording_without_the_triad_is_refused():
+    truth, _, outputs = simulated(1, "g")
+    whole = recording(outputs, "g")
+    lame = Recording({name: whole.column(name) for name in AXES[:2]}, whole.units, name="flight.csv")
+    with pytest.raises(DataError, match=r"flight\.csv: no column accel_z; found accel_x accel_y"):
+        apply(record(truth, 1, "g"), lame)
+
+
+@pytest.mark.parametrize(
+    ("procedure", "message"),
+    [("warmup", "lacks its table"), ("gyro_array", "array fuse --calibration"), ("centrifuge", "lacks x_K0")],
+)
+def test_a_record_with_nothing_to_apply_here_is_refused(procedure, message):
+    other = Calibration(procedure, {}, Covariance((), ()), {}, {})
+    with pytest.raises(RecordError, match=message):
+        apply(other, recording(np.zeros((2, 3)), "g"))
+
+
+@pytest.mark.parametrize("lacking", ["order", "output_unit", "scale_factor_y", "misalignment_zx", "k2_z"])
+def test_a_record_that_lacks_what_is_applied_is_refused_naming_it(lacking):
+    truth, _, outputs = simulated(2, "g")
+    whole = record(truth, 2, "g")
+    lame = replace(
+        whole,
+        parameters={name: value for name, value in whole.parameters.items() if name != lacking},
+        model={name: value for name, value in whole.model.items() if name != lacking},
+    )
+    with pytest.raises(RecordError, match=lacking):
+        apply(lame, recording(outputs, "g"))
+
+
+# The misalignment is lower triangular: x reaches y and z, y reaches z, z reaches nothing else.
+TOUCHED = {"accel_x": [True, True, True], "accel_y": [False, True, True], "accel_z": [False, False, True]}
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("order", [1, 2, 3, 5])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_reading_that_is_no_number_stays_in_the_channels_it_touches(order, axis, bad):
+    truth, forces, outputs = simulated(order, "g")
+    outputs[17, AXES.index(axis)] = bad
+    with np.errstate(all="ignore"):
+        corrected = apply(record(truth, order, "g"), recording(outputs, "g")).triad("accel")
+    lost = np.zeros((len(forces), 3), dtype=bool)
+    lost[17] = TOUCHED[axis]
+    assert np.array_equal(~np.isfinite(corrected), lost)
+    np.testing.assert_allclose(corrected[~lost], forces[~lost], rtol=0, atol=1e-12 * 2 * G)
+
+
+@pytest.mark.parametrize("order", [1, 3])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
+def test_a_wild_reading_is_corrected_without_a_warning_of_numpy(order, bad):
+    truth, _, outputs = simulated(order, "g")
+    outputs[[17, 18, 19], [0, 1, 2]] = bad
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        apply(record(truth, order, "g"), recording(outputs, "g"))
+
+
+def test_a_wild_reading_does_not_spoil_the_others():
+    truth, forces, outputs = simulated(3, "g")
+    outputs[17, 2] = 1e300
+    with np.errstate(all="ignore"):
+        corrected = apply(record(truth, 3, "g"), recording(outputs, "g")).triad("accel")
+    others = np.arange(len(forces)) != 17
+    np.testing.assert_allclose(corrected[others], forces[others], rtol=0, atol=1e-12 * 2 * G)
+
+
+def test_columns_that_the_record_does_not_touch_pass_unchanged():
+    truth, _, outputs = simulated(2, "g", count=50)
+    rng = np.random.default_rng(4)
+    before = recording(
+        outputs,
+        "g",
+        time=(np.arange(50), "ms"),
+        gyro_x=(rng.standard_normal(50), "deg/s"),
+        truth_accel_x=(rng.standard_normal(50), "m/s^2"),
+        pressure=(np.full(50, np.nan), "1"),
+    )
+    after = apply(record(truth, 2, "g"), before)
+    assert list(after.columns) == list(before.columns)
+    for name in ("time", "gyro_x", "truth_accel_x", "pressure"):
+        assert after.column(name).tobytes() == before.column(name).tobytes()
+        assert after.units[name] == before.units[name]
+    assert (after.name, after.metadata, after.lines_before) == (before.name, before.metadata, 2)
+    np.testing.assert_array_equal(before.triad("accel"), outputs)
+
+
+@pytest.mark.parametrize("size", [1, 7, 64, 500])
+@pytest.mark.parametrize("order", [1, 4])
+def test_blocks_are_corrected_as_the_whole(size, order):
+    truth, _, outputs = simulated(order, "count", count=300)
+    outputs[100, 1] = np.nan
+    made = record(truth, order, "count")
+    whole = apply(made, recording(outputs, "count")).triad("accel")
+    blocks = (recording(outputs[start : start + size], "count") for start in range(0, 300, size))
+    joined = np.vstack([block.triad("accel") for block in apply_blocks([made], blocks)])
+    assert joined.tobytes() == whole.tobytes()
+
+
+def test_records_are_applied_in_the_order_given():
+    first, forces, outputs = simulated(2, "g")
+    second = reference.random_truth(np.random.default_rng(9), 1, 1.0)
+    chain = [record(first, 2, "g"), record(second, 1, "m/s^2")]
+    (corrected,) = apply_blocks(chain, [recording(outputs, "g")])
+    expected = np.array([reference.inverse(force, second, 1) for force in forces])
+    np.testing.assert_allclose(corrected.triad("accel"), expected, rtol=0, atol=2e-12 * 2 * G)
+    with pytest.raises(UnitError, match=r"are in m/s\^2,"):
+        list(apply_blocks([chain[1], record(first, 2, "count")], [recording(outputs, "g")]))
+
+
+# --- temperature -----------------------------------------------------------------------------------------------
+
+
+def at(values, unit="degC", **metadata) -> Recording:
+    made = recording(np.zeros((len(values), 3)), "g", temperature=(values, unit))
+    return Recording(made.columns, made.units, name="flight.csv", metadata=metadata)
+
+
+MADE = {"temperature": {"value": 24.0, "unit": "degC"}}
+
+
+@pytest.mark.parametrize("mean", [3.9, 44.1, -40.0])
+def test_a_record_made_far_from_the_recordings_temperature_is_warned_of(mean):
+    truth, _, _ = simulated(1, "g")
+    (message,) = warnings_of(record(truth, 1, "g", **MADE), at([mean - 1, mean + 1]))
+    assert message.startswith(
+        f"flight.csv: temperature {mean:.1f} degC is {abs(mean - 24):.0f} K away from the 24.0 degC"
+    )
+
+
+def test_a_temperature_in_the_head_of_the_recording_counts_too():
+    truth, _, outputs = simulated(1, "g")
+    warm = Recording(
+        {name: outputs[:, i] for i, name in enumerate(AXES)}, dict.fromkeys(AXES, "g"), {"temperature": "61.5 degC"}
+    )
+    (message,) = warnings_of(record(truth, 1, "g", **MADE), warm)
+    assert "temperature 61.5 degC" in message
+
+
+@pytest.mark.parametrize("mean", [4.0, 24.0, 44.0])
+def test_twenty_kelvin_are_not_far(mean):
+    truth, _, _ = simulated(1, "g")
+    assert warnings_of(record(truth, 1, "g", **MADE), at([mean])) == []
+
+
+def test_an_unknown_temperature_is_not_warned_of():
+    truth, _, _ = simulated(1, "g")
+    assert warnings_of(record(truth, 1, "g"), at([90.0])) == []
+    assert warnings_of(record(truth, 1, "g", **MADE), recording(np.zeros((2, 3)), "g")) == []
+    assert warnings_of(record(truth, 1, "g", **MADE), at([np.nan])) == []
+
+
+def test_outputs_beyond_a_turning_point_have_no_specific_force():
+    """k3 = -2 mg/g^3: the output turns back at s = 1 / sqrt(3 * 0.002) = 12.9 g, A = 8.6 g."""
+    truth, _, _ = simulated(3, "g")
+    nominal = {n: (1 / G if n[0] == "s" else -2e-3 / G**2 if n[:2] == "k3" else 0.0) for n in truth}
+    readings = np.array([[r, 0.0, 0.0] for r in (1.0, 8.0, 8.6, 8.61, 10.0, 16.0, -8.6, -8.61)])
+    corrected = apply(record(nominal, 3, "g"), recording(readings, "g")).triad("accel")[:, 0] / G
+    assert np.isnan(corrected).tolist() == [False, False, False, True, True, True, False, True]
+    np.testing.assert_allclose(corrected[:3] - 2e-3 * corrected[:3] ** 3, [1.0, 8.0, 8.6], rtol=1e-12)
+
+
+def test_a_record_in_other_units_is_refused():
+    truth, _, outputs = simulated(1, "g")
+    whole = record(truth, 1, "g")
+    altered = replace(whole, parameters={**whole.parameters, "bias_x": Parameter(10.0, None, "mg")})
+    with pytest.raises(RecordError, match=r"has bias_x in 'mg', expected 'm/s\^2'"):
+        apply(altered, recording(outputs, "g"))
+
+
+def test_a_record_of_another_unit_is_warned_of():
+    truth, _, outputs = simulated(1, "g")
+    other = replace(record(truth, 1, "g"), sensor={"serial": "SN41"})
+    (message,) = warnings_of(other, recording(outputs, "g"))
+    assert message == "flight.csv: serial SN42, but the record was made for SN41"
+
+
+ACCEL = {f"accel_{axis}": np.array([10.0, -200.0, 3000.0]) for axis in "xyz"}
+
+
+GYRO = {f"gyro_{axis}": np.array([1.0, 20.0, -300.0]) for axis in "xyz"}
+
+
+def flight(**columns):
+    made = columns or ACCEL
+    return Recording(made, dict.fromkeys(made, "count"), name="flight.csv", metadata={"serial": "SN42"})
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_corrected_file_names_every_record_and_its_hash(tmp_path, kind, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    first, second = (
+        madeup.tumble(1),
+        replace(madeup.tumble(2), model={**madeup.tumble(2).model, "output_unit": "m/s^2"}),
+    )
+    second = replace(
+        second,
+        parameters={
+            name: replace(p, unit=p.unit.replace("count", "m/s^2"), value=1.0 if "scale" in name else p.value)
+            for name, p in second.parameters.items()
+        },
+    )
+    first.save("a.json")
+    second.save("b.json")
+    write(flight(), "raw.csv")
+    assert main(["apply", "a.json", "b.json", "raw.csv", "-o", f"out.{kind}"]) == 0
+    expected = tuple(f"{name}.json sha256:{r.to_dict()['content_sha256']}" for name, r in (("a", first), ("b", second)))
+    assert il.read(f"out.{kind}").corrected_by == expected
+    if kind == "csv":
+        assert re.findall(r"^# corrected_by: (.*)$", (tmp_path / "out.csv").read_text(), re.M) == list(expected)
+    capsys.readouterr()
+    assert main(["apply", "b.json", f"out.{kind}", "-o", "again.csv"]) == 2
+    assert f"out.{kind}: already corrected by b.json" in capsys.readouterr().err
+    assert not (tmp_path / "again.csv").exists()
+    assert main(["apply", "b.json", f"out.{kind}", "--again", "-o", "again.csv"]) == 0
+    assert f"was corrected before, by {expected[0]}" in capsys.readouterr().err
+    assert il.read("again.csv").corrected_by == (*expected, expected[1])
+    assert main(["convert", f"out.{kind}", "-o", "converted.csv"]) == 0
+    assert il.read("converted.csv").corrected_by == expected
+
+
+def test_a_blob_is_known_by_the_records_that_it_was_made_from(tmp_path):
+    record = madeup.tumble(1)
+    il.export("blob", [record], tmp_path)
+    blob = load_blob(tmp_path / "unit.blob")
+    once = il.apply(record, flight())
+    again = replace(once, columns=flight().columns, units=flight().units)
+    with pytest.raises(DataError, match="already corrected by"):
+        il.apply(blob, again)
+    assert il.apply(blob, again, again=True).corrected_by[1].endswith(loaded(blob).holds[0])
+
+
+def test_what_a_record_leaves_unchanged_is_not_called_corrected():
+    time = {"time": np.arange(3.0), "gyro_x": np.zeros(3), "gyro_z": np.zeros(3)}
+    cold = Recording(time, {"time": "s", "gyro_x": "rad/s", "gyro_z": "rad/s"}, name="cold.csv")
+    assert il.apply(madeup.warmup(), cold).corrected_by == ()
+
+
+def test_a_record_of_six_axes_corrects_the_triad_that_is_there_and_says_so():
+    record = madeup.tumble(1, gyro=True)
+    both = il.apply(record, flight(**ACCEL, **GYRO))
+    for there, away, words in ((ACCEL, "gyroscopes", "accelerometers"), (GYRO, "accelerometers", "gyroscopes")):
+        alone = flight(**there)
+        corrected = il.apply(record, alone)
+        for name in there:
+            np.testing.assert_array_equal(corrected.column(name), both.column(name))
+        assert warnings_of(record, alone) == [f"flight.csv: no {away} in it: its {words} alone are corrected"]
+    assert warnings_of(record, flight(**ACCEL, **GYRO)) == []
+
+
+def test_gyroscopes_whose_g_sensitivity_needs_the_accelerometers_are_refused_without_them():
+    with pytest.raises(DataError, match=r"g-sensitivity, which needs accel_x, accel_y and accel_z; found gyro_x"):
+        il.apply(madeup.tumble(1, gyro=True, sensitive=True), flight(**GYRO))
+
+
+def test_a_record_of_one_triad_is_not_applied_to_the_other():
+    with pytest.raises(DataError, match="no column accel_x; found gyro_x"):
+        il.apply(madeup.tumble(1), flight(**GYRO))
