@@ -35,19 +35,19 @@ from imulab.recording import Array, Recording
 from imulab.units import from_si, parse_unit, si_unit
 
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
-"""How far the zero of a sensor at rest may drift, SI, and the unit to say it in."""
-_NOISE_REACH = 20.0  # times the noise: a step of the level up to there may be of the noise, not of a motion
+"""How far the zero of a sensor at rest may drift, SI, and the unit in which messages state it."""
+_NOISE_REACH = 20.0  # standard uncertainties of a mean: means farther apart show a motion, not noise
 _LARGEST = 1e140  # beyond it, or below its inverse, squares overflow or vanish in double precision
 _MOST_NAMED, _MOST_COLUMNS = 3, 6  # lines of a column, and columns with lines, that a note names
-# Samples that noise is told from; degrees of freedom of an Allan deviation that is shown
+# Fewest samples for noise coefficients; fewest degrees of freedom of an Allan deviation that counts
 FEWEST, _LEAST_FREEDOM = 50, 4.0
-_COARSE = 2.2  # of the deviation from sample to sample; whole counts of an angle show steps of 2.0 of it at most
-_FITTED = 0.5  # averaging times that a band tells, in terms of 1/f_max
+_COARSE = 2.2  # largest step of the output over the deviation from sample to sample; a rounded angle's is at most 2.0
+_FITTED = 0.5  # shortest averaging time that the band shows, in units of 1/f_max
 
 
 @dataclass(frozen=True)
 class ColumnNoise:
-    """Allan curve of a column, its noise coefficients, and the model that they are from, None where there is none."""
+    """Allan curve of a column, its noise coefficients, and the fitted model (None where none can be fitted)."""
 
     curve: DeviationCurve
     coefficients: NoiseCoefficients
@@ -60,13 +60,14 @@ class ColumnNoise:
 
     @property
     def lines(self) -> list[float]:
-        """Lines of the spectrum, which are no noise, the largest first, Hz."""
+        """Frequencies of the spectral lines, Hz, the largest first; lines are not part of the noise."""
         return [] if self.model is None else [line.frequency for line in self.model.stretches[0].lines]
 
     def mean_uncertainty(self, duration: float) -> float:
         """Return the standard uncertainty of the mean over a duration, s, as a measure of the bias.
 
-        That of the model; where it is not that of the record, at least the Allan deviation at the far end of the curve.
+        The model's value; where the record does not agree with the model, at least the Allan deviation at the far end
+        of the curve.
         """
         by_model = 0.0 if self.model is None else mean_uncertainty(self.model, duration)
         if self.fits:
@@ -76,7 +77,7 @@ class ColumnNoise:
         return max(by_model, float(upper[-3:].max(initial=0.0)))
 
     def unseen(self, duration: float) -> float:
-        """Return how many times as large noise that the record cannot show could make it, from 2 on; else 1."""
+        """Return by what factor noise too weak to show could enlarge that uncertainty; 1 where it is below 2."""
         return unseen(self.model, self.coefficients, duration) if self.model is not None and self.fits else 1.0
 
     def fitted(self, tau: Array) -> Array | None:
@@ -131,24 +132,24 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
 def curves_and_noise(
     recording: Recording, wanted: Sequence[str], taus: str | Array
 ) -> tuple[Recording, float, dict[str, ColumnNoise], list[str]]:
-    """Return what is left of a recording, its rate, Hz, the noise of some of its sensor columns, and what is to say.
+    """Return the readings of a recording, their rate, Hz, the noise of the columns `wanted`, and notes.
 
-    Of a recording whose sampling rate changes, the longest stretch of one rate counts; a few rows without numbers are
-    bridged. The notes name both.
+    Where the sampling rate changes, the longest stretch of one rate is used; a few rows without numbers are bridged.
+    The notes name both.
 
     Raises
     ------
     DataError, OptionError
         As for `allan_deviation`; also without a time column.
     """
-    names = list(noise_columns(recording))  # rows are left out by what all sensors show
+    names = list(noise_columns(recording))  # of all sensors: each may show that a row is no reading
     recording, rate, notes = _mended(recording, names)
     noises, more = _noises(recording, rate, names, wanted, taus)
     return recording, rate, noises, [*notes, *more]
 
 
 def samples_noise(samples: Array, rate: float, taus: str | Array) -> tuple[ColumnNoise, list[str]]:
-    """Return the noise of samples of no known sensor, shape (n,), n >= 50, at a rate, Hz, and what is to say.
+    """Return the noise of samples of an unknown sensor, shape (n,), n >= 50, at a rate, Hz, and notes.
 
     Up to 1 % of them may be no numbers and are bridged; all others stay as they are.
 
@@ -169,7 +170,7 @@ def samples_noise(samples: Array, rate: float, taus: str | Array) -> tuple[Colum
 def _noises(
     recording: Recording, rate: float, names: list[str], wanted: Sequence[str], taus: str | Array
 ) -> tuple[dict[str, ColumnNoise], list[str]]:
-    """The noise of the columns `wanted`, none of which may have moved of the sensors' `names`, and what is to say."""
+    """Return the noise of the columns `wanted`, with notes; a column of a sensor that moved has no coefficients."""
     notes = []
     moved = moved_columns(recording, names, rate)
     values = (recording.si(name) for name in wanted)  # one at a time: a long log is large
@@ -184,7 +185,7 @@ def _noises(
 
 
 def _mended(recording: Recording, names: list[str]) -> tuple[Recording, float, list[str]]:
-    """Rows that are readings, at one rate, Hz, and what is to say of the others."""
+    """Return the rows that are readings, at one rate, Hz, and notes on the other rows."""
     notes = [f"{recording.name}: {note}" for note in recording.notes]
     recording, more = bridged(recording, names)
     for sensor in dict.fromkeys(map(kind_of, names)):
@@ -202,7 +203,7 @@ def _mended(recording: Recording, names: list[str]) -> tuple[Recording, float, l
 
 
 def _check_squares(recording: Recording, names: list[str]) -> None:
-    """Refuse samples whose squares, summed over a recording, are no numbers of this machine."""
+    """Refuse samples whose squares overflow in double precision."""
     for name in names:
         values = recording.si(name)
         index = int(max(np.argmax(values), np.argmin(values), key=lambda k: abs(values[k])))
@@ -220,10 +221,10 @@ def _listed(values: Array | None) -> list[float | None] | None:
 def columns_noise(
     columns: Iterable[Array], rate: float, moved: Sequence[str] = (), candidates: tuple[str, ...] = CANDIDATES
 ) -> list[ColumnNoise]:
-    """Return the Allan curves of columns, shape (n,) each, at a rate, Hz, and the coefficients of the model that fits.
+    """Return the Allan curves of columns, shape (n,) each, at a rate, Hz, and the coefficients of the fitted models.
 
-    Spikes and lines of the spectrum stay in the curve and are taken out of what the model is fitted to. `moved` says
-    of each column why it has no coefficients.
+    Spikes and spectral lines stay in the curve and are removed before the model is fitted. `moved` gives for each
+    column the reason why it has no coefficients, or nothing.
 
     Raises
     ------
@@ -249,7 +250,7 @@ def columns_noise(
 
 
 def _unfit(samples: Array, noise: float) -> str:
-    """Why no model of noise can be fitted to samples whose deviation from one to the next is `noise`; else nothing."""
+    """Return why no noise model can be fitted to samples with `noise` as their Allan deviation from one to the next."""
     if not np.ptp(samples):
         return "all samples are the same: a dead sensor"
     if not noise:
@@ -261,7 +262,7 @@ def _unfit(samples: Array, noise: float) -> str:
 
 
 def _step_line(recording: Recording, name: str, step: Step) -> str:
-    """Say that a level jumped, which the coefficients take for noise."""
+    """Return the warning of a change of level, which the coefficients would take for noise."""
     unit = recording.units[name]
     when = f" within {step.within} rows near {recording.place(step.sample)}"
     if recording.time is not None:
@@ -275,7 +276,7 @@ def _step_line(recording: Recording, name: str, step: Step) -> str:
 
 
 def noise_lines(noises: Mapping[str, ColumnNoise]) -> list[str]:
-    """Return what is to say of columns by name: filters and lines, and coefficients that are not determined."""
+    """Return notes on columns by name: filters, spectral lines, and coefficients that are not determined."""
     by_reason: dict[str, list[str]] = {}
     for name, noise in noises.items():
         its = noise.coefficients
@@ -317,12 +318,12 @@ def _columns(names: list[str]) -> str:
 
 
 def most_reach(quantity: str, noise: float) -> float:
-    """Return how far means of a sensor at rest may lie apart, SI, by their noise; no bound for other quantities."""
+    """Return how far apart the means of a sensor at rest may lie, SI, for their noise; infinite for other sensors."""
     return max(_STILL[quantity][0], _NOISE_REACH * noise) if quantity in _STILL else math.inf
 
 
 def moved_columns(recording: Recording, names: list[str], rate: float) -> dict[str, str]:
-    """Return the columns whose means over a second range farther than any zero drifts and than noise explains: why."""
+    """Return, by column, that the means over 1 s range farther than a drifting zero and noise explain."""
     size = max(1, min(round(rate), len(recording)))
     moved: dict[str, float] = {}
     for name in names:

@@ -1,7 +1,7 @@
-"""Levels of the statistical tests that verdicts rest on: all of them, so that one sees how their false alarms add up.
+"""Levels of all statistical tests that verdicts rest on, in one place, so that their false alarms can be added up.
 
-Of data in which nothing is wrong, a test says that something is in a share `level`: its false alarms. A procedure makes
-several tests, and a false alarm of any is one of the procedure. With tests of level a_i that are made n_i times each,
+Where nothing is wrong, a test still finds something in a share `level` of the data: its false alarms. A procedure makes
+several tests, and a false alarm of one is a false alarm of the procedure. With tests of level a_i made n_i times each,
 the share of clean data with a false alarm is at most ``sum n_i a_i`` (Boole's inequality, used so by Bonferroni),
 whatever the tests have in common, and close to that where they have little. What a procedure may have in all is
 `MOST_FALSE_ALARMS`; what it has is `false_alarms`.
@@ -9,9 +9,9 @@ whatever the tests have in common, and close to that where they have little. Wha
 A test of the largest of m values allows for m where it is made: its level is that of the largest. `times` counts what
 is repeated beyond that, such as once for each of three axes.
 
-Only what a user must look at counts: a finding that lowers the verdict, data that are set aside and named so, and a
-check that fails. A level that decides which terms a model has, or whether uncertainties grow by a scatter, changes
-numbers that stay covered, and blames nobody; a note changes no verdict.
+Only what a user must look at counts: a finding that lowers the verdict, data that are set aside, and a check that
+fails. A level that decides which terms a model has, or whether uncertainties grow by a scatter, changes numbers but not
+whether their uncertainties hold; a note changes no verdict.
 """
 
 from __future__ import annotations
@@ -274,7 +274,7 @@ MOST_FALSE_ALARMS: Mapping[tuple[str, ...], float] = {
     ("noise check",): 0.05,
     ("compare",): 0.05,
 }
-"""Share of clean tests whose verdict may be other than *good*, or that may fail a check: what is aimed at, in all."""
+"""Largest share of clean tests that may get another verdict than *good*, or fail a check, by all tests together."""
 
 
 def all_decisions() -> dict[str, Decision]:
@@ -283,7 +283,7 @@ def all_decisions() -> dict[str, Decision]:
 
 
 def false_alarms(procedures: Iterable[str]) -> float:
-    """Return the share of clean data that procedures blame at most: ``sum n_i a_i`` of what lowers a verdict."""
+    """Return the largest share of clean data with a false alarm: ``sum n_i a_i`` over what lowers a verdict."""
     names = tuple(procedures)
     return sum(
         decision.level * decision.procedures.get(name, 0)

@@ -1,8 +1,8 @@
 """Distribution functions of statistics, over arrays of any shapes that numpy broadcasts, and the sine integral.
 
-All digits of the smaller tail are right to 1e-12, down to the smallest numbers, for 0.01 to 1e12 degrees of freedom and
-infinitely many. In C (`_distributions`), whose head names the series and fractions; ``import scipy.special`` would take
-0.2 s of processor time, more than most commands have to do.
+The smaller tail is right to 1e-12 of its value, down to the smallest numbers, for 0.01 to 1e12 and infinitely many
+degrees of freedom. Computed in C (`_distributions`), whose head names the series and fractions: ``import
+scipy.special`` would take 0.2 s of processor time, more than most commands need.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def normal_cdf(value: ArrayLike) -> Array:
 
 
 def normal_quantile(probability: ArrayLike) -> Array:
-    """Return what a standard normal variable is below with a probability; its inverse by Halley's method."""
+    """Return the value below which a standard normal variable lies with a probability (Halley's method)."""
     return _elementwise(_distributions.fill_normal_quantile, probability)
 
 
@@ -35,12 +35,12 @@ def chi_square_tail(value: ArrayLike, freedom: ArrayLike) -> Array:
 
 
 def chi_square_upper_quantile(probability: ArrayLike, freedom: ArrayLike) -> Array:
-    """Return what chi-square with `freedom` degrees exceeds with a probability."""
+    """Return the value that chi-square with `freedom` degrees exceeds with a probability."""
     return _elementwise(_distributions.fill_chi_square_upper_quantile, probability, freedom)
 
 
 def f_tail(value: ArrayLike, numerator_freedom: ArrayLike, denominator_freedom: ArrayLike) -> Array:
-    """Return the probability that Fisher's F, a ratio of two mean squares of one noise, exceeds `value`.
+    """Return the probability that Fisher's F, the ratio of two mean squares of the same noise, exceeds `value`.
 
     ``I_x(n/2, m/2)``, ``x = n / (n + m value)``, of m and n degrees of freedom above and below; I is the regularised
     incomplete beta function, DLMF 8.17.2.
@@ -49,7 +49,7 @@ def f_tail(value: ArrayLike, numerator_freedom: ArrayLike, denominator_freedom: 
 
 
 def f_quantile(probability: ArrayLike, numerator_freedom: ArrayLike, denominator_freedom: ArrayLike) -> Array:
-    """Return what Fisher's F is below with a probability."""
+    """Return the value below which Fisher's F lies with a probability."""
     return _elementwise(_distributions.fill_f_quantile, probability, numerator_freedom, denominator_freedom)
 
 
@@ -62,7 +62,7 @@ def t_cdf(value: ArrayLike, freedom: ArrayLike) -> Array:
 
 
 def t_quantile(probability: ArrayLike, freedom: ArrayLike) -> Array:
-    """Return what Student's t with `freedom` degrees is below with a probability."""
+    """Return the value below which Student's t with `freedom` degrees lies with a probability."""
     return _elementwise(_distributions.fill_t_quantile, probability, freedom)
 
 
@@ -72,7 +72,7 @@ def sine_integral(value: ArrayLike) -> Array:
 
 
 def _elementwise(fill: Callable[..., None], *arguments: ArrayLike) -> Array:
-    """Values of a function of numbers, for each element of its arguments; a number where all of these are."""
+    """Return a function's values for each element of its broadcast arguments; a number where all are numbers."""
     arrays = [np.asarray(argument, dtype=np.float64) for argument in arguments]
     shape = np.broadcast(*arrays).shape
     values = np.empty(shape)

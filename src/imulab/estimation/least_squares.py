@@ -1,19 +1,17 @@
 """Weighted nonlinear least squares, the statistics of its results, and nested models blended.
 
-The leading axis of every array counts independent problems, of which one fit is a batch of one and Monte Carlo a batch
-of trials. There is no Python loop over problems; batches of tumbles are solved in C (tumble/_fit.c).
+The leading axis of every array counts independent problems: a fit is a batch of one, Monte Carlo a batch of trials.
+There is no Python loop over problems; batches of tumble tests are solved in C (tumble/_fit.c).
 
-Sources: Huber, Robust Statistics (1981), 7.6-7.10;
-Mandel and Paule, Analytical Chemistry 42 (1970) 1194 (excess variance); Birge, Physical Review 40 (1932) 207, and
-Gelman, Bayesian Analysis 1 (2006) 515 (how much of it is plausible); Belsley, Kuh, Welsch, Regression
-Diagnostics (1980) (scaled condition number).
+Sources: Huber, Robust Statistics (1981), 7.6-7.10; Mandel and Paule, Analytical Chemistry 42 (1970) 1194 (excess
+variance); Birge, Physical Review 40 (1932) 207, and Gelman, Bayesian Analysis 1 (2006) 515 (how much of it is
+plausible); Belsley, Kuh, Welsch, Regression Diagnostics (1980) (scaled condition number).
 
-A model chosen from the data states an uncertainty as if it were right. Here each step from a model to the next larger
-one is shrunk by the share of it that is likely to be noise, and that share's own uncertainty is part of the covariance.
-
-Source: a normal prior of unknown variance for the terms of each step, with a Beta(b, 1) distribution of the share
-(Strawderman, Annals of Mathematical Statistics 42 (1971) 385); limit for every such method: Pratt, Journal of the
-American Statistical Association 56 (1961) 549.
+A model chosen from the data states its uncertainty as if it were certainly right. A blend instead shrinks each step
+from a model to the next larger one by the share of the step that is likely to be noise; the uncertainty of that share
+is part of the covariance. Source: a normal prior of unknown variance for the terms of each step, with a Beta(b, 1)
+distribution of the share (Strawderman, Annals of Mathematical Statistics 42 (1971) 385); limit of every such method:
+Pratt, Journal of the American Statistical Association 56 (1961) 549.
 """
 
 from __future__ import annotations
@@ -43,12 +41,12 @@ Model = Callable[[Array], tuple[Array, Array]]
 _HUBER = 1.345
 """95 % efficiency for normal errors (Huber 1981)."""
 _PEAK, _PER_DEGREE, _PER_SQUARE = 0.25, 40.0, 19.0
-"""Exponent b of the prior of an excess variance: the smaller, the more is thought of none."""
-_TOLD = 0.5  # degrees of freedom below which nothing is left to tell an excess from
+"""Exponent b of the prior of an excess variance: the smaller it is, the more weight has no excess at all."""
+_TOLD = 0.5  # degrees of freedom below which the data show no excess
 _EXCESSES = 64  # midpoints of the grid of excess variances over which its posterior is integrated
 _REACH, _LEAST_CHI_SQUARE, _LEAST_EXCESS = 8.0, 1e-3, 1e-3  # where the grid of excess variances ends
 _SENSED = 1e-9
-"""Columns of the Jacobian shorter than this, relative to the longest, are parameters that nothing senses."""
+"""A column of the Jacobian shorter than this, relative to the longest, belongs to a parameter that nothing senses."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ class Fit:
 def least_squares(
     model: Model, start: Array, weights: Array, *, tolerance: float = 1e-10, max_evaluations: int = 100
 ) -> Fit:
-    """Minimise ``sum_i w_i r_i(p)^2`` of one problem by scipy's trust regions, as a batch of one.
+    """Return the minimum of ``sum_i w_i r_i(p)^2`` of one problem, a batch of one, by scipy's trust-region method.
 
     Parameters
     ----------
@@ -131,7 +129,7 @@ def covariance(jacobian: Array, weights: Array) -> Array:
 
 @dataclass(frozen=True)
 class Observability:
-    """What one problem's observations can tell apart, from the singular values of its scaled Jacobian.
+    """Which combinations of parameters one problem's observations determine (singular values of the scaled Jacobian).
 
     Attributes
     ----------
@@ -151,18 +149,18 @@ class Observability:
     weakest: Array
 
     def confused(self, names: list[str]) -> list[str]:
-        """Return the parameters in the undetermined combinations (or in the weakest), by their share."""
+        """Return the parameters in the undetermined combinations (or in the weakest), the largest share first."""
         vectors = self.blind if len(self.blind) else self.weakest[None]
         share = np.sqrt((vectors**2).sum(axis=0))
         return [names[i] for i in np.argsort(-share, kind="stable") if share[i] > 0.2 * share.max()]
 
 
-_WORST_CONDITION = 2000.0  # a singular value this far below the largest is not determined by the data
-_WORST_CURVATURE = 2.0  # noises: u^2/2 of a direction, which the model bends by, that shows it undetermined
+_WORST_CONDITION = 2000.0  # a combination whose singular value is this far below the largest is not determined
+_WORST_CURVATURE = 2.0  # in units of the noise: second-order change over one u beyond which it is not determined
 
 
 def observability(jacobian: Array, weights: Array) -> Observability:
-    """Judge what the observations of one problem, Jacobian (n, p) and weights (n,), can tell apart.
+    """Return which combinations of parameters a Jacobian (n, p) and weights (n,) of one problem determine.
 
     A combination of parameters counts as determined when its singular value is above 1/2000 of the largest, and when
     the observations fix it to first order: where its standard uncertainty is so large that the second-order change
@@ -193,7 +191,7 @@ def observability(jacobian: Array, weights: Array) -> Observability:
 
 
 def leverage(jacobian: Array, weights: Array) -> Array:
-    """Return the diagonal of each hat matrix, shape (b, n)."""
+    """Return the leverage of each observation, the diagonal of the hat matrix, shape (b, n)."""
     weighted = jacobian * np.sqrt(weights)[:, :, None]
     scale = np.maximum(np.linalg.norm(weighted, axis=1), np.finfo(float).tiny)
     q = np.linalg.qr(weighted / scale[:, None, :])[0]
@@ -208,10 +206,10 @@ def huber_weights(standardised: Array) -> Array:
 
 
 def huber_inflation(standardised: Array, size: int) -> Array:
-    """Return the factor of the covariance of a Huber estimate, shape (b,).
+    """Return the factor by which the covariance of a Huber estimate grows, shape (b,).
 
     ``K^2 [sum psi^2 / (n - p)] / [mean psi']^2`` (Huber 1981, 7.6.12) with residuals in units of their standard
-    deviation; multiplies ``(J' W J)^-1`` with the weights before down-weighting.
+    deviation. It multiplies ``(J' W J)^-1`` with the weights before down-weighting.
     """
     count = standardised.shape[1]
     inside = np.abs(standardised) <= _HUBER
@@ -223,13 +221,13 @@ def huber_inflation(standardised: Array, size: int) -> Array:
 
 
 def excess_variance(residuals: Array, variance: Array, freedom: float | Array) -> Array:
-    """Return the variance that must be added to each observation's own for chi-square to equal its expectation.
+    """Return the variance that, added to that of each observation, makes chi-square equal its expectation.
 
     Mandel-Paule: the root tau^2 >= 0 of ``sum r^2 / (variance + tau^2) = freedom``, by Newton from below (the sum is
     convex and falling). Residuals and variances have shape (b, n), the result (b,).
     """
     squares = residuals**2
-    # With all variances as large as the largest the root would be here: the real one lies above.
+    # If all variances were as large as the largest, this would be the root; the actual root lies above it.
     tau: Array = np.maximum(squares.sum(axis=1) / freedom - variance.max(axis=1), 0.0)
     for _ in range(60):
         total = variance + tau[:, None]
@@ -242,16 +240,16 @@ def excess_variance(residuals: Array, variance: Array, freedom: float | Array) -
 
 
 def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[Array, Array]:
-    """Return the variance tau^2 that attitudes scatter with beyond their own, and the degrees of freedom of the sum.
+    """Return the variance tau^2 of the scatter beyond the stated noise, and the degrees of freedom of the sum of both.
 
     With v the median variance, the precision ``kappa = v / (v + tau^2)`` has the prior density ``(1 - kappa)^(b - 1) /
     kappa`` on (0, 1) and the likelihood ``exp(-1/2 sum [spare ln(variance + tau^2) + r^2 / (variance + tau^2)])``.
-    Returned are tau^2 at the mean of kappa, and ``2 mean^2 / variance`` of kappa, which Student's t of the same spread
-    has. No test decides: the result goes from the observations' own variances (and a normal distribution) to their
-    scatter (and its degrees of freedom) as the scatter grows. With b = 1/4 intervals of 95 % cover 96 to 97 % where
-    there is no excess and 92.5 to 95 % where there is one. Below 10 degrees of freedom b
-    is less, and below 9 it falls as their square, or intervals would be too wide where there is none; at 6 they cover
-    90 % where there is one.
+    Returned are tau^2 at the mean of kappa, and ``2 mean^2 / variance`` of kappa: the degrees of freedom of Student's t
+    with the same spread. No test decides: as the scatter grows, the result goes from the stated variances (and a normal
+    distribution) to the scatter (and its degrees of freedom). With b = 1/4, intervals of 95 % cover 96 to 97 % where
+    there is no excess and 92.5 to 95 % where there is one. Below 10 degrees of freedom b is smaller, and below 9 it
+    falls as their square, because the intervals would be too wide where there is no excess; at 6 they cover 90 % where
+    there is one.
 
     Parameters
     ----------
@@ -263,7 +261,7 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
     Returns
     -------
     tuple
-        tau^2, shape (b,), and the degrees of freedom, shape (b,): infinite where nothing is left to tell.
+        tau^2, shape (b,), and the degrees of freedom, shape (b,): infinite below half a degree of freedom.
     """
     squares, freedom = residuals**2, spare.sum(axis=1)
     enough, freedom = freedom >= _TOLD, np.maximum(freedom, _TOLD)
@@ -274,7 +272,7 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
     last = excess_variance(residuals, variance, np.maximum(freedom - reach, _LEAST_CHI_SQUARE * freedom))[:, None]
     width = np.log(np.maximum(last, typical) / first)
     grid = first * np.exp(width * (np.arange(_EXCESSES) + 0.5) / _EXCESSES)
-    # In ln tau^2 the prior is (1 - kappa)^b; all that lies below the grid is as good as no excess.
+    # In ln tau^2 the prior is (1 - kappa)^b; the first point of the grid stands for every excess below the others.
     below, within = (first / (typical + first)) ** peak / peak, (grid / (typical + grid)) ** peak * width / _EXCESSES
     grid = np.hstack([np.zeros_like(first), grid])
     total = variance[:, None, :] + grid[:, :, None]
@@ -289,9 +287,9 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
 
 
 def robust_scale(standardised: Array, size: int) -> Array:
-    """Return the scale of standardised residuals from their median absolute value, shape (b,).
+    """Return the standard deviation of standardised residuals from their median absolute value, shape (b,).
 
-    As many residuals as there are parameters are near zero by construction: the median is that of the others.
+    A fit makes as many residuals small as it has parameters, so the smallest `size` of them are left out.
     """
     largest = np.sort(np.abs(standardised), axis=1)[:, min(size, standardised.shape[1] - 1) :]
     scale: Array = MAD_TO_SIGMA * medians(largest)
@@ -299,7 +297,7 @@ def robust_scale(standardised: Array, size: int) -> Array:
 
 
 def f_test(cost: float, size: int, larger_cost: float, larger_size: int, count: int) -> float:
-    """Return the probability of so large a gain if the larger of two nested models were no better (F-test)."""
+    """Return the probability of so large a gain of the larger of two nested models if its terms are zero (F-test)."""
     if larger_size >= count:
         return 1.0
     gain = (cost - larger_cost) / (larger_size - size)
@@ -310,7 +308,7 @@ def f_test(cost: float, size: int, larger_cost: float, larger_size: int, count: 
 
 
 def bayesian_information(cost: float, size: int, count: int) -> float:
-    """Return ``n ln(cost / n) + p ln n`` (Schwarz 1978, noise level unknown)."""
+    """Return Schwarz's criterion (1978) of a model whose noise level is unknown: ``n ln(cost / n) + p ln n``."""
     return float(count * np.log(max(cost, np.finfo(float).tiny) / count) + size * np.log(count))
 
 
@@ -330,20 +328,20 @@ def chi_square_probability(value: float, freedom: float) -> float:
     return float(chi_square_tail(value, freedom))
 
 
-# Nested models blended: what their estimates say together, whichever of them is right.
+# Nested models blended: estimates that do not depend on which of the models is chosen.
 
 
-_MIDPOINTS = 160  # of the integral over the share of an order's effect
+_MIDPOINTS = 160  # of the integral over the share of a step that is noise
 _ROOTS = (np.arange(_MIDPOINTS) + 0.5) / _MIDPOINTS
 _SHARES = _ROOTS**3
-"""Midpoints in the cube root: a large gain leaves shares far below 1 / 160."""
+"""Equally spaced in the cube root, because a large gain makes shares far below 1 / 160."""
 _WIDER = 1.3
-"""Calibrated by simulation: without it intervals of tumble's biases cover 88 %, with it 93 %."""
+"""Calibrated by simulation: without it, 95 % intervals of the tumble test's biases cover 88 %, with it 93 %."""
 
 
 @dataclass(frozen=True)
 class Blend:
-    """What nested models say together.
+    """Estimates of nested models blended into one.
 
     Attributes
     ----------
@@ -358,7 +356,7 @@ class Blend:
     noise: Array
 
     def about(self, chosen: Array) -> Array:
-        """Return the covariance of other values, shape (p,): ``V + (chosen - theta)(chosen - theta)'``."""
+        """Return the covariance about other values, shape (p,): ``V + (chosen - theta)(chosen - theta)'``."""
         away = chosen - self.values
         return np.asarray(self.covariance + np.outer(away, away))
 
@@ -367,7 +365,7 @@ def blend(
     values: Array, covariances: Array, gains: ArrayLike, added: ArrayLike, *, scale: float = 1.0,
     freedom: float | None = None, prior: float = 0.5,
 ) -> Blend:  # fmt: skip
-    """Blend m nested models, the smallest first.
+    """Return the blend of m nested models, given from the smallest to the largest.
 
     ``theta = theta_1 + sum (1 - kappa_e) d_e``, ``d_e = theta_e - theta_(e-1)``;
     ``V = s^2 V_1 + 1.3 sum [(1 - kappa_e) s^2 (V_e - V_(e-1)) + var(kappa_e) d_e d_e']``, kappa_e as in `noise_share`.
@@ -400,7 +398,7 @@ def blend(
 def noise_share(
     gains: ArrayLike, added: ArrayLike, freedom: float | None = None, prior: float = 0.5
 ) -> tuple[Array, Array]:
-    """Return mean and variance of the share of a step that is noise, from its gain in chi-square.
+    """Return the mean and the variance of the share of a step that is noise, from its gain in chi-square.
 
     The density of kappa on (0, 1) is proportional to ``kappa^(d / 2 + b - 1) exp(-kappa q / 2)``, with the noise
     estimated from nu degrees of freedom to ``kappa^(d / 2 + b - 1) (1 + kappa q / nu)^(-(nu + d) / 2)``, for a step of

@@ -1,8 +1,7 @@
-"""The Allan deviation, and noise coefficients of a column: N, B, K, Q of the model that its record is fitted by.
+"""The Allan deviation, and the noise coefficients N, B, K, Q of the model that is fitted to a column's spectrum.
 
-Source: NIST SP 1065 (equations 11 and table 5) for the overlapping estimator and its equivalent degrees of freedom.
-
-Sources: IEEE Std 952 (annex C) and IEEE Std 647 for the coefficients.
+Sources: NIST SP 1065 (equation 11 and table 5) for the overlapping estimator and its equivalent degrees of freedom;
+IEEE Std 952 (annex C) and IEEE Std 647 for the coefficients.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class DeviationCurve:
 
 
 def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -> DeviationCurve:
-    """Compute the overlapping Allan deviation of evenly spaced samples.
+    """Return the overlapping Allan deviation of evenly spaced samples.
 
     ``sigma^2(m / rate) = sum_k (x_{k+2m} - 2 x_{k+m} + x_k)^2 / (2 (m / rate)^2 (N - 2m))``, x the integral of the
     samples less their mean, N its length.
@@ -103,7 +102,7 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
 
 
 def _averages(length: int, rate: float, taus: str | Array) -> np.ndarray:
-    """Numbers of samples to average, each with two terms or more in its sum."""
+    """Return how many samples are averaged at each point of the curve, so that every sum has two terms or more."""
     most = (length - 2) // 2
     if isinstance(taus, str):
         if taus == "octave":
@@ -125,7 +124,7 @@ def _averages(length: int, rate: float, taus: str | Array) -> np.ndarray:
 
 
 def _square(integral: Array, m: int) -> float:
-    """Sum of squared second differences at lag m, in pieces that stay in the cache."""
+    """Return the sum of squared second differences at lag m, computed in pieces that stay in the cache."""
     count = len(integral) - 2 * m
     buffer = np.empty(min(_CHUNK, count))
     total = []
@@ -140,7 +139,11 @@ def _square(integral: Array, m: int) -> float:
 
 
 def _freedom(length: int, counts: np.ndarray, variance: Array) -> Array:
-    """Equivalent degrees of freedom of the overlapping estimator, by the slope of the curve at each point."""
+    """Return the equivalent degrees of freedom at each point: those of the noise with the curve's slope there.
+
+    White noise below a slope of the logarithms of the variance of -1/2, 1/f noise up to 1/2, random walk above it
+    (NIST SP 1065, table 5).
+    """
     n, m = float(length), counts.astype(np.float64)
     white = (3 * (n - 1) / (2 * m) - 2 * (n - 2) / n) * 4 * m**2 / (4 * m**2 + 5)
     flicker = np.where(m == 1, 2 * (n - 2) ** 2 / (2.3 * n - 4.9), 5 * n**2 / (4 * m * (n + 3 * m)))
@@ -151,25 +154,26 @@ def _freedom(length: int, counts: np.ndarray, variance: Array) -> Array:
     return np.maximum(chosen, 1.0)
 
 
-# Noise coefficients of a column: N, B, K, Q of the model that its record is fitted by, where that model fits it.
+# Noise coefficients: N, B, K, Q of the fitted model, where the record agrees with it.
 
 
 COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk", "quantisation")
 _EDGE, _SHARE = 1.5, 0.003
-"""Of the shortest time constant, and of the record: what is as fast is a filter, where the band has no level end."""
+"""In shortest time constants, and of the record's length: a faster Gauss-Markov process is the sensor's filter; the
+second counts where the band has no level end."""
 _LEVELS = 0.01
-"""How far off the white noise the level at the end of the band may be, relative."""
+"""Relative standard uncertainty of taking the level at the end of the band for white noise."""
 _MUCH = 2.0
-"""How many times as large unseen noise must be able to make the uncertainty of a mean for a warning."""
+"""A warning says by what factor unseen noise could enlarge the uncertainty of a mean from this factor on."""
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A noise coefficient, its standard uncertainty and its 95 % interval; all nan where it is not determined.
+    """A noise coefficient, its standard uncertainty and its 95 % interval; all NaN where it is not determined.
 
-    Unit of the samples times s (quantisation), s^1/2, 1 or s^-1/2; `reason` says why it is not determined. The interval
-    is where the deviance is 3.84 above its least (the profile of the likelihood), the uncertainty its longer side over
-    1.96.
+    In the unit of the samples times s (quantisation), s^1/2, 1 or s^-1/2; `reason` says why it is not determined. In
+    the interval the deviance is at most 3.84 above its minimum (profile likelihood); the standard uncertainty is the
+    longer side over 1.96.
     """
 
     value: float
@@ -189,7 +193,7 @@ class NoiseCoefficients:
     highest
         Up to which frequency the noise counts, Hz; 0 where nothing is determined.
     filtered
-        Whether the noise is plainly correlated from sample to sample.
+        Whether the noise is clearly correlated from sample to sample.
     """
 
     angle_random_walk: Coefficient
@@ -201,12 +205,13 @@ class NoiseCoefficients:
 
 
 def read_coefficients(columns: Sequence[Analysis]) -> list[NoiseCoefficients]:
-    """Return the coefficients of the noise of columns, with profile intervals, where their model fits it.
+    """Return the noise coefficients of columns, with profile-likelihood intervals, where their model fits.
 
-    They are those of white noise, 1/f noise and random walk together, and quantisation of an angle where it shows; one
-    that the record does not show is 0 or little, with an interval from 0. Where Gauss-Markov processes explain the
-    record plainly better, there is no B and no K, unless they are the filter of the sensor. Where the test of fit
-    rejects the best model at 1 %, there is no number but N, as the level at the end of the band, where that is level.
+    They come from the model of white noise, 1/f noise and random walk together, with quantisation of an angle where it
+    shows. A coefficient that the record does not show is 0 or small, with an interval from 0. Where Gauss-Markov
+    processes explain the record clearly better, B and K are not determined, unless those processes are the sensor's
+    filter. Where the test of fit rejects the best model at 1 %, only N is given: the level at the end of the band,
+    where that is level.
     """
     wanted = [(k, index) for k, analysis in enumerate(columns) for index in sorted({*_candidates(analysis)} - {-1})]
     ends = dict(zip(wanted, intervals_of([columns[k] for k, _ in wanted], [index for _, index in wanted]), strict=True))
@@ -217,12 +222,12 @@ def read_coefficients(columns: Sequence[Analysis]) -> list[NoiseCoefficients]:
 
 
 def fits(analysis: Analysis) -> bool:
-    """Whether the test of fit lets the best model pass at 1 %."""
+    """Return whether the test of fit accepts the best model at 1 %."""
     return bool(analysis.test.probability >= NOISE_MODEL_REJECTED.level)
 
 
 def _candidates(analysis: Analysis) -> tuple[int, int, int]:
-    """From which candidates N, B and K are taken; -1 for none."""
+    """Return the candidate models that N, B and K are taken from; -1 for none."""
     if not fits(analysis):
         return (-1, -1, -1)
     names = ["".join(sorted(letters(model).replace("Q", ""))) for model in analysis.choice.models[0]]
@@ -238,12 +243,12 @@ def _candidates(analysis: Analysis) -> tuple[int, int, int]:
 
 
 def _fast(analysis: Analysis) -> float:
-    """Up to which time constant a Gauss-Markov process is the filter of the sensor, s."""
+    """Return the longest time constant, s, of a Gauss-Markov process that counts as the sensor's filter."""
     return max(_EDGE * analysis.limits[0], 0.0 if analysis.band.flat else _SHARE * analysis.length)
 
 
 def _white(analysis: Analysis) -> Coefficient:
-    """White noise, with what lies behind a filter, over all candidates."""
+    """Return the white noise, averaged over all candidates, with processes behind the filter: ``N^2 + sum 2 s^2 T``."""
 
     def square(values: Array) -> Array:
         sizes, times = values[..., list(SIGMA)], values[..., list(TIME)]
@@ -282,14 +287,14 @@ def _read(
 
 
 def _widened(coefficient: Coefficient, relative: float) -> Coefficient:
-    """A coefficient with a further relative standard uncertainty."""
+    """Return a coefficient whose interval is widened by a further relative standard uncertainty."""
     value, more = coefficient.value, relative * coefficient.value
     sides = [math.hypot(end - value, NORMAL_95 * more) for end in coefficient.interval]
     return _coefficient(value, value - sides[0], value + sides[1])
 
 
 def _level(analysis: Analysis) -> Coefficient:
-    """White noise as the level of the two highest octaves of the band, which agree."""
+    """Return the white noise as the level of the two highest octaves of the band, which agree."""
     highest = analysis.band.highest
     f = np.concatenate([frequencies(each) for each in analysis.spectra])
     top = np.where(f > highest / 4, analysis.bins.freedom, 0.0)
@@ -299,7 +304,7 @@ def _level(analysis: Analysis) -> Coefficient:
 
 
 def _markov(analysis: Analysis) -> str:
-    """Say which Gauss-Markov processes were found."""
+    """Return the words for the Gauss-Markov processes of the fitted model."""
     times = [f"{analysis.values[t]:.3g}" for t, size in zip(TIME, SIGMA, strict=True) if analysis.values[size] > 0]
     return f"a Gauss-Markov {'process' if len(times) == 1 else 'processes'} of {' and '.join(times)} s"
 
@@ -313,7 +318,7 @@ def _not_determined(reason: str) -> Coefficient:
 
 
 def undetermined(reason: str, highest: float = 0.0, filtered: bool = False) -> NoiseCoefficients:
-    """Return coefficients none of which is determined, for this reason."""
+    """Return coefficients none of which is determined, for one reason."""
     none = _not_determined(reason)
     return NoiseCoefficients(none, none, none, none, highest, filtered)
 
@@ -321,16 +326,16 @@ def undetermined(reason: str, highest: float = 0.0, filtered: bool = False) -> N
 def mean_uncertainty(analysis: Analysis, duration: float) -> float:
     """Return the standard uncertainty of a mean over a duration, s, as a measure of the bias.
 
-    ``u^2`` of `use.bias_square`, averaged over all candidate models, each times exp(variance of ln u^2 / 2).
+    ``u^2`` of `noise.terms.bias_square`, averaged over all candidates, each times exp(variance of ln u^2 / 2).
     """
     square = average(analysis.choice, lambda values: bias_square(values, np.array([duration]), analysis.interval))
     return float(np.sqrt(square.expected[0, 0]))
 
 
 def unseen(analysis: Analysis, coefficients: NoiseCoefficients, duration: float) -> float:
-    """Return how many times as large noise that does not show could make that uncertainty; 1 where that is below 2.
+    """Return by what factor noise too weak to show could enlarge that uncertainty; 1 where it is below 2.
 
-    1/f noise or random walk at the upper end of its interval, beside the white noise.
+    Taken is 1/f noise or random walk at the upper end of its interval, beside the white noise.
     """
     white, *slow = (each.interval[1] for each in (coefficients.angle_random_walk, coefficients.bias_instability,
                                                   coefficients.rate_random_walk))  # fmt: skip
@@ -344,16 +349,13 @@ def unseen(analysis: Analysis, coefficients: NoiseCoefficients, duration: float)
 
 
 def resolution(samples: Array) -> float:
-    """Return the smallest step between different values of samples, shape (n,), or 0 where all are the same.
-
-    The first 20,000 samples tell it.
-    """
+    """Return the smallest step between different values of the first 20,000 samples, or 0 where all are the same."""
     values = distinct(samples[:20_000])
     return float(np.diff(values).min()) if len(values) > 1 else 0.0
 
 
 def coefficients_dict(coefficients: NoiseCoefficients, unit: str) -> dict[str, Any]:
-    """Return the coefficients as plain JSON values with their units: null, and why, where one is not determined."""
+    """Return the coefficients as plain JSON values with their units: null and the reason where not determined."""
     units = (f"{unit}/sqrt(Hz)", unit, f"{unit}/sqrt(s)", {"rad/s": "rad", "m/s^2": "m/s"}.get(unit, f"{unit} s"))
     listed: dict[str, Any] = {}
     for name, its in zip(COEFFICIENTS, units, strict=True):

@@ -1,9 +1,10 @@
-"""Medians and quantiles, rows that are not readings, and levels that jump, in samples of a sensor.
+"""Robust statistics of samples, and what in a recording is no noise: changes of level, and rows that are not readings.
 
-NumPy's own load its package for masked arrays, which takes 0.03 s of processor time, a tenth of a short command.
+Medians and quantiles are written here because NumPy's own load its package for masked arrays: 0.03 s of processor time,
+a tenth of a short command.
 
-Loggers fill what they lost with zeros or with the last row, and shift or tear frames. Such rows are found before
-anything else looks at the samples, and bridged by straight lines, so that rows and times stay where they are.
+Loggers fill lost rows with zeros or with the row before, and shift or tear frames. Such rows are found before anything
+else looks at the samples. They are bridged by straight lines, so that all rows keep their places and times.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ MAD_TO_SIGMA = 1.4826
 
 
 def median(values: NDArray[Any]) -> float:
-    """Return the median of values of any shape, NaN if there is one among them.
+    """Return the median of values of any shape, NaN if one of them is NaN.
 
     Examples
     --------
@@ -42,7 +43,7 @@ def median(values: NDArray[Any]) -> float:
 
 
 def medians(values: NDArray[Any], axis: int = -1) -> Array:
-    """Return the medians of values along an axis, NaN where there is one among them.
+    """Return the medians of values along an axis, NaN where one of the values is NaN.
 
     Examples
     --------
@@ -56,7 +57,7 @@ def medians(values: NDArray[Any], axis: int = -1) -> Array:
 
 
 def quantile(values: NDArray[Any], share: float) -> float:
-    """Return the value below which this share of values, finite, of any shape, lies, on lines between neighbours.
+    """Return the value below which this share of finite values lies, interpolated linearly between neighbours.
 
     Examples
     --------
@@ -93,25 +94,26 @@ def rms(values: ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-# A level that jumps, in samples of a sensor at rest: no noise, though an Allan curve reads it as one.
+# Changes of level of a sensor at rest, which an Allan curve would take for noise.
 
 
-_BLOCKS, _SMALLEST = 256, 16  # means over which a jump is looked for; samples of a mean at least
+_BLOCKS, _SMALLEST = 256, 16  # means among which a jump is looked for; fewest samples of a mean
 _LIMITS = {4: 5.5, 8: 5.8, 16: 7.0}
-"""Blocks on each side of a step to how many times the usual difference it must be: white noise, 1/f noise, random walk
-and sums of them reach one of these in 4 of 1000 recordings at most."""
-_WHITE = 5.0  # sigma of white noise that a jump exceeds, beside the limit by the scatter of the other differences
+"""Blocks on each side of a step -> how many times the usual difference the step must be. White noise, 1/f noise, random
+walk and their sums exceed one of these in at most 4 of 1000 recordings."""
+_WHITE = 5.0  # standard uncertainties of white noise that a jump must exceed as well
 _REACHES = (8, 16, 32, 64)
-"""Blocks on each side of a step over which it is held against smooth drifts."""
+"""Blocks on each side of a step over which it is compared with smooth drifts."""
 _TAUS = np.geomspace(0.003, 2.0, 20)
 """Time constants of exponential drifts, in lengths of the part that they are fitted to."""
 _ALLOWED, _PLAIN = 6.0, 10.0
-"""By how many variances of a mean a step may fit worse than a drift near its place, and must fit better farther out."""
+"""Misfit in variances of a mean: a step may fit worse than a drift by 6 near its place, and must fit better by 10 over
+the widest reach."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A change of level: its size, in the unit of the samples, the first sample behind it, and how exact that is."""
+    """A change of level: its size, the first sample behind it, and within how many samples its place is known."""
 
     size: float
     sample: int
@@ -119,13 +121,13 @@ class Step:
 
 
 def find_step(samples: Array) -> Step | None:
-    """Return the plainest step of the level of samples, shape (n,), or None where noise explains what there is.
+    """Return the clearest change of level in samples, shape (n,), or None where noise explains them.
 
-    The samples become 256 means of equal length. For every place between two of them, the means of 4, 8 and 16 on both
-    sides are compared: of noise, whether white, 1/f or a random walk, these differences are alike everywhere, and a
+    The samples become 256 means of equal length. At every place between two of them, the means of 4, 8 and 16 blocks on
+    both sides are compared. Noise, whether white, 1/f or a random walk, makes these differences alike everywhere; a
     step makes one that is many times their median. So does a drift that is faster in one part of the recording than in
-    the others; a step therefore has to fit the means around it better than smooth drifts do. Fewer than 4096 samples
-    are too few to tell.
+    the others; a step therefore has to fit the means around it better than smooth drifts do. Below 4096 samples no step
+    is looked for.
     """
     length = len(samples) // _BLOCKS
     if length < _SMALLEST:
@@ -154,10 +156,10 @@ def deviation_of_steps(samples: Array) -> float:
 
 
 def _jumps(means: Array, place: int) -> bool:
-    """Whether a step near a place fits the means around it better than any smooth drift.
+    """Return whether a step near a place fits the means around it better than any smooth drift.
 
-    A drift is a polynomial of fourth order, or one of second order with an exponential (or two); the step comes with a
-    polynomial of second order or with an exponential, so that neither has more to adapt.
+    A drift is a polynomial of fourth order, or one of second order with one or two exponentials. The step comes with a
+    polynomial of second order or with an exponential, so that both have as many coefficients.
     """
     for reach in _REACHES:
         low, high = max(0, place - reach), min(_BLOCKS, place + reach)
@@ -184,29 +186,30 @@ def _jumps(means: Array, place: int) -> bool:
 
 
 def _misfit(basis: Array, values: Array) -> float:
-    """Sum of the squares that a basis, shape (n, k), leaves of values, shape (n,)."""
+    """Return the sum of squared residuals of values, shape (n,), fitted by a basis, shape (n, k)."""
     return float(np.sum((values - basis @ np.linalg.lstsq(basis, values)[0]) ** 2))
 
 
-# Rows that are not readings: exact zeros, repeats of the row before, single samples far from both neighbours.
+# Rows that are not readings: exact zeros, repeats of the row before, and samples far from the rows on both sides.
 
 
 FAR = "far from the rows on both sides"
 MOST = 0.05
-"""Share of a stretch at rest that may be left out: more, and what is left is hardly to be trusted either."""
+"""Largest share of a stretch at rest that may be left out; beyond it the rest is not trusted either."""
 _GLITCH_SIGMAS = 10.0
-"""Standard deviations of the noise around it, or steps of its output, beyond which a sample is none."""
-_SHARE_NOTED = 1e-3  # share of all rows below which rows left out are a note
-_FAR_ZERO = 5.0  # usual steps around it
+"""A sample is no reading beyond this many standard deviations of the noise around it, and steps of the output."""
+_SHARE_NOTED = 1e-3  # below this share of all rows, rows left out are a note and no warning
+_FAR_ZERO = 5.0  # usual steps around a single zero
 _BESIDE = 4  # samples on both sides
-_QUIET = 4.0  # times the steps of the quietest fifth
-_AROUND = 64  # samples whose differences tell the noise
+_QUIET = 4.0  # a part rests while its steps are below this many times those of the quietest fifth
+_AROUND = 64  # samples whose differences show the noise
 HISTORY, _FEW_ZEROS = 50, 0.02
-"""A row of zeros is none of a gyro at rest whose last 50 rows hold hardly a zero."""
-_LONGEST_ZERO = 20  # rows; gyros without noise rest at zero for longer
-_BEYOND_CHANCE_ZEROS = 3.0  # times what chance makes, and six roots of it: beyond are zeros that were no readings
+"""A row of zeros is no reading of a gyroscope whose last 50 rows hold at most this share of zeros."""
+_LONGEST_ZERO = 20  # rows of a dropout; longer zeros are a gyroscope at rest without noise
+_BEYOND_CHANCE_ZEROS = 3.0  # repeats beyond 3 times what chance makes, and 6 roots of it, are no readings
 _UPPER, _TO_SIGMA = 24, 0.615
-"""Three quarters of 32 steps, not half: a log may hold each sample twice. To the standard deviation of white noise."""
+"""The quantile at three quarters of 32 steps, since a log may hold each sample twice; its factor to the standard
+deviation of white noise."""
 
 
 @dataclass(frozen=True)
@@ -220,7 +223,7 @@ class LeftOut:
     names
         The columns.
     kinds
-        What the rows are, and which they are, of shape (n,).
+        By reason: which rows were left out, shape (n,).
     """
 
     recording: Recording
@@ -228,13 +231,13 @@ class LeftOut:
     kinds: Mapping[str, NDArray[np.bool_]]
 
     def notes(self, rest: NDArray[np.bool_] | None = None) -> list[str]:
-        """Say what was left out and why, a sentence for each kind; of knocks and the like only what is `rest`, (n,)."""
+        """Return a sentence for each reason why rows were left out; far samples count only at `rest`, shape (n,)."""
         notes = []
         for kind, rows in self.kinds.items():
             left_out = rows & rest if rest is not None and kind == FAR else rows
             count = int(np.count_nonzero(left_out))
             if count:
-                # A few knocks are in every recording; zeros and repeats are a fault of the logger.
+                # Every recording has a few knocks; zeros and repeats are faults of the logger.
                 kind_of = Note if kind == FAR and count < _SHARE_NOTED * len(left_out) else str
                 notes.append(
                     kind_of(
@@ -245,12 +248,12 @@ class LeftOut:
         return notes
 
     def check(self, start: int, stop: int, where: str) -> None:
-        """Check that not too much is left out between two samples of a stretch at rest, called `where` in messages.
+        """Refuse a stretch at rest, called `where` in the message, of which too many rows are left out.
 
         Raises
         ------
         DataError
-            More than 5 %.
+            More than 5 % of the rows from `start` to `stop` are left out.
         """
         if not self.kinds or stop <= start:
             return
@@ -266,13 +269,13 @@ class LeftOut:
 
 
 def leave_out(recording: Recording, names: Sequence[str]) -> LeftOut:
-    """Find the rows of one sensor that are not readings, and bridge them.
+    """Return a recording in which the rows of one sensor that are not readings are bridged by straight lines.
 
     - Zeros: all columns are exactly zero; of gyroscopes, where zeros are rare in the rows before.
     - Repeats: all columns are exactly as in the row before, more often than their steps make it by chance, in no more
       than 5 % of the rows (beyond that the sensor is slower than its log).
-    - Far: at rest, a sample or two farther than ten standard deviations of the noise around them, and ten steps of the
-      output, from the samples on both sides, which rest; and a single zero between values of one sign far from it.
+    - Far: at rest, one or two samples that lie farther from their neighbours than ten standard deviations of the noise
+      and ten steps of the output, while the neighbours rest; and a single zero far from values of one sign around it.
 
     Parameters
     ----------
@@ -304,7 +307,7 @@ def leave_out(recording: Recording, names: Sequence[str]) -> LeftOut:
 
 
 def zero_rows(values: Sequence[Array], never_zero: bool = False) -> NDArray[np.bool_]:
-    """Return the rows in which all columns are exactly zero, and that are not the zeros of a quantised sensor at rest.
+    """Return the rows in which all columns are exactly zero, except those of a coarsely quantised sensor at rest.
 
     Parameters
     ----------
@@ -327,7 +330,7 @@ def zero_rows(values: Sequence[Array], never_zero: bool = False) -> NDArray[np.b
 
 
 def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
-    """Return the rows that repeat the row before in all columns, where the sensor does not do that by itself."""
+    """Return the rows that repeat the row before in all columns, where the sensor itself does not repeat readings."""
     same = [np.concatenate([[False], column[1:] == column[:-1]]) for column in values]
     every = np.logical_and.reduce(same)
     count, n = int(np.count_nonzero(every)), len(every)
@@ -341,7 +344,7 @@ def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
 
 
 def far_rows(values: Sequence[Array], known: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the rows with a sample far from the rows on both sides, and those with a zero that is; not the `known`."""
+    """Return the rows with a sample far from both neighbours, and those with such a zero, without the `known`."""
     far = np.zeros((2, len(known)), dtype=np.bool_)
     good = np.flatnonzero(~known)
     if len(good) >= 2 * _AROUND:
@@ -352,9 +355,10 @@ def far_rows(values: Sequence[Array], known: NDArray[np.bool_]) -> tuple[NDArray
 
 
 def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which samples, one or two in a row, are far from the others, and which zeros are, shape (n,).
+    """Return which samples, one or two in a row, are far from their neighbours, and which are far zeros, shape (n,).
 
-    At rest only, since in motion there are knocks; but single zeros between values of one sign everywhere.
+    Far samples are looked for at rest only, since a motion has knocks; single zeros between values of one sign
+    anywhere.
     """
     steps = np.diff(x)
     np.abs(steps, out=steps)
@@ -362,7 +366,7 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     count = len(steps) // _AROUND
     parts = steps[: count * _AROUND].reshape(count, _AROUND)
     local = np.partition(parts[:, : _AROUND // 2], _UPPER, axis=1)[:, _UPPER]
-    # Rest next to motion is no rest: the largest of a part's steps and its neighbours' counts.
+    # Next to a motion there is no rest: the largest of a part's steps and its neighbours' counts.
     wide = np.maximum(local, np.maximum(np.append(local[1:], 0.0), np.concatenate([[0.0], local[:-1]])))
     resolution = float(np.min(steps, where=steps > 0, initial=np.inf))
     if resolution == np.inf:
@@ -374,7 +378,7 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     def part(samples: NDArray[np.intp]) -> NDArray[np.intp]:
         return np.minimum(samples // _AROUND, count - 1)
 
-    # A sample that is far from what is around it is a large step away from it, or from the one before.
+    # A sample far from its surroundings is a large step away from them, or from the sample before.
     suspect = np.flatnonzero(parts > limits[:, None])
     rest = np.flatnonzero(steps[count * _AROUND :] > limits[-1]) + count * _AROUND
     suspect = np.concatenate([suspect, rest])

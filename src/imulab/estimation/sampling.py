@@ -1,4 +1,4 @@
-"""What a recording's time says of its sampling: rate, gaps, changes of rate, a unit that cannot be right; bad rows."""
+"""What time shows of a recording's sampling: rate, gaps, changes of rate, a wrong unit; rows without numbers."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from imulab.recording import Array, Recording, check_finite, check_time, stored_
 from imulab.units import to_si
 
 WIDEST_GAP = 10.0
-"""Sampling intervals across which readings are interpolated at most."""
+"""Most sampling intervals across which readings are interpolated."""
 _FEWEST = 3  # samples of a recording that has a rate
-GAP = 1.5  # of the usual step: a longer one is a gap
-_COARSE = 0.2  # share of steps beyond the limit from which these are the grain of the stamps, not gaps
-_BLOCKS, _SMALLEST_BLOCK = 100, 100  # of steps whose medians show a change of rate; steps of a block at least
-SAME_RATE = 0.05  # relative: parts of a recording whose steps are this near have one rate
-_SLOWEST, _FASTEST = 5.0, 20_000.0  # Hz, of sensors as they are logged
-_USUAL = (10.0, 10_000.0)  # Hz
-BRIDGED = 0.01  # of all rows
+GAP = 1.5  # usual steps: a longer step is a gap
+_COARSE = 0.2  # share of steps beyond the limit from which time stamps are coarse and the steps are no gaps
+_BLOCKS, _SMALLEST_BLOCK = 100, 100  # blocks whose median steps show a change of rate; fewest steps of a block
+SAME_RATE = 0.05  # relative: parts of a recording whose steps are this close have one rate
+_SLOWEST, _FASTEST = 5.0, 20_000.0  # Hz: rates at which inertial sensors are logged
+_USUAL = (10.0, 10_000.0)  # Hz: likely rates, for the guess at the right unit of time
+BRIDGED = 0.01  # largest share of rows without numbers
 
 
 def usual_step(step: Array) -> tuple[float, float]:
-    """Return the usual step of time, s, and the longest that is no gap, from steps of time, shape (n,), n >= 1.
+    """Return the usual step of time, s, and the longest step that is no gap, from steps of time, shape (n,), n >= 1.
 
     Beyond 1.5 times the median a step is a gap, unless a fifth of all steps are: then time is written that coarsely
     (stamps in whole milliseconds at 700 Hz alternate between 1 and 2 ms), and the limit is 1.5 times the step that a
@@ -40,9 +40,9 @@ def usual_step(step: Array) -> tuple[float, float]:
 
 
 def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
-    """Return the sampling rate, Hz, of a recording, and what there is to say of its time.
+    """Return the sampling rate of a recording, Hz, and warnings about its time.
 
-    Said are gaps, a rate that changes, and a rate at which no sensor is logged: the unit of time is wrong then.
+    The warnings name gaps, a change of rate, and a rate at which no sensor is logged (then the unit of time is wrong).
 
     Raises
     ------
@@ -72,10 +72,10 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
 
 
 def steady_rows(time: Array) -> tuple[int, int]:
-    """Return the first row and the last + 1 of the longest stretch with one sampling rate, by times, s, shape (n,).
+    """Return the first row, and the last plus 1, of the longest stretch with one sampling rate; times in s, shape (n,).
 
-    Blocks of a hundred samples or more whose usual steps differ by more than 5 % have different rates; a single block
-    that differs is passed over.
+    Blocks of at least a hundred samples have different rates where their usual steps differ by more than 5 %; a single
+    block that differs is passed over.
     """
     step = np.diff(time)
     if step.size and step.max() < (1 + SAME_RATE / 2) * step.min():  # as most are
@@ -99,7 +99,7 @@ def steady_rows(time: Array) -> tuple[int, int]:
 
 
 def steady_part(recording: Recording) -> tuple[Recording, list[str]]:
-    """Return the longest stretch of a recording that has one sampling rate, and a line where that is not all of it.
+    """Return the longest stretch of a recording with one sampling rate, and a warning where that is not all of it.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def steady_part(recording: Recording) -> tuple[Recording, list[str]]:
 
 
 def bridged(recording: Recording, names: list[str]) -> tuple[Recording, list[str]]:
-    """Return a recording without the few rows that hold no numbers, and a line that counts them.
+    """Return a recording without the few rows that hold no numbers, and a message that counts them.
 
     A row without a time is dropped; other samples that are not finite become the line through their neighbours.
 
@@ -152,14 +152,14 @@ def bridged(recording: Recording, names: list[str]) -> tuple[Recording, list[str
 
 
 def bridged_line(name: str, count: int, first: str) -> str:
-    """Say how many rows of a file hold no numbers, and where the first of them is."""
+    """Return the message of how many rows of a file hold no numbers, and where the first of them is."""
     rows = f"{count} row{'s' if count > 1 else ''} without numbers"
     where = first if count == 1 else f"the first {first}"
     return f"{name}: {rows} ({where}) bridged from their neighbours"
 
 
 def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
-    """Say where the rate changes, and between which rates."""
+    """Return the message of where the rate changes, and between which rates."""
 
     def rate(rows: slice) -> float:
         return 1 / usual_step(np.diff(time[rows]))[0]
@@ -174,7 +174,7 @@ def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
 
 
 def mislabelled(recording: Recording, rate: float) -> list[str]:
-    """Say that no sensor is logged at a rate, and in which unit of time it would be."""
+    """Return a warning where no sensor is logged at this rate, with the unit of time that would make it a usual one."""
     if _SLOWEST < rate < _FASTEST:
         return []
     unit = recording.units["time"]

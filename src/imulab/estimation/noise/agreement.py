@@ -1,7 +1,7 @@
-"""Whether two sets of spectra are of the same noise: by the terms of a model, and octave by octave without one.
+"""Test of whether two sets of spectra show the same noise: by the terms of a model, and octave by octave without one.
 
-Source: the likelihood ratio of one model for both against one for each, its mean under the common model from drawn
-spectra (Bartlett 1937); ratios of mean squares in octaves, which are F variables whatever the model.
+Sources: the likelihood ratio of one common model against one model for each set, scaled by its mean over spectra drawn
+from the common model (Bartlett 1937); ratios of mean squares in octaves, which are F variables whatever the model.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from imulab.estimation.noise.spectrum import Spectrum, frequencies
 from imulab.estimation.noise.terms import Bins, prepare
 from imulab.recording import Array
 
-_DRAWS = 100  # spectra drawn from the common model: they tell how the two tests go together
+_DRAWS = 100  # spectra drawn from the common model, which show how the two tests are correlated
 _TAIL = 0.025  # on both sides of a 95 % interval
 _SMALLEST, _LARGEST, _MOST_ALIKE, _LARGEST_SCORE = 1e-12, 1 - 1e-9, 0.99, 9.0
-"""Of probabilities, correlations and normal scores."""
+"""Limits of probabilities, correlations and normal scores, within which all formulas are finite."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class Octaves:
     Attributes
     ----------
     low, high
-        Ends of each, Hz, shape (o,).
+        Ends of each octave, Hz, shape (o,).
     ratio
-        Of the mean squares, each over the common model, shape (..., o).
+        Ratio of the mean squares, each over the common model, shape (..., o).
     freedom
-        Coefficients in both, shape (2, o).
+        Number of coefficients in both sets, shape (2, o).
     tolerance
-        Relative change of size that is not held against the second set.
+        Relative change of size that the test allows.
     """
 
     low: Array
@@ -49,13 +49,13 @@ class Octaves:
 
     @property
     def allowed(self) -> Array:
-        """The part of the ratio that the tolerance explains, shape (..., o)."""
+        """Part of the ratio that the tolerance explains, shape (..., o)."""
         most = (1 + self.tolerance) ** 2
         return np.clip(self.ratio, 1 / most, most)
 
     @property
     def scores(self) -> Array:
-        """Of what the tolerance leaves; without one, standard normal where both are of the same noise, (..., o)."""
+        """Normal scores of the ratio beyond the tolerance, (..., o): standard normal for one noise, no tolerance."""
         left = self.ratio / self.allowed
         upper = f_tail(left, self.freedom[1], self.freedom[0])
         lower = f_tail(1 / left, self.freedom[0], self.freedom[1])
@@ -64,7 +64,7 @@ class Octaves:
 
     @property
     def probability(self) -> Array:
-        """Of so large a sum of squares of the scores, if both are of the same noise, shape (...)."""
+        """Probability of so large a sum of squared scores if both sets are of the same noise, shape (...)."""
         return np.asarray(chi_square_tail(np.sum(self.scores**2, axis=-1), max(len(self.low), 1)))
 
     @property
@@ -76,18 +76,18 @@ class Octaves:
 
 @dataclass(frozen=True)
 class Agreement:
-    """What speaks against one noise for both sets.
+    """Result of the test of whether two sets are of the same noise.
 
     Attributes
     ----------
     model
         Terms of the common model, shape (8,).
     terms_probability
-        Of so large a likelihood ratio, if both are of the same noise.
+        Probability of so large a likelihood ratio if both sets are of the same noise.
     octaves
-        The ratios by octave.
+        Ratios by octave.
     probability
-        Of either probability as small as the smaller of the two, if both are of the same noise.
+        Probability that either test gives a probability as small as the smaller of the two, for the same noise.
     """
 
     model: Flags
@@ -105,19 +105,19 @@ def agreement(
     candidates: tuple[str, ...] = CANDIDATES,
     full_band: bool = False,
 ) -> Agreement:
-    """Test whether two sets of spectra, of one sampling rate, are of the same noise but for a tolerance.
+    """Return the test of whether two sets of spectra of one sampling rate are of the same noise, within a tolerance.
 
-    Among all changes within the tolerance, octave by octave, the tests are of the one that brings the sets closest.
-    Spectra drawn from the common model tell the mean of the likelihood ratio, and how the two tests are correlated.
+    Of all changes within the tolerance, octave by octave, the one that brings the sets closest is tested. Spectra drawn
+    from the common model give the mean of the likelihood ratio and the correlation of the two tests.
 
     Parameters
     ----------
     first, second
-        All of a set are of one noise.
+        Spectra of the two sets.
     highest
-        Up to which frequency, Hz.
+        Highest frequency that counts, Hz.
     tolerance
-        Relative change of the size of the noise of an octave that is not held against the second.
+        Relative change of the size of the noise in an octave that the test allows.
     candidates, full_band
         For the choice of the common model, as for `choose`.
     """
@@ -144,10 +144,10 @@ def agreement(
 
 
 def _either(least: float, correlation: float) -> float:
-    """Probability that one of two tests, whose normal scores are correlated, has a probability of `least` or below.
+    """Return the probability that one of two correlated tests gives a probability of `least` or below.
 
-    ``2 p - int_c^inf phi(x) Phi((rho x - c)/sqrt(1 - rho^2)) dx``, c the score of p; with a number of independent tests
-    in its place, 4 % of all pairs more were below 0.5 than should be.
+    ``2 p - int_c^inf phi(x) Phi((rho x - c)/sqrt(1 - rho^2)) dx``, c the normal score of p, rho the correlation of the
+    scores. A number of independent tests in place of rho put 4 % too many pairs below 0.5.
     """
     rho = min(max(correlation, 0.0), _MOST_ALIKE)
     start = max(float(-normal_quantile(min(max(least, 1e-300), _LARGEST))), -_LARGEST_SCORE)
@@ -157,7 +157,7 @@ def _either(least: float, correlation: float) -> float:
 
 
 def _likelihood_ratios(bins: Bins, of_first: Flags, values: Array, limits: tuple[float, float], power: Array) -> Array:
-    """Of powers, shape (r, b), from the values of the common model on, shape (r,)."""
+    """Return twice the log likelihood ratios of powers, shape (r, b), each fitted from the common model's values on."""
     start = np.broadcast_to(values, (len(power), len(values)))
     deviances = []
     for part in (of_first | ~of_first, of_first, ~of_first):
@@ -167,7 +167,7 @@ def _likelihood_ratios(bins: Bins, of_first: Flags, values: Array, limits: tuple
 
 
 def _octaves(spectra: Sequence[Spectrum], of_first: Flags, relative: Array, highest: float) -> Octaves:
-    """Octaves below `highest` that both sets have, of powers over the model, shape (r, b)."""
+    """Return the octaves below `highest` that both sets have, from powers over the model, shape (r, b)."""
     below = np.concatenate([_octave(each, highest) for each in spectra])
     inside = below == np.arange(int(below.max()) + 1)[:, None]
     freedom = np.concatenate([each.freedom for each in spectra])
@@ -180,7 +180,7 @@ def _octaves(spectra: Sequence[Spectrum], of_first: Flags, relative: Array, high
 
 
 def _allowed(spectra: Sequence[Spectrum], octaves: Octaves, highest: float) -> Array:
-    """The part of the ratio of each bin's octave that the tolerance explains, shape (b,); 1 where there is no ratio."""
+    """Return the part of each bin's ratio that the tolerance explains, shape (b,); 1 in octaves without a ratio."""
     below = np.concatenate([_octave(each, highest) for each in spectra])
     factor = np.ones(int(below.max()) + 1)
     factor[np.rint(np.log2(highest / octaves.high)).astype(np.int64)] = octaves.allowed
@@ -188,5 +188,5 @@ def _allowed(spectra: Sequence[Spectrum], octaves: Octaves, highest: float) -> A
 
 
 def _octave(spectrum: Spectrum, highest: float) -> NDArray[np.int64]:
-    """Which octave below `highest`, Hz, each bin is in, from 0, shape (b,)."""
+    """Return the number of each bin's octave below `highest`, Hz, counted from 0, shape (b,)."""
     return np.floor(np.log2(highest / np.minimum(frequencies(spectrum), highest))).astype(np.int64)

@@ -1,11 +1,9 @@
-"""The noise of one column, from its stretches at rest to a model.
+"""The noise of one column: candidate models, the choice among them, drift with a covariate, and the test of fit.
 
-The candidate terms, the choice among them and the test of fit.
-
-Source: generalised least squares; the cosine coefficients of the noise are independent, with the model's variances.
-
-Source: Guerrier, Skaloud, Stebler and Victoria-Feser (2013). The record is continued by its mirror image, so that its
-Allan variances are sums over squares of cosine coefficients, whose covariance is known.
+Sources: generalised least squares for the drift (the cosine coefficients of the noise are independent, with the model's
+variances); Guerrier, Skaloud, Stebler and Victoria-Feser (2013) for the test of fit by Allan variances. The record is
+continued by its mirror image, which makes its Allan variances sums over squares of cosine coefficients, whose
+covariance is known.
 """
 
 from __future__ import annotations
@@ -36,30 +34,29 @@ from imulab.estimation.noise.spectrum import Spectrum, Stretch, binned, variance
 from imulab.estimation.noise.terms import NAMES, Bins, letters, prepare, terms
 from imulab.recording import Array
 
-# Drift that follows a covariate, time or temperature, told apart from slow noise: least squares under the noise
-# model.
+# Drift with a covariate, time or temperature, separated from slow noise by least squares under the noise model.
 
 
 Refit = Callable[[Sequence[Spectrum]], tuple[Sequence[Array], float]]
-"""Fits a model to spectra; returns its variance in each bin of each of them, (b,), and its deviance."""
-# Of regression and fit of the noise to what is left, one after the other
+"""Fits a model to spectra; returns its variance in each bin of each spectrum, (b,), and its deviance."""
+# How often regression and noise model are fitted in turn
 _REGRESSION_ROUNDS = 3
-# Of a covariate in deviance, as for a term of the model; what the deviance must fall by beyond it
+# Price of a covariate in deviance, as of a term of the model; further fall of the deviance that is asked for
 _PENALTY, _GAIN = 4.0, 6.0
 
 
 @dataclass(frozen=True)
 class Regression:
-    """How samples follow covariates.
+    """Linear dependence of samples on covariates.
 
     Attributes
     ----------
     slope, standard_uncertainty
         In the unit of the samples over that of the covariate, shape (k,).
     gain
-        By how much the deviance falls that all of them together are taken out.
+        Fall of the deviance when the dependence on all covariates is removed.
     residual
-        The stretches without what follows the covariates.
+        The stretches without that dependence.
     """
 
     slope: Array
@@ -69,13 +66,13 @@ class Regression:
 
     @property
     def follows(self) -> bool:
-        """Whether a slope is beyond 3 standard uncertainties, and the deviance, at 4 a parameter, falls by 6."""
+        """Whether a slope exceeds 3 standard uncertainties and the deviance falls by 6 beyond 4 for each covariate."""
         z = np.abs(self.slope) / self.standard_uncertainty
         return bool(z.max() > FOLLOWS_COVARIATE.limit and self.gain - _PENALTY * len(z) >= _GAIN)
 
 
 def ramp_coefficients(stretch: Stretch) -> Array:
-    """Return the slow coefficients of time, s, over a stretch, shape (J,)."""
+    """Return the slow cosine coefficients of time, s, over a stretch, shape (J,)."""
     n = stretch.count
     j = np.arange(1, len(stretch.slow) + 1)
     # sum_i i cos(pi j (i + 1/2)/n) = -(1 - (-1)^j)/(4 sin^2(pi j/2n)) cos(pi j/2n)
@@ -86,16 +83,16 @@ def ramp_coefficients(stretch: Stretch) -> Array:
 def regress(
     stretches: Sequence[Stretch], covariates: Sequence[Array], refit: Refit, rounds: int = _REGRESSION_ROUNDS
 ) -> Regression:
-    """Regress stretches on covariates, with the noise model fitted again to what is left, in three rounds.
+    """Return the dependence of stretches on covariates, fitted in turn with the noise model, three times.
 
-    ``b = (X' Lambda^-1 X)^-1 X' Lambda^-1 c``, the coefficients of the stretches one below the other.
+    ``b = (X' Lambda^-1 X)^-1 X' Lambda^-1 c``, with the cosine coefficients c of all stretches one below the other.
 
     Parameters
     ----------
     stretches
-        One or more of the same column.
+        One or more stretches of the same column.
     covariates
-        Of each stretch the slow coefficients of each covariate, shape (k, J); all k are fitted at once.
+        For each stretch the slow coefficients of each covariate, shape (k, J); all k are fitted together.
     refit
         Fits the noise model to spectra.
     """
@@ -130,7 +127,7 @@ def _slopes(
 
 
 def counted(stretch: Stretch) -> Array:
-    """Return how much each slow coefficient counts, shape (J,): what its bin counts of its coefficients."""
+    """Return the weight of each slow coefficient, shape (J,): the share of its bin's coefficients that count."""
     counts = np.zeros(len(stretch.slow))
     f = np.arange(1, len(counts) + 1) / stretch.count
     for spectrum in stretch.spectra:
@@ -142,7 +139,7 @@ def counted(stretch: Stretch) -> Array:
 
 
 def without(stretch: Stretch, taken: Array) -> Stretch:
-    """Return a stretch whose slow coefficients are less by `taken`, shape (J,), and its spectra accordingly."""
+    """Return a stretch with `taken`, shape (J,), subtracted from its slow coefficients and so from its spectra."""
     slow = stretch.slow - taken
     spectrum = stretch.spectra[0]
     low = spectrum.last <= len(slow)
@@ -152,28 +149,28 @@ def without(stretch: Stretch, taken: Array) -> Stretch:
     return replace(stretch, slow=slow, spectra=(replace(spectrum, power=power), *stretch.spectra[1:]))
 
 
-# The test of fit: Allan variances of a record against those of the model, by the method of wavelet moments.
+# Test of fit: Allan variances of a record against those of the model (generalised method of wavelet moments).
 
 
-_SHORTEST, _LONGEST = 4.0, 10.0  # tau f_max at least; parts of the record at least
-_STEP = 1e-4  # relative change of a parameter from which slopes are taken
+_SHORTEST, _LONGEST = 4.0, 10.0  # least tau f_max; least number of the longest tau in a record
+_STEP = 1e-4  # relative change of a parameter from which slopes are computed
 _NODES = 32  # midpoints of the integral of an Allan variance over a bin
 
 
 @dataclass(frozen=True)
 class MomentsFit:
-    """How well a model fits.
+    """How well a model describes the Allan variances of a record.
 
     Attributes
     ----------
     statistic, freedom, probability
-        J, its degrees of freedom, and the probability of a larger J of a good model; 1 where there is nothing to test.
+        J, its degrees of freedom, and the probability of a larger J under the model; 1 where nothing can be tested.
     tau
         Averaging times, s, shape (t,).
     variance, predicted
-        Allan variances of the record (its mirror image continuing it) and of the model, shape (t,).
+        Allan variances of the record (continued by its mirror image) and of the model, shape (t,).
     values
-        The parameters that fit the Allan variances best, one step of Gauss and Newton from the model, shape (8,).
+        Parameters that fit the Allan variances best, one Gauss-Newton step from the model, shape (8,).
     """
 
     statistic: float
@@ -186,15 +183,15 @@ class MomentsFit:
 
 
 def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> MomentsFit:
-    """Hold the Allan variances at octaves of averaging time, 4/f_max to L/10, against a model.
+    """Return the test of a model by its Allan variances at octaves of averaging time from 4/f_max to L/10.
 
-    ``J = r' Omega^-1 r``, r the difference that is left when the parameters are fitted to it, of cube roots, which are
-    nearly normal (Wilson and Hilferty 1931), Omega the covariance of the Allan variances under the model.
+    ``J = r' Omega^-1 r``, r the difference of the cube roots, which are nearly normal (Wilson and Hilferty 1931), that
+    is left after the parameters are fitted to it; Omega the covariance of the Allan variances under the model.
 
     Parameters
     ----------
     spectra
-        What the model was fitted to.
+        Spectra that the model was fitted to.
     values
         Its parameters in the order of `NAMES`, shape (8,).
     highest
@@ -222,7 +219,7 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> M
     observed = weight @ (counted * bins.power)
     scale = 1 / predicted[0]
     root = np.linalg.cholesky((spread * scale[:, None]) @ (spread * scale[:, None]).T)
-    # The cube root of what is distributed as chi-square over its freedom is nearly normal, about 1 - 2/(9 freedom).
+    # The cube root of chi-square over its degrees of freedom is nearly normal, with the mean 1 - 2/(9 freedom).
     square = np.sum((spread * scale[:, None]) ** 2, axis=1)
     ratio = 3 * (np.cbrt(np.maximum(observed * scale, 0.0)) - (1 - square / 9))
     r = np.linalg.solve(root, ratio)
@@ -237,10 +234,10 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> M
 
 
 def allan_of_bins(records: Sequence[Sequence[Spectrum]]) -> tuple[Array, Array]:
-    """Return octaves of averaging time up to a quarter of a record, s, and the Allan variance there, shapes (t,).
+    """Return octaves of averaging time up to a quarter of a record, s, and the Allan variances there, shapes (t,).
 
-    Sums over the bins of each record, which its mirror image continues and whose lines are left out: they need no
-    samples. Records count by how many means they hold.
+    They are sums over the bins of each record, without its lines and without its samples. The record is continued by
+    its mirror image. Records are weighted by the number of means in each.
     """
     interval, longest = records[0][0].interval, max(each.length for record in records for each in record)
     m = 2 ** np.arange(max(0, int(np.log2(longest / interval / 4))) + 1)
@@ -255,12 +252,12 @@ def allan_of_bins(records: Sequence[Sequence[Spectrum]]) -> tuple[Array, Array]:
 
 
 def _share(spectrum: Spectrum) -> Array:
-    """Which part of all coefficients of the record each bin holds, those left out as lines included."""
+    """Return the share of all coefficients of the record in each bin, with those left out as lines."""
     return np.asarray((spectrum.last - spectrum.first + 1) / spectrum.count)
 
 
 def _weights(spectrum: Spectrum, m: np.ndarray) -> Array:
-    """Mean over each bin of ``2 sin^4(m w/2)/(m^2 sin^2(w/2))``, w = pi j/n, for means of m samples, shape (t, b)."""
+    """Return the mean of ``2 sin^4(m w/2)/(m^2 sin^2(w/2))``, w = pi j/n, over bins, for means of m samples, (t, b)."""
     width = (spectrum.last - spectrum.first + 1).astype(np.float64)
     share = (np.arange(_NODES) + 0.5) / _NODES
     # Midpoints stand for the j of a bin; those of a narrow one are repeated.
@@ -269,14 +266,14 @@ def _weights(spectrum: Spectrum, m: np.ndarray) -> Array:
     return np.stack([np.mean(2 * np.sin(k * half) ** 4 / (k * np.sin(half)) ** 2, axis=1) for k in m])
 
 
-# Which terms the noise of a record has, and what all models that it allows say together.
+# Choice of the terms of a model, and quantities averaged over all candidate models.
 
 
 CANDIDATES = ("N", "NK", "NB", "NG", "NBK", "NGK", "NGB", "NGG", "NGGK")
 PER_PARAMETER, _RIVAL, _QUANTISATION = 4.0, 4.0, 12.0
-"""What a parameter must gain in deviance, how near a rival is, what quantisation noise must gain."""
+"""Deviance that a parameter must gain; distance of a rival from the best; what quantisation noise must gain."""
 _LARGEST_VARIANCE = 2.0
-"""Of the logarithm of a square: beyond it the expansion that it comes from says nothing more."""
+"""Largest variance of the logarithm of a square: the expansion that it comes from holds no farther."""
 _HALVINGS = 60  # of a bracket that holds a quantile: to the last digit of a double
 
 
@@ -303,22 +300,22 @@ class Choice:
 
     @property
     def chosen(self) -> NDArray[np.int64]:
-        """The candidate of the least deviance plus 4 for each parameter, shape (c,)."""
+        """Candidate with the least deviance plus 4 for each parameter, shape (c,)."""
         return np.asarray(self._cost.argmin(axis=-1))
 
     @property
     def rivals(self) -> Flags:
-        """Candidates within 4 of the chosen one, shape (c, m)."""
+        """Whether a candidate's cost is within 4 of the chosen one's, shape (c, m)."""
         near = self._cost - self._cost.min(axis=-1, keepdims=True) < _RIVAL
         near[np.arange(len(near)), self.chosen] = False
         return np.asarray(near)
 
     @property
     def weights(self) -> Array:
-        """``exp(-deviance/2 - parameters)`` over their sum, shape (c, m).
+        """Weights of the candidates, ``exp(-deviance/2 - parameters)`` over their sum, shape (c, m).
 
-        A parameter counts half of what it does in the choice: with the same price averages are too sure of the fewest
-        terms, and the mean over a tenth of a log of a Gauss-Markov process as long is within 2 u in 87 %, not 91 %.
+        A parameter costs half of what it does in the choice. At the same price the averages favour the fewest terms too
+        much: the mean over a tenth of a log of a Gauss-Markov process as long is within 2 u in 87 %, not 91 %.
         """
         exponent = self.deviance / 2 + self.models.sum(axis=-1)
         weights = np.exp(exponent.min(axis=-1, keepdims=True) - exponent)
@@ -333,9 +330,9 @@ def choose(
     candidates: tuple[str, ...] = CANDIDATES,
     full_band: bool = False,
 ) -> Choice:
-    """Fit candidate models to the spectra of columns.
+    """Return the candidate models fitted to the spectra of columns.
 
-    Quantisation noise joins all candidates of a column where it gains 12 in the best one; it shows only in spectra that
+    Quantisation noise joins all candidates of a column where the best one gains 12 by it. It shows only in spectra that
     reach up to half the sampling rate (`full_band`).
 
     Parameters
@@ -379,16 +376,16 @@ def _fitted(bins: Bins, models: Flags, limits: tuple[float, float], power: Array
 
 @dataclass(frozen=True)
 class Averaged:
-    """A positive quantity, a variance, as all candidates together have it: a mixture of lognormal distributions.
+    """A variance averaged over all candidates: a mixture of lognormal distributions.
 
     Attributes
     ----------
     squares
-        Of each candidate, shape (c, m, t).
+        Variance by each candidate, shape (c, m, t).
     spread
-        Variance of the logarithms of these, shape (c, m, t).
+        Variance of its logarithm, shape (c, m, t).
     weights
-        Of the candidates, shape (c, m).
+        Weights of the candidates, shape (c, m).
     """
 
     squares: Array
@@ -397,16 +394,16 @@ class Averaged:
 
     @property
     def mean(self) -> Array:
-        """Weighted mean of the squares, shape (c, t)."""
+        """Weighted mean of the variances, shape (c, t)."""
         return np.asarray(np.einsum("cm,cmt->ct", self.weights, self.squares))
 
     @property
     def expected(self) -> Array:
-        """Weighted mean of the expectations ``square exp(spread/2)``, shape (c, t)."""
+        """Weighted mean of the expected variances ``square exp(spread/2)``, shape (c, t)."""
         return np.asarray(np.einsum("cm,cmt->ct", self.weights, self.squares * np.exp(self.spread / 2)))
 
     def quantile(self, probability: float) -> Array:
-        """Return what the square is below with a probability, shape (c, t); 0 where that is the share of no noise."""
+        """Return the value below which the variance lies with a probability, shape (c, t); 0 if none is likely."""
         with np.errstate(divide="ignore"):
             centre = np.log(self.squares)
         width = np.sqrt(self.spread) + 1e-9
@@ -423,7 +420,7 @@ class Averaged:
 
 
 def average(choice: Choice, square: Callable[[Array], Array]) -> Averaged:
-    """Return a quantity over all candidates, with the uncertainty that the covariance of each gives it.
+    """Return a variance averaged over all candidates, with the uncertainties of their parameters.
 
     Parameters
     ----------
@@ -441,7 +438,7 @@ def average(choice: Choice, square: Callable[[Array], Array]) -> Averaged:
     return Averaged(each[..., 0, :], np.clip(spread, 0, _LARGEST_VARIANCE), choice.weights)
 
 
-# The noise of one column, from its stretches at rest to a model: band, allowance, candidates, intervals, test.
+# Noise of one column: from its stretches at rest to a model with intervals and a test.
 
 
 _RICHEST = "NGGK"
@@ -454,13 +451,13 @@ class Analysis:
     Attributes
     ----------
     stretches
-        What it was found from.
+        The stretches that were analysed.
     band, allowance
-        Up to which frequency, and how exactly, a model is held against the spectra.
+        Highest frequency, and ripple, with which a model is fitted to the spectra.
     limits
         Least and greatest time constant, s.
     choice
-        The candidates, fitted, c = 1.
+        The fitted candidates, c = 1.
     """
 
     stretches: tuple[Stretch, ...]
@@ -471,7 +468,7 @@ class Analysis:
 
     @property
     def spectra(self) -> tuple[Spectrum, ...]:
-        """The spectra with what counts of them."""
+        """Spectra with the weights of their bins."""
         return self.allowance.spectra
 
     @cached_property
@@ -491,7 +488,7 @@ class Analysis:
 
     @property
     def index(self) -> int:
-        """Which candidate is chosen."""
+        """Number of the chosen candidate."""
         return int(self.choice.chosen[0])
 
     @property
@@ -511,7 +508,7 @@ class Analysis:
 
     @property
     def covariance(self) -> Array:
-        """Of the logarithms of these, shape (8, 8)."""
+        """Covariance of the logarithms of the chosen candidate's parameters, shape (8, 8)."""
         return np.asarray(self.choice.covariance[0, self.index])
 
     @cached_property
@@ -520,7 +517,7 @@ class Analysis:
         return test_of_fit(self.spectra, self.values, self.band.highest)
 
     def intervals(self, model: Flags | None = None) -> tuple[Array, Array]:
-        """Return the ends of 95 % intervals, shapes (8,), of the chosen candidate or of it with more terms."""
+        """Return the ends of 95 % intervals, shapes (8,), of the chosen candidate, with the terms of `model` added."""
         models = (self.model if model is None else model | self.model)[None]
         low, high = profile(
             self.bins, self.values[None], models, self.limits, self.bins.power[None], self.bins.freedom[None]
@@ -528,15 +525,15 @@ class Analysis:
         return low[0], high[0]
 
     def average(self, square: Callable[[Array], Array]) -> Averaged:
-        """Return a variance over all candidates; see `choice.average`."""
+        """Return a variance averaged over all candidates; see `average`."""
         return average(self.choice, square)
 
     def variances(self) -> list[Array]:
-        """Return the variance of the coefficients in the bins of each spectrum, (b,)."""
+        """Return the variance of the coefficients in the bins of each spectrum, shapes (b,)."""
         return _split(self.bins.variances(self.values[None])[0], self.spectra)
 
     def steps(self, stretches: Sequence[Stretch], limit: float = LEVEL_STEP.limit) -> list[tuple[LevelChange, ...]]:
-        """Return the changes of level of stretches, its own or these before something was taken out, by its noise."""
+        """Return the changes of level of stretches, the analysed ones or earlier ones, under the chosen noise model."""
         steps, start = [], 0
         variances = self.variances()
         for each in stretches:
@@ -547,11 +544,11 @@ class Analysis:
         return steps
 
     def regressed(self, covariates: Sequence[Array]) -> Regression:
-        """Return how the column follows covariates: of each stretch their slow coefficients, shape (k, J)."""
+        """Return the column's dependence on covariates, given as slow coefficients of each stretch, shape (k, J)."""
         return regress(self.stretches, covariates, self._refit)
 
     def _refit(self, spectra: Sequence[Spectrum]) -> tuple[Sequence[Array], float]:
-        """The chosen model fitted to spectra that count what those of the analysis do."""
+        """Return variances and deviance of the chosen model fitted to spectra with the weights of the analysed ones."""
         bins = prepare(
             [
                 Spectrum(s.interval, s.count, s.first, s.last, s.power, mine.freedom)
@@ -565,16 +562,16 @@ class Analysis:
 def analysed(
     stretches: Sequence[Stretch], candidates: tuple[str, ...] = CANDIDATES, highest: float | None = None
 ) -> Analysis:
-    """Return the noise of a column from its stretches at rest, of one sampling rate.
+    """Return the noise of a column from its stretches at rest, all of one sampling rate.
 
     Parameters
     ----------
     stretches
-        One or more, whose deviances add up.
+        One or more stretches, whose deviances are added.
     candidates
         Letters of the models; a single one is fitted as it is.
     highest
-        Up to which frequency, Hz; found from the spectra if not given.
+        Highest frequency that is fitted, Hz; from the spectra if None.
     """
     return analyses([stretches], candidates, highest)[0]
 
@@ -582,7 +579,7 @@ def analysed(
 def analyses(
     columns: Sequence[Sequence[Stretch]], candidates: tuple[str, ...] = CANDIDATES, highest: float | None = None
 ) -> list[Analysis]:
-    """Return the noise of columns with the same times, all at once: see `analysed`."""
+    """Return the noise of columns with the same times, fitted together: see `analysed`."""
     spectra = [[each for stretch in stretches for each in stretch.spectra] for stretches in columns]
     nyquist = 0.5 / columns[0][0].interval
     bands = [
@@ -591,12 +588,12 @@ def analyses(
     by_column: dict[int, Analysis] = {}
     for band in dict.fromkeys(bands):
         alike = [k for k, its in enumerate(bands) if its == band]
-        fitted = _of_one_band([spectra[k] for k in alike], band, candidates)
+        fitted = _fit_in_band([spectra[k] for k in alike], band, candidates)
         by_column |= {k: Analysis(tuple(columns[k]), band, *its) for k, its in zip(alike, fitted, strict=True)}
     return [by_column[k] for k in range(len(columns))]
 
 
-def _of_one_band(
+def _fit_in_band(
     columns: Sequence[Sequence[Spectrum]], band: Band, candidates: tuple[str, ...]
 ) -> list[tuple[Allowance, tuple[float, float], Choice]]:
     inside = [[within(each, band.highest) for each in spectra] for spectra in columns]
@@ -613,7 +610,7 @@ def _of_one_band(
 
 
 def intervals_of(analysed_columns: Sequence[Analysis], index: Sequence[int]) -> list[tuple[Array, Array]]:
-    """Return the ends of 95 % intervals, shapes (8,), of one candidate of each column, columns as in `analyses`."""
+    """Return the ends of 95 % intervals, shapes (8,), of one candidate for each column; columns as in `analyses`."""
     ends: dict[int, tuple[Array, Array]] = {}
     for limits in dict.fromkeys(each.limits for each in analysed_columns):
         alike = [k for k, each in enumerate(analysed_columns) if each.limits == limits]
@@ -629,7 +626,7 @@ def intervals_of(analysed_columns: Sequence[Analysis], index: Sequence[int]) -> 
 
 
 def without_steps(stretches: Sequence[Stretch], steps: Sequence[Sequence[LevelChange]]) -> list[Stretch]:
-    """Return stretches without the changes of level that were found in them."""
+    """Return stretches without these changes of level."""
     cleaned = []
     for stretch, its in zip(stretches, steps, strict=True):
         for step in its:

@@ -1,4 +1,4 @@
-"""What is no noise in a log at rest: spikes, lines of the spectrum, steps of the level."""
+"""Removal of what is no noise from a log at rest: spikes, knocks, spectral lines, and changes of level."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from imulab.estimation.distributions import chi_square_upper_quantile
 from imulab.estimation.rows import median, medians, quantile
 from imulab.recording import Array
 
-_BLOCK, _SPIKE = 50, 6.0  # samples of a block whose median is the level; a spike is so many sigma off it
-_CHUNK = 1 << 16  # samples whose deviations are looked at together
+_BLOCK, _SPIKE = 50, 6.0  # samples of a block whose median is the level; sigma beyond which a sample is a spike
+_CHUNK = 1 << 16  # samples whose deviations are compared together
 _TO_SIGMA = 1.959964  # 95 % of |x| of a normal distribution
-# Coefficients of a bin that has a median of its own; coefficients left out on each side of a line
+# Fewest coefficients of a bin with its own median; coefficients left out on each side of a line
 _FEWEST, _SKIRT = 16, 3
-_LEAST = 100  # coefficients whose median tells the level: that of 16 is off by a factor of 3 now and then
+_LEAST = 100  # coefficients of a median: that of 16 is sometimes off by a factor of 3
 _STRONG, _NEAR, _WANDERS, _MOST_STRONG, _ROUNDS = 1e3, 50, 0.01, 8, 14
-"""Lines so far above the median are fitted, by so many coefficients on both sides, if so little of them is left."""
+"""Strong lines: power over the median, coefficients fitted on both sides, largest share of power left, how many lines,
+rounds of the search for the frequency."""
 _STRONG_SLOW, _SLOW = 1e5, 200
-"""The same of the lowest coefficients, where slow noise is read: a sway there must not pass for a line."""
+"""The same limit among the lowest coefficients, which show slow noise: a slow sway must not pass for a line."""
 _NOISE = 3.0
-"""Over the median of the squares of coefficients: their mean is 2.2 of it, and scatters over 100 of them."""
-_MOST_STEPS = 5  # of a stretch: noise with more is no noise with steps
-# Blocks whose median is what is usual around one; blocks needed; share that may be knocked
+"""Noise beside a line, over the median of its squares: their mean is 2.2 medians, and scatters over 100 of them."""
+_MOST_STEPS = 5  # of a stretch: with more, the steps are noise
+# Blocks whose median is the usual level around one; fewest blocks; largest share of knocked blocks
 _AROUND, _FEWEST_BLOCKS, _MOST_KNOCKED = 21, 64, 0.05
 _KNOCK_OFF, _FIFTH, _LOUD = 6.0, 10, 3.0
-"""How many sigma the median of a knocked block is off those around it; or how many times as far as in nineteen of
-twenty blocks its ten outermost samples are from its median."""
+"""A block is knocked if its median is 6 sigma off those around it, or if ten of its samples are 3 times as far from the
+median as in nineteen of twenty blocks."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of the spectrum: frequency, Hz, and amplitude of the sine, in the unit of the samples."""
+    """A spectral line: frequency, Hz, and amplitude of the sine, in the unit of the samples."""
 
     frequency: float
     amplitude: float
@@ -51,10 +52,10 @@ class LevelChange:
 
 
 def spikes_removed(samples: Array) -> tuple[Array, int]:
-    """Return samples, shape (n,), with spikes replaced, and their number.
+    """Return samples, shape (n,), with spikes replaced, and the number of spikes.
 
-    A spike is more than 6 sigma off the line through medians of 50 samples, sigma from the 95 % of the deviations of
-    65,536 samples around: 4 % of spikes do not change it. Samples that hardly ever change have no sigma, and no spikes.
+    A spike is more than 6 sigma off the line through medians of 50 samples, with sigma from the 95 % of the deviations
+    of the 65,536 samples around it: 4 % of spikes do not change it. Samples that hardly ever change have no spikes.
 
     Examples
     --------
@@ -68,7 +69,7 @@ def spikes_removed(samples: Array) -> tuple[Array, int]:
     if blocks < 4:
         return samples, 0
     level = medians(samples[: blocks * _BLOCK].reshape(blocks, _BLOCK))
-    # The line from the middle of a block to that of the next, and on beyond the first and the last.
+    # Lines join the middles of neighbouring blocks; the outer ones are extended.
     rise = np.diff(level)
     share = (np.arange(_BLOCK) + 0.5) / _BLOCK
     count, cleaned = 0, samples
@@ -94,11 +95,11 @@ def spikes_removed(samples: Array) -> tuple[Array, int]:
 
 
 def knocks_removed(samples: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return samples, shape (n,), with knocks replaced by straight lines, and first sample and end of each, (k, 2).
+    """Return samples, shape (n,), with knocks replaced by straight lines, and the knocks' first and last + 1, (k, 2).
 
-    A knock is a block of 50 samples whose median is 6 sigma off the median of 21 blocks around, or ten of whose samples
-    are farther from it than three times what nineteen of twenty blocks have, and half a block on both sides. Where that
-    is more than 5 % of all blocks, these are no knocks.
+    A knock is a block of 50 samples whose median is 6 sigma off the median of the 21 blocks around it, or with ten
+    samples farther from that than three times what nineteen of twenty blocks have; half a block on both sides belongs
+    to it. Where more than 5 % of all blocks are knocked, none is replaced.
     """
     count = len(samples) // _BLOCK
     none = np.empty((0, 2), dtype=np.int64)
@@ -112,10 +113,10 @@ def knocks_removed(samples: Array) -> tuple[Array, NDArray[np.int64]]:
     knocked = np.zeros(count, dtype=np.bool_)
     for size, limit in ((off, _KNOCK_OFF / _TO_SIGMA), (far, _LOUD)):
         usual = limit * quantile(size, 0.95)
-        knocked |= (size > usual) & (quantile(size, 0.9) > 0)  # whole counts hardly ever differ
+        knocked |= (size > usual) & (quantile(size, 0.9) > 0)  # samples in whole counts hardly ever differ
     if not 0 < np.count_nonzero(knocked) <= _MOST_KNOCKED * count:
         return samples, none
-    # What reaches into the next block is part of it.
+    # A knock that reaches into the next block includes it.
     half = _BLOCK // 2
     edge = np.flatnonzero(np.diff(np.concatenate([[0], knocked.astype(np.int8), [0]]))).reshape(-1, 2) * _BLOCK
     edge = np.clip(edge + half * np.array([-1, 1]), 0, len(samples))
@@ -129,11 +130,11 @@ def knocks_removed(samples: Array) -> tuple[Array, NDArray[np.int64]]:
 def line_groups(
     squares: Array, first: NDArray[np.int64], last: NDArray[np.int64], averages: int, count: int, interval: float
 ) -> tuple[NDArray[np.bool_], tuple[Line, ...]]:
-    """Find lines: squares of coefficients that stand out of their bin, and what is beside them.
+    """Return which cosine coefficients belong to no spectral line, and the lines, from squares of the coefficients.
 
-    A square, the mean of `averages`, is that of a line beyond the 1e-9 point of chi-square about the median of its bin
-    with neighbours, 100 in all; none is found below the 25th. Left out are three coefficients on both sides, and as
-    many as stand out themselves: a strong line leaks far.
+    A square, averaged over `averages` coefficients, belongs to a line beyond the 1e-9 point of chi-square about the
+    median of the 100 coefficients around it; no line is looked for below the 25th. Three coefficients on both sides are
+    left out with it, and all that stand out themselves, because a strong line leaks far.
 
     Returns
     -------
@@ -160,13 +161,13 @@ def line_groups(
 
 
 def _levels(squares: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -> Array:
-    """The median around each coefficient, bin by bin, shape (J,); 0 where there are too few around it."""
+    """Return the median around each coefficient, bin by bin, shape (J,); 0 where too few are around it."""
     width = last - first + 1
     level = np.zeros(len(width))
     for k in np.flatnonzero(width >= _FEWEST).tolist():
         beside = max(0, (_LEAST - int(width[k]) + 1) // 2)
         level[k] = median(squares[max(int(first[k]) - 1 - beside, 0) : int(last[k]) + beside])
-    # Of narrow bins as many on both sides: the median of noise that falls with frequency is that of the middle.
+    # Narrow bins take as many neighbours on both sides, or noise that falls with frequency would shift the median.
     centre = (first + last) // 2 - 1
     for half, most in ((_LEAST // 4, _LEAST // 2), (_LEAST // 2, len(squares) - _LEAST // 2)):
         near = np.flatnonzero((width < _FEWEST) & (centre >= half) & (centre < min(most, len(squares) - half)))
@@ -178,12 +179,12 @@ def _levels(squares: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -
 
 
 def strong_lines_removed(c: Array, lines: Sequence[Line], interval: float) -> tuple[Array, tuple[Line, ...]]:
-    """Return coefficients c_1 .. c_{n-1} without the lines that stand far out, and which these are.
+    """Return coefficients c_1 .. c_{n-1} without the strong lines, and the lines that were removed.
 
-    What a sine leaks falls with the distance j alone: 100 sigma of it raise the white noise by a third, and half a
+    The leakage of a sine falls only with the distance j: 100 sigma of it raise the white noise by a third, and half a
     sigma in 40,000 samples raises it by 0.2 %. So a sine of constant frequency is fitted to the coefficients next to
-    its line, and taken out of all; of one that wanders, which leaves more than 1 % of the power there beside the
-    noise, nothing is taken.
+    its line and subtracted from all. A line that wanders, which leaves more than 1 % of its power beside the noise,
+    stays.
     """
     taken = []
     for line in lines[:_MOST_STRONG]:
@@ -203,7 +204,7 @@ def strong_lines_removed(c: Array, lines: Sequence[Line], interval: float) -> tu
 
 
 def _sine(c: Array, j: Array, start: float, count: int) -> tuple[float, Array]:
-    """Frequency, in units of j, and cosine and sine amplitudes that fit coefficients best, from next to it."""
+    """Return the frequency, in units of j, and the cosine and sine amplitudes that fit coefficients best."""
 
     def fitted(place: float) -> tuple[float, Array]:
         basis = _sine_coefficients(j, place, count).T
@@ -212,7 +213,7 @@ def _sine(c: Array, j: Array, start: float, count: int) -> tuple[float, Array]:
 
     low, high = start - 1.5, start + 1.5
     for _ in range(_ROUNDS):
-        grid = np.linspace(low, high, 11) + 1e-9  # next to whole numbers, where the formula is 0/0
+        grid = np.linspace(low, high, 11) + 1e-9  # off whole numbers, where the formula is 0/0
         best = int(np.argmin([fitted(place)[0] for place in grid.tolist()]))
         low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, 10)])
     place = (low + high) / 2
@@ -220,7 +221,7 @@ def _sine(c: Array, j: Array, start: float, count: int) -> tuple[float, Array]:
 
 
 def _sine_coefficients(j: Array, place: float, count: int) -> Array:
-    """Coefficients of the cosine and the sine of ``w (i + 1/2)``, w = pi place/n, i = 0 .. n - 1, shape (2, ...)."""
+    """Return the coefficients of cosine and sine of ``w (i + 1/2)``, w = pi place/n, i = 0 .. n - 1, shape (2, ...)."""
     below, above = np.pi * (place - j) / count, np.pi * (place + j) / count
     cosine = np.sin(count * below) / np.sin(below / 2) + np.sin(count * above) / np.sin(above / 2)
     sine = (1 - np.cos(count * below)) / np.sin(below / 2) + (1 - np.cos(count * above)) / np.sin(above / 2)
@@ -230,11 +231,11 @@ def _sine_coefficients(j: Array, place: float, count: int) -> Array:
 def find_steps(
     slow: Array, variances: Array, count: int, interval: float, limit: float = LEVEL_STEP.limit
 ) -> tuple[LevelChange, ...]:
-    """Find steps of the level, one after the other, by their size over its standard uncertainty under the noise model.
+    """Return changes of level, found one after the other by size over standard uncertainty under the noise model.
 
     A step at sample k has the coefficients ``h_j = -sqrt(2/n) sin(pi j k/n)/s_j``, s_j = 2 sin(pi j/2n); its size is
-    ``sum h_j c_j/lambda_j / sum h_j^2/lambda_j``, and z that over its uncertainty. |z| above the limit is a
-    step.
+    ``sum h_j c_j/lambda_j / sum h_j^2/lambda_j``, and z is that over its uncertainty. A place with ``|z|`` above the
+    limit is a step.
 
     Parameters
     ----------
@@ -243,7 +244,7 @@ def find_steps(
     count, interval
         Samples of the stretch, n, and the time between them, s.
     limit
-        Of ``|z|``.
+        Limit of ``|z|``.
     """
     steps: list[LevelChange] = []
     c = slow
@@ -263,10 +264,10 @@ def step_coefficients(many: int, place: float, count: int) -> Array:
 
 
 def _largest_step(c: Array, variances: Array, count: int) -> tuple[float, float, float]:
-    """Place, size and uncertainty of the step with the largest z: all places by two transforms."""
+    """Return place, size and uncertainty of the step with the largest z, with all places tried by two transforms."""
     from scipy.fft import dst
 
-    # Places are as fine as the highest of the coefficients can tell, and no finer than the samples.
+    # The spacing of places is that of the highest coefficient, but no finer than the samples.
     grid = len(c) + 1 if len(c) + 1 >= count else 1 << (len(c)).bit_length()
     grid = min(grid, count)
     used = c[: grid - 1]
@@ -283,7 +284,7 @@ def _largest_step(c: Array, variances: Array, count: int) -> tuple[float, float,
 
 
 def _cosines(weight: Array, grid: int) -> Array:
-    """``sum_j w_j cos(2 pi j q/grid)``, j = 1 .. grid - 1, for q = 1 .. grid - 1."""
+    """Return ``sum_j w_j cos(2 pi j q/grid)``, j = 1 .. grid - 1, for q = 1 .. grid - 1."""
     padded = np.zeros(grid)
     padded[1 : 1 + len(weight)] = weight
     half = np.fft.rfft(padded).real

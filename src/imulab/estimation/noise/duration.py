@@ -1,4 +1,7 @@
-"""How long to record: what a record of some length tells of each term of a noise model."""
+"""How long to record: the uncertainty of each term of a noise model as a function of the record's length.
+
+Source: the Cramer-Rao bound of the Whittle likelihood that the fit maximises (`likelihood.information`).
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,9 @@ from imulab.estimation.noise.terms import prepare
 from imulab.recording import Array
 
 LONGEST = 1e9
-"""s, 30 years: no record is as long."""
-_FEWEST, _DRAWN = 500, 100  # samples of the shortest record that is planned; records drawn to tell what a length shows
-_PER_DECADE = 6  # lengths in a decade that are tried
+"""s, 30 years: longer than any record."""
+_FEWEST, _DRAWN = 500, 100  # samples of the shortest planned record; records drawn for the limits of absent terms
+_PER_DECADE = 6  # lengths tried in a decade
 
 
 def accuracy(values: Array, interval: float, length: float, highest: float | None = None, ripple: float = 0.0) -> Array:
@@ -30,9 +33,9 @@ def accuracy(values: Array, interval: float, length: float, highest: float | Non
     length
         Length of the record, s.
     highest
-        Up to which frequency the spectrum is used, Hz; half the sampling rate if not given.
+        Highest frequency of the spectrum that is used, Hz; half the sampling rate if None.
     ripple
-        eps, by how much the level of each bin is off the model, which more samples do not mend.
+        eps, relative deviation of the level of each bin from the model, which more samples do not reduce.
 
     Examples
     --------
@@ -48,7 +51,7 @@ def accuracy(values: Array, interval: float, length: float, highest: float | Non
 def accuracy_curve(
     values: Array, interval: float, highest: float | None = None, ripple: float = 0.0
 ) -> tuple[Array, Array]:
-    """Return lengths of records, s, shape (t,), and what they tell, shape (t, 8), never less than a shorter one.
+    """Return lengths of records, s, shape (t,), and the uncertainties that they reach, shape (t, 8), never rising.
 
     Arguments as for `accuracy`.
     """
@@ -71,26 +74,26 @@ def length_for(lengths: Array, reached: Array, wanted: float) -> float:
     """
     if not reached[-1] <= wanted:
         return float("inf")
-    # Between the lengths of the curve the uncertainty is a power of the length; backwards, for it falls.
+    # Between the lengths of the curve the uncertainty is a power of the length; np.interp wants it rising.
     return float(np.exp(np.interp(np.log(wanted), np.log(reached[::-1]), np.log(lengths[::-1]))))
 
 
 def visible(
     values: Array, model: Flags, interval: float, length: float, highest: float | None = None, draws: int = _DRAWN
 ) -> Array:
-    """Return the 95 % limits that a record of a length sets to the terms of a model, shape (8,).
+    """Return the 95 % upper limits that a record of a length sets to the terms of a model, shape (8,).
 
-    The median upper end of the profile intervals over drawn spectra, the same at every call; NaN for terms that the
-    model has not got.
+    They are medians of the upper ends of profile intervals over drawn spectra, the same at every call; NaN for terms
+    that the model lacks.
 
     Parameters
     ----------
     values, interval, length, highest
-        As for `accuracy`: the noise that there is.
+        The actual noise, as for `accuracy`.
     model
-        Its terms and those to be limited, shape (8,).
+        Terms of the noise and those to be limited, shape (8,).
     draws
-        How many spectra.
+        Number of drawn spectra.
     """
     spectrum = _empty(interval, length, highest)
     frame, limits = prepare([spectrum]), time_limits([spectrum])

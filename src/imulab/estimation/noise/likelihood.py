@@ -1,9 +1,8 @@
-"""Noise models fitted to a spectrum by maximum likelihood, up to which frequency.
-
-The intervals of their parameters from the profile of the likelihood.
+"""Noise models fitted to a spectrum by maximum likelihood, with profile intervals, in the band that the spectrum shows.
 
 Source: Whittle (1953); the likelihood is exact for white noise plus walk. Fisher scoring in the logarithms of the
-parameters, damped; starts from multiplicative updates of the variances with time constants on a grid.
+parameters, damped as by Levenberg and Marquardt; it starts from multiplicative updates of the variances with time
+constants on a grid.
 """
 
 from __future__ import annotations
@@ -22,19 +21,19 @@ from imulab.estimation.noise.terms import LINEAR, NAMES, SIGMA, TIME, Bins
 from imulab.estimation.rows import NORMAL_95
 from imulab.recording import Array
 
-# Up to which frequency a noise model is held against a spectrum, and how exactly: no spectrum is quite the model's.
+# The band in which a model is fitted, and the ripple that is allowed for: no spectrum is exactly the model's.
 
 
 _AGREE, _SIGMAS, _SHARP = 0.03, 3.0, 0.2
-"""How far two octaves may be apart, beyond so many sigma; up to where these sigma tell of an agreement at all."""
-# A band up to this share of the Nyquist frequency is whole; one below this share of the sampling rate, where an octave
-# below Nyquist is 0.25, is filtered
+"""How far two octaves may differ beyond so many sigma; largest value of these sigma that shows an agreement at all."""
+# Share of the Nyquist frequency from which the band is whole; share of the sampling rate below which it is filtered
+# (an octave below Nyquist is 0.25)
 _FULL, _NEARLY_FULL = 0.999, 0.24
 _RIPPLE_FREEDOM, _FEWEST_BINS = 200, 16
-"""Coefficients of a bin that tells the ripple; such bins that are needed to tell it."""
+"""Fewest coefficients of a bin that shows the ripple; fewest such bins."""
 _OFF = 0.10  # a bin that is off by less, relative, is kept whatever its scatter
 _BOUND, _EXPECTED = 6.635, 0.9819
-"""Of the squared deviation of a bin in terms of its variance: at most so much counts, and what is then expected."""
+"""Bound of the squared deviation of a bin over its variance, and the expectation of the bounded value."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +47,9 @@ class Band:
     full
         Whether that is the whole band of the samples.
     flat
-        Whether there is white noise at its end: where no two octaves agree, the band is full and this is False.
+        Whether there is white noise at its end; where no two octaves agree, the band is full and this is False.
     roll_off
-        Relative standard uncertainty of N from what may be left of a filter's roll-off.
+        Relative standard uncertainty of N from what a filter's roll-off may leave.
     """
 
     highest: float
@@ -59,17 +58,17 @@ class Band:
     roll_off: float = field(default=0.0, compare=False)
 
     def filtered(self, interval: float) -> bool:
-        """Return whether it ends below a sensor's filter; at a quarter of the sampling rate it does where none is."""
+        """Return whether it ends below a sensor's filter; without one it ends at a quarter of the sampling rate."""
         return self.flat and self.highest * interval < _NEARLY_FULL
 
 
 def usable_band(spectra: Sequence[Spectrum]) -> Band:
-    """Return the band whose two highest octaves agree: f_max is halved from half the rate until they do, and once more.
+    """Return the usable band: f_max is halved from half the rate until its two highest octaves agree, then once more.
 
-    They agree within 3 % + 3 sigma. Of these 3 % a long record makes a term of its own, and N comes out too small: so
-    the band ends an octave lower, unless 3 sigma are more than 20 %. Quantisation of an angle rises with frequency:
-    where white noise and quantisation together, ``a + b s^2``, bring the three highest octaves to agreement, or the
-    highest octave is plainly above the next, the band is full.
+    They agree within 3 % + 3 sigma. In a long record these 3 % are explained by a term of their own, which makes N too
+    small: so the band ends an octave lower, unless 3 sigma are more than 20 %. Quantisation of an angle rises with
+    frequency: where white noise and quantisation together, ``a + b s^2``, bring the three highest octaves to agreement,
+    or the highest octave is clearly above the next, the band is full.
     """
     nyquist = 0.5 / spectra[0].interval
     f, p, d = (np.concatenate(each) for each in zip(*((frequencies(s), s.power, s.freedom) for s in spectra)))  # noqa: B905
@@ -81,23 +80,23 @@ def usable_band(spectra: Sequence[Spectrum]) -> Band:
             far, u = _apart(f, p, d, highest, 2)
             full = highest > _FULL * nyquist
             if _SIGMAS * u[0] > _SHARP or (full and far[0] < -_SIGMAS * u[0]):
-                # One of first order takes 0.76 of what these octaves are apart from the band, and N half of that.
+                # A first-order filter takes 0.76 of the octaves' difference from the band, and half of that from N.
                 left = 0.0 if full else 0.38 * float(max(far[0], 0.0) + u[0]) / math.sqrt(3)
                 return Band(highest, full, roll_off=left)
-            # One of first order leaves a quarter of it an octave lower, and N has half of that at most.
+            # A first-order filter leaves a quarter of it an octave lower, of which N has at most half.
             return Band(highest / 2, False, roll_off=float(_AGREE + _SIGMAS * u[0]) / 8 / math.sqrt(3))
         highest /= 2
     return Band(nyquist, True, False)
 
 
 def _same_level(f: Array, p: Array, d: Array, highest: float, octaves: int) -> bool:
-    """Whether the highest octaves have the same level, each against the highest."""
+    """Return whether the highest octaves have the same level, each compared with the highest."""
     far, u = _apart(f, p, d, highest, octaves)
     return bool((np.abs(far) <= _AGREE + _SIGMAS * u).all())
 
 
 def _apart(f: Array, p: Array, d: Array, highest: float, octaves: int) -> tuple[Array, Array]:
-    """Logarithms of the levels of octaves in terms of the highest one, and their uncertainties; inf where one is 0."""
+    """Return the log ratios of octaves' levels to the highest one's, and their uncertainties; inf for a level of 0."""
     level, freedom = [], []
     for k in range(octaves):
         inside = (f <= highest / 2**k * (1 + 1e-9)) & (f > highest / 2 ** (k + 1)) & (d > 0)
@@ -110,7 +109,7 @@ def _apart(f: Array, p: Array, d: Array, highest: float, octaves: int) -> tuple[
 
 
 def _rising(f: Array, p: Array, d: Array, nyquist: float) -> bool:
-    """Whether white noise and quantisation of an angle explain the three highest octaves."""
+    """Return whether white noise and quantisation of an angle explain the three highest octaves."""
     top = (f > nyquist / 8) & (d > 0) & (p > 0)
     square = 4 * np.sin(np.pi / 2 * f[top] / nyquist) ** 2
     root = np.sqrt(d[top]) / p[top]
@@ -121,23 +120,23 @@ def _rising(f: Array, p: Array, d: Array, nyquist: float) -> bool:
 
 
 def within(spectrum: Spectrum, highest: float) -> Spectrum:
-    """Return a spectrum whose bins beyond a frequency, Hz, count nothing."""
+    """Return a spectrum whose bins beyond a frequency, Hz, have no weight."""
     inside = spectrum.last / (2 * spectrum.length) <= highest * (1 + 1e-9)
     return replace(spectrum, freedom=np.where(inside, spectrum.freedom, 0.0))
 
 
 @dataclass(frozen=True)
 class Allowance:
-    """What a spectrum may be off its model, and where it is farther off.
+    """Ripple of a spectrum about its model, and the bins that are farther off.
 
     Attributes
     ----------
     ripple
-        eps, the relative standard deviation of the level of bins beyond their scatter.
+        eps, the relative standard deviation of the level of bins beyond their noise.
     spectra
-        With the freedom that this leaves, and nothing for the bins that are off.
+        Spectra with the degrees of freedom that this leaves, and none for the bins that are off.
     off
-        Lowest and highest frequency of each run of bins that were left out, Hz, and by which factor they are off.
+        Lowest and highest frequency of each run of bins left out, Hz, and the factor by which they are off.
     """
 
     ripple: float
@@ -146,11 +145,11 @@ class Allowance:
 
 
 def allow(spectra: Sequence[Spectrum], variances: Sequence[Array]) -> Allowance:
-    """Return spectra that count no more than they agree with the variances of a model in their bins, shapes (b,).
+    """Return spectra whose weights allow for their ripple about a model, with variances in their bins, shapes (b,).
 
     ``eps^2`` is the variance of ``ln(P/lambda)`` beyond 2/d over bins with d > 200, by maximum likelihood with bounded
-    influence: the bins that count most decide, where a median over all bins would find ripple of 1 to 4 % in noise that
-    has none. d becomes ``d/(1 + d eps^2/2)``. Bins that are then off by 5 sigma and 10 % are left out.
+    influence: so the bins with most coefficients decide, while a median over all bins would find 1 to 4 % of ripple in
+    noise without any. d becomes ``d/(1 + d eps^2/2)``. Bins that are then off by 5 sigma and 10 % are left out.
     """
     logarithm = [
         np.log(np.maximum(s.power, 1e-300) / v) + 1 / np.maximum(s.freedom, 1)
@@ -160,7 +159,7 @@ def allow(spectra: Sequence[Spectrum], variances: Sequence[Array]) -> Allowance:
     freedom = np.concatenate([s.freedom for s in spectra])
     ripple = _ripple(log, freedom)
     far = _far_bins(log, freedom, ripple)
-    ripple = _ripple(log[~far], freedom[~far])  # what is left out is no ripple
+    ripple = _ripple(log[~far], freedom[~far])  # bins that are left out are no ripple
     far = _far_bins(log, freedom, ripple)
     edges = np.cumsum([len(s.power) for s in spectra])[:-1]
     parts, off = [], []
@@ -175,14 +174,14 @@ def allow(spectra: Sequence[Spectrum], variances: Sequence[Array]) -> Allowance:
 
 
 def _far_bins(logarithm: Array, freedom: Array, ripple: float) -> NDArray[np.bool_]:
-    """Which bins are off by 5 sigma and 10 %, the ripple allowed for."""
+    """Return which bins are off by 5 sigma and 10 %, allowing for the ripple."""
     u = np.sqrt(2 / np.maximum(freedom, 1) + ripple**2)
     size = np.abs(logarithm)
     return np.asarray((freedom > _FEWEST_BINS) & (size > np.log1p(_OFF)) & (size > BIN_OFF_MODEL.limit * u))
 
 
 def _ripple(logarithm: Array, freedom: Array) -> float:
-    """Scatter of the levels of bins beyond what their numbers of coefficients explain."""
+    """Return the scatter of the bins' levels beyond what their numbers of coefficients explain."""
     many = freedom > _RIPPLE_FREEDOM
     if np.count_nonzero(many) < _FEWEST_BINS:
         return 0.0
@@ -201,18 +200,18 @@ def _ripple(logarithm: Array, freedom: Array) -> float:
     return high
 
 
-# Noise models fitted to a spectrum by maximum likelihood, many models and spectra at a time.
+# Noise models fitted by maximum likelihood, many models and spectra together.
 
 
 Flags = NDArray[np.bool_]
 _SIZES = [*range(LINEAR), *SIGMA]
 _NONE, _LITTLE = 1e-6, 0.03
-"""A term below this share of every bin is 0; at which share one begins that was 0."""
-# Time constants on a grid, the best of which are starts, after so many updates of the sizes
+"""Share of every bin below which a term is 0; share at which an absent term starts."""
+# Time constants of the grid, how many of the best are starts, and updates of the sizes before that
 _GRID, _STARTS, _UPDATES = 8, 3, 12
 _ROUNDS, _DONE, _LONGEST = 60, 1e-5, 2.0
-"""Rounds of scoring at most, change of the deviance that ends them, longest step of a logarithm."""
-# Of Levenberg and Marquardt's steps, which are pure Newton steps below, and no steps above
+"""Most rounds of scoring, change of the deviance that ends them, longest step of a logarithm."""
+# Damping of Levenberg-Marquardt steps: below the least they are pure Newton steps, above the most there is no step
 _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e8
 _ROWS = 2000  # rows of a batch whose arrays stay small
 
@@ -224,11 +223,11 @@ class Fits:
     Attributes
     ----------
     values
-        Parameters in the order of `NAMES`, shape (r, 8); a term that was found to be nothing is 0.
+        Parameters in the order of `NAMES`, shape (r, 8); a term that vanished in the fit is 0.
     deviance
-        ``-2 ln L`` but for a constant of the spectrum, shape (r,).
+        ``-2 ln L`` without a constant of the spectrum, shape (r,).
     covariance
-        Of the logarithms of the parameters that are not 0, from the Fisher information, shape (r, 8, 8).
+        Covariance of the logarithms of the parameters that are not 0, from the Fisher information, shape (r, 8, 8).
     """
 
     values: Array
@@ -237,7 +236,7 @@ class Fits:
 
 
 def time_limits(spectra: Sequence[Spectrum]) -> tuple[float, float]:
-    """Return the least and the greatest time constant that spectra can tell, s: 2/f_max and the longest stretch.
+    """Return the least and the greatest time constant that spectra show, s: 2/f_max and the longest stretch.
 
     A shorter one is white noise up to the highest frequency of the spectra, f_max; a longer one is a walk.
     """
@@ -249,7 +248,7 @@ def time_limits(spectra: Sequence[Spectrum]) -> tuple[float, float]:
 
 
 def deviance(bins: Bins, values: Array) -> Array:
-    """Return ``-2 ln L = sum_b d_b [ln lambda_b + P_b/lambda_b]`` of models, shape (r, 8), as shape (r,).
+    """Return the deviance of models, parameters (r, 8): ``-2 ln L = sum_b d_b [ln lambda_b + P_b/lambda_b]``, (r,).
 
     The powers of `bins` have shape (b,) or (r, b).
     """
@@ -258,7 +257,7 @@ def deviance(bins: Bins, values: Array) -> Array:
 
 
 def information(bins: Bins, values: Array) -> Array:
-    """Return the covariance of the logarithms of a model's parameters, shape (8,), that the bins can tell, (8, 8)."""
+    """Return the Cramer-Rao covariance of the logarithms of a model's parameters, shape (8,), from bins, (8, 8)."""
     power = bins.variances(values[None])
     return np.asarray(
         _inverse(_expansion(bins, values[None].copy(), power, bins.freedom[None])[2], values[None] > 0)[0]
@@ -266,18 +265,18 @@ def information(bins: Bins, values: Array) -> Array:
 
 
 def fit(bins: Bins, models: Flags, limits: tuple[float, float], power: Array, freedom: Array) -> Fits:
-    """Fit every model to every spectrum: rows count models, then spectra.
+    """Return the fits of every model to every spectrum; rows count models, then spectra.
 
     Parameters
     ----------
     bins
-        Of the spectra; their own power is not looked at.
+        Bins of the spectra; their own power is not used.
     models
         Which parameters each model has, shape (m, 8), at least one variance each.
     limits
         Least and greatest time constant of a Gauss-Markov term, s.
     power, freedom
-        Of spectra with these bins, shape (t, b).
+        Power and freedom of spectra with these bins, shape (t, b).
 
     Returns
     -------
@@ -293,7 +292,7 @@ def fit(bins: Bins, models: Flags, limits: tuple[float, float], power: Array, fr
 
 
 def _best(bins: Bins, models: Flags, limits: tuple[float, float], power: Array, freedom: Array) -> Fits:
-    """The deepest minimum that is reached from the best three starts of each model."""
+    """Return the lowest minimum reached from the best three starts of each model."""
     chosen, start = _starts(bins, models, limits, power, freedom)
     spectrum = chosen // len(models)
     fits = score(bins, start, start > 0, limits, power[spectrum], freedom[spectrum])
@@ -304,14 +303,14 @@ def _best(bins: Bins, models: Flags, limits: tuple[float, float], power: Array, 
     for index in np.argsort(models.sum(axis=1)).tolist():
         inner = np.flatnonzero((models <= models[index]).all(axis=1) & (models < models[index]).any(axis=1))
         if inner.size:
-            _not_above(bins, models[index], limits, power, freedom, (values, reached), index, inner)
+            _refit_from_inner(bins, models[index], limits, power, freedom, (values, reached), index, inner)
     values = _sorted(values.reshape(-1, len(NAMES)))
     spectrum = np.arange(len(values)) // len(models)
     fisher = _expansion(bins, values, power[spectrum], freedom[spectrum])[2]
     return Fits(values, reached.ravel(), _inverse(fisher, values > 0))
 
 
-def _not_above(
+def _refit_from_inner(
     bins: Bins,
     model: Flags,
     limits: tuple[float, float],
@@ -321,7 +320,7 @@ def _not_above(
     index: int,
     inner: NDArray[np.int64],
 ) -> None:
-    """Start again from the best model inside this one, where that one came to a lower minimum."""
+    """Start again from the best model within this one where that one has a lower minimum; changes `reached`."""
     values, deviances = reached
     lowest = inner[deviances[:, inner].argmin(axis=1)]
     rows = np.arange(len(power))
@@ -337,7 +336,7 @@ def _not_above(
 
 
 def with_a_little(bins: Bins, values: Array, models: Flags, limits: tuple[float, float]) -> Array:
-    """Return parameters, shape (r, 8), with what models (r, 8) have and they have not at a small share of each bin."""
+    """Return parameters, shape (r, 8), with absent terms of models (r, 8) added at a small share of each bin."""
     start, total = values.copy(), bins.variances(values)
     middle = np.full(len(values), np.sqrt(limits[0] * limits[1]))
     for k in _SIZES:
@@ -351,7 +350,7 @@ def with_a_little(bins: Bins, values: Array, models: Flags, limits: tuple[float,
 
 
 def _sorted(values: Array) -> Array:
-    """Gauss-Markov terms from the shortest to the longest time constant, a single one in the first place."""
+    """Return parameters with Gauss-Markov terms sorted by time constant, a single one in the first place."""
     first, second = [SIGMA[0], TIME[0]], [SIGMA[1], TIME[1]]
     swap = (values[:, SIGMA[1]] > 0) & ((values[:, SIGMA[0]] == 0) | (values[:, TIME[0]] > values[:, TIME[1]]))
     values[np.ix_(swap, first + second)] = values[np.ix_(swap, second + first)]
@@ -361,7 +360,7 @@ def _sorted(values: Array) -> Array:
 def _starts(
     bins: Bins, models: Flags, limits: tuple[float, float], power: Array, freedom: Array
 ) -> tuple[NDArray[np.int64], Array]:
-    """Row (spectrum * models + model) of each start, and its parameters: T on a grid, variances by a few updates."""
+    """Return row (spectrum * models + model) and parameters of each start: T on a grid, variances by a few updates."""
     grid = np.geomspace(limits[0], limits[1], 2 * _GRID + 1)[1::2]
     shapes = np.concatenate([bins.unit, bins.markov(grid)[0]])
     owner, used, times = [], [], []
@@ -402,16 +401,16 @@ def _starts(
 
 
 def score(bins: Bins, start: Array, free: Flags, limits: tuple[float, float], power: Array, freedom: Array) -> Fits:
-    """Return the minima of the deviance next to starts, in the parameters that are free.
+    """Return the minima of the deviance next to starts, over the parameters that are free.
 
     Parameters
     ----------
     start
         Parameters, shape (r, 8); a term of 0 stays absent.
     free
-        Which of them to fit, shape (r, 8).
+        Parameters that are fitted, shape (r, 8).
     power, freedom
-        Of the spectrum of each row, shape (r, b).
+        Power and freedom of the spectrum of each row, shape (r, b).
     """
     values, free = start.copy(), free & (start > 0)
     now, slope, fisher = _expansion(bins, values, power, freedom)
@@ -435,9 +434,9 @@ def score(bins: Bins, start: Array, free: Flags, limits: tuple[float, float], po
 
 
 def _expansion(bins: Bins, values: Array, power: Array, freedom: Array) -> tuple[Array, Array, Array]:
-    """Deviance (r,), half its slope downwards (r, 8) and Fisher information (r, 8, 8), by logarithms of parameters.
+    """Return deviance (r,), half its downward slope (r, 8) and Fisher information (r, 8, 8) in log parameters.
 
-    Terms that are nothing become 0 in `values`.
+    Terms that vanish become 0 in `values`.
     """
     parts = np.zeros((len(values), len(NAMES), power.shape[-1]))
     parts[:, :LINEAR] = values[:, :LINEAR, None] ** 2 * bins.unit
@@ -462,7 +461,7 @@ def _expansion(bins: Bins, values: Array, power: Array, freedom: Array) -> tuple
 
 
 def _movable(values: Array, free: Flags, slope: Array, edges: Array) -> Flags:
-    """Free parameters but for time constants that press against a limit."""
+    """Return the free parameters, without time constants that press against a limit."""
     movable = free & (values > 0)
     for time in TIME:
         at = np.log(np.maximum(values[:, time], 1e-300))
@@ -490,7 +489,7 @@ def _stepped(values: Array, step: Array, edges: Array) -> Array:
 
 
 def _inverse(fisher: Array, free: Flags) -> Array:
-    """Covariance of the free parameters, 0 for the others."""
+    """Return the covariance of the free parameters, 0 for the others."""
     both = free[:, :, None] & free[:, None, :]
     scale = np.where(free, np.sqrt(np.maximum(np.einsum("rpp->rp", fisher), 1e-200)), 1.0)
     outer = scale[:, :, None] * scale[:, None, :]
@@ -499,15 +498,15 @@ def _inverse(fisher: Array, free: Flags) -> Array:
     return np.where(both, np.linalg.inv(scaled) / outer, 0.0)
 
 
-# Intervals of the parameters of a noise model from the profile of its likelihood.
+# Intervals of the parameters from the profile of the likelihood.
 
 
 _DEVIANCE_95 = 3.84
 """The 95 % point of chi-square with one degree of freedom."""
 _END_TRIALS, _EXACT = 14, 0.01
-"""Trials for an end at most, and how close the root of the deviance must come to that of the level."""
+"""Most trials for an end, and how close the root of the deviance must come to that of the level."""
 _FIRST = 1.0
-"""The longest first step of a logarithm."""
+"""Longest first step of a logarithm."""
 
 
 def profile(
@@ -515,8 +514,8 @@ def profile(
 ) -> tuple[Array, Array]:
     """Return the lower and upper ends of the 95 % intervals of the parameters of best fits, shapes (r, 8).
 
-    An end is where the deviance, least in all other parameters, is 3.84 above its minimum. A lower end that is never
-    reached is 0, an end of a time constant its limit. Parameters that a model has not got have NaN.
+    An end is where the deviance, minimised over all other parameters, is 3.84 above its minimum. A lower end that is
+    never reached is 0; an end of a time constant is then its limit. Parameters that a model lacks have NaN.
 
     Parameters
     ----------
@@ -527,13 +526,13 @@ def profile(
     models
         Which parameters each model has, shape (r, 8).
     power, freedom
-        Of the spectrum of each row, shape (r, b).
+        Power and freedom of the spectrum of each row, shape (r, b).
     """
     best = score(bins, values, values > 0, limits, power, freedom)
     row, parameter = (np.repeat(each, 2) for each in np.nonzero(models))
     side = np.tile([-1.0, 1.0], len(row) // 2)
     ends = _Ends(bins, limits, power[row], freedom[row], best.deviance[row], parameter, side)
-    # What is nothing in the best fit may be something when another parameter is held.
+    # A term that vanishes in the best fit may be there when another parameter is held.
     start = with_a_little(bins, best.values, models, limits)[row]
     absent = best.values[row, parameter] == 0
     spread = np.sqrt(best.covariance[row, parameter, parameter])
@@ -545,7 +544,7 @@ def profile(
 
 @dataclass(frozen=True)
 class _Ends:
-    """One end of the interval of one parameter in each row."""
+    """One end of the profile interval of one parameter in each row."""
 
     bins: Bins
     limits: tuple[float, float]
@@ -556,7 +555,7 @@ class _Ends:
     side: Array
 
     def just_visible(self, values: Array, absent: Flags) -> Array:
-        """A tenth of the size at which terms that the best fit has not got would show; a time constant as it is."""
+        """Return a tenth of the size at which absent terms would show; time constants as they are."""
         parameter = self.parameter[absent]
         middle = np.full(len(parameter), np.sqrt(self.limits[0] * self.limits[1]))
         unit = self.bins.markov(middle)[0]
@@ -566,7 +565,7 @@ class _Ends:
         return np.where(np.isin(parameter, TIME), middle, 0.1 * information**-0.25)
 
     def find(self, values: Array, first: Array) -> Array:
-        """Find the ends by secants of the root of the deviance, from best values and first steps of logarithms."""
+        """Return the ends, by secants of the root of the deviance, from best values and first steps of logarithms."""
         timed = np.isin(self.parameter, TIME)
         floor, ceiling = (
             np.where(timed, np.log(edge), far) for edge, far in zip(self.limits, (-700, 700), strict=True)
@@ -581,7 +580,7 @@ class _Ends:
             if not rows.size:
                 break
             at = np.clip(trial[rows], floor[rows], ceiling[rows])
-            root, values[rows] = self._held(values[rows], at, rows)
+            root, values[rows] = self._fit_held(values[rows], at, rows)
             out = root > 0
             at_limit = ~out & (
                 (at <= floor[rows]) & (self.side[rows] < 0) | (at >= ceiling[rows]) & (self.side[rows] > 0)
@@ -591,7 +590,7 @@ class _Ends:
             ends[rows[done]] = end[done]
             moved = np.where(at == low[rows], 1.0, np.abs(at - low[rows]))
             reach = np.clip(moved * -root / np.maximum(root - below[rows], 1e-9), 0.1 * first[rows], 2.0)
-            # A bound that stays where it was for the second time counts half (the Illinois rule).
+            # A bound that stays for the second time counts half (Illinois rule).
             again = last[rows] == out
             above[rows] = np.where(out, root, np.where(again, above[rows] / 2, above[rows]))
             below[rows] = np.where(out, np.where(again, below[rows] / 2, below[rows]), root)
@@ -602,7 +601,7 @@ class _Ends:
         return np.where(np.isnan(ends), np.exp(np.clip(trial, floor, ceiling)), ends)
 
     def _never_reached(self, start: Array) -> Array:
-        """0 for lower ends of terms without which the model fits as well, NaN for all others."""
+        """Return 0 for lower ends of terms without which the model fits as well, NaN for all others."""
         ends = np.full(len(start), np.nan)
         rows = np.flatnonzero((self.side < 0) & ~np.isin(self.parameter, TIME))
         without = start[rows].copy()
@@ -615,13 +614,13 @@ class _Ends:
         ends[rows[rest.deviance - self.lowest[rows] < _DEVIANCE_95]] = 0.0
         return ends
 
-    def _held(self, values: Array, at: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Root of the deviance above its minimum, less that of the level, with the parameter held, and the best fit."""
+    def _fit_held(self, values: Array, at: Array, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return the root of the deviance above its minimum, less that of the level, with the parameter held."""
         held, index = values.copy(), np.arange(len(rows))
         held[index, self.parameter[rows]] = np.exp(at)
         free = held > 0
         free[index, self.parameter[rows]] = False
         fitted = score(self.bins, held, free, self.limits, self.power[rows], self.freedom[rows])
         root = np.sqrt(np.maximum(fitted.deviance - self.lowest[rows], 0)) - np.sqrt(_DEVIANCE_95)
-        # What vanished here may be something again at the next trial.
+        # A term that vanished here may be there again at the next trial.
         return root, np.where(fitted.values > 0, fitted.values, np.where(np.isin(np.arange(8), TIME), held, 0.1 * held))

@@ -23,23 +23,23 @@ from imulab.units import STANDARD_GRAVITY, to_si
 # Whether the unit of samples at rest can be right: by the steps of known sensors, gravity and the Earth's rate.
 
 
-_MOST_SAMPLES, _OF_STEPS = 100_000, 20_000  # samples that are looked at; and of these for the steps of an output
+_MOST_SAMPLES, _OF_STEPS = 100_000, 20_000  # samples that are used; samples that show the step of an output
 _STEPS = (*(full / 32768 for full in (125, 250, 500, 1000, 2000)), *(1 / lsb for lsb in (262.4, 131, 65.5, 32.8, 16.4)),
           0.004375, 0.00875, 0.0175, 0.035, 0.07)  # fmt: skip
-"""deg/s, of gyroscopes of 16 bits."""
+"""deg/s, steps of 16-bit gyroscopes in use."""
 _ALIKE = 1e-3  # relative: a step of the output this near to a known sensor's is that sensor's
 _LOUDEST_GYRO, _QUIET = 0.3, 0.035
-"""deg/s/sqrt(Hz), louder than any gyroscope in use; deg/sqrt(h), so quiet that it shows the Earth's rate."""
+"""deg/s/sqrt(Hz), more noise than any gyroscope in use; deg/sqrt(h), so little that the Earth's rate shows."""
 _EARTH, _PLAIN_OFFSET = (4.0, 100.0), 10.0
-"""deg/h that three such gyroscopes show at rest, the Earth's 15 and their offsets together; not zeroed ones, whose mean
-is within ten standard uncertainties of 0."""
-_NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit makes that the likely one
+"""deg/h that three such gyroscopes show at rest: the Earth's 15 and their offsets. Zeroed ones, whose mean is within
+ten standard uncertainties of 0, are passed over."""
+_NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit makes that unit the likely one
 
 
 def doubtful_units(recording: Recording, names: Sequence[str], rate: float) -> list[str]:
-    """Say of a recording at rest, by its first samples at a rate, Hz, where its unit is hardly right."""
+    """Return notes on units that are probably wrong, from the first samples of a recording at rest, at a rate, Hz."""
     notes: list[str] = []
-    for kind, why in (("gyro", _of_gyros), ("accel", _of_accelerometers)):
+    for kind, why in (("gyro", _doubt_gyros), ("accel", _doubt_accelerometers)):
         its = [name for name in names if kind_of(name) == kind]
         if its and (reason := why(recording, its, rate)):
             named = its[0] if len(its) == 1 else f"{its[0]} .. {its[-1]}"
@@ -48,8 +48,8 @@ def doubtful_units(recording: Recording, names: Sequence[str], rate: float) -> l
     return notes
 
 
-def _of_gyros(recording: Recording, names: Sequence[str], rate: float) -> str:
-    """Why the unit of gyroscopes is doubtful; else nothing."""
+def _doubt_gyros(recording: Recording, names: Sequence[str], rate: float) -> str:
+    """Return why the unit of gyroscopes is doubtful, or nothing."""
     degrees = [np.degrees(_first(recording, name)) for name in names]
     step = max(map(_step, degrees))
     for factor, other in ((math.degrees(1), "rad/s"), (math.radians(1), "deg/s")):
@@ -76,8 +76,8 @@ def _of_gyros(recording: Recording, names: Sequence[str], rate: float) -> str:
     return ""
 
 
-def _of_accelerometers(recording: Recording, names: Sequence[str], _: float) -> str:
-    """Why the unit of accelerometers is doubtful: another one would make gravity of what they show; else nothing."""
+def _doubt_accelerometers(recording: Recording, names: Sequence[str], _: float) -> str:
+    """Return why the unit of accelerometers is doubtful, or nothing: with another unit they would show gravity."""
     if list(names) != triad("accel"):
         return ""
     force = math.hypot(*(float(_first(recording, name).mean()) for name in names))
@@ -93,42 +93,42 @@ def _first(recording: Recording, name: str) -> Array:
 
 
 def _step(samples: Array) -> float:
-    """The step of an output, shape (n,): the mean of the smallest ones, which a file has rounded; 0 of none."""
+    """Return the step of an output, shape (n,): the mean of the smallest steps, which a file has rounded; 0 if none."""
     steps = np.diff(distinct(samples[:_OF_STEPS]))
     return float(steps[steps < 1.5 * steps.min()].mean()) if len(steps) else 0.0
 
 
-# Rows of a log at rest that are no readings of their own: zeros in place of lost readings, and repeated readings.
+# Rows at rest that are no readings: zeros in place of lost readings, and readings repeated over several rows.
 
 
-_SEEN, _SOME = 100_000, 5000  # samples that are looked at; and of these for the levels of an output
+_SEEN, _SOME = 100_000, 5000  # samples that are used; samples that show the levels of an output
 LEVELS = 6
-"""Different values of an output at least, for what is at one of them to be told."""
+"""Fewest different values of an output among which lost readings can be recognised."""
 _CHANCE_ZEROS, _PILED, _MOST = 10, 4, 0.05
-"""Zeros are dropouts beyond so many, and so many times as many as the next level holds: a reading cut to whole counts
-has twice as many. So large a share is refused."""
+"""Zeros are lost readings beyond so many, and beyond so many times the number at the next level (a reading cut to whole
+counts has twice as many). Above this share they are refused."""
 _BESIDE, _STEPS_BESIDE, _SHARE = 0.5, 5.0, 0.15
-"""Standard deviations, or steps, next to a limit in which there are readings: more than this share of those at it."""
+"""Standard deviations, or steps, beside a limit within which more than this share of those at the limit must lie."""
 _COARSE = 0.25
-"""Standard deviations: zeros among readings of larger steps are not told from lost ones."""
+"""Standard deviations: with larger steps of the output, zeros cannot be recognised as lost readings."""
 _LONGEST, _REGULAR, _FEWEST_READINGS = 50, 0.98, 20
-"""Rows for which a reading stands at most; share of the readings that stand for a multiple of them; readings needed."""
+"""Most rows of one reading; least share of readings that stand for a multiple of these rows; fewest readings."""
 _FINE, _REPEATS_PER_STEP = 4.0, 0.27
-"""Steps of output in the usual change that tell repeats from chance, which makes 0.27 over their number of them."""
+"""Steps of output in the usual change from which repeats are no chance, which makes 0.27 over their number of them."""
 
 
 def own_readings(recording: Recording, names: Sequence[str]) -> tuple[Recording, list[str]]:
-    """Return a recording with straight lines for zeros that were lost readings and one row for each reading held.
+    """Return a recording with lost readings bridged by straight lines, and with one row for each reading.
 
-    Readings of all columns `names` that stand for k rows each, as of a sensor slower than its log, leave every k-th
-    row. Where columns differ, or rows repeat irregularly, it is said alone.
+    Where readings of all columns `names` stand for k rows each, as of a sensor slower than its log, every k-th row is
+    kept. Where columns differ, or rows repeat irregularly, only a note says so.
 
     Raises
     ------
     DataError
-        More than 5 % of a column are such zeros.
+        More than 5 % of a column are zeros in place of lost readings.
     """
-    recording, notes = _without_dropouts(recording, names)
+    recording, notes = _bridge_dropouts(recording, names)
     held = {name: _rows_of_a_reading(recording.column(name)[:_SEEN]) for name in names}
     rows = set(held.values())
     if len(rows) == 1 and (count := rows.pop()) > 1:
@@ -158,9 +158,9 @@ def own_readings(recording: Recording, names: Sequence[str]) -> tuple[Recording,
 
 
 def dropouts(values: Array) -> NDArray[np.bool_] | None:
-    """Return which samples, shape (n,), are zeros in place of lost readings; None where no zeros are.
+    """Return which samples, shape (n,), are zeros in place of lost readings; None if none are.
 
-    Zeros that are the outermost level and next to the other readings are those of a limit.
+    Zeros at the outermost level, next to the other readings, are readings at the sensor's limit.
     """
     zero: NDArray[np.bool_] = np.asarray(values == 0)
     count = int(np.count_nonzero(zero))
@@ -181,7 +181,7 @@ def dropouts(values: Array) -> NDArray[np.bool_] | None:
     return zero if count > _PILED * next_to + _CHANCE_ZEROS else None
 
 
-def _without_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Recording, list[str]]:
+def _bridge_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Recording, list[str]]:
     lost_rows = {name: lost for name in names if (lost := dropouts(recording.column(name))) is not None}
     if not lost_rows:
         return recording, []
@@ -206,7 +206,7 @@ def _without_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Recor
 
 
 def _rows_of_a_reading(values: Array) -> int:
-    """For how many rows every reading stands, 1 where they are as many as rows or stand for different numbers."""
+    """Return the rows that every reading stands for; 1 where that varies or every row is a reading."""
     changes = np.diff(np.flatnonzero(values[1:] != values[:-1]))
     if len(changes) < _FEWEST_READINGS or 2 * np.count_nonzero(changes == 1) > len(changes):
         return 1
@@ -215,7 +215,7 @@ def _rows_of_a_reading(values: Array) -> int:
 
 
 def _first_rows(columns: Sequence[Array], count: int) -> NDArray[np.intp]:
-    """The rows in which readings that stand for `count` rows begin; two that are alike are told by their rows."""
+    """Return the first row of each reading that stands for `count` rows, also where two readings are alike."""
     change = np.logical_or.reduce([values[1:] != values[:-1] for values in columns])
     start = np.concatenate([[0], np.flatnonzero(change) + 1])
     length = np.diff(np.append(start, len(columns[0])))
@@ -225,7 +225,7 @@ def _first_rows(columns: Sequence[Array], count: int) -> NDArray[np.intp]:
 
 
 def _repeated(columns: Sequence[Array], kinds: Sequence[str]) -> float:
-    """The largest share of rows, over sensors, that repeat the readings of the row before more often than by chance."""
+    """Return the largest share of rows, over sensors, that repeat the row before more often than by chance."""
     largest = 0.0
     for kind in dict.fromkeys(kinds):
         same = [values[1:] == values[:-1] for values, its in zip(columns, kinds, strict=True) if its == kind]

@@ -1,9 +1,7 @@
-"""Logs at rest, column by column, as stretches that a noise model can be fitted to.
+"""Logs at rest, column by column, as stretches that a noise model can be fitted to, in memory or block by block.
 
-Logs of any length block by block.
-
-Rows without numbers and gaps are bridged, or end a stretch, as in a log that is in memory. Of a log with other faults
-nothing comes: it has to be looked at as a whole, where the messages are made.
+Rows without numbers and short gaps are bridged; long gaps end a stretch. A log of any length is read block by block;
+one with other faults has to be in memory as a whole, where the messages about them are made.
 """
 
 from __future__ import annotations
@@ -37,17 +35,15 @@ from imulab.estimation.sampling import (
 from imulab.recording import Array, Recording, check_time
 from imulab.units import parse_unit
 
-# A recording at rest, column by column, as stretches that a noise model can be fitted to; or why that cannot be.
+# A recording at rest as stretches between gaps, or the reason why it cannot be.
 
 
 FEWEST, SHORT = 500, 100.0
-"""Samples of a stretch at least; s below which only white noise and limits of the rest can be told."""
+"""Fewest samples of a stretch; s below which only white noise and limits of slow noise can be determined."""
 MOST, SHARE = 16, 0.05
-"""Stretches between gaps at most, and how long each must be in terms of the longest."""
-_PILED, _FEW_AT_END = (  # times the readings at the level beside, and so many more: the end of a range
-    2,
-    10,
-)  # times the readings at the level beside, and so many more: an output is at the end of its range
+"""Most stretches between gaps, and how long each must be relative to the longest."""
+_PILED, _FEW_AT_END = 2, 10
+"""An output is at the end of its range beyond so many times the readings at the next level, and so many more."""
 _SEEN = 100_000  # samples of which distinct values are counted
 
 
@@ -58,16 +54,16 @@ class Rest:
     Attributes
     ----------
     recording
-        Its part of one sampling rate, with bad rows bridged.
+        The part with one sampling rate, with bad rows bridged.
     interval
         Time between samples, s.
     parts
-        First row, last + 1, and of these rows the place among evenly spaced samples (None where no row is missing), of
-        each stretch between gaps.
+        For each stretch between gaps: first row, last + 1, and the places of its rows among evenly spaced samples (None
+        where no row is missing).
     bridged
-        Samples in gaps that were short enough for a straight line.
+        Samples in gaps that were bridged by a straight line.
     notes
-        What there is to say.
+        Messages for the user.
     """
 
     recording: Recording
@@ -83,7 +79,7 @@ class Rest:
 
     @property
     def short(self) -> bool:
-        """Whether only white noise and limits of slow noise can be told."""
+        """Whether only white noise and limits of slow noise can be determined."""
         return self.duration < SHORT
 
     def samples(self, name: str) -> list[Array]:
@@ -134,10 +130,10 @@ class Rest:
 
 
 def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
-    """Return a recording as stretches at rest of the columns `names`.
+    """Return a recording at rest as stretches of the columns `names`.
 
-    A few rows without numbers and gaps of up to 10 samples become straight lines, longer gaps end a stretch; of a rate
-    that changes, the longest part counts.
+    A few rows without numbers and gaps of up to 10 samples become straight lines; longer gaps end a stretch. Where the
+    rate changes, the longest part of one rate is used.
 
     Raises
     ------
@@ -159,7 +155,7 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
     parts, filled, left_out = _parts(time)
     if not parts:
         raise _too_few(recording, left_out)
-    # Lines about gaps are said here, for other figures than those of an Allan curve follow from them.
+    # Lines about gaps come from notes_of_gaps: they say what follows for the noise, not for an Allan curve.
     notes += [line for line in timing if " in time, the longest " not in line]
     notes += [*notes_of_steps(recording, names), *doubtful_units(recording, names, rate)]
     notes += notes_of_gaps(recording.name, usual, list(map(_length, parts)), filled, left_out, len(time))
@@ -167,7 +163,7 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
 
 
 def notes_of_steps(recording: Recording, names: Sequence[str]) -> list[str]:
-    """Say of a recording, by its first samples, which outputs take larger steps than their noise."""
+    """Return notes on outputs whose steps are larger than their noise, from the first samples of a recording."""
     notes = []
     for name in names:
         samples = recording.column(name)[:_SEEN]
@@ -183,7 +179,7 @@ def notes_of_steps(recording: Recording, names: Sequence[str]) -> list[str]:
 def notes_of_gaps(
     name: str, interval: float, lengths: Sequence[int], filled: int, left_out: int, rows: int
 ) -> list[str]:
-    """Say of a log what was bridged and left out, and whether its stretches, of so many samples each, are short."""
+    """Return notes on what was bridged and left out of a log, and on short stretches; lengths in samples."""
     notes: list[str] = []
     if filled:
         kind: type[str] = Note if filled < 0.01 * rows else str
@@ -210,7 +206,7 @@ def _length(part: tuple[int, int, Array | None]) -> int:
 
 
 def _parts(time: Array) -> tuple[list[tuple[int, int, Array | None]], int, int]:
-    """Stretches between gaps, samples bridged within them, and samples that are in none."""
+    """Return stretches between gaps, the number of samples bridged within them, and of samples outside them."""
     step = np.diff(time)
     usual, longest = usual_step(step)
     wide = np.flatnonzero(step > longest)
@@ -235,12 +231,12 @@ def _parts(time: Array) -> tuple[list[tuple[int, int, Array | None]], int, int]:
 
 
 def is_clipped(piled: int, next_to: int) -> bool:
-    """Whether the outermost level has too many samples for noise, by how many the next level has."""
+    """Return whether the outermost level has more samples than noise puts there, by the number at the next level."""
     return piled > _FEW_AT_END and piled > _PILED * next_to + _FEW_AT_END
 
 
 def _clipped(values: Array) -> float | None:
-    """Return the limit at which samples pile up: more than twice as many as at the next level; noise has fewer."""
+    """Return the limit at which samples pile up (more than twice as many as at the next level), or None."""
     if len(distinct(values[:_SEEN])) < LEVELS:
         return None
     for limit, outside, nearest in ((values.max(), np.less, np.max), (values.min(), np.greater, np.min)):
@@ -252,35 +248,35 @@ def _clipped(values: Array) -> float | None:
     return None
 
 
-# A log at rest of any length, block by block as it is read: its rows go into spectra, and are not kept.
+# A log of any length, read block by block: its rows go into spectra and are not kept.
 
 
 _FEWEST_STEPS = 100
-"""Steps of time whose usual one tells the rate."""
+"""Fewest steps of time that show the rate."""
 
 
 class _AsWholeError(Exception):
-    """The log has to be looked at as a whole."""
+    """The log has to be read as a whole."""
 
 
 @dataclass(frozen=True)
 class LongRest(Rest):
-    """A recording at rest whose rows are gone: `recording` has none. Else as `Rest`.
+    """A recording at rest whose rows were not kept: its `recording` has none. Otherwise as `Rest`.
 
     Attributes
     ----------
-    found
+    spectra_by_column
         Spectra by column, stretch by stretch.
     temperature
         Slow coefficients of the temperature, stretch by stretch; None where it does not change.
     """
 
-    found: dict[str, list[Stretch]] = field(default_factory=dict)
+    spectra_by_column: dict[str, list[Stretch]] = field(default_factory=dict)
     temperature: list[Array] | None = None
 
     def stretches(self, name: str) -> list[Stretch]:
         """Return the spectra of a column, stretch by stretch."""
-        return self.found[name]
+        return self.spectra_by_column[name]
 
     def slow(self, name: str) -> list[Array] | None:
         """Return the slow coefficients of the temperature, stretch by stretch; None where it does not change."""
@@ -288,12 +284,12 @@ class LongRest(Rest):
 
 
 def long_rest(blocks: Iterable[Recording], names: Sequence[str]) -> LongRest | None:
-    """Return a log at rest from its blocks of rows, one after the other; None where it has to be looked at as a whole.
+    """Return a log at rest from its blocks of rows, in order; None where it has to be read as a whole.
 
     Parameters
     ----------
     blocks
-        Of one file.
+        Blocks of one file.
     names
         Columns to fit.
     """
@@ -307,7 +303,7 @@ def long_rest(blocks: Iterable[Recording], names: Sequence[str]) -> LongRest | N
 
 
 class _Level:
-    """What tells whether a column is one at rest: means over a second, steps, the outermost levels on both sides."""
+    """Evidence of whether a column is at rest: means over 1 s, steps, and the outermost levels on both sides."""
 
     def __init__(self, samples: Array, size: int) -> None:
         self._size = size
@@ -348,7 +344,7 @@ class _Level:
 
 @dataclass(frozen=True)
 class _Part:
-    """A stretch: its samples, those of them that were missing, spectra by column, slow coefficients of temperature."""
+    """A stretch: samples, how many of them were missing, spectra by column, slow coefficients of temperature."""
 
     count: int
     filled: int
@@ -357,7 +353,7 @@ class _Part:
 
 
 class _Log:
-    """Takes blocks of rows, and gives stretches."""
+    """A log that takes blocks of rows and turns them into stretches."""
 
     def __init__(self, names: list[str]) -> None:
         self._names = names
@@ -378,7 +374,7 @@ class _Log:
         self._parts: list[_Part] = []
 
     def add(self, block: Recording) -> None:
-        """Take the next rows; the last ones without numbers wait for what comes."""
+        """Take the next rows; last rows without numbers wait for the next block."""
         self._notes |= dict.fromkeys(block.notes)
         if self._waiting is not None:
             columns = {k: np.concatenate([self._waiting.columns[k], v]) for k, v in block.columns.items()}
@@ -435,7 +431,7 @@ class _Log:
         if not fine.all():
             self._first_bad = self._first_bad or block.place(int(np.argmin(fine)))
             self._bad += int(np.count_nonzero(~fine))
-            columns = {name: self._joined(name, values) for name, values in columns.items()}
+            columns = {name: self._bridge(name, values) for name, values in columns.items()}
         steps = np.diff(np.concatenate([self._time, time]))
         if len(steps) and not steps.min() > 0:
             raise _AsWholeError
@@ -454,8 +450,8 @@ class _Log:
         self._rows += len(time)
         self._time = time[-1:].copy()
 
-    def _joined(self, name: str, values: Array) -> Array:
-        """Straight lines in place of what is no number, from the last sample before the block."""
+    def _bridge(self, name: str, values: Array) -> Array:
+        """Return values with straight lines for missing numbers, from the last sample before the block on."""
         values = np.concatenate([[self._last.get(name, np.nan)], values])
         known = np.flatnonzero(np.isfinite(values))
         if not len(known):
@@ -482,7 +478,7 @@ class _Log:
         self._count = self._filled = 0
 
     def _add(self, steps: Array, columns: dict[str, Array]) -> None:
-        """Put rows into the stretch; beyond a long gap begins another."""
+        """Add rows to the stretch; beyond a long gap another stretch begins."""
         wide = steps > self._longest
         self._steps += int(np.count_nonzero(~wide))
         self._duration += float(steps[~wide].sum())
@@ -499,7 +495,7 @@ class _Log:
                 self._extend(inside, {name: values[start:stop] for name, values in columns.items()})
 
     def _extend(self, steps: Array, columns: dict[str, Array]) -> None:
-        """Add rows to the stretch, and the lines across missing ones; steps in samples lead to each but a first row."""
+        """Add rows, with straight lines across missing ones; a step in samples leads to each row but a log's first."""
         begun = len(columns[self._names[0]]) == len(steps)
         place = np.cumsum(np.concatenate([[0.0], steps]))
         even = place[-1] == len(steps)
@@ -526,6 +522,6 @@ class _Log:
 
 
 def _rows(block: Recording, start: int, stop: int) -> Recording:
-    """Rows of a block."""
+    """Return rows of a block."""
     columns = {name: values[start:stop] for name, values in block.columns.items()}
     return replace(block, columns=columns, first_row=block.first_row + start)

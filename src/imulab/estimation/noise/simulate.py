@@ -1,6 +1,7 @@
-"""Noise of a sensor at rest, drawn in the time domain, block by block: nothing here is shared with the fit.
+"""Simulated noise of a sensor at rest, drawn in the time domain, block by block. Nothing here is shared with the fit.
 
-Source of the sum for 1/f noise: Keshner (1982), Gauss-Markov processes with time constants evenly spaced in logarithm.
+Source of the sum for 1/f noise: Keshner (1982): Gauss-Markov processes with evenly spaced logarithms of their time
+constants.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import numpy as np
 from imulab.errors import OptionError
 from imulab.recording import Array
 
-_BLOCK = 1 << 17  # samples drawn at once; it bounds memory, and the numbers depend on it
+_BLOCK = 1 << 17  # samples drawn together; it bounds memory, and the drawn numbers depend on it
 _PER_DECADE, _SHORTEST, _LONGEST = 2.5, 0.25, 10.0
-"""Time constants of the 1/f sum: how many a decade, and from where, in samples, to where, in records."""
+"""Time constants of the 1/f sum in a decade; the shortest, in samples; the longest, in lengths of the record."""
 TERMS = ("white", "flicker", "walk", "quantisation", "gm1_sigma", "gm1_time", "gm2_sigma", "gm2_time", "ramp")
 
 
@@ -30,7 +31,7 @@ class FlickerSum:
 
 
 def simulated(values: Mapping[str, float], interval: float, count: int, seed: int) -> Iterator[Array]:
-    """Yield blocks of samples of a sum of noises, `count` samples in all.
+    """Yield blocks of samples of a sum of noises, `count` samples in all blocks together.
 
     Parameters
     ----------
@@ -40,7 +41,7 @@ def simulated(values: Mapping[str, float], interval: float, count: int, seed: in
     interval
         Time between samples, s.
     count, seed
-        Number of samples, and of the noise.
+        Number of samples, and seed of the noise.
 
     Raises
     ------
@@ -108,8 +109,8 @@ def _blocks(values: Mapping[str, float], interval: float, count: int, seed: int)
 def flicker_sum(interval: float, count: int) -> FlickerSum:
     """Return the Gauss-Markov processes that make 1/f noise of unit B over `count` samples.
 
-    Their variances, none negative, bring the sum of their spectra next to ``1/(2 |sin(w/2)|)`` from a third of the
-    lowest frequency of the record, w = pi/n, up to half the sampling rate, within .05 %.
+    Their variances, none negative, fit the sum of their spectra to ``1/(2 |sin(w/2)|)`` from a third of the lowest
+    frequency of the record, w = pi/n, up to half the sampling rate, within 0.05 %.
 
     Examples
     --------

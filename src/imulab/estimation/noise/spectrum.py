@@ -1,9 +1,7 @@
-"""The spectrum that noise models are fitted to.
-
-Samples at rest, of any number, into mean squares of cosine coefficients in bins of frequency.
+"""The spectrum that noise models are fitted to: mean squares of cosine coefficients in bins of frequency.
 
 A log of up to 4 million samples is transformed as a whole. Of a longer one, stretches of 262,144 samples give the
-spectrum from a frequency on, and means of m samples the spectrum below it: all bins are in terms of the full rate, and
+spectrum down to a frequency, and means of m samples the spectrum below it. All bins are stated for the full rate, and
 the memory needed does not grow with the log.
 """
 
@@ -19,10 +17,10 @@ from imulab.estimation.noise.cleaning import Line, knocks_removed, line_groups, 
 from imulab.estimation.rows import distinct
 from imulab.recording import Array
 
-# The spectrum that noise models are fitted to: mean squares of cosine coefficients in bins of frequency.
+# Bins of frequency.
 
 
-_ALONE, _PER_DECADE = 24, 60  # lowest coefficients that have a bin of their own; bins in a decade beyond
+_ALONE, _PER_DECADE = 24, 60  # lowest coefficients with a bin of their own; bins in a decade above them
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ class Spectrum:
         trials.
     freedom
         Number of coefficients in each mean, shape (b,) or that of `power`: fewer than ``last - first + 1`` where lines
-        were left out, 0 for a bin that is left out, no whole number after an allowance for ripple.
+        are left out, 0 for a bin that is left out, no whole number after an allowance for ripple.
     """
 
     interval: float
@@ -77,37 +75,37 @@ def bins(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return first, np.append(first[1:] - 1, count - 1)
 
 
-# The cosine transform of samples at rest, of any number of them, into the spectrum that noise models are fitted to.
+# Cosine transform of any number of samples.
 
 
 WHOLE, STRETCH = 1 << 22, 1 << 18
-"""Samples that are transformed as a whole; samples of a stretch of a longer log."""
+"""Most samples that are transformed as a whole; samples of a stretch of a longer log."""
 _MEANS = 1 << 21
-"""Means that are kept at most: twice as many samples go into each when there are more."""
+"""Most means that are kept: with more, each is of twice as many samples."""
 _SHARE = 32
-"""Of the means' frequencies only the lowest 32nd is used: averaging takes .08 % from a slow noise at its end."""
-SLOW = 1 << 19  # coefficients of the lowest frequencies that are kept one by one, for steps and covariates
+"""Only the lowest 32nd of the means' frequencies is used, where averaging takes at most 0.08 % from slow noise."""
+SLOW = 1 << 19  # lowest coefficients that are kept one by one, for steps and covariates
 _FINE = 1 << 10  # angles of the finer of the two tables whose products give all sines
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """What the fit needs of one column of one stretch at rest.
+    """Spectra and slow coefficients of one column of one stretch at rest.
 
     Attributes
     ----------
     spectra
-        One, or of a long log that of its means and that of its stretches at the full rate.
+        One spectrum; for a long log that of its means and that of its stretches at the full rate.
     slow
-        The lowest coefficients of the whole, c_1 .. c_J, J <= 524288, shape (J,): for steps and covariates.
+        Lowest coefficients of the whole stretch, c_1 .. c_J, J <= 524288, shape (J,): for steps and covariates.
     used
-        Which of these are in the spectra, not left out as lines, shape (J,).
+        Whether each of these is in the spectra and not left out as a line, shape (J,).
     lines
-        The lines that were left out, the largest first.
+        Spectral lines that were left out, the largest first.
     spikes
-        Samples that were replaced.
+        Number of samples that were replaced.
     knocks
-        Start and length, s, of each part that was replaced because it is not of the noise around it.
+        Start and length, s, of each part that was replaced because it differs from the noise around it.
     """
 
     spectra: tuple[Spectrum, ...]
@@ -119,7 +117,7 @@ class Stretch:
 
     @property
     def count(self) -> int:
-        """Number of samples, of which there are ``count - 1`` coefficients."""
+        """Number of samples; there are ``count - 1`` coefficients."""
         return self.spectra[0].count
 
     @property
@@ -129,7 +127,7 @@ class Stretch:
 
 
 def smooth_count(count: int) -> int:
-    """Return the largest number up to `count` >= 1 that is 2^a 3^b 5^c, whose transform is fast.
+    """Return the largest number up to `count` >= 1 of the form 2^a 3^b 5^c, whose transform is fast.
 
     Examples
     --------
@@ -155,9 +153,9 @@ def cosine_coefficients(samples: Array) -> Array:
     ['1.9598', '0.5000', '0.8118']
     """
     centred, n = samples - samples.mean(), len(samples)
-    # Even samples, then odd ones backwards: their Fourier transform, turned, is the cosine transform.
+    # The Fourier transform of the even samples, then the odd ones backwards, turned, is the cosine transform.
     turned = np.fft.rfft(np.concatenate([centred[::2], centred[1::2][::-1]]))
-    # The angles of the turn are a coarse one and a fine one each: a thousandth of their exponentials is enough.
+    # Each angle is the sum of a coarse and a fine one, which needs a thousandth of the exponentials.
     fine, coarse = np.arange(_FINE), _FINE * np.arange(len(turned) // _FINE + 1)
     turn = np.multiply.outer(np.exp(-0.5j * np.pi / n * coarse), np.exp(-0.5j * np.pi / n * fine))
     turned *= turn.ravel()[: len(turned)]
@@ -165,7 +163,7 @@ def cosine_coefficients(samples: Array) -> Array:
 
 
 class Accumulator:
-    """Takes the samples of one column block by block, as they are read, and gives what the fit needs of them.
+    """Spectrum of one column whose samples arrive block by block.
 
     Parameters
     ----------
@@ -218,11 +216,11 @@ class Accumulator:
             return self._whole(held)
         if len(held):
             held = self._cleaned(held)
-            self._average(held)
+            self._add_means(held)
         return self._two_parts()
 
     def slow(self) -> Array:
-        """Return the lowest coefficients alone, of a covariate, lines and all, shape (J,); it takes no more then."""
+        """Return the lowest coefficients of a covariate, with lines, shape (J,); the accumulator takes no more."""
         if self._stretches:
             return self.stretch().slow
         held = self._all()
@@ -259,13 +257,13 @@ class Accumulator:
 
     def _transform(self, samples: Array) -> None:
         samples = self._cleaned(samples)
-        self._average(samples)
+        self._add_means(samples)
         c = cosine_coefficients(samples)
         self._squares = c * c if not self._stretches else self._squares + c * c
         self._stretches += 1
 
-    def _average(self, samples: Array) -> None:
-        """Add the means of samples, whose number is a multiple of that of a mean but at the end of the log."""
+    def _add_means(self, samples: Array) -> None:
+        """Add means of samples; their number is a multiple of that of a mean, except at the end of the log."""
         if not len(self._means):
             self._means = np.empty(_MEANS)
         if self._filled + len(samples) // self._averaged > _MEANS:
@@ -290,7 +288,7 @@ class Accumulator:
         parts = [binned(slow**2, fine, kept, self._interval, count)]
         first, last = bins(STRETCH)
         squares = self._squares / self._stretches
-        high = first > (kept[1][-1] + 0.5) * STRETCH / count  # what lies between the two parts is lost: half a bin
+        high = first > (kept[1][-1] + 0.5) * STRETCH / count  # half a bin between the two parts is lost
         fine_above, more = line_groups(squares, first, last, self._stretches, STRETCH, self._interval)
         above = binned(squares, fine_above, (first[high], last[high]), self._interval, STRETCH)
         parts.append(
@@ -309,13 +307,13 @@ def binned(
     interval: float,
     count: int,
 ) -> Spectrum:
-    """Return the spectrum of squares of coefficients, c_1 .. c_J, shape (J,), of which only those `fine` count."""
+    """Return the spectrum from squares of coefficients, c_1 .. c_J, shape (J,), of which only the `fine` ones count."""
     first, last = edges
     inside = slice(int(first[0]) - 1, int(last[-1]))
     starts = first - first[0]
     freedom = np.add.reduceat(fine[inside].astype(np.float64), starts)
     total = np.add.reduceat(np.where(fine[inside], squares[inside], 0.0), starts)
-    # A bin without any coefficient counts nothing, but its logarithm must exist.
+    # A bin without coefficients has no weight, but its logarithm must exist.
     power = np.where(freedom > 0, total / np.maximum(freedom, 1), 1.0)
     return Spectrum(interval, count, first, last, power, freedom)
 
@@ -340,9 +338,9 @@ def frequencies(spectrum: Spectrum) -> Array:
 
 
 def variances_of_coefficients(variances: Sequence[Array], stretch: Stretch) -> Array:
-    """Return the variance of each slow coefficient, shape (J,), from those of the bins of each spectrum, (b,).
+    """Return the variance of each slow coefficient, shape (J,), from the variances in the bins of each spectrum, (b,).
 
-    Straight lines in the logarithms of frequency and variance join the bins.
+    Between the bins it is interpolated linearly in the logarithms of frequency and variance.
     """
     f = np.concatenate([frequencies(each) for each in stretch.spectra])
     j = np.arange(1, len(stretch.slow) + 1)

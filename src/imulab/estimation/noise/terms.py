@@ -1,10 +1,9 @@
-"""The terms of a noise model, and what its users need.
+"""The terms of a noise model: variances of cosine coefficients and means, Allan variance, and what a filter needs.
 
-White noise and walk for a filter, and the uncertainty of a bias from a mean.
+The parameters of a model are an array, shape (..., 8), in the order of `NAMES`; a term that is absent is 0. A filter
+needs white noise and walk, and the uncertainty of a bias from a mean at rest.
 
-The parameters of a model are an array, shape (..., 8), in the order of `NAMES`; a term that is absent is 0.
-
-Sources: IEEE Std 952 and 647 (the terms), Whittle (1953); exact sums over samples throughout.
+Sources: IEEE Std 952 and 647 (the terms), Whittle (1953); sums over samples are exact.
 """
 
 from __future__ import annotations
@@ -20,17 +19,17 @@ from imulab.estimation.distributions import sine_integral
 from imulab.estimation.noise.spectrum import Spectrum
 from imulab.recording import Array
 
-# The terms of a noise model: the variance of their cosine coefficients, of their means, and their Allan variance.
+# Variances of cosine coefficients and of means, and Allan variance.
 
 
 NAMES = ("white", "flicker", "walk", "quantisation", "gm1_sigma", "gm1_time", "gm2_sigma", "gm2_time")
 LINEAR, SIGMA, TIME = 4, (4, 6), (5, 7)
-"""How many terms come before the Gauss-Markov ones, and where those have their parameters."""
+"""Number of terms before the Gauss-Markov ones; places of these terms' parameters."""
 _LETTERS = {"N": (0,), "B": (1,), "K": (2,), "Q": (3,)}
 _FLICKER = 2 * math.log(2) / math.pi
-_NODES = 16  # frequencies of a bin up to which a term is summed over each, beyond which by Gauss
+_NODES = 16  # up to so many frequencies a bin is summed over each; a larger one by Gauss's rule
 _SERIES = 0.5
-"""Below this many time constants, differences of exponentials are summed as power series."""
+"""Duration in time constants below which differences of exponentials are computed as power series."""
 
 
 def terms(letters: str) -> NDArray[np.bool_]:
@@ -49,7 +48,7 @@ def terms(letters: str) -> NDArray[np.bool_]:
 
 
 def letters(present: NDArray[np.bool_]) -> str:
-    """Return the letters of a model from which parameters it has, shape (8,), white noise first.
+    """Return the letters of a model, white noise first, from which parameters it has, shape (8,).
 
     Examples
     --------
@@ -97,7 +96,7 @@ def markov_allan(time: Array, tau: Array, interval: float) -> Array:
 
 
 def _power_series(x: Array, coefficients: Sequence[float], first: int) -> Array:
-    """Sum of ``coefficients[i] (-x)^(first + i)``."""
+    """Return the sum of ``coefficients[i] (-x)^(first + i)``."""
     total = np.zeros_like(x)
     for each in reversed(coefficients):
         total = each - x * total
@@ -145,10 +144,11 @@ def allan_variance(values: Array, tau: Array, interval: float) -> Array:
 
 
 def mean_terms(values: Array, duration: Array, interval: float) -> Array:
-    """Return each term's part of u^2 of a mean over a duration as a measure of the bias, shape (..., 6, t).
+    """Return the parts of u^2 by each term, u the uncertainty of a mean as a measure of the bias, shape (..., 6, t).
 
-    ``u^2 = N^2/t + (2 ln 2/pi) B^2 + K^2 t/3 + 2 Q^2/t^2 + sum V_G(t)``: a Gauss-Markov term counts about the mean of
-    its process, 1/f noise and walk, which have none, by their Allan variance. Arguments as for `allan_terms`.
+    ``u^2 = N^2/t + (2 ln 2/pi) B^2 + K^2 t/3 + 2 Q^2/t^2 + sum V_G(t)``. A Gauss-Markov term counts by its variance
+    about its long-term mean; 1/f noise and walk, which have no such mean, by their Allan variance. Arguments as for
+    `allan_terms`.
     """
     t = np.asarray(duration, dtype=np.float64)
     linear = values[..., :LINEAR, None] ** 2 * np.stack([1 / t, np.full_like(t, _FLICKER), t / 3, 2 / t**2])
@@ -163,18 +163,18 @@ def _markov(values: Array, tau: Array, interval: float, unit: object) -> Array:
 
 @dataclass(frozen=True)
 class Bins:
-    """What the variances of the coefficients in bins, (b,), are computed from, for one or more spectra in a row.
+    """Precomputed arrays that give the variances of coefficients in bins, (b,), of one or more spectra in a row.
 
     Attributes
     ----------
     unit
-        Variance for unit N, B, K, Q, shape (4, b).
+        Variances for unit N, B, K, Q, shape (4, b).
     sine, angular
         ``s^2 = 4 sin^2(pi j/2n)`` and ``w^2 = (pi j/L)^2``, harmonic means over each bin, shape (b,).
     sign
-        Mean of ``(-1)^j``, shape (b,).
+        Mean of ``(-1)^j`` over each bin, shape (b,).
     interval, length
-        dt and L, s, shape (b,), or (1,) where they are the same everywhere.
+        dt and L, s, shape (b,), or (1,) where all bins have the same.
     power, freedom
         As in `Spectrum`, shapes (..., b).
     """
@@ -189,7 +189,7 @@ class Bins:
     freedom: Array
 
     def markov(self, time: Array) -> tuple[Array, Array]:
-        """Return the variances for unit S and time constants, shape (r,), and d/d ln T of these, shapes (r, b)."""
+        """Return the variances for unit S and time constants, shape (r,), and their d/d ln T, shapes (r, b)."""
         t = time[:, None]
         a, ratio = self.interval / t, t / self.length
         body = 2 * np.sinh(a) / (4 * np.sinh(a / 2) ** 2 + self.sine)
@@ -210,12 +210,12 @@ class Bins:
 
 
 def prepare(spectra: Sequence[Spectrum]) -> Bins:
-    """Return the bins of spectra, one after the other.
+    """Return the bins of spectra, one spectrum after the other.
 
     Source: the cosine transform diagonalises the second differences of a walk, so that white noise and walk are exact;
     1/f noise is within 4e-4 of the exact variance, Gauss-Markov noise within 2e-4 (n = 600).
     """
-    each = [_of_one(spectrum) for spectrum in spectra]
+    each = [_bins_of_spectrum(spectrum) for spectrum in spectra]
     alike = len({(spectrum.interval, spectrum.count) for spectrum in spectra}) == 1
     unit, sine, angular, sign, interval, length, power, freedom = (
         np.concatenate(parts, axis=-1) for parts in zip(*each, strict=True)
@@ -225,7 +225,7 @@ def prepare(spectra: Sequence[Spectrum]) -> Bins:
     return Bins(unit, sine, angular, sign, interval, length, power, freedom)
 
 
-def _of_one(spectrum: Spectrum) -> list[Array]:
+def _bins_of_spectrum(spectrum: Spectrum) -> list[Array]:
     n, dt = spectrum.count, spectrum.interval
     j, weight, sign = _nodes(spectrum.first, spectrum.last)
     sine, angular = 4 * np.sin(np.pi * j / (2 * n)) ** 2, (np.pi * j / spectrum.length) ** 2
@@ -251,7 +251,7 @@ def _of_one(spectrum: Spectrum) -> list[Array]:
 
 
 def _nodes(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """Frequencies j at which each bin is evaluated, their weights, shapes (b, 16), and the mean of (-1)^j, (b,)."""
+    """Return the frequencies j at which bins are evaluated, their weights, shapes (b, 16), and the means of (-1)^j."""
     width = (last - first + 1).astype(np.float64)
     steps = np.arange(_NODES, dtype=np.float64)
     points, weights = np.polynomial.legendre.leggauss(4)
@@ -268,35 +268,35 @@ def _nodes(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[Array, Ar
 
 
 def _flicker_end(j: Array, sign: Array) -> Array:
-    """Return ``(2/pi) [Si(pi j) - (1 - cos pi j)/(pi j)]``, what the ends of the stretch leave of 1/f noise."""
+    """Return what the ends of the stretch leave of 1/f noise: ``(2/pi) [Si(pi j) - (1 - cos pi j)/(pi j)]``."""
     x = np.pi * j
     near = np.minimum(x, 25 * np.pi)
     exact = sine_integral(near) - (1 - np.cos(near)) / near
     return np.asarray(np.where(x <= 24.5 * np.pi, 2 / np.pi * exact, 1 - 2 / (np.pi * x) + 4 / np.pi * sign / x**3))
 
 
-# What users of a noise model need: white noise and walk for a filter, and the uncertainty of a bias from a mean.
+# What a filter needs: white noise and walk over its horizon, and the uncertainty of a bias from a mean.
 
 
 _AT_BOUND = 1.5
-"""A Gauss-Markov term within this factor of the shortest time constant is the edge of the band, no slow noise."""
+"""A Gauss-Markov term within this factor of the shortest time constant is the edge of the band, not slow noise."""
 _WHITE_TO_FILTER = 3.0
-"""Horizons of so many time constants see a Gauss-Markov term as white noise."""
-_NO_TIME = 1e-30  # s: stands for none where a ratio of times is taken
+"""A Gauss-Markov term is white noise over horizons of at least so many time constants."""
+_NO_TIME = 1e-30  # s: stands for no time constant where a ratio of times is taken
 _OF_FLICKER = 0.1
-"""Share of B^2 h that is white to a filter.
+"""Share of B^2 h that is white noise to a filter.
 
-Both numbers are from filters run on simulated noise (1/f with a corner of 3 and 30 s, Gauss-Markov of 20 times the
-white density, h = 10 to 300 s): their errors are the smallest so, and their predictions right to 15 %. With all of it
-in the walk, errors are up to twice as large, and 1.4 to 2 times the prediction.
+Both numbers minimise the errors of filters run on simulated noise (1/f with a corner of 3 and 30 s, Gauss-Markov of 20
+times the white density, h = 10 to 300 s); the predicted errors are then right to 15 %. With all of it in the walk, the
+errors are up to twice as large, and 1.4 to 2 times the prediction.
 """
 
 
 def walk_square(values: Array, horizon: Array, interval: float, shortest: float = 0.0) -> Array:
-    """Return the square of the walk that predicts the mean over a horizon as well as the model does, (u/sqrt(s))^2.
+    """Return the square of the random walk that predicts the mean over a horizon best, (u/sqrt(s))^2.
 
-    ``K_h^2 = 3 sigma^2_slow(h)/h``, sigma^2_slow the Allan variance of 1/f noise, walk and Gauss-Markov terms of more
-    than h/3; those at the shortest time constant are the edge of the band.
+    ``K_h^2 = 3 sigma^2_slow(h)/h``, with sigma^2_slow the Allan variance of 1/f noise, walk and Gauss-Markov terms of
+    more than h/3; terms at the shortest time constant are the edge of the band and left out.
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ def walk_square(values: Array, horizon: Array, interval: float, shortest: float 
     interval
         Time between samples, s.
     shortest
-        The least time constant that the fit allowed, s.
+        Least time constant that the fit allowed, s.
     """
     parts = allan_terms(values, horizon, interval)
     slow = parts[..., 1, :] + parts[..., 2, :]
@@ -317,10 +317,10 @@ def walk_square(values: Array, horizon: Array, interval: float, shortest: float 
 
 
 def white_square(values: Array, horizon: Array, shortest: float = 0.0) -> Array:
-    """Return the square of the white noise that goes with the walk of a horizon, (u/sqrt(Hz))^2, shape (..., t).
+    """Return the square of the white noise that belongs to that walk, (u/sqrt(Hz))^2, shape (..., t).
 
     ``N_h^2 = N^2 + 0.1 B^2 h + sum 2 S^2 T [1 - (T/h) (1 - e^(-h/T))]`` over the Gauss-Markov terms that `walk_square`
-    leaves out, whose integral over h it predicts; those at the edge of the band count in full. Parameters as there.
+    leaves out: their mean over h. Terms at the edge of the band count in full. Parameters as there.
     """
     total = values[..., :1] ** 2 + _OF_FLICKER * values[..., 1:2] ** 2 * horizon
     edge = at_band_edge(values, shortest)
@@ -338,29 +338,29 @@ def bias_square(values: Array, duration: Array, interval: float) -> Array:
 
 
 def at_band_edge(values: Array, shortest: float) -> NDArray[np.bool_]:
-    """Return which Gauss-Markov terms, shape (..., 2), lie at the shortest time constant that the fit allowed, s.
+    """Return whether Gauss-Markov terms, shape (..., 2), lie at the shortest time constant that the fit allowed, s.
 
-    Such a term is the roll-off of the sensor's filter at the end of the band, and no slow noise.
+    Such a term is the roll-off of the sensor's filter at the end of the band, not slow noise.
     """
     return np.asarray((values[..., SIGMA] > 0) & (values[..., TIME] <= _AT_BOUND * shortest))
 
 
 def letters_inside(model: NDArray[np.bool_], values: Array, shortest: float) -> str:
-    """Return the letters of a model without the Gauss-Markov terms that are the edge of the band; arguments (8,)."""
+    """Return the letters of a model without Gauss-Markov terms at the edge of the band; arguments of shape (8,)."""
     return letters(model).replace("G", "", int(np.count_nonzero(at_band_edge(values, shortest))))
 
 
 def edge_as_white(values: Array, covariance: Array, shortest: float) -> tuple[Array, Array]:
-    """Return a model whose Gauss-Markov terms at the end of the band are white noise, as slower noise sees them.
+    """Return a model and its covariance with Gauss-Markov terms at the edge of the band as white noise.
 
-    ``N^2 + sum 2 S^2 T`` in place of N^2; a term that is left is the first.
+    ``N^2 + sum 2 S^2 T`` in place of N^2; a term that remains is the first.
 
     Parameters
     ----------
     values, covariance
         Parameters, shape (8,), and the covariance of their logarithms, shape (8, 8).
     shortest
-        The least time constant that the fit allowed, s.
+        Least time constant that the fit allowed, s.
     """
     edge = np.flatnonzero(at_band_edge(values, shortest))
     if not edge.size:
@@ -372,7 +372,7 @@ def edge_as_white(values: Array, covariance: Array, shortest: float) -> tuple[Ar
         parts[[SIGMA[k], TIME[k]]] = 2 * values[SIGMA[k]] ** 2 * values[TIME[k]]
         terms[[SIGMA[k], TIME[k]]] = 0.0
     terms[0] = np.sqrt(white_square(values, np.zeros(1), shortest)[0])
-    # d ln N: of a term's variance by S as by N, by T half as much.
+    # d ln N: a term's variance depends on S as on N, on T half as much.
     parts[list(TIME)] /= 2
     turn[0] = parts / terms[0] ** 2
     turn[terms == 0] = 0.0
