@@ -1,12 +1,6 @@
-"""Centrifuge test.
-
-The acceleration-sensitive drift of a gyroscope; and the words that the options of a reduction take.
-"""
+"""Centrifuge test: the drift of a gyroscope with specific force. Here are the words that the options take."""
 
 from __future__ import annotations
-
-# The words that the options of a centrifuge reduction take.
-
 
 METHODS = ("least-squares", "fourier")
 CURVES: dict[str, tuple[int, ...]] = {"constant": (), "c1": (1,), "c2": (2,), "c1+c2": (1, 2)}

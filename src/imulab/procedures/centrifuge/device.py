@@ -1,7 +1,4 @@
-"""A centrifuge record as the table that the C core runs, its vectors for an exported unit.
-
-The drift subtracted from recordings.
-"""
+"""A centrifuge record on the device: table of the C core, test vectors, and the drift subtracted from recordings."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import from_si, parse_unit
 
-# A centrifuge record as the table that the C core runs, and the vectors by which an exported unit tests itself.
+# The table of the C core, and the vectors by which exported code tests itself.
 
 
 _CURVE_UNITS = {"K0": "rad/s/(m/s^2)", "c1": "1/(m/s^2)", "c2": "1/(m/s^2)^2", "direction": "rad"}
@@ -67,7 +64,7 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
 
 
 def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
-    """Return rates under specific forces up to the highest level, and what is left of them."""
+    """Return random rates under specific forces up to the highest level, and the rates without the drift."""
     force = rng.uniform(-1, 1, (VECTORS, 2)) * float(field_of(table, "highest")) / np.sqrt(2)
     rate = rng.uniform(-1, 1, (VECTORS, 2)) * 0.01  # rad/s
     rate[1, 0] = np.nan
@@ -77,12 +74,12 @@ def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     return {"": VECTORS, "scale": scale, "force": force, "rate": rate, "expected": expected}
 
 
-# A centrifuge record applied by the C core: the acceleration-sensitive drift taken off a two-axis gyroscope.
+# The drift of a two-axis gyroscope, subtracted by the C core.
 
 
 FORCE_COLUMNS = ("accel_x", "accel_y")
 _BEYOND = 1.001
-"""The highest level is not exceeded by its own rounding."""
+"""Factor of the highest level, so that rounding does not exceed it."""
 
 
 def apply_centrifuge(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
@@ -106,7 +103,7 @@ def apply_centrifuge(unit: DeviceUnit, columns: Mapping[str, Any], recording: Re
         if name[-1] not in columns["axes"]:
             raise RecordError(f"the record has no curve for {name} (no {name[-1]}_K0)")
     force = [_force(recording, name) for name in FORCE_COLUMNS]
-    # The drift alone, as the core takes it off a rate of zero, so that a column keeps the digits of its own unit.
+    # The core subtracts the drift from a rate of zero: so a column keeps the digits of its own unit.
     still = np.zeros(len(recording))
     drift, _ = unit.centrifuge(force, [still if f"dtg_{axis}" in names else None for axis in "xy"])
     corrected = {}
@@ -121,7 +118,7 @@ def apply_centrifuge(unit: DeviceUnit, columns: Mapping[str, Any], recording: Re
 
 
 def beyond_levels(record: Calibration, recording: Recording) -> tuple[int, float]:
-    """Return how many samples lie beyond the highest level tested, and the largest specific force, m/s^2."""
+    """Return how many samples lie beyond the highest level of the test, and the largest specific force, m/s^2."""
     top = highest_force(record)
     size = np.hypot(*(_force(recording, name) for name in FORCE_COLUMNS))
     size = np.where(np.isfinite(size), size, 0.0)
@@ -129,7 +126,7 @@ def beyond_levels(record: Calibration, recording: Recording) -> tuple[int, float
 
 
 def beyond_message(record: Calibration, count: int, largest: float) -> str:
-    """Say that so many samples, the largest in m/s^2, lie beyond the highest level."""
+    """Return the warning of samples beyond the highest level, the largest in m/s^2."""
     return (
         f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {from_si(largest, 'g'):.1f} g), "
         "the highest level of the record's test: K(a) is extrapolated there"

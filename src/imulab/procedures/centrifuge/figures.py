@@ -349,7 +349,7 @@ def numbers(record: Calibration, prefix: str) -> list[int]:
 
 
 def axis_label(prefix: str) -> str:
-    """Return what people call a set of parameters: ``X``, or ``X, spin axis down``."""
+    """Return the words for a set of parameters: ``X``, or ``X, spin axis down``."""
     return prefix[0].upper() + (", spin axis down" if "down" in prefix else "")
 
 
@@ -358,7 +358,7 @@ def text_in_g(force: float) -> str:
     return f"{from_si(force, 'g'):.3g} g"
 
 
-# The figures and tables of a centrifuge record, from the record alone.
+# Figures and tables of a record.
 
 
 _POINTS = 121  # of a curve
@@ -402,7 +402,7 @@ def _bars(values: Any, colour: str) -> dict[str, Any]:
 
 
 def _zeta(record: Calibration, sets: list[str]) -> Figure:
-    """Change of K over g: the source's zeta and the fitted curve, each with its 95 % interval."""
+    """Return the figure of the change of K over g: zeta and the fitted curve, each with its 95 % interval."""
     traces: list[dict[str, Any]] = []
     shown = [p for p in sets if "down" not in p] or sets
     for number, prefix in enumerate(shown):
@@ -452,17 +452,17 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
 
 
 def _half_width(record: Calibration, factors: dict[str, float], name: str) -> float:
-    """Half the 95 % interval of a parameter."""
+    """Return half the 95 % interval of a parameter."""
     return (record.parameter(name).standard_uncertainty or 0.0) * factors[name]
 
 
 def _place(number: int) -> dict[str, Any]:
-    """The axes of a panel, as a trace names them."""
+    """Return the axes of a panel, as a trace names them."""
     return dict(zip(("xaxis", "yaxis"), names(number), strict=True))
 
 
 def _panels(titles: list[str], below: str, gap: float = 0.09) -> dict[str, Any]:
-    """Layout of panels side by side, the legend above."""
+    """Return the layout of panels side by side, with the legend above."""
     count = len(titles)
     width = (1 - gap * (count - 1)) / count
     layout: dict[str, Any] = {
@@ -478,7 +478,7 @@ def _panels(titles: list[str], below: str, gap: float = 0.09) -> dict[str, Any]:
 
 
 def _polar(record: Calibration, sets: list[str]) -> Figure:
-    """The complex K of each level in the gyroscope's frame."""
+    """Return the figure of each level's complex K in the gyroscope's frame."""
     traces: list[dict[str, Any]] = []
     shown = [p for p in sets if "down" not in p] or sets
     annotations = []
@@ -531,7 +531,7 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
 
 
 def _repeatability(record: Calibration, r: CentrifugeRecord, sets: list[str]) -> Figure:
-    """K of every run against its level's K, by power cycle."""
+    """Return the figure of every run's K against its level's, by power cycle."""
     traces: list[dict[str, Any]] = []
     axes = list(dict.fromkeys(p[0] for p in sets))
     cycles = sorted({row.power_cycle for row in r.runs if row.role == "loaded"})
@@ -582,7 +582,7 @@ def _repeatability(record: Calibration, r: CentrifugeRecord, sets: list[str]) ->
 
 
 def _spectra(r: CentrifugeRecord) -> list[Figure]:
-    """Spectra of X, FOG and residual around the table rate, at the lowest, a middle and the highest level."""
+    """Return spectra of X, FOG and residual around the table rate, at the lowest, a middle and the highest level."""
     shown = [spectrum for spectrum in r.data.spectra if spectrum.spin_axis == r.data.spectra[0].spin_axis]
     if not shown:
         return []

@@ -1,4 +1,8 @@
-"""The reduction of a centrifuge test: manifest and recordings to K(a) with its uncertainty, and the record."""
+"""The fit of a centrifuge test: from manifest and recordings to K(a) with its uncertainty, and the record.
+
+Stages: `run` reduces each recording to lines (regression in `lines`), `levels` pools runs, `parameters` corrects errors
+of the rig and fits K(a); `plan` has the error budget. The equations stand there, their sources too.
+"""
 
 from __future__ import annotations
 
@@ -104,13 +108,13 @@ def fit_centrifuge(
     """
     check_options(method, curve)
     if isinstance(manifest, str | PathLike):
-        manifest, beside, read_from = _beside(fspath(manifest), layout)
+        manifest, beside, read_from = _read_beside(fspath(manifest), layout)
         recording_of, sources = recording_of or beside, sources or read_from
     if not isinstance(manifest, Manifest):
         raise OptionError(f"fit_centrifuge: expected a manifest or its file, found {quoted(manifest)}")
     if not callable(recording_of):
         raise OptionError("fit_centrifuge: a manifest without its file needs recording_of, a function of a run")
-    recordings = _Seen(recording_of)
+    recordings = _TemperatureKeeper(recording_of)
     statics: list[StaticRun] = []
     runs: list[LoadedRun] = []
     numbers, drawn = level_numbers(manifest), set[tuple[str, int]]()
@@ -120,13 +124,13 @@ def fit_centrifuge(
         if run.role == "static":
             statics.append(reduce_static(recordings(run), manifest, index))
         else:
-            rest = _rest(statics, run, manifest, index) if method == "fourier" else None
+            rest = _static_mean(statics, run, manifest, index) if method == "fourier" else None
             place = run.spin_axis, numbers[index]
             runs.append(reduce_run(recordings(run), manifest, index, rest, spectrum=place not in drawn))
             drawn.add(place)
         if progress is not None:
             progress(done)
-    _same_channels(statics, runs, manifest)
+    _check_channels(statics, runs, manifest)
     levels = before = pool_levels(runs, manifest, method)
     corrections = find_corrections(runs, before.lines, correct=method == "least-squares")
     if corrections.common:
@@ -147,10 +151,10 @@ def fit_centrifuge(
     return CentrifugeFit(record, tuple(runs), levels, estimates)
 
 
-def _beside(
+def _read_beside(
     file: str, layout: str | PathLike[str] | None
 ) -> tuple[Manifest, Callable[[Run], Iterable[Recording]], Callable[[], list[Source]]]:
-    """Return a manifest, what reads the recordings beside it, and what states the files."""
+    """Return a manifest, a function that reads the recordings beside it, and one that states their files and hashes."""
     test, folder = load_manifest(file), Path(file).parent
     paths = {run.file: folder / run.file for run in test.runs}
     for index, run in enumerate(test.runs):  # a missing file is refused before hours of data are read
@@ -172,7 +176,7 @@ def _source(called: str, path: Path) -> Source:
 
 
 def check_options(method: str, curve: str) -> None:
-    """Check what can be checked before there is data.
+    """Check the options before any data are read.
 
     Raises
     ------
@@ -186,8 +190,8 @@ def check_options(method: str, curve: str) -> None:
 
 
 @dataclass
-class _Seen:
-    """Passes blocks on and keeps each run's temperature at its start."""
+class _TemperatureKeeper:
+    """Reader of blocks that keeps the temperature at the start of each run."""
 
     source: Callable[[Run], Iterable[Recording]]
     temperatures: list[float] = field(default_factory=list)
@@ -199,8 +203,8 @@ class _Seen:
             yield block
 
 
-def _rest(statics: list[StaticRun], run: Run, manifest: Manifest, index: int) -> Array:
-    """Mean of the static records of a run's power cycle, weighted by their samples."""
+def _static_mean(statics: list[StaticRun], run: Run, manifest: Manifest, index: int) -> Array:
+    """Return the mean of the static records of a run's power cycle, weighted by their samples."""
     mine = [static for static in statics if static.run.power_cycle == run.power_cycle]
     if len({static.channels for static in mine}) > 1:
         raise DataError(f"{manifest.place(index)}: the static runs of its power cycle have different columns")
@@ -208,7 +212,7 @@ def _rest(statics: list[StaticRun], run: Run, manifest: Manifest, index: int) ->
     return mean
 
 
-def _same_channels(statics: list[StaticRun], runs: list[LoadedRun], manifest: Manifest) -> None:
+def _check_channels(statics: list[StaticRun], runs: list[LoadedRun], manifest: Manifest) -> None:
     reduced: list[StaticRun | LoadedRun] = [*statics, *runs]
     for each in reduced:
         if "dtg_y" not in each.channels and any("dtg_y" in run.channels for run in runs):

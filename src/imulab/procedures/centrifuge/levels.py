@@ -1,17 +1,13 @@
-"""Runs to levels.
+"""Runs to levels: pooled lines, repeatability of power cycles, and how the channels differ besides the drift.
 
-The lines of all power cycles and both senses, how channels differ besides the drift, and how far a power cycle
-repeats.
+A level's line is per specific force: ``Z = (A + i B) / a``, rad/s/(m/s^2), one complex number for each axis. Without an
+encoder its phase is unknown; then magnitudes are pooled, each corrected for noise (Rice: ``-sigma^2 / 2 |Z|``).
 
-A gyroscope that comes back from power-off with another K has it at all levels: such a change does not average out over
-levels, and cancels in zeta. The scatter of the runs is split into an effect of the power cycle and the rest, by least
-squares with a value for each level and one for each cycle; a variance is added where chi-square passes its 5 % point.
+A gyroscope that has another K after a power-off has it at all levels: such a change does not average out over levels,
+and cancels in zeta. The scatter of the runs is split into an effect of the power cycle and the rest, by least squares
+with a value for each level and one for each cycle; a variance is added where chi-square passes its 5 % point.
 
 Source: Mandel and Paule, Analytical Chemistry 42 (1970) 1194.
-
-A level's line is per unit of specific force: ``Z = (A + i B) / a``, rad/s/(m/s^2), one complex number for each axis.
-Without encoder its phase means nothing; then magnitudes are pooled, each corrected for noise (Rice: ``-sigma^2 / 2
-|Z|``).
 """
 
 from __future__ import annotations
@@ -31,21 +27,21 @@ from imulab.procedures.centrifuge.manifest import SAME_LEVEL, Manifest, fog_shar
 from imulab.procedures.centrifuge.run import LoadedRun
 from imulab.recording import Array
 
-# Repeatability: what a power cycle does to the drift beyond noise, and what a run does besides.
+# Repeatability: how power cycles, and runs within them, change the drift beyond noise.
 
 
 @dataclass(frozen=True)
 class Deviations:
-    """What runs of one axis found, relative to the line of their level.
+    """Deviations of the runs' lines of one axis from the line of their level.
 
     Attributes
     ----------
     level, cycle
-        Labels of each run's level (and sense), and power cycle, shape (n,).
+        Numbers of each run's level (and sense) and power cycle, shape (n,).
     size, turn
-        Relative deviation along the line, and across it, rad, shape (n,).
+        Relative deviation along the line, and deviation across it, rad, shape (n,).
     size_variance, turn_variance
-        By noise and rates, shape (n,).
+        Their variances from noise and rates, shape (n,).
     """
 
     level: NDArray[np.int64]
@@ -58,18 +54,18 @@ class Deviations:
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Variances beyond the noise, of all axes alike; 0 where noise explains the scatter.
+    """Variances beyond the noise, common to all axes; 0 where noise explains the scatter.
 
     Attributes
     ----------
     cycle
-        Of K from power cycle to power cycle, at all levels alike, relative.
+        Relative variance of K from power cycle to power cycle, the same at all levels.
     turn
-        Of the direction of the drift, likewise, rad^2.
+        Variance of the direction of the drift from power cycle to power cycle, rad^2.
     run
-        Of K from run to run within a power cycle, relative.
+        Relative variance of K from run to run within a power cycle.
     chi_square, freedom
-        Of the sizes of the power cycles over their noise.
+        Chi-square of the power cycles' effects on K over their noise, and its degrees of freedom.
     run_freedom
         Degrees of freedom of `run`.
     """
@@ -83,19 +79,19 @@ class Repeatability:
 
 
 def find_repeatability(axes: Sequence[Deviations]) -> Repeatability:
-    """Return what the scatter of the runs calls for beyond their noise."""
-    run, _, run_freedom = _excess([_rest(a, a.size, a.size_variance) for a in axes])
-    cycle, chi_square, freedom = _excess([_of_cycles(a, a.size, a.size_variance + run) for a in axes])
-    turn, _, _ = _excess([_of_cycles(a, a.turn, a.turn_variance) for a in axes])
+    """Return the variances of power cycles and runs beyond the noise of the runs."""
+    run, _, run_freedom = _excess([_run_effects(a, a.size, a.size_variance) for a in axes])
+    cycle, chi_square, freedom = _excess([_cycle_effects(a, a.size, a.size_variance + run) for a in axes])
+    turn, _, _ = _excess([_cycle_effects(a, a.turn, a.turn_variance) for a in axes])
     return Repeatability(cycle, turn, run, chi_square, freedom, run_freedom)
 
 
 _Scatter = tuple[Array, Array, int]
-"""Deviations, their variances, and degrees of freedom."""
+"""Deviations, their variances, and their degrees of freedom."""
 
 
 def _fitted(a: Deviations, values: Array, variance: Array) -> tuple[Array, Array, int]:
-    """Values of the cycles (their weighted mean zero), their weights, and rank of the design."""
+    """Return the effects of the power cycles (weighted mean zero), their weights, and the rank of the design."""
     levels, cycles = np.unique(a.level), np.unique(a.cycle)
     design = np.concatenate([a.level[:, None] == levels, a.cycle[:, None] == cycles], axis=1).astype(float)
     root = 1 / np.sqrt(np.maximum(variance, 1e-24))
@@ -105,14 +101,14 @@ def _fitted(a: Deviations, values: Array, variance: Array) -> tuple[Array, Array
     return effect - np.average(effect, weights=weights), weights, int(rank)
 
 
-def _of_cycles(a: Deviations, values: Array, variance: Array) -> _Scatter:
+def _cycle_effects(a: Deviations, values: Array, variance: Array) -> _Scatter:
     if not len(values):
         return np.empty(0), np.empty(0), 0
     effect, weights, rank = _fitted(a, values, variance)
     return effect, 1 / weights, rank - len(np.unique(a.level))
 
 
-def _rest(a: Deviations, values: Array, variance: Array) -> _Scatter:
+def _run_effects(a: Deviations, values: Array, variance: Array) -> _Scatter:
     if not len(values):
         return np.empty(0), np.empty(0), 0
     effect, _, rank = _fitted(a, values, variance)
@@ -125,7 +121,7 @@ def _rest(a: Deviations, values: Array, variance: Array) -> _Scatter:
 
 
 def _excess(parts: Sequence[_Scatter]) -> tuple[float, float, int]:
-    """Variance to add, chi-square without it, and degrees of freedom."""
+    """Return the variance to add, chi-square without it, and the degrees of freedom."""
     values, variance = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     freedom = sum(part[2] for part in parts)
     if not freedom:
@@ -136,25 +132,25 @@ def _excess(parts: Sequence[_Scatter]) -> tuple[float, float, int]:
     return float(excess_variance(values[None], variance[None], freedom)[0]), chi_square, freedom
 
 
-# Runs to levels: the lines of all power cycles and both senses at one specific force, pooled with their covariance.
+# Pooling: the lines of all power cycles and both senses at one specific force, with their covariance.
 
 
 @dataclass(frozen=True)
 class RunLine:
-    """The residual lines of a run per unit of specific force.
+    """Residual lines of a run per specific force.
 
     Attributes
     ----------
     line
-        Shape (p,) for p axes; real and positive where magnitudes are used.
+        Line of each axis, shape (p,) for p axes; real and positive where only magnitudes are known.
     noise
         Covariance of (Re, Im) of each axis from noise, shape (2p, 2p).
     rate
-        The same from the arm rate's uncertainty.
+        The same from the uncertainty of the arm rate.
     freedom
-        Of the noise.
+        Degrees of freedom of the noise.
     common
-        What a standard uncertainty of each correction does to (Re, Im) of each axis, shape (c, 2p).
+        Change of (Re, Im) of each axis by a standard uncertainty of each correction, shape (c, 2p).
     """
 
     source: LoadedRun
@@ -172,29 +168,30 @@ class RunLine:
 
 @dataclass(frozen=True)
 class Level:
-    """One specific force with the spin axis one way.
+    """All runs at one specific force, with the spin axis one way.
 
     Attributes
     ----------
     number
-        From 1, by rising specific force, the reference being 1.
+        Number of the level, rising with specific force; the reference is 1.
     force
-        Mean over its runs, m/s^2.
+        Mean specific force of its runs, m/s^2.
     line, covariance
-        Pooled, shapes (p,) and (2p, 2p), without what is common to all levels: radius and power cycles.
+        Pooled line and its covariance, shapes (p,) and (2p, 2p), without what all levels share: radius and power
+        cycles.
     cycles
-        Share of each power cycle in the line of each axis, shape (p,).
+        Weight of each power cycle in the line of each axis, shape (p,).
     component_variance
-        Of the noise of one component, shape (p,), for the Rice correction.
+        Variance of the noise of one component, shape (p,), for the Rice correction.
     freedom
-        Of the variance along each line, shape (p,).
+        Degrees of freedom of the variance along each line, shape (p,).
     runs
         Numbers of its runs, counted from 0.
     directed
-        Whether the lines are complex.
+        Whether the lines have a direction (encoder), and not only a magnitude.
     common
-        What a standard uncertainty of each correction does to (Re, Im) of each axis, alike in sign at all levels,
-        shape (c, 2p).
+        Change of (Re, Im) of each axis by a standard uncertainty of each correction, shape (c, 2p), with one sign at
+        all levels.
     """
 
     number: int
@@ -212,14 +209,14 @@ class Level:
 
 @dataclass(frozen=True)
 class Levels:
-    """All levels, spin axis up first, by rising force.
+    """All levels: spin axis up first, then by rising force.
 
     Attributes
     ----------
     items, lines
         The levels, and the lines of each run by its number.
     repeatability
-        What power cycles and runs do beyond the noise.
+        Variances of power cycles and runs beyond the noise.
     """
 
     items: tuple[Level, ...]
@@ -235,7 +232,7 @@ def as_vector(line: Complex) -> Array:
 
 
 def axis_lines(run: LoadedRun, method: str) -> tuple[Complex, Complex]:
-    """Return the lines of X - FOG and Y - i FOG, rad/s, and their covariance ``E[z z*]``, by one method."""
+    """Return the lines of X - FOG and Y - i FOG, rad/s, and their covariance ``E[z z*]``, by one of the methods."""
     share = fog_share(len(run.channels) - 1)
     if run.fog_factor is not None:
         share[:, -1] *= run.fog_factor
@@ -248,7 +245,7 @@ def axis_lines(run: LoadedRun, method: str) -> tuple[Complex, Complex]:
 
 
 def level_numbers(manifest: Manifest) -> dict[int, int]:
-    """Return the level of each loaded run, by index: numbers from 1 at the reference, 0 and less below it."""
+    """Return the level of each loaded run by its index: 1 at the reference, rising with force, 0 and less below it."""
     loaded = sorted((run.arm_rate, index) for index, run in enumerate(manifest.runs) if run.role == "loaded")
     clusters: list[list[int]] = []
     first = 0.0
@@ -263,7 +260,7 @@ def level_numbers(manifest: Manifest) -> dict[int, int]:
 
 
 def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> Levels:
-    """Pool runs into levels.
+    """Return runs pooled into levels, with the scatter beyond their noise.
 
     Raises
     ------
@@ -355,7 +352,7 @@ def _run_line(run: LoadedRun, manifest: Manifest, method: str, directed: bool) -
 
 
 def arm_rate_off(run: LoadedRun) -> tuple[float, float]:
-    """Return how far the arm rate, table rate plus net rate as measured, is from the manifest's, and u; rad/s.
+    """Return by how much the arm rate, table rate plus net rate as measured, differs from the manifest's, and u; rad/s.
 
     Both are zero where a rate was not measured.
     """
@@ -367,10 +364,10 @@ def arm_rate_off(run: LoadedRun) -> tuple[float, float]:
 
 
 def amplitude_lost(run: LoadedRun, manifest: Manifest, method: str) -> float:
-    """Return the part of the amplitude that an error of the rate used costs, ``(error T)^2 / 24``, at most 1.
+    """Return the relative loss of amplitude by an error of the rate used, ``(error T)^2 / 24``, at most 1.
 
-    With an encoder, or the rate of a clear line of the FOG, it is next to nothing; where the manifest's rate is taken
-    as it is, what was measured of the rate, or the uncertainty of the manifest's rates, says how much it may be.
+    With an encoder, or the rate of a clear FOG line, the loss is negligible; where the manifest's rate is used, the
+    measured rate, or the uncertainty of the manifest's rates, bounds it.
     """
     measured = run.rates.table_uncertainty
     if method == "least-squares" and run.rates.origin != "manifest":
@@ -383,7 +380,7 @@ def amplitude_lost(run: LoadedRun, manifest: Manifest, method: str) -> float:
 
 
 def _weights(group: list[RunLine], axis: int, excess: float) -> Array:
-    """Inverse-variance weights of a level's runs for one axis; half for each sense where there are both."""
+    """Return inverse-variance weights of a level's runs for one axis; half for each sense where there are both."""
     variance = np.array([_radial(line, axis, excess) for line in group])
     weights: Array = 1 / np.maximum(variance, 1e-12 * variance.max() + 1e-300)
     senses = np.array([line.source.run.sense for line in group])
@@ -393,7 +390,7 @@ def _weights(group: list[RunLine], axis: int, excess: float) -> Array:
 
 
 def _radial(line: RunLine, axis: int, excess: float, *, rates: bool = True) -> float:
-    """Variance along the line of one axis; without that of the rates, across it."""
+    """Return the variance along the line of one axis, or, without that of the rates, the variance across it."""
     pair = slice(2 * axis, 2 * axis + 2)
     noise = float(np.trace(line.noise[pair, pair])) / 2
     if not rates:
@@ -402,12 +399,12 @@ def _radial(line: RunLine, axis: int, excess: float, *, rates: bool = True) -> f
 
 
 def pooled(number: int, spin_axis: str, group: list[RunLine], repeatability: Repeatability, directed: bool) -> Level:
-    """Return the level that runs at one specific force make, their scatter beyond the noise given."""
+    """Return the level that runs at one specific force make, widened by the scatter beyond their noise."""
     axes = len(group[0].line)
     weights = np.array([_weights(group, axis, repeatability.run + repeatability.cycle) for axis in range(axes)])
     line = np.einsum("ar,ra->a", weights, np.array([member.line for member in group]))
     spread = np.repeat(weights, 2, axis=0)
-    axis_blocks = np.kron(np.eye(axes), np.ones((2, 2)))  # what a run does to one axis it need not do to the other
+    axis_blocks = np.kron(np.eye(axes), np.ones((2, 2)))  # a run's deviation of one axis says nothing of the other
     covariance = np.zeros((2 * axes, 2 * axes))
     for r, member in enumerate(group):
         total = member.noise + member.rate + repeatability.run * axis_blocks * np.outer(member.vector, member.vector)
@@ -432,7 +429,7 @@ def pooled(number: int, spin_axis: str, group: list[RunLine], repeatability: Rep
 
 
 def _deviations(members: list[list[RunLine]]) -> list[Deviations]:
-    """What each axis's runs found relative to the mean of their level and sense."""
+    """Return, by axis, the deviations of runs from the mean of their level and sense."""
     by_axis = []
     for axis in range(len(members[0][0].line)):
         rows: list[tuple[int, int, float, float, float, float]] = []
@@ -445,9 +442,7 @@ def _deviations(members: list[list[RunLine]]) -> list[Deviations]:
                     continue
                 line = np.array([member.line[axis] for member in same])
                 mean = complex(np.average(line, weights=1 / np.maximum(variance, 1e-300)))
-                if (
-                    abs(mean) ** 2 < 25 * variance.max()
-                ):  # hardly above the noise, it says nothing of a relative scatter
+                if abs(mean) ** 2 < 25 * variance.max():  # hardly above the noise, the line shows no relative scatter
                     continue
                 label += 1
                 off = line / mean - 1
@@ -459,16 +454,16 @@ def _deviations(members: list[list[RunLine]]) -> list[Deviations]:
     return by_axis
 
 
-# How the channels of a test differ besides the drift: tilt and delay of the FOG, scale mismatch and azimuth.
+# Differences between the channels besides the drift: tilt and delay of the FOG, scale mismatch and azimuth.
 
 
 _STEPS = 12  # of the iterations for tilt and delay
 _LEAST = 3e-4
-"""Gravity terms at the net rate, on a base that is not level, look like a mismatch of this size."""
+"""Gravity terms at the net rate, on a base that is not level, look like a mismatch of up to this size."""
 
 
 class Measured:
-    """Arrays over the runs, X axis: signed rates, forces, lines of FOG and residual with variances of a component."""
+    """Arrays over runs, X axis: signed rates, forces, lines of FOG and residual, and variances of a component."""
 
     def __init__(self, runs: list[LoadedRun], lines: dict[int, RunLine]) -> None:
         self.runs = runs
@@ -497,7 +492,7 @@ def weighted(design: Array, values: Array, variance: Array) -> tuple[Array, Arra
 
 
 def _scatter(left: Array, variance: Array, used: int) -> float:
-    """Chi-square per degree of freedom where it is above one: what a model leaves beyond the noise is no noise."""
+    """Return chi-square per degree of freedom, at least 1: the factor by which a model's misfit enlarges variances."""
     floor = np.maximum(variance, 1e-12 * variance.max() + 1e-300)
     return max(1.0, float((left**2 / floor).sum()) / max(len(left) - used, 1))
 
@@ -507,7 +502,7 @@ def _pairs(values: Complex) -> Array:
 
 
 def tilted(test: Measured) -> tuple[Array, Array, bool]:
-    """Fit the FOG's lines by ``-w_t (delta + kappa a) exp(i w_s tau)``; parameters, covariance, and tau or not."""
+    """Return values, covariance, and whether tau is known, of ``-w_t (delta + kappa a) exp(i w_s tau)`` for the FOG."""
     with_flexure, with_delay = test.levels >= 2, test.levels >= 3
     parameters = np.zeros(5)
     variance = np.concatenate([test.fog_variance / test.arm**2] * 2)
@@ -515,10 +510,10 @@ def tilted(test: Measured) -> tuple[Array, Array, bool]:
     covariance = np.zeros((5, 5))
     everything = [0, 1, *([2, 3] if with_flexure else []), *([4] if with_delay else [])]
     for step_number in range(_STEPS):
-        # Without a first value of the tilt nothing senses the delay.
+        # The delay shows only once there is a first value of the tilt.
         kept = everything if step_number else [index for index in everything if index < 4]
         tilt = parameters[0] + 1j * parameters[1] + (parameters[2] + 1j * parameters[3]) * test.force
-        # A late channel shows an earlier angle: its line, as a function of the true angle, turns back by w_s tau.
+        # A late channel shows an earlier angle: over the true angle its line is turned back by w_s tau.
         turn = np.exp(1j * test.table * parameters[4])
         columns = [turn, 1j * turn, turn * test.force, 1j * turn * test.force, 1j * test.table * tilt * turn]
         design = np.stack([_pairs(column) for column in columns], axis=1)[:, kept]
@@ -533,7 +528,7 @@ def tilted(test: Measured) -> tuple[Array, Array, bool]:
 
 @dataclass(frozen=True)
 class Mismatch:
-    """How an axis shows Earth rate beside the FOG: 1 + scale + i sense azimuth, standard uncertainty of each."""
+    """How an axis shows the Earth's rate relative to the FOG: 1 + scale + i sense azimuth, with u of both parts."""
 
     scale: float
     azimuth: float
@@ -542,14 +537,14 @@ class Mismatch:
 
 
 def mismatch(test: Measured, axis: int = 0, delay: float = 0.0) -> Mismatch | None:
-    """Return scale mismatch and azimuth of an axis against the FOG by Earth rate; None where that is not seen.
+    """Return scale mismatch and azimuth of an axis against the FOG by the Earth's rate; None where that does not show.
 
     `delay` is that of the FOG against the axis, s.
     """
     with_net_line = [run for run in test.runs if run.rates.net_rate is not None]
     if not with_net_line:
         return None
-    # What is fixed in the room passes Y a quarter turn before X.
+    # A vector fixed in the room passes Y a quarter turn before X.
     quarter = (1.0, -1j)[axis]
     expected = np.array(
         [quarter * run.room[-1] * np.exp(-1j * (run.rates.net_rate or 0.0) * delay) for run in with_net_line]
@@ -560,7 +555,7 @@ def mismatch(test: Measured, axis: int = 0, delay: float = 0.0) -> Mismatch | No
     variance = (
         np.array([(s @ C @ s.conj()).real / 2 for s, C in zip(share, noise, strict=True)]) / np.abs(expected) ** 2
     )
-    # A run's own noise at the net rate comes from a few blocks: that of all runs together is known better.
+    # A few blocks give a run's noise at the net rate; all runs together give it better.
     seconds = np.array([run.duration for run in with_net_line])
     variance = np.maximum((variance * seconds).mean() / seconds, 1e-300)
     weight = 1 / variance
@@ -570,8 +565,8 @@ def mismatch(test: Measured, axis: int = 0, delay: float = 0.0) -> Mismatch | No
     return Mismatch(value.real, value.imag, float(u), max(2 * len(with_net_line) - 2, 1))
 
 
-def _seen(mismatch_found: Mismatch | None, sense: Array) -> Complex:
-    """How an axis shows the FOG's rotation: what is not clear of its uncertainty counts as none."""
+def _clear_share(mismatch_found: Mismatch | None, sense: Array) -> Complex:
+    """Return how an axis shows the FOG's rotation; a mismatch that is not clear of its uncertainty counts as none."""
     share = np.ones(len(sense), dtype=np.complex128)
     if mismatch_found is not None:
         reach = max(three_sigma(mismatch_found.freedom) * mismatch_found.uncertainty, _LEAST)
@@ -587,40 +582,40 @@ class Delays:
 
     fog: float
     fog_uncertainty: float
-    own: float
-    own_uncertainty: float
+    axis: float
+    axis_uncertainty: float
     uncertainty: float
 
     @property
     def late(self) -> float:
         """How much later than X the FOG is, s."""
-        return self.fog - self.own
+        return self.fog - self.axis
 
 
 def delays(test: Measured) -> Delays | None:
-    """Return the delays that the lines' turning with the table rate shows; None without encoder or three levels.
+    """Return the delays that the lines show by turning with the table rate; None without encoder or three levels.
 
-    That of the FOG from its own lines, ``-w_t (delta + kappa a) exp(i w_s tau)``; that of X from what is left of X
-    without them, ``exp(i w_s own) K a exp(i theta)``. Differential flexure across the drift looks like `own`.
+    The FOG's from its own lines, ``-w_t (delta + kappa a) exp(i w_s tau)``; that of X from the rest of X without them,
+    ``exp(i w_s tau_x) K a exp(i theta)``. Differential flexure across the drift looks like a delay of X.
     """
     if not test.encoder or test.levels < 3:
         return None
     parameters, covariance, _ = tilted(test)
     tau, u_tau = float(parameters[4]), float(np.sqrt(covariance[4, 4]))
-    axis_delay, u_own = _own_delay(test, tau)
-    lever = (_own_delay(test, tau + u_tau)[0] - axis_delay) / max(u_tau, 1e-300)
+    axis_delay, u_own = _axis_delay(test, tau)
+    lever = (_axis_delay(test, tau + u_tau)[0] - axis_delay) / max(u_tau, 1e-300)
     return Delays(
         tau, u_tau, axis_delay, float(np.hypot(u_own, lever * u_tau)), float(np.hypot(u_own, (1 - lever) * u_tau))
     )
 
 
-def _own_delay(test: Measured, tau: float) -> tuple[float, float]:
-    """Delay of X and its uncertainty, that of the FOG given, s."""
+def _axis_delay(test: Measured, tau: float) -> tuple[float, float]:
+    """Return the delay of X and its uncertainty for a delay of the FOG, s."""
     axis_delay = u = 0.0
     sense = np.array([run.run.sense for run in test.runs])
     design = np.stack([np.ones(len(test.table)), test.table], axis=1)
     for _ in range(_STEPS):
-        share = _seen(mismatch(test, 0, tau - axis_delay), sense)
+        share = _clear_share(mismatch(test, 0, tau - axis_delay), sense)
         drift = (test.x - share * test.fog * np.exp(-1j * test.table * (tau - axis_delay))) / test.force
         angle = np.angle(drift / (drift / np.maximum(test.line_variance, 1e-300)).sum())
         variance = test.line_variance / np.abs(drift) ** 2

@@ -1,24 +1,20 @@
-"""The lines of a run.
+"""The lines of a run: samples summed over cells, the actual rates of the lines, and their amplitudes.
 
-Its samples compressed to cells, the rates at which its lines really are, and their amplitudes by regression or by
-the source's sums.
+Model of each channel: constant, trend, and cosine and sine of chi, 2 chi, 3 chi and of the net angle. Over a cell it is
+linear in the columns of `COLUMNS`: constant, time, cosine and sine of these four angles, and time times those of chi
+and of the net angle. A rate that differs from the assumed one by d turns a line by ``d (t - t0)``; within a cell that
+is its value at the centre plus a small linear part, which the last four columns take up to second order, ``(d tau)^2 /
+6``. So one pass gives the normal equations at any nearby rates, for any stretch of the run, and the scatter between
+stretches.
 
-Over a cell the model is linear in the columns of `COLUMNS`: constant, time, cosine and sine of chi, 2 chi, 3 chi and
-of the net angle, and time times those of chi and of the net angle. A rate that differs from the assumed one by d
-turns a line by ``d (t - t0)``; within a cell that is its value at the centre plus a small linear part, which the last
-four columns take up to second order, ``(d tau)^2 / 6``. So one pass gives the normal equations at any nearby rates,
-for any stretch of the run, and the scatter between stretches.
-
-Model of each channel: constant, trend, and cosine and sine of chi, 2 chi, 3 chi and of the net angle. Noise of a line
-is taken from the scatter of the line over blocks of the run (batch means): it holds for coloured noise as long as
-that is no longer correlated than a block.
+The noise of a line is the scatter of the line over blocks of the run (batch means), which holds for coloured noise that
+is not correlated for longer than a block.
 
 Sources: IEEE Std 1057 (four-parameter sine fit); Fishman, Management Science 24 (1978) 510 (batch means).
 
-``A = (2/N) sum D cos(j w_s t)``, ``B`` likewise with the sine, ``N = m T / t`` rounded to the nearest sample; j
-counts samples from 0, t is the sampling period, T the table period, m the number of whole periods.
-
-Source: CN102636185A, steps (a) to (e).
+Method ``fourier`` (CN102636185A, steps (a) to (e)): ``A = (2/N) sum D cos(j w_s t)``, ``B`` likewise with the sine,
+``N = m T / t`` rounded to the nearest sample; j counts samples from 0, t is the sampling period, T the table period, m
+the number of whole periods.
 """
 
 from __future__ import annotations
@@ -36,26 +32,26 @@ from imulab.gravity import EARTH
 from imulab.recording import Array
 from imulab.units import from_si, to_si
 
-# A run compressed as it streams by: sums over cells of about one table period, from which all else is computed.
+# Sums of a run over cells of about one table period, made as it streams by; all else is computed from them.
 
 
-# Rows of the design of a cell; those that are a cosine have the sine beside them
+# Rows of the design of a cell; beside each row of a cosine stands that of the sine
 CONSTANT, TIME, CHI, CHI2, CHI3, NET, TIME_CHI, TIME_NET = 0, 1, 2, 4, 6, 8, 10, 12
 COLUMNS = 14  # of the design of a cell
 _CHUNK = 16384
-"""Samples worked on at once: small enough to stay in the cache."""
+"""Samples in one step: few enough to stay in the cache."""
 _BINS = 16
-"""Means per cell that are kept as a time series."""
-_PRODUCT = 800  # samples of a matrix product that is not spread over threads
+"""Means in a cell that are kept as a time series."""
+_PRODUCT = 800  # samples of a matrix product that BLAS does not spread over threads
 FIRST_LOOK = 1024
-"""Samples from which the sampling period is found."""
-FEWEST_PER_PERIOD = 8  # samples of a turn of the table: third harmonics need more than six
-_GAP = 2.5  # usual steps: a longer one is a gap
+"""Samples that the sampling period is computed from."""
+FEWEST_PER_PERIOD = 8  # samples in a turn of the table: third harmonics need more than six
+_GAP = 2.5  # usual steps: a longer step is a gap
 
 
 @dataclass(frozen=True)
 class CellSamples:
-    """A block of a run in SI: time (n,), channels (k, n), chi, rad, (n,), or None."""
+    """A block of a run in SI: time (n,), channels (k, n), and chi, rad, (n,), or None."""
 
     time: Array
     channels: Array
@@ -71,15 +67,15 @@ class Cells:
     centre
         Mean time of each cell, s, shape (c,).
     moments
-        Products of the columns and channels with each other, shape (c, 14 + k, 14 + k).
+        Products of columns and channels with each other, shape (c, 14 + k, 14 + k).
     offset
-        Taken from the channels before summing, rad/s, shape (k,).
+        Subtracted from the channels before summing, rad/s, shape (k,).
     start, step, samples
         Time of the first sample, sampling period, s, and number of samples.
     cell
         Samples in a full cell.
     table_rate, net_rate
-        Signed rates that the cells were summed at, rad/s.
+        Signed rates that the sums were made at, rad/s.
     series_time, series
         Centre, s, and mean of short bins, shapes (b,) and (k, b); `series_step` s apart unless samples are missing.
     series_begin, series_angle
@@ -116,7 +112,7 @@ class Cells:
         return min(_BINS, self.cell)
 
     def cut(self, first: int, last: int) -> Cells:
-        """Return the cells from `first` up to `last` (half-open) as a run of their own."""
+        """Return the cells from `first` up to `last` (exclusive) as a run."""
         bins = slice(first * self.bins, last * self.bins)
         moments = self.moments[first:last]
         return Cells(
@@ -128,11 +124,11 @@ class Cells:
 
 
 class TooSlowError(Exception):
-    """Fewer samples in a table period than three harmonics need; carries their number."""
+    """A table period has fewer samples than three harmonics need; carries their number."""
 
 
 def sampling_period(time: Array) -> float:
-    """Return the sampling period without gaps, s: a whole number of samples a second where it is one within 1e-9."""
+    """Return the sampling period without gaps, s; a whole number of samples in a second where it is one within 1e-9."""
     steps = np.diff(time)
     gaps = steps > _GAP * np.median(steps)
     step = float(time[-1] - time[0] - steps[gaps].sum()) / (len(steps) - np.count_nonzero(gaps))
@@ -141,14 +137,14 @@ def sampling_period(time: Array) -> float:
 
 
 def compress(blocks: Iterable[CellSamples], table_rate: float, net_rate: float) -> Cells | None:
-    """Sum a run over cells, block by block.
+    """Return the sums of a run over cells, made block by block.
 
     Parameters
     ----------
     blocks
         Consecutive blocks of the run.
     table_rate, net_rate
-        Signed rates of chi and of the turning against the room, rad/s; chi is taken from the blocks where they have it.
+        Signed rates of chi and of the turning against the room, rad/s; the angle chi of the blocks is used if present.
 
     Returns
     -------
@@ -197,7 +193,7 @@ def compress(blocks: Iterable[CellSamples], table_rate: float, net_rate: float) 
     assert begin is not None
     left = len(rest.time)
     if left:
-        # What remains is less than a cell: it joins the last one, whose columns are about its own centre.
+        # The remainder is less than a cell and joins the last one, whose columns are about its own centre.
         tail = work.sum_about(rest, float(centre[-1]))
         moments[-1] += tail
         total += left
@@ -207,7 +203,7 @@ def compress(blocks: Iterable[CellSamples], table_rate: float, net_rate: float) 
 
 
 class _Work:
-    """Buffers and constants of the summation."""
+    """Buffers and constants of the sums."""
 
     def __init__(self, start: float, offset: Array, cell: int, bins: int, table_rate: float, net_rate: float) -> None:
         self.start, self.offset, self.cell, self.bins = start, offset, cell, bins
@@ -219,7 +215,7 @@ class _Work:
         shaped = part.time.reshape(number, self.cell)
         centre = shaped.mean(axis=1)
         design = self._fill(part, (shaped - centre[:, None]).ravel())
-        # Products short enough that BLAS does not spread each over threads, which costs more than it gives.
+        # Products this short stay on one thread of BLAS: spreading them costs more than it gains.
         parts = next((n for n in (1, 2, 4, 8) if self.cell % n == 0 and self.cell // n <= _PRODUCT), _BINS)
         parts = parts if self.cell % parts == 0 else 1
         stacked = design.reshape(len(design), number * parts, self.cell // parts).transpose(1, 0, 2)
@@ -261,7 +257,7 @@ class _Work:
 
 
 def pieces_of(blocks: Iterable[CellSamples]) -> Iterator[CellSamples]:
-    """Yield the blocks, the first ones joined until there is enough to find the sampling period."""
+    """Yield the blocks, the first ones joined until they show the sampling period."""
     waiting: list[CellSamples] = []
     count = 0
     enough = False
@@ -280,7 +276,7 @@ def pieces_of(blocks: Iterable[CellSamples]) -> Iterator[CellSamples]:
 
 
 def _none_first(pieces: Iterator[CellSamples]) -> Iterator[CellSamples | None]:
-    """Yield None for what is already at hand, then the rest."""
+    """Yield None for the piece at hand, then the other pieces."""
     yield None
     yield from pieces
 
@@ -301,7 +297,7 @@ def _part(samples: CellSamples, first: int, last: int) -> CellSamples:
     return CellSamples(samples.time[first:last], samples.channels[:, first:last], angle)
 
 
-# Regression of a run's channels on its lines, from cells: at given rates, with rates refined, and its noise.
+# Regression of the channels on the lines, from cells: at given rates, with refined rates, and its noise.
 
 
 Complex = NDArray[np.complex128]
@@ -309,9 +305,9 @@ Complex = NDArray[np.complex128]
 SIZE = 10  # coefficients of a channel in the regression over cells
 TREND, LINE, SECOND, THIRD, ROOM = 1, 2, 4, 6, 8
 """Rows of the solution: constant is 0, then trend; lines at chi, 2 chi, 3 chi; the line at the net rate."""
-_BLOCKS = 64  # parts of a run by whose scatter a line's noise is known
+_BLOCKS = 64  # most parts of a run whose scatter gives a line's noise
 _SINGULAR = 1e-7  # eigenvalue of the scaled normal matrix below which a column is left out
-_STEPS = 30  # of Newton's method for the rates
+_STEPS = 30  # most steps of Newton's method for the rates
 
 
 @dataclass(frozen=True)
@@ -321,15 +317,15 @@ class LineRegression:
     Attributes
     ----------
     coefficients
-        Shape (10, k), rad/s (the trend per half duration); zero where a column was left out.
+        Solution of all channels, shape (10, k), rad/s (trend per half duration); zero where a column was left out.
     inverse
         Inverse of the normal matrix: covariance per unit variance of a sample, shape (10, 10).
     table_shift, net_shift
-        What was added to the cells' rates, rad/s.
+        Added to the cells' rates, rad/s.
     middle, half
         Centre of the run and half its duration, s.
     kept
-        Columns that the run could tell apart, shape (10,).
+        Columns that the run can separate, shape (10,).
     """
 
     coefficients: Array
@@ -341,17 +337,17 @@ class LineRegression:
     kept: NDArray[np.bool_]
 
     def line(self, row: int) -> Complex:
-        """Return ``A + i B`` of all channels, with the phase that the cells' angle has at the middle of the run."""
+        """Return ``A + i B`` of all channels, with the phase of the cells' angle at the middle of the run."""
         pair: Complex = self.coefficients[row] + 1j * self.coefficients[row + 1]
         return pair
 
     def gain(self, row: int) -> float:
-        """Variance of one component of a line per variance of a sample; 2/N for a long run."""
+        """Return the variance of one component of a line per variance of a sample; 2/N for a long run."""
         return float(self.inverse[row, row] + self.inverse[row + 1, row + 1]) / 2
 
 
 def basis(cells: Cells, middle: float, half: float, table_shift: float, net_shift: float) -> Array:
-    """Return the ten columns of the model in those of the cells, shape (c, 14, 10)."""
+    """Return the ten columns of the model as combinations of those of the cells, shape (c, 14, 10)."""
     since = cells.centre - middle
     P = np.zeros((len(since), COLUMNS, SIZE))
     P[:, CONSTANT, 0] = 1.0
@@ -372,7 +368,7 @@ def basis(cells: Cells, middle: float, half: float, table_shift: float, net_shif
 
 
 def solve(cells: Cells, table_shift: float = 0.0, net_shift: float = 0.0) -> LineRegression:
-    """Regress all channels at the cells' rates plus the given shifts."""
+    """Return the regression of all channels at the cells' rates plus these shifts."""
     middle, half = _span(cells)
     P = basis(cells, middle, half, table_shift, net_shift)
     normal, right = _normal(cells, P)
@@ -389,7 +385,7 @@ def _span(cells: Cells) -> tuple[float, float]:
 
 def _normal(cells: Cells, P: Array) -> tuple[Array, Array]:
     carried = cells.moments[:, :COLUMNS, :COLUMNS] @ P
-    # Many small products, which no threads are spent on, rather than one long and thin one.
+    # Many small products on one thread are faster than a single long and thin one on several.
     turned = P.transpose(0, 2, 1)
     normal = (turned @ carried).sum(axis=0)
     right = (turned @ cells.moments[:, :COLUMNS, COLUMNS:]).sum(axis=0)
@@ -397,7 +393,7 @@ def _normal(cells: Cells, P: Array) -> tuple[Array, Array]:
 
 
 def _independent(normal: Array) -> NDArray[np.bool_]:
-    """Which columns to keep: without the net line, then without harmonics and trend, where they are not distinct."""
+    """Return which columns to keep: without the net line, then harmonics and trend, where they are not distinct."""
     kept = np.ones(SIZE, dtype=np.bool_)
     for drop in ((ROOM, ROOM + 1), (THIRD, THIRD + 1), (SECOND, SECOND + 1), (TREND,)):
         part = normal[np.ix_(kept, kept)]
@@ -416,7 +412,7 @@ def _inverse(normal: Array) -> Array:
 
 @dataclass(frozen=True)
 class Refined:
-    """Shifts of the table rate and of the net rate that fit a channel best, and their variance per sample variance."""
+    """Shifts of table rate and net rate that fit a channel best, and their variances per variance of a sample."""
 
     table_shift: float
     net_shift: float
@@ -425,10 +421,10 @@ class Refined:
 
 
 def refine(cells: Cells, channel: int, table_shift: float | None, net_shift: float | None) -> Refined | None:
-    """Fit rates together with all lines of one channel, from good starts; None where that does not converge.
+    """Return rates fitted together with all lines of one channel, from good starts; None without convergence.
 
-    The four-parameter sine fit of IEEE Std 1057, with the other lines, constant and trend in the model. A shift that is
-    given as None stays at zero.
+    This is the four-parameter sine fit of IEEE Std 1057 with the other lines, constant and trend in the model. A shift
+    of None stays at zero.
     """
     middle, half = _span(cells)
     shifts = [table_shift or 0.0, net_shift or 0.0]
@@ -467,7 +463,7 @@ def refine(cells: Cells, channel: int, table_shift: float | None, net_shift: flo
 
 
 def _rate_column(cells: Cells, P: Array, beta: Array, row: int, linear: int, middle: float, half: float) -> Array:
-    """Derivative of a line with respect to its rate times `half`, in the columns of the cells, shape (c, 14)."""
+    """Return the derivative of a line by its rate, times `half`, in the columns of the cells, shape (c, 14)."""
     turned = beta[row + 1] * P[:, :, row] - beta[row] * P[:, :, row + 1]
     column: Array = turned * ((cells.centre - middle) / half)[:, None]
     turned_pair = {TIME_CHI: CHI, TIME_NET: NET}[linear]
@@ -477,18 +473,18 @@ def _rate_column(cells: Cells, P: Array, beta: Array, row: int, linear: int, mid
 
 @dataclass(frozen=True)
 class LineScatter:
-    """A line's scatter over blocks.
+    """Scatter of a line over blocks of a run.
 
     Attributes
     ----------
     noise
-        Variance of a sample that white noise would need to scatter the line so, shape (k, k), Hermitian.
+        Variance of a sample of white noise that scatters the line as much, shape (k, k), Hermitian.
     freedom
         Degrees of freedom of each of its diagonal elements.
     deviation
         Line of each block less that of the run, shape (m, k).
     centre, gain
-        Of each block: time, s, and variance of a component per variance of a sample, shapes (m,).
+        Time of each block, s, and variance of its component per variance of a sample, shapes (m,).
     edges
         First cell of each block, and the end, shape (m + 1,).
     """
@@ -504,10 +500,10 @@ class LineScatter:
 def scatter(
     cells: Cells, solution: LineRegression, row: int = LINE, *, least: float = 0.0, blocks: int = _BLOCKS
 ) -> LineScatter | None:
-    """Return the scatter of a line over blocks of at least `least` seconds; None with fewer than three of them.
+    """Return the scatter of a line over blocks of at least `least` seconds; None with fewer than three blocks.
 
-    Each block has a constant of its own, and a trend where it holds two cells or more, so that slow drift does not pass
-    for noise at the line.
+    Each block has its own constant, and a trend if it holds two cells or more, so that slow drift does not count as
+    noise of the line.
     """
     per_block = max(1.0, least / (cells.cell * cells.step))
     count = min(blocks, int(len(cells.centre) / per_block))
@@ -535,17 +531,17 @@ def scatter(
     fitted = (inverse @ score)[:, -2:]
     deviation = fitted[:, 0] + 1j * fitted[:, 1]
     gain = (inverse[:, -1, -1] + inverse[:, -2, -2]) / 2
-    if not (np.isfinite(gain).all() and gain.min() > 0):  # blocks too short to tell the line from their constant
+    if not (np.isfinite(gain).all() and gain.min() > 0):  # blocks too short to separate line and constant
         return None
     noise = np.einsum("m,mi,mj->ij", 1 / gain, deviation, deviation.conj()) / (2 * (count - 1))
     return LineScatter(noise, 2.0 * (count - 1), deviation, centre, gain, edges)
 
 
-# The source's reduction: sums over whole periods at the manifest's rate, as the run streams by.
+# Method fourier: sums over whole periods at the manifest's rate, made as the run streams by.
 
 
 class PeriodSums:
-    """Sums over each whole period, fed block by block through `watch`."""
+    """Sums over each whole period, made of the blocks that pass through `watch`."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -556,7 +552,7 @@ class PeriodSums:
         self._time = (0.0, 0.0)
 
     def watch(self, blocks: Iterable[CellSamples]) -> Iterator[CellSamples]:
-        """Pass blocks on and sum them; the first block must hold what the sampling period is found from."""
+        """Yield the blocks after summing them; the first block must be long enough for the sampling period."""
         for block in blocks:
             if not self._index:
                 if len(block.time) < 2:
@@ -570,12 +566,12 @@ class PeriodSums:
 
     @property
     def even(self) -> bool:
-        """Whether the samples were evenly spaced over the run, within half a period of sampling."""
+        """Whether the samples are evenly spaced over the run, within half a sampling period."""
         span = self._time[1] - self._time[0]
         return abs(span - (self._index - 1) * self._step) < 0.5 * self._step
 
     def _add(self, block: CellSamples) -> None:
-        """Sum cosine and sine times the channels and 1 from period to period."""
+        """Add cosine and sine times the channels and 1, period by period."""
         count = len(block.time)
         j = np.arange(self._index, self._index + count)
         phase = self._rate * self._step * j
@@ -596,7 +592,7 @@ class PeriodSums:
 
     @staticmethod
     def _period(sample: int, samples: float) -> int:
-        """Number of the period that a sample belongs to; period m begins at sample round(m T / t)."""
+        """Return the number of the period of a sample; period m begins at sample round(m T / t)."""
         number = int(sample / samples)
         while round((number + 1) * samples) <= sample:
             number += 1
@@ -605,17 +601,17 @@ class PeriodSums:
         return number
 
     def result(self, mean: Array, first: float = 0.0, last: float = np.inf) -> PeriodResult | None:
-        """Return the lines over the whole periods between two times after the start, s; None without any.
+        """Return the lines over the whole periods between two times after the start, s; None if there is no period.
 
         Parameters
         ----------
         mean
-            Of the static records, taken from the channels, rad/s, shape (k,).
+            Means of the static records, subtracted from the channels, rad/s, shape (k,).
         """
         samples = 2 * np.pi / abs(self._rate) / self._step
         sums = list(self._sums)
         if self._edge is not None and self._index >= round((len(sums) + 1) * samples):
-            sums.append(self._edge)  # the run ends with a period
+            sums.append(self._edge)  # a run that ends with a period
         begin = int(np.ceil(first / self._step / samples - 1e-9))
         end = min(len(sums), int(min(last / self._step / samples + 1e-9, 1e15)))
         if end <= begin:
@@ -635,21 +631,21 @@ class PeriodResult:
     samples: int
 
 
-# Spectra of a run's series: where a line is, and how far it stands out.
+# Spectra of a run's series: places of lines, and how far they stand out.
 
 
 SEARCH = to_si(1.0, "deg/s")
-"""How far from the manifest's rate a line is looked for."""
+"""How far from the manifest's rate a line is searched for."""
 FAINT = to_si(0.001, "deg/h")
-"""A line below this is none, however quiet the channel."""
+"""Smallest line, however quiet the channel."""
 PEAK = 6.0
-"""Height of a peak of the spectrum over the median: one false alarm in 1e10 bins of noise."""
+"""Height of a peak over the median of the spectrum: one false alarm in 1e10 bins of noise."""
 FINE = 4
-"""Points of a spectrum per inverse of the run."""
+"""Points of a spectrum per resolution 1/T of the run."""
 
 
 def even_series(cells: Cells, values: Array) -> Array:
-    """Return what belongs to the bins of a run at even steps: zero where the recording has a gap, shape (n,)."""
+    """Return the values of a run's bins at even steps, zero where the recording has a gap, shape (n,)."""
     place = np.round((cells.series_time - cells.series_time[0]) / cells.series_step).astype(np.int64)
     if place[-1] == len(place) - 1:
         return values
@@ -659,11 +655,11 @@ def even_series(cells: Cells, values: Array) -> Array:
 
 
 def hann_spectrum(step: float, values: Array, frequencies: Array) -> Complex:
-    """Return the Hann-windowed spectrum of values a `step` apart, a line showing as its ``A - i B``, shape (f,)."""
+    """Return the Hann-windowed spectrum of values a `step` apart, in which a line shows as its ``A - i B``, (f,)."""
     count = len(values)
     window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
     weighted = window * values / window.sum() * 2
-    # Times as start of a stretch plus a multiple of the step: few exponentials, and the rest is a matrix product.
+    # Time is the start of a stretch plus a multiple of the step: few exponentials and one matrix product.
     stretch = max(1, int(np.sqrt(count)))
     padded = np.append(weighted, np.zeros(-count % stretch)).reshape(-1, stretch)
     inner = padded @ np.exp(-1j * np.outer(np.arange(stretch) * step, frequencies))
@@ -673,7 +669,7 @@ def hann_spectrum(step: float, values: Array, frequencies: Array) -> Complex:
 
 
 def detrended(time: Array, values: Array) -> Array:
-    """Return values less the straight line through them."""
+    """Return values without the straight line through them."""
     middle = time - time.mean()
     slope = (middle * values).sum() / (middle * middle).sum()
     left: Array = values - values.mean() - slope * middle
@@ -703,7 +699,7 @@ def search_line(cells: Cells, series: Array, rate: float, within: float) -> tupl
 
 
 def interpolated(grid: Array, height: Array) -> float:
-    """Abscissa of the highest point, by a parabola through it and its neighbours."""
+    """Return the abscissa of the maximum, by a parabola through the highest point and its neighbours."""
     index = int(np.argmax(height))
     if not 0 < index < len(grid) - 1:
         return float(grid[index])
@@ -729,11 +725,11 @@ def strongest_line(cells: Cells, series: Array, above: float) -> float | None:
 
 
 def in_degrees(rate: float, digits: int = 6) -> str:
-    """Return a rate as messages give it."""
+    """Return a rate as messages state it, in deg/s."""
     return f"{from_si(rate, 'deg/s'):.{digits}g} deg/s"
 
 
-# The rates of a run: where its lines really are, and whether they match the manifest.
+# The rates of a run: the measured rates of its lines, checked against the manifest.
 
 
 MISMATCH = to_si(0.5, "deg/s")
@@ -744,22 +740,22 @@ _POLAR = to_si(0.05, "deg/h")
 
 @dataclass(frozen=True)
 class Rates:
-    """Rates of a run and its regression at them.
+    """Rates of a run, and its regression at these rates.
 
     Attributes
     ----------
     solution
-        At these rates.
+        The regression.
     table_rate, table_uncertainty
         Signed rate of chi, rad/s, and its standard uncertainty (None where it is the manifest's).
     origin
         ``encoder``, ``fog`` or ``manifest``.
     net_rate, net_uncertainty
-        As measured; None where the FOG shows no line.
+        Measured; None where the FOG shows no such line.
     net_noise, net_freedom
-        Variance of a sample that the scatter of the net line stands for, shape (k, k), and its degrees of freedom.
+        Variance of a sample of white noise that scatters the net line as much, shape (k, k); its degrees of freedom.
     warnings
-        What a user should know.
+        Messages for the user.
     """
 
     solution: LineRegression
@@ -774,7 +770,7 @@ class Rates:
 
 
 def find_rates(cells: Cells, place: str) -> Rates:
-    """Refine table rate and net rate on the FOG, the last channel, and regress all channels at them.
+    """Return table rate and net rate, refined on the FOG (the last channel), and the regression of all channels there.
 
     Raises
     ------
@@ -835,7 +831,7 @@ def find_rates(cells: Cells, place: str) -> Rates:
 
 
 def three_sigma(freedom: float | None) -> float:
-    """Return the factor of a standard uncertainty of so many degrees of freedom that is exceeded as seldom as 3."""
+    """Return the number of standard uncertainties, for these degrees of freedom, that is exceeded as rarely as 3."""
     return coverage_factor(freedom, 1 - RIG_ERROR.level)
 
 
@@ -859,7 +855,7 @@ def _mismatch(expected: float, rate: float, place: str) -> DataError:
 
 
 def _check_units(solution: LineRegression, noise: Complex, place: str) -> list[str]:
-    """Check Earth rate for a size that it cannot have, and the gyroscope's size and direction against the FOG's."""
+    """Refuse an impossible size of the Earth's rate, and return warnings where gyroscope and FOG disagree on it."""
     line = solution.line(ROOM)
     fog, earth = line[-1], float(abs(line[-1]))
     if not _POLAR < earth < 1.2 * EARTH:
@@ -869,7 +865,7 @@ def _check_units(solution: LineRegression, noise: Complex, place: str) -> list[s
         )
     warnings = []
     sigma = np.sqrt(solution.gain(ROOM) * np.diagonal(noise).real)
-    # What is fixed in the room passes Y a quarter turn before X.
+    # A vector fixed in the room passes Y a quarter turn before X.
     for name, value, expected, u in zip(("dtg_x", "dtg_y"), line[:-1], (fog, -1j * fog), sigma[:-1], strict=False):
         if not earth / 2 - 5 * u < abs(value) < 2 * earth + 5 * u:
             raise DataError(
@@ -889,14 +885,14 @@ def _check_units(solution: LineRegression, noise: Complex, place: str) -> list[s
 
 
 def _noise(cells: Cells, solution: LineRegression, row: int) -> tuple[Complex, float]:
-    """Noise of a line by its scatter over blocks, or by the residuals where the run is too short, and its freedom."""
+    """Return the noise of a line from its scatter over blocks, or from residuals in a short run, and its freedom."""
     least = 2 * np.pi / max(abs(cells.net_rate), 1e-9) if row == ROOM else 0.0
     scattered = scatter(cells, solution, row, least=min(least, cells.duration / 3))
     return (residual_noise(cells, solution), 1e9) if scattered is None else (scattered.noise, scattered.freedom)
 
 
 def residual_noise(cells: Cells, solution: LineRegression) -> Complex:
-    """Return the covariance of a sample's residuals: that of white noise, shape (k, k)."""
+    """Return the covariance of a sample's residuals, the noise if it is white, shape (k, k)."""
     columns = cells.moments.shape[1] - len(cells.offset)
     P = basis(cells, solution.middle, solution.half, solution.table_shift, solution.net_shift) @ solution.coefficients
     cross = (P.transpose(0, 2, 1) @ cells.moments[:, :columns, columns:]).sum(axis=0)
@@ -914,7 +910,7 @@ def _significant(solution: LineRegression, row: int, channel: int, noise: Comple
 
 
 def _encoder_rate(cells: Cells) -> float:
-    """Slope of the encoder's angle, rad/s."""
+    """Return the slope of the encoder's angle, rad/s."""
     assert cells.series_angle is not None
     begin = cells.series_begin
     deviation = np.unwrap(cells.series_angle - cells.table_rate * (begin - cells.start))
@@ -922,9 +918,9 @@ def _encoder_rate(cells: Cells) -> float:
 
 
 def _net_start(cells: Cells, table_shift: float, fog: int, place: str) -> float | None:
-    """Where the FOG's Earth-rate line is, as a shift from the manifest's net rate; None where there is none.
+    """Return the FOG's Earth-rate line as a shift from the manifest's net rate; None where there is none.
 
-    The whole spectrum is searched, table lines removed, for a peak; the one nearest to the net rate is taken.
+    The whole spectrum without the table lines is searched for peaks; the one nearest to the net rate is taken.
     """
     seconds = cells.duration
     bin_width = 2 * np.pi / seconds
@@ -958,13 +954,13 @@ def _net_start(cells: Cells, table_shift: float, fog: int, place: str) -> float 
 
 
 def _peak_rate(index: int, rates: Array, height: Array) -> float:
-    """Rate of a peak of a spectrum, by its neighbours."""
+    """Return the rate of a peak of a spectrum, interpolated between its neighbours."""
     part = slice(max(index - 2, 0), index + 3)
     return interpolated(rates[part], height[part])
 
 
 def _strongest_elsewhere(cells: Cells, fog: int) -> str:
-    """Where the FOG's strongest line is instead: the rate of another run, perhaps."""
+    """Return the end of the message that names the FOG's strongest line: perhaps it is the rate of another run."""
     strongest = strongest_line(cells, cells.series[fog], 1.5 * abs(cells.net_rate))
     return (
         ""
@@ -974,7 +970,7 @@ def _strongest_elsewhere(cells: Cells, fog: int) -> str:
 
 
 def _without_table_lines(cells: Cells, table_shift: float, channel: int) -> Array:
-    """The series of a channel less constant, trend and table lines, by least squares on the series itself."""
+    """Return the series of a channel without constant, trend and table lines, fitted by least squares."""
     time = cells.series_time
     if cells.series_angle is not None:
         chi = np.unwrap(cells.series_angle) + cells.table_rate * (cells.series_step - cells.step) / 2

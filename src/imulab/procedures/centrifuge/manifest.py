@@ -1,12 +1,13 @@
-"""The manifest of a centrifuge test, which file was recorded at which level, and what such a test measures.
+"""The manifest of a centrifuge test: which file was recorded at which level, and what such a test measures.
 
 A line at the phase chi is written as the complex number ``Z = A + i B`` for ``A cos chi + B sin chi``. chi is the angle
-from the X input axis to the specific force, turning X to Y: ``arg Z`` is where in the gyroscope's frame the drift is
-largest. What is fixed in the arm reaches Y a quarter turn after X: Y shows ``i Z`` where X shows ``Z``.
+from the X input axis to the specific force, turning from X to Y: ``arg Z`` is the direction of the largest drift in the
+gyroscope's frame. A vector fixed in the arm reaches Y a quarter turn after X: Y shows ``i Z`` where X shows ``Z``.
+
+The file is TOML; its keys are those of docs/centrifuge.md. An unknown key is refused by name, so that misspelt keys do
+not pass.
 
 Source: CN102636185A; IEEE Std 813 (two-axis gyroscopes), IEEE Std 836 (precision centrifuge), IEEE Std 528.
-
-TOML; the keys are those of docs/centrifuge.md. An unknown key is refused by name, so that a misspelt one does not pass.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from imulab.files import check_keys, load_toml, number_of, scale_factor_of, unit
 from imulab.recording import Array
 from imulab.units import STANDARD_GRAVITY, from_si, to_si
 
-# What a centrifuge test measures: specific force, the drift K(a) a, and the names of its parameters.
+# Specific force, the drift K(a) a, and the names of its parameters.
 
 
 Force = TypeVar("Force", float, Array)
@@ -52,7 +53,7 @@ def fog_share(axes: int) -> np.ndarray:
 def real_covariance(covariance: np.ndarray) -> Array:
     """Return the covariance of (Re z_1, Im z_1, Re z_2, ...) of circular complex numbers with ``E[z z*] = covariance``.
 
-    Circular: noise that does not know the phase of the line, so that both of its components are alike.
+    Circular: the noise has no preferred phase, so that both components have the same variance.
     """
     size = len(covariance)
     real = np.empty((2 * size, 2 * size))
@@ -62,11 +63,11 @@ def real_covariance(covariance: np.ndarray) -> Array:
     return real
 
 
-# Entries of a manifest: quantities and windows, each refused with its place where it cannot be.
+# Entries of a manifest: quantities and windows. A wrong one is refused with its place.
 
 
 Window = tuple[float | None, float | None]
-"""First and last time of a part of a file, s, either None for no bound."""
+"""First and last time of a part of a file, s; None for no bound."""
 
 
 def quantity_of(entry: Any, key: str, kind: str, name: str) -> tuple[float, float]:
@@ -86,7 +87,7 @@ def quantity_of(entry: Any, key: str, kind: str, name: str) -> tuple[float, floa
 
 
 def example(key: str) -> str:
-    """Return how a key of a manifest is written."""
+    """Return an example of a key of a manifest, for messages."""
     return {
         "radius": 'radius = { value = 2.0, standard_uncertainty = 2e-5, unit = "m" }',
         "gravity": 'gravity = { value = 9.8015, unit = "m/s^2" }',
@@ -98,12 +99,12 @@ def example(key: str) -> str:
 
 
 def window_text(window: Window) -> str:
-    """Return a window as a manifest writes it, FROM:TO in seconds."""
+    """Return a window as it stands in a manifest, FROM:TO in seconds."""
     return ":".join("" if end is None else f"{end:.12g}" for end in window)
 
 
 def overlap(first_window: Window, other: Window) -> bool:
-    """Return whether two windows have more than a bound in common; a window overlaps itself unless it is empty."""
+    """Return whether two windows share more than a bound; a window overlaps itself unless it is empty."""
 
     def ends(window: Window) -> tuple[float, float]:
         first, last = window
@@ -114,7 +115,7 @@ def overlap(first_window: Window, other: Window) -> bool:
 
 
 def window_of(text: Any, place: str) -> Window | None:
-    """Return a window that a manifest writes as FROM:TO in seconds."""
+    """Return the window of a text FROM:TO in seconds; None without one."""
     if text is None:
         return None
     try:
@@ -126,16 +127,16 @@ def window_of(text: Any, place: str) -> Window | None:
     return first, last
 
 
-# The manifest of a centrifuge test: which file was recorded at which rates, with which radius.
+# The manifest: runs with their rates, radius, and units.
 
 
 COLUMNS = ("dtg_x", "dtg_y", "fog")
 ROLES = ("static", "loaded")
 SPIN_AXES = ("up", "down")
 SAME_LEVEL = 1e-3
-"""Loaded runs whose arm rates agree within this are one level."""
+"""Loaded runs whose arm rates agree within this, relative, are one level."""
 _SAME_RATE = 1e-3
-"""Two lines closer than this part of the net rate cannot be told apart by any run."""
+"""Lines closer than this part of the net rate cannot be separated by any run."""
 _KEYS = ("radius", "gravity", "rates", "reference", "sensor", "scale_factor", "run")
 _RUN_KEYS = ("file", "power_cycle", "role", "arm_rate", "table_rate", "sense", "spin_axis", "window")
 _REFERENCE = {"value": 1.0, "unit": "g"}
@@ -145,7 +146,7 @@ _REFERENCE = {"value": 1.0, "unit": "g"}
 class Run:
     """One recording of the test; rates are magnitudes, rad/s (0 for a static run), `sense` 1 or -1.
 
-    `window` is the part of the file that is this run, from and to, s, either None for no bound; None for all of it.
+    `window` is the part of the file of this run, from and to, s, either None for no bound; None for the whole file.
     """
 
     file: str
@@ -170,7 +171,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Manifest:
-    """A centrifuge test as it was run.
+    """A centrifuge test as it was made.
 
     Attributes
     ----------
@@ -179,15 +180,15 @@ class Manifest:
     rate_uncertainty
         Standard uncertainty of every arm rate, independent from run to run, rad/s.
     gravity
-        Local, m/s^2; enters the gravity terms only.
+        Local gravity, m/s^2; it enters the gravity terms only.
     reference
-        Specific force of the level that is K_1, m/s^2.
+        Specific force of the level of K_1, m/s^2.
     rate_unit
         Unit of the rates in the file.
     scale_factors
-        Column to output per rate and its unit, for columns in count or V.
+        For columns in count or V: output per rate, and its unit.
     name
-        Path of the manifest, as messages name it.
+        Path of the manifest for messages.
     """
 
     radius: float
@@ -202,7 +203,7 @@ class Manifest:
     name: str = "manifest"
 
     def place(self, index: int) -> str:
-        """Return how messages name run `index`, counted from 0: manifest, number from 1, and file."""
+        """Return the name of run `index`, counted from 0, in messages: manifest, number from 1, and file."""
         return f"{self.name}: run {index + 1} ({self.runs[index].label})"
 
     def force(self, run: Run) -> float:
@@ -271,7 +272,7 @@ def parse_manifest(table: Mapping[str, Any], name: str) -> Manifest:
 
 
 def check_runs(manifest: Manifest) -> None:
-    """Check that the runs together make a test.
+    """Refuse runs that do not make a test together.
 
     Raises
     ------
@@ -417,7 +418,7 @@ def make_manifest(
     sensor: Mapping[str, str] | None = None,
     name: str = "manifest",
 ) -> Manifest:
-    """Return the manifest of a test at the given levels: per power cycle a static run, then every level.
+    """Return the manifest of a test at these levels: per power cycle a static run, then every level.
 
     Parameters
     ----------
@@ -454,7 +455,7 @@ def make_manifest(
 
 
 def manifest_text(manifest: Manifest, comments: list[str] | None = None) -> str:
-    """Return the manifest as TOML, comments at its head."""
+    """Return the manifest as TOML, with comments at its head."""
     unit = manifest.rate_unit
     lines = [f"# {comment}" for comment in comments or []]
     uncertainty = f", standard_uncertainty = {manifest.radius_uncertainty!r}" if manifest.radius_uncertainty else ""

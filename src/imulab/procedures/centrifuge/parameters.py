@@ -1,11 +1,9 @@
-"""Levels to parameters.
+"""Levels to parameters: K, zeta, the curve K(a) and its terms, corrected for errors that the test shows.
 
-K, zeta, the curve K(a) and its terms, and errors that a test shows beyond three standard uncertainties.
+The FOG's line is subtracted from X and Y as the axis sees it: turned back by the FOG's delay, scaled and turned by the
+mismatch that the Earth's rate shows. The uncertainty of each correction is common to all runs.
 
-The FOG's line is taken off X and Y as the axis would have seen it: turned back by the FOG's delay, scaled and turned
-by the mismatch that Earth rate shows. Each correction's uncertainty is common to all runs.
-
-Every parameter is a function of the levels' lines; its derivative carries their covariance. The radius is common:
+Every parameter is a function of the levels' lines; its derivative propagates their covariance. The radius is common:
 with a relative error rho of R every K is off by -rho, c1 by -rho, c2 by -2 rho, zeta not at all.
 """
 
@@ -37,11 +35,11 @@ from imulab.procedures.centrifuge.manifest import CROSS_UNIT, CURVE_UNITS, K_UNI
 from imulab.procedures.centrifuge.run import LoadedRun
 from imulab.recording import Array
 
-# The fitted curve K(a) = K0 (1 + c1 a + c2 a^2), and which of its terms the levels call for.
+# The fitted curve K(a) = K0 (1 + c1 a + c2 a^2), and the choice of its terms.
 
 
 _NESTED = ("constant", "c1", "c1+c2")
-_CURVE_ROUNDING = 1e-9  # of K, relative: noise that exact data are given
+_CURVE_ROUNDING = 1e-9  # of K, relative: least noise, which exact data get
 
 
 @dataclass(frozen=True)
@@ -51,17 +49,18 @@ class CurveFit:
     Attributes
     ----------
     model
-        Key of `CURVES`.
+        Name of the model, a key of `CURVES`.
     coefficients
-        Of 1, a, a^2: ``K(a) = p0 + p1 a + p2 a^2``; zero where the model has no such term.
+        Those of 1, a, a^2: ``K(a) = p0 + p1 a + p2 a^2``; zero where the model has no such term.
     from_levels
-        Matrix that turns the K_i into them, shape (3, n).
+        Matrix from the K_i to the coefficients, shape (3, n).
     covariance
-        Of `coefficients`, shape (3, 3): given the model where it was given; whichever of them is right where it was
-        chosen here (`imulab.estimation.least_squares`).
+        Of the coefficients, shape (3, 3): for a stated model, given that model; for a chosen one, whichever model is
+        right (`imulab.estimation.least_squares`).
     chi_square, freedom
-        Of the residuals.
+        Chi-square of the residuals and its degrees of freedom.
     tried
+        For every model that the levels allow: name, number of coefficients, chi-square, and whether it was chosen.
         Model, number of coefficients, chi-square and whether it was chosen, of every model that the levels allow.
     """
 
@@ -75,23 +74,23 @@ class CurveFit:
 
     @property
     def probability(self) -> float | None:
-        """Of so large a chi-square if the model holds; None without degrees of freedom."""
+        """Probability of so large a chi-square if the model holds; None without degrees of freedom."""
         return chi_square_probability(self.chi_square, self.freedom) if self.freedom > 0 else None
 
 
 def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") -> CurveFit:
-    """Fit K(a) by generalised least squares.
+    """Return K(a) fitted by generalised least squares.
 
     A term is taken where it lowers chi-square by more than the 5 % point of chi-square with one degree of freedom;
     where even the largest model leaves more scatter than the covariance explains, chi-square counts in units of that
-    scatter (F-test). What is chosen so has its own values, and the uncertainty of all models together.
+    scatter (F-test). A chosen model keeps its own values and has the uncertainty of all models together.
 
     Parameters
     ----------
     force
         Specific force of the levels, m/s^2, shape (n,).
     K, covariance
-        Shapes (n,), (n, n).
+        Values at the levels and their covariance, shapes (n,), (n, n).
     model
         ``auto``, ``constant``, ``c1``, ``c2`` or ``c1+c2``.
 
@@ -127,7 +126,7 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
 
 
 def _blended(force: Array, K: Array, root: Array, covariance: Array, chosen: Array, chosen_covariance: Array) -> Array:
-    """Covariance of the chosen coefficients whichever model is right: nowhere less than that given the model."""
+    """Return the covariance of the chosen coefficients whichever model is right, at least that given the model."""
     nested = [name for name in _NESTED if len(CURVES[name]) < len(K)]
     steps = [_solve(force, K, root, CURVES[name]) for name in nested]
     squares = np.array([chi_square for *_, chi_square in steps])
@@ -143,7 +142,7 @@ def _blended(force: Array, K: Array, root: Array, covariance: Array, chosen: Arr
 
 
 def _regular(covariance: Array, K: Array) -> Array:
-    """Keep a covariance of (nearly) noise-free data invertible, and rounding from looking significant."""
+    """Return a covariance that stays invertible for noise-free data and keeps rounding from looking significant."""
     floor = max(float(np.diagonal(covariance).max()) * 1e-12, (_CURVE_ROUNDING * float(np.abs(K).max())) ** 2, 1e-60)
     regular: Array = covariance + floor * np.eye(len(covariance))
     return regular
@@ -161,30 +160,29 @@ def _solve(force: Array, K: Array, root: Array, terms: tuple[int, ...]) -> tuple
     return coefficients, matrix, float(left @ left)
 
 
-# Errors that a test shows beyond three standard uncertainties: corrected, and what is left of them made part of u.
+# Errors of rig and channels that the test shows beyond three standard uncertainties: corrected, the rest added to u.
 
 
 _FLOOR = 1e-4
-"""What changes K by less than this part is left alone, however small its uncertainty."""
+"""An effect on K below this part is left alone, however small its uncertainty."""
 _QUARTER = np.array([1.0, 1j])
-"""Y sees what is fixed in the arm a quarter turn from X."""
+"""Y sees vectors fixed in the arm a quarter turn from X."""
 
 
 @dataclass(frozen=True)
 class Corrections:
-    """What the reduction does about errors that the test shows.
+    """Corrections for errors that the test shows.
 
     Attributes
     ----------
     fog
-        Run index to the factors of the FOG's line in each axis, shape (axes,).
+        By run index: factors of the FOG's line in each axis, shape (axes,).
     common
-        What one standard uncertainty of each correction does to each run's lines: run index to rad/s, shape
-        (k, axes).
+        By run index: change of the run's lines by one standard uncertainty of each correction, rad/s, shape (k, axes).
     corrected
-        Names of entries of the error budget.
+        Names of the entries of the error budget that are corrected.
     warnings
-        What was found, a sentence each.
+        A sentence for each error.
     """
 
     fog: dict[int, Complex] = field(default_factory=dict)
@@ -194,23 +192,23 @@ class Corrections:
 
 
 def find_corrections(runs: Sequence[LoadedRun], lines: dict[int, RunLine], *, correct: bool = True) -> Corrections:
-    """Return what the lines of a test call for.
+    """Return the corrections that the lines of a test call for.
 
     Parameters
     ----------
     runs, lines
-        As reduced, without any correction.
+        Reduced runs and their lines, without any correction.
     correct
-        Whether to correct what is found; otherwise all of it is uncertainty (method ``fourier``).
+        Whether errors are corrected; otherwise all of them are uncertainty (method ``fourier``).
     """
     test = Measured([run for run in runs if run.index in lines], lines)
     axes = len(test.runs[0].channels) - 1
-    late, shown = _delay(test, lines, axes, correct=correct)
+    late, shown = _correct_delay(test, lines, axes, correct=correct)
     turn: Complex = np.exp(-1j * test.table * late)
     factor: Complex = turn[:, None] * np.ones(axes)
     if not test.both:
         for axis in range(axes):
-            change, more = _difference(test, axis, axes, late, correct=correct)
+            change, more = _correct_mismatch(test, axis, axes, late, correct=correct)
             factor[:, axis] += turn * change
             shown += more
     if not shown:
@@ -226,22 +224,24 @@ def find_corrections(runs: Sequence[LoadedRun], lines: dict[int, RunLine], *, co
 
 @dataclass(frozen=True)
 class _Finding:
-    """An error that a test shows; `common` is what a standard uncertainty of it does to the lines, (runs, axes)."""
+    """An error that the test shows; `common` is the change of the lines by one u of it, shape (runs, axes)."""
 
     common: Complex
     warning: str
     named: tuple[str, ...] = ()
 
 
-def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: bool) -> tuple[float, list[_Finding]]:
-    """How much the FOG's line is turned back by, s, and what was found of delays."""
+def _correct_delay(
+    test: Measured, lines: dict[int, RunLine], axes: int, *, correct: bool
+) -> tuple[float, list[_Finding]]:
+    """Return by how much the FOG's line is turned back, s, and the delays that the test shows."""
     delay = delays(test)
     if delay is None:
         return 0.0, []
     late = 0.0
     shown: list[_Finding] = []
     top = float(np.abs(test.table).max())
-    turning = _is_clear(delay.own, delay.own_uncertainty) and abs(delay.own) * top > _FLOOR
+    turning = _is_clear(delay.axis, delay.axis_uncertainty) and abs(delay.axis) * top > _FLOOR
     size = max(abs(delay.fog), abs(delay.late)) if turning else abs(delay.late)
     clear = _is_clear(delay.fog, delay.fog_uncertainty) or (_is_clear(delay.late, delay.uncertainty) and not turning)
     if clear and size * top * test.fog_share > _FLOOR:
@@ -269,17 +269,20 @@ def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: boo
         drift = np.array([lines[run.index].line * run.force for run in test.runs])
         shown.append(
             _Finding(
-                1j * delay.own * test.table[:, None] * drift,
-                f"X turns against table_angle as if it were {1e3 * delay.own:.3g} ± {1e3 * delay.own_uncertainty:.1g} "
-                "ms late (differential flexure looks the same): added to the uncertainty of the direction, which it "
-                f"changes by up to {np.degrees(abs(delay.own) * top):.2g} deg at the highest level",
+                1j * delay.axis * test.table[:, None] * drift,
+                f"X turns against table_angle as if it were {1e3 * delay.axis:.3g} ± "
+                f"{1e3 * delay.axis_uncertainty:.1g} ms late (differential flexure looks the same): "
+                "added to the uncertainty of the direction, which it "
+                f"changes by up to {np.degrees(abs(delay.axis) * top):.2g} deg at the highest level",
             )
         )
     return late, shown
 
 
-def _difference(test: Measured, axis: int, axes: int, late: float, *, correct: bool) -> tuple[Complex, list[_Finding]]:
-    """What to add to the factor of the FOG's line in an axis, by run, and what Earth rate shows of it."""
+def _correct_mismatch(
+    test: Measured, axis: int, axes: int, late: float, *, correct: bool
+) -> tuple[Complex, list[_Finding]]:
+    """Return, by run, the term to add to the factor of the FOG's line in an axis, and the mismatch found."""
     change = np.zeros(len(test.runs), dtype=np.complex128)
     shown: list[_Finding] = []
     ratio = mismatch(test, axis, late)
@@ -310,7 +313,7 @@ def _difference(test: Measured, axis: int, axes: int, late: float, *, correct: b
 
 
 def corrected(runs: Sequence[LoadedRun], corrections: Corrections) -> list[LoadedRun]:
-    """Return the runs with the factors of their FOG's line and what is common to all of them."""
+    """Return the runs with the factors of their FOG's line and the common uncertainties set."""
     return [
         replace(run, fog_factor=corrections.fog.get(run.index), common=corrections.common.get(run.index))
         for run in runs
@@ -321,16 +324,16 @@ def _is_clear(value: float, uncertainty: float, freedom: float | None = None) ->
     return abs(value) > three_sigma(freedom) * uncertainty
 
 
-# Levels to parameters: K, zeta, the curve, its direction and the cross terms, with one covariance over all of them.
+# Parameters: K, zeta, the curve, its direction and the cross terms, with one covariance over all of them.
 
 
 _ROUNDING = 1e-7
-"""Turning of the drift, rad, below which it is not warned of however small the noise."""
+"""Turning of the drift, rad, below which no warning is given, however small the noise."""
 
 
 @dataclass
 class _Row:
-    """A parameter under construction: value, derivative with respect to the levels' vectors, and to ln R."""
+    """A parameter under construction: value, unit, and its derivatives by the levels' vectors and by ln R."""
 
     name: str
     value: float
@@ -346,7 +349,7 @@ class Estimates:
     Attributes
     ----------
     names, units
-        In the order of the record.
+        Names and units in the order of the record.
     values, covariance
         SI, shapes (p,), (p, p).
     levels
@@ -354,12 +357,12 @@ class Estimates:
     freedom, coverage
         Effective degrees of freedom (Welch-Satterthwaite) and the factor of the 95 % interval, shapes (p,).
     curves
-        Prefix (``x_``, ``y_``, ``x_down_`` ..) to the fitted curve.
+        Fitted curve by prefix (``x_``, ``y_``, ``x_down_`` ..).
     turning
-        Prefix to the probability that the line's direction turns so much between levels by chance.
+        By prefix: probability that the line's direction turns so much between levels by chance.
     cross
-        Level to the complex cross term and half-sum of each axis, rad/s/(m/s^2)^2 and rad/s/(m/s^2).
-    given
+        By level: complex cross term and half-sum of each axis, rad/s/(m/s^2)^2 and rad/s/(m/s^2).
+    given_model
         Standard uncertainties if the chosen model of the curve is right, shape (p,).
     """
 
@@ -373,7 +376,7 @@ class Estimates:
     curves: dict[str, CurveFit]
     turning: dict[str, float]
     cross: dict[int, tuple[np.ndarray, np.ndarray]]
-    given: Array
+    given_model: Array
     warnings: tuple[str, ...] = field(default=())
 
 
@@ -383,7 +386,7 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
     Parameters
     ----------
     levels
-        Pooled.
+        Pooled levels.
     manifest
         For radius and gravity.
     method
@@ -458,7 +461,7 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
 
 
 def _covariance(items: tuple[Level, ...], common: Array, width: int) -> Array:
-    """Covariance of the levels' lines: of each its own, what power cycles do to all, and what corrections leave."""
+    """Return the covariance of the levels' lines: each level's part, the power cycles' and the corrections'."""
     V = np.zeros_like(common)
     for index, level in enumerate(items):
         V[index * width : (index + 1) * width, index * width : (index + 1) * width] = level.covariance
@@ -503,7 +506,7 @@ def _curve(
 
 
 def _widen(covariance: Array, names: list[str], prefix: str, fitted: CurveFit, J: Array, V: Array) -> None:
-    """Add to the curve's part of the covariance what the choice of its model leaves open."""
+    """Add to the curve's part of the covariance the uncertainty of the choice of its model."""
     powers = {"K0": 0, "c1": 1, "c2": 2}
     mine = [(names.index(f"{prefix}{term}"), power) for term, power in powers.items() if f"{prefix}{term}" in names]
     place, power = (np.array(part) for part in zip(*mine, strict=True))
@@ -518,7 +521,7 @@ def _widen(covariance: Array, names: list[str], prefix: str, fitted: CurveFit, J
 def _direction(
     prefix: str, items: tuple[Level, ...], mine: list[int], axis: int, V: Array, size: int, width: int
 ) -> tuple[_Row, float]:
-    """Angle of the pooled line, and the probability that the levels' angles differ so much by chance."""
+    """Return the angle of the pooled line, and the probability that the levels' angles differ so much by chance."""
     lines = np.array([items[index].line[axis] for index in mine])
     weights = 1 / np.maximum([items[index].component_variance[axis] for index in mine], 1e-60)
     weights = weights / weights.sum()
@@ -531,7 +534,7 @@ def _direction(
         normal = np.array([-unit.imag, unit.real])
         derivative[place : place + 2] = weight * normal / max(abs(pooled), 1e-300)
         across[number, place : place + 2] = normal / max(abs(lines[number]), 1e-300)
-    # Angles of the levels against the pooled one; their covariance has one degree less than levels.
+    # Angles of the levels against the pooled one; their covariance has the rank of the number of levels less one.
     angle = np.angle(lines / unit)
     spread = across - derivative
     covariance = spread @ V @ spread.T + _ROUNDING**2 * np.eye(len(mine))
@@ -551,7 +554,7 @@ def _cross(
     rows: list[_Row],
     warnings: list[str],
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Add the cross terms where a level has the spin axis both ways: half the difference of its lines over g."""
+    """Add and return the cross terms of levels with the spin axis both ways: half the lines' difference over g."""
     where = {(level.spin_axis, level.number): index for index, level in enumerate(items)}
     by_level: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for (spin_axis, number), up in where.items():
@@ -574,9 +577,9 @@ def _cross(
 
 
 def _cycles(levels: Levels, size: int, width: int) -> Array:
-    """Covariance of the levels' lines by what each power cycle does to all of them alike, axis by axis.
+    """Return the covariance of the levels' lines by the common effect of each power cycle, axis by axis.
 
-    In units of the mean K of a set, not of each level's own: a noisy level would take a share of its own noise.
+    It is in units of the mean K of all levels: in units of a noisy level's own K it would take up that level's noise.
     """
     repeatability = levels.repeatability
     total = np.zeros((size, size))
@@ -604,7 +607,7 @@ def _mean_size(levels: Levels, spin_axis: str, axis: int) -> float:
 
 
 def _freedom(J: Array, V: Array, common: Array, radius: Array, levels: Levels, width: int) -> Array:
-    """Effective degrees of freedom of each parameter's variance."""
+    """Return the effective degrees of freedom of each parameter's variance."""
     cycles = np.einsum("pi,ij,pj->p", J, common, J)
     variance = cycles.copy()
     spent = cycles**2 / max(levels.repeatability.freedom, 1)
@@ -612,7 +615,7 @@ def _freedom(J: Array, V: Array, common: Array, radius: Array, levels: Levels, w
         part = slice(index * width, (index + 1) * width)
         run_noise = V[part, part] - common[part, part]
         mine = np.einsum("pi,ij,pj->p", J[:, part], run_noise, J[:, part])
-        # An axis's own share decides which of the degrees of freedom counts.
+        # The share of each axis decides which degrees of freedom count.
         shares = np.abs(J[:, part]).reshape(len(J), -1, 2).sum(axis=2)
         nu = level.freedom[np.argmax(shares, axis=1)]
         variance += mine
@@ -622,11 +625,11 @@ def _freedom(J: Array, V: Array, common: Array, radius: Array, levels: Levels, w
     return result
 
 
-# K and zeta of each power cycle by itself: how far a test repeats.
+# K and zeta of each power cycle alone: how far a test repeats.
 
 
 def power_cycles(levels: Levels, method: str) -> list[dict[str, Any]]:
-    """Return K_i and zeta_i of every power cycle, with what noise and rates leave uncertain of them.
+    """Return K_i and zeta_i of every power cycle, with their uncertainty by noise and rates.
 
     ``zeta_i = K_i / K_1 - 1`` with both K of the same cycle; a cycle without the reference has no zeta. Prefixes are
     those of the parameters.
@@ -652,12 +655,12 @@ def power_cycles(levels: Levels, method: str) -> list[dict[str, Any]]:
                 values[f"K_{level.number}"] = {"value": size, "standard_uncertainty": u, "unit": K_UNIT}
         for values in row.values():
             if isinstance(values, dict) and "K_1" in values:
-                values |= _zeta_of_cycle(values)
+                values |= _cycle_zeta(values)
         rows.append(row)
     return rows
 
 
-def _zeta_of_cycle(values: dict[str, Any]) -> dict[str, Any]:
+def _cycle_zeta(values: dict[str, Any]) -> dict[str, Any]:
     first = values["K_1"]
     zeta = {}
     for name, K in values.items():

@@ -1,10 +1,10 @@
-"""Which runs a centrifuge test needs, what they will give, and which errors survive the subtraction.
-
-Each entry gives a value with its uncertainty where the data determine it, and what it does to K at the highest level,
-as a fraction of K. What the data do not bound is given as the effect of a stated size.
+"""Planning a centrifuge test: its runs, the uncertainty they will reach, and the error budget.
 
 A run of duration T gives its line with ``sigma = N sqrt(2 / T)`` for noise of density N (angle random walk,
 rad/sqrt(s)) of DTG and FOG together; ``u(K)/K = sigma / (K a)``, over sqrt(n) for n runs.
+
+The error budget states each error that survives the subtraction of the FOG, with its effect on K at the highest level
+as a fraction of K. Where the data do not bound an error, the effect is that of a stated size.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from imulab.report.plots import Plot
 from imulab.report.traces import BAD, GOOD, LEGEND, Figure, log_axis, short_log_axis
 from imulab.units import STANDARD_GRAVITY, from_si, to_si
 
-# Errors that survive the subtraction of the FOG: which of them the data bound, and by how much.
+# Error budget: errors that survive the subtraction of the FOG.
 
 
-FLEXURE = 1e-7 / STANDARD_GRAVITY  # rad/(m/s^2): 0.1 µrad a g, the flexure of a stiff arm, where none is stated
+FLEXURE = 1e-7 / STANDARD_GRAVITY  # rad/(m/s^2): 0.1 µrad per g, a stiff arm, where none is stated
 _DELAY = 1e-3  # s between FOG and X that a data logger may have, where the data do not show it
 _MISMATCH = 5e-3  # of a scale factor: 0.5 % between FOG and X, where the data do not show it
 
 
 @dataclass(frozen=True)
 class BudgetEntry:
-    """One error.
+    """One error of the budget.
 
     Attributes
     ----------
     error
-        Its name.
+        Name of the error.
     bounded
-        Whether these data bound it.
+        Whether the data bound it.
     value, standard_uncertainty, unit
         As measured (an angle, a time, a fraction); where it is not bounded, the size that the effect is stated for.
     effect
-        On K at the highest level, as a fraction: of the measured value and its uncertainty, after what the reduction
-        does against it; where it is not bounded, of the size stated.
+        Effect on K at the highest level, as a fraction, of value and uncertainty after the reduction's corrections;
+        where it is not bounded, of the stated size.
     removed
         The same without the subtraction or combination that removes it, where there is one.
     basis
-        Where this comes from, or what it would need.
+        What bounds it, or what would be needed for that.
     """
 
     error: str
@@ -73,7 +73,7 @@ def error_budget(
 ) -> list[dict[str, Any]]:
     """Return the error budget of the X axis as plain values.
 
-    `runs` and `lines` are those before any correction; `corrected` names the entries that the reduction corrected.
+    `runs` and `lines` are those before any correction; `corrected` names the errors that are corrected.
     """
     test = Measured([run for run in runs if run.index in lines], lines)
     entries = [
@@ -84,7 +84,7 @@ def error_budget(
 
 
 def _corrected_entry(entry: BudgetEntry) -> BudgetEntry:
-    """An entry once its value is corrected: what is left is its uncertainty."""
+    """Return an entry whose value is corrected: only its uncertainty has an effect."""
     share = (entry.standard_uncertainty or 0.0) / max(
         np.hypot(entry.value or 0.0, entry.standard_uncertainty or 0.0), 1e-300
     )
@@ -116,7 +116,7 @@ def _tilt(test: Measured) -> list[BudgetEntry]:
 
 
 def _flexure(test: Measured) -> BudgetEntry:
-    """Differential flexure: what changes sign with the sense of rotation."""
+    """Return differential flexure: the part of the lines that changes sign with the sense of rotation."""
     reach = float(np.abs(test.arm).max()) / test.K
     senses = np.sign(test.arm)
     if not test.encoder or len(np.unique(senses)) < 2:
@@ -124,7 +124,7 @@ def _flexure(test: Measured) -> BudgetEntry:
             "differential flexure", False, FLEXURE, None, "rad/(m/s^2)", FLEXURE * reach, None,
             "needs both senses, encoder",
         )  # fmt: skip
-    # Per unit of force: Z = D(level) + w_t kappa_d; the levels' own lines are free.
+    # Per specific force: Z = D(level) + w_t kappa_d; the levels' own lines are free.
     labels = np.round(np.abs(test.arm), 6)
     design = np.zeros((len(labels), test.levels + 1))
     for column, label in enumerate(np.unique(labels)):
@@ -140,7 +140,7 @@ def _flexure(test: Measured) -> BudgetEntry:
 
 
 def _scale_mismatch(test: Measured) -> list[BudgetEntry]:
-    """Scale mismatch and azimuth of X against the FOG, by Earth rate."""
+    """Return scale mismatch and azimuth of X against the FOG, by the Earth's rate."""
     measured = mismatch(test)
     if measured is None:
         return [
@@ -158,7 +158,7 @@ def _scale_mismatch(test: Measured) -> list[BudgetEntry]:
 
 
 def _delays(test: Measured) -> list[BudgetEntry]:
-    """Delays of FOG and X against the encoder: by the turning of their lines with the table rate."""
+    """Return the delays of FOG and X against the encoder, by the turning of their lines with the table rate."""
     per_second = float(np.abs(test.table).max()) * test.fog_share
     measured = delays(test)
     if measured is None:
@@ -168,7 +168,7 @@ def _delays(test: Measured) -> list[BudgetEntry]:
     return [
         BudgetEntry("delay of the FOG", True, measured.fog, measured.fog_uncertainty, "s", effect, None,
               "FOG phase over table rate"),
-        BudgetEntry("delay of X", True, measured.own, measured.own_uncertainty, "s", effect, None,
+        BudgetEntry("delay of X", True, measured.axis, measured.axis_uncertainty, "s", effect, None,
               "drift phase over table rate"),
     ]  # fmt: skip
 
@@ -195,7 +195,7 @@ def _table_rate(test: Measured) -> BudgetEntry:
 
 
 def _arm_rate(test: Measured, manifest: Manifest) -> BudgetEntry:
-    """Arm rate, table rate plus net rate as measured, against the manifest's."""
+    """Return the error of the arm rate: table rate plus net rate as measured, against the manifest's."""
     runs = [run for run in test.runs if run.rates.net_rate is not None and run.rates.origin != "manifest"]
     stated = manifest.rate_uncertainty / float(np.abs(test.arm).max())
     if not runs:
@@ -224,14 +224,14 @@ def _radius(test: Measured, manifest: Manifest) -> BudgetEntry:
     )
 
 
-# Which runs a centrifuge test needs: rates for the wanted levels, what they will give, and what is wrong with them.
+# The plan: rates for the wanted levels, predicted uncertainties, and warnings.
 
 
 DRIFT = {"deg/h/g": 0.01745329251994329577 / 3600 / 9.80665, "rad/s/(m/s^2)": 1.0}
-"""Units of K that texts have, in SI."""
-PERIODS_ASKED = 500  # of the table in a run, as the source of method fourier asks for
+"""Units of K in texts, in SI."""
+PERIODS_ASKED = 500  # of the table in a run, asked for by the source of method fourier
 _NEAR = 0.05
-"""A table rate this close to a multiple of the net rate, as part of the net rate, is warned of."""
+"""A warning is given where the table rate is this close to a multiple of the net rate, relative to the net rate."""
 _LONGEST = 7200.0  # s of a run that a plan proposes
 _HIGHEST_RATE = 50.0  # rad/s
 
@@ -243,11 +243,11 @@ class PlannedLevel:
     Attributes
     ----------
     force, arm_rate, table_rate
-        m/s^2 and rad/s.
+        Specific force, m/s^2, and rates, rad/s.
     periods
         Table periods in a run.
     relative, zeta
-        Predicted standard uncertainty of K, as a part of it, with all runs; and of zeta.
+        Predicted relative standard uncertainty of K, with all runs, and that of zeta.
     needed
         Duration of a run for the wanted uncertainty, s.
     """
@@ -263,7 +263,7 @@ class PlannedLevel:
 
 @dataclass(frozen=True, repr=False)
 class Plan(PlannedTest):
-    """A planned test: manifest, levels, times on the centrifuge, s, wanted u(K) / K, and warnings with what to do."""
+    """A planned test: manifest, levels, durations, s, wanted u(K) / K, and warnings with what to do."""
 
     manifest: Manifest
     levels: tuple[PlannedLevel, ...]
@@ -274,7 +274,7 @@ class Plan(PlannedTest):
     warnings: tuple[str, ...]
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return how long the test takes and whether it reaches what is wanted, and its levels."""
+        """Return how long the test takes and whether it reaches the wanted uncertainty, and its levels."""
         rows = [
             [
                 f"{from_si(level.force, 'g'):.4g}",
@@ -320,7 +320,7 @@ class Plan(PlannedTest):
         }
 
     def findings(self) -> tuple[str, ...]:
-        """Return what is wrong with the test, with what to do."""
+        """Return warnings about the test, with what to do."""
         return self.warnings
 
     def save(self, path: str | Path) -> None:
@@ -467,7 +467,7 @@ def plan_centrifuge(
 
 @dataclass(frozen=True)
 class _Test:
-    """What is the same at all levels: `noise` is that of DTG and FOG together, rad/sqrt(s)."""
+    """Values common to all levels: `noise` is that of DTG and FOG together, rad/sqrt(s)."""
 
     radius: float
     net_rate: float
@@ -480,7 +480,7 @@ class _Test:
 
 
 def _planned_levels(levels: Sequence[float], test: _Test) -> list[PlannedLevel]:
-    """Return the arm and table rates of levels, m/s^2, ascending, and the uncertainties that K and zeta will have."""
+    """Return arm and table rates of levels, m/s^2, ascending, with the predicted uncertainties of K and zeta."""
     planned: list[PlannedLevel] = []
     for force in levels:
         arm = math.sqrt(force / test.radius)
@@ -503,12 +503,12 @@ def _planned_levels(levels: Sequence[float], test: _Test) -> list[PlannedLevel]:
 
 
 def read_levels(stated: Sequence[float] | str) -> list[float]:
-    """Return specific forces, m/s^2, given as such or as a text of them in g, with commas.
+    """Return specific forces, m/s^2, from numbers, or from a text of values in g with commas.
 
     Raises
     ------
     OptionError
-        They are none.
+        The text or the numbers are no specific forces.
     """
     try:
         values = [float(part) for part in (stated.removesuffix("g").split(",") if isinstance(stated, str) else stated)]
@@ -566,7 +566,7 @@ def _warnings(
                 f"line or its harmonic{refused}; take a net rate of {_deg(better)} or move the level by some percent"
             )
         if level.relative > uncertainty:
-            messages.append(_too_short(name, level, duration, runs, uncertainty))
+            messages.append(_warn_too_short(name, level, duration, runs, uncertainty))
     few = [level for level in planned if level.periods < PERIODS_ASKED]
     if few:
         longest = max(PERIODS_ASKED * 2 * math.pi / level.table_rate for level in few)
@@ -586,7 +586,7 @@ def _warnings(
     return messages
 
 
-def _too_short(name: str, level: PlannedLevel, duration: float, runs: int, uncertainty: float) -> str:
+def _warn_too_short(name: str, level: PlannedLevel, duration: float, runs: int, uncertainty: float) -> str:
     wanted = f"{100 * uncertainty:.3g} %"
     text = f"{name}: predicted u(K) {100 * level.relative:.2g} %, wanted {wanted}: "
     if math.isinf(level.needed):

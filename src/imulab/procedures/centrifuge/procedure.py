@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from imulab.report.traces import Exhibits
 
 
-# A centrifuge test from its manifest, which names the recordings.
+# The fit as a task: from a manifest, which names the recordings.
 
 
 def _fit(
@@ -69,7 +69,7 @@ TASK = Task(
 )
 
 
-# The g-sensitive drift of a flexible gyro, which changes with g, as the registry knows it.
+# The procedure and its section of a device.
 
 
 class CentrifugeSection(Section):

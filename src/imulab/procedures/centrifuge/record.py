@@ -85,7 +85,7 @@ def _fit(
                 "probability": fitted.probability,
                 "standard_uncertainty_given_model": {
                     name.removeprefix(prefix): float(u)
-                    for name, u in zip(estimates.names, estimates.given, strict=True)
+                    for name, u in zip(estimates.names, estimates.given_model, strict=True)
                     if name in (f"{prefix}K0", f"{prefix}c1", f"{prefix}c2")
                 },
                 "tried": [

@@ -1,7 +1,4 @@
-"""One run of a centrifuge test, streamed.
-
-Its channels, where it is steady, its lines with their noise, or the means of a static run.
-"""
+"""One run of a centrifuge test, streamed: channels, steady part, lines with their noise, or means at rest."""
 
 from __future__ import annotations
 
@@ -48,11 +45,11 @@ from imulab.procedures.centrifuge.manifest import Manifest, Run
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import from_si, parse_unit, to_si
 
-# The channels of a run's recording: its columns as rates in SI, checked, block by block.
+# The channels of a run: its columns as rates in SI, checked block by block.
 
 
 class Channels:
-    """Samples of a run; the names of its channels are known once the first block has come.
+    """Samples of a run; the names of its channels are known after the first block.
 
     Attributes
     ----------
@@ -74,7 +71,7 @@ class Channels:
         UnitError
             A column in count or V without a scale factor in that unit; an angle that is none.
         ImulabError
-            What the reader refuses.
+            An error of the reader, with the run's name.
         """
         place = self._manifest.place(self._index)
         file = self._manifest.runs[self._index].file
@@ -82,7 +79,7 @@ class Channels:
             yield from self._samples()
         except ImulabError as error:
             name, colon, rest = str(error).partition(": ")
-            # What does not name the run names its file alone, as it was opened: that is in `place` already.
+            # An error that does not name the run names only its file, as it was opened: that is in `place` already.
             raise type(error)(f"{place}: {rest if colon and name.endswith(file) else error}") from None
 
     def _samples(self) -> Iterator[CellSamples]:
@@ -113,7 +110,7 @@ class Channels:
 
 
 def _rate(block: Recording, name: str, manifest: Manifest) -> Array:
-    """A column as rate, rad/s."""
+    """Return a column as rate, rad/s."""
     unit = parse_unit(block.units[name])
     if unit.quantity == "rate":
         return block.si(name)
@@ -129,21 +126,21 @@ def _rate(block: Recording, name: str, manifest: Manifest) -> Array:
     return rate
 
 
-# Where a run is steady: rate ramps at its ends are cut, others are refused.
+# The steady part of a run: rate ramps at its ends are cut, ramps elsewhere are refused.
 
 
 _MISMATCH = to_si(0.5, "deg/s")
 _STANDS_OUT = 8.0  # sigma beyond which a cell is a disturbance, besides the share of the signal below
 _UNSTEADY = 0.05  # of the size of the signal in a cell
-_SLOW, _SLOW_WARNING = 0.1, 0.02  # of the amplitude: slow changes beyond are refused, and beyond the second warned of
+_SLOW, _SLOW_WARNING = 0.1, 0.02  # of the amplitude: larger slow changes are refused, or warned of
 _RATE_CHANGE = 1e-3  # of the table's rate within a run
-_ROUNDS = 8  # in which disturbed cells are left out, as long as more are seen
-# Parts of a run whose lines drift in one direction where they correlate by more with time
+_ROUNDS = 8  # most rounds in which disturbed cells are left out
+# Parts of a run; correlation with time from which lines drift in one direction
 _SEGMENTS, _STEADILY = 8, 0.9
 
 
 def steady_part(cells: Cells, place: str) -> tuple[Cells, list[str]]:
-    """Cut a rate ramp at either end of a run, and say so.
+    """Return a run without rate ramps at its ends, and the warnings about them.
 
     With an encoder a ramp shows in its rate, otherwise in the lines' phase and size from block to block.
 
@@ -183,7 +180,7 @@ def steady_part(cells: Cells, place: str) -> tuple[Cells, list[str]]:
 
 
 def _steady_encoder(cells: Cells, place: str) -> tuple[int, int]:
-    """Cells (half-open) over which the encoder's rate is steady."""
+    """Return the first cell, and the last + 1, over which the encoder's rate is steady."""
     angle = cells.series_angle
     assert angle is not None
     begin = cells.series_begin
@@ -224,12 +221,12 @@ def _steady_encoder(cells: Cells, place: str) -> tuple[int, int]:
         raise DataError(
             f"{place}: column table_angle: the rate drifts by {in_degrees(change)} over the run; expected steady rates"
         )
-    # A cell whose end is still ramping counts as ramp.
+    # A cell whose end is still ramping belongs to the ramp.
     return first if first == 0 else first + 1, count if last == len(good) else last
 
 
 def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | None:
-    """Cells to keep and warnings, where blocks of the run show other lines than the rest; None where all agree."""
+    """Return the cells to keep, and warnings, where some blocks show other lines than the rest; None if all agree."""
     shift = 0.0 if cells.series_angle is not None else _strongest_shift(cells)
     if shift is None:
         _check_wandering(cells, place)
@@ -239,11 +236,11 @@ def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | N
     if scattered is None or len(scattered.centre) < 6:
         return None
     size = np.abs(solution.line(LINE))
-    # Against the median of the blocks: the line of the whole run has the disturbance in it.
+    # The comparison is with the median of the blocks, because the line of the whole run contains the disturbance.
     middle = np.median(scattered.deviation.real, axis=0) + 1j * np.median(scattered.deviation.imag, axis=0)
     deviation = np.abs(scattered.deviation - middle)
     sigma = np.median(deviation, axis=0) / 1.1774
-    # Below `FAINT` nothing is seen of a gyroscope: a simulated line without noise has no scatter to compare with.
+    # Below `FAINT` a gyroscope shows nothing: a simulated line without noise has no scatter to compare with.
     bad: NDArray[np.bool_] = np.any(deviation > _STANDS_OUT * sigma + _UNSTEADY * size + FAINT, axis=1)
     count = len(bad)
     low = int(np.argmin(bad))
@@ -284,7 +281,7 @@ def _check_wandering(cells: Cells, place: str) -> None:
 
 
 def _slow_change(deviation: Complex, size: Array, place: str) -> list[str]:
-    """Judge a line that wanders slowly: steps from block to block much smaller than the wandering itself."""
+    """Return a warning of a line that wanders slowly, by steps much smaller than the wandering; refuse a large one."""
     if len(deviation) < 16:
         return []
     power = (np.abs(deviation) ** 2).mean(axis=0)
@@ -305,7 +302,7 @@ def _slow_change(deviation: Complex, size: Array, place: str) -> list[str]:
 
 
 def _strongest_shift(cells: Cells) -> float | None:
-    """Shift of the table rate by the channel whose line stands out most; None where none does."""
+    """Return the shift of the table rate by the channel with the clearest line; None where no line is clear."""
     best, where = 0.0, None
     for channel in range(len(cells.series)):
         shift, height = search_line(cells, cells.series[channel], cells.table_rate, SEARCH)
@@ -318,24 +315,24 @@ def _strongest_shift(cells: Cells) -> float | None:
 
 
 def _peak_shift(cells: Cells, rate: float) -> float:
-    """Shift of the FOG's strongest line within the search range of the net rate, or none where it is not clear."""
+    """Return the shift of the FOG's strongest line within the search range of the net rate; 0 where none is clear."""
     shift, height = search_line(cells, cells.series[-1], rate, SEARCH)
     return shift if height > PEAK else 0.0
 
 
-# A static run of a centrifuge test: the mean of each channel, once it is sure that nothing moved.
+# Static runs: the mean of each channel, after a check that nothing moved.
 
 
 _STEP = to_si(5.0, "deg/h")
-"""A second off the straight line through the record by less than this is no motion, however small the noise."""
-# Sigma within blocks, and steps of the output, that a jump of a log at rest exceeds
+"""A mean over 1 s closer to the straight line through the record is no motion, however small the noise."""
+# A jump at rest exceeds so many sigma within blocks, and steps of the output
 _STEP_SIGMA, _STEP_STEPS = 10.0, 8.0
 _DRIFT = to_si(20.0, "deg/h")
-"""More than a warm gyroscope drifts over a static record, or a table held by its servo shakes."""
+"""More than the drift of a warm gyroscope over a static record, or the shaking of a table held by its servo."""
 _LINE = to_si(1.0, "deg/h")
-"""More than rest shows at a rate that the table has in this test."""
+"""Larger than any line at rest at a rate that the table has in this test."""
 _LOWEST_BIN = 3
-"""A drift that bends shows in the first bins of a spectrum."""
+"""The first bins of a spectrum show a drift that bends."""
 _AROUND = 16  # bins on both sides whose median is the floor of a spectrum
 _FEWEST = 64  # samples of a spectrum
 _TURNED = np.radians(0.05)
@@ -343,7 +340,7 @@ _TURNED = np.radians(0.05)
 
 @dataclass(frozen=True)
 class StaticRun:
-    """Mean of each channel over a static run, rad/s, shape (k,), and its duration, s."""
+    """Mean of each channel over a static run, rad/s, shape (k,), and the run's duration, s."""
 
     run: Run
     index: int
@@ -372,22 +369,22 @@ def reduce_static(blocks: Iterable[Recording], manifest: Manifest, index: int) -
     count = cells.moments[:, CONSTANT, CONSTANT]
     sums = cells.moments[:, CONSTANT, COLUMNS:]
     fastest = max((run.table_rate for run in manifest.runs), default=0.0)
-    motion = _turn(cells) or _line(cells, channels.names, 1.1 * fastest) or _step(cells, channels.names)
+    motion = _find_turn(cells) or _find_line(cells, channels.names, 1.1 * fastest) or _find_step(cells, channels.names)
     if motion:
         raise DataError(f"{place}: a static run that moves: column {motion}; expected a record at rest")
     mean = sums.sum(axis=0) / count.sum() + cells.offset
     return StaticRun(manifest.runs[index], index, channels.names, mean, cells.samples, cells.duration)
 
 
-def _turn(cells: Cells) -> str | None:
+def _find_turn(cells: Cells) -> str | None:
     if cells.series_angle is None:
         return None
     reach = float(np.ptp(np.unwrap(cells.series_angle)))
     return f"table_angle goes over {np.degrees(reach):.3g} deg" if reach > _TURNED else None
 
 
-def _line(cells: Cells, names: tuple[str, ...], fastest: float) -> str | None:
-    """What a channel shows as a line: Earth rate at the net rate, tilt at the table rate of a rig that turns."""
+def _find_line(cells: Cells, names: tuple[str, ...], fastest: float) -> str | None:
+    """Return what a channel shows as a line: Earth rate at the net rate, or tilt at the table rate, if it turns."""
     for name, values in zip(names, cells.series, strict=True):
         series = even_series(cells, detrended(cells.series_time, values))
         count = len(series)
@@ -412,8 +409,8 @@ def _line(cells: Cells, names: tuple[str, ...], fastest: float) -> str | None:
     return None
 
 
-def _step(cells: Cells, names: tuple[str, ...]) -> str | None:
-    """What a channel's means over one second do besides noise: a step, or a drift that is none of a warm gyroscope."""
+def _find_step(cells: Cells, names: tuple[str, ...]) -> str | None:
+    """Return what the means over 1 s show: a step, or a larger drift than that of a warm gyroscope; None if neither."""
     count = cells.moments[:, CONSTANT, CONSTANT]
     means = cells.moments[:, CONSTANT, COLUMNS:] / count[:, None]
     squares = np.einsum("ckk->ck", cells.moments[:, COLUMNS:, COLUMNS:])
@@ -437,50 +434,50 @@ def _step(cells: Cells, names: tuple[str, ...]) -> str | None:
     return None
 
 
-# One run of a centrifuge test, streamed: its blocks to lines with their noise.
+# Loaded runs: blocks to lines with their noise.
 
 
 _MOST_LOST = 0.5  # share of a run that gaps and bad samples may take
-_SPECTRUM_HALF_WIDTH = 24  # resolutions of the run, on both sides of a line, that are drawn
-_SPECTRUM_POINTS = 4  # drawn in a resolution
+_SPECTRUM_HALF_WIDTH = 24  # resolutions of the run drawn on both sides of a line
+_SPECTRUM_POINTS = 4  # points drawn in a resolution
 
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """Lines of a loaded run.
+    """The lines of a loaded run.
 
     Attributes
     ----------
     run, index, channels
-        Of the manifest; columns as `dtg_x`, [`dtg_y`,] `fog`.
+        Run and index of the manifest; columns as `dtg_x`, [`dtg_y`,] `fog`.
     force
         Specific force, m/s^2.
     line, second, third
-        ``A + i B`` at chi, 2 chi, 3 chi, rad/s, shape (k,); phase of chi as the contract has it.
+        ``A + i B`` at chi, 2 chi, 3 chi, rad/s, shape (k,), with chi as in `manifest`.
     covariance
         ``E[z z*]`` of the errors of `line`, (rad/s)^2, shape (k, k).
     freedom
-        Degrees of freedom of that estimate.
+        Degrees of freedom of the covariance.
     blocks
-        Number of blocks behind it; 0 where the run was too short and white noise was assumed.
+        Number of blocks that it comes from; 0 where the run is too short and white noise is assumed.
     room, room_covariance
         Line at the net rate and its ``E[z z*]``.
     mean
-        Of each channel, rad/s, shape (k,).
+        Mean of each channel, rad/s, shape (k,).
     rates
-        As measured.
+        Measured rates.
     encoder
         Whether chi was measured.
     duration, periods, samples
-        Of the part used.
+        Of the part that is used.
     whole_periods
-        What the source's sums give, where they were asked for.
+        Lines by whole-period sums, where they were asked for.
     spectrum
         Rates about the line, rad/s, (f,), and height of each channel and residual, rad/s, (2k - 1, f); or None.
     fog_factor
-        Of the FOG's line as each axis saw it, shape (k - 1,); None where the test shows no difference.
+        Factors of the FOG's line as each axis sees it, shape (k - 1,); None where the test shows no difference.
     common
-        What a standard uncertainty of each correction does to the axes' lines, rad/s, shape (c, k - 1); or None.
+        Change of the axes' lines by a standard uncertainty of each correction, rad/s, shape (c, k - 1); or None.
     """
 
     run: Run
@@ -525,7 +522,7 @@ def reduce_run(
     manifest, index
         The test, and which of its runs this is, counted from 0.
     static
-        Means of the static records of its power cycle, rad/s, shape (k,); given, the source's sums are formed too.
+        Means of the static records of its power cycle, rad/s, shape (k,); with them, whole-period sums are made too.
     spectrum
         Whether to keep the spectrum around the table line.
 
@@ -560,7 +557,7 @@ def reduce_run(
         if np.ptp(values) == 0
     ]
     encoder = cells.series_angle is not None
-    # The regression's phase is that of the cells' rate in the middle of the run; chi starts at 0 without encoder.
+    # The regression's phase is that of the cells' rate at the middle of the run; chi starts at 0 without encoder.
     turn = np.exp(1j * solution.table_shift * (solution.middle - cells.start))
     whole = None
     if sums is not None and static is not None:
@@ -591,7 +588,7 @@ def reduce_run(
 
 
 def _cells(pieces: Iterable[CellSamples], run: Run, place: str) -> Cells:
-    """Return a run averaged over cells; a run that is too slow or too short is refused."""
+    """Return the sums of a run over cells; refuse a run with too few samples, or shorter than a period."""
     try:
         cells = compress(pieces, run.sense * run.table_rate, run.net_rate)
     except TooSlowError as error:
@@ -613,7 +610,7 @@ def _check_gaps(cells: Cells, place: str) -> None:
 
 
 def _check_resolution(cells: Cells, run: Run, place: str) -> None:
-    """Check that the run is long enough to tell table line and Earth-rate line apart."""
+    """Refuse a run that is too short to separate table line and Earth-rate line."""
     net = abs(run.net_rate)
     for times in (1, 2):
         beat = abs(times * run.table_rate - net)
@@ -638,7 +635,7 @@ def _whole_periods(sums: PeriodSums, static: Array, cells: Cells, used: Cells, p
 
 
 def _spectrum(cells: Cells, rates: Rates) -> tuple[Array, Array]:
-    """Hann spectra around the table line: every channel, then what is left of each without the FOG."""
+    """Return Hann spectra around the table line: of every channel, then of each axis without the FOG."""
     width = 2 * np.pi / cells.duration
     points = _SPECTRUM_HALF_WIDTH * _SPECTRUM_POINTS
     shifts = np.arange(-points, points + 1) * width / _SPECTRUM_POINTS
@@ -646,7 +643,7 @@ def _spectrum(cells: Cells, rates: Rates) -> tuple[Array, Array]:
     series = [even_series(cells, detrended(cells.series_time, values)) for values in cells.series]
     spectra = [hann_spectrum(cells.series_step, values, rate + shifts) for values in series]
     heights = [np.abs(spectrum) for spectrum in spectra]
-    # Y sees what is fixed in the arm a quarter turn after X, which in a spectrum at positive rates is a factor -i.
+    # Y sees vectors fixed in the arm a quarter turn after X; in a spectrum at positive rates that is a factor -i.
     quarter = -1j if rates.table_rate > 0 else 1j
     heights += [np.abs(s - (1.0, quarter)[i] * spectra[-1]) for i, s in enumerate(spectra[:-1])]
     return rate + shifts, np.array(heights)

@@ -1,7 +1,7 @@
 """A simulated centrifuge test: every term of the error model, for a plan, a manifest or levels.
 
-Written from the equations of motion in the time domain, apart from the reduction, which knows lines only. An arm-fixed
-vector stands in the gyroscope's frame at the angle chi (from X, turning to Y), which grows at the table rate; what is
+The equations of motion in the time domain, which the reduction does not share: it knows lines only. A vector fixed in
+the arm stands in the gyroscope's frame at the angle chi (from X, turning to Y), which grows at the table rate; one
 fixed in the room stands there at minus the angle by which the gyroscope has turned. An input axis at the angle psi
 (X: 0, Y: a quarter turn, FOG: its azimuth error) senses the cosine of the angle between.
 """
@@ -30,18 +30,18 @@ from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit, to_si
 from imulab.writers import write_csv
 
-# A simulated centrifuge test: every term of the error model as a named parameter, block by block.
+# The error model, with every term a named parameter.
 
 
 _DEG_H = np.pi / 180 / 3600  # rad/s
 _DEG_ROOT_H = np.pi / 180 / 60  # rad/sqrt(s)
 _PER_G = 1 / STANDARD_GRAVITY  # 1/(m/s^2)
-_BLOCK = 65536  # samples made at once; it bounds memory, and the numbers depend on it
+_BLOCK = 65536  # samples drawn together; it bounds memory, and the drawn numbers depend on it
 
 
 @dataclass(frozen=True)
 class AxisTruth:
-    """One axis of the gyroscope. Its own axis carries the component ``a cos(chi - psi)`` of the specific force.
+    """One axis of the gyroscope. Its component of the specific force is ``a cos(chi - psi)``.
 
     Attributes
     ----------
@@ -50,11 +50,11 @@ class AxisTruth:
     D_x, D_y
         Drift per specific force along X and along Y, rad/s/(m/s^2).
     c1, c2
-        Both change with the magnitude as ``1 + c1 a + c2 a^2``, 1/(m/s^2), 1/(m/s^2)^2.
+        Change of both with the magnitude, ``1 + c1 a + c2 a^2``, 1/(m/s^2), 1/(m/s^2)^2.
     cross_x, cross_y
         D_XZ, D_YZ: per product of specific force along X or Y and along the spin axis, rad/s/(m/s^2)^2.
     quadratic, cubic
-        D_XX, D_XXX: per square and cube of the own component, rad/s/(m/s^2)^2, rad/s/(m/s^2)^3.
+        D_XX, D_XXX: per square and cube of the axis's component, rad/s/(m/s^2)^2, rad/s/(m/s^2)^3.
     scale_error
         k_x: sensed rate is 1 + k_x times the true one.
     out_of_plane
@@ -62,7 +62,7 @@ class AxisTruth:
     differential_flexure, differential_phase
         kappa_d: tilt of this axis against the FOG per specific force, rad/(m/s^2), and where in the frame, rad.
     angle_random_walk
-        rad/sqrt(s).
+        Density of the white noise, rad/sqrt(s).
     drift
         Trend, rad/s^2.
     markov, markov_time
@@ -103,7 +103,7 @@ class FogTruth:
 
 @dataclass(frozen=True)
 class RigTruth:
-    """Centrifuge and place.
+    """Centrifuge and site.
 
     Attributes
     ----------
@@ -116,9 +116,9 @@ class RigTruth:
     earth_rate, earth_phase
         W_N: level component of Earth rate, rad/s, and its phase at the start of a run, rad.
     gravity
-        m/s^2.
+        Local gravity, m/s^2.
     arm_rate_error, table_rate_error
-        True rate over the manifest's, less 1.
+        True rate over the manifest's, minus 1.
     """
 
     tilt: float = 0.0
@@ -136,7 +136,7 @@ class RigTruth:
 
 @dataclass(frozen=True)
 class Truth:
-    """Everything that the simulated test has in it; all zero unless given."""
+    """All parameters of a simulated test; all zero unless stated."""
 
     x: AxisTruth = field(default_factory=AxisTruth)
     y: AxisTruth | None = None
@@ -191,7 +191,7 @@ class Simulation(Shown):
     Attributes
     ----------
     manifest, truth
-        Of the test.
+        The simulated test and its parameters.
     sample_rate
         Hz.
     duration, static_duration
@@ -199,11 +199,11 @@ class Simulation(Shown):
     encoder
         Whether the recordings have a `table_angle` column.
     unit
-        Of the rates in the recordings.
+        Unit of the rates in the recordings.
     ramp
         Duration of a spin-up from rest at the start of every loaded run, s.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
     """
 
     manifest: Manifest
@@ -237,7 +237,7 @@ class Simulation(Shown):
             raise OptionError(f"unit {self.unit!r}: expected a unit of rate")
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return what it is a simulation of, and its runs."""
+        """Return the simulated test in words, and its runs."""
         runs = self.manifest.runs
         rows = [[run.file, str(run.power_cycle), run.role, str(run.sense)] for run in runs]
         return f"simulated centrifuge test of {len(runs)} runs", ["file", "power cycle", "role", "sense"], rows
@@ -309,7 +309,7 @@ class Simulation(Shown):
         return Recording(columns=columns, units=units, metadata=dict(self.manifest.sensor), name=run.file)
 
     def _noise(self, walk: float, rng: np.random.Generator, count: int) -> Array:
-        """White noise of the rate whose integral is an angle random walk, rad/s."""
+        """Return white noise of the rate whose integral is an angle random walk, rad/s."""
         if not walk:
             return np.zeros(count)
         noise: Array = walk * np.sqrt(self.sample_rate) * rng.standard_normal(count)
@@ -324,7 +324,7 @@ class _Motion:
         arm = run.sense * run.arm_rate * (1 + rig.arm_rate_error)
         table = run.sense * run.table_rate * (1 + rig.table_rate_error)
         ramp = simulation.ramp if run.role == "loaded" else 0.0
-        # Angle turned in units of the steady rate: a parabola while spinning up, then a line.
+        # Turned angle in units of the steady rate: a parabola during spin-up, then a line.
         turned = time if not ramp else np.where(time < ramp, time**2 / (2 * ramp), time - ramp / 2)
         share: Array | float = 1.0 if not ramp else np.minimum(time / ramp, 1.0)
         self.time = time
@@ -337,7 +337,7 @@ class _Motion:
 
 
 def _common(motion: _Motion, psi: float, out_of_plane: float, rig: RigTruth) -> Array:
-    """Rate of the body along an input axis at the angle psi, rad/s."""
+    """Return the rate of the body along an input axis at the angle psi, rad/s."""
     tilted = rig.tilt * np.cos(motion.chi + rig.tilt_phase - psi)
     bent = rig.flexure * motion.force * np.cos(motion.chi + rig.flexure_phase - psi)
     rate: Array = (
@@ -374,7 +374,7 @@ def _fog(motion: _Motion, fog: FogTruth, rig: RigTruth) -> Array:
 def _markov(
     axis: AxisTruth, sample_rate: float, rng: np.random.Generator, count: int, state: Array, slot: int
 ) -> Array:
-    """First-order Gauss-Markov noise, continued from block to block through `state`."""
+    """Return first-order Gauss-Markov noise, continued from block to block through `state`."""
     from scipy.signal import lfilter
 
     decay = np.exp(-1 / (sample_rate * axis.markov_time))
@@ -385,7 +385,7 @@ def _markov(
     return noise
 
 
-# A simulated test as people ask for it: of a plan or manifest, or of levels and rates.
+# The call that simulates a plan, a manifest, or levels and rates.
 
 
 _LEVELS, _RADIUS, _NET_RATE = "1,2,5,10,15,20", "2 m", "40 deg/s"
