@@ -349,7 +349,7 @@ def any_settings(rng, method):
     )
 
 
-def of_axis(settings, axis):
+def axis_suffix(settings, axis):
     """The same for one of the axes."""
 
     def row(value):
@@ -407,7 +407,7 @@ def compare(rng, method):
     ]
     share = len(together._state) // 3
     for axis in range(3):
-        alone = Stream(of_axis(settings, axis))
+        alone = Stream(axis_suffix(settings, axis))
         fused = alone.process(z[:, axis], flags=flags, weights=weights, still=still)
         np.testing.assert_array_equal(np.concatenate([part.rate[:, axis] for part in parts]), fused.rate[:, 0])
         if flags:

@@ -455,7 +455,7 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
         curves=curves,
         turning=turning,
         cross=cross,
-        given=given_model,
+        given_model=given_model,
         warnings=tuple(warnings),
     )
 

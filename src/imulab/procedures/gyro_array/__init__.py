@@ -1,12 +1,6 @@
-"""Gyro array: several gyroscopes on one axis, or three, fused into one better.
-
-And the words that the options of its commands take.
-"""
+"""Gyro array: several gyroscopes on one axis, or three, fused into a better one. Here are the options' values."""
 
 from __future__ import annotations
-
-# The words that the options of an array's commands take.
-
 
 EXPERIMENTS = {"static": (100.0, 2000.0), "dynamic": (50.0, 100.0), "moving": (100.0, 120.0)}
 """Sampling rate, Hz, and duration, s, of each."""

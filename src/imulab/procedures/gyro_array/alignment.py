@@ -1,13 +1,11 @@
-"""Biases and noise of an array at rest, alignment of an array's elements against their consensus.
-
-Elements that answer late.
+"""Biases and noise of an array at rest, and its elements' alignment and latency in motion.
 
 All readings are one motion seen n times. The largest eigenvectors of their covariance, whitened by the noise at rest,
-span what the elements sense of it (maximum likelihood of the factor model); the frame within is fixed by a convention.
+span what the elements sense of it (maximum likelihood of the factor model); a convention fixes the frame within it.
 
-An element whose readings come later by tau than the others' reads ``A w(t - tau) = A w - tau A dw/dt + ...``: what the
-consensus leaves of it goes with the derivative of the consensus. The regression on that gives tau to a fraction of a
-sample, and is repeated on readings moved by it (cubic splines) until it stands still.
+An element whose readings come later by tau than the others' reads ``A w(t - tau) = A w - tau A dw/dt + ...``: its
+residual from the consensus is proportional to the derivative of the consensus. The regression on that gives tau to a
+fraction of a sample. It is repeated on readings moved by tau (cubic splines) until tau no longer changes.
 """
 
 from __future__ import annotations
@@ -30,16 +28,16 @@ from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.mean_noise import mean_uncertainties
 
-# Biases and noise of an array at rest, and how uncertain the biases are.
+# At rest: biases with their uncertainty, and noise.
 
 
 _CANDIDATES = ("N", "NK", "NB", "NG", "NBK")
-"""Models of the noise: a stretch at rest is too short to tell more."""
+"""Noise models: a stretch at rest is too short to determine more."""
 
 
 @dataclass(frozen=True)
 class AtRest:
-    """What the recording at rest says: biases, their uncertainties, curves and noise per axis and element; rad/s."""
+    """Biases, their uncertainties, curves and noise of a recording at rest, by axis and element; rad/s."""
 
     bias: Array
     curves: tuple[tuple[DeviationCurve, ...], ...]
@@ -53,12 +51,12 @@ class AtRest:
 def at_rest(
     readings: Array, rate: float, elements: Elements, record: Calibration | None, head: Mapping[str, str]
 ) -> tuple[AtRest, list[str]]:
-    """Return what readings at rest say, shape (m, axes, n), rad/s, at a rate, Hz, and what there is to say of `record`.
+    """Return biases and noise of readings at rest, shape (m, axes, n), rad/s, at a rate, Hz, and notes.
 
     Raises
     ------
     RecordError
-        The noise record is none, or lacks an element.
+        The record is no noise record, or lacks an element.
     """
     n, duration = elements.count, len(readings) / rate
     columns = [readings[:, a, i] for a in range(len(elements.axes)) for i in range(n)]
@@ -77,7 +75,7 @@ def at_rest(
 
 
 def unseen(noises: Mapping[str, ColumnNoise], rest: AtRest) -> list[str]:
-    """Return by how much noise that is slower than a stretch shows could raise the uncertainties of the biases."""
+    """Return a note by how much noise too slow to show could enlarge the uncertainties of the biases."""
     most = max((each.unseen(rest.duration) for each in noises.values()), default=1.0)
     if most == 1:
         return []
@@ -89,29 +87,29 @@ def unseen(noises: Mapping[str, ColumnNoise], rest: AtRest) -> list[str]:
     ]
 
 
-# Alignment of an array's elements against their consensus, from a recording in motion.
+# In motion: alignment of the elements against their consensus.
 
 
-_BLOCKS = 20  # parts of a motion by whose scatter uncertainties are known (jackknife)
-_WORST = 0.05  # uncertainty, relative and in rad, of an alignment that is of use
-_VISIBLE = 25.0  # variance of the motion over that of the noise, in the direction where it is least
+_BLOCKS = 20  # parts of a motion whose scatter gives the uncertainties (jackknife)
+_WORST = 0.05  # largest uncertainty of a useful alignment, relative and in rad
+_VISIBLE = 25.0  # least variance of the motion over that of the noise, in the direction of least motion
 _NEAR_PERMUTATION = 0.35  # rad
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """What each element senses of the array's rate, ``z_i = A_i w + b_i``.
+    """What each element senses of the array's rate: ``z_i = A_i w + b_i``.
 
     Attributes
     ----------
     sensing, standard_uncertainty
         A_i and its standard uncertainty, shape (n, axes, axes).
     residual
-        Rms of what the consensus leaves of each element, rad/s, shape (n, axes).
+        Rms of each element's residual from the consensus, rad/s, shape (n, axes).
     gauge
-        The convention that fixes the frame.
+        Convention that fixes the frame.
     latency, latency_uncertainty
-        By how much each element's readings come later than the median's (than the truth), s, shape (n,), or None.
+        Delay of each element's readings relative to the median's (or the truth), s, shape (n,), or None.
     """
 
     sensing: Array
@@ -123,7 +121,7 @@ class Alignment:
 
 
 def align(readings: Array, white: Array, truth: Array | None = None, *, strict: bool = True) -> Alignment:
-    """Estimate what each element senses of the array's rate.
+    """Return what each element senses of the array's rate.
 
     Without `truth`, element 1 in its nominal orientation gives the directions and the mean over all elements of
     ``P_i' A_i`` is the unit matrix, P_i the nominal orientation of element i (a signed permutation where it is near
@@ -132,13 +130,13 @@ def align(readings: Array, white: Array, truth: Array | None = None, *, strict: 
     Parameters
     ----------
     readings
-        In motion, shape (m, axes, n), rad/s; their means are taken off.
+        Readings in motion, shape (m, axes, n), rad/s; their means are subtracted.
     white
         Standard deviation of a sample at rest, shape (axes, n).
     truth
         True rate, shape (m, axes), or None.
     strict
-        Whether to refuse what is not fixed to 5 %.
+        Whether to refuse an alignment that is not determined to 5 %.
 
     Raises
     ------
@@ -147,7 +145,7 @@ def align(readings: Array, white: Array, truth: Array | None = None, *, strict: 
     """
     m, axes, n = readings.shape
     stacked = np.moveaxis(readings, 2, 1).reshape(m, n * axes)  # element by element
-    # Biases may have changed since the array was at rest: what does not vary says nothing here.
+    # Biases may have changed since the array was at rest: only variations count here.
     stacked = stacked - stacked.mean(axis=0)
     truth = None if truth is None else truth - truth.mean(axis=0)
     sigma = white.T.reshape(n * axes)
@@ -161,7 +159,7 @@ def align(readings: Array, white: Array, truth: Array | None = None, *, strict: 
     size = n * axes
     weakest = np.linalg.eigvalsh(total[:size, :size] / np.outer(sigma, sigma))[-axes] / m
     if strict and (not np.isfinite(uncertainty).all() or uncertainty.max() > _WORST or weakest < _VISIBLE):
-        # Its own first element is nearest to the frame: the axis about which it moves least against its noise.
+        # In its first element's frame, the axis with the least motion relative to its noise.
         worst = int(np.argmin(readings[:, :, 0].std(axis=0) / white[:, 0]))
         axis = f" about {'xyz'[worst]}" if axes == 3 else ""
         raise ObservabilityError(
@@ -177,7 +175,7 @@ def align(readings: Array, white: Array, truth: Array | None = None, *, strict: 
 
 
 def _moments(stacked: Array, truth: Array | None) -> Array:
-    """Second moments of readings, with those of the truth appended where there is one."""
+    """Return the second moments of the readings, with those of the truth appended if there is one."""
     columns = stacked if truth is None else np.hstack([stacked, truth])
     moments: Array = columns.T @ columns
     return moments
@@ -220,21 +218,21 @@ def nominal_orientation(matrix: Array) -> Array:
     return permutation if near else rotation
 
 
-# Elements of an array that answer late, and their alignment in spite of it.
+# Latency: elements whose readings come late, and alignment with the delay removed.
 
 
-_STEPS = 8  # of Gauss and Newton
+_STEPS = 8  # most Gauss-Newton steps
 _HARMLESS = 1e-4  # s; 5 ppm of scale factor in motion at 5 Hz
-_SETTLED = 0.02  # standard uncertainties
-_BESIDE = 4  # samples beside a gap that a spline does not follow
-_FEWEST = 100  # samples that tell a latency
+_SETTLED = 0.02  # standard uncertainties of a step that ends the search
+_BESIDE = 4  # samples beside a gap where a spline is not trusted
+_FEWEST = 100  # samples that show a latency
 _LONGEST = 0.1  # s, of a step
 
 
 def align_in_time(time: Array, readings: Array, white: Array, truth: Array | None = None) -> Alignment:
-    """Align elements as `align` does, after those that are late were moved by their latency.
+    """Return the alignment of elements as `align` does, with late readings moved by their latency.
 
-    Where no latency is clear (four standard uncertainties) and above 0.1 ms, the readings are taken as they are.
+    Where no latency is clear (four standard uncertainties) and above 0.1 ms, no readings are moved.
 
     Parameters
     ----------
@@ -251,18 +249,18 @@ def align_in_time(time: Array, readings: Array, white: Array, truth: Array | Non
     count = readings.shape[2]
     delay, u = np.zeros(count), np.full(count, np.inf)
     moved, fine = readings, np.ones(len(time), dtype=np.bool_)
-    # Late elements alone can make an alignment uncertain: only the last one must be good enough.
+    # Late elements can make an alignment uncertain: only the last one has to be good enough.
     alignment = align(readings, white, truth, strict=False)
     for _ in range(_STEPS):
         if fine.sum() < _FEWEST or not np.isfinite(alignment.sensing).all():
             break
-        step, u = _regressed(time[fine], moved[fine], white, alignment, None if truth is None else truth[fine])
+        step, u = _fit_latency(time[fine], moved[fine], white, alignment, None if truth is None else truth[fine])
         if truth is None:
             step = step - np.median(step)
         delay = delay + np.clip(step, -_LONGEST, _LONGEST)
         if moved is readings and not _is_late(delay, u).any():
             break
-        moved, fine = _without_delays(time, readings, delay)
+        moved, fine = _remove_delays(time, readings, delay)
         alignment = align(moved[fine], white, None if truth is None else truth[fine], strict=False)
         if np.abs(step).max() < _SETTLED * u.min():
             break
@@ -275,13 +273,13 @@ def align_in_time(time: Array, readings: Array, white: Array, truth: Array | Non
 
 
 def _is_late(delay: Array, u: Array) -> NDArray[np.bool_]:
-    """Which latencies are clear, and not too small to matter."""
+    """Return which latencies are clear, and large enough to matter."""
     late: NDArray[np.bool_] = np.abs(delay) > np.maximum(READINGS_LATE.limit * u, _HARMLESS)
     return late
 
 
 def latency_notes(alignment: Alignment, names: Sequence[str]) -> list[str]:
-    """Say which elements are late, under these names."""
+    """Return a message on the late elements, under these names."""
     if alignment.latency is None or alignment.latency_uncertainty is None:
         return []
     late = np.flatnonzero(_is_late(alignment.latency, alignment.latency_uncertainty)).tolist()
@@ -298,10 +296,10 @@ def latency_notes(alignment: Alignment, names: Sequence[str]) -> list[str]:
     ]
 
 
-def _regressed(
+def _fit_latency(
     time: Array, readings: Array, white: Array, alignment: Alignment, truth: Array | None
 ) -> tuple[Array, Array]:
-    """Latency that is left of each element, s, and its standard uncertainty by jackknife over 20 stretches."""
+    """Return the remaining latency of each element, s, and its standard uncertainty by jackknife over 20 stretches."""
     weight = alignment.sensing / white.T[:, :, None] ** 2
     centred = readings - readings.mean(axis=0)
     if truth is None:
@@ -326,12 +324,12 @@ def _regressed(
 
     without = delays(total - parts)
     spread = np.sqrt((_BLOCKS - 1) / _BLOCKS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
-    # The element that is the median has none of its own: it is known as well as the others.
+    # The median element has no latency of its own, and is known as well as the others.
     return delays(total), np.maximum(spread, np.median(spread))
 
 
-def _without_delays(time: Array, readings: Array, delay: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return readings earlier by each element's delay, and which rows are interpolated, not made up, (m,)."""
+def _remove_delays(time: Array, readings: Array, delay: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return readings moved earlier by each element's delay, and which rows are interpolated between samples, (m,)."""
     from scipy.interpolate import CubicSpline
 
     moved = np.empty_like(readings)

@@ -1,7 +1,4 @@
-"""What fusing really buys.
-
-Every method over one recording or over the source's experiments, with errors and bandwidths.
-"""
+"""Comparison of all methods of fusion over one recording, or over the source's experiments: errors and bandwidths."""
 
 from __future__ import annotations
 
@@ -35,7 +32,7 @@ from imulab.procedures.gyro_array.elements import (
     fixed_weights,
     on_one_clock,
 )
-from imulab.procedures.gyro_array.figures import exhibits_of_comparison
+from imulab.procedures.gyro_array.figures import comparison_exhibits
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, memory_text, open_stream
 from imulab.procedures.gyro_array.schema import MethodRow
@@ -45,29 +42,29 @@ from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance
 from imulab.report.traces import Exhibits
 
-# What a comparison compares with: the gyros of an array that work, and the least noise of any fixed weights.
+# What a comparison is made against: the working gyros, and the least noise of any fixed weights.
 
 
-_IN_USE = 0.5  # share of the time: an element that is used for less is left out of a comparison
+_IN_USE = 0.5  # share of the time: a gyro in use for less is left out of a comparison
 _FEWEST = 2  # elements with a common time
 
 
 @dataclass(frozen=True)
 class Singles:
-    """The gyros of one axis on their own.
+    """The single gyros of one axis.
 
     Attributes
     ----------
     working
-        Whether each gyro counts, shape (n,): never stuck nor jumped, finite and in use under `robust` in half of the
-        samples or more.
+        Whether each gyro counts, shape (n,): never stuck or jumped, finite and in use under `robust` in at least half
+        of the samples.
     noise
-        Mean over these of the standard deviation of the rate error, in the samples in which each was in use.
+        Mean of their standard deviations of the rate error, each over the samples in which the gyro was in use.
     limit
-        (1' C^-1 1)^-1/2, C the covariance of the noise from sample to sample of all gyros that are in use in half of
-        the samples or more; 0 where it is unknown.
+        (1' C^-1 1)^-1/2, C the covariance of the sample-to-sample noise of all gyros in use in at least half of the
+        samples; 0 where it is unknown.
     middle
-        The gyro with the median noise.
+        Number of the gyro with the median noise.
     """
 
     working: np.ndarray
@@ -77,10 +74,10 @@ class Singles:
 
 
 def single_gyros(error: Array, flags: np.ndarray | None) -> Singles:
-    """Return what the gyros of one axis do on their own.
+    """Return noise and limit of the single gyros of one axis.
 
-    A gyro that failed says nothing of what fusing buys: the mean of all would be the size of the fault. Where none
-    works, or health is not known, every gyro with a finite reading counts.
+    A gyro that failed does not count: with it, the mean would be the size of the fault. Where none works, or health is
+    not known, every gyro with a finite reading counts.
 
     Parameters
     ----------
@@ -112,7 +109,7 @@ def single_gyros(error: Array, flags: np.ndarray | None) -> Singles:
 
 
 def _limit(error: Array) -> float:
-    """Limit of errors with nan where a gyro was out of use, each pair over the samples that it shares."""
+    """Return the limit for errors with NaN where a gyro was not in use, each pair over the samples that it shares."""
     step = np.diff(error, axis=0)
     known = np.isfinite(step)
     step = np.where(known, step, 0.0)
@@ -128,15 +125,15 @@ def _limit(error: Array) -> float:
     return limit if math.isfinite(limit) else 0.0
 
 
-# Response of a method of fusion to a small white probe that all gyros see.
+# Response of a method to a small white probe that is added to all gyros.
 
 
-_PROBE_SAMPLES = 16_384  # by which the response of a method is measured
+_PROBE_SAMPLES = 16_384  # samples over which the response of a method is measured
 _SEGMENT = 256  # samples of a spectrum
 _HALF_POWER = math.sqrt(0.5)
-_FROZEN, _UNUSUAL = 0.5, 20.0  # s; times as long as usual
+_FROZEN, _UNUSUAL = 0.5, 20.0  # a gyro is frozen from so many s, and times as long as usual
 _FOLLOWED = 0.95  # of the time in which an element must move to be counted
-_FEWEST_PAIRS = 4  # segments that a response has a scatter by
+_FEWEST_PAIRS = 4  # fewest segments whose scatter gives the uncertainty of a response
 
 
 @dataclass(frozen=True)
@@ -157,16 +154,16 @@ def responses(
 ) -> list[Response]:
     """Return the response of each axis.
 
-    The method runs twice, with and without the probe: |S_pr| / S_pp of probe p and response r (Welch, windowed halves
-    that overlap). The probe is as large as the gyros' noise. A gyro does not see it while it repeats itself for longer
-    than the steps of its output make it (`_frozen`), as a dead gyro sees no motion.
+    The method runs with and without the probe: |S_pr| / S_pp of probe p and response r (Welch, windowed segments that
+    overlap by half). The probe is as large as the gyros' noise. It is not added to a gyro that repeats a reading for
+    longer than the steps of its output explain (`_frozen`), because a dead gyro sees no motion.
 
     Parameters
     ----------
     readings
         As logged, shape (m, axes, n); the first 16,384 samples are used.
     record
-        The calibration in `options`, where there is one: the probe goes through the elements' matrices.
+        Calibration in `options`, if any: the probe then goes through the elements' matrices.
     """
     readings = readings[:_PROBE_SAMPLES]
     step = np.diff(readings, axis=0)
@@ -202,9 +199,9 @@ def responses(
 
 
 def _noise(step: Array) -> Array:
-    """Typical noise of the gyros on each axis, from the median of their changes, shape (axes,); 1 where there is none.
+    """Return the usual noise of the gyros on each axis, from the median of their changes, shape (axes,); 1 if none.
 
-    The median gyro's: neither spikes nor a turn during a part of the recording make the probe larger.
+    It is that of the median gyro: neither spikes nor a turn in a part of the recording enlarge the probe.
     """
     sigma = np.ones(step.shape[1])
     for a in range(step.shape[1]):
@@ -215,10 +212,10 @@ def _noise(step: Array) -> Array:
 
 
 def _frozen(step: Array, rate: float) -> np.ndarray:
-    """Samples at which a gyro repeats itself, shape (m, axes, n), by its changes from sample to sample.
+    """Return whether a gyro repeats its reading at a sample, shape (m, axes, n), from its changes between samples.
 
-    That is for half a second or more, and for 20 times as long as it usually does: the output of a healthy gyro whose
-    steps are as large as its noise repeats itself, too.
+    A repeat lasts half a second or more, and 20 times as long as usual for that gyro: a healthy gyro whose steps are as
+    large as its noise repeats readings too.
     """
     same = np.concatenate([np.zeros((1, *step.shape[1:]), dtype=bool), step == 0])
     frozen = np.zeros(same.shape, dtype=bool)
@@ -231,9 +228,9 @@ def _frozen(step: Array, rate: float) -> np.ndarray:
 
 
 def _transfer(probe: Array, response: Array) -> tuple[Array, float]:
-    """Size of the transfer function, by half-overlapping windowed segments (Welch), and its u at the lowest frequency.
+    """Return the size of the transfer function, by windowed segments that overlap by half (Welch), and u at its start.
 
-    The uncertainty is a jackknife that leaves out pairs of segments, which overlap.
+    The uncertainty is a jackknife that leaves out pairs of overlapping segments.
     """
     size = min(_SEGMENT, len(probe))
     window = np.hanning(size)
@@ -252,31 +249,31 @@ def _transfer(probe: Array, response: Array) -> tuple[Array, float]:
     return gain, float(np.sqrt((len(pairs) - 1) / len(pairs) * ((without - without.mean()) ** 2).sum()))
 
 
-# What fusing really buys: every method over one recording, with errors, limit, Allan curves and bandwidth.
+# The comparison: errors, limit, Allan curves and bandwidth of every method.
 
 
 _TRACE = 800  # points of a drawing
 _QUIET_FACTOR = 3.0  # times the usual scatter up to which a window is quiet
-_SHORTEST_QUIET = 5.0  # s of rest by which methods are compared where no truth is known
-_FILTERED = 0.9  # of half the sampling rate
-_BEYOND_LIMIT = 0.97  # of the least noise that weights alone can reach
+_SHORTEST_QUIET = 5.0  # s of rest over which methods are compared where no truth is known
+_FILTERED = 0.9  # of half the sampling rate: a lower bandwidth is filtering
+_BEYOND_LIMIT = 0.97  # of the least noise that weights can reach: less noise is filtering
 _FOLLOWS, _FINEST = 0.95, 0.01  # share of a motion that a method must follow; least uncertainty of it that is shown
-_NOTHING = 1e-9  # of a gyro's noise
-_HALVES = 2 * FEWEST_ROBUST  # elements of which each half can be fused robustly
+_NOTHING = 1e-9  # of a gyro's noise: less is rounding
+_HALVES = 2 * FEWEST_ROBUST  # elements of which both halves can be fused robustly
 
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Drawn):
-    """Every method over one recording.
+    """Comparison of every method over one recording.
 
     Attributes
     ----------
     figures
-        Method to one `MethodRow` per axis, or to the reason why it cannot run.
+        By method: a `MethodRow` for each axis, or the reason why the method cannot run.
     record
-        All of it with curves and traces, as a record that a report can be drawn from.
+        Figures, curves and traces as a record, from which a report is made.
     warnings
-        What a reader must know.
+        Messages for the user.
     """
 
     figures: dict[str, tuple[MethodRow, ...] | str]
@@ -288,7 +285,7 @@ class Comparison(Drawn):
 
     def exhibits(self) -> Exhibits:
         """Return what its report shows."""
-        return exhibits_of_comparison(self.record)
+        return comparison_exhibits(self.record)
 
     def __repr__(self) -> str:
         lines = [f"Comparison of {len(self.figures)} methods, rate std in {' '.join(self.elements.units)}"]
@@ -305,7 +302,7 @@ def compare_methods(
     memory: str | float = "growing",
     count_from: int = 1,
 ) -> Comparison:
-    """Run all seven methods over a recording; memory and `count_from` are memory and start of `FuseOptions`.
+    """Return all seven methods over a recording; memory and `count_from` are memory and start of `FuseOptions`.
 
     The truth is the column ``truth_rate`` (or ``truth_rate_x`` ..); without it the unit must be still, or still for a
     stretch of 5 s or more: the figures are then of the longest such stretch, and the truth there is 0. With six gyros
@@ -323,7 +320,7 @@ def compare_methods(
     rate, notes = sampling_rate(recording)
     warnings = [*(f"{recording.name}: {note}" for note in recording.notes), *notes]
     logged = elements.readings(recording)
-    readings, aligned = _corrected(logged, recording, elements, calibration)
+    readings, aligned = _correct_readings(logged, recording, elements, calibration)
     for a, row in enumerate(elements.names):
         if not np.isfinite(logged[:, a]).any():
             raise DataError(f"{recording.name}: columns {row[0]} to {row[-1]}: expected finite readings, found none")
@@ -342,7 +339,7 @@ def compare_methods(
     options = partial(FuseOptions, memory=memory, start=count_from, rate=rate)
     runs = _run_methods(recording, elements, logged, readings, options, calibration, slice(start, stop))
     figures, data = _evaluate(recording, elements, runs, readings, reference, rate, slice(start, stop))
-    warnings += _filtering(figures, runs.response, rate)
+    warnings += _warn_filtering(figures, runs.response, rate)
     if not isinstance(figures["feedback"], str):
         warnings += [type(line)(f"{recording.name}: {line}") for line in feedback_notes(elements.count, rate)]
     record = Calibration(
@@ -374,7 +371,7 @@ def compare_methods(
 
 @dataclass(frozen=True)
 class _Runs:
-    """What each method made of a recording, the difference of its halves and its response, or why it cannot run."""
+    """By method: rates, difference of the halves, response, or the reason why it cannot run."""
 
     rates: dict[str, Fused] = field(default_factory=dict)
     halves: dict[str, list[float | None]] = field(default_factory=dict)
@@ -386,7 +383,7 @@ def _run_methods(
     recording: Recording, elements: Elements, logged: Array, readings: Array, options: Callable[..., FuseOptions],
     calibration: Calibration | None, part: slice,
 ) -> _Runs:  # fmt: skip
-    """Run all methods over a recording; halves and response are of a part of it."""
+    """Return the results of all methods over a recording; halves and response are of a part of it."""
     runs = _Runs()
     lost = ~np.isfinite(readings).any(axis=2)
     for method in METHODS:
@@ -454,7 +451,7 @@ def rate_figures(error: Array, rate: float) -> tuple[float, float, float, float]
 def _figures(error: Array, rate: float, single: Singles, bandwidth: float, split_half: float | None) -> MethodRow:
     std, largest, angle_std, angle_max = rate_figures(error, rate)
     noise = float(np.diff(error[np.isfinite(error)]).std() / math.sqrt(2))
-    if std <= _NOTHING * single.noise:  # rounding alone: it follows a dead gyro
+    if std <= _NOTHING * single.noise:  # rounding only: the method follows a dead gyro
         std = noise = 0.0
     limit = single.limit
     return MethodRow(
@@ -469,10 +466,10 @@ def _figures(error: Array, rate: float, single: Singles, bandwidth: float, split
     )
 
 
-def _corrected(
+def _correct_readings(
     logged: Array, recording: Recording, elements: Elements, calibration: Calibration | None
 ) -> tuple[Array, bool]:
-    """Readings with a record's biases and matrices taken off, shape (m, axes, n); whether there were matrices."""
+    """Return readings without a record's biases and through its matrices, (m, axes, n); whether there are matrices."""
     if calibration is None:
         return logged, False
     known = array_calibration(calibration, elements, recording.name)
@@ -483,11 +480,11 @@ def _corrected(
 
 
 def _longest_quiet(recording: Recording, readings: Array, rate: float) -> tuple[int, int]:
-    """First sample and last + 1 of the longest stretch in which the array's median hardly moves."""
+    """Return the first sample, and the last + 1, of the longest stretch in which the array's median hardly moves."""
     middle = _medians(readings)
     size = max(2, round(rate))
     count = len(middle) // size
-    windows = middle[: count * size].reshape(count, size, -1).std(axis=1)  # nan where the array was lost
+    windows = middle[: count * size].reshape(count, size, -1).std(axis=1)  # NaN where no gyro was left
     whole = np.isfinite(windows).all(axis=1)
     if whole.any():
         usual = np.quantile(windows[whole], 0.1, axis=0)
@@ -496,7 +493,7 @@ def _longest_quiet(recording: Recording, readings: Array, rate: float) -> tuple[
         runs = edges.reshape(-1, 2)
         best = runs[int(np.argmax(runs[:, 1] - runs[:, 0]))] if len(runs) else np.array([0, 0])
         drift = np.abs(np.diff(middle[: count * size].reshape(count, size, -1).mean(axis=1), axis=0))
-        if (best[1] - best[0]) * size >= _SHORTEST_QUIET * rate and not _moving(drift, usual, size, best):
+        if (best[1] - best[0]) * size >= _SHORTEST_QUIET * rate and not _wanders(drift, usual, size, best):
             stop = len(middle) if best[1] == count else int(best[1]) * size
             return int(best[0]) * size, stop
     raise DataError(
@@ -506,7 +503,7 @@ def _longest_quiet(recording: Recording, readings: Array, rate: float) -> tuple[
 
 
 def _medians(readings: Array) -> Array:
-    """Median over the finite readings of each sample, shape (m, axes); nan where there is none."""
+    """Return the median over the finite readings of each sample, shape (m, axes); NaN where there is none."""
     count = np.isfinite(readings).sum(axis=2)
     ordered = np.sort(np.where(np.isfinite(readings), readings, np.nan), axis=2)  # nan goes to the end
     low, high = np.maximum(count - 1, 0) // 2, count // 2
@@ -516,14 +513,14 @@ def _medians(readings: Array) -> Array:
     return middle
 
 
-def _moving(drift: Array, usual: Array, size: int, best: np.ndarray) -> bool:
-    """Whether the means of successive windows wander more than the noise within them allows."""
+def _wanders(drift: Array, usual: Array, size: int, best: np.ndarray) -> bool:
+    """Return whether the means of successive windows wander more than the noise within them explains."""
     steps = drift[int(best[0]) : int(best[1]) - 1]
     return bool(len(steps)) and bool((np.median(steps, axis=0) > 10 * usual / math.sqrt(size) + 0.5 * usual).any())
 
 
 def _half_differences(readings: Array, elements: Elements, options: FuseOptions, kept: slice) -> list[float | None]:
-    """Standard deviation of the difference of the two halves of the array (odd and even elements), each axis."""
+    """Return the standard deviation of the difference of the halves (odd and even elements) on each axis."""
     if elements.count < _HALVES or options.method == "covariance":
         return [None] * len(elements.axes)
     plain = replace(options, calibration=None)
@@ -550,7 +547,7 @@ def _trace(values: Array) -> list[float]:
 
 
 def _health(fused: Fused, recording: Recording) -> dict[str, Any]:
-    """Share of each stretch in which each gyro was in use, and its weight, for the figure over time."""
+    """Return, for the figure over time, the share of each stretch in which each gyro was in use, and its weight."""
     weights, flags = fused.weights, fused.flags
     if weights is None or flags is None:
         return {}
@@ -566,10 +563,10 @@ def _health(fused: Fused, recording: Recording) -> dict[str, Any]:
     }
 
 
-def _filtering(
+def _warn_filtering(
     figures: dict[str, tuple[MethodRow, ...] | str], response: dict[str, list[Response]], rate: float
 ) -> list[str]:
-    """Warn where less noise is bought by not following the motion: its fast part (a low-pass filter), or all of it."""
+    """Return warnings where lower noise comes from not following motion: its fast part (low-pass filter), or all."""
     messages = []
     for method, rows in figures.items():
         if isinstance(rows, str):
@@ -597,7 +594,7 @@ def _filtering(
     return messages
 
 
-# The source's two experiments, over many seeds: every method with and without a calibrated start.
+# The source's two experiments over many seeds: every method with and without a calibrated start.
 
 
 CALIBRATION_TIME = 60.0
@@ -624,7 +621,7 @@ def run_experiment(
     methods: tuple[str, ...] = METHODS,
     progress: Callable[[int], None] = lambda _: None,
 ) -> list[ExperimentRow]:
-    """Run one of the source's set-ups (6 gyros) over many seeds.
+    """Return the results of one of the source's set-ups (6 gyros) over many seeds.
 
     A calibrated start takes the biases, and for `covariance` and `kalman` the noise, from 60 s at rest before the run.
 

@@ -1,4 +1,4 @@
-"""What a unit computes of an array, apart since exports need it without the estimators."""
+"""An array's record on the device: the table of the C core and its test vectors, apart from the estimators."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _SAMPLES = 300  # of the exported self-test
 def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
     """Return the table of an array: its elements' biases, alignment and noise; readings in rad/s.
 
-    It fuses by `fusion`, by what the record carries if not given.
+    It fuses as `fusion` says, or as the record states.
 
     Raises
     ------
     RecordError
-        It is no calibration, or the method has no table.
+        The record is no calibration, or the method has no table.
     """
     check_calibration(record)
     held = array_of(record)
@@ -63,7 +63,7 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Device
 
 
 def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
-    """A slow turn seen by all gyros, with noise, one spike and a gap."""
+    """Return a slow turn seen by all gyros, with noise, one spike and a gap, and the fused rates."""
     elements, axes = table.columns["elements"], table.columns["axes"]
     turn = 0.2 * np.sin(np.linspace(0, 6, _SAMPLES))[:, None, None]
     noise = 1e-3 * rng.uniform(0.5, 1.5, (axes, elements)) * rng.standard_normal((_SAMPLES, axes, elements))

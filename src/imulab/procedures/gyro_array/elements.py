@@ -1,6 +1,4 @@
-"""The elements of a gyro array.
-
-Which columns they are, their clocks, where they are at rest, and which of them fail.
+"""The elements of a gyro array: columns, clocks, stretches at rest, and faults.
 
 One axis: columns ``gyro_1 .. gyro_n``. Three axes: ``gyro_x_1 .. gyro_z_n``. ``z_i = A_i w + b_i``: reading z of
 element i, body rate w, bias b; the record holds ``M_i = A_i^-1`` so that ``w = M_i (z_i - b_i)``.
@@ -25,13 +23,13 @@ from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, from_si, parse_unit
 
-# What a gyro array is: which columns of a recording are its elements, and what a record says of them.
+# Columns of the elements, and what a record states of them.
 
 
-FEWEST_ROBUST = 3  # elements of which one can be outvoted
+FEWEST_ROBUST = 3  # elements among which one can be outvoted
 SOURCE_RATES = (50.0, 200.0)
 """Sampling rates for which the source states its recursion, Hz."""
-MOST_ELEMENTS = 64  # as IL_ARRAY_ELEMENTS of the largest configuration of the C core
+MOST_ELEMENTS = 64  # IL_ARRAY_ELEMENTS of the largest configuration of the C core
 _ELEMENT = re.compile(r"gyro_(?:([xyz])_)?([1-9][0-9]*)")
 _MISNUMBERED = re.compile(r"gyro_(?:[xyz]_)?0[0-9]*")
 
@@ -99,12 +97,12 @@ class Elements:
 
 
 def find_elements(recording: Recording) -> Elements:
-    """Find the elements of a recording by their column names.
+    """Return the elements of a recording, found by their column names.
 
     Raises
     ------
     DataError
-        There are none, numbers are missing or do not begin with 1, or the axes have different numbers of elements.
+        There are no elements, numbers are missing or do not begin with 1, or axes have different numbers of elements.
     UnitError
         The elements of an axis have different units.
     """
@@ -149,14 +147,14 @@ def find_elements(recording: Recording) -> Elements:
 
 @dataclass(frozen=True)
 class ArrayCalibration:
-    """What a record says of an array, in the unit of the readings.
+    """The calibration of an array, in the unit of the readings.
 
     Attributes
     ----------
     bias
-        Plain means at rest, the common part included, shape (axes, n).
+        Mean at rest, with the part common to all elements, shape (axes, n).
     matrices
-        Shape (n, axes, axes), or None where no moving recording was calibrated from.
+        Shape (n, axes, axes), or None without a calibration in motion.
     weights
         Fixed weights ``C^-1 1 / (1' C^-1 1)``, shape (axes, n).
     white, walk
@@ -172,7 +170,7 @@ class ArrayCalibration:
 
 
 def feedback_notes(count: int, rate: float) -> list[str]:
-    """Return what to know of the method `feedback` for so many gyros on each axis and this sampling rate, Hz."""
+    """Return notes on method `feedback` for this number of gyros on each axis and sampling rate, Hz."""
     notes: list[str] = []
     if count < FEWEST_ROBUST:
         notes.append(
@@ -193,7 +191,7 @@ def feedback_notes(count: int, rate: float) -> list[str]:
 
 
 def check_calibration(record: Calibration, name: str = "the record") -> None:
-    """Check that a record, of this file name, is that of an array calibration.
+    """Refuse a record, of this file name, that is not an array calibration.
 
     Raises
     ------
@@ -206,7 +204,7 @@ def check_calibration(record: Calibration, name: str = "the record") -> None:
 
 
 def array_calibration(record: Calibration, elements: Elements, recording: str = "recording") -> ArrayCalibration:
-    """Return what a record says of the elements of a recording of this name.
+    """Return the calibration in a record for the elements of a recording of this name.
 
     Raises
     ------
@@ -265,17 +263,17 @@ def unit_of_angle(unit: str) -> tuple[str, float]:
     return {"deg/s": ("deg", 1.0), "rad/s": ("rad", 1.0), "deg/h": ("deg", 1 / 3600)}.get(known, (f"{known} s", 1.0))
 
 
-# Elements on clocks of their own, brought to one; gaps in time.
+# Clocks: elements with their own times, brought to one time; gaps in time.
 
 
 _MOST_OFFSET = 0.5  # s between the time of an element and of its row
-_TO_ESTIMATE = 16  # steps from which the usual one is told
+_TO_ESTIMATE = 16  # steps that show the usual one
 _MOST_NAMED = 3  # gaps that a warning names
 
 
 @dataclass
 class SampleClock:
-    """Watches time over the blocks of a recording: the sampling rate of its beginning, gaps, and order."""
+    """Time over the blocks of a recording: the sampling rate of its beginning, gaps, and order."""
 
     nominal: float | None = None
     steps: list[float] = field(default_factory=list)
@@ -285,7 +283,7 @@ class SampleClock:
     gaps: list[str] = field(default_factory=list)
 
     def watch(self, block: Recording) -> None:
-        """Check a block's time against what came before, and note its gaps.
+        """Check that a block's time follows the block before, and note gaps.
 
         Raises
         ------
@@ -321,7 +319,7 @@ class SampleClock:
 
     @property
     def rate(self) -> float:
-        """Sampling rate, Hz: as given, or from the first steps of time; 100 while there are none."""
+        """Sampling rate, Hz: as stated, or from the first steps of time; 100 while there are none."""
         if self.nominal is not None:
             return self.nominal
         return 1 / usual_step(np.array(self.steps))[0] if self.steps else 100.0
@@ -332,7 +330,7 @@ class SampleClock:
         return self.nominal is not None or len(self.steps) >= _TO_ESTIMATE
 
     def lines(self, name: str) -> list[str]:
-        """Return what there is to say of gaps."""
+        """Return messages on gaps."""
         messages = [f"{name}: {gap}" for gap in self.gaps]
         if self.count > len(self.gaps):
             messages.append(
@@ -341,8 +339,8 @@ class SampleClock:
         return messages
 
 
-def own_clocks(recording: Recording) -> dict[int, str]:
-    """Return the columns ``time_1 .. time_n`` in which elements have clocks of their own."""
+def find_clocks(recording: Recording) -> dict[int, str]:
+    """Return the columns ``time_1 .. time_n`` of elements with their own clocks, by element."""
     clocks = {}
     for name in recording.columns:
         number = name.removeprefix("time_")
@@ -352,9 +350,9 @@ def own_clocks(recording: Recording) -> dict[int, str]:
 
 
 def to_one_clock(blocks: Iterable[Recording]) -> Iterator[Recording]:
-    """Interpolate elements with clocks of their own (columns ``time_i``) to the column ``time``, block by block.
+    """Yield blocks with all elements interpolated from their clocks (columns ``time_i``) to the column ``time``.
 
-    Linear between an element's samples. Rows before an element's first sample or after its last are dropped.
+    Interpolation is linear. Rows before an element's first sample or after its last are dropped.
 
     Raises
     ------
@@ -362,21 +360,21 @@ def to_one_clock(blocks: Iterable[Recording]) -> Iterator[Recording]:
         A clock stands still or runs backwards, or is more than half a second away from ``time``.
     """
     held: Recording | None = None
-    until = -np.inf  # time of the last row given out
+    until = -np.inf  # time of the last row that was yielded
     for block in blocks:
-        clocks = own_clocks(block)
+        clocks = find_clocks(block)
         if not clocks:
             yield block
             continue
         if "time" not in block:
             raise DataError(f"{block.name}: columns time_1 .. but no column time; expected the clock to interpolate to")
         joined = block if held is None else _join(held, block)
-        time, element_times = check_time(joined), _own_times(joined, clocks)
+        time, element_times = check_time(joined), _clock_times(joined, clocks)
         start, stop = max(t[0] for t in element_times.values()), min(t[-1] for t in element_times.values())
         ready = np.flatnonzero((time > until) & (time >= start) & (time <= stop))
         if ready.size:
             until = float(time[ready[-1]])
-            yield _interpolated(joined, time[ready], element_times, clocks, ready)
+            yield _interpolate(joined, time[ready], element_times, clocks, ready)
         keep = min(int(np.searchsorted(t, until, side="right")) - 1 for t in (*element_times.values(), time))
         held = _rows(joined, np.arange(max(keep, 0), len(time)))
 
@@ -399,7 +397,7 @@ def _join(first: Recording, second: Recording) -> Recording:
     return replace(first, columns=columns)
 
 
-def _own_times(recording: Recording, clocks: dict[int, str]) -> dict[int, Array]:
+def _clock_times(recording: Recording, clocks: dict[int, str]) -> dict[int, Array]:
     times: dict[int, Array] = {}
     time = recording.si("time")
     for number, name in clocks.items():
@@ -420,7 +418,7 @@ def _own_times(recording: Recording, clocks: dict[int, str]) -> dict[int, Array]
     return times
 
 
-def _interpolated(
+def _interpolate(
     block: Recording, time: Array, element_times: dict[int, Array], clocks: dict[int, str], ready: np.ndarray
 ) -> Recording:
     columns = {name: values[ready] for name, values in block.columns.items() if name not in clocks.values()}
@@ -437,7 +435,7 @@ def _rows(block: Recording, index: np.ndarray) -> Recording:
     return replace(block, columns=columns, first_row=block.first_row + (int(index[0]) if index.size else 0))
 
 
-# What happened to each gyro while an array was fused.
+# Health: what happened to each gyro during fusion.
 
 
 NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, HELD, ALONE = (1 << bit for bit in range(8))
@@ -453,7 +451,7 @@ _KINDS = (
 
 @dataclass
 class HealthEvent:
-    """How often a gyro was in one state, and when first: sample count, time, s."""
+    """State of a gyro: in how many samples, and when first, s."""
 
     samples: int
     first: float
@@ -461,7 +459,7 @@ class HealthEvent:
 
 @dataclass
 class Health:
-    """Counts the flags of each gyro over the blocks of a recording."""
+    """Numbers of flags of each gyro over the blocks of a recording."""
 
     names: Sequence[Sequence[str]]
     total: int = 0
@@ -470,7 +468,7 @@ class Health:
     events: dict[tuple[int, int, str], HealthEvent] = field(default_factory=dict)
 
     def watch(self, time: np.ndarray, flags: np.ndarray | None, rate: np.ndarray) -> list[tuple[int, int, str]]:
-        """Count the flags (m, axes, n) of a block; return what is new: axis, element and kind."""
+        """Count the flags (m, axes, n) of a block; return the states that are new: axis, element and kind."""
         self.total += len(time)
         self.lost += int(np.isnan(rate).any(axis=1).sum())
         new: list[tuple[int, int, str]] = []
@@ -493,7 +491,7 @@ class Health:
         return new
 
     def first(self, key: tuple[int, int, str]) -> str:
-        """Return a line on the first time that a gyro was in a state."""
+        """Return a line on the first time of a state of a gyro."""
         axis, element, kind = key
         return f"{self.names[axis][element]}: {kind} at {self.events[key].first:.6g} s"
 
@@ -502,7 +500,7 @@ class Health:
         return {self.names[a][i] for a, i, kind in self.events if kind == "stuck"}
 
     def lines(self) -> list[str]:
-        """Return one line per gyro that was excluded, stuck, jumped or non-finite, and one where all were lost."""
+        """Return a line for each gyro that was excluded, stuck, jumped or not finite, and one where none was left."""
         lines = []
         gyros = sorted({(a, i) for a, i, _ in self.events})
         for a, i in gyros:
@@ -525,35 +523,35 @@ def _samples(count: int) -> str:
     return f"{count} sample{'' if count == 1 else 's'}"
 
 
-# What readings say of an array before any alignment: dead gyros, mixed units, elements mounted otherwise.
+# Checks before any alignment: dead gyros, mixed units, elements mounted otherwise.
 
 
 _FEWEST = 100  # samples
-_EVERY_ROW, _THINNED = 20_000, 16  # rows looked at each, and one in so many beyond
+_EVERY_ROW, _THINNED = 20_000, 16  # rows that are all used; beyond them one in so many
 _FOLLOWS = 0.81
 """Share of a gyro's variance that the first element must explain: a correlation of 0.9."""
-_ONE_AXIS = 0.8  # of what is explained
-_APART = 20.0  # times apart: groups of elements whose readings differ by so much have different units
-_WITHIN = 8.0  # times apart within such a group
+_ONE_AXIS = 0.8  # of the explained share
+_APART = 20.0  # times: groups of elements whose readings differ by more have different units
+_WITHIN = 8.0  # times: largest ratio within such a group
 _FACTORS = {
     180 / math.pi: "rad/s labelled deg/s, or the other way round",
     3600.0: "deg/h labelled deg/s, or the other way round",
     3600 * 180 / math.pi: "rad/s labelled deg/h, or the other way round",
     1000.0: "thousandths, or the other way round",
 }
-_NEAR = 1.6  # times: a ratio this near to that of two units is theirs
+_NEAR = 1.6  # times: a ratio this near to that of two units is that of these units
 _UNTURNED = "array calibrate --moving finds it, and --calibration puts it right"
 
 Map = tuple[tuple[int, int] | None, ...]
-"""For each axis of an element the axis of the reference that it reads and the sign, or None where nothing tells."""
+"""For each axis of an element: the axis of the reference that it reads, and the sign; None where motion is small."""
 
 
 @dataclass
 class Checks:
-    """Watches the readings of an array, block by block."""
+    """Statistics of the readings of an array, block by block."""
 
     names: Sequence[Sequence[str]]
-    seen: int = 0
+    row_count: int = 0
     count: int = 0
     moments: list[Array] = field(default_factory=list)
     pivot: Array | None = None
@@ -563,9 +561,9 @@ class Checks:
     twins: list[tuple[int, int]] | None = None
 
     def watch(self, readings: Array) -> None:
-        """Add readings, shape (m, axes, n); rows with a reading that is not finite do not count for the moments.
+        """Add readings, shape (m, axes, n); rows with a reading that is not finite do not enter the moments.
 
-        The moments are of every row of the first 20,000, and of every 16th after them.
+        The moments are of every row of the first 20,000, and of every 16th beyond them.
         """
         rows, axes, n = readings.shape
         if not rows:
@@ -573,9 +571,9 @@ class Checks:
         flat = readings.reshape(rows, axes * n)
         self._watch_still(flat)
         self._watch_twins(flat, n)
-        number = np.arange(self.seen, self.seen + rows)
+        number = np.arange(self.row_count, self.row_count + rows)
         chosen = np.flatnonzero((number < _EVERY_ROW) | (number % _THINNED == 0))
-        self.seen += rows
+        self.row_count += rows
         if not chosen.size:
             self.last = flat[-1]
             return
@@ -590,7 +588,7 @@ class Checks:
         if not len(part):
             return
         if self.pivot is None:
-            self.pivot = part[0]  # moments about it: a constant has none, to the last bit
+            self.pivot = part[0]  # about it, the moments of a constant are exactly zero
         part = part - self.pivot
         step[~np.isfinite(step).all(axis=1)] = 0.0
         moments = [
@@ -603,7 +601,7 @@ class Checks:
         self.count += len(part)
 
     def _watch_still(self, flat: Array) -> None:
-        """Keep the gyros that have read one number so far."""
+        """Keep the gyros that have repeated one number so far."""
         if self.still is None or self.first is None:
             self.still, self.first = np.ones(flat.shape[1], dtype=bool), np.full(flat.shape[1], np.nan)
         for k in np.flatnonzero(self.still).tolist():
@@ -613,7 +611,7 @@ class Checks:
                 self.still[k] = bool((column == self.first[k]).all())
 
     def _watch_twins(self, flat: Array, n: int) -> None:
-        """Keep the pairs of an axis that have read the same so far, by their places among the columns."""
+        """Keep the pairs of an axis with the same readings so far, by their places among the columns."""
         if self.twins is None:
             self.twins = [(i, j) for i in range(flat.shape[1]) for j in range(i + 1, (i // n + 1) * n)]
         self.twins = [
@@ -624,15 +622,15 @@ class Checks:
         ]
 
     def lines(self, *, turned: bool = True, known: Collection[str] = ()) -> list[str]:
-        """Return what there is to say; of `turned` elements only if asked, and not of dead gyros `known` already."""
+        """Return messages on all checks; on `turned` elements only if asked, and not on dead gyros already `known`."""
         lines = self.dead(known) + self.doubled() + self.units()
         if turned:
             lines += [f"{line}: mounted the other way round? {_UNTURNED}" for line in self.turned()]
         return lines
 
     def dead(self, known: Collection[str] = ()) -> list[str]:
-        """Return a line on gyros whose readings never change, and one on axes without any that do."""
-        if self.still is None or self.first is None or self.seen < _FEWEST:
+        """Return messages on gyros whose readings never change, and on axes on which no reading changes."""
+        if self.still is None or self.first is None or self.row_count < _FEWEST:
             return []
         still = (self.still & np.isfinite(self.first)).reshape(len(self.names), -1)
         messages: list[str] = []
@@ -647,8 +645,8 @@ class Checks:
         return messages
 
     def doubled(self) -> list[str]:
-        """Return a line on gyros that read the same throughout: one that was logged twice counts twice."""
-        if self.still is None or self.first is None or self.seen < _FEWEST:
+        """Return a message on gyros with the same readings throughout: one that was logged twice counts twice."""
+        if self.still is None or self.first is None or self.row_count < _FEWEST:
             return []
         flat = [name for row in self.names for name in row]
         live = ~self.still
@@ -659,7 +657,7 @@ class Checks:
         ]
 
     def units(self) -> list[str]:
-        """Return a line where the readings of an axis fall into two groups of very different size."""
+        """Return a message where the readings of an axis fall into two groups of very different size."""
         if self.count < _FEWEST:
             return []
         spread, explained = self._spread()
@@ -692,7 +690,7 @@ class Checks:
         return messages
 
     def turned(self) -> list[str]:
-        """Return a line for each way in which elements are mounted unlike the others, or wired."""
+        """Return a message for each way in which elements are mounted, or wired, unlike the others."""
         maps = self.maps()
         if not maps:
             return []
@@ -730,7 +728,7 @@ class Checks:
         return lines
 
     def maps(self) -> list[Map]:
-        """Return for each element which axis of the first it reads on each of its own, where motion tells."""
+        """Return, for each element, the axes of the first element that its axes read, where motion shows it."""
         if self.count < _FEWEST or not np.isfinite(self.moments[1]).all():
             return []
         axes, n = self.moments[0].shape
@@ -756,13 +754,13 @@ class Checks:
         return axis_maps
 
     def _covariance(self) -> tuple[Array, Array]:
-        """Variance of each gyro, shape (axes, n), and covariance with the axes of element 1, (axes, n, axes)."""
+        """Return the variance of each gyro, (axes, n), and the covariance with element 1's axes, (axes, n, axes)."""
         mean, square, product = (moment / self.count for moment in self.moments[:3])
         variance = np.maximum(square - mean * mean, 0.0)
         return variance, product - mean[:, :, None] * mean[None, None, :, 0]
 
     def _spread(self) -> tuple[Array, Array]:
-        """Standard deviation of each gyro, (axes, n), and share of the others that goes with an axis of element 1."""
+        """Return the standard deviation of each gyro, (axes, n), and the share that an axis of element 1 explains."""
         variance, cross = self._covariance()
         both = variance[:, :, None] * variance[None, None, :, 0]
         share = np.where(both > 0, cross**2 / np.where(both > 0, both, 1.0), 0.0).max(axis=2)
@@ -778,7 +776,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _mirrored(mapping: Map) -> str:
-    """Say that a known map is left-handed."""
+    """Return an addition to a message where a map is left-handed."""
     if any(pair is None for pair in mapping):
         return ""
     matrix = np.zeros((len(mapping), len(mapping)))
@@ -790,29 +788,29 @@ def _mirrored(mapping: Map) -> str:
     )
 
 
-# Where an array is at rest: judged element by element, and by what all elements do together, however mounted.
+# Rest: stretches in which no element moves, and all elements together show no motion, however they are mounted.
 
 
 _WINDOW = 1.0  # s
 _FEWEST_WINDOWS = 12  # of a recording
 _SMALLEST_WINDOW = 8  # samples
-_QUIETEST = 0.1  # quantile of the windows' scatter that is the usual one at rest
+_QUIETEST = 0.1  # quantile of the windows' scatter that is usual at rest
 _QUIET_FACTOR = 3.0  # times the usual scatter up to which a window is quiet
 _STEP_NOISE = 0.29
-"""Standard deviation that rounding brings at least, in steps of the output."""
+"""Least standard deviation that rounding makes, in steps of the output."""
 _DRIFT = math.radians(1.0)
-"""How far the zero of a gyro at rest may wander within one recording, rad/s."""
+"""Largest change of the zero of a gyro at rest within one recording, rad/s."""
 _SHORTEST = 5  # windows
-_TOGETHER = 10.0  # times what each element does by itself: beyond, the array turned
-_ALIKE = 1.25  # times, between quartiles of the elements: what they share in unlike sizes is no motion
+_TOGETHER = 10.0  # times the elements' own scatter: more common motion means that the array turned
+_ALIKE = 1.25  # between quartiles of the elements: a common part of more unlike sizes is no motion
 _STEADY, _STEADY_SPREAD = math.radians(5.0), 0.1
 _LARGEST_ZERO = math.radians(100.0)
-_MOST_SAMPLES = 20_000  # by which a fast motion is looked for
+_MOST_SAMPLES = 20_000  # samples in which a fast motion is looked for
 
 
 @dataclass(frozen=True)
 class ArrayRest:
-    """A stretch at rest: first sample, last + 1, and what moved first outside of it ("" where it is everything)."""
+    """A stretch at rest: first sample, last + 1, and what moved first outside it ("" if it is the whole recording)."""
 
     start: int
     stop: int
@@ -820,11 +818,11 @@ class ArrayRest:
 
 
 def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name: str) -> ArrayRest:
-    """Find the longest stretch in which an array is at rest.
+    """Return the longest stretch in which an array is at rest.
 
-    A window of a second is quiet where the standard deviation of every gyro is at most 3 times that of its own quietest
+    A window of a second is quiet where the standard deviation of every gyro is at most 3 times that of its quietest
     windows (a tenth of all; rounding counts), and its mean within 1 deg/s of the median of the quiet ones. Then the
-    whole stretch is at rest unless its elements go together (`together`), or read a rate that no zero has.
+    whole stretch is at rest unless its elements move together (`common_motion`), or read a rate that no zero has.
 
     Parameters
     ----------
@@ -873,16 +871,16 @@ def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name
 
 
 def common_motion(off: Array, noise: Array) -> tuple[float, float]:
-    """Return how far the elements of an array go together, rms, and its ratio to what each does on its own.
+    """Return the common motion of the elements of an array, rms, and its ratio to their individual scatter.
 
-    The largest eigenvectors of the covariance, as many as there are axes, whitened by `noise`, hold what all elements
-    see of one motion, in whichever orientation and sense. A ratio that a quarter of the elements falls short of does
-    not count; neither does what elements share in unlike sizes, as they share a temperature.
+    The largest eigenvectors of the covariance, as many as there are axes, whitened by `noise`, contain what all
+    elements see of one motion, whatever their orientation and sign. A ratio that a quarter of the elements does not
+    reach does not count; neither does a common part of unlike sizes, as of a common temperature.
 
     Parameters
     ----------
     off
-        Readings or their means less their mean over time, shape (m, axes, n).
+        Readings, or their means, less their mean over time, shape (m, axes, n).
     noise
         Their standard deviation at rest, shape (axes, n).
     """
@@ -904,7 +902,7 @@ def common_motion(off: Array, noise: Array) -> tuple[float, float]:
 def _refuse_motion(
     readings: Array, mean: Array, usual: Array, size: int, names: Sequence[Sequence[str]], name: str
 ) -> None:
-    """Refuse a quiet stretch whose elements go together, or that turns steadily."""
+    """Refuse a quiet stretch whose elements move together, or that turns steadily."""
     slow = common_motion(mean - mean.mean(axis=0), usual / math.sqrt(size))
     part = readings[: min(len(readings), _MOST_SAMPLES) // size * size]
     blocks = part.reshape(-1, size, *part.shape[1:])
@@ -939,7 +937,7 @@ def _motion_message(name: str, moves: float, ratio: float) -> str:
 def _restless_message(
     restless: np.ndarray, spread: Array, off: Array, names: Sequence[Sequence[str]], step: float
 ) -> str:
-    """Name the gyro that moves most, its rate, and when, s from the beginning."""
+    """Return the words for the gyro that moves most, its rate, and when, s from the beginning."""
     reach = np.where(restless, np.hypot(spread, off), 0.0)
     k, a, i = (int(index) for index in np.unravel_index(int(np.argmax(reach)), reach.shape))
     return f"{names[a][i]} moves by {math.degrees(reach[k, a, i]):.3g} deg/s {k * step:.3g} s after the beginning"

@@ -1,4 +1,4 @@
-"""The figures and tables of an array's record, of a fused rate, and of a comparison of methods."""
+"""The figures and tables of an array's record, a fused rate, and a comparison of methods."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ from imulab.report.traces import (
 )
 from imulab.units import from_si
 
-# What the figures of an array have in common: titles of axes, rows of numbers, curves.
+# Common parts: titles of axes, rows of numbers, curves.
 
 
-def of_axis(letter: str) -> str:
-    """Return what a title adds for one of three axes."""
+def axis_suffix(letter: str) -> str:
+    """Return the end of a title for one of three axes."""
     return f", axis {letter}" if letter else ""
 
 
@@ -61,7 +61,7 @@ def curves(
 def allan_trace(
     curve: ElementCurve, name: str, colour: str, factor: float, width: float = 1.6, *, number: int = 0
 ) -> dict[str, Any]:
-    """Return a line of deviation times a factor over averaging time, s; values of 0 have no place on a log scale."""
+    """Return a line of deviation times a factor over averaging time, s; 0 has no place on a logarithmic axis."""
     known = [(t, d * factor) for t, d in zip(curve.tau, curve.deviation, strict=False) if d > 0]
     return scatter(
         [t for t, _ in known],
@@ -75,7 +75,7 @@ def allan_trace(
 
 
 def method_texts(row: MethodRow, factor: float, digits: int, *, halves: bool) -> list[str]:
-    """Return the figures of a method as cells of a table, angles times a factor, with or without that of the halves."""
+    """Return the figures of a method as cells of a table, angles times a factor, with that of the halves on request."""
     values = [
         row.rate_std, row.rate_max, factor * row.angle_std, factor * row.angle_max, row.reduction, row.over_limit,
         row.bandwidth, *([row.split_half] if halves else []),
@@ -83,7 +83,7 @@ def method_texts(row: MethodRow, factor: float, digits: int, *, halves: bool) ->
     return ["–" if value is None else plain_number(value, digits) for value in values]
 
 
-# The figures and tables of a comparison of methods, from its record alone.
+# A comparison of methods.
 
 
 _MOST_NAMED = 4  # methods that a sentence names
@@ -98,10 +98,10 @@ _PALETTE = {
     "single gyro": "#b9c2c8",
 }
 _NUMBER = {method: number for number, method in enumerate(_PALETTE)}
-"""By which each method has its dashes and marks in every figure."""
+"""Each method has its own dashes and marks in every figure."""
 
 
-def exhibits_of_comparison(record: Calibration) -> Exhibits:
+def comparison_exhibits(record: Calibration) -> Exhibits:
     """Return what a report on a comparison shows."""
     held = comparison_of(record)
     data, model = held.data, held.model
@@ -144,7 +144,7 @@ def exhibits_of_comparison(record: Calibration) -> Exhibits:
 
 
 def _that_works(broken: list[str]) -> str:
-    """Return what the headline adds where gyros failed: with them the mean would be the size of the fault."""
+    """Return the end of the headline where gyros failed: the mean over them would be the size of the fault."""
     if not broken:
         return ""
     named = ", ".join(broken) if len(broken) <= _MOST_NAMED else f"{len(broken)} others"
@@ -165,7 +165,7 @@ def _methods_table(record: ComparisonRecord, a: int) -> ReportTable:
             continue
         rows.append([method, *method_texts(figures[a], factor, 3, halves=halves)])
     return ReportTable(
-        title=f"Methods{of_axis(model.axes[a])}",
+        title=f"Methods{axis_suffix(model.axes[a])}",
         caption=f"Rates in {unit}, angles in {angle}. Rate error (standard deviation with the mean removed) and angle "
         "error against the truth; reduction of noise against the mean single gyro that works; noise from sample to "
         "sample over the limit of any fixed weights; bandwidth at −3 dB. Lower noise with less bandwidth, or below the "
@@ -205,7 +205,7 @@ def _allan_methods(record: ComparisonRecord, a: int) -> Figure:
         message=f"At the shortest time {quiet} is the quietest, {plain_number(first[quiet], 2)} {unit}."
         if quiet
         else "",
-        title=f"Allan deviation of each method{of_axis(record.model.axes[a])}",
+        title=f"Allan deviation of each method{axis_suffix(record.model.axes[a])}",
         caption="On the left, how quiet a sample is: a curve that bends down there is low-pass filtered. On the "
         "right, what the angle drifts by: no weighting changes the bias that all gyros share.",
         traces=traces,
@@ -232,7 +232,7 @@ def _angles(record: ComparisonRecord, a: int) -> Figure:
     return curves(
         message=f"At the end {least} is off by {plain_number(ends[least], 2)} {angle}, {most} by "
         f"{plain_number(ends[most], 2)} {angle}.",
-        title=f"Angle error over time{of_axis(record.model.axes[a])}",
+        title=f"Angle error over time{axis_suffix(record.model.axes[a])}",
         caption="Integral of the rate error. A straight line is a bias; lines on top of each other differ in nothing "
         "that counts for an attitude.",
         traces=traces,
@@ -271,7 +271,7 @@ def _health(record: ComparisonRecord, a: int) -> Figure:
             hover = f"%{{y}} {label}, %{{x:.4g}} s<extra></extra>"
             traces.append(scatter(at, which, "markers", marker=marker, name=label, hovertemplate=hover))
     return curves(
-        title=f"Weight and health of each gyro under robust{of_axis(record.model.axes[a])}",
+        title=f"Weight and health of each gyro under robust{axis_suffix(record.model.axes[a])}",
         caption="Dark: counts for much. White: not in use. Marks: stuck, non-finite, or a bias that jumped and is "
         "being estimated again.",
         traces=traces,
@@ -281,7 +281,7 @@ def _health(record: ComparisonRecord, a: int) -> Figure:
     )
 
 
-# The figures and tables of an array's record, from the record alone; those of a comparison in `compare_figures`.
+# A calibration.
 
 
 _ELEMENT_SHADES = ("#1f6f8b", "#c8553d", "#8e6bbd", "#c99a2e", "#4f9d69", "#2e4057", "#d081a5", "#6f7f3f")
@@ -289,7 +289,7 @@ _ELEMENT_SHADES = ("#1f6f8b", "#c8553d", "#8e6bbd", "#c99a2e", "#4f9d69", "#2e40
 
 def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
-    return exhibits_of_comparison(record) if model_of(record).kind == "comparison" else _calibration(array_of(record))
+    return comparison_exhibits(record) if model_of(record).kind == "comparison" else _calibration(array_of(record))
 
 
 def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
@@ -367,7 +367,7 @@ def _elements_table(record: ArrayRecord) -> ReportTable:
 
 
 def _text(per_gyro: PerGyro, a: int, factor: float) -> str:
-    """Value and standard uncertainty on an axis, in a unit that is so much smaller."""
+    """Return value and standard uncertainty on an axis as text, times a factor for the unit."""
     value, u = float(per_gyro.values[a]) * factor, float(per_gyro.uncertainties[a]) * factor
     if math.isnan(value):
         return "not determined"
@@ -397,7 +397,7 @@ def _allan_elements(record: ArrayRecord, a: int) -> Figure:
     for i, curve in enumerate(record.data.allan[a]):
         traces.append(allan_trace(curve, record.elements[i].name, _ELEMENT_SHADES[i % 8], math.degrees(1), number=i))
     return curves(
-        title=f"Allan deviation of each gyro{of_axis(record.model.axes[a])}",
+        title=f"Allan deviation of each gyro{axis_suffix(record.model.axes[a])}",
         caption="Slope −1/2: angle random walk. Flat: bias instability. Slope +1/2: rate random walk. A curve apart "
         "from the others is a gyro apart from the others; the last points on the right are few averages.",
         traces=traces,
@@ -414,7 +414,7 @@ def _correlation(record: ArrayRecord, a: int) -> Figure:
     noise = float(np.median(shared.standard_uncertainty[a]))
     return Figure(
         message=f"The pair that goes together most: {strongest_pair(matrix, names)}." if len(names) > 1 else "",
-        title=f"Correlation of the noise{of_axis(record.model.axes[a])}",
+        title=f"Correlation of the noise{axis_suffix(record.model.axes[a])}",
         caption=f"At {shared.averaging_time.value:g} s, ± {noise:.2f} each. What all share, no weights remove; "
         "a pair that goes together counts for less than two.",
         traces=[correlation_map(matrix, names, text=text, texttemplate="%{text}" if len(names) <= 12 else "")],

@@ -1,4 +1,4 @@
-"""Calibration of an array's elements: biases and noise at rest, alignment in motion."""
+"""Calibration of an array's elements: biases and noise at rest, alignment in motion (see `alignment`)."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import parse_unit, to_si
 
-_FEWEST_SAMPLES = 200  # at rest by which variances are told
+_FEWEST_SAMPLES = 200  # at rest whose variances are known
 _FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix
-_OVERLAP = 8  # windows that begin in the length of one
+_OVERLAP = 8  # windows that begin within the length of one
 _CLIPPED_RUN = 3  # equal readings in a row at an end of the range that show a clipped output
-_SHARED = 0.5  # mean correlation of the noise of elements from which it is warned of
+_SHARED = 0.5  # mean correlation of the elements' noise from which a warning is given
 
 
 @dataclass(frozen=True, repr=False)
@@ -63,23 +63,23 @@ def calibrate_array(
     fusion: Fusion | None = None,
     noise: Calibration | None = None,
 ) -> ArrayFit:
-    """Calibrate the elements of an array from a recording at rest and, if there is one, a recording in motion.
+    """Return the calibration of an array's elements from a recording at rest and, if there is one, one in motion.
 
-    At rest, in the longest stretch that is: each element's bias is its plain mean, the common part included; N, B, K
-    come from the model of its noise, and so does the bias's uncertainty, unless `noise` is given; the covariance matrix
-    at `averaging_time` is half the mean of the products of successive differences of means (the Allan covariance;
-    Vaccaro and Zaki 2017). In motion: `align`.
+    At rest, in the longest such stretch: each element's bias is its mean, with the part common to all; N, B, K come
+    from the model of its noise, and so does the uncertainty of the bias, unless `noise` is stated; the covariance
+    matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
+    covariance; Vaccaro and Zaki 2017). In motion: `align`.
 
     Parameters
     ----------
     still, moving
         Recordings with the columns gyro_1 .. (or gyro_x_1 ..) in rad/s, deg/s or deg/h.
     averaging_time
-        Of the covariance matrix, s.
+        Averaging time of the covariance matrix, s.
     fusion
-        Method and memory that `array fuse` and `export` take from the record; robust and growing where not given.
+        Method and memory that `array fuse` and `export` take from the record; robust and growing if None.
     noise
-        Noise record of the same gyros, for the uncertainties of the biases; that of `still` itself where not given.
+        Noise record of the same gyros, for the uncertainties of the biases; the noise of `still` if None.
 
     Raises
     ------
@@ -100,26 +100,26 @@ def calibrate_array(
     if not averaging_time > 0:
         raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
     _check_readings(still, elements)
-    left_out = _leave_out(still, elements)
+    left_out = _bridge_rows(still, elements)
     warnings = [type(note)(f"{still.name}: {note}") for note in still.notes]
     warnings += [type(note)(f"{still.name}: {note}") for note in left_out.notes()]
     still, cut = _still_part(left_out, elements)
     warnings += cut
     _check_readings(still, elements)
     rate, timing = sampling_rate(still)
-    rest, notes = at_rest(_si(still, elements), rate, elements, noise, still.metadata)
+    rest, notes = at_rest(_readings_si(still, elements), rate, elements, noise, still.metadata)
     warnings += [*(f"{still.name}: {line}" for line in notes), *timing]
     aligned = None
     if moving is not None:
-        aligned, more = _in_motion(moving, elements, rest)
+        aligned, more = _align_in_motion(moving, elements, rest)
         warnings += more
-    readings = _si(still, elements) - rest.bias
+    readings = _readings_si(still, elements) - rest.bias
     checks = Checks(elements.names)
     checks.watch(readings)
     warnings += [type(line)(f"{still.name}: {line}") for line in checks.units()]
     if aligned is not None:
         readings = np.einsum("iab,mbi->mai", np.linalg.inv(aligned.sensing), readings)
-    covariance, used, count = _covariance(readings, rest.rate, averaging_time)
+    covariance, used, count = _allan_covariance(readings, rest.rate, averaging_time)
     if used < averaging_time * 0.999:
         warnings.append(
             f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} s: "
@@ -131,7 +131,7 @@ def calibrate_array(
         warnings += [Note(f"{still.name}: {line}") for line in unseen(noises, rest)]
     if fusion is not None and fusion.method == "feedback":
         warnings += [type(line)(f"{still.name}: {line}") for line in feedback_notes(elements.count, rest.rate)]
-    record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
+    record = _make_record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
     if fusion is not None:
         record = replace(record, model={**record.model, "fusion": fusion.to_dict()})
     if serial is not None:
@@ -139,13 +139,13 @@ def calibrate_array(
     return ArrayFit(record, rest.curves)
 
 
-def _leave_out(recording: Recording, elements: Elements) -> LeftOut:
+def _bridge_rows(recording: Recording, elements: Elements) -> LeftOut:
     names = [name for row in elements.names for name in row]
     check_finite(recording, names)
     return leave_out(recording, names)
 
 
-def _si(recording: Recording, elements: Elements) -> Array:
+def _readings_si(recording: Recording, elements: Elements) -> Array:
     readings = elements.readings(recording)
     for axis, unit in enumerate(elements.units):
         readings[:, axis] = to_si(readings[:, axis], unit)
@@ -153,7 +153,7 @@ def _si(recording: Recording, elements: Elements) -> Array:
 
 
 def _check_readings(recording: Recording, elements: Elements) -> None:
-    """Refuse readings that are no numbers, and gyros that are dead."""
+    """Refuse readings that are no numbers, and dead gyros."""
     names = [name for row in elements.names for name in row]
     check_finite(recording, names)
     for name in names:
@@ -167,12 +167,12 @@ def _check_readings(recording: Recording, elements: Elements) -> None:
 
 
 def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[str]]:
-    """The longest stretch at rest, and a line where that is not everything."""
+    """Return the longest stretch at rest, and a message where that is not the whole recording."""
     still = left_out.recording
     if len(still) < _FEWEST_SAMPLES:
         raise DataError(f"{still.name}: {len(still)} samples at rest are too few; expected {_FEWEST_SAMPLES} or more")
     rate, _ = sampling_rate(still)
-    rest = find_rest(_si(still, elements), rate, elements.names, still.name)
+    rest = find_rest(_readings_si(still, elements), rate, elements.names, still.name)
     left_out.check(rest.start, rest.stop, "the recording at rest")
     if not rest.moved:
         return still, []
@@ -191,7 +191,7 @@ def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[
     ]
 
 
-def _in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tuple[Alignment, list[str]]:
+def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tuple[Alignment, list[str]]:
     moving = on_one_clock(moving)
     its = find_elements(moving)
     if its.names != elements.names:
@@ -200,10 +200,10 @@ def _in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tuple[Ali
             f"{len(elements.axes)} as at rest"
         )
     _check_readings(moving, its)
-    left_out = _leave_out(moving, its)
+    left_out = _bridge_rows(moving, its)
     moving = left_out.recording
-    readings = _si(moving, its)
-    clipped = _clipped(readings)
+    readings = _readings_si(moving, its)
+    clipped = _clipped_rows(readings)
     notes = [type(note)(f"{moving.name}: {note}") for note in moving.notes]
     notes += [type(note)(f"{moving.name}: {note}") for note in left_out.notes()]
     if clipped.any():
@@ -227,8 +227,8 @@ def _in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tuple[Ali
     return alignment, [*notes, *(f"{moving.name}: {line}" for line in latency_notes(alignment, names))]
 
 
-def _clipped(readings: Array) -> np.ndarray:
-    """Rows in which a gyro stands at its largest or smallest value, if it stood there for several samples in a row."""
+def _clipped_rows(readings: Array) -> np.ndarray:
+    """Return the rows in which a gyro stays at its largest or smallest reading for several samples in a row."""
     flat = readings.reshape(len(readings), -1)
     rows = np.zeros(len(flat), dtype=bool)
     for column in flat.T:
@@ -240,15 +240,15 @@ def _clipped(readings: Array) -> np.ndarray:
     return rows
 
 
-def _covariance(readings: Array, rate: float, averaging_time: float) -> tuple[Array, float, int]:
-    """Allan covariance of each axis, shape (axes, n, n), the averaging time used, and the degrees of freedom."""
+def _allan_covariance(readings: Array, rate: float, averaging_time: float) -> tuple[Array, float, int]:
+    """Return the Allan covariance of each axis, (axes, n, n), the averaging time used, and its degrees of freedom."""
     m, axes, n = readings.shape
     size = max(1, min(round(averaging_time * rate), m // (_FEWEST_DIFFERENCES * n + 1)))
     total = np.concatenate([np.zeros((1, axes, n)), np.cumsum(readings, axis=0)])
     starts = np.arange(0, m - 2 * size + 1, max(1, size // _OVERLAP))
     first, middle, last = total[starts], total[starts + size], total[starts + 2 * size]
     difference = (last - 2 * middle + first) / size
-    # Equivalent number of independent differences under white noise: NIST SP 1065, table 5.
+    # Equivalent number of independent differences for white noise: NIST SP 1065, table 5.
     freedom = max(2, round(1.5 * m / size))
     return np.einsum("kai,kaj->aij", difference, difference) / (2 * len(difference)), size / rate, freedom
 
@@ -257,16 +257,16 @@ def _with_unit(value: Any, uncertainty: Any, unit: str) -> dict[str, Any]:
     return {"value": value, "standard_uncertainty": uncertainty, "unit": unit}
 
 
-def _elements(
+def _element_entries(
     elements: Elements, rest: AtRest, aligned: Alignment | None
 ) -> tuple[list[dict[str, Any]], dict[str, Parameter]]:
-    """The record's entry for each element, and the parameters in them."""
+    """Return the record's entry for each element, and the parameters in them."""
     axes = len(elements.axes)
     spread = rest.uncertainty
     single_axis = axes == 1
 
     def scalar(values: Array) -> Any:
-        """A number for one axis, a list over x, y, z for three."""
+        """Return a number for one axis, a list over x, y, z for three."""
         return float(values[0]) if single_axis else values.tolist()
 
     listed = []
@@ -298,7 +298,7 @@ def _elements(
     return listed, parameters
 
 
-def _record(
+def _make_record(
     still: Recording,
     moving: Recording | None,
     elements: Elements,
@@ -309,10 +309,10 @@ def _record(
     differences: int,
     warnings: list[str],
 ) -> Calibration:
-    listed, parameters = _elements(elements, rest, aligned)
+    listed, parameters = _element_entries(elements, rest, aligned)
     sigma = np.sqrt(np.einsum("aii->ai", covariance))
     correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
-    shared = _shared(correlation)
+    shared = _mean_correlation(correlation)
     if shared > _SHARED:
         warnings = [
             *warnings,
@@ -362,7 +362,7 @@ def _record(
 def _correlation(
     elements: Elements, covariance: Array, correlation: Array, averaging_time: float, differences: int
 ) -> dict[str, Any]:
-    """The record's section on common noise, with the fixed weights that follow from it."""
+    """Return the record's section on common noise, with the fixed weights that follow from it."""
     fixed = [fixed_weights(matrix) for matrix in covariance]
     return {
         "averaging_time": {"value": averaging_time, "unit": "s"},
@@ -377,7 +377,7 @@ def _correlation(
 
 
 def _over_axes(coefficients: list[dict[str, Any]]) -> dict[str, Any]:
-    """One entry with a list over x, y, z for three of one axis each."""
+    """Return one entry with lists over x, y, z from an entry for each axis."""
     reasons = [axis_coefficient["reason"] for axis_coefficient in coefficients if "reason" in axis_coefficient]
     listed = {
         key: [axis_coefficient[key] for axis_coefficient in coefficients] for key in ("value", "standard_uncertainty")
@@ -385,7 +385,7 @@ def _over_axes(coefficients: list[dict[str, Any]]) -> dict[str, Any]:
     return {**listed, "unit": coefficients[0]["unit"], **({"reason": reasons[0]} if reasons else {})}
 
 
-def _shared(correlation: Array) -> float:
+def _mean_correlation(correlation: Array) -> float:
     n = correlation.shape[1]
     off = ~np.eye(n, dtype=bool)
     return float(np.mean(np.abs(correlation[:, off])))

@@ -1,9 +1,8 @@
-"""Fusing the gyroscopes of an array into one rate, block by block, and that rate as it shows itself.
+"""Fusion of an array's readings into one rate by the C core, block by block, and the figures of the fused rate.
 
-The gain of the virtual gyro; method and memory as texts and in blobs.
-
-Source: Bayard and Ploen, US patent 6882964 (2003). The bias that all gyros share cannot be told from the rate, so the
-biases are kept to a sum that does not change; what is left is observable and has one steady-state gain.
+The gain of method `kalman` is computed here. Source: Bayard and Ploen, US patent 6882964 (2003). The bias common to all
+gyros cannot be separated from the rate, so the biases keep a constant sum; the rest is observable and has one
+steady-state gain. Method and memory as texts, and in records and blobs, are read here too.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from imulab.procedures.gyro_array.elements import (
     find_elements,
     to_one_clock,
 )
-from imulab.procedures.gyro_array.figures import curves, of_axis
+from imulab.procedures.gyro_array.figures import axis_suffix, curves
 from imulab.procedures.gyro_array.schema import model_of
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording
@@ -60,7 +59,7 @@ from imulab.report.traces import (
 )
 from imulab.units import conversion_factor, from_si, parse_unit
 
-# A fused rate as it shows itself: the rate over time, and when each gyro was not in use.
+# The fused rate with its figures: rate over time, and states of each gyro.
 
 
 STATES = (
@@ -70,8 +69,8 @@ STATES = (
     (JUMPED, "jumped", "triangle-up", "#c99a2e"),
     (HELD, "held (end of its range?)", "diamond", "#8e6bbd"),
 )
-"""Flag, what it means, its mark and its colour."""
-_PIECES = 240  # parts of the time of which health is drawn
+"""Flag, its meaning, its mark and its colour."""
+_PIECES = 240  # parts of the time over which health is drawn
 _COLOURS = (GOOD, BAD, "#8e6bbd")
 
 
@@ -84,17 +83,17 @@ class Fused(Drawn):
     time
         s, shape (m,).
     rate
-        In the unit of the readings, shape (m, axes).
+        Rate in the unit of the readings, shape (m, axes).
     weights, flags
-        Of each gyro in each sample, shape (m, axes, n), or None where they were not asked for.
+        Weight and flags of each gyro in each sample, shape (m, axes, n), or None where they were not asked for.
     elements
         The columns that were fused.
     health
-        What happened to each gyro.
+        States of each gyro.
     block
         The samples that were fused.
     notes
-        Gaps in time, and whatever else a user should know.
+        Gaps in time, and other messages for the user.
 
     Examples
     --------
@@ -120,7 +119,7 @@ class Fused(Drawn):
         return _exhibits(self)
 
     def recording(self) -> Recording:
-        """Return the fused rate as a recording, with the time and the head of what was fused: ``write`` takes it."""
+        """Return the fused rate as a recording with the time and the head of the readings: ``write`` takes it."""
         columns, units = {"time": self.block.columns["time"]}, {"time": self.block.units["time"]}
         for a, (name, unit) in enumerate(zip(self.elements.rate_names(), self.elements.units, strict=True)):
             columns[name], units[name] = np.ascontiguousarray(self.rate[:, a]), unit
@@ -132,7 +131,7 @@ class Fused(Drawn):
 
 
 def _exhibits(fused: Fused) -> Exhibits:
-    """Return the rate over time and, for each axis with flags, the state of its gyros; a table of them."""
+    """Return the rate over time and, for each axis with flags, the states of its gyros, and a table of them."""
     elements = fused.elements
     length = f"{fused.time[-1] - fused.time[0]:.4g} s"
     health = fused.health.lines()
@@ -172,7 +171,7 @@ def _rate(fused: Fused) -> Figure:
 
 
 def _begins(fused: Fused, bit: int) -> tuple[np.ndarray, ...]:
-    """Return where gyros begin to have a flag: samples, axes and gyros, each of shape (k,)."""
+    """Return where flags of gyros begin: samples, axes and gyros, each of shape (k,)."""
     if fused.flags is None:
         return (np.empty(0, dtype=np.intp),) * 3
     held = (fused.flags & bit) != 0
@@ -181,7 +180,7 @@ def _begins(fused: Fused, bit: int) -> tuple[np.ndarray, ...]:
 
 
 def _states(fused: Fused) -> list[Figure]:
-    """Return when each gyro was flagged, a figure for each axis on which one was."""
+    """Return the figures of the times of flags, one for each axis with flags."""
     if fused.flags is None:
         return []
     edges = np.linspace(0, len(fused.time), min(_PIECES, len(fused.time)) + 1).astype(int)[:-1]
@@ -200,7 +199,7 @@ def _states(fused: Fused) -> list[Figure]:
         if traces:
             figures.append(
                 curves(
-                    title=f"State of each gyro{of_axis(letter)}",
+                    title=f"State of each gyro{axis_suffix(letter)}",
                     caption=f"A mark where a gyro was in that state in one of {len(edges)} equal pieces of time.",
                     traces=traces,
                     x=figure_axis("time, s", range=[float(fused.time[0]), float(fused.time[-1])]),
@@ -222,16 +221,13 @@ def _table(fused: Fused) -> ReportTable:
     return ReportTable("Samples in each state", "", ["gyro", *labels], rows)
 
 
-# Fusion of an array's readings into one rate, by the C core, whole or block by block.
-
-
-# Gain of the virtual gyro: a rate that walks, and a bias of each gyro that walks.
+# Gain of method kalman: a rate that walks, and biases that walk.
 
 
 RATE_WALK = math.radians(1.4)
 """Default process noise, rad/s/sqrt(s): follows 12.5 deg/s at 0.1 Hz, sampled at 50 Hz, without a visible lag."""
-_BIAS_WALK = 0.004  # of the white noise, in a second, that biases are let walk by
-_LOWEST = 0.05  # of the mean variance: no element is believed to be quieter
+_BIAS_WALK = 0.004  # of the white noise in 1 s: walk of the biases where no record states it
+_LOWEST = 0.05  # of the mean variance: no element counts as quieter
 
 
 def steady_gain(white: Array, walk: Array, rate_walk: float, step: float) -> Array:
@@ -269,10 +265,10 @@ def steady_gain(white: Array, walk: Array, rate_walk: float, step: float) -> Arr
 
 
 def noise_about_mean(readings: Array) -> Array:
-    """Standard deviation of each gyro's noise from its residuals about the array mean, shape (axes, n).
+    """Return the standard deviation of each gyro's noise from residuals about the array mean, shape (axes, n).
 
     ``var_i = n / (n - 2) [m_i - sum_j m_j / (n (n - 1))]``, m_i the variance of the residual (the N-cornered hat); not
-    below 5 % of the mean variance. Rows with readings that are not finite are left out; ones where nothing is left.
+    below 5 % of the mean variance. Rows with readings that are not finite are left out; ones where no row is left.
     """
     _, axes, n = readings.shape
     sigma = np.ones((axes, n))
@@ -281,7 +277,7 @@ def noise_about_mean(readings: Array) -> Array:
         if n < 3 or len(rows) < 50:
             continue
         residual = rows - rows.mean(axis=1, keepdims=True)
-        # Successive differences: a scale factor that differs shows in motion, but hardly from sample to sample.
+        # Successive differences: a differing scale factor shows in motion, but hardly from sample to sample.
         # The median of their size, so that spikes do not count.
         m = (MAD_TO_SIGMA * np.median(np.abs(np.diff(residual, axis=0)), axis=0)) ** 2 / 2
         variance = n / (n - 2) * (m - m.sum() / (n * (n - 1)))
@@ -291,20 +287,20 @@ def noise_about_mean(readings: Array) -> Array:
 
 
 def default_bias_walk(white: Array) -> Array:
-    """Rate random walk where no record states one: 0.4 % of a sample's noise per sqrt(s)."""
+    """Return the rate random walk where no record states one: 0.4 % of a sample's noise per sqrt(s)."""
     return _BIAS_WALK * white
 
 
-# The array of an exported blob: how it fuses, and its stream.
+# The array in an exported blob: its fusion, and its stream.
 
 
 def fusion_of_blob(blob: Blob) -> Fusion:
-    """Return how an exported blob fuses.
+    """Return the fusion of an exported blob.
 
     Raises
     ------
     RecordError
-        It holds no array.
+        The blob holds no array.
     """
     return fusion_of(_array_section(blob))
 
@@ -340,25 +336,25 @@ def blob_stream(blob: Blob, elements: Elements, recording: str) -> _InUnits:
 
 
 def _array_section(blob: Blob) -> Any:
-    """What a blob says of its array."""
+    """Return the section of a blob that holds its array."""
     section = next((s for s in blob.text["sections"] if s["kind"] == "array"), None)
     if section is None:
         raise RecordError(f"{blob.name}: the blob holds no array")
     return section
 
 
-# Method and memory as texts, and as a calibration carries them.
+# Method and memory as texts, and in calibrations.
 
 
 def carried(calibration: Calibration | Blob | None) -> Fusion:
-    """Return the method and memory that a calibration record or a blob carries: robust and growing where none does."""
+    """Return the method and memory of a calibration record or a blob; robust and growing where it has none."""
     if isinstance(calibration, Blob):
         return fusion_of_blob(calibration)
     return fusion_of(None if calibration is None else calibration.model.get("fusion"))
 
 
 def fusion_of_record(record: Calibration, method: str | None, memory: str | None) -> Fusion:
-    """Return how a unit is to fuse: by the texts that are given, else as its record carries.
+    """Return the fusion of a unit: the texts where they are stated, else as in its record.
 
     Raises
     ------
@@ -376,7 +372,7 @@ def memory_text(memory: str | float, start: int) -> str:
 
 
 def fusion_text(method: str | None, memory: str | None, label: str = "--{}", held: Fusion | None = None) -> Fusion:
-    """Return method and memory of two texts, each that of `held` where it is None.
+    """Return method and memory from two texts, each that of `held` where it is None.
 
     Raises
     ------
@@ -399,7 +395,7 @@ def parse_memory(text: str, option: str = "--memory") -> tuple[str | float, int]
     Raises
     ------
     OptionError
-        It is none of these.
+        The text is none of these.
     """
     kind, colon, count = text.partition(":")
     if kind == "growing" and (not colon or (count.isascii() and count.isdecimal() and 0 < int(count) <= MOST_COUNT)):
@@ -413,17 +409,17 @@ def parse_memory(text: str, option: str = "--memory") -> tuple[str | float, int]
     return gain, 1
 
 
-# Fusion of an array's readings into one rate, by the C core, whole or block by block.
+# Fusion of recordings, as a whole or block by block.
 
 
 _NEED_THREE = ("robust", "support", "least-squares")
-_FOR_NOISE = 10_000  # samples by which the noise is told where none is stated
-_WITHOUT_UNIT = 16.0  # rad/s in a second, or times the noise: the walk of a motion that nothing is known of
+_FOR_NOISE = 10_000  # samples that show the noise where none is stated
+_WITHOUT_UNIT = 16.0  # rad/s in a second, or times the noise: walk of an unknown motion
 
 
 @dataclass(frozen=True)
 class FuseOptions:
-    """How to fuse.
+    """Options of a fusion.
 
     Attributes
     ----------
@@ -436,14 +432,14 @@ class FuseOptions:
     initial_bias
         ``first``, ``zero``, or the record of an array calibration whose biases the recursion starts from.
     calibration
-        Record whose biases (and matrices, where it has them) are taken off first; its noise gives weights and gains. Or
-        the blob of such a record: what the unit runs, `robust` with the unit's settings and float numbers.
+        Record whose biases (and matrices, if it has them) are applied first; its noise gives weights and gains. Or the
+        blob of such a record, as the unit runs it: `robust` with the unit's settings and float numbers.
     rate
         Sampling rate, Hz; from the recording's first steps of time where None.
     rate_walk
         Process noise of `kalman`, rad/s/sqrt(s).
     still
-        From when to when the unit is known to be at rest, s: zero-rate updates take the common bias off from then on.
+        First and last time, s, at which the unit is known to be at rest: zero-rate updates then remove the common bias.
 
     Examples
     --------
@@ -500,7 +496,7 @@ class FuseOptions:
 def fuse(
     recording: Recording, options: FuseOptions | None = None, *, weights: bool = False, flags: bool = True
 ) -> Fused:
-    """Fuse a recording as a whole.
+    """Return the fused rate of a whole recording.
 
     Raises
     ------
@@ -517,7 +513,7 @@ def fuse(
 
 @dataclass
 class Fuser:
-    """A stream over the blocks of a recording: the state between them, and the warnings at the end."""
+    """Fusion over the blocks of a recording: the state between them, and the warnings at the end."""
 
     options: FuseOptions
     weights: bool = False
@@ -530,7 +526,7 @@ class Fuser:
     lost: int = 0
 
     def fuse(self, blocks: Iterable[Recording]) -> Iterator[Fused]:
-        """Fuse consecutive blocks; the result does not depend on where they are cut.
+        """Yield the fused rates of consecutive blocks; the result does not depend on where they are cut.
 
         Raises
         ------
@@ -566,7 +562,7 @@ class Fuser:
                 fused_before = 0 if head is None else len(head)
                 head = readings if head is None else np.concatenate([head, readings])
                 if stream is None or self.clock.rate != before:
-                    # The times behind the settings are a different number of samples: start again from the first one.
+                    # The settings' times are another number of samples now: start again from the first sample.
                     stream = self._open(block, elements, head)
                     readings, time = head, early
                 else:
@@ -579,7 +575,7 @@ class Fuser:
             yield self._fused(block, out, fused_before, elements)
 
     def notes(self) -> list[str]:
-        """Return what there is to say at the end: gaps, rows of zeros, and what the readings show (`Checks`)."""
+        """Return messages after the last block: gaps, rows of zeros, and the results of `Checks`."""
         more: list[str] = []
         if self.options.method == "feedback" and self.health is not None:
             more = feedback_notes(len(self.health.names[0]), self.clock.rate)
@@ -591,7 +587,7 @@ class Fuser:
         return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in [*lines, *more])]
 
     def _drop_zeros(self, readings: Array) -> None:
-        """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to not a number."""
+        """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to NaN."""
         flat = readings.reshape(len(readings), -1)
         joined = flat if self.before is None else np.vstack([self.before, flat])
         zero = zero_rows(list(joined.T))[len(joined) - len(flat) :]
@@ -636,7 +632,7 @@ def open_stream(
 ) -> Any:
     """Return a `runtime.Stream` for these elements of a recording of this name.
 
-    `first` are readings to take the noise from where no record has it.
+    The noise comes from the readings `first` where no record states it.
 
     Raises
     ------
@@ -656,10 +652,10 @@ def open_stream(
         start = array_calibration(initial, elements, recording).bias
         if options.method == "feedback":
             initial = start
-        else:  # what the others start from is taken off for good: their own estimates are relative to it
+        else:  # the start is subtracted for good: the methods' estimates are relative to it
             initial, bias = "zero", start
     if options.method == "kalman" and bias is not None:
-        initial = "zero"  # a first sample's noise would stay in the biases for as long as the gain takes
+        initial = "zero"  # the noise of a first sample would stay in the biases until the gain removes it
     settings: dict[str, Any] = {
         "elements": elements.count,
         "axes": len(elements.axes),
@@ -680,7 +676,7 @@ def open_stream(
 
 
 def _aligned(matrices: Array | None, spread: Array) -> Array:
-    """Standard deviations after alignment, shape (axes, n)."""
+    """Return standard deviations after alignment, shape (axes, n)."""
     if matrices is None:
         return spread
     turned: Array = np.sqrt(np.einsum("nab,bn->an", matrices**2, spread**2))
@@ -688,7 +684,7 @@ def _aligned(matrices: Array | None, spread: Array) -> Array:
 
 
 def _white_weights(calibration: ArrayCalibration) -> Array:
-    """Start weights of `robust`: inverse variances of the white noise."""
+    """Return the start weights of `robust`: inverse variances of the white noise."""
     inverse = 1 / np.maximum(_aligned(calibration.matrices, calibration.white), 1e-300) ** 2
     weights: Array = inverse / inverse.sum(axis=1, keepdims=True)
     return weights
@@ -697,7 +693,7 @@ def _white_weights(calibration: ArrayCalibration) -> Array:
 def _gain(
     options: FuseOptions, elements: Elements, rate: float, first: Array, calibration: ArrayCalibration | None
 ) -> Array:
-    """Steady-state gain of `kalman`, shape (axes, n + 1, n)."""
+    """Return the steady-state gain of `kalman`, shape (axes, n + 1, n)."""
     step = 1 / rate
     if calibration is not None:
         white = _aligned(calibration.matrices, calibration.white) / np.sqrt(step)
@@ -710,7 +706,7 @@ def _gain(
     for a, unit in enumerate(elements.units):
         if parse_unit(unit).quantity == "rate":
             rate_walk = float(from_si(options.rate_walk, unit))
-            if calibration is None and (white[a] == 1.0).all():  # nothing known: follow the motion
+            if calibration is None and (white[a] == 1.0).all():  # nothing is known: follow the motion
                 rate_walk = _WITHOUT_UNIT / np.sqrt(step)
         else:
             rate_walk = _WITHOUT_UNIT * float(white[a].mean()) / np.sqrt(step)

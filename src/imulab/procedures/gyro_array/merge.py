@@ -1,4 +1,4 @@
-"""Files of one gyroscope each, joined by time to the recording of an array."""
+"""Files of one gyroscope each, joined by time into the recording of an array."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from imulab.units import conversion_factor, parse_unit
 
 _MOST_POINTS = 1 << 20  # of the common time over which recordings are correlated
 _FEWEST_POINTS, _FEWEST_LEVELS = 100, 8  # samples, and different readings, of recordings that can be correlated
-_LEAST_MOTION = 1e-6  # of the variance of the whole
-_ALIKE = 0.8  # correlation from which two recordings are of one motion
-_SECOND = 0.9  # of the best correlation: a second place this good leaves the offset open
+_LEAST_MOTION = 1e-6  # of the variance of the whole: less is no motion
+_ALIKE = 0.8  # correlation from which two recordings show one motion
+_SECOND = 0.9  # of the best correlation: a second maximum this high leaves the offset open
 
 
 @dataclass(frozen=True, repr=False)
 class Merged(Shown):
-    """The recording of the array, and what there is to say of how its elements came together."""
+    """The recording of the array, and notes on how its elements were joined."""
 
     recording: Recording
     notes: tuple[str, ...]
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return what was joined, and what there is to say of it."""
+        """Return what was joined, and the notes."""
         gyros = sum(kind_of(name) == "gyro" for name in self.recording.columns)
         return f"{len(self.recording)} samples, {gyros} gyros", ["note"], [[note] for note in self.notes]
 
@@ -75,7 +75,7 @@ def merge_recordings(
                 "--axis x, y or z takes one axis of each"
             )
     times = [_time(recording) for recording in recordings]
-    values = [_in_unit_of(first, names[0], r, gyro_names) for r, gyro_names in zip(recordings, names, strict=True)]
+    values = [_convert_units(first, names[0], r, gyro_names) for r, gyro_names in zip(recordings, names, strict=True)]
     notes = []
     for i in range(1, len(recordings)):
         name, offset = recordings[i].name, _clock_offset(times[0], values[0], times[i], values[i])
@@ -98,10 +98,10 @@ def merge_recordings(
             f"{times[0][0]:.9g} to {times[0][-1]:.9g} s; clocks that began apart are moved by --align"
         )
     for recording, time in zip(recordings[1:], times[1:], strict=True):
-        notes += _joined(recording, time, times[0], times[0][rows])
+        notes += _note_joining(recording, time, times[0], times[0][rows])
     columns, units = {"time": first.column("time")[rows]}, {"time": first.units["time"]}
     for i, (time, readings) in enumerate(zip(times, values, strict=True), start=1):
-        joined = readings[rows] if i == 1 else _interpolated(times[0][rows], time, readings)
+        joined = readings[rows] if i == 1 else _interpolate(times[0][rows], time, readings)
         for k, name in enumerate(names[0]):
             title = f"gyro_{'xyz'[k]}_{i}" if len(names[0]) > 1 else f"gyro_{i}"
             columns[title], units[title] = np.ascontiguousarray(joined[:, k]), first.units[name]
@@ -116,7 +116,7 @@ def merge_recordings(
 
 
 def _head(recordings: Sequence[Recording]) -> dict[str, str]:
-    """Return what the heads of all recordings agree on, without a truth, and what each element is."""
+    """Return the entries on which all heads agree, without a truth, and each element's own file and serial."""
     first = recordings[0].metadata
     head = {
         key: text
@@ -180,7 +180,7 @@ def _time(recording: Recording) -> Array:
     return time
 
 
-def _in_unit_of(first: Recording, wanted: Sequence[str], recording: Recording, names: Sequence[str]) -> Array:
+def _convert_units(first: Recording, wanted: Sequence[str], recording: Recording, names: Sequence[str]) -> Array:
     """Return the readings in the units of the first recording, shape (n, axes)."""
     columns = []
     for name, target in zip(names, wanted, strict=True):
@@ -192,7 +192,7 @@ def _in_unit_of(first: Recording, wanted: Sequence[str], recording: Recording, n
     return np.column_stack(columns)
 
 
-def _interpolated(wanted: Array, time: Array, values: Array) -> Array:
+def _interpolate(wanted: Array, time: Array, values: Array) -> Array:
     """Return readings at other times, shape (m, axes); NaN across gaps."""
     values_wanted = np.column_stack([np.interp(wanted, time, column) for column in values.T])
     away, across = _distance_to_samples(wanted, time)
@@ -201,14 +201,14 @@ def _interpolated(wanted: Array, time: Array, values: Array) -> Array:
 
 
 def _distance_to_samples(wanted: Array, time: Array) -> tuple[Array, np.ndarray]:
-    """Return how far times, shape (m,), lie from the nearest sample, s, and which lie in a gap too wide to bridge."""
+    """Return the distance of times, shape (m,), to the nearest sample, s, and whether they lie in a wide gap."""
     right = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
     away = np.minimum(np.abs(time[right] - wanted), np.abs(wanted - time[right - 1]))
     return away, time[right] - time[right - 1] > WIDEST_GAP * usual_step(np.diff(time))[0]
 
 
-def _joined(recording: Recording, time: Array, clock: Array, wanted: Array) -> list[str]:
-    """Say between which rates a recording is interpolated, and how far its own samples are from the times wanted."""
+def _note_joining(recording: Recording, time: Array, clock: Array, wanted: Array) -> list[str]:
+    """Return a note on the two rates, and how far the recording's samples lie from the common times."""
     away, across = _distance_to_samples(wanted, time)
     most = float(away[~across].max(initial=0.0))
     if most == 0:
@@ -221,10 +221,10 @@ def _joined(recording: Recording, time: Array, clock: Array, wanted: Array) -> l
 
 
 def _clock_offset(time: Array, values: Array, other: Array, others: Array) -> float | None:
-    """How much later the other clock shows the same motion, s; None where no single offset fits clearly.
+    """Return by how much the other clock shows the same motion later, s; None where no single offset fits clearly.
 
-    The size of the rate, which is the same however a gyroscope is mounted, is correlated over all shifts that leave
-    half of the shorter recording.
+    The size of the rate does not depend on how a gyroscope is mounted; it is correlated over all shifts that leave half
+    of the shorter recording.
     """
     step = max(usual_step(np.diff(time))[0], usual_step(np.diff(other))[0])
     step = max(step, max(time[-1] - time[0], other[-1] - other[0]) / _MOST_POINTS)
@@ -244,7 +244,7 @@ def _clock_offset(time: Array, values: Array, other: Array, others: Array) -> fl
     mean_a, mean_b = correlated(a, ones[1]) / count, correlated(ones[0], b) / count
     power_a = correlated(a**2, ones[1]) / count - mean_a**2
     power_b = correlated(ones[0], b**2) / count - mean_b**2
-    # Where one of both hardly changes there is no motion to compare, and no likeness.
+    # Where one of the two hardly changes there is no motion to compare, and no correlation.
     moves = (power_a > _LEAST_MOTION * a.var()) & (power_b > _LEAST_MOTION * b.var()) & (count >= shorter / 2)
     together = correlated(a, b) / count - mean_a * mean_b
     spread = np.sqrt(np.where(moves, power_a, 1.0)) * np.sqrt(np.where(moves, power_b, 1.0))
@@ -266,12 +266,12 @@ def _clock_offset(time: Array, values: Array, other: Array, others: Array) -> fl
 
 
 def _is_moving(values: Array) -> bool:
-    """Whether readings, shape (n, axes), take more values than the last digits of a gyroscope at rest."""
+    """Return whether readings, shape (n, axes), take more values than the last digits of a gyroscope at rest."""
     return any(len(np.unique(column[np.isfinite(column)])) >= _FEWEST_LEVELS for column in values.T)
 
 
 def _size_of_rate(time: Array, values: Array, step: float) -> Array:
-    """Size of the rate, without its median, at even steps of time."""
+    """Return the size of the rate, without its median, at even steps of time."""
     grid = np.arange(time[0], time[-1], step)
     size = np.zeros(len(grid))
     for column in values.T:

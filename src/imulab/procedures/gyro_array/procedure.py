@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from imulab.report.traces import Exhibits
 
 
-# A gyro array from a recording at rest and, if there is one, a recording in motion.
+# The fit as a task: from a recording at rest and, if there is one, one in motion.
 
 
 def _fit(
@@ -77,7 +77,7 @@ TASK = Task(
 )
 
 
-# The array of gyroscopes that are fused into one rate, as the registry knows it.
+# The procedure and its section of a device.
 
 
 class ArraySection(Section):

@@ -25,7 +25,7 @@ _DEG = math.pi / 180  # rad
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Noise of one gyro, rad/s: white noise per sample, Gauss-Markov, rate random walk, turn-on bias.
+    """Noise of one gyro, rad/s: white noise of a sample, Gauss-Markov noise, rate random walk, turn-on bias.
 
     Each gyro's white noise is `white` times a factor drawn evenly from `spread`.
     """
@@ -159,7 +159,7 @@ def simulate_array(
             f"{length:g} s at {rate:g} Hz of {elements * axes} gyros: expected 2 to {_MOST_READINGS:g} readings in all"
         )
     time = np.arange(count) / rate
-    unit_rng = np.random.default_rng([seed, 1])  # what is the same in all recordings of one array
+    unit_rng = np.random.default_rng([seed, 1])  # for all recordings of one array
     levels = noise.white * unit_rng.uniform(*noise.spread, (axes, elements))
     biases = noise.turn_on * unit_rng.standard_normal((axes, elements))
     sensing = _sensing(elements, axes, scale_spread, misalignment, mounting, unit_rng)

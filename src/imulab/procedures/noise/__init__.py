@@ -1,15 +1,12 @@
-"""The noise of a sensor at rest: its model, and the numbers that filters want; and what the options may be."""
+"""Noise at rest: a model of every sensor's noise, and the numbers that filters need. Here are the options' values."""
 
 from __future__ import annotations
 
 from imulab.errors import OptionError, listed
 from imulab.estimation.decisions import NOISE_MODEL_REJECTED
 
-# What the options of the noise procedure may be.
-
-
 HORIZON = 10.0
-"""s over which a filter predicts alone."""
+"""s that a filter predicts without aiding."""
 NO_COVARIATE = "no"
 COVARIATES = ("time", "temperature")
 SAY_STEPS = "say"
@@ -18,17 +15,17 @@ LETTERS = {"N": "white", "B": "1/f", "K": "random walk", "G": "Gauss-Markov", "Q
 
 
 def rejected(probability: float, columns: int) -> bool:
-    """Return whether a test of fit speaks against a model: a good one of so many columns does so in 1 % of records."""
+    """Return whether a test of fit rejects a model: a good model of one of so many columns in 1 % of records."""
     return probability < NOISE_MODEL_REJECTED.level / columns
 
 
 def check_terms(text: str, called: str = "terms") -> str:
-    """Return the letters of a model, or ``auto``.
+    """Return the letters of a model, or ``auto``, after a check.
 
     Raises
     ------
     OptionError
-        They are none.
+        The text is no model.
     """
     if text == "auto":
         return text
@@ -45,7 +42,7 @@ def check_terms(text: str, called: str = "terms") -> str:
 def check_options(
     terms: str, horizon: float | None, band: float | None, regress: str | None, steps: str | None, label: str = "{}"
 ) -> None:
-    """Check what can be checked before there is data; `label` is how messages call an option.
+    """Check the options before any data are read; `label` makes the name of an option in messages.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The Allan deviation of what people have: samples and their rate, or a column of a file, recording or data frame."""
+"""The Allan deviation of samples at a rate, or of a column of a file, recording or data frame."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from imulab.units import si_unit
 
 @dataclass(frozen=True, repr=False)
 class AllanCurve(Drawn, noise_coefficients.DeviationCurve):
-    """The same of a column, in SI, or of samples of an unknown unit.
+    """Allan deviation of a column, in SI, or of samples of an unknown unit.
 
     Attributes
     ----------
@@ -36,12 +36,12 @@ class AllanCurve(Drawn, noise_coefficients.DeviationCurve):
     freedom
         Equivalent degrees of freedom, shape (t,).
     name, unit
-        Of the samples.
+        Name and unit of the samples.
     coefficients
         Noise coefficients of a sensor's column, as ``imulab allan`` prints them, or of samples without a column; None
         of other columns, and of fewer than 50 samples.
     notes
-        What is to say of the column and its rows, a sentence each.
+        Notes on the column and its rows, a sentence each.
     """
 
     name: str = "samples"
@@ -54,7 +54,7 @@ class AllanCurve(Drawn, noise_coefficients.DeviationCurve):
     __repr__ = noise_coefficients.DeviationCurve.__repr__
 
     def exhibits(self) -> Exhibits:
-        """Return the coefficients, where there are any, the curve with its 95 % interval, and a table of it."""
+        """Return the coefficients, if there are any, the curve with its 95 % interval, and a table of it."""
         from imulab.report.noise_figures import allan_figure, coefficient_rows, coefficients_table
         from imulab.report.parameters import small_unit
 
@@ -143,7 +143,7 @@ def allan_deviation(
         for name, value in {**reading, "column": column, "window": window}.items():
             if value is not None:
                 raise OptionError(f"allan_deviation: {name} does not go with such data: samples have their rate alone")
-        return _of_samples(unmasked(data).astype(np.float64), rate, taus)
+        return _samples_curve(unmasked(data).astype(np.float64), rate, taus)
     stated: dict[str, Any] = {**reading, "rate": rate, "window": window}
     if isinstance(data, str | PathLike) and is_large(data):
         recording = on_disk(as_blocks(data, stated, allan_deviation)[0])
@@ -166,7 +166,7 @@ def allan_deviation(
     return AllanCurve(**vars(curve), name=chosen, unit=unit)
 
 
-def _of_samples(samples: Array, rate: float, taus: str | Array) -> AllanCurve:
+def _samples_curve(samples: Array, rate: float, taus: str | Array) -> AllanCurve:
     if len(samples) < FEWEST:
         return AllanCurve(**vars(noise_coefficients.allan_deviation(samples, rate, taus)))
     noise, notes = samples_noise(samples, rate, taus)
@@ -174,7 +174,7 @@ def _of_samples(samples: Array, rate: float, taus: str | Array) -> AllanCurve:
 
 
 def _is_line(data: object) -> bool:
-    """Return whether data are numbers one after the other."""
+    """Return whether data are a sequence of numbers."""
     try:
         array = np.asarray(data)
     except ValueError:

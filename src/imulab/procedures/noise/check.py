@@ -1,4 +1,7 @@
-"""Whether a new log at rest agrees with the noise of a record, what differs, and how that is shown."""
+"""The test of a new log at rest against the noise of a record: whether they agree, what differs, and its report.
+
+Source: `imulab.estimation.noise.agreement` (likelihood ratio and octaves of the spectra).
+"""
 
 from __future__ import annotations
 
@@ -32,12 +35,12 @@ from imulab.report import traces as panels
 from imulab.report.traces import BAD, GOOD, Exhibits, Figure, rounded, scatter, table
 from imulab.units import si_unit
 
-# The result of a test of a noise record by a log: verdict, what changed by how much, the octaves of both spectra.
+# The result: verdict, changes of the terms, and octaves of both spectra.
 
 
 _DIGITS = 5  # of the numbers in a drawing
 _TICKS = [0.01, 0.1, 0.2, 0.5, 1, 2, 5, 10, 100]  # of an axis of ratios
-# Changes of size by less are said in per cent; octaves this improbable are named in the text
+# Changes of size below this are stated in per cent; octaves of a smaller probability are named
 _HALF, _CERTAIN = 0.5, 0.05
 
 
@@ -52,22 +55,22 @@ class TermChange:
 
     @property
     def score(self) -> float:
-        """In standard uncertainties of the logarithm."""
+        """Standard uncertainties by which the logarithm of the ratio differs from 0."""
         return abs(math.log(self.ratio)) / (math.log(self.high / self.low) / 2 / NORMAL_95)
 
 
 @dataclass(frozen=True)
 class ColumnCheck:
-    """What speaks against a column of the log being of the record's noise.
+    """Result of the test of one column.
 
     Attributes
     ----------
     name, unit
-        Of the column; the unit in SI.
+        Name of the column, and its unit in SI.
     agreement
         The tests.
     changes
-        Of the terms of the record's model.
+        Changes of the terms of the record's model.
     """
 
     name: str
@@ -77,11 +80,11 @@ class ColumnCheck:
 
     @property
     def probability(self) -> float:
-        """Of so large a difference, if nothing changed."""
+        """Probability of so large a difference if nothing changed."""
         return self.agreement.probability
 
     def text(self) -> str:
-        """Return what changed, by how much, with 95 % intervals: certain changes, or the one that is most so."""
+        """Return what changed, by how much, with 95 % intervals: the certain changes, or the most certain one."""
         certain = [each for each in self.changes if not each.low < 1 < each.high] or list(self.changes[:1])
         parts = [f"{label(each.term, self.unit)} {times(each.ratio, each.low, each.high)}" for each in certain]
         octaves = self.agreement.octaves
@@ -93,7 +96,7 @@ class ColumnCheck:
         return "; ".join(parts)
 
     def content(self) -> dict[str, Any]:
-        """Return the same for scripts."""
+        """Return the result for scripts."""
         octaves = self.agreement.octaves
         return {
             "p": self.probability,
@@ -112,20 +115,20 @@ class ColumnCheck:
 
 @dataclass(frozen=True, repr=False)
 class NoiseCheck(RecordCheck):
-    """How well a log agrees with a record's noise.
+    """Result of the test of a log against a record's noise.
 
     Attributes
     ----------
     columns
-        By name.
+        Results by column.
     false_alarm
-        Share of logs of unchanged noise that fail, at most.
+        Largest share of logs of unchanged noise that fail.
     tolerance
-        Relative change of size that is not held against the log.
+        Relative change of size that the test allows.
     notes
-        What a user must know of the test, a sentence each.
+        Notes on the test, a sentence each.
     log
-        The log's own record, as `fit_noise` makes it.
+        Record of the log, as `fit_noise` makes it.
     """
 
     columns: Mapping[str, ColumnCheck]
@@ -139,7 +142,7 @@ class NoiseCheck(RecordCheck):
 
     @property
     def probability(self) -> float:
-        """Of so large a difference in any column, if nothing changed: ``1 - (1 - min p)^k`` of k columns."""
+        """Probability of so large a difference in any column if nothing changed: ``1 - (1 - min p)^k``, k columns."""
         least = min(each.probability for each in self.columns.values())
         return -math.expm1(len(self.columns) * math.log1p(-min(least, 1 - 1e-16)))
 
@@ -149,7 +152,7 @@ class NoiseCheck(RecordCheck):
         return self.probability >= self.false_alarm
 
     def differs(self, name: str) -> bool:
-        """Return whether a column by itself fails."""
+        """Return whether a column alone fails."""
         share = -math.expm1(math.log1p(-self.false_alarm) / len(self.columns))
         return self.columns[name].probability < share
 
@@ -159,7 +162,7 @@ class NoiseCheck(RecordCheck):
         return min(self.columns.values(), key=lambda column: column.probability)
 
     def meaning(self) -> str:
-        """Return what the test says, in words."""
+        """Return the result in words."""
         if self.passed:
             return "the log agrees with the noise of the record"
         return f"the noise is not that of the record; most in {self.worst.name}: {self.worst.text()}"
@@ -172,7 +175,7 @@ class NoiseCheck(RecordCheck):
         )
 
     def measured(self) -> list[str]:
-        """Return what is said of every column."""
+        """Return the result of every column, a line each."""
         many = len(self.columns)
         lines = [f"{probability_text(self.probability)} over {many} column{'s' if many > 1 else ''}"]
         for name, column in self.columns.items():
@@ -261,13 +264,13 @@ def _octaves(check: NoiseCheck, names: Sequence[str], page: int, pages: int) -> 
     )
 
 
-# Whether a new log at rest agrees with the noise of a record, and what differs by how much.
+# The test.
 
 
 FALSE_ALARM, TOLERANCE = f"{100 * NOISE_CHECK.level:g} %", "1 %"
 _SAME_RATE = 0.01  # relative: a log of another rate has another spectrum
 Choose: TypeAlias = Callable[[Recording], Sequence[str]]
-"""Columns of a log to test, by its first rows."""
+"""Names of the columns of a log to test, from its first rows."""
 
 
 def check_noise(
@@ -342,7 +345,7 @@ def check_logs(
     tolerance: float | str,
     false_alarm: float | str,
 ) -> NoiseCheck:
-    """Test logs against a record; `read` returns them, given what chooses columns. Else as for `check_noise`."""
+    """Return the test of logs against a record; `read` returns them from a choice of columns. Else as `check_noise`."""
     if record.procedure != "noise":
         raise RecordError(f"a {record.procedure} record holds no model of noise; expected a record of noise fit")
     allowed, share = fraction(tolerance, "tolerance"), fraction(false_alarm, "false_alarm")
@@ -353,7 +356,7 @@ def check_logs(
     fit = fit_of(record)
     logs = read(lambda first: [name for name in fit.columns if name in first])
     recordings = [log.recording if isinstance(log, Rest) else log for log in logs]
-    names, notes = _columns(record, fit, recordings)
+    names, notes = _shared_columns(record, fit, recordings)
     options = record.options
     log_record = fit_recordings(
         logs, terms="auto", horizon=fit.columns[names[0]].interval.value, band=None,
@@ -366,12 +369,14 @@ def check_logs(
             "expected a log of the record's rate"
         )
     notes += [f"log: {reason}" for reason in log_record.verdict.reasons]
-    checked = {name: _checked(record, log_record, name, allowed) for name in names}
+    checked = {name: _check_column(record, log_record, name, allowed) for name in names}
     return NoiseCheck(checked, share, allowed, tuple(notes), log_record)
 
 
-def _columns(record: Calibration, fit: NoiseSummary, recordings: Sequence[Recording]) -> tuple[list[str], list[str]]:
-    """The record's columns that all logs have, in its units, and what is to be said."""
+def _shared_columns(
+    record: Calibration, fit: NoiseSummary, recordings: Sequence[Recording]
+) -> tuple[list[str], list[str]]:
+    """Return the record's columns that all logs have in its units, and notes on the others."""
     notes: list[str] = []
     names = [name for name in fit.columns if all(name in each for each in recordings)]
     for recording in recordings:
@@ -395,21 +400,21 @@ def _columns(record: Calibration, fit: NoiseSummary, recordings: Sequence[Record
     return names, notes
 
 
-def _checked(record: Calibration, log: Calibration, name: str, tolerance: float) -> ColumnCheck:
+def _check_column(record: Calibration, log: Calibration, name: str, tolerance: float) -> ColumnCheck:
     column, highest = fit_of(record).columns[name], fit_of(record).band[name].value
     first, off = _spectra(record, name)
     second, _ = _spectra(log, name)
-    before, after = ([_used(each, highest, off) for each in part] for part in (first, second))
+    before, after = ([_limit_band(each, highest, off) for each in part] for part in (first, second))
     chosen = str(record.options.get("terms", "auto"))
     candidates = CANDIDATES if chosen == "auto" else (chosen,)
     comparison = agreement(
         before, after, highest, tolerance=tolerance, candidates=candidates, full_band=column.full_band
     )
-    return ColumnCheck(name, column.unit, comparison, _changes((before, after), column))
+    return ColumnCheck(name, column.unit, comparison, _fit_changes((before, after), column))
 
 
 def _spectra(record: Calibration, name: str) -> tuple[list[Spectrum], list[tuple[float, float]]]:
-    """The spectra of a column, lines left out, and the ranges of frequency, Hz, that its model was not held against."""
+    """Return the spectra of a column without lines, and the ranges of frequency, Hz, left out of its model's fit."""
     spectra, off = [], []
     for each in drawn_of(record, name).spectra:
         first, last = np.array(each.first), np.array(each.last)
@@ -420,7 +425,7 @@ def _spectra(record: Calibration, name: str) -> tuple[list[Spectrum], list[tuple
     return spectra, off
 
 
-def _used(spectrum: Spectrum, highest: float, off: Sequence[tuple[float, float]]) -> Spectrum:
+def _limit_band(spectrum: Spectrum, highest: float, off: Sequence[tuple[float, float]]) -> Spectrum:
     f = frequencies(spectrum)
     out = np.zeros(len(f), dtype=np.bool_)
     for low, high in off:
@@ -429,8 +434,8 @@ def _used(spectrum: Spectrum, highest: float, off: Sequence[tuple[float, float]]
     return within(replace(spectrum, freedom=np.where(out, 0.0, spectrum.freedom)), highest)
 
 
-def _changes(sets: Sequence[Sequence[Spectrum]], column: Column) -> tuple[TermChange, ...]:
-    """The terms of the record's model, fitted to both, the most certain change first."""
+def _fit_changes(sets: Sequence[Sequence[Spectrum]], column: Column) -> tuple[TermChange, ...]:
+    """Return the changes of the terms of the record's model, fitted to both, the most certain change first."""
     model = np.array(column.values) > 0
     fitted: list[tuple[Array, Array]] = []
     for spectra in sets:

@@ -1,4 +1,4 @@
-"""The figures and tables of a noise record, from the record alone."""
+"""The figures and tables of a noise record, made from the record alone."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ from imulab.report.traces import (
 _DIGITS = 5  # of the numbers in a drawing
 _PARTS = ("white", "1/f", "walk", "quantisation", "Gauss-Markov", "second Gauss-Markov")
 _COLOURS = (BAD, "#8e6bbd", "#c99a2e", QUIET, "#4f9d69", "#4f9d69")
-_MOST_CURVES = 12  # columns that have a drawing of their own
+_MOST_CURVES = 12  # most columns with their own figure
 _SEEN = 0.03
-"""A part is drawn where it makes this share of the deviation somewhere."""
+"""A part is drawn where it makes at least this share of the deviation."""
 _NAMES = {"rad/s": "gyroscopes", "m/s^2": "accelerometers"}
 
 
@@ -64,7 +64,7 @@ def exhibits(record: Calibration) -> Exhibits:
 
 
 def _largest(fit: NoiseSummary, unit: str) -> list[tuple[str, str]]:
-    """What a filter wants of the columns with a unit: the largest of them."""
+    """Return the facts about the columns with a unit: the largest numbers that a filter needs."""
     symbol, factor = density_unit(unit).scale
     its = [name for name, column in fit.columns.items() if column.unit == unit]
     white = max(fit.filter_white[name].value for name in its)
@@ -114,7 +114,7 @@ def _terms(record: Calibration) -> ReportTable:
 
 
 def _between(value: float, low: float, high: float) -> tuple[str, str]:
-    """Value and interval, to the digits that the interval leaves."""
+    """Return a value and its interval with as many digits as the interval justifies."""
     width = max(high - low, 1e-12 * abs(value), 1e-300)
     places = max(0, 1 - int(np.floor(np.log10(width))))
     return f"{value:.{places}f}", f"{low:.{places}f} to {high:.{places}f}"
@@ -231,7 +231,7 @@ def _curve(record: Calibration, fit: NoiseSummary, name: str) -> Figure:
 
 
 def _parts(column: Column, tau: np.ndarray) -> np.ndarray:
-    """The Allan deviation of each part of the chosen model; what is the edge of the band belongs to the white noise."""
+    """Return the Allan deviation of each part of the chosen model; edge of the band as white noise."""
     values = np.array(column.values)
     squares = allan_terms(values, tau, column.interval.value)
     for k in np.flatnonzero(at_band_edge(values, column.shortest_time.value)):
@@ -241,7 +241,7 @@ def _parts(column: Column, tau: np.ndarray) -> np.ndarray:
 
 
 def _ratios(record: Calibration, fit: NoiseSummary, names: Any, page: int, pages: int) -> Figure:
-    """The spectrum over the model, by octaves."""
+    """Return the figure of the spectrum over the model, by octaves."""
     layout = panels.grid()
     traces: list[dict[str, Any]] = []
     worst = (0.0, "", 0.0)
@@ -278,7 +278,7 @@ def _ratios(record: Calibration, fit: NoiseSummary, names: Any, page: int, pages
 
 
 def name_at(worst: tuple[float, str, float]) -> str:
-    """Return what is farthest off, in words."""
+    """Return the octave that is farthest off, in words."""
     return f"{worst[1]} at {worst[2]:.3g} Hz, by {worst[0]:.1f} standard deviations"
 
 

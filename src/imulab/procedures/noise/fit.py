@@ -1,8 +1,7 @@
-"""Noise models of sensors at rest, from logs to a record.
+"""The fit of noise models to logs at rest, column by column, and the record: parameters, filter's numbers, findings.
 
-What is found of each column, the model, and what its user must know.
-
-Parameters with intervals, what filters want, and what a user must know, a sentence each.
+The mathematics stands in `imulab.estimation.noise`: `spectrum` makes binned cosine spectra, `likelihood` fits models to
+them, `analysis` chooses among models and tests the fit, `terms` gives white noise and walk for filters.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ from imulab.report.parameters import density_unit, small_unit
 from imulab.report.traces import plain_number
 from imulab.units import parse_unit, si_unit
 
-# What is found of one column of a log at rest: its noise, its lines and steps, and what it drifts with.
+# Results of one column.
 
 
 _COVARIATE_UNITS = {"time": "s", "temperature": "K"}
@@ -80,25 +79,25 @@ _COVARIATE_UNITS = {"time": "s", "temperature": "K"}
 
 @dataclass(frozen=True)
 class CovariateDrift:
-    """How a column follows time or temperature: slope and its uncertainty in SI, with the models without and with it.
+    """Dependence of a column on time or temperature, and the terms of its model without and with that dependence.
 
-    `taken` says whether the model is that of what is left.
+    `taken` says whether the dependence was removed before the model was fitted.
     """
 
     covariate: str
-    found: Regression
+    regression: Regression
     letters: tuple[str, str]
     taken: bool
 
     @property
     def slope(self) -> float:
-        """Unit of the column over that of the covariate."""
-        return float(self.found.slope[0])
+        """Slope, in the column's unit over that of the covariate, SI."""
+        return float(self.regression.slope[0])
 
     @property
     def standard_uncertainty(self) -> float:
-        """Of the slope."""
-        return float(self.found.standard_uncertainty[0])
+        """Standard uncertainty of the slope."""
+        return float(self.regression.standard_uncertainty[0])
 
 
 @dataclass(frozen=True)
@@ -108,13 +107,13 @@ class ColumnModel:
     Attributes
     ----------
     name, unit
-        Of the column; the unit in SI.
+        Name of the column, and its unit in SI.
     analysis
         Spectrum, candidates, chosen model.
     spikes, knocks, lines, steps
-        What was found that is no noise; of knocks start and length, s.
+        What is not noise; of knocks start and length, s.
     drifts
-        How it follows time and temperature.
+        Dependence on time and temperature.
     """
 
     name: str
@@ -127,10 +126,7 @@ class ColumnModel:
     drifts: tuple[CovariateDrift, ...]
 
 
-# Logs at rest, short or long, to noise models, column by column, and their record.
-
-
-# Logs at rest as they are given: short ones as recordings, large files block by block or with columns on disk.
+# Logs: short ones as recordings, large files block by block or with columns on disk.
 
 
 def given_log(
@@ -140,7 +136,7 @@ def given_log(
     choose: Callable[[Recording], Sequence[str]],
     named: Callable[[NDArray[Any]], Mapping[str, Any]] | None = None,
 ) -> Recording | Rest:
-    """Return a log as a function was given it; else as `read_log`. Errors as for `as_recording`."""
+    """Return a log from the data of a call, as a recording or as `read_log` does; errors as for `as_recording`."""
     return read_log(
         Path(data) if isinstance(data, str | PathLike) else None,
         lambda: as_blocks(data, reading, function),
@@ -155,20 +151,20 @@ def read_log(
     whole: Callable[[], Recording],
     choose: Callable[[Recording], Sequence[str]],
 ) -> Recording | Rest:
-    """Return a log; of a large file at rest, read block by block, what is left without its rows.
+    """Return a log; of a large file at rest, read block by block, the stretches without their rows.
 
-    Where a large one has to be looked at as a whole, its columns lie in temporary files.
+    If a large file has to be read as a whole, its columns lie in temporary files.
 
     Parameters
     ----------
     path
-        Of its file, None where it has none.
+        Path of the file, None if there is none.
     blocks
-        Reads it block by block, and says its source.
+        Returns the file's blocks and its source.
     whole
-        Reads it as a whole, where it is short.
+        Reads the file as a whole if it is short.
     choose
-        Returns the columns to fit, given the first block.
+        Returns the columns to fit, from the first block.
     """
     if not is_large(path):
         return whole()
@@ -181,23 +177,23 @@ def read_log(
     return replace(rest, recording=replace(rest.recording, source=source))
 
 
-# What a user of noise models must know, a sentence each.
+# Findings for the user, a sentence each.
 
 
-_MANY_SPIKES = 0.01  # share of samples, or of the time, from which spikes or knocks are no note
+_MANY_SPIKES = 0.01  # share of samples, or of the time, from which spikes or knocks are a warning and no note
 _MOST_NAMED = 3  # lines of a spectrum that are named
-# Parts of a record that a horizon may last; share of white noise that a roll-off may take without a word
+# Largest horizon in parts of a record; largest share of white noise that a roll-off may take without a note
 _SLOW_FACTOR, _LEANS = 10.0, 0.005
 
 
 def findings(columns: Mapping[str, ColumnModel], rests: Sequence[Rest], horizon: float) -> tuple[str, ...]:
-    """Return the findings on all columns, those that several have in one sentence."""
+    """Return the findings on all columns; columns with the same finding share a sentence."""
     columns_by_text: dict[tuple[type[str], str], list[str]] = {}
     for name, column in columns.items():
         if rejected(p := column.analysis.test.probability, len(columns)):
             text = f"no model of these terms fits (p = {p:.1g}); the numbers tell the size of the noise alone"
             columns_by_text[(str, text)] = [name]
-        for kind, text in _of_column(column):
+        for kind, text in _describe_column(column):
             columns_by_text.setdefault((kind, text), []).append(name)
     messages = [note for rest in rests for note in rest.notes]
     for (kind, text), names in columns_by_text.items():
@@ -217,7 +213,7 @@ def _named(names: Sequence[str]) -> str:
     return " ".join(names) if len(names) == 1 else f"columns {' '.join(names)}"
 
 
-def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
+def _describe_column(column: ColumnModel) -> list[tuple[type[str], str]]:
     analysis = column.analysis
     messages: list[tuple[type[str], str]] = []
     if not analysis.band.flat:
@@ -230,7 +226,7 @@ def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
         text = f"fitted up to {highest:.3g} Hz; from about {2 * highest:.3g} Hz on the spectrum is not level"
         messages.append((Note, text + lean))
     if at_band_edge(analysis.values, analysis.limits[0]).any():
-        messages.append((Note, _edge(column)))
+        messages.append((Note, _describe_edge(column)))
     samples = sum(each.count for each in analysis.stretches)
     if column.spikes:
         kind: type[str] = str if column.spikes > _MANY_SPIKES * samples else Note
@@ -241,7 +237,7 @@ def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
         text = f"{many} unlike the noise around, {lost:.2g} s from {start:.5g} s on, bridged by straight lines"
         messages.append((str if lost > _MANY_SPIKES * samples * analysis.interval else Note, text))
     if column.lines:
-        messages.append((Note, _lines(column)))
+        messages.append((Note, _describe_lines(column)))
     for low, high, factor in analysis.allowance.off[:_MOST_NAMED]:
         messages.append((Note, f"from {low:.3g} to {high:.3g} Hz the spectrum, left out, is {factor:.2g} of the model"))
     for step in column.steps:
@@ -257,8 +253,8 @@ def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
     return messages
 
 
-def _edge(column: ColumnModel) -> str:
-    """Say what a Gauss-Markov term of the shortest time constant is, and what the white noise is with it."""
+def _describe_edge(column: ColumnModel) -> str:
+    """Return the sentence about a Gauss-Markov term of the shortest time constant, and the white noise with it."""
     analysis = column.analysis
     unit, factor = density_unit(column.unit).scale
     level = float(edge_as_white(analysis.values, analysis.covariance, analysis.limits[0])[0][0])
@@ -269,7 +265,7 @@ def _edge(column: ColumnModel) -> str:
     )
 
 
-def _lines(column: ColumnModel) -> str:
+def _describe_lines(column: ColumnModel) -> str:
     named = ", ".join(
         f"{line.frequency:.4g} Hz of {_sized(line.amplitude, column.unit)}" for line in column.lines[:_MOST_NAMED]
     )
@@ -278,7 +274,7 @@ def _lines(column: ColumnModel) -> str:
 
 
 def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> tuple[type[str], str] | None:
-    if not drift.found.follows:
+    if not drift.regression.follows:
         return None
     unit, factor = small_unit(column.unit).scale
     per = "h" if drift.covariate == "time" else "K"
@@ -298,20 +294,20 @@ def _sized(value: float, unit: str) -> str:
     return f"{value * factor:.3g} {symbol}"
 
 
-# The record of noise models: parameters with intervals, what filters want, and what the figures are drawn from.
+# The record: parameters with intervals, numbers for filters, and the data of the figures.
 
 
 _DIGITS = 7  # of the numbers in a record
 _TAILS = (0.025, 0.975)  # of a 95 % interval
 _PAIRS = tuple(zip(SIGMA, TIME, strict=True))
 _SLOW = ("flicker", "walk")
-"""Terms that have a limit where the chosen model has not got them."""
+"""Terms that get an upper limit where the chosen model lacks them."""
 _PART = 10.0
-"""Of a record: the mean over so much of it still has an uncertainty that the rest of the record tells."""
+"""Part of a record up to which the uncertainty of a mean can be determined from the record."""
 
 
 def no_tables(record: Calibration) -> NoReturn:
-    """Refuse to make tables for a unit."""
+    """Refuse to make tables for the device."""
     raise RecordError("a noise record corrects nothing, so firmware has no table for it; expected a calibration")
 
 
@@ -366,10 +362,9 @@ def make_record(
 def _parameters(
     columns: Mapping[str, ColumnModel], more: Flags, short: bool
 ) -> tuple[dict[str, Parameter], list[str], list[Array]]:
-    """Parameters, and the names and covariance of those of each column that have an uncertainty.
+    """Return parameters, and names and covariance of those of each column that have an uncertainty.
 
-    Intervals allow for the terms `more` beside those that were chosen. Of a short record the slow terms are limits
-    alone.
+    Intervals allow for the terms `more` beside the chosen ones. A short record gives only limits of slow terms.
     """
     parameters: dict[str, Parameter] = {}
     names, blocks = [], []
@@ -380,13 +375,13 @@ def _parameters(
         white = analysis.average(lambda each, t=analysis.limits[0]: white_square(each, np.zeros(1), t))  # type: ignore[misc]
         ends_of_all = [float(np.sqrt(white.quantile(tail)[0, 0])) for tail in _TAILS]
         low[0], high[0] = min(float(low[0]), ends_of_all[0]), max(float(high[0]), ends_of_all[1])
-        if analysis.band.filtered(analysis.interval):  # what its roll-off leaves in the band is not in the model
+        if analysis.band.filtered(analysis.interval):  # the model has no term for the rest of the filter's roll-off
             covariance, more_of_white = covariance.copy(), analysis.band.roll_off * values[0]
             covariance[0, 0] += analysis.band.roll_off**2
             low[0] = values[0] - np.hypot(values[0] - low[0], NORMAL_95 * more_of_white)
             high[0] = values[0] + np.hypot(high[0] - values[0], NORMAL_95 * more_of_white)
         elif not analysis.band.flat:
-            covariance = _level_nowhere(analysis, float(values[0]), covariance, low, high)
+            covariance = _widen_white(analysis, float(values[0]), covariance, low, high)
         has, known = np.where(analysis.values > 0, values > 0, analysis.model), []
         for k, term in enumerate(NAMES):
             slow = term in _SLOW
@@ -404,7 +399,7 @@ def _parameters(
         size = values[known]
         blocks.append(covariance[np.ix_(known, known)] * np.outer(size, size))
         for drift in column.drifts:
-            if drift.covariate == "time" and (drift.found.follows or drift.taken):
+            if drift.covariate == "time" and (drift.regression.follows or drift.taken):
                 b, u = drift.slope, drift.standard_uncertainty
                 parameters[f"{name}_ramp"] = Parameter(
                     b, u, term_unit("ramp", unit), interval_95=(b - NORMAL_95 * u, b + NORMAL_95 * u)
@@ -414,10 +409,10 @@ def _parameters(
     return parameters, names, blocks
 
 
-def _level_nowhere(analysis: Analysis, white: float, covariance: Array, low: Array, high: Array) -> Array:
-    """Widen the interval of a white noise that no octave shows, and return the covariance with its uncertainty.
+def _widen_white(analysis: Analysis, white: float, covariance: Array, low: Array, high: Array) -> Array:
+    """Widen the interval of a white noise that no octave shows; return the covariance with its uncertainty.
 
-    It lies between the level at the end of the band and that below all Gauss-Markov terms, of which one may be the
+    It lies between the level at the end of the band and that below all Gauss-Markov terms, one of which may be the
     filter of the sensor: ``N^2 + sum 2 S^2 T``.
     """
     below = analysis.average(
@@ -432,7 +427,7 @@ def _level_nowhere(analysis: Analysis, white: float, covariance: Array, low: Arr
 
 
 def _intervals(analysis: Analysis, more: Flags, values: Array, covariance: Array) -> tuple[Array, Array]:
-    """Ends of the 95 % intervals of the parameters in a record, in which the edge of the band is white noise."""
+    """Return the ends of the 95 % intervals of the parameters, with terms at the edge of the band as white noise."""
     low, high = analysis.intervals(more)
     if np.array_equal(values, analysis.values):
         return low, high
@@ -445,7 +440,7 @@ def _intervals(analysis: Analysis, more: Flags, values: Array, covariance: Array
 
 
 def _use(column: ColumnModel, horizon: float) -> dict[str, Any]:
-    """White noise and walk for a filter, and the uncertainty of means, over all candidates."""
+    """Return white noise and walk for a filter, and the uncertainty of means, averaged over all candidates."""
     analysis, dt = column.analysis, column.analysis.interval
     h = np.array([max(round(horizon / dt), 1) * dt])
     shortest = analysis.limits[0]
@@ -464,7 +459,7 @@ def _use(column: ColumnModel, horizon: float) -> dict[str, Any]:
 
 
 def durations(length: float) -> Array:
-    """Return 1, 10, 100 s ..., up to a tenth of a record, and that, shape (t,)."""
+    """Return 1, 10, 100 s ... up to a tenth of a record, and that tenth, shape (t,)."""
     longest = length / _PART
     decades = 10.0 ** np.arange(0, max(int(np.floor(np.log10(max(longest, 1)))) + 1, 0))
     return np.unique(np.append(decades[decades <= longest], longest))
@@ -475,7 +470,7 @@ def _ends(averaged: Any) -> dict[str, Any]:
 
 
 def _column_section(column: ColumnModel) -> dict[str, Any]:
-    """What was found of a column beside its parameters."""
+    """Return the section of a column: everything but its parameters."""
     analysis, choice = column.analysis, column.analysis.choice
     return {
         "unit": column.unit,
@@ -531,8 +526,8 @@ def _drift_section(drift: CovariateDrift, unit: str) -> dict[str, Any]:
             "unit": drift_unit(drift.covariate, unit),
             "standard_uncertainty": _number(drift.standard_uncertainty),
         },
-        "gain": _number(drift.found.gain),
-        "significant": drift.found.follows,
+        "gain": _number(drift.regression.gain),
+        "significant": drift.regression.follows,
         "removed": drift.taken,
         "model_without": drift.letters[0],
         "model_with": drift.letters[1],
@@ -545,7 +540,7 @@ def drift_unit(covariate: str, unit: str) -> str:
 
 
 def _data(column: ColumnModel) -> dict[str, Any]:
-    """The binned spectra, and the Allan deviation with the 95 % band of all candidates."""
+    """Return the binned spectra, and the Allan deviation with the 95 % band of all candidates."""
     analysis = column.analysis
     tau, measured = allan_of_bins([stretch.spectra for stretch in analysis.stretches])
     fitted = analysis.average(lambda values: allan_variance(values, tau, analysis.interval))
@@ -587,7 +582,7 @@ def _numbers(values: Array) -> list[float]:
     return [_number(value) for value in np.asarray(values).tolist()]
 
 
-# Logs at rest to noise models, column by column.
+# The fit.
 
 
 _SAME_RATE = 0.01  # relative: logs of other rates have no common spectrum
@@ -749,8 +744,8 @@ def fit_recordings(
     steps: str | None,
     sources: Iterable[Source] = (),
 ) -> NoiseFit:
-    """Fit noise models to the columns of recordings at rest, or of what is left of long ones: as `fit_noise`."""
-    # A record holds what was asked for beyond the usual; old ones are fitted as they say.
+    """Return noise models fitted to recordings at rest, or to stretches of long ones: as `fit_noise`."""
+    # A record holds only options that are not the default, so that older records can be fitted again.
     regress, steps = None if regress == NO_COVARIATE else regress, None if steps == SAY_STEPS else steps
     rests = read_rests(recordings, columns)
     names = chosen_columns(rests[0].recording, columns)
@@ -765,7 +760,9 @@ def fit_recordings(
         raise DataError(f"{where}: regress temperature: expected a column temperature that changes, found none")
     horizon = min(HORIZON, longest) if horizon is None else horizon
     candidates = CANDIDATES if terms == "auto" else (terms,)
-    models = {name: _column(name, rests, temperatures, candidates, band, regress, steps == "remove") for name in names}
+    models = {
+        name: _fit_column(name, rests, temperatures, candidates, band, regress, steps == "remove") for name in names
+    }
     options = {"terms": terms, "horizon": horizon, "band": band, "regress": regress, "steps": steps}
     record = make_record(models, rests, {**options, "columns": None if columns is None else names}, tuple(sources))
     return NoiseFit(record, models)
@@ -826,7 +823,7 @@ def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> Non
         raise DataError(f"{differ}; expected logs of one unit")
 
 
-def _column(
+def _fit_column(
     name: str,
     rests: Sequence[Rest],
     temperatures: Sequence[list[Array] | None],
@@ -839,7 +836,7 @@ def _column(
     spikes, lines = sum(each.spikes for each in stretches), _longest(stretches).lines
     analysis = analysed(stretches, candidates, band)
     steps = analysis.steps(stretches, LEVEL_STEP_PERHAPS.limit)
-    if any(steps):  # by noise that has no step: fitted to one, the model takes some of it for random walk
+    if any(steps):  # with the steps in the data, the model takes some of them for random walk
         without = analysed(without_steps(stretches, steps), candidates, band)
         steps = without.steps(stretches)
         analysis = analysed(without_steps(stretches, steps), candidates, band) if flat and any(steps) else analysis
@@ -852,8 +849,8 @@ def _column(
         drifts.append(CovariateDrift(covariate, regression, (analysis.letters, left), taken))
     for drift in drifts:
         if drift.taken:
-            analysis = analysed(drift.found.residual, candidates, band)
-    # Steps have the time of their log; those of several logs are told one after the other.
+            analysis = analysed(drift.regression.residual, candidates, band)
+    # Steps have the time of their log; those of several logs are listed one log after the other.
     return ColumnModel(
         name,
         si_unit(rests[0].recording.units[name]),
@@ -871,7 +868,7 @@ def _longest(stretches: Sequence[Stretch]) -> Stretch:
 
 
 def _covariates(temperatures: Sequence[list[Array] | None], stretches: Sequence[Stretch]) -> dict[str, list[Array]]:
-    """The slow coefficients of time, and of the temperature where all logs have one that changes, of each stretch."""
+    """Return the slow coefficients of each stretch for time, and for temperature where it changes in all logs."""
     covariates = {"time": [ramp_coefficients(each)[None] for each in stretches]}
     known = [each for each in temperatures if each is not None]
     if len(known) == len(temperatures):

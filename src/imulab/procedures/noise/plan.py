@@ -1,4 +1,7 @@
-"""How long to record at rest for a wanted accuracy of each noise term."""
+"""The plan of a record at rest: the length that a wanted uncertainty of each noise term needs.
+
+Source: the Cramer-Rao bound, `imulab.estimation.noise.duration`.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from imulab.estimation.noise.rest import FEWEST, SHORT
 from imulab.estimation.noise.terms import NAMES, edge_as_white
 from imulab.options import measure, repeated, text
 from imulab.procedures.noise.schema import Markov, fit_of, given_terms, label, term_reading, term_unit
-from imulab.procedures.noise.simulate import RATE, names_given, terms_of
+from imulab.procedures.noise.simulate import RATE, read_names, terms_of
 from imulab.procedures.result import PlannedTest, Record, amount, as_record, finite
 from imulab.quantities import fraction, in_si
 from imulab.recording import Array, Recording
@@ -35,22 +38,22 @@ _COLOURS = ("#1f6f8b", "#c8553d", "#8e6bbd", "#c99a2e", "#4f9d69", "#22303a")
 
 @dataclass(frozen=True)
 class PlannedTerm:
-    """A term of a column, and what a record tells of it.
+    """A term of a column, and the uncertainty that a record gives it.
 
     Attributes
     ----------
     column, term, unit
         Names, as in a record, and the SI unit of the column.
     value
-        SI; 0 of a term that is not seen.
+        SI; 0 of a term that does not show.
     uncertainty
-        Relative standard uncertainty from a record of the plan's length; NaN of a term that is not seen.
+        Relative standard uncertainty from a record of the plan's length; NaN of a term that does not show.
     limit
-        SI, what such a record limits it to with 95 %; NaN of a term that is seen.
+        Upper limit from such a record with 95 %, SI; NaN of a term that shows.
     wanted
         Relative standard uncertainty; NaN where none is wanted.
     length
-        Of the record that reaches it, s; infinite where none does.
+        Length of the record that reaches it, s; infinite where none does.
     """
 
     column: str
@@ -65,16 +68,16 @@ class PlannedTerm:
 
 @dataclass(frozen=True, repr=False)
 class NoisePlan(PlannedTest):
-    """How long to record at rest.
+    """The planned record at rest.
 
     Attributes
     ----------
     terms
-        Column by column.
+        Terms, column by column.
     length
-        Of the record that the uncertainties are of, s.
+        Length of the record that the uncertainties belong to, s.
     lengths
-        Of records, s, shape (t,).
+        Lengths of records, s, shape (t,).
     reached
         Relative standard uncertainty of each parameter from them, by column, shape (t, 8), in the order of the terms
         white flicker walk quantisation gm1_sigma gm1_time gm2_sigma gm2_time; NaN where there is none.
@@ -87,7 +90,7 @@ class NoisePlan(PlannedTest):
 
     @property
     def needed(self) -> float:
-        """Length of the record that reaches all that is wanted, s."""
+        """Length of the record that reaches every wanted uncertainty, s."""
         return max((each.length for each in self._wanted), default=0.0)
 
     @property
@@ -95,7 +98,7 @@ class NoisePlan(PlannedTest):
         return [each for each in self.terms if each.wanted > 0 and each.value > 0]
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return which record is needed, and what it tells of each term."""
+        """Return which record is needed, and the uncertainty of each term."""
         titles = ["column", "term", "value", "unit", f"u, {duration_text(self.length)}", "wanted", "needs"]
         return self._lead(), titles, [_row(each) for each in self.terms]
 
@@ -190,7 +193,7 @@ def plan_figure(plan: NoisePlan) -> Figure:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a length of time as people say it: ``35 min``, ``6.4 h``, ``12 d``."""
+    """Return a duration with a usual unit: ``35 min``, ``6.4 h``, ``12 d``."""
     factor, unit = next((factor, unit) for factor, unit, most in _UNITS if seconds / factor < most)
     return f"{plain_number(seconds / factor, 2)} {unit}"
 
@@ -279,13 +282,13 @@ def plan_noise(
         for name, value in {**terms, "rate": rate}.items():
             if value not in (None, (), []):
                 raise OptionError(f"{name}: the record says that already; expected either terms or a record")
-        noise, record_length = _of_record(as_record(from_, "plan_noise"), columns)
-    return _planned(noise, wanted, seconds or record_length)
+        noise, record_length = _record_columns(as_record(from_, "plan_noise"), columns)
+    return _plan_terms(noise, wanted, seconds or record_length)
 
 
 @dataclass(frozen=True)
 class _Column:
-    """Noise of a column: parameters, SI unit, time between samples, f_max, ripple, limits of terms not seen, length."""
+    """Noise of a column: parameters, SI unit, time between samples, f_max, ripple, limits of absent terms, length."""
 
     values: Array
     unit: str
@@ -296,8 +299,8 @@ class _Column:
     length: float
 
 
-def _of_record(record: Calibration, columns: str | Sequence[str] | None) -> tuple[dict[str, _Column], float]:
-    values, units, _ = terms_of(record, names_given(columns))
+def _record_columns(record: Calibration, columns: str | Sequence[str] | None) -> tuple[dict[str, _Column], float]:
+    values, units, _ = terms_of(record, read_names(columns))
     fit = fit_of(record)
     by_column = {}
     for name in values:
@@ -313,7 +316,7 @@ def _of_record(record: Calibration, columns: str | Sequence[str] | None) -> tupl
     return by_column, max(fit.columns[name].length.value for name in values)
 
 
-def _planned(noise: Mapping[str, _Column], wanted: Mapping[str, float], length: float | None) -> NoisePlan:
+def _plan_terms(noise: Mapping[str, _Column], wanted: Mapping[str, float], length: float | None) -> NoisePlan:
     known = {
         name
         for column in noise.values()
@@ -344,7 +347,7 @@ def _planned(noise: Mapping[str, _Column], wanted: Mapping[str, float], length: 
 
 
 def _least(column: _Column, slow: bool) -> float:
-    """Length of the shortest record that `fit_noise` takes, s, or that it finds a slow term in."""
+    """Return the length of the shortest record that `fit_noise` takes, s, or that shows a slow term."""
     return max(FEWEST * column.interval, SHORT if slow else 0.0)
 
 
@@ -356,7 +359,7 @@ def _terms(
     at: float,
     duration: float | None,
 ) -> list[PlannedTerm]:
-    """The terms of a column and what a record of length `at` tells of each; limits anew where it is another length."""
+    """Return the terms of a column with their uncertainty from a record of length `at`; limits for that length."""
     u = accuracy(column.values, column.interval, at, column.highest, column.ripple)
     limits = dict(column.limits)
     if limits and duration is not None and not math.isclose(duration, column.length, rel_tol=1e-3):
@@ -374,12 +377,12 @@ def _terms(
 
 
 def _wanted(wanted: Mapping[str, float], term: str) -> float:
-    """What is wanted of a term; what is wanted of all is not of correlation times, which take longest."""
+    """Return the wanted uncertainty of a term; that of all terms leaves out correlation times, which take longest."""
     return wanted.get(term, math.nan if term.endswith("_time") else wanted.get(_ANY, math.nan))
 
 
 def _read_wanted(stated: float | str | Mapping[str, float | str]) -> dict[str, float]:
-    """Wanted relative uncertainties by the name of a term; by '' that of all terms."""
+    """Return the wanted relative uncertainties by the name of a term; under '' that of all terms."""
     pairs: Mapping[str, float | str]
     if isinstance(stated, Mapping):
         pairs = stated

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from imulab.report.traces import Exhibits
 
 
-# The noise of a unit, from logs at rest.
+# The fit as a task: from logs at rest.
 
 
 def _fit(
@@ -57,7 +57,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
 TASK = Task(files="its logs at rest", count=(1, None), function=_function, values=_values, fit=_fit)
 
 
-# The stochastic model of sensors at rest, as the registry knows it.
+# The procedure.
 
 
 class NoiseProcedure(Procedure):

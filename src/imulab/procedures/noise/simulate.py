@@ -1,4 +1,4 @@
-"""Logs at rest, simulated: given noise, column by column and block by block."""
+"""Simulated logs at rest with stated noise, column by column and block by block."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def noise_log(
 ) -> NoiseLog:
     """Return a log to simulate; arguments and errors as for `simulate_noise`."""
     terms = {"white": white, "flicker": flicker, "walk": walk, "quantisation": quantisation, "gm": gm}
-    names = names_given(columns)
+    names = read_names(columns)
     sensor: Mapping[str, str] = {}
     if from_ is None:
         unit = next((u for u, sensor in _SENSORS.items() if names and names[0].startswith(sensor)), None)
@@ -128,8 +128,8 @@ def terms_of(record: Calibration, names: Sequence[str] | None) -> tuple[dict[str
     return values, {name: fit.columns[name].unit for name in kept}, fit.sample_rate.value
 
 
-def names_given(columns: str | Sequence[str] | None) -> list[str] | None:
-    """Return names of columns, given as such or as ``gyro_x,gyro_y``; errors as for `simulate_noise`."""
+def read_names(columns: str | Sequence[str] | None) -> list[str] | None:
+    """Return names of columns from a list or a text like ``gyro_x,gyro_y``; errors as for `simulate_noise`."""
     if columns is None:
         return None
     names = [name.strip() for name in columns.split(",")] if isinstance(columns, str) else list(columns)

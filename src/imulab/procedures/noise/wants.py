@@ -1,4 +1,4 @@
-"""What programs want of the noise of an IMU, in their own keys and units: the largest of the axes of each sensor.
+"""The noise parameters of programs that use an IMU, by their keys and in their units: largest axis of each sensor.
 
 Sources: Kalibr's ConfigReader.py; OpenVINS' Propagator.cpp; integration_base.h of VINS-Mono; PX4's covariance.cpp;
 ArduPilot's AP_NavEKF3; GTSAM's CombinedImuFactor.cpp; MATLAB's documented units.
@@ -23,7 +23,7 @@ STEPS = {"px4": 0.010, "ardupilot": 0.012}
 class Sizes:
     """Noise of a sensor in SI: white N_h and walk K_h for a filter, 1/f noise B, uncertainty u of a bias from a mean.
 
-    `density` is the white noise N by itself, of which the variance of a sample is made.
+    `density` is the white noise N alone, from which the variance of a sample is computed.
     """
 
     white: float
@@ -100,7 +100,7 @@ def check_program(program: str, called: str = "for") -> str:
 def noise_for(
     record: Calibration, program: str, *, rate: float | None = None, step: float | None = None
 ) -> dict[str, float]:
-    """Return what a program's filter wants of the noise in a record, by its keys.
+    """Return the parameters of a program's filter for the noise in a record, by its keys.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def _largest(record: Calibration, fit: NoiseSummary, names: list[str]) -> Sizes:
 
 
 def for_export(record: Calibration) -> dict[str, Any]:
-    """Return white noise and walk of every column in the form of ``allan --json``, which exporters take."""
+    """Return white noise and walk of every column in the form of ``allan --json``, which exporters read."""
     fit = fit_of(record)
     return {
         "sample_rate": {"value": fit.sample_rate.value, "unit": "Hz"},

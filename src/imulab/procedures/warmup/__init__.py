@@ -1,15 +1,9 @@
-"""The bias in the minutes after power-on, as a table over time.
-
-And the words that the options of a warm-up test take.
-"""
+"""Warm-up: the bias in the minutes after power-on, as a table over time. Here are the words that the options take."""
 
 from __future__ import annotations
 
 from imulab.errors import OptionError
 from imulab.quantities import number, quantity
-
-# The words that the options of a warm-up test take.
-
 
 MODELS = ("interval-cubic", "knot-cubic", "knot-log-cubic", "exponential")
 EXITS = ("zero", "hold", "taper")
@@ -17,11 +11,11 @@ BEYOND = ("zero", "hold")
 LAWS = ("smooth", "bent")
 POOLS = ("unit", "type")
 TEMPERATURES = "-40,-30,-20,-10,0,40,50,60"
-"""Calibration temperatures of the source, degC."""
+"""Calibration temperatures of the source (see `fit`), degC."""
 
 
 def settling_size(text: str, option: str) -> dict[str, float]:
-    """Return kind to the |Z| that counts as settled; a share of the peak is negative.
+    """Return, by kind, the |Z| that counts as settled; a share of the peak is negative.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Recordings to power cycles on common bins of time, side by side, each referenced to its own settled mean.
+"""Recordings to power cycles on common bins of time, each relative to the mean of its settled part.
 
 A bin keeps the mean of the data and, for the basis functions, two instants with weights that have the same first three
-moments as the times of its samples (a Gauss rule): averages of cubics over a bin are then exact, those of smooth
+moments as the times of its samples (a Gauss rule). So averages of cubics over a bin are exact, those of smooth
 functions good to fourth order, and 60,000 samples cost no more than 600.
 """
 
@@ -30,7 +30,7 @@ from imulab.recording import (
 )
 from imulab.units import conversion_factor, parse_unit, si_unit
 
-# Recordings to power cycles: the samples averaged over bins of one second, block by block.
+# Recordings averaged over bins of one second, block by block.
 
 
 BIN = 1.0
@@ -41,7 +41,7 @@ _AXIS = re.compile(r"(gyro|accel)_.+")
 
 @dataclass(frozen=True)
 class CycleBins:
-    """Averages over bins of time: of b bins that hold samples, in order.
+    """Averages over bins of time; only the b bins that hold samples, in order.
 
     Attributes
     ----------
@@ -50,13 +50,13 @@ class CycleBins:
     stop
         Nominal end, s, shape (b,).
     count
-        Samples, shape (b,).
+        Number of samples, shape (b,).
     nodes, shares
         Two instants, s, and their weights (sum 1), shapes (b, 2).
     mean
-        Shape (b, axes), SI, or count or V.
+        Mean of the samples, shape (b, axes), SI, or count or V.
     variance
-        Of the samples within the bin, shape (b, axes).
+        Variance of the samples within the bin, shape (b, axes).
     """
 
     start: Array
@@ -82,25 +82,25 @@ class Cycle:
     Attributes
     ----------
     bins
-        The samples, averaged.
+        Averaged samples.
     axes, units
         Columns, and their units in SI (or count, V).
     temperature
-        At power-on, degC.
+        Temperature at power-on, degC.
     first, last
         Time of the first and the last sample, s since power-on.
     name, serial, sensor_model
-        What messages call it; of the head of the file.
+        Name for messages; serial number and model from the head of the file.
     first_reading
         First value of the column temperature, degC, or None.
     chamber
         ``chamber_temperature`` or ``set_point`` of the head of the file, degC, or None.
     source, corrected_by
-        File and hash, and what it was corrected by.
+        File and hash, and the records that it was corrected by.
     file_units
-        Units of the axes as the file has them.
+        Units of the axes in the file.
     zeros
-        Rows left out because every axis is exactly zero in them, as where a logger writes what it has not got.
+        Rows left out because all axes are exactly zero in them: some loggers write missing rows so.
     """
 
     bins: CycleBins
@@ -127,18 +127,18 @@ def find_power_cycle(
     temperature_from_column: bool = False,
     source: Source | None = None,
 ) -> Cycle:
-    """Average a recording of one power cycle, or its consecutive blocks, over bins of one second.
+    """Return a recording of one power cycle, or its consecutive blocks, averaged over bins of one second.
 
     Parameters
     ----------
     recording
-        With columns time (0 is power-on) and gyro_* or accel_*, and ``power_on_temperature`` in its head.
+        Recording with columns time (0 is power-on) and gyro_* or accel_*, and ``power_on_temperature`` in its head.
     latest_start
         A first sample later than this is refused, s.
     temperature_from_column
-        Whether the first reading of the column temperature may stand in for a missing ``power_on_temperature``.
+        Whether the first reading of the column temperature replaces a missing ``power_on_temperature``.
     source
-        File and hash, for the record; that of the recording if not given.
+        File and hash, for the record; those of the recording if None.
 
     Raises
     ------
@@ -286,7 +286,7 @@ def _bins(pieces: list[tuple[np.ndarray, Array, Array]], factors: list[float]) -
     number = np.concatenate([piece[0] for piece in pieces])
     moments = np.concatenate([piece[1] for piece in pieces])
     sums = np.concatenate([piece[2] for piece in pieces])
-    if len(pieces) > 1:  # a bin that two blocks share
+    if len(pieces) > 1:  # two blocks may share a bin
         first = np.flatnonzero(np.diff(number, prepend=number[0] - 1))
         size = moments[:, 0, None]
         weighted = np.add.reduceat(size * sums[:, :, 0], first, axis=0)
@@ -311,7 +311,7 @@ def _bins(pieces: list[tuple[np.ndarray, Array, Array]], factors: list[float]) -
 
 
 def gauss_nodes(moments: Array) -> tuple[Array, Array]:
-    """Return two nodes and their weights, shapes (b, 2), with the given mean, mean square and mean cube (b, 3).
+    """Return two nodes and their weights, shapes (b, 2), with this mean, mean square and mean cube, shape (b, 3).
 
     With central moments m2, m3 the nodes lie at the roots of ``x^2 - (m3 / m2) x - m2 = 0`` about the mean.
     Source: Golub and Welsch, Mathematics of Computation 23 (1969) 221, for n = 2.
@@ -328,7 +328,7 @@ def gauss_nodes(moments: Array) -> tuple[Array, Array]:
 
 
 def merge(bins: CycleBins, edges: Array) -> CycleBins:
-    """Return wider bins between the given times, shape (e,); bins that cross an edge or lie outside are left out.
+    """Return wider bins between times, shape (e,), without bins that cross an edge or lie outside.
 
     The averages of cubics stay exact.
     """
@@ -354,7 +354,7 @@ def merge(bins: CycleBins, edges: Array) -> CycleBins:
 
 
 def common_axes(cycles: list[Cycle]) -> tuple[str, ...]:
-    """Check that all cycles have the same axes in the same units, and return the axes.
+    """Return the axes that all cycles share, in the same units.
 
     Raises
     ------
@@ -388,7 +388,7 @@ def common_axes(cycles: list[Cycle]) -> tuple[str, ...]:
 
 
 def with_axes(cycle: Cycle, wanted: tuple[str, ...]) -> Cycle:
-    """Return a cycle with some of its axes.
+    """Return a cycle with only these axes.
 
     Raises
     ------
@@ -409,17 +409,17 @@ def with_axes(cycle: Cycle, wanted: tuple[str, ...]) -> Cycle:
     )
 
 
-# Power cycles side by side: each referenced to its own settled mean, on common bins of time, by temperature.
+# Power cycles side by side on common bins of time, grouped by temperature, each relative to its settled mean.
 
 
 SETTLED = 30.0
-"""A settled part shorter than this does not make a reference, s."""
+"""A shorter settled part makes no reference, s."""
 _WIDTH, _GROWTH = 2.0, 0.15
-"""Bins are two seconds wide at first, later this share of the time since power-on: few, so that noise weighs little."""
-_MOVED = 9.0  # times the quiet variance of a second in which the unit moved; more in seconds of few samples
-_MOVED_RANGE = 0.02  # of the range of a curve: its own change within a second is no motion
-_APART, _APART_RANGE = 10.0, 0.1  # sigma by which a second stands apart from those around; and of the range of a curve
-_QUIET = 60  # s
+"""Bins are two seconds wide at first, later this share of the time since power-on, so that noise weighs little."""
+_MOVED = 9.0  # times the variance at rest, beyond which the unit moved; more in seconds of few samples
+_MOVED_RANGE = 0.02  # of the range of a curve: smaller changes within a second are the curve's, not a motion
+_APART, _APART_RANGE = 10.0, 0.1  # a second stands apart by so many sigma, and by this share of the curve's range
+_QUIET = 60  # s whose variance is that at rest
 _FEWEST = 10  # s of samples before T_M that a curve needs
 _NEARLY = 1e-9  # s, and K: rounding of decimal limits
 
@@ -445,23 +445,23 @@ class Curves:
     settling_time
         T_M, s.
     edges
-        Of the bins, shape (b + 1,), s.
+        Edges of the bins, shape (b + 1,), s.
     nodes, shares
         Two instants of each bin and their weights, shapes (c, b, 2).
     seconds
-        How much of each bin has samples, shape (c, b); the weights of a fit.
+        Seconds of samples in each bin, shape (c, b); the weights of a fit.
     mean
         Referenced to the cycle's settled mean, shape (c, b, axes), SI or count or V.
     noise
-        Variance of the mean over one second, white noise alone, shape (axes,).
+        Variance of the mean over one second by white noise, shape (axes,).
     reference, reference_seconds
-        Settled mean, shape (c, axes), and how long it was averaged, shape (c,).
+        Settled mean, shape (c, axes), and the time that it was averaged over, shape (c,).
     drift, drift_uncertainty
         Change of the settled part from its start to its end, and standard uncertainty, shapes (c, axes).
     end
-        Where each cycle ends (or the unit begins to move for good), s, shape (c,).
+        End of each cycle (or the beginning of a motion that does not stop), s, shape (c,).
     moved
-        Seconds left out because the unit moved, and when that began, shape (c, 2).
+        Seconds left out because the unit moved, and the time when that began, shape (c, 2).
     halved
         Whether the settled part is the cycle's second half, shape (c,).
     """
@@ -505,13 +505,13 @@ class Curves:
         }
 
     def expected_noise(self) -> Array:
-        """Return the mean square that white noise alone leaves in each cycle's curve, shape (c, axes)."""
+        """Return the mean square of white noise in each cycle's curve, shape (c, axes)."""
         used = (self.seconds > 0).sum(axis=1)
         share = used / np.maximum(self.seconds.sum(axis=1), 1e-300) + 1 / self.reference_seconds
         return np.asarray(share[:, None] * self.noise)
 
     def group_means(self) -> tuple[Array, Array]:
-        """Return the mean curve at each calibration temperature, shape (k, b, axes), and its seconds, (k, b)."""
+        """Return the mean curve at each calibration temperature, shape (k, b, axes), and its seconds, shape (k, b)."""
         member = (self.group[None, :] == np.arange(len(self.temperatures))[:, None]).astype(np.float64)
         seconds = member @ self.seconds
         total = np.einsum("kc,cb,cba->kba", member, self.seconds, self.mean)
@@ -553,12 +553,12 @@ def make_curves(
     settling_time: float | None,
     limit: dict[str, float],
 ) -> tuple[Curves, bool]:
-    """Put power cycles side by side; choose T_M where it is not given.
+    """Return power cycles side by side, and whether all curves settle; T_M is chosen unless it is stated.
 
     Parameters
     ----------
     cycles
-        With the same axes and units.
+        Power cycles with the same axes and units.
     temperatures
         Calibration temperatures, degC, ascending.
     tolerance
@@ -566,11 +566,11 @@ def make_curves(
     settling_time
         T_M, s, or None.
     limit
-        Kind (gyro, accel) to the |Z| below which a curve counts as settled: a share of the largest if negative.
+        |Z| by kind (gyro, accel) below which a curve counts as settled; if negative, a share of the largest.
 
     Returns
     -------
-    Curves, and whether every curve was seen to settle.
+    Curves, and whether every curve settles within its recording.
 
     Raises
     ------
@@ -598,7 +598,7 @@ def make_curves(
     halved = end < settling_time + SETTLED - _NEARLY
     for i, (bins, _) in enumerate(still):
         late = bins.where(bins.start >= (end[i] / 2 if halved[i] else settling_time) - _NEARLY)
-        reference[i], reference_seconds[i], drift[i], uncertain[i] = _settled(late, bins, noise)
+        reference[i], reference_seconds[i], drift[i], uncertain[i] = _settled_mean(late, bins, noise)
         wide = merge(bins, edges)
         where = np.searchsorted(edges, wide.start + _NEARLY, side="right") - 1
         nodes[i, where], shares[i, where] = wide.nodes, wide.shares
@@ -629,7 +629,7 @@ def make_curves(
 
 
 def _check_early(cycles: Sequence[Cycle], still: Sequence[CycleBins], settling_time: float) -> None:
-    """Refuse a cycle that has hardly a sample of the warm-up."""
+    """Refuse a cycle with hardly any samples before T_M."""
     for cycle, bins in zip(cycles, still, strict=True):
         early = int((bins.stop <= settling_time + _NEARLY).sum())
         if early < _FEWEST:
@@ -639,7 +639,7 @@ def _check_early(cycles: Sequence[Cycle], still: Sequence[CycleBins], settling_t
 
 
 def bin_edges(stop: float) -> Array:
-    """Return edges from 0 to `stop`, whole seconds: two apart at first, later 15 % of the time."""
+    """Return edges of bins from 0 to `stop`, in whole seconds: two apart at first, later 15 % of the time."""
     edges = [0.0]
     while edges[-1] < stop:
         edges.append(edges[-1] + max(_WIDTH, round(_GROWTH * edges[-1])))
@@ -652,8 +652,8 @@ def bin_edges(stop: float) -> Array:
 def quiet_levels(cycles: Sequence[Cycle]) -> list[Array]:
     """Return the variance within a bin at rest, shape (axes,) for each cycle.
 
-    Of each cycle the quietest minute (a vehicle may fly for most of its log); if the cycles of the same sample rate
-    are mostly quieter than that, theirs (a cycle may move throughout).
+    It is that of the cycle's quietest minute (a vehicle may fly for most of its log); where the cycles of the same
+    sample rate are mostly quieter, it is theirs (a cycle may move throughout).
     """
     quietest = np.array([_quietest(cycle.bins.variance) for cycle in cycles])
     rate = np.array([np.median(cycle.bins.count) for cycle in cycles])
@@ -665,30 +665,30 @@ def quiet_levels(cycles: Sequence[Cycle]) -> list[Array]:
 
 
 def _quietest(variance: Array) -> Array:
-    """Least median over any minute, or over any quarter of what is shorter than four."""
+    """Return the smallest running median over 1 min, or over a quarter of a log shorter than 4 min."""
     width = max(min(_QUIET, len(variance) // 4), 1)
     windows = np.lib.stride_tricks.sliding_window_view(variance, width, axis=0)[:: max(width // 6, 1)]
     return np.asarray(np.median(windows, axis=-1).min(axis=0))
 
 
 def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
-    """Return the bins in which the unit stood still; seconds left out, and when it first moved.
+    """Return the bins in which the unit stood still, and the seconds left out with the time of the first motion.
 
-    A bin counts as moved when its variance is far above `quiet` and above what the warm-up curve itself makes of it, or
-    when its mean stands apart from those around it, as a knock that fills a bin leaves it.
+    In a bin with motion the variance is far above `quiet` and above what the warm-up curve makes of it, or the mean
+    stands apart from those around it, as after a knock that fills a bin.
     """
     bins = cycle.bins
     slope = np.gradient(bins.mean, axis=0) if len(bins) > 1 else 0.0
     excess = bins.variance - np.square(slope) / 12
     noise = _MOVED * (1 + 10 / bins.count[:, None]) * quiet
     away = np.square(bins.mean - _running_medians(bins.mean))
-    # Its own noise from neighbouring bins: within a bin of a few samples the variance says little.
+    # Noise from neighbouring bins, because within a bin of few samples the variance is poorly known.
     steps = np.diff(bins.mean, axis=0)
     usual = np.median(np.abs(steps - np.median(steps, axis=0)), axis=0) if len(steps) else np.inf
     alone = _APART**2 * np.maximum(quiet / bins.count[:, None], (1.05 * usual) ** 2)
     moved = np.zeros(len(bins), dtype=np.bool_)
     while not moved.all():
-        # The curve's range is that of the bins at rest: in motion it would hide the motion.
+        # The curve's range is taken from bins at rest: in motion a larger range would hide the motion.
         spread = np.subtract(*np.quantile(bins.mean[~moved], [0.95, 0.05], axis=0))
         moved_now = (excess > noise + (_MOVED_RANGE * spread) ** 2).any(axis=1) & (bins.count > 2)
         moved_now |= (away > alone + (_APART_RANGE * spread) ** 2).any(axis=1)
@@ -705,7 +705,7 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
 
 
 def _running_medians(values: Array) -> Array:
-    """Median of each row and the three on either side, which two bad ones do not move."""
+    """Return the median of each row and the three on either side, which two bad rows do not change."""
     if len(values) <= 3:
         return np.asarray(np.median(values, axis=0, keepdims=True))
     padded = np.pad(values, ((3, 3), (0, 0)), mode="reflect", reflect_type="odd")
@@ -713,21 +713,21 @@ def _running_medians(values: Array) -> Array:
 
 
 def _white_noise(still: Sequence[CycleBins]) -> Array:
-    """Variance of the mean over one second, from differences of neighbouring bins, shape (axes,)."""
+    """Return the variance of the mean over 1 s by white noise, from differences of neighbouring bins, shape (axes,)."""
     total, number = np.zeros(still[0].mean.shape[1]), 0
     for bins in still:
         neighbours = (np.diff(bins.start) < 1.5) & (bins.start[1:] > bins.stop[-1] / 4)
         steps = np.diff(bins.mean, axis=0)[neighbours]
         if len(steps) > 1:
-            # Second differences: the curve's own slope is no noise.
+            # Second differences, so that the curve's slope does not count as noise.
             bends = np.diff(steps, axis=0)
             total += (bends**2).sum(axis=0) / 6
             number += len(bends)
     return total / max(number, 1)
 
 
-def _settled(late: CycleBins, bins: CycleBins, noise: Array) -> tuple[Array, float, Array, Array]:
-    """Mean of the settled part, its seconds, its change from start to end with standard uncertainty."""
+def _settled_mean(late: CycleBins, bins: CycleBins, noise: Array) -> tuple[Array, float, Array, Array]:
+    """Return mean and length of the settled part, s, and its change from start to end with standard uncertainty."""
     weight = late.count / late.count.sum()
     mean = weight @ late.mean
     seconds = float(late.count.sum() / np.median(bins.count))
@@ -744,9 +744,9 @@ def _settled(late: CycleBins, bins: CycleBins, noise: Array) -> tuple[Array, flo
 def _choose_settling_time(
     cycles: Sequence[Cycle], still: Sequence[CycleBins], group: Index, end: Array, limit: dict[str, float]
 ) -> tuple[float, bool]:
-    """Return the first time after which every mean curve stays below its limit, rounded up to 10 s, and whether any is.
+    """Return the first time after which all mean curves stay below their limits, rounded up to 10 s, and if any is.
 
-    There is a curve for each group: a temperature of a unit. They are referenced to what follows that time, so that it
+    There is a curve for each group: a temperature of a unit. The curves are relative to the mean after that time, so it
     is found by iteration from three quarters of the shortest cycle.
     """
     shortest = float(np.floor(end.min()))

@@ -1,4 +1,4 @@
-"""A warm-up table as the C core runs it, its vectors for an exported unit, and its curve subtracted from recordings."""
+"""A warm-up record on the device: table of the C core, test vectors, and its curve subtracted from recordings."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from imulab.recording import LATEST_START, Array, Recording, check_clock, check_
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor
 
-# A warm-up table as the C core runs it, and the vectors by which an exported unit tests itself.
+# The table of the C core, and the vectors by which exported code tests itself.
 
 
 _COLDEST, _HOTTEST, _HAIR = -273.15, 1000.0, 1e-3
-"""How far a table is held beyond its edges, degC, and how soon its slope ends there, K."""
+"""How far a table with ``beyond="hold"`` reaches, degC, and the distance over which its slope ends there, K."""
 _GOLDEN_STEP = 0.01  # s
 
 
@@ -53,10 +53,10 @@ def warmup_table(table: Mapping[str, Any]) -> DeviceTable:
     tolerance = float(table.get("tolerance", 0.0))
     if table.get("beyond", "zero") == "hold":
         reach = (_COLDEST, _HOTTEST)
-        temperatures, coefficients, slopes = _held(table["model"], temperatures, coefficients, slopes, reach)
+        temperatures, coefficients, slopes = _extend(table["model"], temperatures, coefficients, slopes, reach)
     elif tolerance:
         reach = (float(temperatures[0]) - tolerance, float(temperatures[-1]) + tolerance)
-        temperatures, coefficients, slopes = _held(table["model"], temperatures, coefficients, slopes, reach)
+        temperatures, coefficients, slopes = _extend(table["model"], temperatures, coefficients, slopes, reach)
     axes = list(table["axes"])
     rows = len(temperatures) - (table["model"] == "interval-cubic")
     terms = len(table["time_constants"]) if table["model"] == "exponential" else 4
@@ -85,14 +85,13 @@ def warmup_table(table: Mapping[str, Any]) -> DeviceTable:
     )
 
 
-def _held(
+def _extend(
     model: str, temperatures: Array, coefficients: Array, slopes: Array | None, reach: tuple[float, float]
 ) -> tuple[Array, Array, Array | None]:
-    """Return a table that goes on as at its edges, as far as it is to reach, degC.
+    """Return a table extended to `reach`, degC, with the values at its edges.
 
-    Outer intervals reach further, or there are outer knots of the same value.
-
-    A unit needs no rule of its own for that. Slopes of exponential amplitudes end a hair beyond the outer knots.
+    Outer intervals reach further, or there are outer knots with the same values: so a unit needs no rule for this.
+    Slopes of exponential amplitudes end a thousandth of a kelvin beyond the outer knots.
     """
     low, high = float(temperatures[0]), float(temperatures[-1])
     if model == "interval-cubic":
@@ -112,7 +111,7 @@ def _held(
 
 
 def _end(table: Mapping[str, Any]) -> float:
-    """Time from which on the table's curve no longer changes, s."""
+    """Return the time after which the table's curve no longer changes, s."""
     return float(table["settling_time"]) + (float(table["taper_time"]) if table["exit"] == "taper" else 0.0)
 
 
@@ -128,7 +127,7 @@ def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     for place, start in zip(bias, starts, strict=True):
         left, _ = unit.warmup(float(start), _GOLDEN_STEP, ticks, [np.zeros(len(ticks))] * axes)
         place[:] = -np.column_stack([column for column in left if column is not None])
-    # The size of the numbers that a polynomial adds up, not of a sum that may be near zero.
+    # The tolerance follows the largest term of a polynomial, because the sum may be near zero.
     sizes = np.abs(field_of(table, "coefficient")).sum(axis=2).max(axis=0)
     return {
         "starts": len(starts),
@@ -141,16 +140,16 @@ def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-# A warm-up record applied by the C core: the table's curve is subtracted while the unit warms up.
+# Correction of recordings by the C core: the table's curve is subtracted while the unit warms up.
 
 
 _TICK, _LONG, _LONG_TICK = 1e-6, 2000.0, 1e-4  # s: the core counts time in ticks, 2^32 of them
 _LAST_TICK = 2**32 - 1  # the core's counter stops there
-_PIECE = 32768  # samples at a time: their ticks stay in the cache
+_PIECE = 32768  # samples in one step: their ticks stay in the cache
 
 
 def apply_warmup(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-    """Return the recording with ``output - Z(t; T)`` in those axes of the record that it has, their units kept.
+    """Return the recording with ``output - Z(t; T)`` in those axes of the record that it has; their units are kept.
 
     `t` is the column time, counted from power-on; `T` is ``power_on_temperature`` of the head of the file. Without it,
     or outside the table, the recording passes unchanged (`unchanged` says why).
@@ -177,7 +176,7 @@ def apply_warmup(unit: DeviceUnit, columns: Mapping[str, Any], recording: Record
     time = recording.time
     if time is None:
         raise DataError(f"{recording.name}: no column time; a warm-up record needs the time since power-on")
-    time = _checked(recording, columns.get("latest_start", LATEST_START))
+    time = _check_time(recording, columns.get("latest_start", LATEST_START))
     temperature = power_on_temperature(recording)
     if temperature is None or unchanged(columns, recording) is not None:
         return recording
@@ -188,8 +187,8 @@ def apply_warmup(unit: DeviceUnit, columns: Mapping[str, Any], recording: Record
     for start in range(0, len(recording), _PIECE):
         piece = slice(start, start + _PIECE)
         ticks = _ticks(time[piece], tick, buffer)
-        into = _parts(corrected, piece)
-        _, active = unit.warmup(temperature, tick, ticks, _parts(outputs, piece), factors=factors, into=into)
+        into = _slice_columns(corrected, piece)
+        _, active = unit.warmup(temperature, tick, ticks, _slice_columns(outputs, piece), factors=factors, into=into)
         if not active:
             return recording
     pairs = zip(columns["axes"], corrected, strict=True)
@@ -206,16 +205,16 @@ def present_axes(columns: Mapping[str, Any], recording: Recording) -> list[str]:
     """
     there = [axis for axis in columns["axes"] if axis in recording]
     if not there:
-        recording.column(columns["axes"][0])  # says what was expected and what was found
+        recording.column(columns["axes"][0])  # raises the message of a missing column
     return there
 
 
-def _parts(columns: Sequence[Array | None], piece: slice) -> list[Array | None]:
+def _slice_columns(columns: Sequence[Array | None], piece: slice) -> list[Array | None]:
     return [None if column is None else column[piece] for column in columns]
 
 
-def _checked(recording: Recording, latest: float) -> Array:
-    """Return the column time, s, once it is sure that it counts from power-on; a later block has no start."""
+def _check_time(recording: Recording, latest: float) -> Array:
+    """Return the column time, s, after a check that it counts from power-on (only in a recording's first block)."""
     time = check_time(recording)
     if time.size and recording.first_row == 1:
         check_start(recording, float(time[0]), latest)
@@ -224,16 +223,16 @@ def _checked(recording: Recording, latest: float) -> Array:
 
 
 def _ticks(time: Array, tick: float, buffer: Array) -> NDArray[np.uint32]:
-    """Return times in whole ticks; `buffer` has room for them."""
+    """Return times in whole ticks, computed in `buffer`."""
     count = np.divide(time, tick, out=buffer[: len(time)])
     np.rint(count, out=count)
     return np.clip(count, 0, _LAST_TICK, out=count).astype(np.uint32)
 
 
 def unchanged(columns: Mapping[str, Any], recording: Recording) -> str | None:
-    """Return why the table of a record or blob leaves a recording unchanged, in one line, or None.
+    """Return the reason why the table of a record or blob leaves a recording unchanged, or None.
 
-    `columns` are those of its section in the C core: range of temperatures, degC, and when the correction ends, s.
+    `columns` are those of its section in the C core: range of temperatures, degC, and end of the correction, s.
     """
     low, high = columns["range"]
     temperature = power_on_temperature(recording)
@@ -259,7 +258,7 @@ def unchanged(columns: Mapping[str, Any], recording: Recording) -> str | None:
 
 
 def remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
-    """Return what a user should know about correcting a recording: why it stays as it is, or which axes it lacks."""
+    """Return remarks on correcting a recording: why it stays unchanged, or which axes it lacks."""
     if message := unchanged(columns, recording):
         return [message]
     there = [axis for axis in columns["axes"] if axis in recording]

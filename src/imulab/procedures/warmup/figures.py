@@ -1,4 +1,4 @@
-"""The figures and tables of a warm-up record, from the record alone."""
+"""The figures and tables of a warm-up record, made from the record alone."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from imulab.report.traces import (
 _ACROSS = 3  # panels in a row
 _DECADES = [1, 10, 100, 1000]  # s that an axis of time is numbered by
 _SCALE = ("#2c4fa3", "#3d8fc4", "#58b5a6", "#a3bf58", "#e0a83c", "#d5663a", "#a8322f")
-"""Cold to warm; distinct in lightness too."""
+"""Colours from cold to warm; they differ in lightness too."""
 
 
 def axis_style(title: str, **more: Any) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def temperature_mark(temperature: float, temperatures: Array) -> str:
 
 
 def _temperature_key(temperatures: Array) -> list[dict[str, Any]]:
-    """Return a trace without points for each temperature, for the key."""
+    """Return, for the key, a trace without points for each temperature."""
     return [
         {
             "type": "scatter",
@@ -85,9 +85,9 @@ def grid(
     temperatures: Array,
     log_time: bool = False,
 ) -> Figure:
-    """Lay out one plot per name, at most three across, with a common key of temperatures below the title.
+    """Return a figure of one plot per name, at most three across, with a common key of temperatures below the title.
 
-    On a logarithm of time bins that widen with time lie evenly.
+    On a logarithmic axis, bins that widen with time are evenly spaced.
     """
     across = min(len(names), _ACROSS)
     down = -(-len(names) // across)
@@ -141,7 +141,7 @@ _LOST = "in noise"
 
 
 def models_table(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[int]) -> ReportTable:
-    """Return the models that were compared, over the axes of one kind."""
+    """Return the table of the compared models, over the axes of one kind."""
     label, factor = small_unit(table.units[index[0]]).scale
     rows, highlight = [], None
     fit = drawn.fit
@@ -179,7 +179,7 @@ def models_table(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list
 def units_table(
     fit: WarmupSummary, table: WarmupTable, kinds: dict[str, list[int]], units: list[float | None]
 ) -> ReportTable:
-    """Return whether one table for the type is enough, axis by axis."""
+    """Return the table that shows, axis by axis, whether one table for the type is enough."""
     spread = fit.repeatability
     rows = []
     for index in kinds.values():
@@ -202,7 +202,7 @@ def units_table(
 
 
 def tests_table(drawn: WarmupRecord, table: WarmupTable) -> ReportTable:
-    """Return what each calibration temperature showed, over the axes of the first kind."""
+    """Return the table of what each calibration temperature showed, over the axes of the first kind."""
     label, factor = small_unit(table.units[0]).scale
     head = next(iter(axes_by_kind(table).values()))
     chosen = drawn.fit.row()
@@ -233,7 +233,7 @@ def tests_table(drawn: WarmupRecord, table: WarmupTable) -> ReportTable:
 
 
 def axes_by_kind(table: WarmupTable) -> dict[str, list[int]]:
-    """Return the numbers of the gyroscopes' axes, and of the accelerometers'."""
+    """Return the places of the gyroscopes' axes, and of the accelerometers'."""
     kinds: dict[str, list[int]] = {}
     for i, axis in enumerate(table.axes):
         kinds.setdefault("gyroscopes" if axis.startswith("gyro") else "accelerometers", []).append(i)
@@ -241,7 +241,7 @@ def axes_by_kind(table: WarmupTable) -> dict[str, list[int]]:
 
 
 def rms_of(values: list[float | None] | None, index: list[int]) -> float:
-    """Return the root mean square of the values of some axes, nan where one is not known."""
+    """Return the root mean square of the values of some axes, NaN where one is not known."""
     chosen = [values[i] for i in index] if values else [None]
     if any(value is None for value in chosen):
         return float("nan")
@@ -249,7 +249,7 @@ def rms_of(values: list[float | None] | None, index: list[int]) -> float:
 
 
 def rms_text(values: list[float | None] | None, index: list[int], factor: float, unit: str = "") -> str:
-    """Return the root mean square of some axes as text; what is not above the white noise has no number."""
+    """Return the root mean square of some axes as text; values below the white noise have no number."""
     value = rms_of(values, index) * factor
     if np.isnan(value):
         return "–"
@@ -262,7 +262,7 @@ def largest_text(values: list[float | None], index: list[int], factor: float) ->
     return plain_number(max(known) * factor, 2) if known else "–"
 
 
-# The figures and tables of a warm-up record, from the record alone.
+# Figures and summary of a record.
 
 
 _POINTS = 121  # of a curve
@@ -273,7 +273,7 @@ def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
     table = record_table(record)
     if not record.fit:
-        return _exhibits_of_table(table)
+        return _table_exhibits(table)
     by_kind = axes_by_kind(table)
     drawn = drawn_of(record)
     fit = drawn.fit
@@ -338,7 +338,7 @@ def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
 def _worst(
     record: Calibration, fit: WarmupSummary, table: WarmupTable, index: list[int], factor: float, label: str
 ) -> list[tuple[str, str]]:
-    """What to expect at the worst power-on temperature; nothing where a record does not hold it."""
+    """Return the fact about the error at the worst power-on temperature; nothing where a record lacks it."""
     at = fit.worst_temperature
     names = [f"worst_temperature_error_{table.axes[i]}" for i in index]
     if at is None or not all(name in record.parameters for name in names):
@@ -347,7 +347,7 @@ def _worst(
     return [(f"at worst, near {at.value:.3g} °C", error)]
 
 
-def _exhibits_of_table(table: WarmupTable) -> Exhibits:
+def _table_exhibits(table: WarmupTable) -> Exhibits:
     low, high = table.temperatures[[0, -1]]
     return Exhibits(
         headline=f"Table of model {table.model}, {low:g} to {high:g} degC, made from a file of coefficients.",
@@ -433,7 +433,7 @@ def _residuals(drawn: WarmupRecord, table: WarmupTable, kind: str, index: list[i
 
 
 def _mean_residual(table: WarmupTable, members: list[CycleCurve]) -> tuple[Array, Array]:
-    """Mean over cycles of curve less table, on the bins that all of them have: time (b,), residual (axes, b)."""
+    """Return the mean over cycles of curve less table, on the bins that all have: time (b,), residual (axes, b)."""
     size = min(len(cycle.time) for cycle in members)
     total, time = np.zeros((len(table.axes), size)), np.zeros(size)
     for cycle in members:
@@ -489,7 +489,7 @@ def _by_temperature(drawn: WarmupRecord, table: WarmupTable, kind: str, index: l
 
 
 def _over_temperature(table: WarmupTable) -> Figure:
-    """Z at a few instants over power-on temperature: jumps at edges are seen at once."""
+    """Return the figure of Z at a few instants over power-on temperature, which shows jumps at edges."""
     low, high = table.temperatures[[0, -1]]
     fine = np.linspace(low, high, 201)
     near = np.concatenate([[t - 1e-9 * (1 + abs(t)), t] for t in table.temperatures])

@@ -1,4 +1,7 @@
-"""Power cycles to a warm-up table."""
+"""The fit of a warm-up test: from recordings of power cycles to the warm-up table and its record.
+
+Stages: `cycles` averages recordings, `model` fits tables by least squares, `quality` compares models and chooses one.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ from imulab.records.comparison import different_units
 TOLERANCE = 1.0
 """How far a power-on temperature may lie from its calibration temperature, K."""
 SETTLING_SHARE = 0.05
-"""A curve counts as settled below this share of the largest |Z| of its kind."""
+"""Share of the largest |Z| of its kind below which a curve counts as settled."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -47,11 +50,11 @@ class WarmupFit(Result):
     calibration
         The record.
     table
-        What the unit subtracts.
+        The table that the unit subtracts.
     models
-        What was compared: no compensation, and each model with its errors.
+        The compared models with their errors; the first is no compensation.
     repeatability
-        Of power cycles, and of units.
+        Repeatability of power cycles, and spread of units.
     curves
         The cycles side by side.
 
@@ -200,7 +203,7 @@ def _names(axes: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def _limits(stated: Mapping[str, float] | str) -> dict[str, float]:
-    """Return kind to the size of Z that counts as settled, in SI, or less its share of the largest."""
+    """Return, by kind, the size of Z that counts as settled, in SI; if negative, its share of the largest."""
     named = settling_size(stated, "settling_limit") if isinstance(stated, str) else stated
     limits = dict.fromkeys(("gyro", "accel"), -SETTLING_SHARE)
     for kind in named:
@@ -212,7 +215,7 @@ def _limits(stated: Mapping[str, float] | str) -> dict[str, float]:
 def _cycles(
     items: Sequence[Cycle | Data], reading: Mapping[str, Any], latest_start: float, *, from_column: bool
 ) -> list[Cycle]:
-    """Return power cycles, those that are not yet averaged over bins of a second."""
+    """Return power cycles; recordings are averaged over bins of a second."""
     averaged = [
         item if isinstance(item, Cycle) else _averaged(item, reading, latest_start, from_column=from_column)
         for item in items
@@ -223,7 +226,7 @@ def _cycles(
 
 
 def _averaged(data: Data, reading: Mapping[str, Any], latest_start: float, *, from_column: bool) -> Cycle:
-    """Return one power cycle, averaged over bins of a second."""
+    """Return one power cycle averaged over bins of a second."""
     blocks, source = as_blocks(data, reading, fit_warmup, name="cycles")
     return find_power_cycle(blocks, source=source, latest_start=latest_start, temperature_from_column=from_column)
 
@@ -248,7 +251,7 @@ def check_options(
     pool: str,
     beyond: str = "zero",
 ) -> Array:
-    """Check what can be checked before there is data, and return the temperatures, degC, shape (k,).
+    """Return the calibration temperatures, degC, shape (k,), after checks of all options before any data are read.
 
     Raises
     ------

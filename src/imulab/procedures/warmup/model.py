@@ -1,14 +1,14 @@
-"""The warm-up table, what is subtracted over time and temperature at power-on, and its coefficients from curves.
-
-Linear least squares, and a search for the shared time scales.
+"""The warm-up table, a curve over time for each temperature at power-on, and its fit to power cycles.
 
 ``Z(t; T) = sum_k c_k(T) b_k(t)`` for ``t < T_M``. The basis is 1, u, u^2, u^3 with ``u = t / T_M`` (models
 ``interval-cubic`` and ``knot-cubic``) or ``u = ln(1 + t / tau0) / ln(1 + T_M / tau0)`` (``knot-log-cubic``), or
 ``exp(-t / tau_j)`` (``exponential``). The coefficients are constant in half-open intervals of power-on temperature, or
 interpolated between knots: linearly, or for exponentials by cubic Hermite polynomials.
 
-All that the fits need of a cycle is its normal matrix, its moments and its sum of squares, so that leaving cycles or
-temperatures out costs no further pass over the data.
+The fit is linear least squares, with a search for the shared time scales. It needs only the normal matrix, the moments
+and the sum of squares of each cycle, so that leaving out cycles or temperatures costs no further pass over the data.
+
+Source: start-up zero error compensation of MEMS inertial instruments (patent record 38161583) for ``interval-cubic``.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, parse_unit
 
-# The warm-up table: what is subtracted from an output, as a function of time and temperature at power-on.
+# The table: what is subtracted from an output, over time and temperature at power-on.
 
 
 MOST_CONSTANTS = 3
-"""Time constants of an exponential that the unit has room for."""
+"""Most time constants of an exponential that the unit has room for."""
 SOURCE_TEMPERATURES = (-40.0, -30.0, -20.0, -10.0, 0.0, 40.0, 50.0, 60.0)
 """Calibration temperatures of the source, degC."""
 
@@ -49,7 +49,7 @@ class WarmupTable:
     axes, units
         Columns that are corrected and the unit of each one's coefficients: rad/s, m/s^2, count or V.
     coefficients
-        Shape (r, axes, p): p = 4, or the number of time constants.
+        Coefficients, shape (r, axes, p): p = 4, or the number of time constants.
     settling_time
         T_M, s.
     exit
@@ -59,13 +59,13 @@ class WarmupTable:
     time_scale
         tau0 of ``knot-log-cubic``, s.
     time_constants
-        Of ``exponential``, s.
+        Time constants of ``exponential``, s.
     slopes
         Derivatives of the amplitudes by temperature at the knots, 1/K, shape of `coefficients` (``exponential``).
     beyond
-        At power-on temperatures beyond the outer ones: ``zero``, no correction; ``hold``, that of the outer one.
+        Beyond the outer power-on temperatures: ``zero``, no correction; ``hold``, that of the outer one.
     tolerance
-        Beyond the outer temperatures by no more than this, K, the correction is that of the outer one in either case.
+        Up to this distance beyond the outer temperatures, K, the correction is always that of the outer one.
     """
 
     model: str
@@ -84,11 +84,11 @@ class WarmupTable:
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """The time constants, tau0 alone, or nothing: what `basis` takes."""
+        """Arguments of `basis`: the time constants, tau0 alone, or nothing."""
         return self.time_constants or (() if self.time_scale is None else (self.time_scale,))
 
     def to_section(self) -> dict[str, Any]:
-        """Return the section ``table`` of a record, the interface to the C core."""
+        """Return the section ``table`` of a record, which the C core is filled from."""
         section: dict[str, Any] = {
             "model": self.model,
             "temperatures": self.temperatures.tolist(),
@@ -133,15 +133,15 @@ class WarmupTable:
         return np.asarray(ends + width * turns)
 
     def with_rules(self, rule: str, taper_time: float, beyond: str, tolerance: float) -> WarmupTable:
-        """Return the table with another exit rule, and another rule and tolerance beyond its temperatures."""
+        """Return the table with other rules after T_M and beyond its temperatures, and another tolerance."""
         return replace(self, exit=rule, taper_time=taper_time, beyond=beyond, tolerance=tolerance)
 
 
 def evaluate(table: WarmupTable, time: Array, temperature: float) -> Array | None:
     """Return Z at times since power-on, shape (n,), for a power-on temperature: shape (axes, n), units of the table.
 
-    None outside the table or where the temperature is not a number. NaN in time gives NaN; times before power-on count
-    as power-on itself. For figures and judging: what corrects recordings is the C core (`imulab.apply`).
+    None outside the table, or where the temperature is not a number. NaN in time gives NaN; times before power-on count
+    as power-on. This is for figures and judgements: recordings are corrected by the C core (`imulab.apply`).
     """
     coefficients = table.coefficients_at(temperature)
     if coefficients is None:
@@ -158,7 +158,7 @@ def evaluate(table: WarmupTable, time: Array, temperature: float) -> Array | Non
 
 
 def reduced_time(time: Array, settling_time: float, time_scale: float | None) -> Array:
-    """Return u, which runs from 0 at power-on to 1 at T_M, of the shape of `time`."""
+    """Return u, which goes from 0 at power-on to 1 at T_M, in the shape of `time`."""
     if time_scale is None:
         return time / settling_time
     u: Array = np.log1p(time / time_scale) / np.log1p(settling_time / time_scale)
@@ -166,7 +166,7 @@ def reduced_time(time: Array, settling_time: float, time_scale: float | None) ->
 
 
 def basis(model: str, time: Array, settling_time: float, scales: Sequence[float] = ()) -> Array:
-    """Return the basis functions at `time`, of any shape, along a new last axis.
+    """Return the basis functions at `time`, of any shape, with a new last axis of functions.
 
     `scales` is () for the cubics in time, (tau0,) for ``knot-log-cubic``, the time constants for ``exponential``.
     """
@@ -210,12 +210,12 @@ def table_from(section: Mapping[str, Any]) -> WarmupTable:
 
 
 def check_table(table: WarmupTable) -> None:
-    """Check that a table can be evaluated.
+    """Refuse a table that cannot be evaluated.
 
     Raises
     ------
     RecordError
-        It cannot; the message says why.
+        It cannot be evaluated; the message says why.
     """
     rows = len(table.temperatures) - (table.model == "interval-cubic")
     size = len(table.time_constants) or 4
@@ -276,7 +276,7 @@ def edge_jumps(table: WarmupTable, times: Array) -> Array:
 
 
 def exit_jump(table: WarmupTable) -> Array:
-    """Return Z(T_M) at each interval or knot, shape (r, axes): what is dropped at T_M under exit ``zero``."""
+    """Return Z(T_M) at each interval or knot, shape (r, axes): the step at T_M with exit ``zero``."""
     last = basis(table.model, np.array(table.settling_time), table.settling_time, table.scales)
     jump: Array = table.coefficients @ last
     return jump
@@ -295,25 +295,25 @@ def record_table(record: Calibration) -> WarmupTable:
     return table_from(record.sections["table"])
 
 
-# Curves to coefficients: linear least squares per interval or knot, a search for the shared time scales.
+# The fit: linear least squares per interval or knot, and a search for the shared time scales.
 
 
 Mask = NDArray[np.bool_]
 
 _START = {1: (20.0,), 2: (0.1, 0.4), 3: (0.06, 0.2, 0.6)}
 _CLOSEST = 1.6
-"""Neighbouring time constants differ by this factor at least: closer ones cannot be told apart."""
+"""Least factor between neighbouring time constants: the data do not separate closer ones."""
 SCALE_LIMIT = 3.0
-"""Longest time scale that is sought, in units of T_M."""
-_PASSES = 3  # in which cycles are carried to their knot by the slopes that the amplitudes have
-_WORST_CONDITION = 1e8  # beyond which exponentials are one
+"""Longest time scale that is tried, in units of T_M."""
+_PASSES = 3  # times that cycles are carried to their knot along the slopes of the amplitudes
+_WORST_CONDITION = 1e8  # beyond it exponentials are the same function
 _SHRINK = 2.0
-"""Degrees of freedom with which the scatter of all temperatures counts at each one."""
+"""Degrees of freedom that the scatter over all temperatures counts for at each one."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Sums over the bins of each cycle for one basis.
+    """Weighted sums over the bins of each cycle, with basis b and data y of one model.
 
     Attributes
     ----------
@@ -336,7 +336,7 @@ class Statistics:
     total: Array
 
     def mean_square(self, coefficients: Array) -> Array:
-        """Return the mean squared residual of each cycle for its coefficients (c, axes, p): shape (c, axes)."""
+        """Return the mean squared residual of each cycle, shape (c, axes), for coefficients (c, axes, p)."""
         cross = np.einsum("cap,cpa->ca", coefficients, self.moment)
         fitted = np.einsum("cap,cpq,caq->ca", coefficients, self.normal, coefficients)
         square: Array = np.maximum(self.square - 2 * cross + fitted, 0.0) / self.weight[:, None]
@@ -368,7 +368,7 @@ def hats(curves: Curves, knots: Index) -> Array:
 
 
 def membership(curves: Curves, knots: Index) -> Array:
-    """Return which cycles serve which interval: those of its two end points, shape (c, knots - 1)."""
+    """Return whether a cycle is fitted in an interval, that is, lies at one of its end points, shape (c, knots - 1)."""
     position = np.searchsorted(knots, curves.group)
     interval = np.arange(len(knots) - 1)
     serves = (position[:, None] == interval) | (position[:, None] == interval + 1)
@@ -377,12 +377,12 @@ def membership(curves: Curves, knots: Index) -> Array:
 
 @dataclass(frozen=True)
 class CurveSolution:
-    """A fitted table, and what its uncertainty needs.
+    """A fitted table, with what its uncertainty is computed from.
 
     Attributes
     ----------
     table
-        With the exit rule of the source.
+        The table, with exit ``zero``.
     scales
         tau0, or the time constants.
     weights
@@ -397,18 +397,18 @@ class CurveSolution:
 def solve(
     curves: Curves, model: str, scales: Sequence[float], sums: Statistics, weights: Array, knots: Index | None = None
 ) -> CurveSolution:
-    """Fit a table to the cycles with positive weight, on all calibration temperatures or on some.
+    """Return the table fitted to the cycles with positive weight, at all calibration temperatures or at some.
 
     Parameters
     ----------
     curves
         The cycles.
     model, scales
-        What to fit.
+        Model and time scales.
     sums
-        Of that model and those scales.
+        Sums for that model and these scales.
     weights
-        Of the cycles, shape (c,).
+        Weights of the cycles, shape (c,).
     knots
         Indices of the temperatures that the table keeps; each needs a cycle.
     """
@@ -416,11 +416,11 @@ def solve(
     used = weights * np.isin(curves.group, kept)
     slopes = None
     if model == "interval-cubic":
-        c = _intervals(sums, membership(curves, kept) * used[:, None])
+        c = _solve_intervals(sums, membership(curves, kept) * used[:, None])
     elif model == "exponential":
-        c, slopes = _amplitudes(curves, sums, used, kept, scales)
+        c, slopes = _solve_amplitudes(curves, sums, used, kept, scales)
     else:
-        c = _knots(sums, hats(curves, kept), used)
+        c = _solve_knots(sums, hats(curves, kept), used)
     table = WarmupTable(
         model=model,
         temperatures=curves.temperatures[kept],
@@ -435,13 +435,13 @@ def solve(
     return CurveSolution(table, tuple(map(float, scales)), used)
 
 
-def _intervals(sums: Statistics, share: Array) -> Array:
+def _solve_intervals(sums: Statistics, share: Array) -> Array:
     normal = np.einsum("cr,cpq->rpq", share, sums.normal)
     moment = np.einsum("cr,cpa->rpa", share, sums.moment)
     return np.linalg.solve(normal, moment).transpose(0, 2, 1)
 
 
-def _knots(sums: Statistics, hat: Array, used: Array) -> Array:
+def _solve_knots(sums: Statistics, hat: Array, used: Array) -> Array:
     normal = knot_normal(sums, hat, used)
     moment = np.einsum("c,ck,cpa->kpa", used, hat, sums.moment)
     k, p, a = moment.shape
@@ -456,10 +456,10 @@ def knot_normal(sums: Statistics, hat: Array, used: Array) -> Array:
     return normal
 
 
-def _amplitudes(
+def _solve_amplitudes(
     curves: Curves, sums: Statistics, used: Array, kept: Index, constants: Sequence[float]
 ) -> tuple[Array, Array]:
-    """Amplitudes and slopes at the knots; each cycle is carried from its own temperature to its knot by the slopes."""
+    """Return amplitudes and slopes at the knots; the slopes carry each cycle from its temperature to its knot."""
     member = (curves.group[:, None] == kept).astype(np.float64) * used[:, None]
     normal = np.einsum("ck,cpq->kpq", member, sums.normal)
     at = curves.temperatures[kept]
@@ -477,9 +477,9 @@ def _amplitudes(
 def amplitude_slopes(knots: Array, amplitudes: Array, constants: Sequence[float]) -> Array:
     """Return the derivatives by temperature, 1/K, of amplitudes (k, axes, p) at knots (k,), degC, shape (k, axes, p).
 
-    Those of the monotone piecewise cubics (Fritsch and Butland) through the values that the curve itself takes at the p
-    time constants. Neighbouring amplitudes err in opposite ways and their errors nearly cancel in the curve; monotone
-    cubics through each amplitude alone are not linear in it and would undo that between the knots.
+    They are those of monotone piecewise cubics (Fritsch and Butland) through the curve's values at the p time
+    constants. Neighbouring amplitudes err in opposite directions and their errors nearly cancel in the curve. Monotone
+    cubics through each amplitude are not linear in it and would undo that between the knots.
     """
     values = np.ascontiguousarray(amplitudes, dtype=np.float64)
     at = np.asarray(constants, dtype=np.float64)
@@ -503,10 +503,10 @@ def _pchip_slopes(knots: Array, values: Array) -> Array:
 def find_scales(
     curves: Curves, model: str, count: int, weights: Array, start: Sequence[float] | None = None
 ) -> tuple[float, ...]:
-    """Return tau0, or the shared time constants, that leave least of all mean curves.
+    """Return tau0, or the shared time constants, with the least squares of all mean curves.
 
-    Each temperature and axis has its own coefficients; axes count by their size and noise. Nelder-Mead in the
-    logarithms, over 2 or 3 numbers at most.
+    Each temperature and axis has its own coefficients; axes are weighted by their size and noise. Nelder-Mead in the
+    logarithms, over at most 3 numbers.
     """
     from scipy.optimize import minimize
 
@@ -552,7 +552,7 @@ def find_scales(
 
 
 def coefficients_of(curves: Curves, table: WarmupTable) -> Array:
-    """Return the coefficients that the unit would use in each cycle, shape (c, axes, p).
+    """Return the coefficients that the unit uses in each cycle, shape (c, axes, p).
 
     A power-on temperature beyond the table (a recording at -41 for a table from -40) counts as its end.
     """
@@ -562,10 +562,10 @@ def coefficients_of(curves: Curves, table: WarmupTable) -> Array:
 
 
 def fitted_noise(curves: Curves, solution: CurveSolution, sums: Statistics) -> Array:
-    """Return the mean square that white noise leaves in the cycles of a fit, shape (c, axes).
+    """Return the mean square of white noise in the residuals of each cycle of a fit, shape (c, axes).
 
-    Less than in cycles that the fit has not seen, since the fit follows some of the noise: with y = X theta for a cycle
-    of b bins, N = X' W X, B = N + X' W 1 1' W X / s for a reference of s seconds, M = sum w N and Q = sum w^2 B,
+    It is less than in cycles outside the fit, because the fit follows some of the noise. With y = X theta for a cycle
+    of b bins, N = X' W X, B = N + X' W 1 1' W X / s for a reference of s seconds, M = sum w N and Q = sum w^2 B, it is
     ``b + T / s - 2 w tr(B M^-1) + tr(N M^-1 Q M^-1)`` per T seconds. Amplitudes carried along slopes count as fixed.
     """
     w, kept = solution.weights, np.arange(len(curves.temperatures))
@@ -575,17 +575,17 @@ def fitted_noise(curves: Curves, solution: CurveSolution, sums: Statistics) -> A
         row = np.clip(np.searchsorted(edges, curves.power_on, side="right") - 1, 0, len(edges) - 2)
         share, taken = membership(curves, kept), np.zeros(len(w))
         for r in range(len(edges) - 1):
-            taken[row == r] = _taken(sums.normal, both, np.ones((len(w), 1)), w * share[:, r])[row == r]
+            taken[row == r] = _followed_noise(sums.normal, both, np.ones((len(w), 1)), w * share[:, r])[row == r]
     elif solution.table.model == "exponential":
-        taken = _taken(sums.normal, both, (curves.group[:, None] == kept).astype(np.float64), w)
+        taken = _followed_noise(sums.normal, both, (curves.group[:, None] == kept).astype(np.float64), w)
     else:
-        taken = _taken(sums.normal, both, hats(curves, kept), w)
+        taken = _followed_noise(sums.normal, both, hats(curves, kept), w)
     share = np.maximum((curves.seconds > 0).sum(axis=1) + sums.weight / curves.reference_seconds - taken, 0.0)
     return np.asarray((share / sums.weight)[:, None] * curves.noise)
 
 
-def _taken(normal: Array, both: Array, hat: Array, weights: Array) -> Array:
-    """What a fit takes of the noise in each cycle, shape (c,): of variances of one second's mean."""
+def _followed_noise(normal: Array, both: Array, hat: Array, weights: Array) -> Array:
+    """Return the noise in each cycle that a fit follows, shape (c,), in units of the variance of one second's mean."""
     size = hat.shape[1] * normal.shape[1]
     spread = np.einsum("cj,ck->cjk", hat, hat)
     normals = np.einsum("cjk,cpq->cjpkq", spread, normal).reshape(-1, size, size)
@@ -601,10 +601,9 @@ def _taken(normal: Array, both: Array, hat: Array, weights: Array) -> Array:
 def scatter(curves: Curves, sums: Statistics, cluster: Index) -> tuple[Array, Array, float]:
     """Return the covariance of a cluster's coefficients by temperature, the pooled one, and its degrees of freedom.
 
-    Shapes (k, axes, p, p) and (axes, p, p).
-
-    A cluster is a cycle, or where units are pooled all cycles of one unit at one temperature. Few clusters make a poor
-    estimate: each temperature's own is averaged with the pooled one, which counts as two degrees of freedom.
+    Shapes (k, axes, p, p) and (axes, p, p). A cluster is a cycle or, where units are pooled, all cycles of one unit at
+    one temperature. Few clusters make a poor estimate: each temperature's covariance is averaged with the pooled one,
+    which counts as two degrees of freedom.
     """
     groups = len(curves.temperatures)
     owners = np.unique(cluster)
@@ -631,7 +630,7 @@ def _sum(sums: Statistics, chosen: Mask) -> tuple[Array, Array]:
 def coefficient_covariance(curves: Curves, solution: CurveSolution, sums: Statistics, cluster: Index) -> Array | None:
     """Return the covariance of each interval's or knot's coefficients, shape (r, axes, p, p), from repeatability.
 
-    ``V = G [sum_c (h h') x (N S N)] G'`` with G the inverse normal matrix, N a cluster's own and S the covariance of
+    ``V = G [sum_c (h h') x (N S N)] G'`` with G the inverse normal matrix, N that of a cluster and S the covariance of
     its coefficients about those of its temperature. None where no temperature has two clusters.
     """
     each, _, freedom = scatter(curves, sums, cluster)

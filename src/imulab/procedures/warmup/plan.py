@@ -1,4 +1,4 @@
-"""The chamber programme of a warm-up test, how long it takes, and what it will give."""
+"""The plan of a warm-up test: the chamber programme, its duration, and the uncertainty that it will reach."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from imulab.units import from_si
 from imulab.writers import write_csv
 
 WIDEST = 20.0
-"""Intervals of power-on temperature wider than this are warned about, K."""
-_FREE = 4  # parameters of a curve at one temperature
+"""Widest interval of power-on temperature without a warning, K."""
+_FREE = 4  # coefficients of a curve at one temperature
 
 
 @dataclass(frozen=True)
 class PlanStep:
-    """One step of the programme: its start and duration, s, the set point, degC, and which cycle it belongs to."""
+    """One step of the programme: start and duration, s, set point, degC, what is done, and in which cycle."""
 
     start: float
     duration: float
@@ -45,21 +45,21 @@ class WarmupPlan(PlannedTest):
     Attributes
     ----------
     steps
-        In order.
+        Steps in order.
     duration
-        Of the whole, s.
+        Duration of the programme, s.
     temperatures
         Set points, degC, ascending.
     cycles
         Power cycles at each.
     warnings
-        What is wrong with the temperatures, and what would be better.
+        Shortcomings of the temperatures, with better ones.
     proposal
         Temperatures with the wide intervals divided; the same where none is wide.
     record
         Duration of a recording, s.
     noise, repeatability
-        Angle random walk, rad/sqrt(s), and how well cycles repeat, as a fraction of the curve.
+        Angle random walk, rad/sqrt(s), and repeatability of cycles, as a fraction of the curve.
     """
 
     steps: tuple[PlanStep, ...]
@@ -74,7 +74,7 @@ class WarmupPlan(PlannedTest):
 
     @property
     def curve_uncertainty(self) -> float:
-        """What white noise alone adds to a curve at its temperature, rad/s.
+        """Standard uncertainty of a curve at its temperature by white noise, rad/s.
 
         ``N sqrt(p / T_M + 1 / (t_end - T_M)) / sqrt(n)`` for p = 4 coefficients, n cycles and the settled reference.
         """
@@ -84,11 +84,11 @@ class WarmupPlan(PlannedTest):
 
     @property
     def repeatability_uncertainty(self) -> float:
-        """What cycles that do not repeat add to it, as a fraction of the curve."""
+        """Standard uncertainty of a curve by the repeatability of cycles, as a fraction of the curve."""
         return self.repeatability / math.sqrt(self.cycles)
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return how long the programme takes, and when each temperature has its turn."""
+        """Return how long the programme takes, and the times of each temperature."""
         head = (
             f"{len(self.temperatures) * self.cycles} power cycles: {len(self.temperatures)} temperatures, "
             f"{self.cycles} at each; the chamber is busy for {_hours(self.duration)}"
@@ -101,7 +101,7 @@ class WarmupPlan(PlannedTest):
         return head, ["set point, degC", "cycles", "from, h:min", "to, h:min"], rows
 
     def remarks(self) -> list[str]:
-        """Return how well a curve will be known, and better temperatures where there are any."""
+        """Return the uncertainty that a curve will have, and better temperatures if there are any."""
         lines = [
             "standard uncertainty of a curve at its temperature: "
             f"{from_si(self.curve_uncertainty, 'deg/h'):.2g} deg/h from noise, and "
@@ -125,7 +125,7 @@ class WarmupPlan(PlannedTest):
         }
 
     def findings(self) -> tuple[str, ...]:
-        """Return what is wrong with the temperatures, and what would be better."""
+        """Return the shortcomings of the temperatures, with better ones."""
         return self.warnings
 
     def save(self, path: str | Path) -> None:
@@ -257,7 +257,7 @@ def plan_warmup(
 def _warnings(
     wide: Sequence[tuple[float, float]], proposal: Sequence[float], count: int, record: float
 ) -> tuple[str, ...]:
-    """Return what the test cannot show: within wide intervals, with one cycle, in short recordings."""
+    """Return warnings of what the test cannot show: within wide intervals, with one cycle, in short recordings."""
     warnings = tuple(
         f"the interval {low:g} to {high:g} degC is {high - low:g} K wide: interval-cubic uses the mean of both ends "
         "for all of it, wrong by half of their difference just inside each end, and no model sees a bend between them; "

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from imulab.report.traces import Exhibits
 
 
-# The warm-up of a unit, or of a type, from recordings of power cycles.
+# The fit as a task: from recordings of power cycles.
 
 
 def _fit(
@@ -68,7 +68,7 @@ TASK = Task(
 )
 
 
-# The bias of the minutes after power-on, as the registry knows it.
+# The procedure and its section of a device.
 
 
 class WarmupSection(Section):

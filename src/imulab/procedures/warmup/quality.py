@@ -1,6 +1,7 @@
-"""How good a warm-up model is.
+"""The quality of a warm-up model: its errors on cycles and temperatures left out of the fit, jumps, and warnings.
 
-What it leaves of cycles that it has not seen, where it jumps, and what is wrong with the test, a sentence each.
+Models are compared by cross-validation; the chosen one predicts best. The floor is the repeatability of power cycles.
+Sources: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11 (jackknife).
 """
 
 from __future__ import annotations
@@ -31,36 +32,37 @@ from imulab.procedures.warmup.model import (
 from imulab.recording import Array
 from imulab.report.parameters import small_text
 
-# How good a model is: what it leaves of cycles and temperatures that it has not seen, and where it jumps.
+# Errors of a model on cycles and temperatures that were left out of the fit, and its jumps.
 
 
 CANDIDATES = (("interval-cubic", 0), ("knot-cubic", 0), ("knot-log-cubic", 1), ("exponential", 2), ("exponential", 3))
-"""Models that are compared, and how many time scales each has."""
+"""Models that are compared, and their number of time scales."""
 _SMOOTH_SCALE = 20.0  # s
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A fitted model and its errors; root mean squares over t < T_M with white noise taken off, per axis.
+    """A fitted model and its errors: root mean squares over t < T_M without white noise, per axis.
 
     Attributes
     ----------
     model, count
         Name and number of time scales (0 for ``none`` and the cubics in time).
+        Name and number of time scales (0 for ``none`` and the cubics in time).
     solution
-        The fit to everything; None for ``none``.
+        Fit to all cycles; None for ``none``.
     training
-        What is left of the cycles' curves, shape (axes,).
+        Error at the cycles of the fit, shape (axes,).
     left_cycle
-        Of cycles left out of the fit (of units, where units are pooled), or None where that is impossible.
+        Error at cycles (or units, where these are pooled) left out of the fit; None where that is impossible.
     left_temperature
-        Of the temperatures between the outer ones, each left out of the fit, or None.
+        Error at inner temperatures, each left out of the fit, or None.
     by_temperature, left_by_temperature
-        The first and the third at each calibration temperature, shape (k, axes); NaN where there is none.
+        `training` and `left_temperature` at each calibration temperature, shape (k, axes); NaN where there is none.
     edge_jump, exit_jump
         Largest jump at an edge, largest |Z(T_M)|, shape (axes,).
     scales_covariance
-        Jackknife over the temperatures, shape (count, count); None where there are too few.
+        Covariance of the time scales by a jackknife over temperatures, shape (count, count); None if there are too few.
     """
 
     model: str
@@ -77,7 +79,7 @@ class Judged:
 
     @property
     def label(self) -> str:
-        """Name in tables: the exponentials say how many."""
+        """Name in tables; exponentials have their number of time constants."""
         return f"{self.model} ({self.count})" if self.model == "exponential" else self.model
 
     @property
@@ -110,9 +112,9 @@ def judge_none(curves: Curves) -> Judged:
 
 
 def judge(curves: Curves, model: str, count: int, weights: Array, *, by_unit: bool = False) -> Judged:
-    """Fit a model and measure what it leaves.
+    """Return a fitted model with its errors.
 
-    Leaving a single cycle out keeps the shared time scales; leaving a temperature out finds them anew.
+    Where a cycle is left out, the shared time scales are kept; where a temperature is left out, they are fitted again.
     """
     scales = find_scales(curves, model, count, weights) if count else ()
     sums = statistics(curves, model, scales)
@@ -143,7 +145,7 @@ def judge(curves: Curves, model: str, count: int, weights: Array, *, by_unit: bo
 def _leave_cycles(
     curves: Curves, model: str, scales: tuple[float, ...], weights: Array, noise: Array, by_unit: bool
 ) -> Array | None:
-    """Root mean square error, shape (axes,), of cycles (or units) predicted from the others."""
+    """Return the root mean square error, shape (axes,), of cycles (or units) predicted from the others."""
     sums = statistics(curves, model, scales)
     owner = curves.unit if by_unit else np.arange(len(curves.cycles))
     groups = len(curves.temperatures)
@@ -151,7 +153,7 @@ def _leave_cycles(
     for o in np.unique(owner):
         kept = weights * (owner != o)
         if np.unique(curves.group[kept > 0]).size < groups:
-            continue  # its temperature would have no cycle left
+            continue  # no other cycle has its temperature
         out = owner == o
         table = solve(curves, model, scales, sums, kept).table
         errors.append((sums.mean_square(coefficients_of(curves, table)) - noise)[out])
@@ -161,7 +163,7 @@ def _leave_cycles(
 def _leave_temperatures(
     curves: Curves, model: str, scales: tuple[float, ...], weights: Array, noise: Array
 ) -> tuple[Array | None, list[tuple[float, ...]]]:
-    """Mean square errors of the cycles at each inner temperature, predicted from the others, and the scales found.
+    """Return the mean square errors of the cycles at each inner temperature, predicted from the others, and the scales.
 
     Shape (c, axes), NaN at the outer temperatures; None where fewer than three temperatures were measured.
     """
@@ -184,14 +186,14 @@ def _leave_temperatures(
 
 @dataclass(frozen=True)
 class Worst:
-    """What to expect at the power-on temperature between calibration temperatures where a table is worst.
+    """Expected error at the power-on temperature, between calibration temperatures, where a table is worst.
 
     Attributes
     ----------
     temperature
-        degC.
+        Temperature, degC.
     error
-        Root mean square over t < T_M of one start there, its repeatability included, shape (axes,).
+        Root mean square over t < T_M of one start there, with its repeatability, shape (axes,).
     """
 
     temperature: float
@@ -199,11 +201,11 @@ class Worst:
 
 
 def worst_between(curves: Curves, chosen: Judged, spread: CycleSpread) -> Worst | None:
-    """Return the error to expect at the worst power-on temperature, from temperatures left out of the fit.
+    """Return the expected error at the worst power-on temperature, from temperatures left out of the fit.
 
-    Interpolation over a gap h errs by up to ``f'' h^2 / 8``; a temperature between neighbours h1 and h2 away, left
-    out, by ``f'' h1 h2 / 2``. Each gap takes the larger f'' of its two ends. None with fewer than three temperatures,
-    and for ``interval-cubic``, whose errors at its end points show what its wide intervals do.
+    Interpolation over a gap h errs by up to ``f'' h^2 / 8``; at a temperature that was left out, h1 and h2 from its
+    neighbours, by ``f'' h1 h2 / 2``. Each gap takes the larger f'' of its two ends. None with fewer than three
+    temperatures, and for ``interval-cubic``, whose errors at its end points already show its wide intervals.
     """
     t = curves.temperatures
     left = np.nan_to_num(chosen.left_by_temperature)
@@ -222,7 +224,7 @@ def worst_between(curves: Curves, chosen: Judged, spread: CycleSpread) -> Worst 
 
 
 def _jackknife(values: Array, count: int) -> Array | None:
-    """Covariance of the time scales from those found with each temperature left out (Efron and Tibshirani 1993, 11)."""
+    """Return the jackknife covariance of the time scales fitted without each temperature (Efron and Tibshirani, 11)."""
     n = len(values)
     if not count or n < 3:
         return None
@@ -231,9 +233,10 @@ def _jackknife(values: Array, count: int) -> Array | None:
 
 
 def choose(curves: Curves, rows: list[Judged]) -> Judged:
-    """Return the model that predicts best: cycles and temperatures that it has not seen, every kind of sensor alike.
+    """Return the model that best predicts cycles and temperatures left out, with both kinds of sensors weighted alike.
 
-    The score is the sum of both mean squares relative to those without compensation; of two models within 2 % the one
+    The score is the sum of both mean squares relative to those without compensation; of models within 2 % of the best
+    the one with the fewest time scales is taken.
     with fewer time scales is taken.
     """
     none = next(row for row in rows if row.model == "none")
@@ -253,7 +256,7 @@ def _score(curves: Curves, row: Judged, none: Judged) -> float:
 
 
 def _root(mean_squares: Array) -> Array:
-    """Root of the mean over cycles (c, axes); what is below the noise counts as nothing."""
+    """Return the root of the mean over cycles (c, axes); a mean below the noise counts as zero."""
     return np.asarray(np.sqrt(np.maximum(mean_squares.mean(axis=0), 0.0)))
 
 
@@ -263,21 +266,21 @@ def _by_group(curves: Curves, mean_squares: Array) -> Array:
 
 @dataclass(frozen=True)
 class CycleSpread:
-    """How well cycles repeat, root mean squares over t < T_M without white noise, per axis.
+    """Repeatability of cycles: root mean squares over t < T_M without white noise, per axis.
 
     Attributes
     ----------
     cycle
         Deviation of a cycle from the mean of its unit and temperature, shape (axes,); NaN where none was repeated.
     uncertainty
-        Of `cycle`: with n degrees of freedom and a white part w^2 taken off, its square r^2 is known to
-        (r^2 + w^2) sqrt(2 / n); so what is lost in the noise (r = 0) is known to w (2 / n)^(1/4), shape (axes,).
+        Standard uncertainty of `cycle`, shape (axes,). With n degrees of freedom and a white part w^2 subtracted, its
+        square r^2 is known to (r^2 + w^2) sqrt(2 / n); below the noise (r = 0), r is known to w (2 / n)^(1/4).
     freedom
         Degrees of freedom.
     by_temperature
-        The same at each calibration temperature, shape (k, axes).
+        `cycle` at each calibration temperature, shape (k, axes).
     unit
-        Deviation of a unit's mean from that of its temperature, over what repeatability explains, (axes,), or None.
+        Deviation of a unit's mean from that of its temperature beyond repeatability, shape (axes,), or None.
     """
 
     cycle: Array
@@ -288,10 +291,10 @@ class CycleSpread:
 
 
 def repeatability(curves: Curves) -> CycleSpread:
-    """Return the repeatability between power cycles, the floor that no table can beat, and the spread between units.
+    """Return the repeatability of power cycles, the floor that no table can beat, and the spread of units.
 
-    Each cycle's curve is first smoothed by a cubic in ln(1 + t / 20 s), whose four coefficients pass far less noise
-    than the bins do; what white noise leaves in them is taken off.
+    Each cycle's curve is first smoothed by a cubic in ln(1 + t / 20 s), whose four coefficients contain far less noise
+    than the bins; the white noise left in them is subtracted.
     """
     scales = (_SMOOTH_SCALE,)
     sums = statistics(curves, "knot-log-cubic", scales)
@@ -330,16 +333,16 @@ def repeatability(curves: Curves) -> CycleSpread:
 
 
 def _squares(deviations: Array, metric: Array) -> Array:
-    """Sum over curves of their mean squares, for coefficients (n, p, axes): shape (axes,)."""
+    """Return the sum over curves of their mean squares, from coefficients (n, p, axes), shape (axes,)."""
     squares: Array = np.einsum("npa,pq,nqa->a", deviations, metric, deviations)
     return squares
 
 
 def cycle_weights(curves: Curves, spread: CycleSpread) -> Array:
-    """Return the weight of each cycle under a random effect per unit, shape (c,).
+    """Return the weight of each cycle with a random effect of the unit, shape (c,).
 
     ``1 / (1 + n rho)`` for each of the n cycles of a unit at a temperature, rho the variance between units over that
-    of a cycle: all cycles alike where units do not differ, all units alike where they differ much.
+    between cycles: all cycles count alike where units do not differ, all units alike where they differ much.
     """
     if spread.unit is None:
         return np.ones(len(curves.cycles))
@@ -350,44 +353,44 @@ def cycle_weights(curves: Curves, spread: CycleSpread) -> Array:
     return np.asarray(weights / weights.max())
 
 
-# What is wrong with a warm-up test, a sentence each.
+# Warnings on a warm-up test, a sentence each.
 
 
 _COLD = 1.0  # K above the chamber at power-on: the unit was still warm
 _OFF_SET_POINT = 0.5  # K from the set point
-_LATE = 0.5  # s after power-on: the fastest part of the curve is then gone
-_DRIFT_SHARE = 0.5  # of what the model leaves over: less drift of the settled part counts nothing beside it
+_LATE = 0.5  # s after power-on: the fastest part of the curve is missing
+_DRIFT_SHARE = 0.5  # of the residual: a smaller drift of the settled part is not warned of
 _MOST_NAMED = 3  # cycles that a warning names
-_WIDE = 20.0  # K between knots from which one curve for all of an interval is doubted
-_AT_LIMIT = 1.02  # a time constant within 2 % of the limit of the search has come to rest there
-_COUNTS = 0.05  # of a curve: a part that is smaller matters to nobody
+_WIDE = 20.0  # K between knots from which one curve for the whole interval is doubted
+_AT_LIMIT = 1.02  # a time constant within 2 % of the limit of the search is at the limit
+_COUNTS = 0.05  # of a curve: smaller parts are not warned of
 _ROUNDING = 1e-12  # of the reference, relative
 _PAUSE, _MOSTLY = 5, 0.5
-"""Seconds of exactly repeated samples that are no coarse output, in a column that changes most of the time."""
-_MORE, _ODD = 1.2, 4.0  # times the error at temperatures left out that is worth saying; medians by which a cycle is odd
+"""Seconds of exact repeats that are a stuck output; share of the time in which a column that is not coarse changes."""
+_MORE, _ODD = 1.2, 4.0  # times the error at temperatures left out that is reported; medians beyond which a cycle is odd
 _IMPROBABLE = {"rad/s": np.radians(5.0), "m/s^2": 1.0}
-"""A change after power-on that no instrument with a warm-up table has: 5 deg/s, 0.1 g."""
+"""A larger change after power-on, 5 deg/s or 0.1 g, is no warm-up: the unit of the column is wrong."""
 
 
 def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]:
     """Return the warnings on a test and the table made from it."""
     return [
-        *_dead_columns(curves),
-        *_ends(curves, settled),
-        *_starts(curves),
-        *_sizes(curves),
-        *_motion(curves),
-        *_drifts(curves, chosen),
-        *_temperatures(curves),
-        *_single(curves),
-        *_odd_cycles(curves),
-        *_intervals(curves, chosen),
-        *_constants(curves, chosen),
+        *_warn_dead_columns(curves),
+        *_warn_ends(curves, settled),
+        *_warn_starts(curves),
+        *_warn_sizes(curves),
+        *_warn_motion(curves),
+        *_warn_drifts(curves, chosen),
+        *_warn_temperatures(curves),
+        *_warn_single(curves),
+        *_warn_odd_cycles(curves),
+        *_warn_intervals(curves, chosen),
+        *_warn_constants(curves, chosen),
     ]
 
 
 def expectations(curves: Curves, chosen: Judged, worst: Worst | None) -> list[str]:
-    """Return what a unit in use has to expect of a table, beyond what the tests show of it."""
+    """Return the errors to expect in use beyond those that the tests show."""
     messages: list[str] = []
     stated = chosen.left_temperature
     if worst is not None and stated is not None and (worst.error > _MORE * stated + _ROUNDING).any():
@@ -404,8 +407,8 @@ def expectations(curves: Curves, chosen: Judged, worst: Worst | None) -> list[st
     return messages
 
 
-def _dead_columns(curves: Curves) -> list[str]:
-    """Columns that never change while others do, for a cycle or for a while, and rows of zeros."""
+def _warn_dead_columns(curves: Curves) -> list[str]:
+    """Return messages on columns that never change, or not for a while, while others do, and on rows of zeros."""
     messages: list[str] = []
     stuck: dict[str, list[str]] = {}
     paused: dict[str, list[str]] = {}
@@ -428,7 +431,7 @@ def _dead_columns(curves: Curves) -> list[str]:
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:
-    """Length of the longest run of true."""
+    """Return the length of the longest run of true values."""
     ends = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return int((ends[1::2] - ends[::2]).max(initial=0))
 
@@ -437,7 +440,7 @@ def _named(names: list[str]) -> str:
     return first_of(names, _MOST_NAMED)
 
 
-def _ends(curves: Curves, settled: bool) -> list[str]:
+def _warn_ends(curves: Curves, settled: bool) -> list[str]:
     messages = []
     if not settled:
         messages.append(
@@ -462,13 +465,13 @@ def _ends(curves: Curves, settled: bool) -> list[str]:
     return messages
 
 
-def _starts(curves: Curves) -> list[str]:
+def _warn_starts(curves: Curves) -> list[str]:
     late = [f"{c.name} ({c.first:.3g} s)" for c in curves.cycles if c.first > _LATE]
     return [f"the first sample comes late after power-on: {_named(late)}"] if late else []
 
 
-def _sizes(curves: Curves) -> list[str]:
-    """What a unit in a column's title that is not that of its numbers looks like."""
+def _warn_sizes(curves: Curves) -> list[str]:
+    """Return messages on changes so large that the column's title probably states a wrong unit."""
     largest = np.nanmax(np.abs(curves.mean), axis=(0, 1))
     return [
         f"{axis} changes by {small_text(change, unit)} after power-on: does its column have the right unit?"
@@ -477,7 +480,7 @@ def _sizes(curves: Curves) -> list[str]:
     ]
 
 
-def _motion(curves: Curves) -> list[str]:
+def _warn_motion(curves: Curves) -> list[str]:
     moved = [
         f"{c.name} ({seconds:g} s, first at {began:g} s)"
         for c, (seconds, began) in zip(curves.cycles, curves.moved, strict=True)
@@ -486,8 +489,8 @@ def _motion(curves: Curves) -> list[str]:
     return [f"the unit moved; those seconds are left out: {_named(moved)}"] if moved else []
 
 
-def _drifts(curves: Curves, chosen: Judged) -> list[str]:
-    """Settled parts that go on changing by much of what the model leaves over."""
+def _warn_drifts(curves: Curves, chosen: Judged) -> list[str]:
+    """Return messages on settled parts that still drift by much of the residual."""
     clear = np.abs(curves.drift) > STILL_DRIFTS.limit * curves.drift_uncertainty
     largest = np.sqrt((curves.mean**2).mean(axis=(0, 1)))
     big = np.abs(curves.drift) > np.maximum(_DRIFT_SHARE * chosen.training, 0.05 * largest)
@@ -506,7 +509,7 @@ def _drifts(curves: Curves, chosen: Judged) -> list[str]:
     return messages
 
 
-def _temperatures(curves: Curves) -> list[str]:
+def _warn_temperatures(curves: Curves) -> list[str]:
     warm, far = [], []
     for cycle, nominal in zip(curves.cycles, curves.temperatures[curves.group], strict=True):
         chamber = nominal if cycle.chamber is None else cycle.chamber
@@ -526,7 +529,7 @@ def _temperatures(curves: Curves) -> list[str]:
     return messages
 
 
-def _single(curves: Curves) -> list[str]:
+def _warn_single(curves: Curves) -> list[str]:
     count = np.bincount(curves.group, minlength=len(curves.temperatures))
     alone = [f"{t:g}" for t, n in zip(curves.temperatures, count, strict=True) if n == 1]
     if not alone:
@@ -534,8 +537,8 @@ def _single(curves: Curves) -> list[str]:
     return [f"one cycle only at {' '.join(alone)} degC: its repeatability is not known there"]
 
 
-def _odd_cycles(curves: Curves) -> list[str]:
-    """Cycles that differ from the others at their temperature far more than cycles of this test do."""
+def _warn_odd_cycles(curves: Curves) -> list[str]:
+    """Return a message on cycles that differ from others at their temperature far more than usual in this test."""
     means, _ = curves.group_means()
     apart = np.einsum("cb,cba->ca", curves.seconds, (curves.mean - means[curves.group]) ** 2)
     apart = np.sqrt(apart / curves.seconds.sum(axis=1)[:, None])
@@ -557,7 +560,7 @@ def _odd_cycles(curves: Curves) -> list[str]:
     ]
 
 
-def _intervals(curves: Curves, chosen: Judged) -> list[str]:
+def _warn_intervals(curves: Curves, chosen: Judged) -> list[str]:
     if chosen.model != "interval-cubic":
         return []
     wide = [
@@ -573,14 +576,14 @@ def _intervals(curves: Curves, chosen: Judged) -> list[str]:
     ]
 
 
-def _constants(curves: Curves, chosen: Judged) -> list[str]:
-    """A time constant that the search was stopped at, not led to, where its part of the curve is one that counts."""
+def _warn_constants(curves: Curves, chosen: Judged) -> list[str]:
+    """Return a message on a time constant at the limit of the search, if its part of the curve matters."""
     if chosen.model != "exponential" or chosen.solution is None:
         return []
     tau = chosen.solution.scales[-1]
     changes = np.abs(chosen.table.coefficients[..., -1]).max(axis=0) * (1 - np.exp(-curves.settling_time / tau))
     whole = np.nanmax(np.abs(curves.mean), axis=(0, 1))
-    # An axis of one value has no curve but what rounding leaves of the difference from its reference.
+    # An axis with one value has only rounding errors as its curve.
     counts = changes > np.maximum(_COUNTS * whole, _ROUNDING * np.abs(curves.reference).max(axis=0))
     if tau < SCALE_LIMIT * curves.settling_time / _AT_LIMIT or not counts.any():
         return []
@@ -591,12 +594,12 @@ def _constants(curves: Curves, chosen: Judged) -> list[str]:
 
 
 def after_of(cycles: Sequence[Cycle]) -> str | None:
-    """Return the SHA-256 of the thermal record that the axes of all cycles were corrected by; None for none.
+    """Return the SHA-256 of the thermal record that all cycles were corrected by; None for none.
 
     Raises
     ------
     DataError
-        It is not the same for all.
+        It is not the same for all cycles.
     """
     first = cycles[0]
     sensors = {axis.partition("_")[0] for axis in first.axes}

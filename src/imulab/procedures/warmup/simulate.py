@@ -1,8 +1,8 @@
-"""Simulated power cycles in a temperature chamber: an inside that heats up in three stages, with its truth.
+"""Simulated power cycles in a temperature chamber: a sensor whose inside heats up in three stages, with its truth.
 
 Each sensor has a zero that depends on its own temperature, b(x); that temperature rises after power-on through die,
-package and housing: ``x(t) = T + sum_j h_j (1 - exp(-t / tau_j))``. What is seen is ``b(x(t))``; the warm-up curve is
-``b(x(t)) - b(x(infinity))``. None of the models of `imulab.procedures.warmup.model` has this form.
+package and housing: ``x(t) = T + sum_j h_j (1 - exp(-t / tau_j))``. The output at rest is ``b(x(t))``; the warm-up
+curve is ``b(x(t)) - b(x(infinity))``. None of the models of `imulab.procedures.warmup.model` has this form.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _DEG_PER_HOUR = np.pi / 180 / 3600  # rad/s
 _MICRO_G = 1e-6 * STANDARD_GRAVITY  # m/s^2
 _TAU = np.array([20.0, 60.0, 180.0])  # s: die, package, housing
 _TAU_BY_KELVIN = -1e-3  # 1/K: convection is better when warm
-_REST = 20.0  # degC at which the time constants hold
+_REST = 20.0  # degC for which the time constants are stated
 # Self-heating of each stage at each of the six sensors, K.
 _HEAT = np.array(
     [[1.2, 3.3, 5.5], [0.9, 3.15, 4.95], [1.65, 3.63, 5.72], [1.1, 3.2, 5.2], [1.0, 3.4, 5.0], [1.4, 3.1, 5.6]]
@@ -121,7 +121,7 @@ def simulate_power_cycle(
         Standard deviation of the self-heating from unit to unit, as a fraction; the unit is drawn by its serial.
     serial
         Of the unit.
-    accel
+        Whether there are accelerometer columns.
         Whether there are accelerometer columns.
     seed
         Of the random numbers.
@@ -228,14 +228,14 @@ def simulate_warmup(
 
 @dataclass(frozen=True, repr=False)
 class PowerCycles(Shown, Sequence[Recording]):
-    """The recordings of a simulated warm-up test, each made when it is asked for.
+    """The recordings of a simulated warm-up test, each made when it is read.
 
     Attributes
     ----------
     temperatures
         Set points, degC.
     cycles
-        At each.
+        Power cycles at each set point.
     law, duration, rate, units, seed
         As for `simulate_warmup`, in SI.
     """
@@ -272,7 +272,7 @@ class PowerCycles(Shown, Sequence[Recording]):
         return replace(made, name=f"cycle_{middle}{at:+g}_{cycle + 1}")
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return what they are in a sentence."""
+        """Return the test in a sentence."""
         at = " ".join(f"{t:g}" for t in self.temperatures)
         head = f"{len(self)} simulated power cycles of {self.duration:g} s at {at} degC, law {self.law}"
         return head, [], []

@@ -1,4 +1,4 @@
-"""The warm-up table as CSV, for people who keep parameter tables in spreadsheets; it reads back to the last bit."""
+"""The warm-up table as CSV for spreadsheets, which reads back to the last bit."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class TableSheet(Shown):
     Attributes
     ----------
     text
-        Of the CSV file.
+        Text of the CSV file.
     record
-        The record that was given, or one that holds the table that was given.
+        The stated record, or one that holds the stated table.
     """
 
     text: str
@@ -44,7 +44,7 @@ class TableSheet(Shown):
 
     @property
     def rows(self) -> list[list[str]]:
-        """Titles, then a row per interval or knot and axis."""
+        """Titles, then a row for each interval or knot and axis."""
         return [line.split(",") for line in self.text.splitlines() if not line.startswith("#")]
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
@@ -99,16 +99,16 @@ def warmup_table(data: Record, *, per_second: bool = False) -> TableSheet:
     if not isinstance(data, Calibration):
         file = os.fspath(data) if isinstance(data, str | PathLike) else None
         if file is not None and not (is_json(file) or is_blob(file)):  # a blob is refused as a record, with the reason
-            made = record_of_table(read_table(file), file)
+            made = make_table_record(read_table(file), file)
             return TableSheet(write_table(made, per_second=per_second), made)
         data = as_record(data, "warmup_table")
     return TableSheet(write_table(data, per_second=per_second), data)
 
 
 def write_table(record: Calibration, *, per_second: bool = False) -> str:
-    """Return the table of a record as CSV: settings as ``# key: value``, then a row per interval or knot and axis.
+    """Return the table of a record as CSV: settings as ``# key: value``, then a row for each interval or knot and axis.
 
-    Coefficients of cubics are of powers of ``t / T_M``; `per_second`: of powers of t in s, which the titles say.
+    Coefficients of cubics belong to powers of ``t / T_M``; with `per_second`, to powers of t in s, as the titles say.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def _titles(model: str, size: int, per_second: bool = False) -> list[str]:
 
 
 def read_table(path: str | Path) -> tuple[WarmupTable, str | None]:
-    """Read a table from CSV as `write_table` makes it in either form, and the serial number in its head.
+    """Return a table from CSV in either form that `write_table` makes, and the serial number in its head.
 
     The unit of a row may be any of its kind (deg/h for a rate); it is converted. Slopes of exponential amplitudes
     are computed anew.
@@ -300,8 +300,8 @@ def _value(place: str, text: str) -> float:
     return value
 
 
-def record_of_table(read: tuple[WarmupTable, str | None], file: str) -> Calibration:
-    """Return a record that holds a table made by hand: it says nothing of its errors."""
+def make_table_record(read: tuple[WarmupTable, str | None], file: str) -> Calibration:
+    """Return a record that holds an edited table; it has no uncertainties."""
     from hashlib import sha256
 
     from imulab.recording import Source
