@@ -66,15 +66,6 @@ class Gravity:
         """What records share that rest on this gravity: its error is the same in all of them."""
         return f"gravity {self.value!r} +- {self.standard_uncertainty!r} m/s^2"
 
-    def entry(self) -> dict[str, Any]:
-        """Return it as it stands in a record's model."""
-        return {
-            "value": self.value,
-            "unit": "m/s^2",
-            "standard_uncertainty": self.standard_uncertainty,
-            "from": self.origin,
-        }
-
 
 Given = TypeVar("Given")
 

@@ -300,7 +300,7 @@ class ThermalCheck(RecordCheck):
             "p_within": self.within,
             "p_between": self.between,
             "limit": None if self.limit is None else {"value": self.limit, "unit": "m/s^2"},
-            "gravity": self.gravity.entry(),
+            "gravity": entries(StatedGravity.of(self.gravity)),
             "holds": holds,
         }
         if (gyro := self.gyro) is not None:

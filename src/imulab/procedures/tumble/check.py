@@ -222,7 +222,7 @@ class Check(RecordCheck):
             "chi_square": self.chi_square,
             "degrees_of_freedom": n,
             "limit": None if self.limit is None else {"value": self.limit, "unit": "m/s^2"},
-            "gravity": self.gravity.entry(),
+            "gravity": entries(StatedGravity.of(self.gravity)),
             "attitudes": residuals,
             **({} if self.mag is None else {"mag": self.mag.content()}),
         }
