@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from imulab.display import has_hidden
 from imulab.errors import UnitError, quoted
 from imulab.units import parse_unit
 
 
-@dataclass(frozen=True)
-class Kind:
+class Kind(Struct, frozen=True):
     """What columns of one name measure (None: any unit passes), a unit for messages, and what such sensors are called.
 
     `triad`: the sensors have three axes, which may come as one array of shape (n, 3).

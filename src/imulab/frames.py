@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import import_module
 from typing import Any, Protocol
 
 import numpy as np
+from msgspec import Struct, field
 from numpy.typing import NDArray
 
 from imulab.arguments import described
@@ -39,8 +39,7 @@ class Frame(Protocol):
         """Return a column."""
 
 
-@dataclass
-class Units:
+class Units(Struct):
     """The units that were given: for single columns or sensors, and one for all sensors whose quantity it measures.
 
     ``where`` is how a message says to state a unit that is missing, with ``{name}``, ``{sensor}`` and ``{unit}``.

@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 import numbers
 import re
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
+
+from msgspec import Struct
 
 from imulab.display import Note
 from imulab.errors import OptionError, quoted
@@ -52,8 +53,7 @@ _USELESS = 0.01
 _TO_MICRO = 1e6  # to ppm
 
 
-@dataclass(frozen=True)
-class Gravity:
+class Gravity(Struct, frozen=True):
     """Local gravity and its standard uncertainty, m/s^2, where the value comes from, and what is to be said of it."""
 
     value: float
@@ -336,8 +336,7 @@ EARTH = 7.292115e-5
 """Rate of the Earth, rad/s (WGS 84)."""
 
 
-@dataclass(frozen=True)
-class EarthRate:
+class EarthRate(Struct, frozen=True):
     """The Earth's rate at a latitude, rad: north of the equator it points up, south of it down."""
 
     latitude: float

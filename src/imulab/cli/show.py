@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from math import inf, nan
 from typing import TYPE_CHECKING, Any
+
+from msgspec import Struct
 
 from imulab.cli.options import call, check_outputs, coloured, note, warn
 from imulab.display import SENTENCES, Verdict, aligned, printable
@@ -217,8 +218,7 @@ def describe_changes(first: str, second: str, comparison: RecordComparison, reco
     return "\n".join(lines)
 
 
-@dataclass
-class _Column:
+class _Column(Struct):
     """Range of a column, as its blocks pass by."""
 
     low: float = inf
@@ -251,8 +251,7 @@ class _Column:
         return [*([f"{x:.6g}" for x in numbers] or ["–"] * 3), str(self.missing)]
 
 
-@dataclass
-class _Clock:
+class _Clock(Struct):
     """Duration, rate and gaps, as the blocks pass by; the usual step is that of the first block."""
 
     first: float | None = None
@@ -292,8 +291,7 @@ class _Clock:
         return [*lines, f"time runs backwards {times}: procedures refuse it"] if self.backwards else lines
 
 
-@dataclass
-class _Contents:
+class _Contents(Struct):
     """What a recording holds, as its blocks have told it."""
 
     last: Recording

@@ -10,11 +10,11 @@ else looks at the samples. They are bridged by straight lines, so that all rows 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
 from imulab.columns import kind_of
@@ -111,8 +111,7 @@ _ALLOWED, _PLAIN = 6.0, 10.0
 the widest reach."""
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(Struct, frozen=True):
     """A change of level: its size, the first sample behind it, and within how many samples its place is known."""
 
     size: float
@@ -212,8 +211,7 @@ _UPPER, _TO_SIGMA = 24, 0.615
 deviation of white noise."""
 
 
-@dataclass(frozen=True)
-class LeftOut:
+class LeftOut(Struct, frozen=True):
     """Rows that were left out of a group of columns.
 
     Attributes

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+from msgspec import Struct
 
 from imulab.errors import OptionError
 from imulab.options import Option, options_of
@@ -46,8 +47,7 @@ class Files(Protocol):
         """Return the name of a file that file `name` names relative to itself."""
 
 
-@dataclass(frozen=True)
-class Task:
+class Task(Struct, frozen=True):
     """How a procedure is run on the files of one unit.
 
     Attributes
@@ -126,8 +126,7 @@ class Section:
         return []
 
 
-@dataclass(frozen=True)
-class OnLine:
+class OnLine(Struct, frozen=True):
     """What units of a line are compared by, where a record's parameters mean what only that record says.
 
     Attributes

@@ -11,11 +11,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from contextvars import ContextVar
-from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct
 
 from imulab.errors import ReadError
 
@@ -89,8 +90,7 @@ _MAT = b"MATLAB 5.0 MAT-file"
 _MAT73 = b"MATLAB 7.3 MAT-file"
 
 
-@dataclass(frozen=True, slots=True)
-class Format:
+class Format(Struct, frozen=True):
     """A kind of file.
 
     Attributes

@@ -14,11 +14,12 @@ from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import BinaryIO
 
 import numpy as np
+from msgspec import Struct
 
 import imulab.readers._text as _text
 from imulab.columns import parse_column_title
@@ -269,8 +270,7 @@ _MOST_ABOVE = 100  # lines above the titles
 _UNENDED = Note("the last line has no line end: if the file was cut there, its last number is short")
 
 
-@dataclass(frozen=True, slots=True)
-class _Job:
+class _Job(Struct, frozen=True):
     """A block of lines that is being parsed.
 
     Attributes

@@ -13,7 +13,7 @@ None; a field with the default `null` is written as null, and may be missing in 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from typing import (
     TYPE_CHECKING,
@@ -49,8 +49,7 @@ _Counts: TypeAlias = dict[str, tuple[int, Place]]
 _Reader: TypeAlias = Callable[[Any, Place, _Counts], Any]
 
 
-@dataclass(frozen=True)
-class PlainKind:
+class PlainKind(msgspec.Struct, frozen=True):
     """A plain value: what messages call it, and its test."""
 
     name: str

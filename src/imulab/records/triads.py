@@ -7,9 +7,8 @@ Accelerometers: ``s = T f``, ``A = s + k2 s^2 + ...``, ``M = S (A + b)``. Gyrosc
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
+from msgspec import Struct, field
 
 from imulab.recording import Array
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
@@ -18,8 +17,7 @@ CROSS_TERMS = ("k_xy", "k_yz", "k_zx")
 """Parameters of the products of two axes."""
 
 
-@dataclass(frozen=True)
-class Gyroscopes:
+class Gyroscopes(Struct, frozen=True):
     """``M = S (A + G f + b)``, ``A = s + k2 s^2 + ...``, ``s = T w``.
 
     Scale factor S (3,), matrix T (3, 3), g-sensitivity G (3, 3), bias (3,), unit of M, k2 .. ke (e - 1, 3).
@@ -38,8 +36,7 @@ class Gyroscopes:
         return self.scale[:, None] * self.matrix
 
 
-@dataclass(frozen=True)
-class AccelerometerLaws:
+class AccelerometerLaws(Struct, frozen=True):
     """``M = S(T) (T(T) f + b(T))`` over temperature: laws of the nine parameters in powers of theta, unit of M.
 
     ``theta`` goes from -1 at one of the `knots`, degC, to 1 at the next, and stays at its end outside; `coefficient`
@@ -84,8 +81,7 @@ def _in_pieces(knots: Array, coefficient: Array, temperature: Array) -> Array:
     return laws
 
 
-@dataclass(frozen=True)
-class GyroscopeLaws:
+class GyroscopeLaws(Struct, frozen=True):
     """``M = S(T) (T w + G f + b(T))`` over temperature: laws in powers of theta between `knots`, as of accelerometers.
 
     The rows of `coefficient` (pieces, 6, terms) are b_x b_y b_z, rad/s, and S_x S_y S_z, unit of M per rad/s; matrix T
@@ -104,8 +100,7 @@ class GyroscopeLaws:
         return [Gyroscopes(row[3:], self.matrix, self.sensitivity, row[:3], self.unit) for row in law]
 
 
-@dataclass(frozen=True)
-class Accelerometers:
+class Accelerometers(Struct, frozen=True):
     """``M = S (A + b)``: scale factor (3,), lower-triangular T (3, 3), bias (3,), k2 .. ke (e - 1, 3), unit of M.
 
     With cross terms `CROSS_TERMS` (3,) in A.
@@ -132,8 +127,7 @@ class Accelerometers:
         return output
 
 
-@dataclass(frozen=True)
-class Magnetometers:
+class Magnetometers(Struct, frozen=True):
     """``P M = S (A + b)``, ``A = s + k2 s^2``, ``s = T m``: what a unit's magnetometers put out in a field m.
 
     Scale factor S (3,), matrix T (3, 3), bias (3,), k2 (3,), signed permutation P (3, 3), the unit of outputs M, and
@@ -161,8 +155,7 @@ class Magnetometers:
         return h
 
 
-@dataclass(frozen=True)
-class Triads:
+class Triads(Struct, frozen=True):
     """The accelerometers of a unit, and its gyroscopes and magnetometers, None where the record has none."""
 
     accel: Accelerometers
@@ -170,8 +163,7 @@ class Triads:
     mag: Magnetometers | None = None
 
 
-@dataclass(frozen=True)
-class LinearFit:
+class LinearFit(Struct, frozen=True):
     """Accelerometers fitted anew without nonlinearity, None where they cannot be, and what is said of it.
 
     `remark` goes on from the parameters that were fitted: ``are those of the whole model: ...``.

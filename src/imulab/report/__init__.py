@@ -6,10 +6,11 @@ import json
 import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from typing import Any
+
+from msgspec import Struct
 
 from imulab.display import SENTENCES, Verdict
 from imulab.records.calibration import Calibration
@@ -77,8 +78,7 @@ def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicte
     return str(_template("plan.html.j2").render(title=title, lead=lead, attitudes=shown, predicted=predicted))
 
 
-@dataclass(frozen=True)
-class Card:
+class Card(Struct, frozen=True):
     """What an index shows of one piece of work: question, answer, commands, a figure, the report, the verdict."""
 
     question: str

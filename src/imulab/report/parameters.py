@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cache
 from typing import overload
+
+from msgspec import Struct
 
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -61,8 +62,7 @@ _NONLINEARITY = re.compile(r"1/\((m/s\^2|rad/s)\)(?:\^(\d))?")
 _POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
 
 
-@dataclass(frozen=True, slots=True)
-class ReadingUnit:
+class ReadingUnit(Struct, frozen=True):
     """How a value in SI is read: ``reading = factor value + offset``, in `symbol`."""
 
     symbol: str
@@ -92,8 +92,7 @@ class ReadingUnit:
         return "ppm" if self.offset else self.symbol
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(Struct, frozen=True):
     """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ...
 
     `given_order` is the standard uncertainty if the order chosen from the data is right, None where none was chosen.

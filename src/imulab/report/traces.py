@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+from msgspec import Struct, field
 from numpy.typing import ArrayLike, NDArray
 
 from imulab.estimation.rows import MAD_TO_SIGMA
@@ -32,8 +33,7 @@ ALARM = 0.5
 """An observation with less than this share of its weight is drawn as standing out."""
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(Struct, frozen=True):
     """A Plotly figure (traces and layout as plain JSON values), a title, how to read it, and what it shows."""
 
     title: str
@@ -44,8 +44,7 @@ class Figure:
     message: str = ""
 
 
-@dataclass(frozen=True)
-class ReportTable:
+class ReportTable(Struct, frozen=True):
     """A table: column titles, rows of text, how to read it, the row to highlight, and what it shows."""
 
     title: str
@@ -259,8 +258,7 @@ _FEWEST = 5  # points of which a range can be usual
 _MOST_LABELS = 4  # points outside the range that are labelled
 
 
-@dataclass(frozen=True)
-class Bulk:
+class Bulk(Struct, frozen=True):
     """Range of an axis, and which values lie beyond it, shape (n,)."""
 
     low: float
@@ -461,8 +459,7 @@ def line(x: str, y: str, place: float, colour: str, dash: str, height: float = 1
 # Figures and tables that all procedures draw alike: points with bars, by groups, and a table by its columns.
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(Struct, frozen=True):
     """Points that look alike: their name in the legend, which they are, shape (n,), symbol and colour."""
 
     name: str

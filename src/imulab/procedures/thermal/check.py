@@ -36,6 +36,7 @@ from imulab.procedures.thermal.solve import ThermalProblem, linearise, together
 from imulab.quantities import in_si
 from imulab.recording import Array, Data, Reading, Recording
 from imulab.records.calibration import Calibration
+from imulab.records.sections import StatedGravity, entries
 from imulab.report.parameters import micro_g
 from imulab.report.traces import LEGEND, Exhibits, Figure, figure_axis, points, table, within_and_beyond
 from imulab.units import conversion_factor, from_si, parse_unit, to_si

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, Unpack
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
 import imulab.procedures.tumble._segment as _segment
@@ -35,8 +36,7 @@ POOL_DEGREES = 10.0
 """Weight, in degrees of freedom, of the noise pooled over all attitudes against an attitude's own."""
 
 
-@dataclass(frozen=True)
-class Trace:
+class Trace(Struct, frozen=True):
     """Windowed variance of a triad over time (sum of the axes), in the squared unit of its columns.
 
     ``threshold`` is the variance below which a window is at rest, ``quiet`` that of the quietest stretch.
@@ -57,8 +57,7 @@ class Trace:
         )
 
 
-@dataclass(frozen=True)
-class Motion:
+class Motion(Struct, frozen=True):
     """Motion of the unit during each hold, as far as it changes the mean magnitude of f.
 
     The mean of the magnitudes differs from the magnitude of the mean by the motion, and their scatter is the noise.
@@ -346,8 +345,7 @@ _BATCHES = 10
 """Batches per attitude: few, so that they are long against the correlation of the noise, but enough to tell it."""
 
 
-@dataclass(frozen=True)
-class HeldStill:
+class HeldStill(Struct, frozen=True):
     """The samples of all holds, one after the other, in blocks as long as a hand's tremor.
 
     `start` and `stop` are the stretches in blocks, `attitude` says whose each is; `centre` is an attitude's mean.
@@ -482,8 +480,7 @@ _TRACE_POINTS = 2000  # of the drawing of the scatter over time
 _A_PART = 2000  # samples by which the resolution of an output is told
 
 
-@dataclass(frozen=True)
-class _Blocks:
+class _Blocks(Struct, frozen=True):
     """Means and mean squared scatters of consecutive blocks of `length` samples, shape (n, 3)."""
 
     mean: Array
@@ -493,8 +490,7 @@ class _Blocks:
     broken: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class _Pieces:
+class _Pieces(Struct, frozen=True):
     """Static stretches in blocks, half-open, the attitude that each belongs to, and the attitudes' means (n, 3)."""
 
     start: NDArray[np.int64]

@@ -28,6 +28,7 @@ from imulab.procedures.tumble.schema import attitudes_of, fit_of, model_of
 from imulab.quantities import in_si
 from imulab.recording import Array, Reading
 from imulab.records.calibration import Calibration
+from imulab.records.sections import StatedGravity, entries
 from imulab.report.parameters import micro_g, reading_unit, small_g
 from imulab.report.traces import (
     BAD,

@@ -14,9 +14,8 @@ off-diagonals input-axis misalignments). Gravity's magnitude cannot see a rotati
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec import Struct
 
 import imulab.procedures.tumble._model as _model
 from imulab.estimation.least_squares import Fit, least_squares
@@ -83,8 +82,7 @@ def powers_of_gravity(order: int, size: int) -> Array:
     return powers
 
 
-@dataclass(frozen=True)
-class Inversion:
+class Inversion(Struct, frozen=True):
     """Specific force of a batch of outputs, shape (..., 3); NaN where no specific force gives this output."""
 
     force: Array

@@ -31,12 +31,13 @@ fitted with the same weights, each step from one to the next is shrunk by the sh
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import combinations
 from math import comb, lgamma, log
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from imulab.estimation.decisions import (
@@ -89,8 +90,7 @@ _NOTHING_KNOWN = 1e12
 """Inverse variance where no residual tells the noise: only the geometry is judged then."""
 
 
-@dataclass(frozen=True)
-class OrderChoice:
+class OrderChoice(Struct, frozen=True):
     """The table of orders, lowest first, the order that it leads to, and the solution of each order that was fitted."""
 
     order: int
@@ -244,8 +244,7 @@ _TINY = 1e-7  # g: patterns below 0.1 µg are rounding
 _MICRO = 1e6  # to µg and ppm
 
 
-@dataclass(frozen=True)
-class Pattern:
+class Pattern(Struct, frozen=True):
     """What a group of columns explains of the residuals.
 
     Attributes
@@ -397,8 +396,7 @@ _PASSES, _SEARCHES = 5, 5  # exchanges of members of a set; searches, each by th
 _FIRST_LOOK = 32  # likeliest sets whose gain is computed first; mostly these hold the best
 
 
-@dataclass(frozen=True)
-class Aside:
+class Aside(Struct, frozen=True):
     """Attitudes that stand out: their indices, rising, and their shifts over the standard uncertainties, shape (m,)."""
 
     index: tuple[int, ...]
@@ -412,8 +410,7 @@ class Aside:
 NONE_ASIDE = Aside((), ())
 
 
-@dataclass(frozen=True)
-class _Whitened:
+class _Whitened(Struct, frozen=True):
     """Residuals of one order in units of their noise, (n,), and an orthonormal basis of what the model explains."""
 
     residual: Array
@@ -647,8 +644,7 @@ _BLEND_PASSES = 8  # in which noise, weights and order agree
 _TINY_WEIGHT = 1e-300  # stands for a variance of 0
 
 
-@dataclass(frozen=True)
-class Blended:
+class Blended(Struct, frozen=True):
     """Blend of the fits of all orders, in units of g.
 
     Attributes

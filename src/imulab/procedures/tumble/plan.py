@@ -7,13 +7,14 @@ every parameter, and the order of the attitudes that turns least.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
+from msgspec.structs import replace
 
 from imulab.columns import triad
 from imulab.errors import DataError, ImulabError, ObservabilityError, OptionError, RecordError, UnitError, listed

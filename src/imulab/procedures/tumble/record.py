@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from imulab.display import Note
@@ -75,8 +76,7 @@ _WORST_MISALIGNMENT = 0.1  # rad: a larger misalignment is an axis with another 
 _MOST_NAMED = 8  # attitudes that a warning names
 
 
-@dataclass(frozen=True)
-class FittedAttitudes:
+class FittedAttitudes(Struct, frozen=True):
     """All attitudes that were found, those set aside included, under the solution for the others."""
 
     attitudes: Attitudes
@@ -85,8 +85,7 @@ class FittedAttitudes:
     aside: Aside
 
 
-@dataclass(frozen=True)
-class StatedUncertainty:
+class StatedUncertainty(Struct, frozen=True):
     """Stated covariance, in units of g, and its degrees of freedom (None: noise known); both also given the order."""
 
     covariance: Array
@@ -242,8 +241,7 @@ _REMEDIES = {
 }
 
 
-@dataclass(frozen=True)
-class Scaling:
+class Scaling(Struct, frozen=True):
     """Nominal zero and scale (output per g) of each axis, shape (3,), that the fit works relative to."""
 
     zero: Array

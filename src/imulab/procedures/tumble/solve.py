@@ -23,6 +23,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from imulab.errors import DataError
@@ -49,8 +50,7 @@ _REFIT_AT_MOST = 150  # attitudes up to which each is left out by a fit of its o
 _REFIT_TOLERANCE = 1e-7  # the next step would be a thousandth of it, or less
 
 
-@dataclass(frozen=True)
-class Prior:
+class Prior(Struct, frozen=True):
     """Earlier knowledge of the scaled parameters: normal, as observations ``rows (theta - mean) = 0 ± 1``.
 
     `mean` has shape (p,), `rows` shape (q, p), with ``rows' rows`` the inverse of the covariance.
@@ -332,8 +332,7 @@ _DIVERGED = 0.98
 """A relative change of scale, or of bias in g, after which the linear step cannot be meant."""
 
 
-@dataclass(frozen=True)
-class Threshold:
+class Threshold(Struct, frozen=True):
     """Changes from one pass to the next below which the iteration rests: relative, in g, and in rad."""
 
     scale_factor: float
@@ -493,8 +492,7 @@ def inverse(information: Array) -> Array:
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class Search:
+class Search(Struct, frozen=True, dict=True):
     """What a set of attitudes is for.
 
     Attributes

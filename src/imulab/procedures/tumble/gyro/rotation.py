@@ -9,10 +9,10 @@ direction of gravity into the second. Swapped or reversed axes make a left-hande
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 import imulab.procedures.tumble._rotation as _rotation
@@ -26,8 +26,7 @@ from imulab.units import parse_unit, to_si
 # Rotations from sampled rates, many segments at once.
 
 
-@dataclass(frozen=True)
-class Turns:
+class Turns(Struct, frozen=True):
     """Turns over segments, and their sensitivity to errors of the rate.
 
     Attributes
