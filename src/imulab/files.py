@@ -10,10 +10,9 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
-
-from msgspec import Struct
 
 from imulab.errors import OptionError, ReadError, UnitError, file_name, listed, quoted
 from imulab.units import Unit, parse_scale_factor, parse_unit
@@ -188,7 +187,8 @@ def _has_wide(value: Any) -> bool:
 # Entries of TOML files: keys, numbers, units and scale factors, each refused with its place where it cannot be.
 
 
-class ScaleFactor(Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class ScaleFactor:
     """Output per unit of what is measured: its value, and the units of both."""
 
     value: float

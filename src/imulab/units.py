@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, overload
-
-from msgspec import Struct
 
 from imulab.errors import UnitError, listed
 
@@ -27,7 +26,8 @@ STANDARD_GRAVITY = 9.80665
 _DEGREE = math.pi / 180.0  # rad
 
 
-class Unit(Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class Unit:
     """A unit: its symbol, the quantity that it measures, and ``SI = value * factor + offset``."""
 
     symbol: str

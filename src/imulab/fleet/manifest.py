@@ -8,7 +8,7 @@ import io
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,7 @@ from imulab.procedures.registry import PROCEDURES
 from imulab.readers.formats import library
 
 if TYPE_CHECKING:
+    from imulab.procedures.procedure import Procedure
     from imulab.readers import Layout
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
@@ -314,11 +315,12 @@ def load_fleet(path: str) -> FleetManifest:
         data = local.read_bytes()
     rows = _parquet(data, path) if data.startswith(b"PAR1") else _csv(data, path)
     titles = rows[0][1]
-    _check_columns(titles, path)
+    table = [(place, dict(zip(titles, cells, strict=True))) for place, cells in rows[1:]]
+    _check_columns(titles, {cells.get("procedure", "") for _, cells in table}, path)
     units: list[FleetUnit] = []
     places: dict[str, tuple[str, str]] = {}
-    for place, cells in rows[1:]:
-        unit = _unit(place, dict(zip(titles, cells, strict=True)))
+    for place, cells in table:
+        unit = _unit(place, cells)
         key = unit.serial.casefold()
         if key in places:
             first, other = places[key]
@@ -371,16 +373,23 @@ def _parquet(data: bytes, name: str) -> list[tuple[str, list[str]]]:
     return rows
 
 
-def _check_columns(titles: Sequence[str], name: str) -> None:
+def _check_columns(titles: Sequence[str], procedures: Set[str], name: str) -> None:
+    """Refuse titles that are missing, unknown or there twice; the options of unused procedures are seldom imported."""
     for title in COLUMNS:
         if title not in titles:
             raise OptionError(f"{name}: no column {title}; found {several(titles)}")
-    known = [*COLUMNS, *dict.fromkeys(option for entry in PROCEDURES.values() for option in entry.task.names)]
+    usual = {*COLUMNS, *_options_of(PROCEDURES[key] for key in procedures & PROCEDURES.keys())}
     for index, title in enumerate(titles):
-        if title.replace("-", "_") not in known:
-            raise OptionError(f"{name}: unknown column {title!r}; known columns: {listed(known, title)}")
+        if title.replace("-", "_") not in usual:
+            known = [*COLUMNS, *dict.fromkeys(_options_of(PROCEDURES.values()))]
+            if title.replace("-", "_") not in known:
+                raise OptionError(f"{name}: unknown column {title!r}; known columns: {listed(known, title)}")
         if title in titles[:index]:
             raise OptionError(f"{name}: column {title} appears twice")
+
+
+def _options_of(procedures: Iterable[Procedure]) -> Iterator[str]:
+    return (name for procedure in procedures for name in procedure.task.names)
 
 
 def _unit(place: str, cells: Mapping[str, str]) -> FleetUnit:
