@@ -292,11 +292,11 @@ def test_degrees_taken_for_radians_are_said_by_the_turns(turned):
 
 @pytest.mark.parametrize("change", [{"gyro_x": "gyro_y", "gyro_y": "gyro_x"}, {"gyro_z": "-"}])
 def test_swapped_and_reversed_axes_are_refused(turned, change):
-    made = [{**c, **{a: -c[a] if b == "-" else c[b] for a, b in change.items()}} for c in turned[2]]
+    made = [{**c, **{a: -c[a] if b == "-" else c[b] for a, b in change.items()}} for c in turned[2][::2]]
     with pytest.raises(
         il.ImulabError, match=r"^soak_\d.csv: columns gyro_x gyro_y gyro_z: the turns miss .*swapped or"
     ):
-        il.fit_thermal(recordings(made), gravity=G, with_="gyro", degrees="3,2,1")
+        il.fit_thermal(recordings(made), gravity=G, with_="gyro", degrees="2,1,0")
 
 
 def test_lost_samples_and_saturated_turns_are_named(turned):
@@ -351,7 +351,7 @@ def at_rest(rng, gyros, temperatures, count, turn_on, noise, rate=0.0, loop=0.0)
 )
 def test_intervals_of_the_biases_hold_as_many_times_as_they_say(temperatures, count, low, worst, reduced):
     """Turn-on scatter of 0.01 deg/s, 36 deg/h, which cubics through five recordings pass on to 86 %."""
-    trials = 80 if reduced else 300
+    trials = 30 if reduced else 300
     held, errors = [], []
     places = np.linspace(min(temperatures), max(temperatures), 9)
     for trial in range(trials):
