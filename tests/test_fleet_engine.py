@@ -334,7 +334,7 @@ def test_a_folder_for_temporary_files_may_have_a_long_name(tmp_path):
 
 
 OF_THE_TRACKER = r"(?m)^.*UserWarning: resource_tracker: .*\n +warnings\.warn\(.*\n"
-"""A warning of joblib's process that looks after semaphores, which on a busy machine outlives the one that it serves."""
+"""A warning of joblib's process that looks after semaphores, which on a busy machine outlives the one it serves."""
 
 
 def test_an_interrupt_does_not_wait_for_what_is_under_work(tmp_path):

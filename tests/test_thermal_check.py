@@ -70,7 +70,7 @@ def moved(group, axis, power, by):
     ],
 )
 def test_a_record_that_holds_fails_once_in_twenty(at, count, unit, reduced):
-    """At most 5 %, within what trials tell: a binomial of 5 % lies below 9 % of 200, below 15 % of 20 and more, with 92 %."""
+    """At most 5 %, within what trials tell: of a binomial of 5 %, 99 % lie below 9 % of 200, 92 % below 15 % of 20."""
     trials, most = (20, 0.15) if reduced else (200, 0.09)
     assert share_of_alarms(trials, at, count, **unit) < most
 
