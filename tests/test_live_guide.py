@@ -101,7 +101,7 @@ def hold_to_the_promise(units: int) -> None:
 
 @pytest.mark.slow
 def test_the_guide_saves_a_quarter_of_the_attitudes(reduced):
-    hold_to_the_promise(3 if reduced else 20)
+    hold_to_the_promise(2 if reduced else 20)
 
 
 def test_a_session_takes_no_more_attitudes_than_predicted_where_the_noise_is_known(noise_as_stated, reduced):

@@ -62,7 +62,7 @@ def coefficients(samples, rate):
 def test_coefficients_cover_what_was_put_in(walk, low, reduced):
     rng = np.random.default_rng(3)
     white, rate, covered = 0.2, 50.0, []
-    for _ in range(20 if reduced else 60):
+    for _ in range(10 if reduced else 60):
         n = 40_000
         wander = np.cumsum(rng.standard_normal(n))
         samples = white * np.sqrt(rate) * rng.standard_normal(n) + walk / np.sqrt(rate) * wander

@@ -43,8 +43,8 @@ def worst(plan, stem):
         (24, 2, {"k2": 1.2}),
         (24, 3, {"k2": 1.6, "k3": 2.1}),
         (24, 4, {"k2": 5.4, "k3": 3.0, "k4": 4.5}),
-        (48, 2, {"k2": 0.8}),
-        (48, 3, {"k2": 1.0, "k3": 1.4}),
+        pytest.param(48, 2, {"k2": 0.8}, marks=pytest.mark.further),
+        pytest.param(48, 3, {"k2": 1.0, "k3": 1.4}, marks=pytest.mark.further),
         (48, 4, {"k2": 3.8, "k3": 2.0, "k4": 3.2}),
     ],
 )
@@ -55,7 +55,7 @@ def test_plans_are_no_worse_than_the_table_of_the_method(count, order, table):
         assert worst(plan, stem) < value + 0.05, stem
 
 
-@pytest.mark.parametrize(("count", "order"), [(24, 2), (24, 4), (48, 3)])
+@pytest.mark.parametrize(("count", "order"), [(24, 2), (24, 4), pytest.param(48, 3, marks=pytest.mark.further)])
 def test_the_axes_of_a_plan_are_alike_at_no_cost_in_the_sum(count, order):
     """x, y and z of each kind within 4 %, the sum within 1 % of the least that is found without balancing."""
     plan = planned(order, count)
