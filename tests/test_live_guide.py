@@ -19,6 +19,8 @@ from imulab.units import STANDARD_GRAVITY as G
 BIAS = Target("bias", 100e-6 * G, "100 ug")
 NOISE = 120e-6 * G
 MOST = 80
+FEWEST = 18
+"""With the noise known, a plan of 18 attitudes predicts a bias 5 % above the target; 20 units all need 20 or more."""
 
 
 class Unit:
@@ -70,7 +72,7 @@ def planned(count: int) -> Plan:
 
 def attitudes_planned(seed: int) -> int:
     """The least number of attitudes, planned for that number before the session, that gets the unit's bias to it."""
-    for count in range(12, MOST):
+    for count in range(FEWEST, MOST):
         unit, guide = Unit(seed), Guide(2, Gravity(G, "test"), (BIAS,))
         for number, up in enumerate(planned(count).directions, start=1):
             guide.attitudes.append(unit.at(up, number))
@@ -84,7 +86,7 @@ def attitudes_predicted() -> int:
     """The least number of attitudes whose plan predicts the bias for noise of which nothing must be estimated."""
     return next(
         count
-        for count in range(12, MOST)
+        for count in range(FEWEST, MOST)
         if max(u for name, u in planned(count).uncertainties(NOISE / G).items() if name.startswith("bias"))
         <= BIAS.value / G
     )
@@ -101,7 +103,7 @@ def hold_to_the_promise(units: int) -> None:
 
 @pytest.mark.slow
 def test_the_guide_saves_a_quarter_of_the_attitudes(reduced):
-    hold_to_the_promise(2 if reduced else 20)
+    hold_to_the_promise(3 if reduced else 20)
 
 
 def test_a_session_takes_no_more_attitudes_than_predicted_where_the_noise_is_known(noise_as_stated, reduced):
