@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from imulab.gravity import Gravity
-from imulab.live.guide import Attitude, Guide, Target, read_targets, share_of
+from imulab.live.guide import Attitude, Guide, Target, read_targets, worst_share
 from imulab.live.session import Session
 from imulab.live.sources import simulated_unit
 from imulab.procedures.tumble.plan import Plan, plan_attitudes
@@ -59,7 +59,7 @@ def attitudes_needed(seed: int, *, guided: bool) -> int:
         if up is None:
             up = unit.anywhere()
         guide.accept(unit.at(up, number))
-        if guide.fit is not None and share_of(BIAS, guide.fit.calibration, G) <= 1:
+        if guide.fit is not None and worst_share(BIAS, guide.fit.calibration, G) <= 1:
             return number
     return MOST
 
@@ -77,7 +77,7 @@ def attitudes_planned(seed: int) -> int:
         for number, up in enumerate(planned(count).directions, start=1):
             guide.attitudes.append(unit.at(up, number))
         guide.refit()
-        if guide.fit is not None and share_of(BIAS, guide.fit.calibration, G) <= 1:
+        if guide.fit is not None and worst_share(BIAS, guide.fit.calibration, G) <= 1:
             return count
     return MOST
 

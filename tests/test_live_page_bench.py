@@ -239,7 +239,7 @@ def test_a_refusal_is_said(tmp_path, monkeypatch):
     jobs = Jobs(lambda job: None)
     job = jobs.run("tumble fit", ["tumble", "fit", "none.csv", "-o", "r.json"], ["r.json"])
     until(lambda: job.ended)
-    assert (job.state, job.status, job.said, job.text) == ("refused", 2, ["imulab: none.csv: no such file"], "")
+    assert (job.state, job.status, job.messages, job.text) == ("refused", 2, ["imulab: none.csv: no such file"], "")
 
 
 def test_a_module_in_the_working_folder_is_not_imported(tmp_path, monkeypatch):
@@ -486,7 +486,7 @@ def test_names_that_windows_does_not_take_are_refused_there(tmp_path, monkeypatc
 def test_a_command_that_says_much_is_told_of_in_few_messages(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told: list[int] = []
-    jobs = Jobs(lambda job: told.append(len(job.said)))
+    jobs = Jobs(lambda job: told.append(len(job.messages)))
     lines = subprocess.Popen([sys.executable, "-c", "print('line\\n' * 900)"], stdout=subprocess.PIPE, text=True)
     job = jobs.run("show", ["show", "--formats"], [])
     until(lambda: job.ended)

@@ -21,7 +21,7 @@ from rich.console import Console
 import imulab as il
 from imulab.live.guide import read_targets
 from imulab.live.session import Session
-from imulab.live.terminal import draw, turned
+from imulab.live.terminal import direction_of_key, draw
 
 
 def shown(session: Session, width: int, height: int) -> list[str]:
@@ -62,10 +62,10 @@ def test_the_keys_of_a_simulated_unit_turn_it(session):
     assert last.startswith("n xyz XYZ: turn   u: drop")
     assert last.endswith("Ctrl-C: stop")
     wanted = np.array([0.6, 0.0, 0.8])
-    assert turned("n", wanted) is wanted
-    np.testing.assert_array_equal(turned("y", wanted), [0, 1, 0])
-    np.testing.assert_array_equal(turned("Z", None), [0, 0, -1])
-    assert [turned(key, wanted) for key in ("", "u", "q", "\x1b")] == [None] * 4
+    assert direction_of_key("n", wanted) is wanted
+    np.testing.assert_array_equal(direction_of_key("y", wanted), [0, 1, 0])
+    np.testing.assert_array_equal(direction_of_key("Z", None), [0, 0, -1])
+    assert [direction_of_key(key, wanted) for key in ("", "u", "q", "\x1b")] == [None] * 4
 
 
 def test_a_key_turns_the_simulated_unit_of_a_terminal(tmp_path):

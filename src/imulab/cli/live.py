@@ -246,14 +246,14 @@ def _make_record(save: str, fitted: dict[str, str | None], output: str | None, r
 
 def _all_triads(save: str, fitted: dict[str, str | None]) -> tuple[Calibration, list[str], list[str]]:
     """Fit a recording; a further triad that is refused is left out, so that no session is in vain. Return why, too."""
-    from imulab.live.view import fit_triads, further_of
+    from imulab.live.view import fit_triads, further_triads
     from imulab.procedures.registry import run_task
     from imulab.readers import read
 
     def fit(further: list[str]) -> Calibration:
         return run_task("tumble", [save], {**fitted, "with": ",".join(further) or None}, GivenFiles())
 
-    return fit_triads(fit, further_of(read(save).columns))
+    return fit_triads(fit, further_triads(read(save).columns))
 
 
 def _in_terminal(runner: Runner, made: Callable[[], Calibration], *, plain: bool, typed: bool) -> None:
@@ -361,7 +361,7 @@ def _drawn(runner: Runner, *, typed: bool) -> None:
 
     from rich.live import Live
 
-    from imulab.live.terminal import draw, keys, pressed, turned
+    from imulab.live.terminal import direction_of_key, draw, keys, pressed
 
     by_hand = runner.source.by_hand
     with keys(wanted=typed) as usable, Live(auto_refresh=False, transient=True) as screen:
@@ -373,7 +373,7 @@ def _drawn(runner: Runner, *, typed: bool) -> None:
                 break
             if key == "u":
                 events += runner.drop()
-            if by_hand and (direction := turned(key, runner.session.next)) is not None:
+            if by_hand and (direction := direction_of_key(key, runner.session.next)) is not None:
                 runner.turn(direction)
             for event in events:
                 if event.kind not in ("state", "next", "format"):

@@ -1,4 +1,4 @@
-"""The C core's Python face: settings and tables of a unit as bytes, blobs and streams."""
+"""The C core in Python: settings and tables of a unit as bytes, blobs and streams."""
 
 from __future__ import annotations
 

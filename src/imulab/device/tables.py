@@ -1,4 +1,4 @@
-"""Tables as the C core's structs and as bytes: of gyroscopes, of polynomials, and of how an array is fused.
+"""Tables as the C core's structs and as bytes: of gyroscopes, of polynomials, and of the fusion of an array.
 
 A blob is little-endian, versioned and closed by a CRC-32; the core checks it (``runtime/table.c`` has the layout).
 The desk runs the same core on the same layout with 8 bytes per number, so that nothing is computed twice.
@@ -22,7 +22,7 @@ from imulab.recording import Array, Recording
 from imulab.records.calibration import BLOB_MAGIC, Calibration
 from imulab.units import conversion_factor, from_si
 
-# Tables as the C core's structs and as the bytes ("blob") that it loads.
+# Structs and bytes.
 
 
 VERSION, WITH_POWERS = 1, 2
@@ -33,7 +33,7 @@ KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5, "mag"
 
 @dataclass(frozen=True)
 class Field:
-    """One member of a C struct: whole or real numbers, of shape () for a scalar, or real numbers that it points to.
+    """One member of a C struct: whole or real numbers, shape () for a scalar, or a pointer to real numbers.
 
     None stands for NULL.
     """
@@ -50,7 +50,7 @@ class Field:
 
 @dataclass(frozen=True)
 class DeviceTable:
-    """The members of one section's struct (``il_tumble`` ...), in order, and what the desk knows about its columns."""
+    """The members of one section's struct (``il_tumble`` ...), in order, and a description of its columns."""
 
     kind: str
     fields: tuple[Field, ...]
@@ -100,7 +100,7 @@ def whole(value: int) -> NDArray[np.int64]:
 
 
 def values_of(record: Calibration, names: Sequence[str], unit: str) -> Array:
-    """Return the values of parameters, in this unit.
+    """Return the values of parameters, after a check that they are in this unit.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def values_of(record: Calibration, names: Sequence[str], unit: str) -> Array:
 
 
 def nonzero(scale: Array) -> Array:
-    """Return scale factors; none is 0.
+    """Return scale factors; refuse a zero.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def field_of(table: DeviceTable, name: str) -> NDArray[Any]:
     return np.asarray(values)
 
 
-# How a gyro array is fused, as settings and as the table that the C core runs.
+# Fusion of a gyro array, as settings and as a table.
 
 
 MOST_ELEMENTS = 64  # of an axis, as IL_ARRAY_ELEMENTS of the largest configuration of the C core
@@ -145,7 +145,7 @@ MOST_COUNT = 1_000_000_000
 
 @dataclass(frozen=True)
 class Fusion:
-    """The method that a unit fuses by, with its memory: None for the growing one that begins at k = `start`."""
+    """The method of fusion of a unit, with its memory: None for the growing one that begins at k = `start`."""
 
     method: str = "robust"
     memory: float | None = None
@@ -156,12 +156,12 @@ class Fusion:
             raise OptionError(f"method {self.method!r}: expected one of {listed(METHODS, self.method)}")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as a record or a blob holds it."""
+        """Return it as it stands in a record or a blob."""
         return {"method": self.method, "memory": "growing" if self.memory is None else self.memory, "start": self.start}
 
 
 def fusion_of(held: Any) -> Fusion:
-    """Return what a record or a blob holds; robust with growing memory where it says nothing.
+    """Return the fusion in a record or a blob; robust with growing memory if it states none.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def fusion_of(held: Any) -> Fusion:
 
 @dataclass(frozen=True)
 class ArraySettings:
-    """How an array is fused; times in s become samples at `rate`.
+    """Settings of a fusion; times in s become samples at `rate`.
 
     Attributes
     ----------
@@ -311,7 +311,7 @@ def _shaped(values: Any, shape: tuple[int, ...], name: str) -> Array | None:
 
 HIGHEST_POWER = 5  # of the rate in the C core's polynomial
 _BEYOND = 1.05
-"""Noise, bias and the Earth's rate do not exceed the largest rate by more."""
+"""Factor of the largest tested rate that noise, bias and the Earth's rate do not exceed."""
 
 
 def gyro_table(
@@ -406,7 +406,7 @@ def beyond_rates(record: Calibration, recording: Recording) -> tuple[int, float]
 
 
 def beyond_message(record: Calibration, count: int, largest: float) -> str:
-    """Say that so many samples, the largest in rad/s, lie beyond the rates of the test."""
+    """Return the message that so many samples, the largest in rad/s, lie beyond the rates of the test."""
     held = "line" if record.model["gyro_order"] == 1 else "polynomial"
     return (
         f"{count} samples beyond {from_si(record.model['largest_rate']['value'], 'deg/s'):.4g} deg/s (up to "

@@ -1,4 +1,4 @@
-"""The C core on the desk.
+"""The C core on this computer: tables of a unit, streams with state, blobs, and vectors for the self-test.
 
 The tables of one unit loaded once, arrays in and out, streams that keep the core's state, the bytes ("blob") that
 its firmware loads, and the vectors by which it tests itself.
@@ -30,7 +30,7 @@ from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
 from imulab.records.sections import Part, Positive, Size, check_sizes, holds, read
 from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
 
-# Python face of the C core: tables loaded once, arrays in and out, streams that keep the core's state.
+# One unit: its tables are loaded once; arrays in and out.
 
 
 NOT_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, BEYOND, ALONE = (1 << bit for bit in range(8))
@@ -126,11 +126,11 @@ def _columns(columns: Sequence[Array]) -> tuple[Array, ...]:
     return tuple(np.ascontiguousarray(column, dtype=np.float64) for column in columns)
 
 
-# Recordings by a unit: outputs in the unit that a record calibrates, and what gyroscopes need beside them.
+# Recordings corrected by a unit.
 
 
 def outputs_of(recording: Recording, sensor: str, needed: str) -> list[Array]:
-    """Return the columns of a triad in the unit of the outputs that a record calibrates; errors as `output_factor`."""
+    """Return the columns of a triad in the unit that a record calibrates; errors as for `output_factor`."""
     factor = output_factor(recording.name, triad(sensor), recording.triad_unit(sensor), needed)
     return [recording.column(name) * factor for name in triad(sensor)]
 
@@ -209,7 +209,7 @@ class FusedBlock:
 
 
 class Stream:
-    """A gyro array being fused: owns the core's state, so that blocks give what one call over the whole gives.
+    """Fusion of a gyro array with the core's state, so that blocks give the same as one call over the whole.
 
     Raises
     ------
@@ -330,7 +330,7 @@ class Stream:
 
 
 def array_stream(method: str = "robust", elements: int = 0, axes: int = 1, **settings: Any) -> Stream:
-    """Return a stream of the C core that fuses an array; settings are those of `ArraySettings`."""
+    """Return a stream of the C core that fuses an array, with the settings of `ArraySettings`."""
     if settings.get("memory") == "growing":
         settings["memory"] = None
     return Stream(ArraySettings(method, elements, axes, **settings))
@@ -349,7 +349,7 @@ def _listed(value: Any) -> Any:
     return np.asarray(value).tolist()
 
 
-# Vectors by which an exported unit tests itself, of the tables that several procedures make.
+# Vectors of the self-test, for tables that several procedures make.
 
 
 VECTORS = 64  # inputs and outputs that the exported self-test compares
@@ -426,12 +426,12 @@ _COLUMNS: dict[str, type[Part]] = {
     "warmup": _Warmup,
     "array": _Array,
 }
-"""What the text says of a section of each kind."""
+"""Keys of the text for a section of each kind."""
 
 
 @dataclass(frozen=True)
 class Blob:
-    """A blob: its bytes, and what it says about itself (sensor, columns and units of each section)."""
+    """A blob: its bytes, and its description (sensor, columns and units of each section)."""
 
     name: str
     data: bytes
@@ -468,7 +468,7 @@ def is_blob(path: str | Path) -> bool:
 
 
 def load_blob(path: str | Path) -> Blob:
-    """Read a blob and check it by the core's own loader.
+    """Return a blob from a file, checked by the core's loader.
 
     Raises
     ------
@@ -501,7 +501,7 @@ def load_blob(path: str | Path) -> Blob:
 
 
 def _check_text(text: Any, kinds: list[str]) -> None:
-    """Check that what a blob says of its sections, of these kinds, in this order, is what `make_blob` writes."""
+    """Refuse a description of sections, of these kinds, that `make_blob` does not write."""
     _complete(_Text, text, "its text")
     check_sizes(text)
     stated = [section["kind"] for section in text["sections"]]

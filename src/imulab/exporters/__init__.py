@@ -28,7 +28,7 @@ EXPORTERS = tuple(_HOMES)
 
 
 def _nothing(message: str) -> None:
-    """Tell nobody."""
+    """Ignore a message."""
 
 
 MAG_MOUNTS = ("external", "internal")
@@ -36,7 +36,7 @@ MAG_MOUNTS = ("external", "internal")
 
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
-    """What the command line of ``export`` offers.
+    """Options of ``export``.
 
     Attributes
     ----------

@@ -47,7 +47,7 @@ from imulab.records.calibration import Calibration
 from imulab.records.triads import AccelerometerLaws, text_in_g
 from imulab.units import STANDARD_GRAVITY
 
-# What both autopilots take of a unit: an offset and a scale of each accelerometer, and an offset of each gyroscope.
+# Common to both autopilots: offset and scale of each accelerometer, and offset of each gyroscope.
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class AutopilotCorrections:
 def corrections(
     records: Sequence[Calibration], target: str, options: ExportOptions, check: Callable[[Array, Array], None]
 ) -> AutopilotCorrections:
-    """Return what an autopilot takes of the one record; `check` refuses offsets and scales that it does not take.
+    """Return the corrections that an autopilot can hold; `check` refuses offsets and scales out of its range.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def corrections(
     return AutopilotCorrections(unit, offset, scale, None if gyro is None else gyro.scale * gyro.bias, mag, lost)
 
 
-# Accelerometers over temperature as autopilots hold them: a cubic of the offset in the temperature, and one scale.
+# Over temperature: a cubic of the offset in the temperature, and one scale.
 
 
 _NODES = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
@@ -126,7 +126,7 @@ class OffsetLaw:
 def offset_law(
     records: Sequence[Calibration], target: str, options: ExportOptions, reference: float | None = None
 ) -> OffsetLaw | None:
-    """Return what an autopilot takes of a record over temperature, about `reference` or the middle of its range.
+    """Return the offsets over temperature that an autopilot can hold, about `reference` or the middle of the range.
 
     None where no record is over temperature.
 
@@ -179,7 +179,7 @@ def offset_law(
 def _rest(
     record: Calibration, target: str, temperature: Array, design: Array
 ) -> tuple[Array | None, list[str], list[str]]:
-    """Return the gyroscopes' offset as coefficients of a design, what its lack of all else costs, and a comment."""
+    """Return the gyroscopes' offset as coefficients of a design, the error from all that is left out, and a comment."""
     laws = procedure_of(record).gyro_laws(record)
     if laws is None:
         return None, [], []
@@ -205,7 +205,7 @@ def _rest(
 def _settle(
     target: str, laws: AccelerometerLaws, error: Array, slope: float, costs: list[str], options: ExportOptions
 ) -> list[str]:
-    """Refuse what would be lost, the costs of all else included, or return the comments that say so, and tell them."""
+    """Refuse losses, or return and report the comments on them, with the errors from all that is left out."""
     span = f"from {laws.low:g} to {laws.high:g} degC"
     follows = [f"the offset changes by up to {text_in_g(slope)} per K {span}"]
     worst, left = float(np.abs(error).max()), list(costs)

@@ -1,4 +1,4 @@
-"""Where the work on units is done, by processes of this machine or the workers of a Dask cluster.
+"""The processes that fit the units of a fleet: on this machine or on a Dask cluster, and the work of each on one unit.
 
 What a worker does with one unit.
 """
@@ -33,21 +33,21 @@ from imulab.procedures.procedure import OnLine
 from imulab.procedures.registry import PROCEDURES, run_task
 from imulab.records.calibration import Calibration, Parameter
 
-# Processes of this machine, which joblib starts, feeds and ends.
+# Processes of this machine, managed by joblib.
 
 
 T = TypeVar("T")
 
 _LOOK = 0.2
-"""Seconds between two looks of a process at whether the one that started it is still there."""
+"""Seconds between two checks of a process that the one that started it still runs."""
 
 
 class WorkersLostError(Exception):
-    """Processes have ended under their work; what they had not written is to be done again."""
+    """Processes have ended during their work; units without a written record have to be fitted again."""
 
 
 def available() -> int:
-    """Return how many processors this process may use, by its affinity and the quota of its control group."""
+    """Return the number of processors that this process may use, by its affinity and its control group's quota."""
     from joblib import cpu_count
 
     return int(cpu_count())
@@ -83,7 +83,7 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
 
 
 def _close(results: Generator[object, None, None]) -> None:
-    """Close results that nobody takes, silently: joblib warns, and its thread may look for work that was dropped."""
+    """Close results that nobody reads, silently: joblib warns, and its thread may look for work that was dropped."""
     hook = threading.excepthook
     threading.excepthook = lambda _: None
     try:
@@ -96,7 +96,7 @@ def _close(results: Generator[object, None, None]) -> None:
 
 @contextmanager
 def _no_interrupts() -> Iterator[None]:
-    """Start processes with interrupts blocked, and threads that start more of them.
+    """Block interrupts while processes, and threads that start processes, are started.
 
     An interrupt of the terminal goes to all its processes; this one alone reports it, once the processes have been
     started.
@@ -114,7 +114,7 @@ def _no_interrupts() -> Iterator[None]:
 
 
 def _begin(parent: int) -> None:
-    """End this process soon after the one that started it, whatever that dies of."""
+    """End this process soon after the one that started it ends, for whatever reason."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -124,16 +124,16 @@ def _begin(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-# What a worker does with one unit: nothing if its record is there, else fit and write, and say how it went.
+# Work on one unit: nothing if its record exists, else fit and write it, and return the outcome.
 
 
 DONE, KEPT, FAILED, LEFT = "done", "kept", "failed", "left"
-"""Made now; there already; refused, with a reason; not touched, because another run has taken over."""
+"""Made now; made before; refused, with a reason; not touched, because another run has taken over."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What all units of a run share: the folder of the records, the base of the manifest's paths, the run's token.
+    """Values common to all units of a run: folder of the records, base of the manifest's paths, token of the run.
 
     Without a folder the records are sent back.
     """
@@ -145,7 +145,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run, its table and its history need to know of a record.
+    """The part of a record that a run, its table and its history use.
 
     `inputs` are the hashes of its files; `freedom` the degrees of freedom of its uncertainties, None where the noise
     was known; `on_line` is what its own parameters are about, where that differs from record to record.
@@ -166,13 +166,13 @@ class Summary:
 
     @property
     def when(self) -> str:
-        """Date of the recording where its head states one, otherwise that of the record."""
+        """Date of the recording if its head states one, otherwise that of the record."""
         return self.date or self.created
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one unit went; `text` is the record where the worker does not see the folder."""
+    """Result of the work on one unit; `text` is the record if the worker does not see the folder."""
 
     serial: str
     status: str
@@ -182,7 +182,7 @@ class Outcome:
 
 
 def work(unit: FleetUnit, job: Job) -> Outcome:
-    """Make the record of one unit, unless it is there already and was made from the same files and options."""
+    """Return the outcome for a unit: its record is made, unless one from the same files and options exists."""
     if job.folder is None:
         return _fit(unit, job, None)
     store = Store(Path(job.folder))
@@ -224,7 +224,7 @@ def _fit(unit: FleetUnit, job: Job, store: Store | None) -> Outcome:
 
 
 def make_record(unit: FleetUnit, files: UnitFiles) -> Calibration:
-    """Fit a unit as the single command does, and add what it was made from."""
+    """Return the record of a unit, fitted as the single command does, with the files that it was made from."""
     record = run_task(unit.procedure, unit.files, unit.options, files, label="column {}")
     others = [serial for serial in files.serials if serial != unit.serial]
     says = [
@@ -245,7 +245,7 @@ def make_record(unit: FleetUnit, files: UnitFiles) -> Calibration:
 
 
 def summarise(record: Calibration, content_sha256: str) -> Summary:
-    """Return what table and history need of a record that `make_record` has made."""
+    """Return the values that table and history use of a record that `make_record` has made."""
     made = record.sections["fleet"]
     on_line = PROCEDURES[made["procedure"]].on_line(record)
     return Summary(
@@ -274,7 +274,7 @@ def _one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-# Where the work is done: processes of this machine, or the workers of a Dask cluster.
+# Engines: processes of this machine, or the workers of a Dask cluster.
 
 
 _CONNECT = 10.0
@@ -286,29 +286,29 @@ _LOST = 30.0
 
 
 class Engine(Protocol):
-    """Something that works on units."""
+    """Base of the engines, which work on units."""
 
     def run(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
-        """Work on the units, and give each outcome as it comes; raises WorkersLostError."""
+        """Yield each outcome as it comes; raises WorkersLostError."""
 
     def run_alone(self, unit: FleetUnit, job: Job) -> Iterator[Outcome]:
-        """Work on one unit with nothing beside it, in a process that may end."""
+        """Return the outcome of one unit, worked on alone, in a process that may end."""
 
 
 class LocalEngine:
-    """Processes of this machine: nothing to start; one process works without a second."""
+    """Processes of this machine; with a single one, no second process is started."""
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
 
     def run(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
-        """Work on the units in several processes."""
+        """Yield the outcomes of units from several processes."""
         workers = min(self.workers, max(len(units), 1))
         calls = ((unit, job) for unit in units)
         return (work(*call) for call in calls) if workers == 1 else run(work, calls, workers)
 
     def run_alone(self, unit: FleetUnit, job: Job) -> Iterator[Outcome]:
-        """Work on one unit in a process of its own."""
+        """Return the outcome of one unit from its own process."""
         return run(work, [(unit, job)], 1)
 
 
@@ -320,7 +320,7 @@ class DaskEngine:
         self._name = name
 
     def run(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
-        """Work on the units on the cluster, and see to it that a lost cluster is noticed."""
+        """Yield the outcomes of units from the cluster; a lost cluster raises an error."""
         results: queue.SimpleQueue[Outcome | BaseException | None] = queue.SimpleQueue()
 
         def consume() -> None:
@@ -348,7 +348,7 @@ class DaskEngine:
             yield result
 
     def _outcomes(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
-        """Give each outcome as it comes; the scheduler has a few units for each thread."""
+        """Yield each outcome as it comes; the scheduler holds a few units for each thread."""
         from distributed import as_completed
 
         threads = sum(self._client.ncores().values())
@@ -360,12 +360,12 @@ class DaskEngine:
             running.update(list(islice(waiting, 1)))  # type: ignore[no-untyped-call]
 
     def run_alone(self, unit: FleetUnit, job: Job) -> Iterator[Outcome]:
-        """Work on one unit."""
+        """Return the outcome of one unit."""
         return self.run([unit], job)
 
 
 class _Watch:
-    """Notices that nothing more will come of a cluster, which Dask would wait for without end."""
+    """Check of whether a cluster is lost, for which Dask would wait without end."""
 
     def __init__(self, client: Any, name: str) -> None:
         self._client = client
@@ -376,7 +376,7 @@ class _Watch:
         self._since.clear()
 
     def look(self, *, end: bool = False) -> None:
-        """Raise if the cluster is lost for some time; with `end`, because work has ended in an error, at once."""
+        """Raise if the cluster has been lost for some time; with `end`, because work has ended in an error, at once."""
         patience = 0.0 if end else _LOST
         workers: Any = {}
         tasks: dict[str, Any] = {}
@@ -386,15 +386,15 @@ class _Watch:
                 workers, tasks = self._client.ncores(), self._client.processing()
             except Exception:  # the connection was lost in between
                 connected = False
-        if self._seen("scheduler", not connected, patience):
+        if self._has_lasted("scheduler", not connected, patience):
             raise OptionError(f"scheduler {self._name}: the connection is lost; a second run does what is missing")
-        if connected and self._seen("workers", not workers, patience):
+        if connected and self._has_lasted("workers", not workers, patience):
             raise OptionError(f"scheduler {self._name}: no workers are left; a second run does what is missing")
-        if connected and self._seen("tasks", not any(tasks.values()), _LOST):
+        if connected and self._has_lasted("tasks", not any(tasks.values()), _LOST):
             raise WorkersLostError("nothing is left of what was submitted")
 
-    def _seen(self, what: str, bad: bool, patience: float) -> bool:
-        """Return whether `bad` has held for so long."""
+    def _has_lasted(self, what: str, bad: bool, patience: float) -> bool:
+        """Return whether `bad` has lasted for so long."""
         if not bad:
             self._since.pop(what, None)
             return False
@@ -404,7 +404,7 @@ class _Watch:
 
 @contextmanager
 def open_engine(kind: str, *, scheduler: str | None, workers: int | None) -> Iterator[Engine]:
-    """Give the engine for a run.
+    """Return the engine for a run.
 
     Raises
     ------
@@ -453,7 +453,7 @@ def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskE
 
 
 def _check_address(address: str) -> None:
-    """Wait until something listens at an address: a client that fails to connect leaves its complaints on the screen.
+    """Wait until something listens at an address, because a client that fails to connect prints its errors.
 
     Raises
     ------
@@ -484,7 +484,7 @@ def _check_address(address: str) -> None:
 
 
 def _check_workers(client: Any, name: str) -> None:
-    """Check that there are workers, and that each has this version of imulab."""
+    """Refuse a cluster without workers, or with a worker of another version of imulab."""
     try:
         client.wait_for_workers(1, timeout=_CONNECT)
     except TimeoutError:

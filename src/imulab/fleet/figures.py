@@ -1,4 +1,4 @@
-"""What the report of a fleet shows.
+"""The figures and tables of a fleet's report: parameters over units and dates, outliers, changes, failures.
 
 Parameters over units and dates, units that stand out, what changed since last time, and failures.
 """
@@ -36,11 +36,11 @@ from imulab.report.traces import (
     scatter,
 )
 
-# What is drawn in the panels of a fleet, one for each parameter.
+# Panels of the figures, one for each parameter.
 
 
 _DAYS = 4.0
-"""Dates that span no more than so many days are told apart by their time."""
+"""Dates that span at most so many days are shown with their time."""
 
 
 def staggered(marked: NDArray[np.bool_], top: int) -> list[float]:
@@ -50,7 +50,7 @@ def staggered(marked: NDArray[np.bool_], top: int) -> list[float]:
 
 
 def limits_in_view(item: ParameterStatistics, shown: ReadingUnit, values: Array) -> list[float]:
-    """Return the limits of a parameter that lie near enough to the values that are shown to be drawn."""
+    """Return the limits of a parameter that are close enough to the shown values to be drawn."""
     if item.capability is None:
         return []
     limits = item.capability.limits
@@ -60,7 +60,7 @@ def limits_in_view(item: ParameterStatistics, shown: ReadingUnit, values: Array)
 
 
 def bin_edges(values: Array) -> Array:
-    """Return the edges of bins by Freedman and Diaconis over the bulk, at most 60 over all."""
+    """Return edges of bins by the rule of Freedman and Diaconis for the bulk of the values, at most 60 bins."""
     low, high = float(values.min()), float(values.max())
     if not high > low:
         half = abs(low) * 1e-6 or 0.5
@@ -71,12 +71,12 @@ def bin_edges(values: Array) -> Array:
 
 
 def date(day: float) -> str:
-    """Return days since 1970 as Plotly's dates."""
+    """Return days since 1970 as dates of Plotly."""
     return datetime.fromtimestamp(day * 86400.0, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
 def date_axis(days: Array) -> dict[str, Any]:
-    """Return an axis of dates with three ticks, whatever it spans: the first date, the middle and the last."""
+    """Return an axis of dates with three ticks: the first date, the middle and the last."""
     first, last = float(np.nanmin(days)), float(np.nanmax(days))
     margin = 0.04 * max(last - first, 1 / 24)
     form = "%m-%d<br>%Y" if last - first > _DAYS else "%H:%M<br>%m-%d"
@@ -90,7 +90,7 @@ def date_axis(days: Array) -> dict[str, Any]:
 
 
 def which_are_drawn(statistics: Sequence[ParameterStatistics], panels: Sequence[ParameterStatistics]) -> str:
-    """Say that not all parameters are drawn, where that is so."""
+    """Return a sentence where not all parameters are drawn, else nothing."""
     if len(panels) == len(statistics):
         return ""
     return f"{len(panels)} of {len(statistics)} parameters, those to be looked at first; the table has all. "
@@ -103,7 +103,7 @@ _MOST_ROWS = 40  # of a table on the page; the rest is in the files beside
 
 
 def number(value: float, digits: int = 4) -> str:
-    """Return a number as text, an infinite or unknown one as a dash."""
+    """Return a number as text; a dash for an infinite or unknown one."""
     return plain_number(value, digits) if math.isfinite(value) else "–"
 
 
@@ -155,14 +155,14 @@ def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Repo
 
 
 def _places(scale: float) -> int:
-    """Decimals that show a hundredth of a scale."""
+    """Return the decimals that show a hundredth of a scale."""
     if not scale > 0 or not math.isfinite(scale):
         return 3
     return min(max(0, 2 - math.floor(math.log10(scale))), 9)
 
 
 def outlier_table(statistics: Sequence[ParameterStatistics]) -> ReportTable | None:
-    """List the units that stand out, furthest first."""
+    """Return the table of the units that stand out, the farthest first."""
     rows = []
     for item in statistics:
         shown = reading_unit(item.unit, item.name)
@@ -186,7 +186,7 @@ def outlier_table(statistics: Sequence[ParameterStatistics]) -> ReportTable | No
 
 
 def change_table(changes: Sequence[FleetChange]) -> ReportTable | None:
-    """List the largest changes since the last calibration."""
+    """Return the table of the largest changes since the last calibration."""
     if not changes:
         return None
     ranked = sorted(changes, key=lambda change: (change.same_files, -abs(change.deviations or 0.0)))
@@ -217,7 +217,7 @@ def change_table(changes: Sequence[FleetChange]) -> ReportTable | None:
 
 
 def verdict_table(state: FleetState) -> ReportTable | None:
-    """List the verdict of every unit that has a record, the gravest first."""
+    """Return the table of the verdicts of all units with a record, the gravest first."""
     good = [row for row in state.rows if row.verdict == "good"]
     rows = [*state.doubtful, *good]
     if not rows:
@@ -234,7 +234,7 @@ def verdict_table(state: FleetState) -> ReportTable | None:
 
 
 def failure_table(failures: Sequence[FleetRow]) -> ReportTable | None:
-    """List the units that failed."""
+    """Return the table of the units that failed."""
     if not failures:
         return None
     more = f" The first {_MOST_ROWS} of {len(failures)}." if len(failures) > _MOST_ROWS else ""
@@ -246,7 +246,7 @@ def failure_table(failures: Sequence[FleetRow]) -> ReportTable | None:
     )
 
 
-# What the report of a fleet shows: its parameters over units and dates, and what changed since last time.
+# Figures: parameters over units and dates, and changes since the last calibration.
 
 
 MOST_PANELS = 24  # of a page; the parameters that change most have them
@@ -268,7 +268,7 @@ def shown_first(statistics: Sequence[ParameterStatistics]) -> list[ParameterStat
 
 
 def distributions(title: str, statistics: Sequence[ParameterStatistics]) -> list[Figure]:
-    """Draw a histogram of each parameter, with median, units that stand out, and limits."""
+    """Return the histograms of parameters, with median, units that stand out, and limits."""
     panels = shown_first(statistics)
     pages = grid.pages(panels)
     return [
@@ -338,7 +338,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
 
 
 def _outlier_marks(serials: Sequence[str], values: Array, out: np.ndarray, x: str, y: str) -> dict[str, Any]:
-    """Mark the units that stand out, at the foot of a histogram."""
+    """Add marks of the units that stand out, at the foot of a histogram."""
     return scatter(
         rounded(values[out]), [0] * int(out.sum()), "markers", text=[s for s, o in zip(serials, out, strict=True) if o],
         marker={"color": BAD, "size": 9, "symbol": "diamond"}, cliponaxis=False, xaxis=x, yaxis=y,
@@ -347,7 +347,7 @@ def _outlier_marks(serials: Sequence[str], values: Array, out: np.ndarray, x: st
 
 
 def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> list[Figure]:
-    """Draw each parameter over the date, or over the number of the unit where there is but one date."""
+    """Return the figure of each parameter over the date, or over the unit's number if there is a single date."""
     panels = shown_first(statistics)
     dated = any(item.drift is not None for item in panels)
     name = f"{title}: over the {'date' if dated else 'units in the order of the manifest'}"
@@ -411,7 +411,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, 
 
 
 def _drift_line(drift: FleetDrift, shown: ReadingUnit, x: str, y: str) -> dict[str, Any]:
-    """Draw the fitted drift from the first date to the last."""
+    """Add the fitted drift from the first date to the last."""
     ends = np.array([drift.value_at_start, drift.value_at_start + drift.per_day * drift.days])
     colour, dash = (BAD, "dash") if drift.significant else (QUIET, "solid")
     days = [date(drift.start), date(drift.start + drift.days)]
@@ -420,7 +420,7 @@ def _drift_line(drift: FleetDrift, shown: ReadingUnit, x: str, y: str) -> dict[s
 
 
 def change_figure(title: str, changes: Sequence[FleetChange]) -> Figure | None:
-    """Draw every change since the last calibration in its standard uncertainties, a column for each parameter."""
+    """Return the figure of all changes since the last calibration in standard uncertainties, a column per parameter."""
     usable = [change for change in changes if change.deviations is not None and not change.same_files]
     if not usable:
         return None
@@ -467,7 +467,7 @@ def change_figure(title: str, changes: Sequence[FleetChange]) -> Figure | None:
 
 
 def _change_layout(names: Sequence[str], limit: float, scale: dict[str, Any]) -> dict[str, Any]:
-    """Lay out a column for each parameter, over the band of what chance explains."""
+    """Return the layout of a column for each parameter, over the band that chance explains."""
     return {
         "xaxis": {
             "tickvals": list(range(len(names))),

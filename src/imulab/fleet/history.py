@@ -1,4 +1,4 @@
-"""History: every calibration that a line has made, so that the next knows the last; SQLite or PostgreSQL."""
+"""The history: every calibration that a line has made, in SQLite or PostgreSQL, so that changes can be shown."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from imulab.fleet.engine import Summary
 from imulab.fleet.manifest import masked
 from imulab.records.calibration import Parameter
 
-_SERIALS_AT_ONCE = 500  # serials asked for at once: SQLite takes 999 variables at least
+_SERIALS_AT_ONCE = 500  # serials in one query: SQLite takes at least 999 variables
 
 
 @dataclass(frozen=True)
 class Past:
-    """One calibration of the history; `sources` is a hash over those of its files."""
+    """One calibration of the history; `sources` is a hash over the hashes of its files."""
 
     serial: str
     procedure: str
@@ -76,7 +76,7 @@ class History:
                 connection.execute(sa.select(table).limit(0))
 
     def add(self, summaries: Sequence[Summary]) -> None:
-        """Add calibrations that are not there yet, all or none."""
+        """Add the calibrations that the history lacks, all or none."""
         if not summaries:
             return
         from importlib import import_module
@@ -194,7 +194,7 @@ def open_history(url: str, *, there: bool = False) -> Iterator[History]:
 
 @contextmanager
 def _in_one_line(name: str) -> Iterator[None]:
-    """Turn what the database refuses into one line."""
+    """Raise a refusal of the database as an error of one line."""
     from sqlalchemy.exc import SQLAlchemyError
 
     try:

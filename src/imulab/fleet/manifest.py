@@ -1,4 +1,4 @@
-"""The manifest of a fleet, one row per unit, and its files by path or URL, each known by its hash."""
+"""The manifest of a fleet, one row per unit, and its files by path or URL, each with its hash."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 
-# Files by path or URL: a cluster reads from its own storage, and every file that was used is known by its hash.
+# Files by path or URL: a cluster reads from its own storage, and every file that was used is recorded with its hash.
 
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[A-Za-z][A-Za-z0-9+.-]*)*://")
 _BLOCK = 1 << 22  # bytes copied at once
 SCHEMES = ("file", "https", "s3", "gs", "az")
-"""Where files may be fetched from; a manifest is somebody else's text, and fsspec knows dozens of others."""
+"""Allowed protocols: a manifest may come from somebody else, and fsspec knows dozens of others."""
 _LARGEST = 1 << 33  # bytes of a file that is fetched: 8 GiB
 _LOGIN = re.compile(r"(?<=://)[^/@\s]*@")
 _SECRET = re.compile(r"([?&][\w-]*(?:pass|pwd|token|secret|key|sig|auth)[\w-]*=)[^&\s]+", re.IGNORECASE)
@@ -45,18 +45,18 @@ def is_url(name: str) -> bool:
 
 
 def masked(text: str) -> str:
-    """Return a text in which the credentials of URLs are replaced by asterisks."""
+    """Return a text with the credentials of URLs replaced by asterisks."""
     return _SECRET.sub(r"\1***", _LOGIN.sub("***@", text))
 
 
 def parent_of(path: str) -> str:
-    """Return the folder or URL that a manifest's paths are relative to."""
+    """Return the folder or URL that the paths of a manifest are relative to."""
     return path.rpartition("/")[0] if is_url(path) else str(Path(os.path.realpath(path)).parent)
 
 
 @contextmanager
 def local_file(address: str, name: str) -> Iterator[Path]:
-    """Give a file (or folder) as one of this machine: itself, or a copy of what a URL names, for the time of the block.
+    """Yield a file (or folder) of this machine: the file, or a copy of a URL's content for the time of the block.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def sha256_of(path: Path, name: str) -> str:
 
 
 class UnitFiles:
-    """Access to one unit's files for `imulab.procedures`; remembers the hash of each and what the first head says.
+    """Access to one unit's files for `imulab.procedures`, with their hashes and what their heads state.
 
     Attributes
     ----------
@@ -175,7 +175,7 @@ class UnitFiles:
         self._stack.close()
 
     def path(self, name: str) -> Path:
-        """Return a local path for a name that is relative to the manifest; URLs are fetched once."""
+        """Return a local path for a name that is relative to the manifest; a URL is fetched once."""
         if name not in self._local:
             if is_url(name):
                 address = name
@@ -202,7 +202,7 @@ class UnitFiles:
         return load_layout(path, name)
 
     def blocks(self, name: str, layout: str | None, **part: Any) -> Iterator[Recording]:
-        """Read a recording in blocks."""
+        """Yield a recording in blocks."""
         from imulab.readers import read_blocks
 
         known = self._layout(layout)
@@ -213,7 +213,7 @@ class UnitFiles:
             yield block
 
     def beside(self, name: str, file: str) -> str:
-        """Return the name of a file that file `name` names relative to itself, and note `name` as used."""
+        """Return the name of a file that file `name` refers to relative to itself, and note `name` as used."""
         if name not in self.inputs:
             self.inputs[name] = self.sha256(name)
         if is_url(file) or (not is_url(name) and Path(file).is_absolute()):
@@ -222,7 +222,7 @@ class UnitFiles:
         return f"{folder}{slash}{file}"
 
     def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
-        """Read a recording as a whole; messages and the record call it as the manifest does."""
+        """Return a recording as a whole, with the manifest's name for messages and the record."""
         from imulab.readers import read
 
         known = self._layout(layout)
@@ -233,7 +233,7 @@ class UnitFiles:
         return recording
 
     def record(self, name: str) -> Calibration:
-        """Read a calibration record."""
+        """Return a calibration record."""
         from imulab.procedures.registry import loads
 
         with readable(name):
@@ -242,7 +242,7 @@ class UnitFiles:
         return loads(data, name)
 
     def remember_head(self, recording: Recording) -> None:
-        """Remember what the head of a recording says of unit and date."""
+        """Keep the serial number and the date that the head of a recording states."""
         serial = recording.metadata.get("serial")
         if serial and serial not in self.serials:
             self.serials.append(serial)
@@ -250,21 +250,21 @@ class UnitFiles:
             self.date = recording.metadata.get("date")
 
     def unchanged(self, inputs: Sequence[Any]) -> bool:
-        """Return whether every file of a record's list is there with the hash that the record states."""
+        """Return whether every file of a record's list exists with the hash that the record states."""
         try:
             return bool(inputs) and all(self._has(item["file"], item["sha256"]) for item in inputs)
         except (ImulabError, KeyError, TypeError):
             return False
 
     def _has(self, name: str, sha256: str) -> bool:
-        """Return whether a file, or the layout of this name that comes with imulab, has this hash."""
+        """Return whether a file, or the layout of this name that imulab brings, has this hash."""
         from imulab.readers.layout import shipped_file
 
         shipped = shipped_file(name)
         return (shipped is not None and sha256_of(shipped, name) == sha256) or self.sha256(name) == sha256
 
 
-# The manifest of a fleet: one row per unit, checked as a whole before any work.
+# The manifest, which is checked as a whole before any work.
 
 
 COLUMNS = ("serial", "procedure", "file")
@@ -275,7 +275,7 @@ _RESERVED = {"con", "prn", "aux", "nul", *(f"{name}{digit}" for name in ("com", 
 
 @dataclass(frozen=True)
 class FleetUnit:
-    """One row: the unit, the procedure, its files and the texts of its options, as the manifest has them."""
+    """One row: unit, procedure, files, and texts of options as in the manifest."""
 
     serial: str
     procedure: str
@@ -293,7 +293,7 @@ class FleetManifest:
 
 
 def load_fleet(path: str) -> FleetManifest:
-    """Read and check a manifest, CSV or Parquet.
+    """Return a checked manifest, from CSV or Parquet.
 
     Columns ``serial,procedure,file`` (several files: ``;`` between them); any other column is an option of the
     procedure's fit, an empty cell an option that is not given. Paths are relative to the manifest.
@@ -334,7 +334,7 @@ def load_fleet(path: str) -> FleetManifest:
 
 
 def _csv(data: bytes, name: str) -> list[tuple[str, list[str]]]:
-    """Return title row and data rows, each with its place; blank lines and ``#`` comments at the head are passed."""
+    """Return the title row and the data rows, each with its place, without blank lines and comments."""
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -419,7 +419,7 @@ def _unit(place: str, cells: Mapping[str, str]) -> FleetUnit:
 
 
 def _check_serial(serial: str, place: str) -> None:
-    """Check that a serial can name a file in any folder."""
+    """Refuse a serial number that cannot be the name of a file."""
     unsafe = (
         _SERIAL.fullmatch(serial) is None
         or serial.endswith(".")

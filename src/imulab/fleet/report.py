@@ -35,7 +35,7 @@ from imulab.report.traces import Exhibits, Figure, ReportTable
 
 _NAMED = 4  # units that a sentence names
 _FEWEST_TO_DRAW = 4
-"""Fewer units have no distribution: the table says all there is."""
+"""Fewest units with a figure of their distribution."""
 
 
 def write_fleet_report(
@@ -89,12 +89,12 @@ def write_fleet_report(
 
 
 def exhibits_of_folder(folder: str, *, limits: str | None = None, history: str | None = None) -> Exhibits:
-    """Return what the report of a fleet's folder shows; options and errors as for `write_fleet_report`."""
+    """Return the figures and tables of a fleet's folder; options and errors as for `write_fleet_report`."""
     return _exhibits(fleet_status(folder), limits, history)[0]
 
 
 def _exhibits(state: FleetState, limits: str | None, history: str | None) -> tuple[Exhibits, list[Summary]]:
-    """Return what the report shows, and the summaries that it is made of."""
+    """Return the figures and tables, and the summaries that they are made from."""
     summaries = [row.summary for row in state.rows if row.summary is not None]
     if not summaries:
         raise OptionError(
@@ -111,7 +111,7 @@ def _exhibits(state: FleetState, limits: str | None, history: str | None) -> tup
 def fleet_exhibits(
     state: FleetState, statistics: Sequence[ParameterStatistics], changes: Sequence[FleetChange]
 ) -> Exhibits:
-    """Return what the report shows."""
+    """Return the figures and tables of a fleet's report."""
     out = {serial for item in statistics for serial, o in zip(item.serials, item.outliers, strict=True) if o}
     capable = [item for item in statistics if item.capability is not None]
     drifting = [item.name for item in statistics if item.drift is not None and item.drift.significant]
@@ -160,7 +160,7 @@ def fleet_exhibits(
 
 
 def _standing(statistics: Sequence[ParameterStatistics], out: set[str]) -> Iterator[str]:
-    """Say which units stand out, and of which procedures there are too few units to tell."""
+    """Return a sentence on the units that stand out, and on procedures with too few units to tell."""
     if any(item.enough for item in statistics):
         named = f"{first_of(sorted(out), _NAMED)} {'stands' if len(out) == 1 else 'stand'} out"
         yield named if out else "none stands out"
@@ -184,7 +184,7 @@ def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
 
 
 def _differing(summaries: Sequence[Summary]) -> Iterator[str]:
-    """Say which parameters the units are not compared by, and what takes their place."""
+    """Return a sentence on the parameters that are not compared between units, and on their substitutes."""
     reasons = {procedure: why for (procedure, _), why in not_compared(summaries).items()}
     for procedure, why in reasons.items():
         mine = [summary for summary in summaries if summary.procedure == procedure and summary.on_line is not None]

@@ -40,7 +40,7 @@ from imulab.procedures.registry import PROCEDURES
 from imulab.quantities import whole, whole_number
 
 _FRUITLESS = 5
-"""Losses of workers in a row, without a unit done between them, before giving up."""
+"""Losses of workers in a row, with no unit done between them, after which the run gives up."""
 _FLUSH = 2.0  # s between two writings of what is done
 _NAMED = 3  # units that a sentence names
 TABLE, HISTORY = "parameters.csv", "history.sqlite"
@@ -48,7 +48,7 @@ TABLE, HISTORY = "parameters.csv", "history.sqlite"
 
 @dataclass(frozen=True, repr=False)
 class FleetState(Shown):
-    """Where a fleet stands.
+    """State of a fleet.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class FleetState(Shown):
     notes: tuple[str, ...] = ()
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return how many units are done, failed and missing, what their records are worth, and which failed."""
+        """Return how many units are done, failed and missing, the verdicts of their records, and which units failed."""
         counts = ", ".join(f"{self.count(name)} {name}" for name in ("done", "failed", "missing"))
         rows = [[row.unit.serial, "; ".join(row.unit.files), row.reason or ""] for row in self.failures]
         headline = f"{len(self.rows)} units of {self.manifest.name}: {counts}" + (self.judged and f"; {self.judged}")
@@ -92,7 +92,7 @@ class FleetState(Shown):
 
     @property
     def judged(self) -> str:
-        """How many records are good, and which are not and why, as ``2 good, 1 look: SN2 ...``; empty without any."""
+        """How many records are good, and which are not, with reasons: ``2 good, 1 look: SN2 ...``; or nothing."""
         same: dict[str, list[str]] = {}
         for row in self.doubtful:
             same.setdefault(row.first_reason, []).append(row.unit.serial)
@@ -101,7 +101,7 @@ class FleetState(Shown):
 
     @property
     def verdicts(self) -> str:
-        """How many records are good, to be looked at, and bad, as ``2 good, 1 look``; empty without any."""
+        """How many records are good, to be looked at, and bad: ``2 good, 1 look``; empty without records."""
         counts = {state: sum(row.verdict == state for row in self.rows) for state in SENTENCES}
         return ", ".join(f"{count} {state}" for state, count in counts.items() if count)
 
@@ -112,7 +112,7 @@ class FleetState(Shown):
 
 
 def default_history(folder: str | Path) -> str:
-    """Return the URL of the history that a fleet has where no other is named."""
+    """Return the URL of a fleet's history if no other is named."""
     return f"sqlite:///{real_path(folder) / HISTORY}"
 
 
@@ -206,7 +206,7 @@ def run_fleet(
 
 
 def read_by(fleet: FleetManifest) -> dict[str, str]:
-    """Return the files here that a fleet reads, full name to name: manifest, recordings, layouts, priors."""
+    """Return the local files that a fleet reads, full name to name: manifest, recordings, layouts, priors."""
     if is_url(fleet.base):
         return {}
     files = {_absolute(os.path.join(fleet.base, Path(fleet.name).name)): fleet.name}  # noqa: PTH118
@@ -220,7 +220,7 @@ def read_by(fleet: FleetManifest) -> dict[str, str]:
 
 
 def own_files(store: Store, fleet: FleetManifest, *, table: bool = True) -> dict[str, str]:
-    """Return the files that a fleet's folder holds, full name to name."""
+    """Return the files in a fleet's folder, full name to name."""
     names = [HISTORY, TABLE] if table else [HISTORY]
     mine = [*(store.record(unit.serial) for unit in fleet.units), *(store.folder / name for name in names)]
     return {_absolute(path): str(path) for path in mine}
@@ -237,7 +237,7 @@ def _real_folder(folder: str) -> str:
 
 
 def refuse_overwriting(outputs: Iterable[Path], kept: Mapping[str, str]) -> None:
-    """Check that no output takes the place of a file that is to be kept.
+    """Refuse an output that would replace a file that is to be kept.
 
     Raises
     ------
@@ -255,7 +255,7 @@ def _open_history(url: str, stack: ExitStack) -> History | None:
 
 
 class _Keeper:
-    """Takes outcomes in: what is over, and what goes to folder and history."""
+    """Receiver of outcomes: it keeps what is done, and writes folder and history."""
 
     def __init__(
         self, store: Store, fleet: FleetManifest, history: History | None, progress: Callable[[int], None]
@@ -315,7 +315,7 @@ class _Keeper:
 
 
 def _remarks_on(rows: Sequence[FleetRow]) -> Iterator[str]:
-    """Say what a person must know of the records as a whole, and no record can say by itself."""
+    """Return remarks on the records as a whole, which no single record can make."""
     made = [row.summary for row in rows if row.summary is not None]
     others = [summary.software for summary in made if summary.software != f"imulab {VERSION}"]
     if others:
@@ -340,7 +340,7 @@ def _counted(count: int, what: str) -> str:
 
 
 def _work_through(engine: Engine, job: Job, keeper: _Keeper) -> None:
-    """Work until every unit is over; processes may end under it."""
+    """Work until every unit is done or has failed, also if processes end meanwhile."""
     fruitless = 0
     while keeper.left:
         before = len(keeper.left)
@@ -371,7 +371,7 @@ def _take_all(outcomes: Iterator[Outcome], keeper: _Keeper) -> None:
 
 
 def fleet_status(folder: Folder) -> FleetState:
-    """Return where a fleet stands, from its records alone.
+    """Return the state of a fleet, from its records alone.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Statistics of a line: how a parameter spreads over the units, which stand out, what drifts, what meets its limits.
+"""Statistics of a line: spread of a parameter over the units, outliers, drift, and capability within limits.
 
 [tumble]
 "bias_*" = { lower = -20, upper = 20, unit = "mg" }
@@ -32,7 +32,7 @@ from imulab.records.calibration import Parameter
 from imulab.report.parameters import reading_unit
 from imulab.units import conversion_factor
 
-# Limits of parameters, from a TOML file: what a line may let pass.
+# Limits of parameters, from a TOML file.
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Limits:
 
 
 def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[str, str], Limits]:
-    """Read limits; a later line overrides an earlier one, so that a name may follow a pattern.
+    """Return limits from a file; a later line overrides an earlier one, so that a name may follow a pattern.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def _limits(entry: Any, name: str, unit: str, place: str) -> Limits:
 
 
 def to_parameter_unit(value: float, unit: str, target: str, name: str = "") -> float:
-    """Return a value in a parameter's unit; `unit` is that, one of its quantity, or the one it is read in.
+    """Return a value in a parameter's unit; `unit` is that, one of its quantity, or its reading unit.
 
     Raises
     ------
@@ -119,19 +119,19 @@ def to_parameter_unit(value: float, unit: str, target: str, name: str = "") -> f
         raise UnitError(f"unit {unit!r}: expected {target}{also}") from None
 
 
-# Statistics of a line: how a parameter spreads over the units, which stand out, what drifts, what meets its limits.
+# Spread, outliers, drift and capability.
 
 
 _MAD_TO_SIGMA = 1.482602218505602  # unrounded, as these numbers are shown in full
 # Sqrt(pi / 2): mean distance from the median to standard deviation of normal values
 _MEAN_TO_SIGMA = 1.2533141373155001
-FEWEST_FOR_OUTLIERS = 8  # units of which one can stand out
-# Numbers of units; between them the limit goes with the logarithm
+FEWEST_FOR_OUTLIERS = 8  # units among which one can stand out
+# Numbers of units; between them the limit is interpolated in the logarithm
 _SIZES = (8, 10, 12, 15, 20, 30, 50, 100, 300, 1000, 10000)
 _BEYOND = (7.90, 6.90, 6.29, 5.92, 5.24, 4.80, 4.46, 4.31, 4.34, 4.52, 4.84)
-"""Largest robust z of so many normal values: passed by one sample in a hundred (simulated, 400 to 200 000 samples)."""
-_FEWEST_FOR_DRIFT = 8  # units through which a line has a scatter
-_SHORTEST_SPAN = 1.0 / 24  # days: an hour; calibrations within it tell no drift
+"""Largest robust z of so many normal values, exceeded by one in a hundred (simulated, 400 to 200 000 samples)."""
+_FEWEST_FOR_DRIFT = 8  # units whose scatter about a line is known
+_SHORTEST_SPAN = 1.0 / 24  # days: an hour; calibrations within it show no drift
 _ONE_SIDED_95 = 1.6448536269514722  # standard uncertainties
 
 
@@ -198,18 +198,18 @@ class ParameterStatistics:
 
     @property
     def enough(self) -> bool:
-        """Whether there are enough units to tell which stand out."""
+        """Whether there are enough units to find outliers."""
         return math.isfinite(self.outlier_limit)
 
     @property
     def outliers(self) -> NDArray[np.bool_]:
-        """Which units stand out, shape (n,)."""
+        """Whether each unit stands out, shape (n,)."""
         return np.abs(self.z) > self.outlier_limit
 
 
 @dataclass(frozen=True)
 class FleetChange:
-    """A parameter of a unit against its last calibration.
+    """Change of a parameter of a unit since its last calibration.
 
     Attributes
     ----------
@@ -253,7 +253,7 @@ def outlier_limit(count: int) -> float:
 
 
 def parameter_units(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
-    """Return the unit of every parameter; of records in different units, that of most."""
+    """Return the unit of every parameter; where records differ, the most frequent one."""
     units: dict[tuple[str, str], Counter[str]] = {}
     for summary in summaries:
         for name, parameter in summary.parameters.items():
@@ -262,7 +262,7 @@ def parameter_units(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
 
 
 def not_compared(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
-    """Return which parameters the units are not compared by, since they are about different numbers, and why."""
+    """Return the parameters that are not compared between units, because they are different quantities, and why."""
     reasons: dict[tuple[str, str], str] = {}
     for procedure in dict.fromkeys(summary.procedure for summary in summaries):
         lines = [s.on_line for s in summaries if s.procedure == procedure and s.on_line is not None]
@@ -284,7 +284,7 @@ def _mean_the_same(first: OnLine, second: OnLine) -> bool:
 def line_statistics(
     summaries: Sequence[Summary], limits: Mapping[tuple[str, str], Limits]
 ) -> list[ParameterStatistics]:
-    """Return the statistics of every parameter that units can be compared by, in the order of the records."""
+    """Return the statistics of every parameter that can be compared between units, in the order of the records."""
     statistics = []
     left_out = not_compared(summaries)
     for (procedure, name), unit in parameter_units(summaries).items():
@@ -357,7 +357,7 @@ def robust_deviation(values: Array, median: float) -> float:
 
 
 def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> FleetDrift | None:
-    """Fit a straight line over the date to the units that do not stand out; None for few units or one date.
+    """Return the straight line over the date through units that do not stand out; None for few units or one date.
 
     ``value = a + slope (day - mean day)``; ``u(slope) = s / sqrt(sum (day - mean)^2)``, s from the residuals.
     """
@@ -399,7 +399,7 @@ def capability(values: Array, serials: Sequence[str], limits: Limits) -> Capabil
 
 
 def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past]]) -> list[FleetChange]:
-    """Return what changed in every unit since the last calibration of the same procedure before its present one."""
+    """Return the changes of every unit since the previous calibration by the same procedure."""
     changes = []
     for summary in summaries:
         last = _last(summary, past.get(summary.serial, ()))
@@ -422,7 +422,7 @@ def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past
 
 
 def change_limit(count: int) -> float:
-    """Return the deviations that one in so many normal changes is beyond in one set out of a hundred."""
+    """Return the limit that one of so many normal deviations exceeds in one set out of a hundred."""
     return float(-normal_quantile(FLEET_CHANGE.level / 2 / max(count, 1)))
 
 
@@ -445,7 +445,7 @@ def _compared(
 
 
 def _last(summary: Summary, past: Sequence[Past]) -> Past | None:
-    """The calibration made last before this one; the history is in the order in which records were made."""
+    """Return the calibration made last before this one; the history is in the order in which records were made."""
     mine = [item for item in past if item.procedure == summary.procedure]
     index = next((i for i, item in enumerate(mine) if item.content_sha256 == summary.content_sha256), None)
     if index is None:

@@ -27,20 +27,20 @@ from imulab.procedures.registry import load_sealed
 from imulab.records.calibration import Calibration
 
 MOST_ATTEMPTS = 3
-"""A unit that was under work when its process ended this often is not tried again."""
-_PATIENCE = 60.0  # s that a store which another process holds is waited for
+"""Number of times that a unit's process may end before the unit is not tried again."""
+_PATIENCE = 60.0  # s of waiting for a folder that another process holds
 _HIDDEN = ".fleet"
 
 
 @dataclass(frozen=True)
 class Store:
-    """The folder of a fleet; only its path, so that a worker elsewhere can open it too."""
+    """The folder of a fleet; it holds only the path, so that a worker elsewhere can open it too."""
 
     folder: Path
 
     @property
     def hidden(self) -> Path:
-        """Folder of what is no record."""
+        """Folder of all files that are no records."""
         return self.folder / _HIDDEN
 
     def record(self, serial: str) -> Path:
@@ -52,14 +52,14 @@ class Store:
         return self.hidden / "failed" / f"{serial}.json"
 
     def mark(self, serial: str) -> Path:
-        """Path of the mark of a unit under work; a byte for every time it was begun."""
+        """Path of the mark of a unit that is being worked on, with a byte for each start."""
         return self.hidden / "active" / serial
 
     # --- one run at a time -----------------------------------------------------------------------------------------
 
     @contextmanager
     def run(self) -> Iterator[str]:
-        """Hold the folder for one run, and give its token.
+        """Hold the folder for one run, and yield its token.
 
         Raises
         ------
@@ -86,7 +86,7 @@ class Store:
             yield token
 
     def at_work(self) -> str | None:
-        """Return who is at work on the folder, or None."""
+        """Return the process that works on the folder, or None."""
         try:
             stream = (self.hidden / "lock").open("r", encoding="utf-8")
         except OSError:
@@ -101,7 +101,7 @@ class Store:
             return "its process is not known"
 
     def _wait_for_orphans(self) -> None:
-        """Wait until workers whose run was killed have ended the unit that each is at; the token stops them then."""
+        """Wait until workers whose run was killed have ended their present units; then the token stops them."""
         end = time.monotonic() + _PATIENCE
         with (self.hidden / "turn").open("a") as stream:
             while not _lock(stream.fileno(), exclusive=True):
@@ -135,14 +135,14 @@ class Store:
     # --- what is there ---------------------------------------------------------------------------------------------
 
     def clear(self) -> None:
-        """Remove what a killed run has left: half-written files, marks, and reasons of units that are tried again."""
+        """Remove what a killed run has left: unfinished files, marks, and reasons of units that are tried again."""
         self._clear_parts()
         for name in ("failed", "active"):
             for path in (self.hidden / name).iterdir():
                 path.unlink(missing_ok=True)
 
     def tidy(self) -> None:
-        """Remove what workers that were killed under this run have half written, if nobody is at a unit any more."""
+        """Remove unfinished files of workers that were killed in this run, if no unit is being worked on."""
         with (self.hidden / "turn").open("a") as stream:
             if _lock(stream.fileno(), exclusive=True):
                 self._clear_parts()
@@ -152,18 +152,18 @@ class Store:
             part.unlink(missing_ok=True)
 
     def begin(self, serial: str) -> int:
-        """Mark a unit as under work, and return how often this was begun and not ended before."""
+        """Mark a unit as being worked on, and return how often this was started and not ended before."""
         with self.mark(serial).open("ab") as stream:
             before = stream.seek(0, os.SEEK_END)
             stream.write(b".")
         return before
 
     def end(self, serial: str) -> None:
-        """Take the mark off."""
+        """Remove the mark."""
         self.mark(serial).unlink(missing_ok=True)
 
     def marked(self) -> set[str]:
-        """Return the serials of units under work."""
+        """Return the serials of units with a mark."""
         try:
             return {path.name for path in (self.hidden / "active").iterdir()}
         except OSError:
@@ -180,7 +180,7 @@ class Store:
                 shutil.move(record, aside / f"{unit.serial}.{time.time_ns()}.json")
 
     def reason(self, serial: str) -> str | None:
-        """Return why a unit failed, or None."""
+        """Return the reason why a unit failed, or None."""
         try:
             return str(json.loads(self.failure(serial).read_text(encoding="utf-8"))["reason"])
         except (OSError, ValueError, KeyError, TypeError):
@@ -201,11 +201,11 @@ class Store:
     # --- what was asked --------------------------------------------------------------------------------------------
 
     def keep_manifest(self, manifest: FleetManifest) -> None:
-        """Write what this run was asked to do."""
+        """Write the manifest and the options of this run."""
         write_text(self.hidden / "manifest.json", json.dumps(asdict(manifest), ensure_ascii=False))
 
     def manifest(self) -> FleetManifest:
-        """Return what the last run was asked to do.
+        """Return the manifest and the options of the last run.
 
         Raises
         ------
@@ -224,7 +224,7 @@ class Store:
 
 
 def request_of(unit: FleetUnit) -> dict[str, Any]:
-    """Return what identifies the work on a unit, as its record keeps it."""
+    """Return the description of the work on a unit, as its record holds it."""
     return {"procedure": unit.procedure, "files": list(unit.files), "options": dict(unit.options)}
 
 
@@ -233,14 +233,14 @@ def _request_in(made: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _lock_attempts(descriptor: int) -> Iterator[bool]:
-    """Try for the lock for a moment: `at_work` may just be looking."""
+    """Try for a moment to get the lock, because `at_work` may be reading it."""
     for _ in range(20):
         yield _lock(descriptor, exclusive=True)
         time.sleep(0.02)
 
 
 def _lock(descriptor: int, *, exclusive: bool) -> bool:
-    """Take a lock that ends with the process, without waiting; return whether it was there to take."""
+    """Take a lock that ends with the process, without waiting; return whether it was free."""
     try:
         import fcntl
     except ImportError:

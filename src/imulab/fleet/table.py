@@ -1,4 +1,4 @@
-"""The table of a fleet: one row per unit with every parameter, its uncertainty, and what is to be known of it."""
+"""The table of a fleet: one row per unit with every parameter, its uncertainty, and verdict and warnings."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class FleetRow:
 
     @property
     def verdict(self) -> str:
-        """``good``, ``look`` or ``bad``, as its record says; empty without one."""
+        """``good``, ``look`` or ``bad``, as in its record; empty without one."""
         return "" if self.summary is None else self.summary.verdict.state
 
     @property
@@ -44,7 +44,7 @@ class FleetRow:
 
 
 def columns_of(rows: Sequence[FleetRow]) -> dict[str, list[Any]]:
-    """Return the table by columns: the head, then ``name [unit]`` and ``std_name [unit]`` of every parameter.
+    """Return the table by columns: head, then ``name [unit]`` and ``std_name [unit]`` of every parameter.
 
     ``reason`` is why a unit failed, or why its verdict is not good; ``warnings`` all that its record says.
     """
@@ -79,7 +79,7 @@ def columns_of(rows: Sequence[FleetRow]) -> dict[str, list[Any]]:
 
 
 def check_table(path: str) -> None:
-    """Check the name of a table before the work.
+    """Refuse a name that a table cannot have, before the work.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def check_table(path: str) -> None:
 
 
 def write_table(rows: Sequence[FleetRow], path: str | Path) -> None:
-    """Write the table, CSV or Parquet by the name of the file, whole or not at all; numbers read back exactly."""
+    """Write the table, CSV or Parquet by the ending of the name, whole or not at all; numbers read back exactly."""
     columns = columns_of(rows)
     if Path(path).suffix.lower() == ".parquet":
         import pyarrow

@@ -1,9 +1,9 @@
-"""Streams of lines of text and of binary messages: native titles, MotionCal, x-IMU3, layouts, MAVLink and MSP.
+"""Decoders of live streams: lines of text (native titles, MotionCal, x-IMU3, layouts) and messages (MAVLink, MSP).
 
-Lines are taken one by one in Python: a stream has thousands of lines a second where files have millions.
+Lines are read one by one in Python: a stream has thousands of lines a second, where files have millions.
 
-Frames are found here, so that after a cut frame the search goes on at its second byte and the next frame is not lost,
-as it is in pymavlink's own parser; what a frame says, and whether its checksum is right, pymavlink decides.
+Frames of messages are found here, so that after a damaged frame the search goes on at its second byte and the next
+frame is not lost, as it is in pymavlink's own parser; pymavlink reads the content of a frame and checks its checksum.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from imulab.errors import OptionError, ReadError, UnitError, quoted
 from imulab.live.stamps import Counts
 from imulab.recording import Array, Layout
 
-# Streams of lines of text: native titles, MotionCal, x-IMU3, and layouts of delimited text or JSON.
+# Lines of text.
 
 
 Rows = list[list[float]]
-_LONGEST = 1 << 14  # bytes: what has no end of line for longer is no text
+_LONGEST = 1 << 14  # bytes: a longer line without an end is no text
 
 
 def units_of(sensor: str, unit: str) -> dict[str, str]:
@@ -35,11 +35,11 @@ def units_of(sensor: str, unit: str) -> dict[str, str]:
 
 
 _EXTRA = {b"M": units_of("mag", "1"), b"T": {"temperature": "degC"}}
-"""Messages of the x-IMU3 beside the inertial ones, and their columns."""
+"""Messages of the x-IMU3 beside the inertial ones, with their columns."""
 
 
 class LineDecoder:
-    """What all streams of lines share: cutting bytes into lines, and counting those that cannot be read."""
+    """Base of all streams of lines: it cuts bytes into lines, and counts those that cannot be read."""
 
     name = over = ""
     units: Mapping[str, str] = {}
@@ -51,7 +51,7 @@ class LineDecoder:
         self._begun = False
 
     def rows(self, data: bytes) -> Array:
-        """Return the rows that these bytes complete, shape (n, columns); none behind a line that ends the stream."""
+        """Return the rows that these bytes complete, shape (n, columns), up to a line that ends the stream."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > _LONGEST:
             self.counts.damaged += 1
@@ -77,19 +77,19 @@ class LineDecoder:
         return self._table(rows)
 
     def finish(self) -> Array:
-        """Return the row of a last line without an end: none, because it may have been cut."""
+        """Return no rows: a last line without an end may be cut."""
         return self._table([])
 
     def _table(self, rows: Rows) -> Array:
         return np.array(rows, dtype=np.float64).reshape(len(rows), len(self.units))
 
     def _row(self, line: bytes) -> list[float] | None:
-        """Return the numbers of a line, None for one that holds none; raise ValueError where it is damaged."""
+        """Return the numbers of a line, None if it has none; raise ValueError where it is damaged."""
         raise NotImplementedError
 
 
 class Native(LineDecoder):
-    """Rows below a line of titles ``name [unit]``, as in files; the titles may come again, in another order too."""
+    """Rows below a line of titles ``name [unit]``, as in files; titles may be repeated, in another order too."""
 
     name = "titles with units"
 
@@ -104,7 +104,7 @@ class Native(LineDecoder):
             self._places = list(range(len(self.units)))
             return None
         if b"[" in line and not line.startswith(b"#") and self._places is not None:
-            self._tell_again(line.decode("utf-8", "replace"))
+            self._read_titles(line.decode("utf-8", "replace"))
             return None
         if line.startswith(b"#"):
             key, colon, value = line[1:].decode("utf-8", "replace").partition(":")
@@ -118,8 +118,8 @@ class Native(LineDecoder):
             raise ValueError
         return [float(fields[place]) for place in self._places]
 
-    def _tell_again(self, titles: str) -> None:
-        """Take titles that come again; what is no whole line of them is damage."""
+    def _read_titles(self, titles: str) -> None:
+        """Read repeated titles; an incomplete line of them is damage."""
         words = titles.split(",")
         if len(words) < len(self.units) or not all(word.endswith("]") for word in words):
             raise ValueError
@@ -169,7 +169,7 @@ class XImu3(LineDecoder):
         numbers = [float(field) for field in fields]
         if kind == b"I" and len(numbers) == 7:
             if any(other not in self._latest for other in self._extra):
-                return None  # a moment at the beginning, before each sensor has sent a reading
+                return None  # at the beginning, before each sensor has sent a reading
             return numbers + [value for other in self._extra for value in self._latest[other]]
         if kind in self._extra and len(numbers) == 1 + len(_EXTRA[kind]):
             self._latest[kind] = numbers[1:]
@@ -203,7 +203,7 @@ class LayoutDecoder(LineDecoder):
         text = line.decode(self._layout.encoding, "replace")
         if text.startswith("{"):
             document = json.loads(text)
-            return [float(_looked_up(document, key)) for key in self._keys]
+            return [float(_look_up(document, key)) for key in self._keys]
         delimiter = None if self._layout.delimiter == " " else self._layout.delimiter
         behind = self._layout.behind_prefix([field.strip() for field in text.split(delimiter)])
         if behind is None:
@@ -239,7 +239,7 @@ def native_units(titles: str) -> dict[str, str]:
     Raises
     ------
     ReadError, UnitError
-        It is none.
+        The line is no line of native titles.
     """
     pairs = [parse_column_title(title, "titles") for title in titles.split(",")]
     units = dict(pairs)
@@ -249,14 +249,14 @@ def native_units(titles: str) -> dict[str, str]:
 
 
 def is_titles(line: str) -> bool:
-    """Return whether a line is one of native titles."""
+    """Return whether a line is a line of native titles."""
     try:
         return bool(native_units(line))
     except (ReadError, UnitError):
         return False
 
 
-def _looked_up(document: Any, key: str) -> Any:
+def _look_up(document: Any, key: str) -> Any:
     if key in document:
         return document[key]
     for part in key.split("."):
@@ -264,7 +264,7 @@ def _looked_up(document: Any, key: str) -> Any:
     return document
 
 
-# Streams of binary messages: MAVLink 1 and 2, and MSP v1 and v2.
+# Binary messages.
 
 
 _V1, _V2 = 0xFE, 0xFD  # first bytes of frames of MAVLink 1 and 2
@@ -286,13 +286,13 @@ MESSAGES: dict[str, tuple[str, dict[str, str], list[str]]] = {
         ["time_usec", *_RAW],
     ),
 }
-"""Messages of MAVLink that are taken, the best first: unit of the stamp, columns, fields."""
+"""Messages of MAVLink that are read, the best first: unit of the time stamp, columns, fields."""
 MSP_RAW_IMU = 102  # number of that message of Betaflight and INAV
 _POLL = b"$M<\x00" + bytes([MSP_RAW_IMU, MSP_RAW_IMU])
 
 
 class PacketDecoder:
-    """What both kinds of packets share: a buffer, and the search for the next frame after damage."""
+    """Base of both kinds of packets: a buffer, and the search for the next frame after damage."""
 
     name = over = ""
     units: Mapping[str, str] = {}
@@ -310,7 +310,7 @@ class PacketDecoder:
         return self._table(ended=False)
 
     def finish(self) -> Array:
-        """Return the rows that were waiting for bytes of a frame that never came."""
+        """Return the rows that waited for the rest of a frame that never came."""
         return self._table(ended=True)
 
     def _table(self, *, ended: bool) -> Array:
@@ -318,7 +318,7 @@ class PacketDecoder:
         while place < len(buffer):
             length = self._length(buffer, place)
             if length is None and not ended:
-                break  # not enough bytes to tell
+                break  # more bytes are needed
             frame = buffer[place : place + length] if length else b""
             if length and len(frame) < length and not ended:
                 break
@@ -335,19 +335,19 @@ class PacketDecoder:
         return np.array(rows, dtype=np.float64).reshape(len(rows), len(self.units))
 
     def _length(self, buffer: bytes, place: int) -> int | None:
-        """Return the length of a frame that begins here, 0 where none does, None where that cannot be told yet."""
+        """Return the length of a frame that begins here, 0 if none does, None if more bytes are needed."""
         raise NotImplementedError
 
     def _row(self, frame: bytes) -> list[float] | None:
-        """Return the numbers of a frame, none of one that holds others; None where it is damaged."""
+        """Return the numbers of a frame, an empty list for other messages, None where it is damaged."""
         raise NotImplementedError
 
 
 class Mavlink(PacketDecoder):
-    """One kind of message of one sender; the first sender and the best kind of the first seconds."""
+    """One kind of message of one sender: the first sender, and the best kind of the first seconds."""
 
     def __init__(self, head: bytes, counts: Counts) -> None:
-        super().__init__(Counts())  # while looking for the kind nothing is counted
+        super().__init__(Counts())  # nothing is counted during the choice of the kind
         self._dialect = _dialect()
         self._parser = self._dialect.MAVLink(None)
         self._sender: tuple[int, int] | None = None
@@ -380,7 +380,7 @@ class Mavlink(PacketDecoder):
             return None
         kind = message.get_type()
         if kind.startswith("UNKNOWN"):
-            return None  # of another dialect, or none: it has no checksum that is known
+            return None  # of another dialect, or no frame: its checksum is unknown
         if kind not in MESSAGES:
             return []
         self._seen.add(kind)
@@ -392,7 +392,7 @@ class Mavlink(PacketDecoder):
 
 
 class Msp(PacketDecoder):
-    """MSP_RAW_IMU of Betaflight, INAV and their like, which is sent when it is asked for, in v1 or v2."""
+    """MSP_RAW_IMU of Betaflight, INAV and similar firmware, v1 or v2, which is sent on request."""
 
     name = "MSP RAW_IMU"
     units = units_of("accel", "count") | units_of("gyro", "count") | units_of("mag", "count")
@@ -434,7 +434,7 @@ def crc8(data: bytes) -> int:
 
 
 def looks_like_mavlink(head: bytes) -> bool:
-    """Return whether two frames follow each other somewhere, by their first bytes and lengths."""
+    """Return whether two MAVLink frames follow each other somewhere, by their first bytes and lengths."""
     for magic, more in ((_V1, 8), (_V2, 12)):
         place = head.find(magic)
         while 0 <= place < len(head) - 1:
@@ -448,7 +448,7 @@ def looks_like_mavlink(head: bytes) -> bool:
 
 
 def looks_like_msp(head: bytes) -> bool:
-    """Return whether there is an answer of MSP with a right checksum."""
+    """Return whether there is an MSP answer with a correct checksum."""
     decoder = Msp(Counts())
     return len(decoder.rows(head)) > 0
 

@@ -1,6 +1,6 @@
-"""Bytes of a stream to blocks with named columns and units.
+"""Bytes of a live stream to blocks with named columns and units.
 
-What it is, is recognised from its first two seconds; a layout is offered where nobody has described it.
+The format is recognised from the first two seconds; for an unknown stream of numbers a layout is offered.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from imulab.readers.text import is_number
 from imulab.recording import Array, Layout, Recording
 from imulab.units import STANDARD_GRAVITY
 
-# A layout to start from for a stream of numbers that nobody has described: offered, never taken.
+# Offered layout for an unknown stream of numbers; it is never used without the user's consent.
 
 
-_FEWEST = 5  # lines from which columns are told
+_FEWEST = 5  # lines that show the columns
 _UNITS = (("m/s^2", STANDARD_GRAVITY), ("g", 1.0), ("mg", 1000.0))
-_NEAR = 0.25  # relative: a mean this near to g, in some unit, is a specific force
-_STEADY = 0.2  # relative scatter of the length of three columns that are a specific force in a hand
+_NEAR = 0.25  # relative: a mean this near to g in some unit is a specific force
+_STEADY = 0.2  # largest relative scatter of the length of three columns of specific force in a hand
 
 
 @dataclass(frozen=True)
 class Guess:
-    """A layout as the text of a file, and what it was guessed from."""
+    """A layout as the text of a file, and the reasons for it."""
 
     toml: str
     why: str
@@ -57,10 +57,10 @@ def guess_layout(lines: list[str], seconds: float) -> Guess | None:
     lines
         The first lines of the stream.
     seconds
-        How long they took to come, which tells the unit of a time.
+        Time in which they came, s, which shows the unit of a time column.
     """
     if sum(line.startswith("{") for line in lines) > len(lines) / 2:
-        return _of_json(lines, seconds)
+        return _guess_json(lines, seconds)
     delimiter = max(",;\t", key=lambda sign: sum(line.count(sign) for line in lines))
     split: Callable[[str], list[str]] = lambda line: [field.strip() for field in line.split(delimiter)]  # noqa: E731
     shown = {",": '","', ";": '";"', "\t": '"\\t"'}[delimiter]
@@ -82,7 +82,7 @@ def guess_layout(lines: list[str], seconds: float) -> Guess | None:
     return _guess(head, named, table, seconds)
 
 
-def _of_json(lines: list[str], seconds: float) -> Guess | None:
+def _guess_json(lines: list[str], seconds: float) -> Guess | None:
     rows = []
     for line in lines:
         try:
@@ -90,7 +90,7 @@ def _of_json(lines: list[str], seconds: float) -> Guess | None:
         except ValueError:
             continue
         if isinstance(document, dict):
-            rows.append(_flat(document))
+            rows.append(_flatten(document))
     keys = list(rows[-1]) if rows else []
     rows = [row for row in rows if list(row) == keys]
     if len(rows) < _FEWEST or len(keys) < 3:
@@ -98,20 +98,20 @@ def _of_json(lines: list[str], seconds: float) -> Guess | None:
     return _guess([], list(keys), np.array([list(row.values()) for row in rows]), seconds)
 
 
-def _flat(document: dict[str, object], before: str = "") -> dict[str, float]:
+def _flatten(document: dict[str, object], before: str = "") -> dict[str, float]:
     numbers: dict[str, float] = {}
     for key, value in document.items():
         if isinstance(value, dict):
-            numbers |= _flat(value, f"{before}{key}.")
+            numbers |= _flatten(value, f"{before}{key}.")
         elif isinstance(value, list):
-            numbers |= _flat({str(place): each for place, each in enumerate(value)}, f"{before}{key}.")
+            numbers |= _flatten({str(place): each for place, each in enumerate(value)}, f"{before}{key}.")
         elif isinstance(value, int | float):
             numbers[f"{before}{key}"] = float(value)
     return numbers
 
 
 def _guess(head: list[str], names: list[str | int], table: Array, seconds: float) -> Guess | None:
-    """Return the layout: a first column that rises is the time, three whose length is steady the accelerometers."""
+    """Return the layout: a rising first column is the time, three columns of steady length the accelerometers."""
     columns, why = ["[columns]"], []
     steps = np.diff(table[:, 0])
     first = 0
@@ -144,28 +144,28 @@ def _triad(stem: str, names: list[str | int], start: int, unit: str) -> list[str
 
 
 def _prefix(rows: list[list[str]]) -> str:
-    """Return the first field that most lines share where it is no number."""
+    """Return the first field that most lines share if it is no number, else nothing."""
     first = [row[0] for row in rows if len(row) > 1]
     pairs = [field for field, other in pairwise(first) if field == other and not is_number(field)]
     return max(set(pairs), key=pairs.count) if len(pairs) > len(first) / 2 else ""
 
 
-# Bytes of a stream to blocks with named columns and units: what it is, is recognised from its first two seconds.
+# Streams: the format is recognised from the first two seconds.
 
 
 FIRST = 2.0
-"""So many seconds of a stream say what it is."""
-_MOST = 1 << 18  # bytes that are held until the format is known
-_SILENT = 0.5  # s without an answer after which a device is asked again
-_POLL_AGAIN = 0.1  # s between two questions to a device that answers
+"""Seconds from which the format is recognised."""
+_MOST = 1 << 18  # most bytes kept until the format is known
+_SILENT = 0.5  # s without an answer after which a device is polled again
+_POLL_AGAIN = 0.1  # s between two polls of a device that answers
 _TEXT = bytes(range(32, 127)) + b"\r\n\t"
-_MOSTLY = 0.9  # share of printable bytes from which a stream is text
+_MOSTLY = 0.9  # least share of printable bytes in text
 STRAIGHTENED = "arrival time, straightened by a robust line"
-"""What the head of a recording says of times without a device's stamps."""
+"""Entry in the head of a recording for times without a device's stamps."""
 
 
 class UnknownFormatError(ReadError):
-    """A stream is none of the known; `lines` are its first, `guess` a layout to start from where there is one."""
+    """A stream of no known format; `lines` are its first lines, `guess` a layout to start from, if there is one."""
 
     def __init__(self, message: str, lines: tuple[str, ...] = (), guess: Guess | None = None) -> None:
         super().__init__(message)
@@ -174,7 +174,7 @@ class UnknownFormatError(ReadError):
 
 
 class Decoder(Protocol):
-    """Bytes to rows of numbers: what is recognised ends in one of these."""
+    """Bytes to rows of numbers, in one recognised format."""
 
     name: str
     metadata: dict[str, str]
@@ -188,20 +188,20 @@ class Decoder(Protocol):
         """Return the rows that these bytes complete, shape (n, columns)."""
 
     def finish(self) -> Array:
-        """Return the rows that are left at the end."""
+        """Return the rows left at the end."""
 
 
 class LineStream:
-    """One stream: bytes and when they came to recordings of some rows each.
+    """One stream: bytes with their arrival times to recordings of a few rows.
 
     Parameters
     ----------
     source
-        What messages call where it comes from.
+        Name of its source in messages.
     layout
-        Where the columns of a foreign stream are.
+        Layout of a foreign stream.
     polled
-        Whether the other side may have to be asked before it sends (serial ports and TCP).
+        Whether the other side may have to be polled (serial ports and TCP).
     """
 
     def __init__(self, source: str, layout: Layout | None = None, *, polled: bool = False) -> None:
@@ -218,12 +218,12 @@ class LineStream:
         self._arrival: ArrivalClock | None = None
 
     def feed(self, data: bytes, arrival: float) -> list[Recording]:
-        """Return what these bytes complete; no bytes tell how time passes.
+        """Return the recordings that these bytes complete; without bytes only time passes.
 
         Raises
         ------
         UnknownFormatError
-            Two seconds have passed, and the stream is none of the known.
+            Two seconds have passed, and the stream has no known format.
         """
         if self._decoder is not None:
             blocks = self._blocks([(data, arrival)])
@@ -238,12 +238,12 @@ class LineStream:
         return self._begin()
 
     def finish(self) -> list[Recording]:
-        """Return what is left at the end of the stream.
+        """Return the recordings left at the end of the stream.
 
         Raises
         ------
         UnknownFormatError
-            It ended before it was recognised, and is none of the known.
+            It ended before it was recognised, and has no known format.
         """
         blocks = self._begin() if self._decoder is None and self._held else []
         if self._decoder is None:
@@ -252,12 +252,12 @@ class LineStream:
 
     @property
     def over(self) -> str:
-        """Why nothing more of the stream can be read; empty while it can."""
+        """Reason why nothing more of the stream can be read; empty while it can."""
         return f"{self._source}: {self._decoder.over}" if self._decoder is not None and self._decoder.over else ""
 
     def _begin(self) -> list[Recording]:
         head = b"".join(data for data, _ in self._held)
-        self._decoder = decoder = self._recognised(head)
+        self._decoder = decoder = self._recognise(head)
         self.format = decoder.name
         self._polled = self._polled and isinstance(decoder, Msp)
         if "time" in decoder.units:
@@ -298,20 +298,20 @@ class LineStream:
         return Recording(columns, units, metadata, self._source)
 
     def _poll(self, answered: bool, now: float) -> None:
-        """Ask a flight controller for its readings: where nothing comes unasked, and again after each answer."""
+        """Poll a flight controller: when nothing comes without a poll, and again after each answer."""
         self.to_send = b""
         if not self._polled:
             return
         if self._asked is None:
-            self._asked = now + _SILENT - _POLL_AGAIN  # a device that sends unasked is given the time to do so
+            self._asked = now + _SILENT - _POLL_AGAIN  # a device that sends without a poll gets time to do so
         waited = now - self._asked
         answers = isinstance(self._decoder, Msp)
         silent = answers or not self._held or all(looks_like_msp(d) or d[:1] == b"$" for d, _ in self._held)
         if silent and waited >= (0 if answered else _POLL_AGAIN):
             self.to_send, self._asked = Msp.poll, now
 
-    def _recognised(self, head: bytes) -> Decoder:
-        """Return the decoder of a stream by its first bytes."""
+    def _recognise(self, head: bytes) -> Decoder:
+        """Return the decoder of a stream, from its first bytes."""
         if self._layout is not None and not self._layout.if_needed:
             return LayoutDecoder(self._layout, self.counts)
         if looks_like_msp(head):
@@ -365,5 +365,5 @@ class LineStream:
 
 
 def _share(lines: list[str], fits: Callable[[str], bool]) -> float:
-    """Return which part of the lines fits."""
+    """Return the share of lines that fit."""
     return sum(bool(fits(line)) for line in lines) / max(len(lines), 1)

@@ -1,4 +1,7 @@
-"""What the attitudes so far say, which one to take next, and what the parameters are to be known to."""
+"""The guide of a live session: fit of the attitudes so far, plan of those to come, and targets.
+
+Source of the plan: D- and A-optimal attitudes of the tumble test (`imulab.procedures.tumble`, planning).
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
-# What the parameters are to be known to: ``bias 100 ug, scale_factor 200 ppm``.
+# Targets, such as ``bias 100 ug, scale_factor 200 ppm``.
 
 
 _KINDS = {
@@ -33,12 +36,12 @@ _KINDS = {
     "k2": ("acceleration", "ug"),
     "k3": ("acceleration", "ug"),
 }
-"""Parameters by the stem of their names; a nonlinearity in what it makes at 1 g."""
+"""Parameters by the stem of their names; a nonlinearity as its effect at 1 g."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A standard uncertainty that the parameters of one stem are to have: SI, relative for scale factors."""
+    """Wanted standard uncertainty of the parameters with one stem: SI, relative for scale factors."""
 
     stem: str
     value: float
@@ -46,12 +49,12 @@ class Target:
 
 
 def read_targets(text: str | None) -> tuple[Target, ...]:
-    """Return the targets of a text; none of None.
+    """Return the targets in a text; none for None.
 
     Raises
     ------
     OptionError
-        It is no list of parameters with an uncertainty each.
+        The text is no list of parameters with an uncertainty each.
     """
     targets = []
     for part in (text or "").split(",") if text is not None else []:
@@ -68,13 +71,13 @@ def read_targets(text: str | None) -> tuple[Target, ...]:
     return tuple(targets)
 
 
-def share_of(target: Target, record: Calibration, gravity: float) -> float:
-    """Return the largest standard uncertainty of the target's parameters over the target; infinite without them."""
-    return max(shares_of(target, record, gravity).values(), default=float("inf"))
+def worst_share(target: Target, record: Calibration, gravity: float) -> float:
+    """Return the largest ratio of standard uncertainty to target over the target's parameters; infinite without any."""
+    return max(target_shares(target, record, gravity).values(), default=float("inf"))
 
 
-def shares_of(target: Target, record: Calibration, gravity: float) -> dict[str, float]:
-    """Return the standard uncertainty over the target for each of its parameters."""
+def target_shares(target: Target, record: Calibration, gravity: float) -> dict[str, float]:
+    """Return the ratio of standard uncertainty to target for each of the target's parameters."""
     shares = {}
     for name, parameter in record.parameters.items():
         if name.rpartition("_")[0] != target.stem or parameter.standard_uncertainty is None:
@@ -89,43 +92,43 @@ def shares_of(target: Target, record: Calibration, gravity: float) -> dict[str, 
 
 
 def predicted_share(target: Target, uncertainties: dict[str, float], gravity: float) -> float:
-    """Return the same of predicted uncertainties in units of g; 0 where the model lacks the parameter."""
+    """Return that ratio for predicted uncertainties in units of g; 0 where the model lacks the parameter."""
     factor = gravity if target.stem == "bias" or target.stem[0] == "k" else 1.0
     sizes = [u for name, u in uncertainties.items() if name.rpartition("_")[0] == target.stem]
     return max(sizes, default=0.0) * factor / target.value
 
 
-# What the attitudes so far say, and which one to take next: the fit after each, and the plan of those to come.
+# The fit of the attitudes so far, and the plan of those to come.
 
 
 _USUAL_ORDER = 3
-"""The order that is planned for under ``auto``: its attitudes show what an order 2 would leave in the scale factors."""
+"""Order that is planned for under ``auto``: its attitudes show what an order 2 would leave in the scale factors."""
 _MORE = 1.5
-"""Attitudes over parameters where neither a number nor a target is given."""
+"""Attitudes per parameter where neither a number nor a target is stated."""
 _SPARE = 4
-"""Attitudes beyond the parameters without which a fit can neither tell a knocked one nor whether its order is right."""
+"""Attitudes beyond the parameters that a fit needs to find a knocked attitude and to test its order."""
 _NEAR = np.cos(np.radians(12.0))
 _HORIZON = 60
-"""So many attitudes are planned ahead at most: more take seconds, and hardly change which one is next."""
+"""Most attitudes that are planned ahead: more take seconds, and hardly change which one is next."""
 _OFF = 2.0
-"""A plan that is longer or shorter by more than this factor, and two attitudes, is made anew."""
+"""A plan longer or shorter than needed by more than this factor, and two attitudes, is replaced."""
 _MUCH = 10.0
-"""Scatter of the attitudes over their own noise from which on something else than noise must be at work."""
-_FIVE = 5  # attitudes ahead for which a gain is computed at once
-_LOWERS = 0.05  # share of the uncertainty that more time in an attitude must gain to be asked for
-_LONGEST = 10.0  # s of a hold that is asked for
-_ROUNDS = 4  # of the search for how many attitudes are still needed
+"""Scatter of the attitudes over their noise from which it has another cause than noise."""
+_FIVE = 5  # attitudes ahead whose gain is computed together
+_LOWERS = 0.05  # least relative gain in uncertainty for which a longer hold is asked
+_LONGEST = 10.0  # s, the longest hold that is asked for
+_ROUNDS = 4  # of the search for the number of attitudes still needed
 _SEED = 1  # of the search, so that the same attitudes get the same advice
 _OTHERS = 0.1
-"""What a parameter without a target counts for, over what the one with the lowest target does."""
-_GUESSED_NOISE = 1e-4  # g: of an attitude before any is held
+"""Weight of a parameter without a target, relative to that of the parameter with the lowest target."""
+_GUESSED_NOISE = 1e-4  # g, of an attitude, before any is held
 _PRIOR = 1e-2
-"""Before they are measured, parameters are known to about this in units of g: enough to weigh one hold."""
+"""Uncertainty of parameters before they are measured, in units of g: enough to weigh one hold."""
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """An attitude that was accepted: mean output, covariance of the mean, times and length, s."""
+    """An accepted attitude: mean output, covariance of the mean, times and length, s."""
 
     number: int
     mean: Array
@@ -143,17 +146,17 @@ class Guide:
     Attributes
     ----------
     order
-        Of the fit, as `fit_tumble` takes it.
+        Order of the fit, as for `fit_tumble`.
     gravity
         Local gravity, or None: that of the stream's head, or standard gravity.
     targets
-        What the parameters are to be known to.
+        Wanted uncertainties.
     planned
-        Number of attitudes that the person wants, or None.
+        Number of attitudes that the user wants, or None.
     unit
-        Of the outputs.
+        Unit of the outputs.
     metadata
-        Of the stream's head.
+        Head of the stream.
     beyond
         Whether the target needs more attitudes than are planned ahead.
     """
@@ -178,12 +181,12 @@ class Guide:
 
     @property
     def model_order(self) -> int:
-        """The order that attitudes are planned for."""
+        """Order that attitudes are planned for."""
         return self.order if isinstance(self.order, int) else _USUAL_ORDER
 
     @property
     def local_gravity(self) -> float:
-        """Local gravity as far as it is known, m/s^2."""
+        """Local gravity as far as known, m/s^2."""
         if self.fit is not None:
             return model_of(self.fit.calibration).gravity.value
         return self.gravity.value if self.gravity else STANDARD_GRAVITY
@@ -197,35 +200,35 @@ class Guide:
         return float(np.median(lengths)) if lengths else 1.0
 
     def accept(self, attitude: Attitude) -> None:
-        """Take an attitude, fit anew and plan what comes."""
+        """Add an attitude, fit again and plan the next ones."""
         self.attitudes.append(attitude)
         self.refit()
         direction = self.directions()[-1]
         near = self._outstanding @ direction if len(self._outstanding) else np.empty(0)
         if near.size and near.max() > _NEAR:
             self._outstanding = np.delete(self._outstanding, int(np.argmax(near)), axis=0)
-            self._known = len(self._outstanding) > 0 and not self._off()
+            self._known = len(self._outstanding) > 0 and not self._plan_is_off()
         else:
             self._known = False
 
-    def _off(self) -> bool:
-        """Whether far fewer or more attitudes are planned than a scatter of another kind than noise asks for."""
+    def _plan_is_off(self) -> bool:
+        """Whether the plan has far fewer or more attitudes than the scatter, beyond noise, asks for."""
         if not self.targets or self.met or not self.scatter():
             return False
-        # Variances fall as the number of attitudes rises, in proportion.
+        # Variances fall in inverse proportion to the number of attitudes.
         need = min(len(self.kept) * (max(self.shares()) ** 2 - 1), _HORIZON)
         return not len(self._outstanding) / _OFF - 2 <= need <= len(self._outstanding) * _OFF + 2
 
     @property
-    def _sure(self) -> int:
-        """The number of attitudes from which on a fit can be relied on."""
+    def _fewest_reliable(self) -> int:
+        """Number of attitudes from which a fit is reliable."""
         return parameter_count(self.model_order) + _SPARE
 
     def scatter(self) -> str:
-        """Say where the attitudes disagree by far more than each scatters by itself; empty where they do not."""
-        if self.fit is None or len(self.kept) < self._sure:
+        """Return a message where the attitudes disagree by far more than their noise; empty otherwise."""
+        if self.fit is None or len(self.kept) < self._fewest_reliable:
             return ""
-        usual = float(np.median([self._own_noise(each.mean, each.covariance) for each in self.kept]))
+        usual = float(np.median([self._attitude_noise(each.mean, each.covariance) for each in self.kept]))
         if self._excess() < _MUCH * usual:
             return ""
         higher = "--order auto" if self.order != "auto" else "a still table"
@@ -235,11 +238,11 @@ class Guide:
         )
 
     def lengthen(self, attitude: Attitude) -> None:
-        """Put a longer hold of the last attitude in its place."""
+        """Replace the last attitude by a longer hold of it."""
         self.attitudes[-1] = attitude
 
     def drop(self, number: int) -> None:
-        """Do without an attitude."""
+        """Drop an attitude."""
         self.attitudes[number - 1] = replace(self.attitudes[number - 1], dropped=True)
         self.refit()
         self._known = False
@@ -247,11 +250,11 @@ class Guide:
     def refit(self) -> None:
         """Fit the attitudes that are kept."""
         try:
-            self.fit, self.why_not = fit_tumble(self._as_found(), order=self.order, gravity=self.gravity), ""
+            self.fit, self.why_not = fit_tumble(self._kept_attitudes(), order=self.order, gravity=self.gravity), ""
         except ImulabError as error:
             self.fit, self.why_not = None, str(error)
 
-    def _as_found(self) -> Attitudes:
+    def _kept_attitudes(self) -> Attitudes:
         kept = self.kept
         mean = np.array([each.mean for each in kept])
         columns = {name: mean[:, k].copy() for k, name in enumerate(triad("accel"))}
@@ -268,7 +271,7 @@ class Guide:
         )
 
     def directions(self) -> Array:
-        """Return the upward direction of the body in each attitude that is kept, shape (n, 3)."""
+        """Return the upward direction of the body in each kept attitude, shape (n, 3)."""
         if not self.kept:
             return np.empty((0, 3))
         if self.fit is not None:
@@ -279,19 +282,19 @@ class Guide:
         return directions
 
     def residuals(self) -> tuple[Array, NDArray[np.bool_]]:
-        """Return ``|f| - g`` of each attitude that is kept, m/s^2, and whether it agrees with the others, (n,)."""
+        """Return ``|f| - g`` of each kept attitude, m/s^2, and whether it agrees with the others, shape (n,)."""
         count = len(self.kept)
         if self.fit is None:
             return np.full(count, np.nan), np.ones(count, dtype=np.bool_)
         return self.fit.residuals, self.fit.down_weights > 0
 
     def noise(self) -> float:
-        """Return the noise of |f| in the usual attitude, in units of g, with the scatter beyond that of the holds."""
-        noises = [self._own_noise(each.mean, each.covariance) for each in self.kept]
+        """Return the noise of |f| of the median attitude, in units of g, with the scatter between attitudes."""
+        noises = [self._attitude_noise(each.mean, each.covariance) for each in self.kept]
         usual = float(np.median(noises)) if noises else _GUESSED_NOISE
         return float(np.hypot(usual, self._excess()))
 
-    def _own_noise(self, mean: Array, covariance: Array) -> float:
+    def _attitude_noise(self, mean: Array, covariance: Array) -> float:
         up = mean / np.linalg.norm(mean)
         return float(np.sqrt(up @ covariance @ up)) / self.one_g
 
@@ -301,13 +304,13 @@ class Guide:
         return float(fit_of(self.fit.calibration).excess.value) / self.local_gravity
 
     def wants_longer(self, mean: Array, covariance: Array, seconds: float) -> bool:
-        """Return whether twice as long a hold would lower the standard uncertainty of some parameter by over 5 %.
+        """Return whether a hold twice as long lowers the standard uncertainty of some parameter by more than 5 %.
 
-        The attitudes that are still to come count as if they were there, each with the usual noise.
+        The planned attitudes count as measured, each with the usual noise.
         """
         if seconds >= _LONGEST:
             return False
-        hold_noise, excess, usual = self._own_noise(mean, covariance), self._excess(), self.noise()
+        hold_noise, excess, usual = self._attitude_noise(mean, covariance), self._excess(), self.noise()
         others = np.vstack([self.directions(), self.outstanding()])
         rows = information_rows(others, self.model_order) / usual
         row = information_rows((mean / np.linalg.norm(mean))[None], self.model_order)[0]
@@ -322,7 +325,7 @@ class Guide:
     def met(self) -> bool:
         """Whether the targets are met, or, without any, the number of attitudes is reached."""
         if self.targets:
-            enough = len(self.kept) >= self._sure
+            enough = len(self.kept) >= self._fewest_reliable
             return enough and self.fit is not None and max(self.shares()) <= 1.0
         return self.fit is not None and len(self.kept) >= self.wanted()
 
@@ -330,23 +333,23 @@ class Guide:
         """Return the worst standard uncertainty over each target; infinite before a fit."""
         if self.fit is None:
             return [float("inf")] * len(self.targets)
-        return [share_of(target, self.fit.calibration, self.local_gravity) for target in self.targets]
+        return [worst_share(target, self.fit.calibration, self.local_gravity) for target in self.targets]
 
     def parameter_shares(self) -> dict[str, float]:
-        """Return the standard uncertainty over its target for each parameter that has one."""
+        """Return the ratio of standard uncertainty to target for each parameter that has a target."""
         if self.fit is None:
             return {}
-        by_target = [shares_of(target, self.fit.calibration, self.local_gravity) for target in self.targets]
+        by_target = [target_shares(target, self.fit.calibration, self.local_gravity) for target in self.targets]
         return {name: share for shares in by_target for name, share in shares.items()}
 
     def wanted(self) -> int:
-        """Return how many attitudes the session will need in all, as far as can be told."""
+        """Return how many attitudes the session will need in all, as far as known."""
         if self.planned is not None or not self.targets:
             return self.planned or int(np.ceil(_MORE * parameter_count(self.model_order)))
         return len(self.kept) + max(len(self.outstanding()), int(not self.met))
 
     def outstanding(self) -> Array:
-        """Return the attitudes that are planned, shape (k, 3)."""
+        """Return the planned attitudes, shape (k, 3)."""
         if not self._known:
             self._known = True
             self._outstanding = self._plan()
@@ -359,7 +362,7 @@ class Guide:
         if self.planned is not None or not self.targets:
             left = self.wanted() - len(there)
             return self._planned(max(min(left, _HORIZON), least), there) if left > 0 or least > 1 else np.empty((0, 3))
-        noise = self._noise_as_fitted() if self._off() else self.noise()
+        noise = self._noise_as_fitted() if self._plan_is_off() else self.noise()
         count, self.beyond = max(least, 3), False
         tried: list[int] = []
         for _ in range(_ROUNDS):
@@ -374,7 +377,7 @@ class Guide:
         return self._planned(count, there)
 
     def _noise_as_fitted(self) -> float:
-        """Return the noise by which the uncertainties of the fit so far are those predicted, in units of g."""
+        """Return the noise, in units of g, for which the predicted uncertainties equal those of the fit so far."""
         noise = self.noise()
         now = Search(self.model_order, "A", self.directions()).covariance(np.empty((0, 3)))
         return noise * max(self.shares()) / self._predicted(now, noise)
@@ -385,7 +388,7 @@ class Guide:
         return max(predicted_share(target, named, self.local_gravity) for target in self.targets)
 
     def _weight(self) -> Array:
-        """Return what the variance of each parameter counts for: the more, the lower its target is."""
+        """Return the weight of each parameter's variance: the lower its target, the larger."""
         names = parameter_names(self.model_order)
         shares = np.array(
             [
@@ -402,14 +405,14 @@ class Guide:
         chosen = quick_set(Search(self.model_order, "A", there), points, count, _SEED, weight=self._weight(), move=move)
         if chosen is not None:
             return chosen
-        # Readings that no unit at rest has, as of a dead axis, or attitudes too much alike: plan as if none were there.
+        # Readings that no unit at rest has, as of a dead axis, or attitudes too much alike: plan without them.
         fewest = max(count, parameter_count(self.model_order) + 1)
         anew = quick_set(Search(self.model_order, "A", np.empty((0, 3))), points, fewest, _SEED, move=move)
         assert anew is not None
         return anew
 
     def next_direction(self) -> Array | None:
-        """Return the upward direction to take next: of those planned the one that lowers the worst axis most."""
+        """Return the upward direction to take next: the planned one that lowers the worst axis most."""
         waiting = self.outstanding()
         if not len(waiting):
             if self.met:
@@ -423,7 +426,7 @@ class Guide:
         return best
 
     def five_more(self) -> str:
-        """Say what five more attitudes would bring for the worst bias."""
+        """Return a sentence on the gain of five more attitudes for the worst bias."""
         if self.fit is None:
             return ""
         there = self.directions()

@@ -1,7 +1,7 @@
-"""Whether the unit is at rest, sample by sample, with memory that does not grow; and what it put out while it was.
+"""Detection of rest, sample by sample with bounded memory, and the mean outputs at rest.
 
 As in `find_attitudes`, the recording is cut into short blocks, windows slide over them, and the unit is at rest where
-the variance of a window is not much above that of the quietest so far.
+the variance of a window is not much above that of the quietest window so far.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from imulab.recording import Array
 
 BLOCK = 0.1  # s over which the scatter of samples is computed, as in a recording
 WINDOW, TRIM = 6, 3
-"""Blocks of a window, and of what is left out at both ends of a hold."""
+"""Blocks of a window, and blocks left out at both ends of a hold."""
 SHORTEST, SURE = 12, 15
-"""Blocks, trimmed, of a hold that counts when it has ended, and of one that is accepted while it lasts.
+"""Blocks, after trimming, of a hold that counts once it has ended, and of one that is accepted while it lasts.
 
-`find_attitudes` needs 10; its threshold is its own.
+`find_attitudes` needs 10; its threshold is another.
 """
 _THRESHOLD = 10.0  # times the quiet variance up to which the unit rests
 _LOUDEST = 0.03
-"""No variance within a window is that of rest beyond this part of the reading, squared."""
-_SAME = 2e-3  # of g: a hold that moved less from the one before is the same attitude, as in a recording
-# Of the histogram of log10 of variances, where it begins, and bins in a decade
+"""A window with a larger variance than this part of the reading, squared, is not at rest."""
+_SAME = 2e-3  # of g: a hold that differs less from the one before is the same attitude, as in a recording
+# Histogram of log10 of the variances: bins, lower end, and bins in a decade
 _BINS, _LOWEST, _PER_DECADE = 1200, -22.0, 50
 _QUIET = 0.05  # quantile of the variances that is the quiet one
 _GAP, _GAP_STEPS = 0.25, 6.0  # s, and usual steps: a longer gap ends a hold, as in a recording
-_LEARNED = 50  # samples from which the usual step is told
+_LEARNED = 50  # samples that show the usual step
 
 
 @dataclass(frozen=True)
 class Hold:
-    """A stretch at rest: its times, s, mean output, covariance of that, and its length in blocks, trimmed."""
+    """A stretch at rest: times, s, mean output with its covariance, and length in blocks after trimming."""
 
     start: float
     stop: float
@@ -46,13 +46,13 @@ class Hold:
 
     @property
     def seconds(self) -> float:
-        """How long it is after trimming, s."""
+        """Length after trimming, s."""
         return self.blocks * BLOCK
 
 
 @dataclass(frozen=True)
 class Moment:
-    """The state after a block: ``moving``, ``settling`` or ``still``; its mean; the hold, or the one that has ended."""
+    """State after a block (``moving``, ``settling`` or ``still``), its mean, and the present or the ended hold."""
 
     time: float
     state: str
@@ -125,14 +125,14 @@ class Stillness:
         )
 
     def _variance(self) -> float:
-        """Variance of the window, summed over the axes; infinite until it is full."""
+        """Return the variance of the window, summed over the axes; infinite until it is full."""
         if len(self._window) < WINDOW:
             return np.inf
         means, scatters = (np.array(part) for part in zip(*self._window, strict=True))
         return float(scatters.mean(axis=0).sum() + means.var(axis=0).sum())
 
     def _limit(self, variance: float, mean: Array) -> float:
-        """Return the variance below which a window is at rest, this window taken into account."""
+        """Return the variance below which a window is at rest, with this window included."""
         size = float(mean @ mean) or 1.0
         if np.isfinite(variance):
             place = int((np.log10(max(variance / size, 10**_LOWEST)) - _LOWEST) * _PER_DECADE)
@@ -147,14 +147,14 @@ class Stillness:
         return min(_THRESHOLD * quiet, _LOUDEST**2 * size)
 
     def _learn_resolution(self, values: Array) -> None:
-        """Follow the smallest step of each output, whose rounding no variance can be below."""
+        """Follow the smallest step of each output: rounding keeps the variance above it."""
         for axis in range(3):
             steps = np.diff(np.unique(values[:, axis]))
             if steps.size:
                 self._resolution[axis] = min(self._resolution[axis], float(steps.min()))
 
     def _go_on(self, mean: Array, start: float, stop: float) -> None:
-        """Add a block to the hold; the last ones wait, because they may already belong to a motion."""
+        """Add a block to the hold; the last blocks wait, because a motion may begin in them."""
         if self._hold is None:
             recent = np.mean([each for each, _ in list(self._window)[-TRIM:]], axis=0)
             last = self._last
@@ -170,7 +170,7 @@ class Stillness:
             self._hold.stop = stop
 
     def _end(self) -> Hold | None:
-        """End the hold, if there is one, and learn from its scatter."""
+        """End the hold, if there is one, and return it; its scatter updates the quiet variance."""
         if self._hold is None:
             return None
         ended, self._hold = self._hold, None

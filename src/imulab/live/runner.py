@@ -16,35 +16,35 @@ from imulab.files import replacing
 from imulab.live.formats import LineStream
 from imulab.live.session import Event, Session
 from imulab.live.sources import LiveSource
-from imulab.live.view import FurtherFits, further_of
+from imulab.live.view import FurtherFits, further_triads
 from imulab.readers import read_blocks
 from imulab.recording import Array, Layout, Recording
 from imulab.units import from_si
 from imulab.writers import decimal_rows, write_csv_to
 
-# The recording of a session: native CSV that grows, is written out every second, and can be gone on with.
+# The recording: native CSV that grows, is written out every second, and can be continued.
 
 
 EVERY = 1.0
-"""Written to the file at least every so many seconds: what a sudden end may lose."""
-_PAUSE = 1.0  # s between two parts of a recording that goes on
-_END = 1 << 12  # bytes at the end of a recording in which its last line is looked for
+"""s between two writes to the file: what a sudden end may lose."""
+_PAUSE = 1.0  # s between two parts of a continued recording
+_END = 1 << 12  # bytes at the end of a recording in which its last line is searched for
 
 
 class Recorder:
-    """The file that the samples go to.
+    """The file of the samples.
 
     Parameters
     ----------
     path
-        Its name, which ends in .csv.
+        Its name, ending in .csv.
     resume
-        Whether to go on with it where it is there.
+        Whether to continue it if it exists.
 
     Raises
     ------
     OptionError
-        The file is there and is not to be gone on with, or cannot be written.
+        The file exists and is not to be continued, or cannot be written.
     """
 
     def __init__(self, path: str, *, resume: bool) -> None:
@@ -70,12 +70,12 @@ class Recorder:
             self._cut_last_line()
 
     def before(self) -> Iterator[Recording]:
-        """Yield what the file holds already, in blocks.
+        """Yield what the file already holds, in blocks.
 
         Raises
         ------
         ReadError, UnitError
-            It is no recording.
+            The file is no recording.
         """
         if not self.resumed or not self._good:
             return
@@ -87,7 +87,7 @@ class Recorder:
             yield block
 
     def write(self, block: Recording, now: float) -> None:
-        """Append samples with the times of `placed`, written out once a second by the time `now`, s.
+        """Append samples with the times of `placed`, written out once a second of the time `now`, s.
 
         Raises
         ------
@@ -107,7 +107,7 @@ class Recorder:
             self.flush(now)
 
     def flush(self, now: float | None = None) -> None:
-        """Write out what waits; a disk that is full leaves whole lines.
+        """Write out all waiting lines; a full disk leaves whole lines.
 
         Raises
         ------
@@ -129,12 +129,12 @@ class Recorder:
         self._good += len(whole)
 
     def tick(self, now: float) -> None:
-        """Write out what has waited for a second where the stream has stopped."""
+        """Write out lines that have waited for a second because the stream stopped."""
         if self._waiting and self._written is not None and now - self._written >= EVERY:
             self.flush(now)
 
     def cut(self, start: float, stop: float) -> None:
-        """Take the samples of an attitude out of the file; it is written anew beside itself and renamed."""
+        """Remove the samples of an attitude from the file, through a new file that replaces it."""
         self.flush(self._written)
         first = True
         with replacing(self.path) as out:
@@ -152,14 +152,14 @@ class Recorder:
         self._good = self._file.seek(0, os.SEEK_END)
 
     def close(self) -> None:
-        """Write out what waits and close the file; one without a sample is taken away."""
+        """Write out all lines and close the file; a file without samples is deleted."""
         self.flush()
         self._file.close()
         if not self._good:
             Path(self.path).unlink(missing_ok=True)
 
     def placed(self, block: Recording) -> Recording:
-        """Return a block behind what the file holds already.
+        """Return a block with times that follow what the file already holds.
 
         Raises
         ------
@@ -174,7 +174,7 @@ class Recorder:
                 "same unit and format to go on with a recording"
             )
         if self._shift is None:
-            # A device that stayed on goes on in its own time; another one behind a gap that no window reaches across.
+            # A device that stayed on continues with its own time; another device follows a gap wider than a window.
             ahead = float(block.si("time")[0]) - self.last
             self._shift = 0.0 if ahead > _PAUSE else _PAUSE - ahead
         if not self._shift:
@@ -182,7 +182,7 @@ class Recorder:
         return block.with_columns({"time": block.column("time") + from_si(self._shift, block.units["time"])}, {})
 
     def _cut_last_line(self) -> None:
-        """Take off the part of a line that a sudden end may have left."""
+        """Remove a partial line that a sudden end may have left."""
         size = self._file.seek(0, os.SEEK_END)
         self._file.seek(max(size - _END, 0))
         tail = self._file.read()
@@ -199,16 +199,16 @@ def _head_lines(text: bytes) -> int:
     return next(k for k, line in enumerate(text.split(b"\n"), start=1) if not line.startswith(b"#"))
 
 
-# A session with its source and its recording: what a terminal and a page run alike, a step at a time.
+# The session with its source and its recording, a step at a time.
 
 
-_SILENT = 3.0  # s without samples after which it is said
+_SILENT = 3.0  # s without samples after which a message is given
 _BEFORE, _BEHIND = 1.0, 0.6
-"""What is cut out with an attitude that is dropped, s: the settling before it, and the moment of taking it up."""
+"""s that are cut out around a dropped attitude: the settling before it, and the moment of lifting after it."""
 
 
 class Runner:
-    """Brings samples from the source to the session and the recording."""
+    """Passes samples from the source to the session and the recording."""
 
     def __init__(self, source: LiveSource, session: Session, recorder: Recorder, layout: Layout | None = None) -> None:
         self.source, self.session, self.recorder = source, session, recorder
@@ -225,7 +225,7 @@ class Runner:
     def open(
         cls, source: Callable[[], LiveSource], session: Session, save: str, layout: Layout | None, *, resume: bool
     ) -> Runner:
-        """Open the recording and the source; where the source cannot be opened no empty recording stays behind."""
+        """Return a runner with open recording and source; if the source fails, no empty recording is left."""
         recorder = Recorder(save, resume=resume)
         try:
             opened = source()
@@ -244,7 +244,7 @@ class Runner:
         return self.source.ended
 
     def step(self, wait: float) -> list[Event]:
-        """Take what has come, after `wait` seconds at most, and return what happened.
+        """Take the samples that come within `wait` seconds, and return what happened.
 
         Raises
         ------
@@ -252,7 +252,7 @@ class Runner:
             The connection is lost, or the stream is none of the known, or its columns have changed; the recording so
             far is kept.
         OptionError
-            The recording cannot be written on.
+            The recording cannot be written any more.
         DataError
             The stream is not one of an accelerometer triad.
         """
@@ -279,7 +279,7 @@ class Runner:
         return events
 
     def kept(self) -> str:
-        """Say what the recording keeps of a session that ends before its record."""
+        """Return a sentence on what the recording keeps of a session that ends before its record."""
         count = len(self.session.guide.kept)
         return f"{self.recorder.path} keeps {count} attitude{'s' * (count != 1)}: --resume goes on with it"
 
@@ -291,19 +291,19 @@ class Runner:
         return self.session.events
 
     def turn(self, direction: Array) -> None:
-        """Turn a simulated unit until this direction of the body is up, as a person does; others turn them in hand.
+        """Turn a simulated unit until this direction of the body is up; real units are turned by hand.
 
         Raises
         ------
         OptionError
-            It is no simulated unit.
+            The unit is not simulated.
         """
         if not self.source.by_hand:
             raise OptionError(f"{self.source.name}: expected a simulated unit (simulate) to be turned from here")
         self.source.turn_by_hand(direction)
 
     def listen(self, wait: float) -> list[Recording]:
-        """Return the samples that have come, after `wait` seconds at most, without session and recording."""
+        """Return the samples that come within `wait` seconds, without session and recording."""
         blocks: list[Recording] = []
         for piece in self.source.get(wait):
             blocks += self._fed(piece.data, piece.time)
@@ -325,15 +325,15 @@ class Runner:
         for block in blocks:
             lies = self.session.dropping
             placed = self.recorder.placed(block)
-            if self._further is None and further_of(block.columns):
+            if self._further is None and further_triads(block.columns):
                 self._further = FurtherFits(self.recorder.path, self.session.order, self.session.gravity)
             events += self.session.feed(placed, self._stream.counts)
-            if not lies:  # in an attitude that was dropped nothing is recorded until it is left
+            if not lies:  # after an attitude is dropped nothing is recorded until the unit leaves it
                 self.recorder.write(placed, now)
         return events
 
     def _further_triads(self, events: list[Event]) -> list[Event]:
-        """Fit gyroscopes and magnetometers after an attitude once there is a fit of the accelerometers to stand on."""
+        """Fit gyroscopes and magnetometers after an attitude, once there is a fit of the accelerometers."""
         if self._further is None:
             return []
         self._fit_due |= self.session.guide.fit is not None and any(event.kind == "accepted" for event in events)
@@ -341,7 +341,7 @@ class Runner:
             self._fit_due = False
             self.recorder.flush()
             self._further.begin()
-        result = self._further.found()
+        result = self._further.take_result()
         return [] if result is None else self.session.know(*result)
 
     def _answer(self) -> None:
@@ -349,7 +349,7 @@ class Runner:
             self.source.send(self._stream.to_send)
 
     def _check_silence(self, arrived: bool, now: float) -> list[Event]:
-        """Say that nothing comes any more, or again."""
+        """Return an event when samples stop coming, or come again."""
         if arrived:
             self._last_arrival = now
             again, self._silent = self._silent, False

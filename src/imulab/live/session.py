@@ -1,6 +1,6 @@
 """A guided session: blocks of samples go in, events and warnings come out.
 
-No clock, no thread and no file is in here: the same samples give the same events.
+It has no clock, thread or file: the same samples give the same events.
 """
 
 from __future__ import annotations
@@ -21,41 +21,41 @@ from imulab.procedures.views import parameter_rows
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, parse_unit, to_si
 
-# What is wrong with a stream or a unit, said when it happens and once, in one sentence with what to do.
+# Warnings on a stream or a unit: each once, when it happens, in one sentence with what to do.
 
 
 _OFF_GRAVITY = 0.2
-"""Part of g by which a unit of MEMS size is never off."""
+"""A unit of MEMS size is never off by more than this part of g."""
 _UNITS = ("m/s^2", "g", "mg")
-_CONSTANT = 3.0  # s in which a reading that lived has not changed
-_WARMING, _PER_MINUTE = 5.0, 2.0  # K since the beginning, and K in a minute, by which a unit still warms up
+_CONSTANT = 3.0  # s without a change in which a reading that changed before counts as clipped
+_WARMING, _PER_MINUTE = 5.0, 2.0  # K since the beginning, and K in a minute, from which a unit still warms up
 _MINUTE = 60.0  # s
-_LOST = 0.01  # share of lost samples from which it is said
-_FEWEST = 500  # samples from which lost ones are a share
+_LOST = 0.01  # share of lost samples from which a warning is given
+_FEWEST = 500  # samples from which that share is meaningful
 
 
 @dataclass
 class Watch:
-    """What was said already, and what is needed to tell what is new."""
+    """The warnings so far, and what is needed to recognise new ones."""
 
-    said: dict[str, str] = field(default_factory=dict)
+    given_texts: dict[str, str] = field(default_factory=dict)
     _since: list[float | None] = field(default_factory=lambda: [None] * 3)
     _held: Array = field(default_factory=lambda: np.full(3, np.nan))
     _lively: list[bool] = field(default_factory=lambda: [False] * 3)
     _temperatures: list[tuple[float, float]] = field(default_factory=list)
 
     def _once(self, key: str, text: str) -> list[str]:
-        if key in self.said:
+        if key in self.given_texts:
             return []
-        self.said[key] = text
+        self.given_texts[key] = text
         return [text]
 
     def scatter(self, text: str) -> list[str]:
-        """Take why more attitudes help little; empty where they help."""
+        """Return the warning that more attitudes help little, the first time that there is a reason."""
         return self._once("scatter", text) if text else []
 
     def hold(self, hold: Hold, unit: str, gravity: float) -> list[str]:
-        """Look at the length of f at rest."""
+        """Return a warning where the length of f at rest shows a wrong unit."""
         length = float(np.linalg.norm(hold.mean))
         if parse_unit(unit).quantity != "acceleration":
             return [] if length else self._once("unit", "all three outputs are 0: are the accelerometers on?")
@@ -69,7 +69,7 @@ class Watch:
         )
 
     def moment(self, moment: Moment) -> list[str]:
-        """Look for an axis that is dead, or that has reached the end of its range."""
+        """Return warnings on axes that are dead, or at the end of their range."""
         messages: list[str] = []
         for k, axis in enumerate("xyz"):
             since, value = self._since[k], float(moment.mean[k])
@@ -92,7 +92,7 @@ class Watch:
         return messages
 
     def block(self, block: Recording, time: float) -> list[str]:
-        """Look at the temperature."""
+        """Return warnings on a changing temperature."""
         if "temperature" not in block or block.units["temperature"] not in ("degC", "K"):
             return []
         values = block.column("temperature")
@@ -102,7 +102,7 @@ class Watch:
         last = self._temperatures
         if not last or time - last[-1][0] >= 1.0:
             last.append((time, now))
-            del last[1 : max(len(last) - int(_MINUTE), 1)]  # the first, and those of the last minute
+            del last[1 : max(len(last) - int(_MINUTE), 1)]  # keeps the first, and those of the last minute
         first, minute = last[0][1], last[min(1, len(last) - 1)]
         messages = []
         if time - minute[0] > _MINUTE / 2 and abs(now - minute[1]) > _PER_MINUTE:
@@ -118,7 +118,7 @@ class Watch:
         return messages
 
     def counts(self, counts: Counts, samples: int) -> list[str]:
-        """Look at what the stream has lost."""
+        """Return warnings on lost, damaged, repeated and misplaced samples."""
         messages = []
         came = samples + counts.repeated + counts.reordered + counts.stray
         if counts.stray:
@@ -154,7 +154,7 @@ class Watch:
         return messages
 
 
-# A guided session: blocks of samples go in, events come out, and a view says at any moment what is to be seen.
+# The session: samples in, events out, and a view of its state.
 
 
 _ADVICE = {
@@ -183,7 +183,7 @@ class Session:
     order, gravity, targets, planned
         As for `Guide`.
     source
-        What is shown as the source.
+        Name of the source, as shown.
     """
 
     order: int | str = "auto"
@@ -213,12 +213,12 @@ class Session:
     _magnetometers: bool = False
 
     def feed(self, block: Recording, counts: Counts | None = None) -> list[Event]:
-        """Take samples, with what was wrong with the stream so far, and return what happened.
+        """Take samples, with the faults of the stream so far, and return what happened.
 
         Raises
         ------
         DataError
-            They are no samples of an accelerometer triad over time.
+            The samples are not those of an accelerometer triad over time.
         """
         self.events = []
         if not len(block):
@@ -243,7 +243,7 @@ class Session:
 
     @property
     def guide(self) -> Guide:
-        """The attitudes and the plan; there once samples have come."""
+        """The attitudes and the plan; they exist once samples have come."""
         if self._guide is None:
             self._guide = Guide(self.order, self.gravity, self.targets, self.planned)
         return self._guide
@@ -264,14 +264,14 @@ class Session:
         return self._dropping
 
     def drop(self, number: int | None = None) -> tuple[float, float] | None:
-        """Drop an attitude by its number, or else the one named as knocked, or the last; return its times, s.
+        """Drop an attitude by its number, or the one named as knocked, or the last one; return its times, s.
 
-        None where there is no attitude at all.
+        Returns None if there is no attitude.
 
         Raises
         ------
         OptionError
-            There is none of this number.
+            There is no attitude of this number.
         """
         kept = self.guide.kept
         if not kept:
@@ -291,7 +291,7 @@ class Session:
         return gone.start, gone.stop
 
     def know(self, further: tuple[KnownUnit, ...], why: Sequence[str]) -> list[Event]:
-        """Take the parameters of further triads that the recording so far gives, or why some have none."""
+        """Take the parameters of further triads, or the reasons why some have none, and return what is new."""
         self.events = []
         for name, words in FURTHER.items():
             had, has = (any(row.name.startswith(f"{name}_") for row in rows) for rows in (self._further, further))
@@ -305,7 +305,7 @@ class Session:
         return self.events
 
     def view(self) -> View:
-        """Return what is to be seen now."""
+        """Return the view of the session now."""
         guide = self.guide
         residuals, agree = guide.residuals()
         directions = guide.directions()
@@ -344,7 +344,7 @@ class Session:
             next_words="" if self._next is None else self._in_words(self._next),
             enough=self._enough,
             why_not=guide.why_not,
-            warnings=tuple(self._watch.said.values()),
+            warnings=tuple(self._watch.given_texts.values()),
         )
 
     def _begin(self, block: Recording) -> None:
@@ -357,7 +357,7 @@ class Session:
         self._plan()
 
     def _at(self, moment: Moment) -> None:
-        """Take a tenth of a second."""
+        """Process a tenth of a second."""
         self._reading, self._time = moment.mean, moment.time
         self._warn(self._watch.moment(moment))
         if moment.ended is not None:
@@ -381,7 +381,7 @@ class Session:
             self._say("state", self._advice())
 
     def _ended(self, hold: Hold) -> None:
-        """Take a hold that has ended: any that is long enough counts, and the last is known as well as it lasted."""
+        """Process a hold that has ended: a long enough one counts, and may lengthen the last attitude."""
         last = self._accepted
         if last is not None and last.start == hold.start:
             if not last.dropped and self.guide.attitudes[-1] is last:
@@ -402,7 +402,7 @@ class Session:
         return Attitude(number, hold.mean, hold.covariance, hold.start, hold.stop, hold.seconds)
 
     def _look(self) -> None:
-        """Name the attitudes that disagree with the others."""
+        """Give a message on attitudes that disagree with the others."""
         residuals, agree = self.guide.residuals()
         aside = {e.number: off for e, off, good in zip(self.guide.kept, residuals, agree, strict=True) if not good}
         for number, off in aside.items():
@@ -432,7 +432,7 @@ class Session:
             self._say("next", f"next: {self._in_words(self._next)} ({to_go})")
 
     def _in_words(self, up: Array) -> str:
-        """The attitude to take; magnetometers want another heading each time."""
+        """Return the attitude to take in words; magnetometers need another heading each time."""
         return in_words(up) + (", a quarter turn about the vertical from the last" if self._magnetometers else "")
 
     def _advice(self) -> str:

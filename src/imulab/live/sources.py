@@ -1,9 +1,7 @@
-"""Where a stream comes from.
+"""Sources of a live stream: serial ports, sockets, standard input, files, and a simulated unit.
 
-Serial ports, sockets, standard input, files, and a simulated unit on a simulated table.
-
-Each source gives what has come with its time of arrival. What blocks is read by one thread, so that neither a fit nor a
-slow screen makes the operating system's buffer run over.
+Each source returns the bytes that came with their time of arrival. Reads that block run in a thread, so that neither a
+fit nor a slow screen overflows the operating system's buffer.
 """
 
 from __future__ import annotations
@@ -29,12 +27,12 @@ from imulab.quantities import number, quantity, whole_number
 from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, from_si
 
-# A simulated unit on a simulated table: turned by the guide, by hand, or from one random attitude to the next.
+# Simulated unit: turned by the guide, by hand, or from one random attitude to the next.
 
 
 _LONGEST = 60.0  # s of a hold of the simulated unit
 _STRUCK, _SHIFT = 0.5, 5e-3 * STANDARD_GRAVITY
-"""When an attitude is knocked, s after it is put down: before it is accepted; and by how much, m/s^2."""
+"""s after an attitude is put down when it is knocked (before it is accepted), and by how much, m/s^2."""
 _KEYS = ("seed", "order", "rate", "noise", "hold", "move", "unit", "gravity", "knock", "gyro", "field", "dip", "speed")
 _KINDS = {
     "rate": ("frequency", "Hz"),
@@ -49,18 +47,18 @@ _KINDS = {
 
 @dataclass
 class SimulatedUnit:
-    """A unit that is turned while its samples are asked for.
+    """A simulated unit that is turned while its samples are read.
 
     Attributes
     ----------
     seed, order, rate, noise, move, unit, gravity
         As for `simulate_tumble`, in SI.
     hold
-        How long it stays in an attitude where nobody turns it, s.
+        Duration of an attitude where nobody turns the unit, s.
     knock
         Number of an attitude, from 1, that is knocked as soon as it is put down, or None.
     gyro
-        Whether it has gyroscopes, too.
+        Whether it has gyroscopes.
     field, dip
         Magnitude of the magnetic field, T, and its dip, rad, for magnetometers; None without them.
     follow
@@ -85,16 +83,16 @@ class SimulatedUnit:
     _field_here: Array | None = dataclass_field(default=None, init=False)
 
     def turn_to(self, direction: Array) -> None:
-        """Turn until this direction of the body is up, where it follows."""
+        """Turn until this direction of the body is up, if the unit follows the guide."""
         if self.follow and not self._held:
             self._wanted = direction
 
     def turn_by_hand(self, direction: Array) -> None:
-        """Turn until this direction of the body is up; from then on it is turned by hand alone."""
+        """Turn until this direction of the body is up; from then on the unit is turned by hand alone."""
         self._held, self._wanted = True, direction
 
     def blocks(self, step: float) -> Iterator[Recording]:
-        """Yield its samples, `step` seconds at a time, without end."""
+        """Yield its samples, `step` seconds in each block, without end."""
         rng = np.random.default_rng(self.seed)
         here = _random_direction(rng)
         known: dict[str, float] = {}
@@ -122,7 +120,7 @@ class SimulatedUnit:
                 if alone and start + size >= stay and (start + size - stay) / self.rate >= self.hold:
                     self._wanted = _random_direction(rng)
                 if self._wanted is not None and np.allclose(self._wanted, here):
-                    self._wanted = None  # said once more while the unit was being taken up
+                    self._wanted = None  # asked for again while the unit was being lifted
                 if self._wanted is not None and start + size >= stay:
                     break
             there, self._wanted = here if self._wanted is None else self._wanted, None
@@ -145,10 +143,10 @@ class SimulatedUnit:
             seed=self.seed if not number else 1000 * (self.seed + 1) + number,
         )
         if self.field is not None:
-            # The next turn begins with the field where this one leaves it.
+            # The next turn begins with the field at the end of this one.
             self._field_here = np.array([recording.si(f"truth_mag_{axis}")[-1] for axis in "xyz"])
         resting = round(_LONGEST * self.rate)
-        # The first attitude, and one that lasts longer than expected, are lain in without having been turned to.
+        # The first attitude, and one that lasts longer than expected, have no turn before them.
         first = 0 if not number or np.allclose(here, there) else resting
         names = [name for name in recording.columns if not name.startswith("truth_")]
         last = resting if first == 0 else len(recording)
@@ -161,12 +159,12 @@ class SimulatedUnit:
 
 
 def simulated_unit(text: str, *, follow: bool) -> tuple[SimulatedUnit, float]:
-    """Return a unit and its speed by a text such as ``seed=3,noise=0.5mg,speed=0``.
+    """Return the unit and its speed that a text such as ``seed=3,noise=0.5mg,speed=0`` describes.
 
     Raises
     ------
     OptionError
-        A key or value is none.
+        A key is unknown, or a value cannot be used.
     """
     settings: dict[str, Any] = {}
     for pair in text.split(",") if text else []:
@@ -189,7 +187,7 @@ def simulated_unit(text: str, *, follow: bool) -> tuple[SimulatedUnit, float]:
     if not 0 <= speed <= 1e6:
         raise OptionError(f"simulate: speed {speed:g}; expected 0 (as fast as it goes) to 1e6")
     unit = SimulatedUnit(**settings, follow=follow)
-    replace(unit)._leg(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), {}, 0)  # refuses what cannot be
+    replace(unit)._leg(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), {}, 0)  # refuses impossible settings
     return unit, speed
 
 
@@ -199,37 +197,37 @@ def _random_direction(rng: np.random.Generator) -> Array:
     return unit
 
 
-# Where a stream comes from: serial ports, sockets, standard input, files and a simulated unit.
+# Sources.
 
 
 KINDS = ("serial:PORT[@BAUD]", "udp:PORT", "tcp:HOST:PORT", "-", "replay:FILE[@SPEED]", "simulate[:key=value,..]")
 BAUD = 115_200  # of a serial port, where none is stated
-_PATIENCE = 0.1  # s that one read waits, so that a thread can be ended
+_PATIENCE = 0.1  # s that one read waits, so that its thread can be ended
 _STEP = 0.05  # s of a block of a replay or a simulation
-_CHUNK = 1 << 16  # bytes read at once; a UDP datagram has fewer
+_CHUNK = 1 << 16  # bytes of one read; a UDP datagram has fewer
 
 
 @dataclass(frozen=True, slots=True)
 class Arrived:
-    """Bytes, or samples that are known already, and when they came, s on the source's own clock."""
+    """Bytes, or decoded samples, with their time of arrival, s on the source's clock."""
 
     data: bytes | Recording
     time: float
 
 
 class LiveSource:
-    """What all sources have.
+    """Base of all sources.
 
     Attributes
     ----------
     name
-        What messages call it.
+        Name in messages.
     polled
-        Whether it can be asked for readings.
+        Whether it can be polled.
     ended
         Whether nothing more will come.
     lost
-        Why it ended, where that was no ordinary end.
+        Reason of an unexpected end.
     by_hand
         Whether it is a simulated unit, which `turn_by_hand` turns.
     """
@@ -242,7 +240,7 @@ class LiveSource:
         self.lost = ""
 
     def get(self, wait: float) -> list[Arrived]:
-        """Return what has come, after `wait` seconds at most; nothing where nothing has."""
+        """Return what comes within `wait` seconds, or nothing."""
         raise NotImplementedError
 
     def now(self) -> float:
@@ -250,20 +248,20 @@ class LiveSource:
         return time.monotonic()
 
     def send(self, data: bytes) -> None:
-        """Send bytes to the unit, where the source can."""
+        """Send bytes to the unit, if the source can."""
 
     def turn_to(self, direction: Array) -> None:
-        """Turn the unit until this direction of the body is up, where it is a simulated one that follows."""
+        """Turn a simulated unit that follows the guide until this direction of the body is up."""
 
     def turn_by_hand(self, direction: Array) -> None:
-        """Turn a simulated unit until this direction of the body is up, as a person does."""
+        """Turn a simulated unit until this direction of the body is up, as if by hand."""
 
     def close(self) -> None:
-        """Let go of what the source holds."""
+        """Release what the source holds."""
 
 
 class Threaded(LiveSource):
-    """A source that is read by a thread: `read` returns bytes, none for a moment without, None at the end."""
+    """A source that a thread reads: `read` returns bytes, empty for a moment without any, None at the end."""
 
     def __init__(
         self,
@@ -300,7 +298,7 @@ class Threaded(LiveSource):
         self._queue.put(None)
 
     def get(self, wait: float) -> list[Arrived]:
-        """Return what has come, after `wait` seconds at most."""
+        """Return what comes within `wait` seconds."""
         arrived: list[Arrived] = []
         try:
             piece = self._queue.get(timeout=wait)
@@ -313,7 +311,7 @@ class Threaded(LiveSource):
         return arrived
 
     def send(self, data: bytes) -> None:
-        """Send bytes; that the unit is gone is found by the thread that reads."""
+        """Send bytes; a lost connection is also found by the reading thread."""
         if self._write is not None:
             try:
                 self._write(data)
@@ -329,7 +327,7 @@ class Threaded(LiveSource):
 
 
 class Paced(LiveSource):
-    """Blocks of samples that are made here, each at its time: `speed` times as fast as it was, 0 without waiting."""
+    """Blocks of samples that are replayed or simulated at `speed` times their pace; 0 is without waiting."""
 
     def __init__(self, name: str, blocks: Iterator[Recording], speed: float) -> None:
         super().__init__(name)
@@ -366,7 +364,7 @@ class Paced(LiveSource):
 
 
 class Simulated(Paced):
-    """A simulated unit, which follows the guide where it is told to."""
+    """A simulated unit, which can follow the guide."""
 
     by_hand = True
 
@@ -384,7 +382,7 @@ class Simulated(Paced):
 
 
 def open_source(text: str, layout: str | None = None, *, follow: bool = False) -> LiveSource:
-    """Open a source by what a person calls it.
+    """Return the open source that a text names.
 
     Parameters
     ----------
@@ -392,14 +390,14 @@ def open_source(text: str, layout: str | None = None, *, follow: bool = False) -
         ``serial:PORT[@BAUD]``, ``udp:PORT``, ``tcp:HOST:PORT``, ``-``, ``replay:FILE[@SPEED]`` or
         ``simulate[:key=value,..]``.
     layout
-        Of the file that is replayed.
+        Layout of a replayed file.
     follow
-        Whether a simulated unit does what the guide says.
+        Whether a simulated unit follows the guide.
 
     Raises
     ------
     OptionError
-        There is no such kind of source, or it needs something that is not given.
+        There is no such kind of source, or a part of its name is missing.
     ReadError
         The port, address or file cannot be opened; the message says what to do.
     """
@@ -420,12 +418,12 @@ def open_source(text: str, layout: str | None = None, *, follow: bool = False) -
 
 
 def serial_ports() -> list[tuple[str, str]]:
-    """Return the serial ports of this machine and what is connected to them.
+    """Return the serial ports of this machine with the devices at them.
 
     Raises
     ------
     OptionError
-        pyserial is not here.
+        pyserial is not installed.
     """
     _pyserial()
     from serial.tools.list_ports import comports
@@ -495,8 +493,8 @@ def _udp(rest: str) -> LiveSource:
             return b""
         sender[:] = sender or [address]
         if address != sender[0]:
-            return b""  # one unit at a time: the one that spoke first
-        # A line of text in a datagram of its own often comes without its end.
+            return b""  # one unit only: the one that sent first
+        # A line of text in its own datagram often has no end of line.
         return data + b"\n" if data[-1:] != b"\n" and data.isascii() and data.decode().isprintable() else data
 
     return Threaded(name, read, close=link.close)

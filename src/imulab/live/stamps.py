@@ -1,4 +1,4 @@
-"""The time of each sample of a stream: the device's stamps without wrap-around, or arrival times, straightened."""
+"""The time of each sample of a stream: the device's time stamps without wrap-around, or straightened arrival times."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from imulab.recording import Array
 from imulab.units import parse_unit
 
 _WRAPS = ((2**32, 1e-6), (2**32, 1e-3), (2**24, 1e-6), (2**16, 1e-3))
-"""Counters that begin again: after how many ticks, and how long a tick is, s."""
+"""Counters that wrap around: after how many ticks, and the length of a tick, s."""
 _NEAR, _NEAR_STEPS = 0.25, 10.0
-"""A stamp at most so far behind another, s or usual steps, goes on from it."""
+"""A stamp at most this far after another, s or usual steps, continues it."""
 _SURE = 2.5
-"""A stamp at most so many usual steps behind the last, or behind a wrap-around, needs no next one to be believed."""
+"""A stamp at most so many usual steps after the last, or after a wrap-around, is accepted without a next one."""
 _SOON, _SOON_PART = 10.0, 0.005
-"""A stamp within both behind a wrap-around, s and part of the counter's length, has wrapped around."""
+"""A stamp within both after a wrap-around, s and part of the counter's length, has wrapped around."""
 _RESTART = 1.0
-"""Stamps that jump back by more than this, s, are those of a device that has started again."""
+"""Stamps that jump back by more than this, s, show that the device has started again."""
 _SET_ANEW = 600.0
-"""Stamps that jump ahead by more than this, s, are those of a clock that was set: nobody waits so long in a test."""
+"""Stamps that jump ahead by more than this, s, show that a clock was set: no test has such a pause."""
 _SLOWEST = 10.0
-"""No rate has longer steps than this, s."""
+"""s, the longest step of any rate."""
 _LATE = 1.5
-"""Steps in time longer than so many usual ones have lost samples between them."""
+"""Steps longer than so many usual ones have lost samples between them."""
 _ALIKE = 5
-"""So many steps that are alike tell the rate."""
-_POINTS, _APART = 48, 0.5  # pairs of number and arrival by which the rate is told, s apart
+"""So many similar steps show the rate."""
+_POINTS, _APART = 48, 0.5  # pairs of number and arrival that show the rate; s between them
 _PAUSE, _PAUSE_STEPS = 0.5, 20.0
 """A stream without stamps that falls behind by more than both, s and steps, has paused."""
 
 
 @dataclass
 class Counts:
-    """What was wrong with a stream so far.
+    """Faults of a stream so far.
 
     Attributes
     ----------
     lost
-        Samples that are missing, by the steps in time.
+        Missing samples, by the steps in time.
     gaps
-        Places where they are missing.
+        Places where samples are missing.
     repeated, reordered
-        Samples that came again, or behind later ones; they are left out.
+        Samples that came again, or after later ones; they are left out.
     stray
         Samples whose stamp fits neither those before nor those after; they are left out.
     damaged
         Lines or messages that could not be read, or stretches of bytes between them.
     restarts
-        Times that the device began to count its time anew, or that its clock was set.
+        How often the device started its time again, or its clock was set.
     """
 
     lost: int = 0
@@ -63,7 +63,7 @@ class Counts:
     restarts: int = 0
 
     def summary(self) -> str:
-        """Return in words what was wrong; nothing where nothing was."""
+        """Return the faults in words; empty without any."""
         parts = (
             (self.lost, "lost"),
             (self.repeated, "came again and left out"),
@@ -76,11 +76,10 @@ class Counts:
 
 
 class DeviceClock:
-    """Stamps of a device in their own unit, without wrap-around; they rise from sample to sample.
+    """Time stamps of a device in their unit, without wrap-around; they rise from sample to sample.
 
-    A stamp that jumps is believed once the next one goes on from it, or the next two do in steps that are alike: a
-    damaged digit moves one stamp, while a gap, a counter that begins again, a device that does or a slower rate moves
-    all that follow.
+    A stamp that jumps is accepted once the next one continues it, or the next two do in similar steps: a damaged digit
+    moves one stamp, while a gap, a wrap-around, a restart or a slower rate moves all that follow.
     """
 
     def __init__(self, unit: str, counts: Counts) -> None:
@@ -97,13 +96,13 @@ class DeviceClock:
         self._missing: Array = np.empty(0)
 
     def times(self, stamps: Array) -> tuple[Array, NDArray[np.bool_], list[int]]:
-        """Take stamps on.
+        """Return the times of stamps.
 
         Returns
         -------
         times, kept, again
-            Times in the stamps' unit and which samples to keep, both of shape (n,); the numbers of the samples to be
-            given again in front of the next ones, because only those can tell what their stamps are worth.
+            Times in the stamps' unit and which samples to keep, both of shape (n,); the numbers of the samples to
+            repeat before the next ones, because only those can decide on their stamps.
         """
         times = stamps + self._offset
         steps = np.diff(times) if self._last is None else np.diff(times, prepend=self._last)
@@ -121,7 +120,7 @@ class DeviceClock:
         return times, kept, again
 
     def _count(self, steps: Array) -> None:
-        """Count the samples that are missing, and follow the usual step."""
+        """Count the missing samples, and follow the usual step."""
         if not steps.size:
             return
         usual = _middle(steps)
@@ -131,16 +130,16 @@ class DeviceClock:
         if len(newest) == _ALIKE and _alike(newest.tolist()):
             self._step = float(newest.mean())
             longer = max(self._step, known)
-        else:  # slowly, and no further than a jitter, so that gaps do not become usual
+        else:  # slowly, and only within the jitter, so that gaps do not become usual
             self._step = known + 0.05 * (min(usual, _LATE * known) - known)
         missing = np.append(self._missing, np.round(steps / longer) - 1)
-        missing[joined <= _LATE * longer] = 0  # of steps that turn out to be those of another rate, too
+        missing[joined <= _LATE * longer] = 0  # also of steps that turn out to be those of another rate
         self._counts.gaps += int(np.count_nonzero(missing)) - int(np.count_nonzero(self._missing))
         self._counts.lost += int(missing.sum() - self._missing.sum())
         self._recent, self._missing = joined[1 - _ALIKE :], missing[1 - _ALIKE :]
 
     def _judged(self, stamps: list[float], usual: float) -> tuple[Array, NDArray[np.bool_], list[int]]:
-        """Go through a block with a stamp that does not rise, or jumps ahead."""
+        """Return times, kept samples and repeats of a block with a stamp that falls, or jumps ahead."""
         last = self._last
         times, kept = np.empty(len(stamps)), np.zeros(len(stamps), dtype=np.bool_)
         for index, stamp in enumerate(stamps):
@@ -166,17 +165,17 @@ class DeviceClock:
         return times, kept, []
 
     def _believed(self, step: float | None, ahead: list[float], reach: float) -> bool | None:
-        """Tell whether to believe a stamp that jumped by `step`, from the one or two steps behind it; None: not yet."""
+        """Return whether to accept a stamp that jumped by `step`, by the one or two steps after it; None: not yet."""
         if not ahead:
             return None
         if ahead[0] <= 0 or (step is not None and 0 < step <= reach):
             return ahead[0] > 0
-        if ahead[0] <= reach:  # a stamp that fell back is not believed where the next goes on from the last before it
+        if ahead[0] <= reach:  # a stamp that fell is rejected if the next one continues the last before it
             return step is None or not step < 0 < step + ahead[0] <= reach
         return ahead[0] <= self._slowest and _alike(ahead) if len(ahead) > 1 else None
 
     def _jump(self, stamp: float, last: float, sure: float) -> None:
-        """Take a jump of the stamps out of the time, where it is none of time."""
+        """Remove a jump of the stamps from the time unless time has really passed."""
         step = stamp + self._offset - last
         wrap = next((w for w, soon in self._wraps if step < 0 < step + w <= max(soon, sure) and stamp < w), None)
         if wrap is not None:
@@ -187,7 +186,7 @@ class DeviceClock:
 
 
 def _others(stamps: list[float], index: int) -> list[int]:
-    """Return the place of a stamp and those of the next two, each other than the one before."""
+    """Return the places of a stamp and of the next two stamps that differ from the one before."""
     places = [index]
     for place in range(index + 1, len(stamps)):
         if stamps[place] != stamps[places[-1]]:
@@ -198,7 +197,7 @@ def _others(stamps: list[float], index: int) -> list[int]:
 
 
 def _middle(steps: Array) -> float:
-    """Return the median, the lesser of two; for a few numbers `numpy.median` takes ten times as long."""
+    """Return the lower median; for a few numbers `numpy.median` takes ten times as long."""
     return float(np.sort(steps)[(len(steps) - 1) // 2])
 
 
@@ -207,10 +206,10 @@ def _alike(steps: Sequence[float]) -> bool:
 
 
 class ArrivalClock:
-    """Times of samples without stamps: a robust line through arrival times over the numbers of samples.
+    """Times of samples without stamps: a robust line of arrival times over the numbers of samples.
 
     The line is Theil's (median of slopes; Sen 1968) through the ends of at most 48 blocks, half a second apart once
-    there are so many, so that bursts of a driver or a network leave no trace and a drift is followed.
+    there are so many: bursts of a driver or a network have no effect, and a drift is followed.
     """
 
     def __init__(self, counts: Counts) -> None:
@@ -240,12 +239,12 @@ class ArrivalClock:
             self._arrivals.append(arrival)
             del self._numbers[:-_POINTS], self._arrivals[:-_POINTS]
             slope, level = self._line()
-        if not slope:  # one block only: its samples came since the time before, of which nothing is known
+        if not slope:  # one block only: its samples came since the time before, at an unknown rate
             slope = max(arrival - self._last, 1e-3) / count if self._count else 1e-2
             level = arrival - slope * number
         numbers = np.arange(self._count, self._count + count, dtype=np.float64)
         times: Array = level + slope * numbers
-        if self._count and times[0] <= self._last:  # a better line lies lower: catch up with it without standing still
+        if self._count and times[0] <= self._last:  # a better line lies lower: slow down until it catches up
             end = max(float(times[-1]), self._last + 0.5 * slope * count)
             times = self._last + (end - self._last) / count * (numbers + 1 - self._count)
         self._count += count
@@ -253,7 +252,7 @@ class ArrivalClock:
         return times
 
     def begin(self, counts: list[int], arrivals: list[float]) -> None:
-        """Learn the line from the blocks of the first seconds before their times are asked for."""
+        """Fit the line to the blocks of the first seconds before their times are asked for."""
         if not counts:
             return
         self._origin = arrivals[0]

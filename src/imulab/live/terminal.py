@@ -1,4 +1,4 @@
-"""A session in the terminal: the view drawn anew several times a second, or a line for each event."""
+"""A session in the terminal: the view drawn several times a second, or a line for each event."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _ROWS, _COLUMNS = 9, 37  # of the sphere on the terminal
 _MILLI = 1e3  # to mg
 _BAR = 14  # characters of a bar
 _EVENTS = 3
-"""Lines that are left for what has happened, above the picture."""
+"""Lines for the latest events, above the picture."""
 _MOST_WARNINGS = 3  # the latest
 _NARROW = 70  # characters of a terminal whose table has narrow gaps
 
 
 def draw(view: View, width: int = 80, height: int = 24, *, by_hand: bool = False) -> Group:
-    """Return a view as what rich prints in `width` columns and `height` lines: what to do, where one is, what is known.
+    """Return a view for rich in `width` columns and `height` lines: what to do, the attitudes, and the parameters.
 
-    `by_hand` is whether keys turn the unit. What there is no room for is left out, the map first.
+    `by_hand` is whether keys turn the unit. Parts without room are left out, the map first.
     """
     above = [*_advice(view, width), _progress(view), _facts(view)]
     below = [Text(line, style="yellow") for text in view.warnings[-_MOST_WARNINGS:] for line in wrap(text, width)]
@@ -52,7 +52,7 @@ def draw(view: View, width: int = 80, height: int = 24, *, by_hand: bool = False
 
 
 def _advice(view: View, width: int) -> list[Text]:
-    """What to do, in a bar across the screen; and how the unit lies."""
+    """Return what to do, in a bar across the screen, and the unit's present attitude."""
     style = f"bold reverse {_COLOURS[view.state]}"
     advice = f"{view.advice}: {view.hold:.1f} s" if view.state == "still" and view.hold else view.advice
     lines = [Text(f" {line}".ljust(width), style=style) for line in wrap(advice, width - 2) or [""]]
@@ -92,7 +92,7 @@ def _facts(view: View) -> Text:
 
 
 def _sphere(view: View) -> list[Text]:
-    """The sphere of upward directions as a map: z up at the top, x in the middle; o held, x off, N next, + now."""
+    """Return a map of upward directions: z up at the top, x in the middle; o held, x off, N next, + now."""
     marks = np.full((_ROWS, _COLUMNS), "·")
     for up, mark in [
         *((held.up, "x" if held.aside else "o") for held in view.attitudes),
@@ -110,7 +110,7 @@ def _sphere(view: View) -> list[Text]:
 
 
 def _parameters(view: View, width: int) -> list[Text]:
-    """A line for each kind of parameter: its axes, the largest standard uncertainty, and what of its target that is."""
+    """Return a line for each kind of parameter: its axes, largest standard uncertainty, and ratio to the target."""
     if not view.parameters:
         return [Text("no result yet: more attitudes are needed", style="dim")] if view.attitudes else []
     kinds: dict[str, list[KnownUnit]] = {}
@@ -160,8 +160,8 @@ def _attitudes(view: View) -> str:
     return "|f| - g in mg:  " + "   ".join(parts) if parts else ""
 
 
-def turned(key: str, wanted: Array | None) -> Array | None:
-    """Return the direction that a key turns upward: x, y, z, down with X, Y, Z, the one wanted with n; else None."""
+def direction_of_key(key: str, wanted: Array | None) -> Array | None:
+    """Return the direction that a key turns upward: x, y, z; down with X, Y, Z; the next one with n; else None."""
     if key == "n":
         return wanted
     axis = "xyz".find(key.lower()) if key else -1
@@ -181,7 +181,7 @@ def _keys(view: View, *, by_hand: bool) -> Text:
 
 @contextmanager
 def keys(*, wanted: bool) -> Iterator[list[str]]:
-    """Yield a list that `pressed` fills: keys without Enter where standard input is a terminal that has them."""
+    """Yield a list that `pressed` fills: keys without Enter, if standard input is a terminal that has them."""
     try:
         import termios
         import tty
@@ -200,7 +200,7 @@ def keys(*, wanted: bool) -> Iterator[list[str]]:
 
 
 def pressed(usable: list[str]) -> str:
-    """Return a key that was pressed, or nothing."""
+    """Return a key that was pressed, or an empty text."""
     if not usable:
         return ""
     import os

@@ -1,9 +1,6 @@
-"""What is to be seen of a session at one moment.
+"""The view of a session at one moment, the fits of further triads, and readings corrected by a fresh record.
 
-The further triads of a session, gyroscopes and magnetometers, and what a fresh record makes of the readings that
-still come.
-
-A fit runs in a process of its own, beside the session.
+Fits of gyroscopes and magnetometers run in their own process beside the session.
 """
 
 from __future__ import annotations
@@ -31,15 +28,15 @@ from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import STANDARD_GRAVITY
 
-# What is to be seen of a session at one moment: numbers and sentences that a terminal and a page draw alike.
+# The view: numbers and sentences that terminal and page draw alike.
 
 
-_FULL, _HALF, _LITTLE = 0.88, 0.55, 0.2  # sines of how far a side is turned, from which a movement is called so
+_FULL, _HALF, _LITTLE = 0.88, 0.55, 0.2  # sines of the angle from which a side is up, half up or slightly up
 
 
 @dataclass(frozen=True)
 class HeldValues:
-    """An attitude: its number, upward direction of the body, ``|f| - g``, m/s^2, whether it disagrees, length, s."""
+    """An attitude: number, upward direction of the body, ``|f| - g``, m/s^2, whether it disagrees, length, s."""
 
     number: int
     up: tuple[float, ...]
@@ -50,7 +47,7 @@ class HeldValues:
 
 @dataclass(frozen=True)
 class KnownUnit:
-    """A parameter as people read it, and its standard uncertainty over its target where it has one."""
+    """A parameter in its reading unit, and the ratio of its standard uncertainty to its target, if it has one."""
 
     name: str
     value: float
@@ -66,7 +63,7 @@ class View:
     Attributes
     ----------
     source, format
-        Where the stream comes from, and what it is.
+        Name of the stream's source, and its format.
     state
         ``waiting``, ``moving``, ``settling``, ``still`` or ``accepted``.
     advice
@@ -74,29 +71,29 @@ class View:
     seconds, samples, rate
         Length of the stream, s; its samples; samples per second.
     counts
-        What was wrong with it.
+        Faults of the stream.
     up, length
         Upward direction of the body, shape (3,), and length of the reading, in `unit`; None before samples.
     temperature
-        degC, where the stream has it.
+        degC, if the stream has it.
     hold
-        How long the present hold is, trimmed, s.
+        Length of the present hold after trimming, s.
     attitudes
-        Those that are kept.
+        The kept attitudes.
     wanted
-        How many there will be, as far as can be told.
+        How many there will be, as far as known.
     parameters
-        Of the fit; empty before there are enough attitudes.
+        Parameters of the fit; empty before there are enough attitudes.
     targets
-        Each target and the worst standard uncertainty over it: met at 1 or below, infinite before a fit.
+        Each target, with the largest ratio of standard uncertainty to target: met at 1 or below, infinite before a fit.
     next, next_words
-        Upward direction to take next, None where none is needed; in words.
+        Upward direction to take next, None where none is needed; the same in words.
     enough
-        A sentence once the target is met, with what five more attitudes would bring; empty before.
+        A sentence once the target is met, with the gain of five more attitudes; empty before.
     why_not
-        Why there is no fit; empty where there is one.
+        Why there is no fit; empty if there is one.
     warnings
-        All that were given.
+        All warnings so far.
     """
 
     source: str
@@ -133,19 +130,19 @@ def in_words(up: Array) -> str:
     return ", ".join(parts)
 
 
-# What a fresh record makes of the readings that still come: to see that it works.
+# Readings corrected by a fresh record, to show that it works.
 
 
 @dataclass(frozen=True)
 class CorrectedReading:
-    """Length of the mean reading of a block, m/s^2, as it came (None for counts) and corrected; and its rate, rad/s."""
+    """Length of a block's mean reading, m/s^2, raw (None for counts) and corrected, and its rate, rad/s."""
 
     raw: float | None
     length: float
     rate: float | None
 
     def text(self, gravity: float) -> str:
-        """Say it in words, the length against local gravity, m/s^2."""
+        """Return it in words, with the length against local gravity, m/s^2."""
         off = 1e3 * (self.length - gravity) / STANDARD_GRAVITY
         rate = "" if self.rate is None else f"   rate {np.degrees(self.rate):.3f} deg/s"
         return f"corrected |f| {self.length:.4f} m/s², {off:+.2f} mg from g{rate}"
@@ -157,7 +154,7 @@ def corrected_reading(ready: Loaded, block: Recording, *, gyro: bool) -> Correct
     Raises
     ------
     DataError
-        The record corrects nothing in it.
+        The record corrects nothing in the block.
     """
     after = apply(ready, block)
 
@@ -168,15 +165,15 @@ def corrected_reading(ready: Loaded, block: Recording, *, gyro: bool) -> Correct
     return CorrectedReading(raw, length(after, "accel"), length(after, "gyro") if gyro else None)
 
 
-# The further triads of a session, gyroscopes and magnetometers: fitted to the saved recording while it goes on.
+# Further triads, gyroscopes and magnetometers, fitted to the growing recording.
 
 
 _REST = 5.0
-"""The next fit waits for so many times as long as the last took, so that it stays beside the session."""
+"""The next fit waits so many times as long as the last one took, so that the session stays fast."""
 FURTHER = {"gyro": "gyroscopes", "mag": "magnetometers"}
-"""The triads that are fitted on top of the accelerometers, by the first part of their columns' names."""
-Found = tuple[tuple[KnownUnit, ...], tuple[str, ...]]
-"""Parameters of the further triads, and why some have none."""
+"""Triads that are fitted beside the accelerometers, by the first part of their columns' names."""
+TriadResult = tuple[tuple[KnownUnit, ...], tuple[str, ...]]
+"""Parameters of the further triads, and the reasons why some have none."""
 
 
 class FurtherFits:
@@ -194,7 +191,7 @@ class FurtherFits:
         return self._process is None and monotonic() >= self._after
 
     def begin(self) -> None:
-        """Fit what the file holds now."""
+        """Start a fit of what the file holds now."""
         context = get_context("spawn")
         self._answer, theirs = context.Pipe(duplex=False)
         self._process = context.Process(target=_fit, args=(theirs, *self._given), daemon=True)
@@ -202,12 +199,12 @@ class FurtherFits:
         theirs.close()
         self._begun = monotonic()
 
-    def found(self) -> Found | None:
-        """Return what a fit has found; None while there is none that has ended."""
+    def take_result(self) -> TriadResult | None:
+        """Return the result of a fit that has ended, or None."""
         if self._process is None or self._answer is None or not self._answer.poll():
             return None
         try:
-            result: Found = self._answer.recv()
+            result: TriadResult = self._answer.recv()
         except EOFError:
             result = (), ("the fit of the further triads was ended from outside",)
         self._after = monotonic() + _REST * (monotonic() - self._begun)
@@ -215,7 +212,7 @@ class FurtherFits:
         return result
 
     def close(self) -> None:
-        """End a fit that is still running."""
+        """End a running fit."""
         if self._process is not None and self._answer is not None:
             self._process.kill()
             self._process.join(1.0)
@@ -224,14 +221,14 @@ class FurtherFits:
 
 
 def fit_triads(fit: Callable[[list[str]], Calibration], there: list[str]) -> tuple[Calibration, list[str], list[str]]:
-    """Fit the accelerometers and further triads; one that is refused is left out. Return why, too.
+    """Return the record of accelerometers and further triads, the triads in it, and why others are left out.
 
     Parameters
     ----------
     fit
         Makes a record with these further triads.
     there
-        Those that the recording has, of `FURTHER`.
+        Further triads in the recording, of `FURTHER`.
     """
     try:
         return fit(there), there, []
@@ -247,8 +244,8 @@ def fit_triads(fit: Callable[[list[str]], Calibration], there: list[str]) -> tup
     return record, further, why
 
 
-def further_of(columns: Container[str]) -> list[str]:
-    """Return the further triads that a recording or block of these columns has."""
+def further_triads(columns: Container[str]) -> list[str]:
+    """Return the further triads in a recording or block with these columns."""
     return [name for name in FURTHER if all(column in columns for column in triad(name))]
 
 
@@ -259,7 +256,7 @@ def _fit(answer: Connection, path: str, order: int | str, gravity: Gravity | Non
         attitudes = find_attitudes(recording)
         record, further, why = fit_triads(
             lambda names: fit_tumble(attitudes, order=order, gravity=gravity, with_=names).calibration,
-            further_of(recording.columns),
+            further_triads(recording.columns),
         )
     except ImulabError as error:
         answer.send(((), (str(error),)))

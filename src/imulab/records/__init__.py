@@ -1,4 +1,4 @@
-"""Calibration records: what a procedure determined, written whole, read back checked, and compared."""
+"""Calibration records: written whole, checked when read, and compared."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from pathlib import Path
 
 from imulab.errors import readable
 
-# Whether a file is a record, told by its first bytes.
+# Recognition of records by the first bytes of a file.
 
 
 _LARGEST_RECORD = 1 << 26  # bytes; no record is larger
 
 
 def is_json(file: str) -> bool:
-    """Return whether a file is a record rather than a recording: an object that holds one of two marks of records."""
+    """Return whether a file is a record and not a recording: a JSON object with one of two marks of records."""
     from imulab.records.calibration import FORMAT
 
     if file == "-" or (Path(file).exists() and not Path(file).is_file()):

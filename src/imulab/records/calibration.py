@@ -62,7 +62,7 @@ def json_text(content: Mapping[str, Any]) -> str:
 
 
 def sealed_text(content: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the `content_sha256` of a record's content, and the text of its file with it as the last key.
+    """Return the `content_sha256` of a record's content, and the text of its file with that as the last key.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def content_sha256(content: Mapping[str, Any]) -> str:
 
 
 def sealed_bytes(data: bytes) -> bytes | None:
-    """Return what `content_sha256` hashes, rearranged from the bytes of a record's file, each value as it stands there.
+    """Return the bytes that `content_sha256` hashes, rearranged from a record's file, each value as it stands there.
 
     Writing numbers takes longer than all else of a record's reading. None where a key appears twice, or has an escape.
 
@@ -113,7 +113,7 @@ def sealed_bytes(data: bytes) -> bytes | None:
 
 
 def _add_object(members: Mapping[str, Raw], escapes: bool, pieces: list[bytes]) -> bool:
-    """Add the text of an object; return False where a key has an escape, as far as the file holds any."""
+    """Add the text of an object; return False where a key has an escape."""
     before = b'{"'
     for key in sorted(members):
         if escapes and ('"' in key or "\\" in key or not key.isprintable()):
@@ -143,7 +143,7 @@ def _add_value(text: bytes, escapes: bool, pieces: list[bytes]) -> bool:
     return True
 
 
-# The calibration record: what a procedure found, with uncertainty, provenance and the data behind its figures.
+# The record.
 
 
 FORMAT = "imulab.calibration"
@@ -284,7 +284,7 @@ class Calibration:
         return sealed if first_hidden(content) is None else sealed_text(plain_values(content, ""))
 
     def _content(self) -> dict[str, Any]:
-        """Return the record as it goes into its file, without ``content_sha256``."""
+        """Return the record as it stands in its file, without ``content_sha256``."""
         return {
             "format": FORMAT,
             "version": self.version,
@@ -333,7 +333,7 @@ class Calibration:
     @classmethod
     @checked
     def load(cls, path: str | PathLike[str]) -> Calibration:
-        """Read a record; see `imulab.load`."""
+        """Return a record from a file; see `imulab.load`."""
         record: Calibration = views().load(Path(path))
         return record
 

@@ -1,4 +1,4 @@
-"""One record of a unit against another of the same procedure: what changed, in units of the combined uncertainty."""
+"""Comparison of two records of a unit by the same procedure: changes in units of their combined uncertainty."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from imulab.records.calibration import Calibration
 _SINGULAR = 1e-9
 """Eigenvalues of the correlations below this share of the largest belong to parameters that follow from others."""
 _ALIKE = {"degC": (1.0, 0.0), "s": (0.0, 0.1)}
-"""Quantities of two models count as different beyond this, absolute and relative; others beyond 1e-6 relative."""
+"""Quantities of two models differ beyond this, absolute and relative; others beyond 1e-6 relative."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What became of one parameter: the difference, and its standard uncertainty, None where one record states none."""
+    """Change of one parameter: difference and its standard uncertainty, None where one record states none."""
 
     name: str
     difference: float
@@ -62,7 +62,7 @@ class RecordComparison:
 def compared(
     first: Calibration, second: Calibration, same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
 ) -> RecordComparison:
-    """Compare two records of one unit by one procedure, in units of their combined uncertainty.
+    """Return the comparison of two records of one unit by one procedure, in units of their combined uncertainty.
 
     A change counts as significant where it exceeds what chance gives one of all the parameters in twenty comparisons
     (Bonferroni), by Student's t where a noise was estimated. A parameter without an uncertainty, or one that the
@@ -116,7 +116,7 @@ def _check_units(first: Calibration, second: Calibration) -> None:
 
 
 def _model_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[str]:
-    """Entries of the models that both have and that differ: words, numbers, quantities with a unit, sets of these."""
+    """Return the entries of both models that differ: words, numbers, quantities with a unit, sets of these."""
     for key, mine in first.items():
         its = second.get(key)
         if isinstance(mine, dict) and isinstance(its, dict):
@@ -126,7 +126,7 @@ def _model_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> I
 
 
 def _quantity_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[str]:
-    """The difference of two quantities with a unit, or those of two sets of entries."""
+    """Return the difference of two quantities with a unit, or those of two sets of entries."""
     if not {"value", "unit"} <= first.keys() & second.keys():
         yield from _model_differences(first, second)
         return
@@ -137,7 +137,7 @@ def _quantity_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -
 
 
 def _uncertainty(name: str, first: Calibration, second: Calibration) -> float | None:
-    """Return the uncertainty of a difference; None where one is not stated, or is no part of the covariance."""
+    """Return the uncertainty of a difference; None where a record states none, or keeps it out of its covariance."""
     a, b = (record.parameters[name].standard_uncertainty for record in (first, second))
     if a is None or b is None:
         return None
@@ -147,7 +147,7 @@ def _uncertainty(name: str, first: Calibration, second: Calibration) -> float | 
 
 
 def _shared(first: Calibration, second: Calibration, names: list[str]) -> Array:
-    """Covariance that a difference does not have, since both records have the error in common (gravity of a place)."""
+    """Return the covariance of errors that both records have in common (gravity of a place), which cancel."""
     total = np.zeros((len(names), len(names)))
     mine, its = (record.fit.get("shared", {}) for record in (first, second))
     for what in mine.keys() & its.keys():
@@ -190,7 +190,7 @@ def _block(record: Calibration, names: list[str]) -> Array:
 
 
 def different_units(*named: tuple[str, Mapping[str, str]], keys: Sequence[str] = ("serial",)) -> str | None:
-    """Return which two of several things are of different units, in words; None where all may be of one.
+    """Return words for two things that belong to different units; None where all may belong to one.
 
     ``("a.csv", head)`` and ``("the record", sensor)`` give ``a.csv is of serial 7, the record of 8``. What states no
     serial number, or no element of an array (`keys`), speaks for no unit.

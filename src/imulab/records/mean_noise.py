@@ -1,4 +1,4 @@
-"""The uncertainty of means at rest as measures of a bias, from the record of a noise model of the same sensor."""
+"""The uncertainty of means at rest as measures of a bias, from a noise record of the same sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from imulab.records.comparison import different_units
 from imulab.records.sections import Above0, Part, Size, part
 
 _TIMES_THE_REST = 4.0
-"""Means of so much less than the record: 93 to 99 % of them are within twice their uncertainty."""
+"""Part of the record that a mean may last: 93 to 99 % of such means are within twice their uncertainty."""
 
 
 class _Values(Part):
@@ -47,7 +47,7 @@ class _Fit(Part):
 def mean_uncertainties(
     record: Calibration, columns: Sequence[str], duration: float, unit: str, head: Mapping[str, str]
 ) -> tuple[Array, list[str]]:
-    """Return the standard uncertainty of the mean of each column over a duration, shape (k,), and what there is to say.
+    """Return the standard uncertainty of each column's mean over a duration, shape (k,), and notes.
 
     ``u^2`` of `bias_square`, averaged over the candidate models by their weights, times what the uncertainty of their
     parameters adds, as the record states it at 1, 10, 100 s ...

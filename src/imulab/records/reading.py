@@ -1,4 +1,4 @@
-"""Records from the bytes of their files: checked for damage, for what they lack, and for what cannot be."""
+"""Records from the bytes of their files, checked for damage, missing parts and impossible values."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
 
 
 def _as_sealed(data: bytes) -> tuple[dict[str, Any], str] | None:
-    """Return the content of a record's file and its ``content_sha256`` where the file is as it was sealed, else None.
+    """Return the content of a record's file and its ``content_sha256`` if the file is as it was sealed, else None.
 
     Everything else, a file that is laid out in another way included, is left to slower reading.
     """
@@ -115,7 +115,7 @@ def _validated(content: dict[str, Any], name: str, *, plain: bool) -> Calibratio
 
 
 def _check_numbers(record: Calibration) -> None:
-    """Check that uncertainties are none below zero, and that the covariance is one of known parameters."""
+    """Refuse uncertainties below zero, and a covariance of unknown parameters."""
     for key, p in record.parameters.items():
         for value in (p.standard_uncertainty, p.standard_uncertainty_given_order):
             if value is not None and value < 0:

@@ -39,18 +39,18 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 LARGEST = 1e100
-"""No quantity of a sensor is larger; squares and cubes of what is not are numbers."""
+"""Largest quantity of a sensor; its square and cube are finite."""
 
 P = TypeVar("P", bound="Part")
 T = TypeVar("T")
 Place: TypeAlias = "tuple[Place, str | int] | None"
-"""Where in a record a value stands: the place of what holds it, and its key or index there; None for the record."""
+"""Place of a value in a record: the place of its container, and its key or index there; None for the record."""
 _Counts: TypeAlias = dict[str, tuple[int, Place]]
 _Reader: TypeAlias = Callable[[Any, Place, _Counts], Any]
 
 
 class PlainKind(msgspec.Struct, frozen=True):
-    """A plain value: what messages call it, and its test."""
+    """A plain value: its name in messages, and its test."""
 
     name: str
     fits: Callable[[Any], bool]
@@ -71,7 +71,7 @@ _PLAIN = {
 
 
 class _PartMeta(msgspec.StructMeta):
-    """Makes the classes of parts, which are made with keywords: msgspec does not hand that on to what is derived."""
+    """Metaclass of parts, which passes keywords on to derived classes; msgspec's does not."""
 
     def __new__(mcls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **config: Any) -> Any:
         return super().__new__(mcls, name, bases, namespace, kw_only=True, **config)
@@ -79,7 +79,7 @@ class _PartMeta(msgspec.StructMeta):
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
 class Part(msgspec.Struct, metaclass=_PartMeta, frozen=True, dict=True):
-    """What code fills and reads of one part of a record; whoever reads a field that a record lacks gets a RecordError.
+    """One part of a record; reading a field that the record lacks raises RecordError.
 
     A record need not hold what nobody asks it for: one that is only exported needs no data for figures.
     """
@@ -102,7 +102,7 @@ def _none() -> None:
 
 
 def holds(value: Part, name: str) -> bool:
-    """Return whether the record that a part was read from holds a field, or its default stands for it."""
+    """Return whether the record of a part has a field, and not its default."""
     try:
         object.__getattribute__(value, name)
     except AttributeError:
@@ -120,7 +120,7 @@ def entries(value: Part) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return what a field of a part holds as it stands in a record."""
+    """Return the value of a field as it stands in a record."""
     if isinstance(value, Part):
         return entries(value)
     if type(value) is list:
@@ -137,7 +137,7 @@ def _written(kind: type[Part]) -> list[tuple[str, str, bool]]:
 
 
 class Named(dict[str, Any]):
-    """Values by name; whoever asks for one that the record lacks gets a RecordError."""
+    """Values by name; reading one that the record lacks raises RecordError."""
 
     def __init__(self, values: Mapping[str, Any], place: Place) -> None:
         super().__init__(values)
@@ -173,7 +173,7 @@ class StatedGravity(Part):
 
     @classmethod
     def of(cls, gravity: Gravity) -> StatedGravity:
-        """Return what a record says of the gravity that it was made with."""
+        """Return the gravity that a record was made with."""
         return cls(
             value=gravity.value,
             unit="m/s^2",
@@ -220,7 +220,7 @@ def read(kind: type[T], value: Any, place: str = "") -> T:
 
 
 def check_sizes(value: Any, where: Place = None) -> None:
-    """Refuse numbers that no quantity has.
+    """Refuse numbers larger than any quantity.
 
     Raises
     ------
@@ -246,7 +246,7 @@ def check_sizes(value: Any, where: Place = None) -> None:
 
 @cache
 def _reader(kind: Any) -> _Reader:
-    """Return the function that reads an annotation's values: from a plain value, its place, and the lists' lengths."""
+    """Return the function that reads values of an annotation, from a plain value, its place, and the lists' lengths."""
     origin, arguments = get_origin(kind), get_args(kind)
     if kind is Any:
         return lambda value, where, counts: value
@@ -292,7 +292,7 @@ def _plain_reader(kind: PlainKind) -> _Reader:
 
 
 def _list_reader(kind: Any, count: int | str | None) -> _Reader:
-    """Return the reader of a list of so many entries, or of as many as other lists of that name have."""
+    """Return the reader of a list of a fixed length, or of the length of other lists of that name."""
     read_item = _reader(kind)
 
     def read_list(value: Any, where: Place, counts: _Counts) -> list[Any]:
@@ -313,7 +313,7 @@ def _list_reader(kind: Any, count: int | str | None) -> _Reader:
 
 
 def _mapping_reader(read_item: _Reader, *, lacks_named: bool) -> _Reader:
-    """Return the reader of values by name; with `lacks_named`, asking for one that is missing names its place."""
+    """Return the reader of values by name; with `lacks_named`, a missing one raises an error with its place."""
 
     def read_mapping(value: Any, where: Place, counts: _Counts) -> dict[str, Any]:
         items = {key: read_item(item, (where, key), counts) for key, item in _named(value, where).items()}
@@ -356,7 +356,7 @@ def _part_reader(kind: type[Part]) -> _Reader:
 
 
 def _incomplete(kind: type[Part], held: Mapping[str, Any], missing: Sequence[str], where: Place) -> Part:
-    """Return a part without the fields that the record lacks: whoever reads one of these gets an error."""
+    """Return a part without the fields that the record lacks: reading one of these raises an error."""
     result = kind(**held, **dict.fromkeys(missing))
     result.__dict__["place"] = where
     for name in missing:
@@ -389,7 +389,7 @@ def _named(value: Any, where: Place) -> Mapping[str, Any]:
 
 
 def _text(where: Place) -> str:
-    """Return a place as messages name it: ``fit.orders[2].rms``."""
+    """Return a place as messages state it: ``fit.orders[2].rms``."""
     if where is None:
         return ""
     outer, key = _text(where[0]), where[1]

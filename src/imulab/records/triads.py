@@ -71,7 +71,7 @@ class AccelerometerLaws(Struct, frozen=True):
 
 
 def _in_pieces(knots: Array, coefficient: Array, temperature: Array) -> Array:
-    """Return laws of pieces between knots, (pieces, rows, terms), at temperatures (n,), shape (n, rows)."""
+    """Return laws in pieces between knots, (pieces, rows, terms), at temperatures (n,), shape (n, rows)."""
     held = np.clip(temperature, knots[0], knots[-1])
     piece = np.clip(np.searchsorted(knots, held, side="right") - 1, 0, len(knots) - 2)
     start, stop = knots[piece], knots[piece + 1]
@@ -128,7 +128,7 @@ class Accelerometers(Struct, frozen=True):
 
 
 class Magnetometers(Struct, frozen=True):
-    """``P M = S (A + b)``, ``A = s + k2 s^2``, ``s = T m``: what a unit's magnetometers put out in a field m.
+    """Magnetometers ``P M = S (A + b)``, ``A = s + k2 s^2``, ``s = T m``: outputs M in a field m.
 
     Scale factor S (3,), matrix T (3, 3), bias (3,), k2 (3,), signed permutation P (3, 3), the unit of outputs M, and
     the magnitude of the field, T; None where that is not known, and m is in units of it.
@@ -164,7 +164,7 @@ class Triads(Struct, frozen=True):
 
 
 class LinearFit(Struct, frozen=True):
-    """Accelerometers fitted anew without nonlinearity, None where they cannot be, and what is said of it.
+    """Accelerometers fitted again without nonlinearity, or None, and a remark on them.
 
     `remark` goes on from the parameters that were fitted: ``are those of the whole model: ...``.
     """
@@ -185,6 +185,6 @@ def output_to_si(unit: str, si: str) -> tuple[float, str]:
 
 
 def text_in_g(force: float) -> str:
-    """Return a specific force, m/s^2, in mg or ug as people read it."""
+    """Return a specific force, m/s^2, in mg or ug, as text."""
     g = force / STANDARD_GRAVITY
     return f"{1e3 * g:.3g} mg" if g >= 1e-3 else f"{1e6 * g:.3g} ug"

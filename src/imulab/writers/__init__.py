@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-# Powers of ten to 128 bits, which the C modules read and print numbers with; made when the first is needed.
+# Powers of ten to 128 bits, for the C modules that read and print numbers; made when first needed.
 
 
 _LOWEST, _HIGHEST = -342, 308  # powers of ten between which double precision has numbers
@@ -74,7 +74,7 @@ def decimal_rows(table: Array) -> bytes | memoryview:
 
 @cache
 def _prepare() -> bool:
-    """Give C its powers of ten; False where it cannot use them, and writes numbers another way."""
+    """Pass the powers of ten to C; return False where it cannot use them and writes numbers another way."""
     return _digits.prepare(powers_of_ten())
 
 
@@ -111,7 +111,7 @@ def write(blocks: Recording | Iterable[Recording], path: str | Path) -> None:
 
 
 def check_writable(path: str) -> None:
-    """Check before the work that `write` can write a file of this name.
+    """Refuse a name that `write` cannot write, before the work.
 
     Raises
     ------

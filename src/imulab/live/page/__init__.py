@@ -1,4 +1,4 @@
-"""The page: a guided session and the workbench in a browser, served on this machine alone."""
+"""The page: a guided session and the workbench in a browser, served to this machine alone by default."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ _NEEDED = ("starlette", "uvicorn", "websockets")
 
 
 def require_server() -> None:
-    """Check that what serves the page is here.
+    """Refuse to go on without the packages that serve the page.
 
     Raises
     ------
     OptionError
-        It is not; the message says how to get it.
+        A package is missing; the message says how to get it.
     """
     missing = [name for name in _NEEDED if find_spec(name) is None]
     if missing:

@@ -35,11 +35,11 @@ from imulab.recording import Reading
 
 _WIDEST = 4000  # pixels of a drawing that a page asks for
 _LONGEST = 1 << 20
-"""Bytes of a JSON object."""
+"""Largest JSON object, bytes."""
 _READING = tuple(option.name for option in options_of(Reading))
 _HERE = "/api/workbench"
 _ANY = "application/octet-stream"
-_PIECE = 1 << 20  # bytes sent at once
+_PIECE = 1 << 20  # bytes sent in one piece
 
 
 class Workbench(PagePart):
@@ -48,9 +48,9 @@ class Workbench(PagePart):
     Parameters
     ----------
     files
-        Of the session.
+        Files of the session.
     forms
-        The commands that it offers.
+        Forms of the offered commands.
     """
 
     name: ClassVar[str] = "workbench"
@@ -79,25 +79,25 @@ class Workbench(PagePart):
         ]
 
     def begin(self, hub: Hub) -> None:
-        """Begin to tell pages, and to read the recording that they show first."""
+        """Start to send messages, and to read the recording that pages show first."""
         self._hub = hub
         first = next((entry.name for entry in self._files.entries() if entry.kind == "recording"), None)
         if first is not None and self._files.is_given(first):
             self._openings.open(first, {})
 
     def greet(self) -> Iterable[Message]:
-        """Yield the files and what was run."""
+        """Yield the files and the commands that were run."""
         yield self._list_message()
         for job in list(self._jobs.jobs.values()):
             yield _job_message(job)
 
     def end(self) -> None:
-        """End what runs, and remove what only the page needs."""
+        """End running commands, and remove temporary files."""
         self._jobs.end()
         self._openings.end()
 
     def _list_message(self) -> Message:
-        """Return the list of files, numbered: an answer and a message can reach a page in the other order."""
+        """Return the list of files, numbered, because an answer and a message can reach a page in the other order."""
         number = next(self._lists)
         return {"type": "files", "number": number, "folder": str(self._files.folder), "files": self._files.entries()}
 
@@ -138,19 +138,21 @@ class Workbench(PagePart):
             raise OptionError(f"{name}: is a folder")
         stream = Path(name).open("rb")  # noqa: SIM115 -- it is closed once it is sent
         size = os.fstat(stream.fileno()).st_size  # a recording that is still written grows meanwhile
-        headers = {**_to_be_saved(Path(name).name), "content-length": str(size)}
+        headers = {**_download_header(Path(name).name), "content-length": str(size)}
         return StreamingResponse(_pieces(stream, size), headers=headers, media_type=_ANY)
 
     async def _zip(self, request: Request) -> Response:
         name = self._files.path(request.path_params["name"])
         if not Path(name).is_dir():
             raise OptionError(f"{name}: expected a folder")
-        packed = await run_in_threadpool(_packed, Path(name))
+        packed = await run_in_threadpool(_pack, Path(name))
         task = BackgroundTask(Path(packed).unlink, missing_ok=True)
-        return FileResponse(packed, headers=_to_be_saved(f"{Path(name).name}.zip"), media_type=_ANY, background=task)
+        return FileResponse(
+            packed, headers=_download_header(f"{Path(name).name}.zip"), media_type=_ANY, background=task
+        )
 
     async def _report(self, request: Request) -> Response:
-        """Show a report that a command of this session has drawn: pages from elsewhere are only to be saved."""
+        """Return a report that a command of this session has made; other pages can only be saved."""
         name = self._files.path(request.path_params["name"])
         drawn = {path for job in self._jobs.jobs.values() if job.state == "done" for path in job.outputs}
         if name not in drawn or not name.endswith(".html"):
@@ -179,8 +181,8 @@ class Workbench(PagePart):
         )
         return _json({key: value for key, value in asdict(shown).items() if key != "rows"})
 
-    def _made(self, asked: Mapping[str, Any]) -> tuple[Form, list[str], list[str]]:
-        """Return the form, the words and the outputs that a page's values make."""
+    def _fill_form(self, asked: Mapping[str, Any]) -> tuple[Form, list[str], list[str]]:
+        """Return the form, the words and the outputs for the values of a page."""
         form = self._forms.get(str(asked.get("command")))
         values = asked.get("values")
         if form is None or not isinstance(values, dict):
@@ -191,7 +193,7 @@ class Workbench(PagePart):
         taken = running | self._coming
 
         def output(name: str, ending: str) -> str:
-            """Name what is made after the last file, and after what is done where that alone would not tell."""
+            """Return a name from the last file, with the command's where the ending alone would not tell them apart."""
             stem = inputs[-1].name.partition(".")[0] if inputs else form.path.replace(" ", "-")
             done = str(values.get("to") or form.path.split()[-1])
             default_name = (
@@ -211,11 +213,11 @@ class Workbench(PagePart):
         return form, words, outputs
 
     async def _command(self, request: Request) -> Response:
-        _, words, outputs = self._made(await _object(request))
+        _, words, outputs = self._fill_form(await _object(request))
         return _json({"command": join(["imulab", *words]), "outputs": outputs})
 
     async def _run(self, request: Request) -> Response:
-        form, words, outputs = self._made(await _object(request))
+        form, words, outputs = self._fill_form(await _object(request))
         return _json(_job_message(self._jobs.run(form.path, words, outputs)))
 
     async def _cancel(self, request: Request) -> Response:
@@ -268,21 +270,21 @@ async def _object(request: Request) -> dict[str, Any]:
     return document
 
 
-def _to_be_saved(name: str) -> dict[str, str]:
-    """Return the header of a file to be saved, whatever it says that it is."""
+def _download_header(name: str) -> dict[str, str]:
+    """Return the header of a file that the browser saves, whatever type it has."""
     return {"content-disposition": f"attachment; filename*=UTF-8''{quote(name, safe='')}"}
 
 
 def _pieces(stream: IO[bytes], size: int) -> Iterator[bytes]:
-    """Yield the first bytes of a file, and close it."""
+    """Yield the first bytes of a file, then close it."""
     with stream:
         while size and (piece := stream.read(min(size, _PIECE))):
             size -= len(piece)
             yield piece
 
 
-def _packed(folder: Path) -> str:
-    """Return a new file that holds the files of a folder, packed."""
+def _pack(folder: Path) -> str:
+    """Return a new archive with the files of a folder."""
     handle, name = tempfile.mkstemp(prefix="imulab-", suffix=".zip")
     with os.fdopen(handle, "wb") as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(folder.rglob("*")):

@@ -1,7 +1,7 @@
-"""Reads one file for the page in a process of its own, and prints what it finds, a JSON object a line.
+"""Program that reads one file for the page in its own process, and prints its content, a JSON object a line.
 
-``python -P -m imulab.live.page.contents FILE FOLDER READING`` writes the curves into the folder. A file that is
-damaged, hostile or large so costs the server nothing, and can be given up at any time.
+``python -P -m imulab.live.page.contents FILE FOLDER READING`` writes the curves into the folder. So a damaged, hostile
+or large file costs the server nothing, and can be given up at any time.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _EVERY = 0.15  # s between two messages of progress
 
 
 def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[str, Any]]:
-    """Write the curves of a file, and yield what is known of it.
+    """Write the curves of a file, and yield its content as far as read.
 
     Parameters
     ----------
     file
-        Its path.
+        Path of the file.
     folder
-        Where the curves go.
+        Folder of the curves.
     reading
         Options of reading, as typed: ``layout``, ``topic``, ``instance``, ``window``, ``element``.
 
@@ -64,7 +64,7 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
 
 
 def attitudes(folder: Path, head: Head, name: str) -> dict[str, Any]:
-    """Return the static attitudes of a recording that a `Writer` has written; errors as a text."""
+    """Return the static attitudes of a recording that a `Writer` has written, or an error as text."""
     from imulab.procedures.tumble.attitudes import find_attitudes
 
     names = triad("accel")
@@ -86,7 +86,7 @@ def _all(path: Path, count: int) -> Array:
 
 
 def main() -> int:
-    """Read the file that the command line names; the exit status is 2 where it cannot be read."""
+    """Read the file that the command line names; return 2 where it cannot be read."""
     file, folder, reading = sys.argv[1:4]
     try:
         for message in contents(file, Path(folder), json.loads(reading)):

@@ -1,8 +1,8 @@
 """The curves of a recording for a screen: smallest and largest sample of every channel per column of pixels.
 
-A recording is written once, block by block, as plain numbers of 8 bytes, with the smallest and largest sample of each
-`BUCKET` rows beside them. A view of a wide range takes these, a view of a narrow one the samples themselves, so that a
-view costs the same however long the recording is, and memory holds no more than a block.
+A recording is written once, block by block, as numbers of 8 bytes, with the smallest and largest sample of each
+`BUCKET` rows beside them. A wide view reads these, a narrow view the samples, so that the cost of a view does not
+depend on the recording's length, and memory holds no more than a block.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from imulab.recording import Array, Recording
 
 BUCKET = 256  # rows whose extremes are kept
 _FINE = 2000 * BUCKET
-"""Up to so many rows a view is made of the samples themselves."""
+"""Most rows of a view that is made of samples."""
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
-"""A step in time that is longer than both is a gap, as for `find_attitudes`."""
+"""A step in time longer than both is a gap, as for `find_attitudes`."""
 _MOST_GAPS = 1000  # that are marked
 _NUMBER = np.dtype("<f8")
 
 
 @dataclass
 class Head:
-    """What is known of a recording while it is written.
+    """Description of a recording while it is written.
 
     Attributes
     ----------
     units
-        Name of each column but the time to its unit, in file order.
+        Unit of each column but the time, in file order.
     rows
         Samples so far.
     timed
-        Whether there are times, finite and never falling; places are numbers of rows otherwise.
+        Whether there are times, finite and never falling; otherwise places are numbers of rows.
     first, last
         Time or row number of the first and the last sample.
     usual
-        Step in time from sample to sample, s: the median of the first block.
+        Usual step in time, s: the median of the first block.
     gaps
-        End of the sample before and begin of the sample behind each gap, s; the first thousand.
+        End of the sample before and begin of the sample after each gap, s; the first thousand.
     gap_count
-        How many gaps there are.
+        Number of gaps.
     """
 
     units: dict[str, str] = field(default_factory=dict)
@@ -58,12 +58,12 @@ class Head:
 
     @property
     def longest_step(self) -> float:
-        """The longest step in time that is no gap, s."""
+        """Longest step in time that is no gap, s."""
         return max(_GAP_SECONDS, _GAP_STEPS * self.usual)
 
 
 class Writer:
-    """Writes the blocks of a recording into a folder; `head` says what is there."""
+    """Writer of the blocks of a recording into a folder; `head` describes what is written."""
 
     def __init__(self, folder: Path) -> None:
         self.head = Head()
@@ -222,5 +222,5 @@ def _append(path: Path, values: Array) -> None:
 
 
 def _values(path: Path, count: int) -> Any:
-    """Return the first numbers of a file, which stay on disk until they are used."""
+    """Return the first numbers of a file, which are read when they are used."""
     return np.memmap(path, _NUMBER, "r", shape=(count,)) if count else np.empty(0)

@@ -1,4 +1,4 @@
-"""The files of a session, and those that the page looks into, each read by a process of its own."""
+"""The files of a session, and the recordings that the page shows, each read by its own process."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from imulab.live.page.curves import CurveView, Head, view
 from imulab.live.page.server import inside
 from imulab.records import is_json
 
-# The files of a session: those in its folder, and those that the command line named. The page reaches no others.
+# Files in the session's folder, and those named on the command line. The page reaches no others.
 
 
 _LONGEST = 200  # bytes of a name; file systems take 255
@@ -37,10 +37,10 @@ _KINDS = {".html": "report", ".htm": "report", ".toml": "manifest", ".zip": "oth
 
 @dataclass(frozen=True)
 class FileEntry:
-    """One file: what the command line calls it, its own name, its kind, bytes, and when it was changed, s.
+    """One file: its path as on the command line, its name, its kind, bytes, and when it was changed, s.
 
-    The kind is ``recording``, ``record``, ``report``, ``manifest``, ``folder`` or ``other``; `own` is whether
-    it lies in the session's folder.
+    The kind is ``recording``, ``record``, ``report``, ``manifest``, ``folder`` or ``other``; `in_folder` is whether it
+    lies in the session's folder.
     """
 
     name: str
@@ -48,7 +48,7 @@ class FileEntry:
     kind: str
     size: int
     modified: float
-    own: bool = False
+    in_folder: bool = False
 
 
 class FolderFiles:
@@ -57,17 +57,17 @@ class FolderFiles:
     Parameters
     ----------
     folder
-        Of the session: what is dropped or made goes there. Relative to the working folder, so that a command that is
-        shown is one that can be typed there.
-    given
+        Folder of the session, for dropped files and outputs. Relative to the working folder, so that a shown command
+        can be typed there.
+    named
         Files that the command line named.
     later
-        Such files that may not be there yet.
+        Such files that may not exist yet.
 
     Raises
     ------
     OptionError
-        A file is not there.
+        A file does not exist.
     """
 
     def __init__(self, folder: Path, named: Sequence[str] = (), later: Sequence[str] = ()) -> None:
@@ -84,12 +84,12 @@ class FolderFiles:
         ]
 
     def make(self) -> None:
-        """Make the folder where it is not there.
+        """Make the folder if it does not exist.
 
         Raises
         ------
         OptionError
-            It cannot be made.
+            The folder cannot be made.
         """
         try:
             self.folder.mkdir(exist_ok=True)
@@ -99,7 +99,7 @@ class FolderFiles:
             ) from None
 
     def entries(self) -> list[FileEntry]:
-        """Return the files there are now, those of the command line first, then by name."""
+        """Return the present files: those of the command line first, then by name."""
         there = self.folder.iterdir() if self.folder.is_dir() else ()  # another program may have removed it
         inside = sorted(str(path) for path in there if _plain(path.name) and path.name[0] != ".")
         entries = (self._entry(name) for name in dict.fromkeys([*self._given, *inside]))
@@ -121,20 +121,20 @@ class FolderFiles:
         return name
 
     def is_given(self, name: str) -> bool:
-        """Whether the command line named a file that was there already."""
+        """Return whether the command line named a file that already existed."""
         return name.removeprefix("./") in self._first or name in self._first
 
     def owns(self, name: str) -> bool:
-        """Whether a file lies in the session's folder, and was not named by the command line."""
+        """Return whether a file lies in the session's folder, and was not named on the command line."""
         return name not in self._given and Path(name).parent == self.folder
 
     def check_manifest(self, name: str) -> None:
-        """Check that a manifest in the session's folder names no file elsewhere; one of the command line may.
+        """Refuse a manifest in the session's folder that names a file elsewhere; one of the command line may.
 
         Raises
         ------
         OptionError
-            It does; the message says which.
+            It names a file elsewhere; the message says which.
         """
         if not self.owns(name):
             return
@@ -150,12 +150,12 @@ class FolderFiles:
                     raise OptionError(f"{name}: {error}") from None
 
     def new(self, name: str, taken: Collection[str] = ()) -> str:
-        """Return the path of a file to be made in the session's folder.
+        """Return the path of a new file in the session's folder.
 
         Raises
         ------
         OptionError
-            The name leads elsewhere, or the file is there already, or is in `taken`.
+            The name leads elsewhere, or the file exists, or is in `taken`.
         """
         self.make()
         path = checked(self.folder, name)
@@ -166,7 +166,7 @@ class FolderFiles:
         return str(path)
 
     def unused(self, name: str, taken: Collection[str] = ()) -> str:
-        """Return the path of a file to be made, numbered where one of that name is there, or is in `taken`."""
+        """Return the path of a new file, numbered if the name exists or is in `taken`."""
         self.make()
         stem, dot, rest = name.partition(".")
         path, number = checked(self.folder, name), 1
@@ -179,7 +179,7 @@ class FolderFiles:
         path = Path(name)
         try:
             status = path.stat()
-        except OSError:  # it has gone meanwhile
+        except OSError:  # the file was removed meanwhile
             return None
         key = name, status.st_mtime_ns, status.st_size
         if key not in self._kinds:
@@ -187,19 +187,19 @@ class FolderFiles:
         return FileEntry(name, path.name, self._kinds[key], status.st_size, status.st_mtime, self.owns(name))
 
     def end(self) -> bool:
-        """Remove the folder where nothing is in it; return whether something is."""
+        """Remove the folder if it is empty; return whether it still exists."""
         with suppress(OSError):
             self.folder.rmdir()
         return self.folder.exists()
 
 
 def checked(folder: Path, name: str) -> Path:
-    """Return the path of a file to be written right in a folder; refuse names that a list could not show as they are.
+    """Return the path of a new file directly in a folder; refuse names that a list cannot show unchanged.
 
     Raises
     ------
     OptionError
-        The name leads elsewhere, is hidden, holds control characters, is too long, or is none on this system.
+        The name leads elsewhere, is hidden, has control characters, is too long, or not allowed on this system.
     """
     path = inside(folder, name)
     if _WINDOWS and _NO_WINDOWS_NAME.search(name):
@@ -213,7 +213,7 @@ def checked(folder: Path, name: str) -> Path:
 
 
 def _plain(name: str) -> bool:
-    """Whether a name can be shown and sent as it is."""
+    """Return whether a name can be shown and sent unchanged."""
     try:
         name.encode("utf-8")
     except UnicodeEncodeError:
@@ -232,28 +232,28 @@ def _kind(path: Path) -> str:
         return "other"
 
 
-# Files that the page looks into: each is read by a process of its own, whose curves can be viewed while it goes on.
+# Recordings that the page shows: each is read by its own process, and its curves can be viewed meanwhile.
 
 
 _MOST = 6
-"""Recordings whose curves are kept; the one that was looked at longest ago makes room."""
+"""Most recordings whose curves are kept; the one viewed longest ago makes room."""
 _KNOWN = {each.name for each in fields(Head)}
 
 
 @dataclass
 class Opening:
-    """A file that is or was read.
+    """A file that is being read or was read.
 
     Attributes
     ----------
     number
-        Of this session, from 1.
+        Number in this session, from 1.
     name, reading, stamp
         The file, the options of reading, and its size and time of change.
     folder
-        Of its curves.
+        Folder of its curves.
     about
-        What is known of it: all that `contents` has yielded, in one.
+        Its content so far: all that `contents` has yielded, merged.
     """
 
     number: int
@@ -267,27 +267,27 @@ class Opening:
 
     @property
     def head(self) -> Head:
-        """What there is to view so far."""
+        """Description of the recording so far."""
         described = self.about.get("head", {})
         return Head(**{key: value for key, value in described.items() if key in _KNOWN})
 
 
 class Openings:
-    """The files of a session that the page has looked into; `tell` is called with what is found, from other threads."""
+    """The files that the page has opened; `tell` is called with new content, from other threads."""
 
     def __init__(self, tell: Callable[[Opening], object]) -> None:
         self._tell = tell
-        self._open: dict[str, Opening] = {}  # by file and options, those looked at lately last
+        self._open: dict[str, Opening] = {}  # by file and options, the latest viewed last
         self._place = Path(tempfile.mkdtemp(prefix="imulab-curves-"))
         self._number = 0
 
     def open(self, name: str, reading: Mapping[str, str]) -> Opening:
-        """Return a file that is read, beginning where it was not or has changed since.
+        """Return a file that is being read; reading starts if it has not, or if the file has changed.
 
         Raises
         ------
         OptionError
-            It is not there.
+            The file does not exist.
         """
         try:
             status = os.stat(name)  # noqa: PTH116 -- a name, and its stamp
@@ -315,12 +315,12 @@ class Openings:
         return opening
 
     def known(self, number: int) -> Opening:
-        """Return a file that is open, by the number of its opening.
+        """Return an open file by the number of its opening.
 
         Raises
         ------
         OptionError
-            It is not, or not any more.
+            It is not open, or no longer.
         """
         for opening in self._open.values():
             if opening.number == number:

@@ -1,4 +1,4 @@
-"""The guided session on the page: it runs in a thread of its own, and every page sees the same.
+"""The guided session on the page: it runs in its own thread, and every page shows the same.
 
 Messages to the page, beside those of `parts`:
 
@@ -49,10 +49,10 @@ from imulab.procedures.views import exhibits_of, parameter_rows, rendered
 from imulab.records.calibration import Calibration
 from imulab.report.traces import format_uncertain
 
-_WAIT, _EVERY = 0.05, 0.1  # s of one look at the source; s between two messages to the pages
-_TOLD = 0.3  # s that the last message has to reach the pages
-_EVENTS = 60  # that a page shows which is opened later
-_PATIENCE = 5.0  # s for a thread to end, and for a page that is just being opened
+_WAIT, _EVERY = 0.05, 0.1  # s of one wait for the source; s between two messages to the pages
+_TOLD = 0.3  # s for the last message to reach the pages
+_EVENTS = 60  # latest events that a new page shows
+_PATIENCE = 5.0  # s for a thread to end, and for a page that is being opened
 
 
 class GuidedPart(PagePart):
@@ -63,18 +63,18 @@ class GuidedPart(PagePart):
     runner
         The session with its source and its recording.
     fit
-        Makes the record from the recording, and writes what is to be written.
+        Makes the record from the recording, and writes the outputs.
     command
-        The words of the command, or commands, that make the same record.
+        Words of the command, or commands, that make the same record.
     record_name
-        What the record's file is called.
+        Name of the record's file.
 
     Attributes
     ----------
     record
-        What `fit` has made; None before.
+        The record that `fit` has made, or None.
     error
-        Why the session ended, where it was no ordinary end.
+        Reason of an unexpected end of the session.
     """
 
     name = "session"
@@ -104,16 +104,16 @@ class GuidedPart(PagePart):
         self.routes = [Route("/api/session/{kind}", self._file)]
 
     def begin(self, hub: Hub) -> None:
-        """Begin the session."""
+        """Start the session."""
         self._hub = hub
         self._thread.start()
 
     def greet(self) -> Iterable[Message]:
-        """Yield the view, what happened lately, and how the session has ended where it has."""
+        """Yield the view, the latest events, and the end of the session if it has ended."""
         return [message for message in (self._view, *tuple(self._events), self._done, self._failed) if message]
 
     def end(self) -> None:
-        """End the session; what is recorded is kept."""
+        """End the session; the recording is kept."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(_PATIENCE)
@@ -135,27 +135,27 @@ class GuidedPart(PagePart):
 
     def _run(self) -> None:
         try:
-            while not self._measured():
+            while not self._measure():
                 if self._stop.is_set():
                     return
             self._follow()
         except Exception as error:
             self.error, self._failed = error, _failure(error)
             self._tell(self._failed)
-            given_up = monotonic() + _PATIENCE  # a page that is just being opened is told, too
+            given_up = monotonic() + _PATIENCE  # a page that is being opened gets the message too
             while not (self._hub.pages or self._stop.is_set()) and monotonic() < given_up:
                 sleep(_WAIT)
-            sleep(_TOLD)  # the pages are told before the server ends
+            sleep(_TOLD)  # the message reaches the pages before the server ends
             self._hub.stop()
 
-    def _measured(self) -> bool:
-        """Measure until a person finishes or the stream ends; return whether there is a record then."""
+    def _measure(self) -> bool:
+        """Measure until the user finishes or the stream ends; return whether there will be a record."""
         runner, last_shown = self._runner, 0.0
         self._phase, self._finish = "measuring", False
         while not (self._stop.is_set() or self._finish or runner.ended):
-            events = [*self._answers(), *runner.step(_WAIT)]
+            events = [*self._do_requests(), *runner.step(_WAIT)]
             for event in events:
-                self._told(event)
+                self._publish(event)
             if events or monotonic() - last_shown > _EVERY:
                 self._show()
                 last_shown = monotonic()
@@ -177,8 +177,8 @@ class GuidedPart(PagePart):
         self._tell(self._done)
         return True
 
-    def _answers(self) -> list[Event]:
-        """Do what the pages have asked for."""
+    def _do_requests(self) -> list[Event]:
+        """Do what the pages have asked for, and return the events."""
         events: list[Event] = []
         try:
             while True:
@@ -196,7 +196,7 @@ class GuidedPart(PagePart):
         except Empty:
             return events
 
-    def _told(self, event: Event) -> None:
+    def _publish(self, event: Event) -> None:
         if event.kind == "again":
             self._silent = ""
         elif event.kind == "silent":
@@ -219,7 +219,7 @@ class GuidedPart(PagePart):
         self._hub.tell(message, latest=latest)
 
     def _follow(self) -> None:
-        """Show that the record corrects: the length of the reading, raw and corrected, until the end."""
+        """Show the length of the reading, raw and corrected by the record, until the end."""
         assert self.record is not None
         ready, runner, last_shown = loaded(self.record), self._runner, 0.0
         gravity = runner.session.guide.local_gravity
@@ -283,5 +283,5 @@ def _failure(error: Exception) -> Message:
 
 
 def _ascii(name: str) -> str:
-    """Return a file's name as a header can hold it."""
+    """Return a file's name with characters that a header allows."""
     return "".join(each if each.isascii() and each.isprintable() and each not in '"\\' else "_" for each in name)

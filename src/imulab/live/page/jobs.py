@@ -1,4 +1,4 @@
-"""Commands that the page runs, each in a process of its own, and the forms that are made from them."""
+"""Commands that the page runs, each in its own process, and the forms that are made from their definitions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from typing import IO, Any
 from imulab.errors import OptionError, listed, quoted
 from imulab.options import Option
 
-# Forms made from the commands themselves: what the command line takes stands once, in its own definitions.
+# Forms, made from the definitions of the command line.
 
 
 _FILE = re.compile(r"FILE|RECORD|[A-Z]+\.[a-z]+")
@@ -34,28 +34,28 @@ class FormField:
     Attributes
     ----------
     name
-        In the values of a form.
+        Name in the values of a form.
     flag
-        As typed; empty for an argument. `unflag` is what turns a switch off that is neither way by default.
+        Flag as typed; empty for an argument. `unflag` turns off a switch that has no default.
     kind
         ``file`` or ``files`` of the session, ``output``, ``switch``, ``either`` (on, off or neither), ``text``, or
-        ``texts``: any number of them, the option once for each.
+        ``texts``: any number of them, with the option once for each.
     shows
-        What the help has in the place of the value.
+        Placeholder of the value in the help.
     help
-        As the command's help has it.
+        Help of the command's option.
     default
-        Text that stands where none is given.
+        Text of the default.
     choices
-        Words that it takes.
+        Allowed words.
     other
-        Whether it takes other texts too.
+        Whether other texts are allowed too.
     required
-        Whether it must be given.
+        Whether it must be filled.
     group
-        Where the page lists it; empty for an argument.
+        Group on the page; empty for an argument.
     ending
-        Of the name of an output; empty for a folder.
+        Ending of an output's name; empty for a folder.
     """
 
     name: str
@@ -84,22 +84,22 @@ class Form:
     def words(
         self, values: Mapping[str, Any], file: Callable[[str], str], output: Callable[[str, str], str]
     ) -> list[str]:
-        """Return the words of the command line that these values make.
+        """Return the words of the command line for these values.
 
         Parameters
         ----------
         values
-            By the names of fields: a text, a list of texts for files and texts, or a truth value, which says of an
-            output that it is to be written under a name to be found. Empty ones count as not given.
+            Values by the names of fields: a text, a list of texts for files and texts, or a truth value, which asks for
+            an output under a new name. Empty ones count as not filled.
         file
-            Name of a file of the session to what the command line calls it.
+            Returns the command line's path of a file of the session.
         output
-            Name that was given for an output (empty for one to be found) and its ending, to the same.
+            Returns the path of an output from its name (empty for a new name) and its ending.
 
         Raises
         ------
         OptionError
-            A value cannot be one of that field, or what is required is missing.
+            A value is not allowed in its field, or a required one is missing.
         """
         fields = {field.name: field for field in self.fields}
         for name in values:
@@ -112,7 +112,7 @@ class Form:
 
 
 def forms(commands: Iterable[Any]) -> dict[str, Form]:
-    """Return the forms of the commands of the command line, by their paths."""
+    """Return the forms of commands of the command line, by their paths."""
     return {command.path: _form(command) for command in commands}
 
 
@@ -127,7 +127,7 @@ def _form(command: Any) -> Form:
 
 
 def _field(option: Option, *, drawn: bool) -> FormField:
-    """Return an option as a field; `drawn` says that the command writes a report beside its output: a record."""
+    """Return the field of an option; `drawn` says that the command writes a report beside its output, a record."""
     shows, text = option.shows if option.takes_value else "", f"{option.help} [{option.unit}]" * bool(option.unit)
     field = FormField(option.keyword, option.flags[-1], option.kind, shows, text or option.help, "", group=option.group)
     field = replace(field, required=option.required)
@@ -184,7 +184,7 @@ def _words(field: FormField, value: Any, file: Callable[[str], str], output: Cal
 
 
 def _file_or_word(field: FormField, text: str, file: Callable[[str], str]) -> str:
-    """Return what the command line calls a file of the session, or a word that names no other file."""
+    """Return the command line's path of a file of the session, or a word that names no other file."""
     try:
         return file(text)
     except OptionError:
@@ -205,10 +205,10 @@ def _texts(value: Any, called: str) -> Sequence[str]:
     return texts
 
 
-# Commands that the page runs: each in a process of its own, as if typed, with what it says and what it makes.
+# Jobs: each command runs in its own process, as if typed.
 
 
-# Bytes of output, lines, and characters of a line, that are kept of a job
+# Most bytes of output, lines, and characters of a line, that are kept of a job
 _LONGEST, _MOST_LINES, _LONGEST_LINE = 1 << 20, 1000, 4000
 _GRACE, _EVERY = 5.0, 0.1  # s for a process to end before it is killed; s between two messages
 _WINDOWS = sys.platform == "win32"
@@ -216,24 +216,24 @@ _WINDOWS = sys.platform == "win32"
 
 @dataclass
 class PageJob:
-    """One command.
+    """One command that was run.
 
     Attributes
     ----------
     number
-        Of this session, from 1.
+        Number in this session, from 1.
     path
-        Of the command: ``tumble fit``.
+        Path of the command: ``tumble fit``.
     command
-        What to type for the same, quoted for a shell.
+        The command to type, quoted for a shell.
     words
-        The same without quotes, and without the program's name.
+        Its words without quotes, and without the program's name.
     outputs
-        Paths that it is to write.
+        Paths of its outputs.
     state
         ``running``, ``done``, ``refused`` (exit status 2, or 1 of a test that failed), ``cancelled``.
-    said, text
-        What it has said beside its result (the lines of standard error), and its result (standard output).
+    messages, text
+        Lines of standard error, and standard output.
     began, ended
         Seconds since 1970.
     """
@@ -245,7 +245,7 @@ class PageJob:
     outputs: list[str]
     state: str = "running"
     status: int | None = None
-    said: list[str] = dataclass_field(default_factory=list)
+    messages: list[str] = dataclass_field(default_factory=list)
     text: str = ""
     began: float = dataclass_field(default_factory=time)
     ended: float | None = None
@@ -262,7 +262,7 @@ class Jobs:
         self._due: set[int] = set()
 
     def run(self, path: str, words: Sequence[str], outputs: Sequence[str]) -> PageJob:
-        """Begin to run a command in the working folder.
+        """Start a command in the working folder, and return its job.
 
         Raises
         ------
@@ -271,7 +271,7 @@ class Jobs:
         """
         number = len(self.jobs) + 1
         job = PageJob(number, path, shlex.join(["imulab", *words]), list(words), list(outputs))
-        process = _started(words)
+        process = _start(words)
         self.jobs[number], self._processes[number] = job, process
         self._watches[number] = threading.Thread(target=self._watch, args=(job, process), daemon=True)
         self._watches[number].start()
@@ -279,7 +279,7 @@ class Jobs:
         return job
 
     def cancel(self, number: int) -> None:
-        """End a command; what it has half written goes with it."""
+        """End a command and remove its unfinished outputs."""
         job, process = self.jobs.get(number), self._processes.get(number)
         if job is None or process is None or job.state != "running":
             return
@@ -309,26 +309,26 @@ class Jobs:
             job.state = "done" if job.status == 0 else "refused"
         for path in [] if job.state == "done" else job.outputs:
             with suppress(OSError):
-                Path(path).rmdir()  # a folder that it has made before it was refused
+                Path(path).rmdir()  # a folder that the command made before it was refused
         del self._processes[job.number]
         self._tell(job)
 
     def _listen(self, job: PageJob, stream: IO[str]) -> None:
         with stream:
             for line in stream:
-                if len(job.said) < _MOST_LINES:
-                    job.said.append(line.rstrip()[:_LONGEST_LINE])
-                    self._soon(job)
+                if len(job.messages) < _MOST_LINES:
+                    job.messages.append(line.rstrip()[:_LONGEST_LINE])
+                    self._report_soon(job)
 
-    def _soon(self, job: PageJob) -> None:
-        """Tell of a job in a moment, with what it says until then: many lines are not told one by one."""
+    def _report_soon(self, job: PageJob) -> None:
+        """Report a job after a short delay, so that many lines make one message."""
         if job.number not in self._due:
             self._due.add(job.number)
-            timer = threading.Timer(_EVERY, self._tell_due, (job,))
+            timer = threading.Timer(_EVERY, self._report_due, (job,))
             timer.daemon = True
             timer.start()
 
-    def _tell_due(self, job: PageJob) -> None:
+    def _report_due(self, job: PageJob) -> None:
         self._due.discard(job.number)
         if job.ended is None:
             self._tell(job)
@@ -352,10 +352,10 @@ def _signal(process: subprocess.Popen[str], number: int) -> None:
             os.killpg(process.pid, number)
 
 
-def _started(words: Sequence[str]) -> subprocess.Popen[str]:
-    """Start a command in a process; raises OptionError where that fails."""
+def _start(words: Sequence[str]) -> subprocess.Popen[str]:
+    """Return the process of a command; raise OptionError where it cannot be started."""
     try:
-        # -P: the working folder is no place to import from.
+        # -P: no imports from the working folder.
         return subprocess.Popen(
             [sys.executable, "-P", "-m", "imulab", *words],
             stdin=subprocess.DEVNULL,

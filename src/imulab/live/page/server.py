@@ -1,14 +1,14 @@
-"""The server of the page, what the page is put together from, and who may speak to it.
+"""The server of the page, the parts that make the page, and the checks of who may use it.
 
-The server listens on this machine only, unless it is told otherwise. That alone does not keep other pages of the same
-browser out, so every request also needs the token of this run, the address as its Host, and this page as its Origin.
+The server listens on this machine only, unless an option says otherwise. That alone does not keep other pages of the
+same browser out, so every request also needs the token of this run, the address as its Host, and this page as its
+Origin.
 
-Messages are JSON objects with a ``type``; each part documents its own. All parts share two from the server: ``hello``
+Messages are JSON objects with a ``type``; each part documents its own. Two are common to all parts: ``hello``
 (``areas``: the names of the parts, ``version``) is the first on every socket, and ``refused`` (``text``: why) answers a
-message that could not be done.
+message that could not be carried out.
 
-Addresses: ``/`` the page, ``/static/..`` its files, ``/ws`` the socket, ``/api/..`` those of the parts. What a part is,
-and what is said on the socket, is in `parts`.
+Addresses: ``/`` the page, ``/static/..`` its files, ``/ws`` the socket, ``/api/..`` those of the parts.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from imulab._version import VERSION
 from imulab.errors import ImulabError, OptionError, quoted
 
-# Who may speak to the server, what the browser may do with its answers, and which files it reaches.
+# Access: who may use the server, what the browser may do with its answers, and which files it reaches.
 
 
 TOKEN_HEADER = "x-imulab-token"
@@ -60,7 +60,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""Nothing inline, nothing from elsewhere: a file's text that reached the page as HTML would still not run."""
+"""Nothing inline, nothing from elsewhere: the text of a file that reached the page as HTML would still not run."""
 _REPORT_POLICY = "sandbox allow-scripts allow-popups allow-modals"
 _HEADERS = {
     "content-security-policy": POLICY,
@@ -75,7 +75,7 @@ _FOREIGN = "Another page has asked for this: refused."
 
 
 def new_token() -> str:
-    """Return a token that nobody can guess."""
+    """Return a token that cannot be guessed."""
     return secrets.token_urlsafe(24)
 
 
@@ -84,7 +84,7 @@ def in_address(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _parted(host: str) -> tuple[str, str, str]:
+def _split_host(host: str) -> tuple[str, str, str]:
     """Return name, colon and port of the header Host; the colons of IPv6 stand in brackets."""
     name, bracket, rest = host.rpartition("]")
     before, colon, port = rest.partition(":")
@@ -92,22 +92,21 @@ def _parted(host: str) -> tuple[str, str, str]:
 
 
 class Guard:
-    """Lets a request through that comes from the page itself, and puts the policy on every answer.
+    """Middleware that passes only requests of the page itself, and sets the policy on every answer.
 
     Parameters
     ----------
     app
-        What is guarded.
+        The guarded application.
     token
-        Given in the address of ``/``, which a cookie of its own then stands for; programs give it in the header
-        ``X-Imulab-Token``.
+        Part of the address of ``/``; a cookie then replaces it. Programs send it in the header ``X-Imulab-Token``.
     limit
-        Bytes that one request may bring.
+        Most bytes of one request.
     once
-        Given in the address in place of the token, a single time: other users of the machine see the address that a
+        Replaces the token in the address a single time, because other users of the machine see the address that a
         browser is started with.
     host
-        The address that is listened at.
+        Address at which the server listens.
     """
 
     def __init__(self, app: ASGIApp, token: str, limit: int, once: str = "", host: str = LOCAL) -> None:
@@ -116,7 +115,7 @@ class Guard:
         self._key = new_token()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or hand it on."""
+        """Answer a request, or pass it on."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -136,13 +135,13 @@ class Guard:
         if answer is not None:
             await answer(scope, receive, headed)
         else:
-            await self._app(scope, self._counted(receive), headed)
+            await self._app(scope, self._limit_body(receive), headed)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        """Return the answer to a request that goes no further; None for the others."""
+        """Return the answer to a request that is refused; None for the others."""
         headers, port = Headers(scope=scope), scope["server"][1]
         host = headers.get("host", "")
-        name, colon, offered = _parted(host)
+        name, colon, offered = _split_host(host)
         if not self._is_here(name) or offered != ("" if port == _HTTP_PORT and not colon else str(port)):
             return PlainTextResponse(_STRANGER, 421)
         if headers.get("origin", f"http://{host}") != f"http://{host}" or (
@@ -155,7 +154,7 @@ class Guard:
                 return PlainTextResponse(f"Too large: at most {self._limit >> 20} MiB at once.", 413)
         cookie = f"imulab_{port}"
         offered = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
-        if scope["type"] == "http" and scope["path"] == "/" and self._opens(offered):
+        if scope["type"] == "http" and scope["path"] == "/" and self._admits(offered):
             answer = RedirectResponse("/", 303)
             answer.set_cookie(cookie, self._key, httponly=True, samesite="strict", path="/")
             return answer
@@ -164,20 +163,20 @@ class Guard:
         return PlainTextResponse(_STRANGER, 403)
 
     def _is_here(self, name: str) -> bool:
-        """Whether a name is one of the address that is listened at: a foreign name may lead here, too."""
+        """Return whether a name is one of the server's address; a foreign name may lead here, too."""
         if self._host in EVERY and (name.replace(".", "").isdigit() or name.startswith("[")):
             return True
         return name.lower() in (*_NAMES, in_address(self._host).lower())
 
-    def _opens(self, token: str) -> bool:
-        """Whether what an address holds lets its browser in."""
+    def _admits(self, token: str) -> bool:
+        """Return whether the token in an address admits its browser."""
         if self._once and _same(token, self._once):
             self._once = ""
             return True
         return _same(token, self._token)
 
-    def _counted(self, receive: Receive) -> Receive:
-        """Return `receive` for a body that ends with an error where it is longer than is taken."""
+    def _limit_body(self, receive: Receive) -> Receive:
+        """Return `receive` for a body that ends with an error beyond the limit."""
         taken = 0
 
         async def counted() -> AsgiMessage:
@@ -205,12 +204,12 @@ def _cookie(headers: Headers, name: str) -> str:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """Return the path of a file right in the session's folder.
+    """Return the path of a file directly in the session's folder.
 
     Raises
     ------
     OptionError
-        The name leads elsewhere: it is none of a file, has a folder before it, or is a link out of the folder.
+        The name leads elsewhere: it is no file name, has a folder in front, or is a link out of the folder.
     """
     path = folder / name
     plain = name not in ("", ".", "..") and not set(name) & {"/", "\\", "\0", ":"}
@@ -220,17 +219,17 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def report_response(text: str) -> HTMLResponse:
-    """Return a report as an answer: a page of its own that cannot reach the session, though it has scripts."""
+    """Return a report as an answer: a page with scripts that cannot reach the session."""
     return HTMLResponse(text, headers={"content-security-policy": _REPORT_POLICY})
 
 
 async def receive_file(request: Request, path: Path) -> int:
-    """Write the body of a request to a file as it comes, whole or not at all; return its length.
+    """Write the body of a request to a file, completely or not at all; return its length.
 
     Raises
     ------
     OptionError
-        It is longer than the guard lets through, or cannot be written.
+        It is longer than the limit, or cannot be written.
     """
     from imulab.files import replacing
 
@@ -242,11 +241,11 @@ async def receive_file(request: Request, path: Path) -> int:
     return size
 
 
-# What the page is put together from: each part brings its addresses and its messages on the socket.
+# Parts: each brings its addresses and its messages on the socket.
 
 
 Message = dict[str, Any]
-_MOST_WAITING = 1000  # messages for a page that is slow; older ones are dropped
+_MOST_WAITING = 1000  # messages for a slow page; older ones are dropped
 
 
 class PagePart:
@@ -255,12 +254,12 @@ class PagePart:
     Attributes
     ----------
     name
-        Of its area in ``index.html`` and of its module under ``static``.
+        Name of its area in ``index.html`` and of its module under ``static``.
     routes
-        Addresses beside those of the others.
+        Addresses of the part.
     handlers
-        What is called with a page's message, by its type, in the server's thread: what takes long belongs in
-        another. An ImulabError that it raises becomes ``refused``.
+        Functions by type of a page's message, called in the server's thread: long work belongs in another thread. An
+        ImulabError that they raise becomes ``refused``.
     """
 
     name: ClassVar[str] = ""
@@ -270,18 +269,18 @@ class PagePart:
         self.handlers: Mapping[str, Callable[[Message], object]] = {}
 
     def begin(self, hub: Hub) -> None:
-        """Begin, once the server runs: from now on `hub.tell` reaches the pages."""
+        """Start, once the server runs: from now on `hub.tell` reaches the pages."""
 
     def greet(self) -> Iterable[Message]:
-        """Yield what a page is told when it has come, or has come back."""
+        """Yield the messages for a page that has connected, or connected again."""
         return ()
 
     def end(self) -> None:
-        """End what runs beside the server; it may be called again."""
+        """End all work of the part; it may be called again."""
 
 
 class Hub:
-    """The pages that are connected, and the way to them from every thread."""
+    """The connected pages, and the way to send them messages from every thread."""
 
     def __init__(self) -> None:
         self._lines: set[TextLine] = set()
@@ -291,18 +290,18 @@ class Hub:
 
     @property
     def pages(self) -> int:
-        """How many pages are connected."""
+        """Number of connected pages."""
         return len(self._lines)
 
     def tell(self, message: Message, *, latest: bool = False) -> None:
-        """Tell every page, from any thread; with `latest`, in place of what still waits of the same type."""
+        """Send a message to every page, from any thread; with `latest`, it replaces a waiting one of its type."""
         text = to_json(message)
         if self._loop is not None:
             with suppress(RuntimeError):  # the server has ended
                 self._loop.call_soon_threadsafe(self._put, str(message["type"]), text, latest)
 
     def begin(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Begin to pass messages on."""
+        """Start to pass messages on."""
         self._loop = loop
 
     def join(self, line: TextLine) -> None:
@@ -310,7 +309,7 @@ class Hub:
         self._lines.add(line)
 
     def leave(self, line: TextLine) -> None:
-        """Let go of a page."""
+        """Disconnect a page."""
         self._lines.discard(line)
 
     def _put(self, kind: str, text: str, latest: bool) -> None:
@@ -319,7 +318,7 @@ class Hub:
 
 
 class TextLine:
-    """What waits for one page: a slow one gets the latest view, and does not hold the others up."""
+    """Messages that wait for one page: a slow page gets the latest view, and does not delay the others."""
 
     def __init__(self) -> None:
         self._waiting: deque[str] = deque(maxlen=_MOST_WAITING)
@@ -335,7 +334,7 @@ class TextLine:
         self._some.set()
 
     async def get(self) -> list[str]:
-        """Return what waits, once there is something."""
+        """Return the waiting messages, once there are any."""
         await self._some.wait()
         self._some.clear()
         messages = [*self._waiting, *self._latest.values()]
@@ -364,11 +363,11 @@ def _plain(value: Any) -> Any:
     return value
 
 
-# The server of the page: `imulab live SOURCE --page` and `imulab open` put different parts into the same one.
+# The server: `imulab live SOURCE --page` and `imulab open` serve different parts.
 
 
 UPLOAD_LIMIT = 4 << 30
-"""Bytes of one request, 4 GiB."""
+"""Largest request, bytes: 4 GiB."""
 _SOCKET_LIMIT = 1 << 16  # bytes of a message from a page
 _GRACE = 2  # s for open requests when the server ends
 
@@ -438,22 +437,22 @@ def serve(
     Parameters
     ----------
     parts
-        Of the page.
+        Parts of the page.
     port
-        To listen at; 0 for a free one.
+        Port to listen at; 0 for a free one.
     host
-        Address of this machine to listen at, ``0.0.0.0`` for all; None for the one that only this machine reaches.
+        Address to listen at, ``0.0.0.0`` for all; None for the one that only this machine reaches.
     browser
         Whether to open a browser there.
     limit
-        Bytes that one request may bring.
+        Most bytes of one request.
     tell
-        Takes the line.
+        Called with the line that states the address.
 
     Raises
     ------
     OptionError
-        The port is taken, or not permitted, or the address is none of this machine.
+        The port is taken, or not permitted, or the address does not belong to this machine.
     """
     listening = _listen(port, host or LOCAL)
     app = application(new_token(), parts, host=host or LOCAL, limit=limit)
@@ -482,13 +481,13 @@ def serve(
             server.run(sockets=[listening])
     finally:
         listening.close()
-        for part in parts:  # a second Ctrl-C ends the server before it has done so
+        for part in parts:  # a second Ctrl-C would end the server before this is done
             part.end()
 
 
 @contextmanager
 def _end_on_hangup(stop: Callable[[], None]) -> Iterator[None]:
-    """End the server as by Ctrl-C where its terminal is closed, so that nothing that it runs is left behind."""
+    """End the server as by Ctrl-C when its terminal is closed, so that nothing keeps running."""
     if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -500,13 +499,13 @@ def _end_on_hangup(stop: Callable[[], None]) -> Iterator[None]:
 
 
 def _open(address: str) -> None:
-    """Open a browser where there is one; the address has been printed."""
+    """Open a browser if there is one; the address has been printed."""
     with suppress(webbrowser.Error, OSError):
         webbrowser.open(address)
 
 
 def _address_for_others(host: str) -> str:
-    """Return the address by which others reach a server that listens at `host`."""
+    """Return the address at which others reach a server that listens at `host`."""
     if host not in EVERY:
         return in_address(host)
     with socket.socket(_family(host), socket.SOCK_DGRAM) as probe, suppress(OSError):
@@ -547,7 +546,7 @@ async def _write(page: WebSocket, line: TextLine) -> None:
 
 
 def _take(text: str, known: Mapping[str, Callable[[Message], object]], line: TextLine) -> None:
-    """Hand a page's message to the part that knows it."""
+    """Pass a page's message to the part that handles it."""
     try:
         message = json.loads(text)
         take = known.get(str(message.get("type"))) if isinstance(message, dict) else None

@@ -54,7 +54,7 @@ export function mount(into, given) {
 
 const fail = error => page.say(error.message, "bad");
 
-export const kept = () => `${folder && files.some(each => each.own) ? `What was dropped and made is in the folder ${folder}. ` : ""}Start imulab again, and open the address that it prints.`;
+export const kept = () => `${folder && files.some(each => each.in_folder) ? `What was dropped and made is in the folder ${folder}. ` : ""}Start imulab again, and open the address that it prints.`;
 
 export function hear(message) {
   if (message.type === "files") listed(message);
@@ -125,7 +125,7 @@ function choose(name) {
 const heading = () => h("div", { class: "heading" }, h("h2", {}, chosen.short),
   h("span", { class: "actions" },
     h("a", { class: "button", href: address(chosen.kind === "folder" ? "zip" : "files", chosen.name), download: "" }, chosen.kind === "folder" ? "Save as zip" : "Save"),
-    chosen.own && chosen.kind !== "folder" ? h("button", { type: "button", onclick: remove }, "Remove") : null));
+    chosen.in_folder && chosen.kind !== "folder" ? h("button", { type: "button", onclick: remove }, "Remove") : null));
 
 function remove() {
   if (confirm(`Remove ${chosen.short} from the folder ${folder}?`)) {

@@ -52,7 +52,7 @@ export function card(job, act) {
     put(state, failed ? "fail" : STATES[now.state]);
     state.className = `chip ${failed ? "refused" : now.state}`;
     show(cancel.parentElement, now.state === "running");
-    for (const line of now.said.slice(said.children.length)) {
+    for (const line of now.messages.slice(said.children.length)) {
       const own = line.replace(/^imulab: /, "");
       said.append(h("li", { class: /^(note|warning)/.test(own) ? own.split(":")[0] : now.status === 0 ? "" : "bad" }, own));
     }
