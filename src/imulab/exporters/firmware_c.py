@@ -1,4 +1,4 @@
-"""Records to firmware.
+"""Records to firmware: the C core with the unit's numbers and a self-test as a library, or one blob loaded at run time.
 
 The C core in one file with the unit's numbers and a self-test, as a library of Arduino, PlatformIO and Zephyr, or
 as one blob that is loaded at run time.
@@ -30,19 +30,19 @@ from imulab.procedures.apply import tables_of_all
 from imulab.procedures.registry import section
 from imulab.records.calibration import Calibration
 
-# An exported folder as a library of Arduino, PlatformIO and Zephyr: manifests, and sources that take in the core.
+# The exported folder as a library of Arduino, PlatformIO and Zephyr: manifests, and sources that include the core.
 
 
 NAME = "imulab_unit"
 
 
 def firmware_file(name: str) -> str:
-    """Return a file that exported folders are made from."""
+    """Return a template file of exported folders."""
     return (files("imulab.exporters") / "firmware" / name).read_text(encoding="utf-8")
 
 
 def libraries(unit: str) -> dict[str, str]:
-    """Return names and contents of what makes the folder of a unit a library; the same for every unit but its name."""
+    """Return names and contents of the files that make a unit's folder a library; they differ only in its name."""
     sentence = f"Compensation of {unit}."
     properties = {
         "name": NAME,
@@ -97,7 +97,7 @@ def export_blob(records: Sequence[Calibration], folder: Path, options: ExportOpt
     return [target]
 
 
-# Records to C: the core in one file, the unit's numbers, and a self-test against what the desk computes.
+# Records to C: the core in one file, the unit's numbers, and a self-test against this computer's results.
 
 
 _HEADERS = ("real.h", "array.h", "robust.h")
@@ -168,19 +168,19 @@ def _source(name: str) -> str:
 
 
 def _most_elements(tables: Sequence[DeviceTable]) -> int:
-    """Gyros per axis that the exported header has room for: its default, or what the unit has."""
+    """Return the gyros per axis that the exported header allows: its default, or the number in the unit."""
     return max([_ELEMENTS, *(int(table.columns["elements"]) for table in tables if table.kind == "array")])
 
 
 def _header(tables: Sequence[DeviceTable]) -> str:
-    """imulab.h, with room for the unit's array, so that no -D is needed."""
+    """Return imulab.h with room for the unit's array, so that no -D is needed."""
     text, default = _source("imulab.h"), f"#define IL_ARRAY_ELEMENTS {_ELEMENTS}\n"
     assert default in text
     return text.replace(default, f"#define IL_ARRAY_ELEMENTS {_most_elements(tables)}\n")
 
 
 def _amalgamation() -> str:
-    """The core's sources as one file, so that a project has one to add."""
+    """Return the core's sources as one file, so that a project has one to add."""
     parts = ["/* The core of imulab in one file; the same for every unit. */\n", '#include "imulab.h"\n']
     for name in (*_HEADERS, *_core()):
         parts += [f"\n/* ==== {name} ==== */\n", _OWN_INCLUDE.sub("", _source(name))]
@@ -193,7 +193,7 @@ def _unit_name(records: Sequence[Calibration]) -> str:
 
 
 def _comment_text(text: str) -> str:
-    """Text that neither ends a C comment nor makes a compiler warn in one."""
+    """Return a text that neither ends a C comment nor makes a compiler warn in one."""
     text = printable(text)
     for wrong, right in (("\\", "|"), ("*/", "* /"), ("/*", "/ *"), ("??", "? ?")):
         text = text.replace(wrong, right)
@@ -244,7 +244,7 @@ def _digest(record: Calibration) -> str:
 
 
 def _definition(table: DeviceTable) -> list[str]:
-    """The struct of one table, after the arrays that it points to."""
+    """Return the struct of one table, after the arrays that it points to."""
     pointed = [field for field in table.fields if field.pointed and field.values is not None]
     lines = [f"static const il_real {table.kind}_{field.name}[] = {{{_numbers(field.values)}}};" for field in pointed]
     lines.append(f"const il_{table.kind} unit_{table.kind} = {{")
@@ -293,7 +293,7 @@ def _golden_h(tables: Sequence[DeviceTable], blob: bytes) -> str:
 
 
 def _golden_vectors(table: DeviceTable) -> dict[str, Any]:
-    """Names, after ``golden_<kind>_``, and values of inputs and what the desk makes of them; an empty name counts."""
+    """Return names, after ``golden_<kind>_``, and values of inputs and expected outputs; an empty name is a count."""
     known = section(table.kind)
     assert known is not None
     return known.golden(table, np.random.default_rng(20250101))
@@ -316,7 +316,7 @@ def _nested(value: NDArray[Any]) -> str:
 
 
 def _words(records: Sequence[Calibration], tables: Sequence[DeviceTable], blob_size: int) -> dict[str, Any]:
-    """Return what the README and the sketch are made with; `use` is the code that calls the core for this unit."""
+    """Return the words for the README and the sketch; `use` is the code that calls the core for this unit."""
     words = {
         "serial": _unit_name(records),
         "software": _comment_text(records[0].software),

@@ -33,7 +33,7 @@ from imulab.exporters.model import (
 )
 from imulab.records.calibration import Calibration
 
-# What the YAML files of Kalibr and OpenVINS have in common: noise keys, and the comment on biases.
+# Common to both files: noise keys, and the comment on biases.
 
 
 _KEYS = {
@@ -123,7 +123,7 @@ def unit_lines(unit: UnitModel) -> list[str]:
 
 
 def without_nonlinearity(unit: UnitModel, target: str, options: ExportOptions) -> tuple[UnitModel, list[str]]:
-    """Return the unit as a target with a full matrix and a bias holds it, and the comment on what is left out."""
+    """Return the unit without terms that a full matrix and a bias cannot hold, and the comment on these."""
     accel, error, how = held_accelerometers(unit, inverse_gain, misalignment=True)
     bent = ([], []) if unit.gyro is None else gyro_powers_lost(unit.gyro)
     lost = settle_losses(target, (accel_terms(unit.accel, misalignment=False), error), bent, how=how, options=options)

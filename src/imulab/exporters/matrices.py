@@ -51,7 +51,7 @@ from imulab.units import conversion_factor, parse_unit
 
 
 _NEGLIGIBLE = np.radians(0.01)
-_NEGLIGIBLE_QUADRATIC = 1e-4  # of the field: less is lost without a word when quadratic terms are left out
+_NEGLIGIBLE_QUADRATIC = 1e-4  # of the field: smaller quadratic terms are left out without a comment
 
 
 @dataclass(frozen=True)
@@ -119,12 +119,12 @@ def field_correction(mag: Magnetometers, target: str) -> FieldCorrection:
 
 
 def quadratic_loss(part: float) -> list[str]:
-    """Name quadratic terms that a target leaves out, where they matter; `part` is the largest, of the field."""
+    """Return the words for quadratic terms that a target leaves out, if they matter; `part` is the largest."""
     return [f"mag_k2, {100 * part:.2g} % of the field"] if part > _NEGLIGIBLE_QUADRATIC else []
 
 
 def settle_magnetometers(lost: list[str], target: str, options: ExportOptions) -> list[str]:
-    """Refuse what a target would lose of the magnetometers, or return comments that say so, and tell them.
+    """Refuse losses of the magnetometers, or return and report the comments on them.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def settle_magnetometers(lost: list[str], target: str, options: ExportOptions) -
 def symmetric(
     magnetometers: Magnetometers, target: str, options: ExportOptions, *, turned: bool
 ) -> tuple[FieldCorrection, list[str]]:
-    """Return the correction for a target that holds a symmetric matrix, with a rotation if `turned`, and what is lost.
+    """Return the correction with a symmetric matrix, with a rotation if `turned`, and the angle that is lost.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The one record whose triads a target takes, what the target leaves out of it, and what that costs."""
+"""The record whose triads a target can hold, the terms that it leaves out, and the error that this makes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from imulab.records.triads import CROSS_TERMS, Accelerometers, Gyroscopes, Magne
 from imulab.units import STANDARD_GRAVITY
 
 AXES = "xyz"
-NEGLIGIBLE = 1e-6  # of g: what an export leaves out and is less is not told
+NEGLIGIBLE = 1e-6  # of g: smaller terms are left out without a comment
 _GRID = np.linspace(-STANDARD_GRAVITY, STANDARD_GRAVITY, 21)
 
 
@@ -36,12 +36,12 @@ class UnitModel:
 
     @property
     def origin(self) -> list[str]:
-        """Where the numbers come from, for the comments of a file."""
+        """Origin of the numbers, for the comments of a file."""
         return origin_of(self.record)
 
 
 def origin_of(record: Calibration) -> list[str]:
-    """Return by what the file was written, for which unit, and from which record."""
+    """Return the program that wrote the file, the unit, and the record, for a comment."""
     content = record.to_dict()["content_sha256"]
     serial = printable(str(record.sensor.get("serial", "without serial number")))
     return [
@@ -111,7 +111,7 @@ def inverse_gain(held: Accelerometers) -> Callable[[Array], Array]:
 def held_accelerometers(
     unit: UnitModel, correction: Callable[[Accelerometers], Callable[[Array], Any]], *, misalignment: bool
 ) -> tuple[Accelerometers, float, list[str]]:
-    """Return the linear model that a target should hold: the record's own, or one fitted anew where more is left out.
+    """Return the linear model for a target: the record's, or one fitted again where the target leaves out more.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def held_accelerometers(
 
 
 def accel_terms(accel: Accelerometers, *, misalignment: bool) -> list[str]:
-    """Name the accelerometers' parameters that a target leaves out."""
+    """Return the names of the accelerometers' parameters that a target leaves out."""
     names = []
     if misalignment and np.abs(accel.matrix - np.eye(3)).max() > 0:
         names += [f"misalignment_{AXES[i]}{AXES[j]}" for i, j in ((1, 0), (2, 0), (2, 1)) if accel.matrix[i, j] != 0]
@@ -153,7 +153,7 @@ def accel_terms(accel: Accelerometers, *, misalignment: bool) -> list[str]:
 
 
 def gyro_terms(gyro: Gyroscopes, *, bias: bool) -> tuple[list[str], list[str]]:
-    """Name the gyroscopes' parameters that a target without gain (if `bias`: without bias) leaves out, and the cost.
+    """Return the names of the gyroscopes' parameters that a target without gain (or bias) leaves out, and the error.
 
     Returns
     -------
@@ -180,7 +180,7 @@ def gyro_terms(gyro: Gyroscopes, *, bias: bool) -> tuple[list[str], list[str]]:
 
 
 def gyro_powers_lost(gyro: Gyroscopes) -> tuple[list[str], list[str]]:
-    """Name the powers of the rate, which no target holds, and the largest error that they leave within +-300 deg/s."""
+    """Return the powers of the rate, which no target holds, and their largest error within +-300 deg/s."""
     rate = np.radians(300.0) * np.array([[-1.0], [1.0]])
     left = sum((k * rate ** (power + 2) for power, k in enumerate(gyro.nonlinearity)), start=np.zeros((2, 3)))
     names = [f"gyro_k{power + 2}" for power, k in enumerate(gyro.nonlinearity) if k.any()]
@@ -195,7 +195,7 @@ def settle_losses(
     how: Sequence[str] = (),
     options: ExportOptions,
 ) -> list[str]:
-    """Refuse what would be lost, or return the comments that say so, and tell them.
+    """Refuse losses, or return and report the comments on them.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def settle_losses(
 
 
 def write_one(folder: Path, name: str, lines: Sequence[str]) -> list[Path]:
-    """Write the one file of a target; the folder is made where it is not there.
+    """Write the single file of a target, in a folder that is made if it does not exist.
 
     Raises
     ------
@@ -254,7 +254,7 @@ def single_precision(value: float) -> str:
 
 
 def yaml_number(value: Any) -> str:
-    """Return a number as YAML 1.1 understands it: ``4.0e-06``, since ``4e-06`` is text to it."""
+    """Return a number in YAML 1.1: ``4.0e-06``, because ``4e-06`` would be a text."""
     text = repr(float(value) + 0.0)
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
 

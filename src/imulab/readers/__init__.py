@@ -28,10 +28,10 @@ from imulab.recording import Array, Layout, Recording, Source, Window
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
 _LOG = logging.getLogger(__name__)
-"""Says of each file what it is, and how many rows of which times were read in how long."""
-_HEAD = 1 << 16  # bytes by which a format is told
+"""Logger of each file's format, rows, times, and reading time."""
+_HEAD = 1 << 16  # bytes that show the format
 _PART = 1 << 22
-"""Rows whose blocks are joined as they are read."""
+"""Rows up to which blocks are joined as they are read."""
 
 
 def read(
@@ -86,17 +86,17 @@ def read(
     selection = Selection(topic, instance, window, element)
     name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
-    blocks = _logged(selection.of(_blocks(file, name, known, selection, hashed), name))
-    first, parts, notes = _gathered(blocks)
+    blocks = _log_reading(selection.of(_blocks(file, name, known, selection, hashed), name))
+    first, parts, notes = _gather(blocks)
     source, units = Source(name, hashed.of(file)), first.units
     first = replace(first, columns={})
-    # The parts of a column go as soon as they are joined, so that a large file is not in memory twice.
-    joined = {key: _joined([part.pop(key) for part in parts]) for key in list(parts[0])}
+    # The parts of a column are freed as soon as they are joined, so that a large file is not in memory twice.
+    joined = {key: _join([part.pop(key) for part in parts]) for key in list(parts[0])}
     return replace(first, columns=joined, units=units, source=source, notes=notes)
 
 
-def _gathered(blocks: Iterator[Recording]) -> tuple[Recording, list[dict[str, Array]], tuple[str, ...]]:
-    """Return the first block, the columns of all in parts, and all notes.
+def _gather(blocks: Iterator[Recording]) -> tuple[Recording, list[dict[str, Array]], tuple[str, ...]]:
+    """Return the first block, the parts of every column, and all notes.
 
     Small arrays that go one by one leave holes, which the system does not get back: a part is of 32 MiB.
     """
@@ -136,11 +136,11 @@ def read_blocks(
     """
     selection = Selection(topic, instance, window, element)
     name = name or _name(file)
-    yield from _logged(selection.of(_blocks(file, name, _layout(layout), selection, None), name))
+    yield from _log_reading(selection.of(_blocks(file, name, _layout(layout), selection, None), name))
 
 
-def _logged(blocks: Iterator[Recording]) -> Iterator[Recording]:
-    """Pass blocks on, and log at the end what there was and the time that reading took."""
+def _log_reading(blocks: Iterator[Recording]) -> Iterator[Recording]:
+    """Yield blocks, and log at the end how many rows were read, and in what time."""
     rows, seconds, name, columns, ends = 0, 0.0, "", "", list[float]()
     while True:
         begun = perf_counter()
@@ -157,8 +157,8 @@ def _logged(blocks: Iterator[Recording]) -> Iterator[Recording]:
         _LOG.info("%s: %d rows%s, columns %s; read in %.2f s", name, rows, times, columns, seconds)
 
 
-def _joined(parts: list[Array]) -> Array:
-    """Join the parts of a column, without a copy where they lie one behind the other in memory."""
+def _join(parts: list[Array]) -> Array:
+    """Return the parts of a column joined, without a copy where they are contiguous in memory."""
     first = parts[0]
     if len(parts) == 1:
         return first
@@ -171,7 +171,7 @@ def _joined(parts: list[Array]) -> Array:
 
 
 class _Hash:
-    """SHA-256 of a source: taken while text is read, afterwards for everything else."""
+    """SHA-256 of a source: updated while text is read, computed afterwards for other formats."""
 
     def __init__(self) -> None:
         self.text: TextFile | None = None
@@ -196,12 +196,12 @@ class _Hash:
 def _blocks(
     file: str | Path, name: str, layout: Layout | None, selection: Selection, hashed: _Hash | None
 ) -> Iterator[Recording]:
-    """Yield the blocks of a file by what its first bytes say it is."""
+    """Yield the blocks of a file in the format that its first bytes show."""
     if str(file) != "-" and Path(file).is_dir():
         kind = next(kind for kind in FORMATS if kind.module == "rosbag")
     else:
         kind = TEXT
-        # A pipe can be read once: it is text, or is refused as none.
+        # A pipe can be read once: it is text, or is refused.
         if not is_pipe(file) and not (layout is not None and layout.text and not layout.if_needed):
             with _open(file, name) as stream:
                 try:
@@ -225,7 +225,7 @@ def _blocks(
     try:
         yield from _text_blocks(file, name, layout, hashed)
     except (ReadError, UnitError) as error:
-        raise _advised(error, file, layout) from None
+        raise _advise(error, file, layout) from None
 
 
 def _text_blocks(file: str | Path, name: str, layout: Layout | None, hashed: _Hash | None) -> Iterator[Recording]:
@@ -236,27 +236,27 @@ def _text_blocks(file: str | Path, name: str, layout: Layout | None, hashed: _Ha
         notes: list[str] | None = None
         for block in text.blocks():
             if notes is None:
-                notes = [] if layout or any(map(_is_known, block.columns)) else _found(file)
+                notes = [] if layout or any(map(_is_known, block.columns)) else _note_layout(file)
             yield replace(block, notes=(*block.notes, *notes)) if notes else block
         if hashed is not None:
             text.drain()
 
 
 def _is_known(column: str) -> bool:
-    """Whether imulab knows what a column measures; times have this name in other programs' files too."""
+    """Return whether imulab knows the quantity of a column; time columns occur in other programs' files too."""
     return column.startswith("truth_") or kind_of(column) not in (None, "time")
 
 
-def _found(file: str | Path) -> list[str]:
-    """Return a note of the layout that fits a file without a column that imulab knows."""
+def _note_layout(file: str | Path) -> list[str]:
+    """Return a note on the layout that fits a file without a known column."""
     from imulab.readers.shipped import advice
 
     hint = advice(_head(file))
     return [Note(hint)] if hint else []
 
 
-def _advised(error: ImulabError, file: str | Path, layout: Layout | None) -> ImulabError:
-    """Return a refusal of a text file with the layout that reads it, or what a layout is, behind it."""
+def _advise(error: ImulabError, file: str | Path, layout: Layout | None) -> ImulabError:
+    """Return a refusal of a text file with advice: the layout that reads it, or what a layout is."""
     from imulab.readers.shipped import advice, is_titled
 
     head = _head(file)
@@ -268,7 +268,7 @@ def _advised(error: ImulabError, file: str | Path, layout: Layout | None) -> Imu
 
 
 def _head(file: str | Path) -> bytes:
-    """Return the first bytes of a file that can be read again, none of another."""
+    """Return the first bytes of a file, or nothing where it can be read only once."""
     if is_pipe(file):
         return b""
     try:
@@ -296,12 +296,12 @@ _FAMILIES = {kind.module: _family(kind.module, by_layout=kind.layout != "none") 
 
 
 def is_pipe(file: str | Path) -> bool:
-    """Return whether a name stands for what can be read only once: standard input, a pipe, a device."""
+    """Return whether a name is standard input, a pipe or a device, which can be read only once."""
     return str(file) == "-" or (Path(file).exists() and not Path(file).is_file() and not Path(file).is_dir())
 
 
 def _name(file: str | Path) -> str:
-    """What messages and records call a file; bytes that are no UTF-8 are written as escapes."""
+    """Return the name of a file in messages and records; bytes that are no UTF-8 become escapes."""
     return "standard input" if str(file) == "-" else os.fsencode(file_name(file)).decode("utf-8", "backslashreplace")
 
 

@@ -1,4 +1,4 @@
-"""Arrays that lie whole in a file, through a layout: what HDF5, MATLAB and Parquet files have in common."""
+"""Arrays of a file through a layout: what HDF5, MATLAB and Parquet files have in common."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _INDEXED = re.compile(r"(.*?)\[(\d{1,9})\]")
 
 
 def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | None]]:
-    """Return for each column its variable and, from ``variable[2]``, the number of its column there.
+    """Return for each column its variable and, from ``variable[2]``, the number of the array's column.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | 
 def sliced(
     shape: tuple[int, ...], number: int | None, by_rows: bool, where: str
 ) -> tuple[int, Callable[[Any, int, int], Any]]:
-    """Return the length of a column of an array, and a function that takes rows ``start`` to ``stop`` out of it.
+    """Return the length of a column of an array, and a function that returns its rows ``start`` to ``stop``.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def sliced(
 
 
 def floats_of_rows(rows: Callable[[Any, int, int], Any], source: Any, where: str, start: int, stop: int) -> Array:
-    """Return rows `start` to `stop` of what a file holds; `rows` cuts them out, errors as for `to_floats`."""
+    """Return rows `start` to `stop` of an array as floats; `rows` selects them, errors as for `to_floats`."""
     return to_floats(rows(source, start, stop), where)
 
 

@@ -22,7 +22,7 @@ from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Array, Recording
 
 MAGIC = b"\xa3\x95\x80"
-_FMT = 128  # message that says how the others are laid out
+_FMT = 128  # message that describes the layout of the others
 _KINDS = {
     "a": ("<i2", 32, 1.0),
     "b": ("i1", 1, 1.0),
@@ -75,10 +75,10 @@ class _Format:
     fields: dict[str, _Field]
     length: int
     sensor: str | None
-    instance: int | None  # None: field I tells
+    instance: int | None  # None: field I holds it
 
     def rows(self, records: logs.Records, kind: int, file: str) -> np.ndarray:
-        """Payloads of the messages of this type, shape (n, length)."""
+        """Return the payloads of the messages of this type, shape (n, length)."""
         indices = records.of(kind)
         if not (records.sizes[indices] == self.length).all():
             raise ReadError(f"{file}: the format of message {self.name} changes within the file")
@@ -90,7 +90,7 @@ class _Format:
         return values if f.factor == 1.0 else values * f.factor
 
     def ticks(self, rows: np.ndarray) -> np.ndarray:
-        """Time since boot, microseconds."""
+        """Return the time since boot, microseconds."""
         key = "TimeUS" if "TimeUS" in self.fields else "TimeMS"
         stamps = logs.field(rows, self.fields[key].offset, self.fields[key].kind).astype(np.int64)
         return stamps if key == "TimeUS" else stamps * 1000
@@ -98,7 +98,7 @@ class _Format:
 
 @dataclass(slots=True)
 class _Contents:
-    """What a first pass over the file finds: formats, and how many messages of each type and instance."""
+    """Result of a first pass over the file: formats, and numbers of messages of each type and instance."""
 
     formats: dict[int, _Format] = field(default_factory=dict)
     counts: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -131,7 +131,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
     )
 
 
-# --- what is inside ----------------------------------------------------------------------------------------------
+# --- contents ----------------------------------------------------------------------------------------------------
 
 
 def _survey(path: Path, name: str) -> _Contents:
@@ -156,7 +156,7 @@ def _survey(path: Path, name: str) -> _Contents:
                     place = (kind, int(instance))
                     contents.counts[place] = contents.counts.get(place, 0) + int(count)
     (end,) = ending
-    # Cards and flash chips are filled with 00 or FF behind the end of a log.
+    # Cards and flash chips are filled with 00 or FF after the end of a log.
     filled = end.left and _is_fill(path, end.position)
     if end.damaged and not filled:
         shown = end.left[:3].hex(" ")
@@ -180,7 +180,7 @@ def _is_fill(path: Path, position: int) -> bool:
 
 
 def _define(contents: _Contents, payload: bytes, name: str) -> None:
-    """Take in a format message: u8 type, u8 length, char[4] name, char[16] types, char[64] field names."""
+    """Add a format message: u8 type, u8 length, char[4] name, char[16] types, char[64] field names."""
     kind, length = payload[0], payload[1]
     title = payload[2:6].rstrip(b"\0").decode("ascii", "replace")
     types = payload[6:22].rstrip(b"\0").decode("ascii", "replace")
@@ -297,7 +297,7 @@ def _add_magnetometer(
     sources: dict[int, list[tuple[int, int | None, tuple[str, ...]]]],
     name: str,
 ) -> None:
-    """Add the magnetometer that was asked for, or else that of the same instance as the rest, or the first there is."""
+    """Add the wanted magnetometer, or that of the same instance as the rest, or the first one."""
     asked, instance = wanted
     places = sorted(place for title, place in every if title == "MAG")
     if asked is not None and asked not in places:
@@ -332,7 +332,7 @@ def _pieces(
                     mine = rows if instance is None else rows[form.column(rows, "I") == instance]
                     values = np.column_stack([form.column(mine, key) for key in keys])
                     if form.sensor == "MAG" and "Health" in keys:
-                        # The field of a compass that does not answer is the last one that it gave.
+                        # A compass that does not answer repeats its last field.
                         mine, values = mine[values[:, 3] != 0], values[values[:, 3] != 0, :3]
                     if len(mine):
                         yield Piece(slot, form.ticks(mine), values)

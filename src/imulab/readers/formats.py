@@ -1,4 +1,4 @@
-"""The kinds of file that can be read.
+"""The kinds of file that can be read: recognition, needed libraries, and limits for unpacking.
 
 How each is recognised, which library it needs, and how compressed parts are unpacked within bounds.
 
@@ -20,21 +20,21 @@ from msgspec import Struct
 
 from imulab.errors import ReadError
 
-# Compressed parts of files, unpacked within bounds: a few kilobytes can pretend to hold terabytes.
+# Unpacking within limits: a few kilobytes can unpack to terabytes.
 
 
-# Bytes unpacked that are always allowed; times the packed size; never beyond
+# Bytes that may always be unpacked; times the packed size; the most in any case
 _SMALL, _RATIO, _LARGEST = 1 << 26, 200, 1 << 33
 _raised: ContextVar[int | None] = ContextVar("unpack_limit", default=None)
 
 
 def raise_limit(size: int | None) -> None:
-    """Set how many bytes a file may unpack to, for this thread; None goes back to the usual bounds."""
+    """Set how many bytes a file may unpack to, for this thread; None restores the usual limits."""
     _raised.set(size)
 
 
 class Budget:
-    """How much a file may still unpack to."""
+    """Bytes that a file may still unpack to."""
 
     def __init__(self, path: Path, name: str) -> None:
         usual = max(_SMALL, min(_LARGEST, _RATIO * path.stat().st_size))
@@ -42,7 +42,7 @@ class Budget:
         self.left = self._limit
 
     def take(self, size: int) -> None:
-        """Count bytes that are about to be unpacked.
+        """Subtract bytes that are about to be unpacked.
 
         Raises
         ------
@@ -58,7 +58,7 @@ class Budget:
 
 
 def unpack(decoder: Callable[[], Any], data: bytes | memoryview, most: int) -> bytes:
-    """Return what compressed data hold, or a byte more than `most` where they hold more.
+    """Return the content of compressed data, or a byte more than `most` where they hold more.
 
     `decoder` makes a decompressor as the standard library has them (zlib, bz2, and lz4 and zstd likewise).
 
@@ -81,7 +81,7 @@ def unpack(decoder: Callable[[], Any], data: bytes | memoryview, most: int) -> b
     return b"".join(parts)
 
 
-# The kinds of file that can be read: how each is recognised, which library it needs, and whether that is here.
+# Kinds of file: recognition and needed libraries.
 
 
 _JSON = re.compile(rb"(\xef\xbb\xbf)?\s*(\{|\[\s*[\[{\]])")  # a line of text may begin with [12.5]
@@ -120,7 +120,7 @@ class Format(Struct, frozen=True):
 
     @property
     def available(self) -> bool:
-        """Whether the library is here."""
+        """Whether the library is installed."""
         return not self.library or find_spec(self.library) is not None
 
 
@@ -149,12 +149,12 @@ def _is_mimu(head: bytes) -> bool:
 
 
 def recognised(head: bytes) -> Format:
-    """Return the kind of a file by its first bytes; text where nothing else fits."""
+    """Return the kind of a file from its first bytes; text where nothing else fits."""
     return next((kind for kind in FORMATS if kind.matches(head)), TEXT)
 
 
 def library(module: str, kind: str, extra: str, name: str) -> Any:
-    """Import the library that a kind of file needs.
+    """Return the imported library that a kind of file needs.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def library(module: str, kind: str, extra: str, name: str) -> Any:
 
 
 def table() -> tuple[list[str], list[list[str]]]:
-    """Return titles and rows of what can be read and written."""
+    """Return titles and rows of the list of formats that can be read and written."""
     rows = []
     for kind in (TEXT, *FORMATS):
         needs = f"pip install 'imulab[{kind.extra}]'" if kind.extra and not kind.available else ""

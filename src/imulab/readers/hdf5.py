@@ -66,7 +66,7 @@ def _check_storage(dataset: Any, where: str) -> None:
 
 
 def _unpacked(dataset: Any) -> int:
-    """Return the bytes that a dataset has in memory, or one of its chunks if that is more."""
+    """Return the bytes that a dataset takes in memory, or one of its chunks if that is more."""
     chunk = prod(dataset.chunks) * dataset.dtype.itemsize if dataset.chunks else 0
     return max(int(dataset.nbytes), chunk)
 

@@ -125,7 +125,7 @@ def _values(document: Any, key: str, number: int | None, where: str, skips: bool
 
 
 def _inside(value: Any, rest: str, number: int | None, row: int, where: str) -> Any:
-    """Return what a name leads to in a row: None where that is null, `KeyError` where there is no such key."""
+    """Return the value that a name leads to in a row; None for null, `KeyError` without such a key."""
     while rest and value is not None:
         if not isinstance(value, dict):
             raise ReadError(f"{where}: row {row}: expected an object with the key {rest!r}, found {_described(value)}")
@@ -197,7 +197,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _names(value: Any, prefix: str = "") -> Iterator[str]:
-    """Yield the names that a layout can take columns from; of records those of the first."""
+    """Yield the names that a layout can use; for a list of records, those of the first."""
     first = value[0] if isinstance(value, list) and value else value
     if not isinstance(first, dict):
         if prefix:

@@ -1,4 +1,4 @@
-"""Layout files.
+"""Layout files, which describe the columns and units of foreign files, and the conversion of what is read.
 
 Where the columns of a foreign file are, and in which units, and what was read to readings in them; `EXAMPLE` has
 every key.
@@ -19,7 +19,7 @@ from imulab.files import check_keys, load_toml, number_of, scale_factor_of, unit
 from imulab.recording import Array, Layout, LayoutColumn
 from imulab.units import Unit, conversion_factor, parse_unit, to_si
 
-# Layout files: where the columns of a foreign file are, and in which units; `EXAMPLE` has every key.
+# Layout files; `EXAMPLE` has every key.
 
 
 EXAMPLE = """\
@@ -63,8 +63,8 @@ _KEYS = (
 )
 _COLUMN_KEYS = ("from", "unit", "scale", "zero", "scale_factor")
 _ASCII = bytes(range(32, 92)) + bytes(range(93, 127)) + b"\\u0041\t\n"
-"""What an encoding of titles must leave as it is; the escape is one that unicode_escape would change."""
-_LARGEST = 1e30  # a scale or offset beyond it, or below its inverse, is a slip of the pen
+"""Characters that an encoding of titles must keep; unicode_escape would change the escape."""
+_LARGEST = 1e30  # a scale or offset beyond it, or below its inverse, is a mistake
 _RATES = (1e-6, 1e9)  # Hz, of any sensor
 _BY_COLUMN = {
     "scale_factor": '{ value = 0.02, unit = "V/(deg/s)" }',
@@ -73,7 +73,7 @@ _BY_COLUMN = {
 
 
 class IfNeeded(str):
-    """The name of a layout that is left out where a file says itself what its columns are."""
+    """Name of a layout that is used only where a file does not describe its columns."""
 
 
 def shipped_names() -> list[str]:
@@ -82,12 +82,12 @@ def shipped_names() -> list[str]:
 
 
 def shipped_file(name: str) -> Path | None:
-    """Return the file of a layout that comes with imulab, or None where no such is called so."""
+    """Return the file of a layout that comes with imulab, or None if there is none of this name."""
     return _SHIPPED / f"{name}.toml" if name in shipped_names() else None
 
 
 def load_layout(path: str | Path, name: str | None = None) -> Layout:
-    """Read a layout: a file, or one that comes with imulab by its name.
+    """Return a layout from a file, or by its name if it comes with imulab.
 
     A text such as ``"phyphox"`` is the name of one that comes with imulab; ``"./phyphox"`` and any `Path` are files.
     `name` is what messages call it, its path if not given.
@@ -153,7 +153,7 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
 
 
 def _with_tables(columns: dict[str, Any], table: dict[str, Any], path: str) -> dict[str, Any]:
-    """Return the columns with what the tables [scale_factor] and [zero] say of them."""
+    """Return the columns with the values of the tables [scale_factor] and [zero]."""
     merged = dict(columns)
     for key, example in _BY_COLUMN.items():
         entries = table.get(key, {})
@@ -229,7 +229,7 @@ def _zero(entry: Any, unit: Unit, place: str) -> float:
 
 
 def _check_size(value: float, place: str) -> None:
-    """Refuse a number by which ordinary readings would become infinite or nothing."""
+    """Refuse a number that would make ordinary readings infinite or zero."""
     if not 1 / _LARGEST <= abs(value) <= _LARGEST:
         raise ReadError(f"{place}: expected a size from {1 / _LARGEST:g} to {_LARGEST:g}, found {value:g}")
 
@@ -274,16 +274,16 @@ def _sample_rate(entry: Any, path: str) -> float | None:
     return rate
 
 
-# What was read to readings in the units of a layout, block by block.
+# Conversion to readings in the units of a layout, block by block.
 
 
-_COUNTERS = [2.0**8, 2.0**16, 2.0**32]  # where counters of 8, 16 and 32 bits begin anew
+_COUNTERS = [2.0**8, 2.0**16, 2.0**32]  # where counters of 8, 16 and 32 bits wrap around
 _LOST_AT_WRAP = 16
-"""Steps that a counter may miss where it begins again."""
+"""Steps that a counter may miss where it wraps around."""
 
 
 class BackwardsError(ReadError):
-    """A date is before the one above it; `index` rows of the block are good."""
+    """A date is before the one above it; the first `index` rows of the block are good."""
 
     def __init__(self, message: str, index: int) -> None:
         super().__init__(message)
@@ -313,7 +313,7 @@ class Readings:
             self._check_dates(name, columns[name], first_row, lines_before)
         rate = self._layout.sample_rate
         if rate is not None and "time" in columns:
-            columns["time"][:] = self._unwrapped(columns["time"])
+            columns["time"][:] = self._unwrap(columns["time"])
         for name, values in columns.items():
             if name in dates:
                 self._count_from_first(name, values)
@@ -327,7 +327,7 @@ class Readings:
         return {"time": np.arange(first_row - 1, first_row - 1 + count) / rate, **columns}
 
     def _count_from_first(self, name: str, values: Array) -> None:
-        """Turn dates, nanoseconds since 1970 in the bits of `values`, into seconds since the first of the file."""
+        """Convert dates, nanoseconds since 1970 in the bits of `values`, to seconds since the first of the file."""
         stamps = values.view(np.int64)
         first, _ = self._dates.get(name, (int(stamps[0]), 0))
         self._dates[name] = first, int(stamps[-1])
@@ -350,8 +350,8 @@ class Readings:
                 index,
             )
 
-    def _unwrapped(self, numbers: Array) -> Array:
-        """Carry a counter on where it begins again within a few of its steps of 2^8, 2^16 or 2^32.
+    def _unwrap(self, numbers: Array) -> Array:
+        """Return a counter without wrap-around, where it wraps within a few of its steps of 2^8, 2^16 or 2^32.
 
         Where it begins again elsewhere, the number stays as it is: that is time that runs backwards.
         """

@@ -18,7 +18,7 @@ MORE, FULL, DAMAGED = range(3)
 
 Integers = NDArray[np.int64]
 PLAINLY_MORE = 1.5
-"""Times as many samples as of a message that holds the same: that one is logged at a low rate, to be looked at."""
+"""A message with so many times fewer samples than another of the same content is logged at a low rate, for display."""
 _AT_ONCE = 1 << 18  # messages whose starts are held at once
 BLOCK_BYTES = 1 << 23  # read at once
 _MCAP_READ = (3, 4, 5, 6)  # schema, channel, message, chunk; attachments may be larger than memory
@@ -39,7 +39,7 @@ class Records:
         return self.block[start : start + int(self.sizes[index])]
 
     def of(self, keys: int | list[int]) -> Integers:
-        """Return the indices of the records of one or several kinds."""
+        """Return the indices of the records of these kinds."""
         return np.flatnonzero(np.isin(self.keys, keys))
 
 
@@ -84,7 +84,7 @@ def field(rows: NDArray[np.uint8], offset: int, kind: str, count: int = 1) -> ND
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """How a log ended: the byte where reading stopped, how many bytes were left, and whether they are damaged."""
+    """End of a log: the byte where reading stopped, how many bytes were left, and whether they are damaged."""
 
     position: int
     left: bytes
@@ -92,7 +92,7 @@ class Ending:
 
 
 def walk_stream(stream: BinaryIO, kind: int, start: int, limit: int, ending: list[Ending]) -> Iterator[Records]:
-    """Yield the records of a file from byte `start` to byte `limit`; how it ended is appended to `ending`."""
+    """Yield the records of a file from byte `start` to byte `limit`; its ending is appended to `ending`."""
     lengths = np.zeros(256, dtype=np.uint8)
     stream.seek(start)
     base, rest = start, b""
@@ -116,7 +116,7 @@ def walk_stream(stream: BinaryIO, kind: int, start: int, limit: int, ending: lis
 
 
 def _passed_over(kind: int, rest: bytes, most: int) -> int:
-    """Return the size of a record that need not be read, where it is whole in the file but not in the block, or 0."""
+    """Return the size of a record that need not be read, if it is whole in the file but not in the block, or 0."""
     if kind != MCAP or len(rest) < 9 or rest[0] in _MCAP_READ:
         return 0
     size = 9 + int.from_bytes(rest[1:9], "little")
@@ -124,7 +124,7 @@ def _passed_over(kind: int, rest: bytes, most: int) -> int:
 
 
 def text_of(data: bytes, name: str, what: str) -> str:
-    """Decode a text of a log.
+    """Return a text of a log, decoded.
 
     Raises
     ------

@@ -34,7 +34,7 @@ _LISTED = 20  # names that a message lists
 
 
 class _DamagedError(Exception):
-    """What is there is no element of the format."""
+    """The bytes are no element of the format."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class _Variable:
 
 
 def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
-    """Yield the columns that a layout names; the variables are held in memory, which the format asks for.
+    """Yield the columns that a layout names; the variables are held in memory, as the format requires.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def _numbers(variables: dict[str, _Variable], path: str, where: str) -> np.ndarr
 
 
 def _variables(data: bytes, wanted: set[str] | None, budget: Budget) -> Iterator[_Variable]:
-    """Yield the variables of a file, the numbers only of those that are wanted; all where that is None."""
+    """Yield the variables of a file, with numbers only for the wanted ones; all if None."""
     if len(data) < _HEAD:
         raise _DamagedError(f"the head has {len(data)} bytes, expected {_HEAD}")
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
@@ -130,7 +130,7 @@ def _variables(data: bytes, wanted: set[str] | None, budget: Budget) -> Iterator
 
 
 def _elements(data: bytes | memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Yield type and payload of the elements within another; small ones have theirs in the tag."""
+    """Yield type and payload of the elements within another; small ones have the payload in the tag."""
     view, at = memoryview(data), 0  # views: a variable may be as large as memory allows
     while at < len(data):
         if len(data) - at < 8:
@@ -146,7 +146,7 @@ def _elements(data: bytes | memoryview, order: str) -> Iterator[tuple[int, memor
 
 
 def _matrix(data: bytes | memoryview, order: str, wanted: set[str] | None, depth: int) -> _Variable:
-    """Take a matrix apart; `wanted` None: whatever its name."""
+    """Return a matrix as a variable; `wanted` None accepts any name."""
     if not data:
         return _Variable("", (0, 0), 0)  # an empty field
     elements = _elements(data, order)

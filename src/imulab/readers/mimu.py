@@ -28,13 +28,13 @@ _HEAD, _SIZE = 0xAA, 0x64  # first byte of a frame, and bytes of its payload
 _SEARCH = 4096  # bytes within which the first frame is looked for
 _CLOCK = 64e6  # Hz
 _WRAP = 1 << 32  # ticks, 67 s
-_RESTARTED = 60_000  # frames: a sequence that jumps further was begun anew
+_RESTARTED = 60_000  # frames: a larger jump of the sequence is a restart
 _ACCEL_STEP = STANDARD_GRAVITY / 2048  # m/s^2
 _GYRO_STEP = 1 / 16.4  # deg/s
 
 
 def is_mimu(start: bytes) -> bool:
-    """Return whether the first bytes of a file (two frames of them at least) hold a MIMU4444 frame with its sum."""
+    """Return whether the first bytes of a file (at least two frames) hold a MIMU4444 frame with a correct sum."""
     return _first_frame(start) is not None
 
 
@@ -46,7 +46,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
 
 
 def read_mimu(stream: BinaryIO, name: str) -> Recording:
-    """Read a MIMU4444 log: ``time [s]`` from 0 and unwrapped, ``gyro_x_1 .. gyro_z_8 [deg/s]``, ``accel_..`` [m/s^2].
+    """Return a MIMU4444 log: ``time [s]`` from 0, ``gyro_x_1 .. gyro_z_8 [deg/s]``, ``accel_..`` [m/s^2].
 
     Axes are as logged. Damaged bytes between frames are skipped, and a log that ends in the middle of a frame is read
     up to there; notes say so.
@@ -91,7 +91,7 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
 
 
 def _ticks(stamp: NDArray[np.int64], lost: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the ticks from frame to frame; where frames are missing, the wraps of the clock that their number says."""
+    """Return the ticks from frame to frame; across missing frames, with the wraps that their number implies."""
     step = np.mod(np.diff(stamp), _WRAP)
     if step.size:
         usual = float(np.median(step))
@@ -101,7 +101,7 @@ def _ticks(stamp: NDArray[np.int64], lost: NDArray[np.int64]) -> NDArray[np.int6
 
 
 def _first_frame(data: bytes, furthest: int = _SEARCH) -> int | None:
-    """Return where the first frame with a right sum begins, or None."""
+    """Return the place of the first frame with a correct sum, or None."""
     place = data.find(_HEAD)
     while 0 <= place <= min(len(data) - _FRAME.itemsize, furthest):
         if data[place + 3] == _SIZE and _good(data[place : place + _FRAME.itemsize]).all():
@@ -120,7 +120,7 @@ def _good(data: bytes) -> np.ndarray:
 
 
 def _frames(data: bytes) -> tuple[np.ndarray, int, int | None]:
-    """Return the good frames, the number of bytes skipped after the first of them, and where a last, cut one begins."""
+    """Return the good frames, the number of bytes skipped after the first, and the place of a last, cut frame."""
     frames, skipped, size, cut = [], 0, _FRAME.itemsize, None
     place = _first_frame(data)
     while place is not None:
@@ -143,5 +143,5 @@ def _frames(data: bytes) -> tuple[np.ndarray, int, int | None]:
 
 
 def _begins_frame(rest: bytes) -> bool:
-    """Return whether the last bytes of a log are the beginning of a frame, which was being written as the log ended."""
+    """Return whether the last bytes of a log are the beginning of a frame that was being written."""
     return 0 < len(rest) < _FRAME.itemsize and rest[0] == _HEAD and rest[3:4] in (b"", bytes([_SIZE]))

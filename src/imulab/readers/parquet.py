@@ -18,7 +18,7 @@ from imulab.readers.layout import Readings
 from imulab.recording import CORRECTED_BY, Array, Layout, Recording
 
 _NOT_OURS = ("ARROW:", "org.apache.")
-_OTHERS_JSON = ("pandas", "huggingface", "geo")  # what other writers leave under these names begins with a brace
+_OTHERS_JSON = ("pandas", "huggingface", "geo")  # metadata of other writers, whose text begins with a brace
 
 
 def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
@@ -62,7 +62,7 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
 
 
 def _columns(there: list[str], name: str, layout: Layout | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Return for each of our columns its title in the file, and its unit."""
+    """Return for each column its title in the file, and its unit."""
     columns: dict[str, str] = {}
     units: dict[str, str] = {}
     if layout is None:

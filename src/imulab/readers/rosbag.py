@@ -42,7 +42,7 @@ from imulab.units import parse_unit
 
 
 def files_of(folder: Path, name: str) -> list[Path]:
-    """Return the data files of a ROS 2 bag's folder in order: those that its metadata lists, or else all.
+    """Return the data files in a ROS 2 bag's folder in order: those in its metadata, or else all.
 
     Raises
     ------
@@ -93,7 +93,7 @@ _AT_ONCE = 1 << 13  # rows of the database that are fetched at once
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic: its number in the file, its name, its message type as ``package/Type``, its serialisation."""
+    """A topic: number in the file, name, message type as ``package/Type``, serialisation."""
 
     number: int
     name: str
@@ -112,7 +112,7 @@ class Container(Protocol):
 
 
 def open_container(path: Path, name: str) -> Container:
-    """Open a file by its first bytes.
+    """Return the open file in the format that its first bytes show.
 
     Raises
     ------
@@ -275,7 +275,7 @@ class Mcap:
             yield _kept(records, records.of(wanted))
 
     def _define(self, records: logs.Records) -> None:
-        """Take in schemas (u16 id, name, ...) and channels (u16 id, u16 schema, topic, encoding ...)."""
+        """Add schemas (u16 id, name, ...) and channels (u16 id, u16 schema, topic, encoding ...)."""
         for index in records.of([3, 4]).tolist():
             data, text = records.payload(index), []
             number, at = int.from_bytes(data[:2], "little"), 2 if records.keys[index] == 3 else 4
@@ -305,7 +305,7 @@ class Mcap:
             raise ReadError(f"{self._name}: damaged: no whole record at byte {end.position}")
 
     def _chunk(self, data: bytes, budget: Budget) -> logs.Records:
-        """Take a chunk apart: u64 first and last time, u64 size, u32 CRC, compression, u64 size of the records."""
+        """Return the records of a chunk: u64 first and last time, u64 size, u32 CRC, compression, u64 size."""
         where = f"the chunk that begins at {int.from_bytes(data[:8], 'little')} ns"
         size, crc = int.from_bytes(data[16:24], "little"), int.from_bytes(data[24:28], "little")
         at = 32 + int.from_bytes(data[28:32], "little")
@@ -360,7 +360,7 @@ class Sqlite:
             yield logs.Records(b"".join(data for _, data in rows), offsets, sizes, keys)
 
     def _check_tables(self) -> None:
-        """Refuse a view or a computed column in the place of a table: what they give is bounded by no file's size."""
+        """Refuse a view or a computed column in place of a table: its content is not bounded by the file's size."""
         for table in ("topics", "messages"):
             tables = [
                 row
@@ -443,7 +443,7 @@ _MOST_FIELD = 1e-3
 """T; ten times and more what a magnetometer of a moving unit sees, hard iron included, or can put out."""
 _EARTH = (15e-6, 120e-6)
 """T; fields on Earth with the hard iron of an ordinary unit, so narrow that one unit at most fits a number."""
-_SAMPLES_LOOKED_AT = 4096  # samples to find out what a topic reports; a chunk may hold only one
+_SAMPLES_LOOKED_AT = 4096  # samples that show what a topic reports; a chunk may hold only one
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
@@ -569,7 +569,7 @@ def _pieces(files: list[Container], slots: dict[str, int], name: str) -> Iterato
 
 
 def _in_tesla(pieces: Iterator[Piece], stream: int, topic: str, notes: list[str]) -> Iterator[Piece]:
-    """Pass pieces on, a magnetometer's in tesla: drivers that write another unit are found out by its size."""
+    """Yield pieces with magnetic fields in tesla; drivers that write another unit are recognised by the size."""
     factor = None
     for piece in pieces:
         if piece.stream != stream:
@@ -584,7 +584,7 @@ def _in_tesla(pieces: Iterator[Piece], stream: int, topic: str, notes: list[str]
 
 
 def _unit_of_field(size: float, topic: str) -> tuple[float, list[Note]]:
-    """Return the factor to tesla of a field of this usual size, stated as tesla, and what is said of it."""
+    """Return the factor to tesla for a field of this usual size, stated as tesla, and a note."""
     if size <= _MOST_FIELD:
         return 1.0, []
     wrong = f"{topic} says that the field is {size:.3g} T, which none on Earth is"
@@ -596,7 +596,7 @@ def _unit_of_field(size: float, topic: str) -> tuple[float, list[Note]]:
 
 
 def _reported(pieces: Iterator[Piece], name: str, topic: str) -> tuple[list[bool], Iterator[Piece]]:
-    """Return whether the clock's stream reports specific force and rate, by its first samples; and all pieces."""
+    """Return whether the clock's stream reports specific force and rate, from its first samples; and all pieces."""
     before: list[Piece] = []
     there, count = [False, False], 0
     for piece in pieces:
@@ -629,7 +629,7 @@ _READINGS: dict[str, Callable[[Array], Array]] = {_IMU: _readings, _FIELD: _fiel
 
 
 def _decoded(records: logs.Records, indices: logs.Integers, topic: Topic, name: str) -> tuple[logs.Integers, Array]:
-    """Return header stamps, ns (n,), and the doubles behind the header (n, count)."""
+    """Return header stamps, ns, (n,), and the doubles after the header, (n, count)."""
     if topic.encoding not in ("cdr", "ros1"):
         raise ReadError(f"{name}: {topic.name} is serialised as {topic.encoding!r}; expected cdr or ros1")
     count = _DOUBLES[topic.type]

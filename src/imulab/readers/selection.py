@@ -1,4 +1,4 @@
-"""Which part of a file to read: topic, instance, element, time window."""
+"""The part of a file to read: topic, instance, element, time window."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from imulab.recording import Ends, Recording, Window
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What to take out of a file that holds more than one recording.
+    """The choice of a recording in a file that holds several.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Selection:
 
     @property
     def ends(self) -> Ends | None:
-        """The window's first and last time, s; None where there is no window."""
+        """First and last time of the window, s; None without one."""
         return span(self.window, "window") if isinstance(self.window, str) else self.window
 
     def beside(self, title: str) -> tuple[str | None, int | None]:
@@ -68,7 +68,7 @@ class Selection:
         return (others or None), (int(number) if number else None)
 
     def of(self, blocks: Iterator[Recording], name: str) -> Iterator[Recording]:
-        """Pass on the rows of the element within the window; errors as for `of_element` and `windowed`."""
+        """Yield the rows of the element within the window; errors as for `of_element` and `windowed`."""
         return windowed(of_element(blocks, self.element, name), self.ends, name)
 
     def refuse(self, name: str, kind: str, *, topic: bool = True, instance: bool = True) -> None:
@@ -80,7 +80,7 @@ class Selection:
 
 
 def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Iterator[Recording]:
-    """Pass on the rows within a time window, and stop reading behind it.
+    """Yield the rows within a time window, and stop reading after it.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Ite
 
 
 def of_element(blocks: Iterator[Recording], element: int | None, name: str) -> Iterator[Recording]:
-    """Pass on the columns of one IMU of several (``accel_x_7`` as ``accel_x``), with those that belong to none.
+    """Yield the columns of one IMU of several (``accel_x_7`` as ``accel_x``), with those common to all.
 
     Raises
     ------

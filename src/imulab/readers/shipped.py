@@ -10,12 +10,12 @@ from imulab.readers.layout import load_layout, shipped_file, shipped_names
 from imulab.readers.text import titles_of
 from imulab.recording import Layout
 
-_MOST_LINES = 200  # of a head by which a known logger is told
+_MOST_LINES = 200  # of a head that show a known logger
 
 
 @dataclass(frozen=True, slots=True)
 class Shipped:
-    """A layout that comes with imulab: its name, the files that it is for, and what it says."""
+    """A layout that comes with imulab: name, the files that it is for, and its text."""
 
     name: str
     about: str
@@ -23,18 +23,18 @@ class Shipped:
 
     @property
     def titles(self) -> frozenset[str]:
-        """The titles that it takes columns from; none where it counts them."""
+        """Titles of its columns; none where it uses numbers."""
         return frozenset(c.origin for c in self.layout.columns.values() if isinstance(c.origin, str))
 
     @property
     def sensors(self) -> list[str]:
-        """What its columns hold, a triad as one: ``time``, ``accel``, ``gyro``."""
+        """Content of its columns, with a triad as one: ``time``, ``accel``, ``gyro``."""
         return list(dict.fromkeys(name.partition("_")[0] for name in self.layout.columns))
 
 
 @cache
 def shipped() -> tuple[Shipped, ...]:
-    """Return all of them, by name."""
+    """Return all layouts that come with imulab, by name."""
     layouts = []
     for name in shipped_names():
         text = (shipped_file(name) or Path()).read_text(encoding="utf-8")
@@ -43,7 +43,7 @@ def shipped() -> tuple[Shipped, ...]:
 
 
 def fitting(head: bytes) -> list[str]:
-    """Return the names of the layouts that fit a text file by its first lines.
+    """Return the names of the layouts that fit the first lines of a text file.
 
     A layout fits where one line holds all titles that it wants, or begins with its prefix. One that wants only some of
     the titles of another that fits is not named. Layouts that count columns without a prefix cannot be recognised.
@@ -61,7 +61,7 @@ def _fits(entry: Shipped, line: str) -> bool:
 
 
 def advice(head: bytes, layout: str | None = None) -> str:
-    """Return which layout to try with a text file by its first lines; empty where none fits, or `layout` does."""
+    """Return advice on a layout for a text file, from its first lines; empty if none fits, or if `layout` does."""
     names = fitting(head)
     if not names:
         return _separated(head)
@@ -71,7 +71,7 @@ def advice(head: bytes, layout: str | None = None) -> str:
 
 
 def _separated(head: bytes) -> str:
-    """Return which layout fits but for what stands between columns, and what to change; empty where none does."""
+    """Return the layout that fits except for the delimiter, with the change that it needs; empty if there is none."""
     lines = head.decode("utf-8-sig", "replace").splitlines()[:_MOST_LINES]
     for entry in shipped():
         for delimiter in {",", ";", "\t"} - {entry.layout.delimiter}:
@@ -89,7 +89,7 @@ def _separated(head: bytes) -> str:
 
 
 def is_titled(head: bytes) -> bool:
-    """Return whether the first line that is no comment has a unit in brackets, as imulab's titles have."""
+    """Return whether the first line that is no comment has a unit in brackets, as in imulab's titles."""
     lines = head.decode("utf-8", "replace").splitlines()
     return "[" in next((line for line in lines if line.strip() and not line.startswith("#")), "")
 

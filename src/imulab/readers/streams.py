@@ -1,4 +1,4 @@
-"""Streams of different clocks, and recordings of one unit whose sensors have a file each, to one recording.
+"""Streams with different clocks, and recordings of one unit with a file for each sensor, joined to one recording.
 
 Logs interleave the samples of several sensors. The accelerometer's samples (or whatever stream comes first) are the
 clock; the others are interpolated linearly between their neighbours, as they pass, without holding the file. Before a
@@ -28,14 +28,14 @@ from imulab.recording import Array, Recording, check_time
 Ticks = NDArray[np.int64]
 
 _ROWS = 1 << 16  # samples of the slowest stream after which rows are joined
-_PATIENCE = 1 << 20  # samples that are held while another stream lags behind
+_PATIENCE = 1 << 20  # most samples that wait for a late stream
 _MUCH = 0.1
-"""Part of a stream whose loss is warned of by every command."""
+"""Lost part of a stream from which every command warns."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoggedStream:
-    """The columns of one stream, and what to call it.
+    """The columns of one stream, and its name in messages.
 
     `slow`: its values change so little that any gap is bridged. `placed`: each sample goes into the row of the clock
     that is nearest in time, and is not interpolated. Rows end with neither kind.
@@ -62,7 +62,7 @@ class Piece:
 
 
 class _Buffer:
-    """Samples of a stream that are not used up yet."""
+    """Samples of a stream that are still needed."""
 
     def __init__(self, stream: LoggedStream) -> None:
         self.stream = stream
@@ -87,7 +87,7 @@ class _Buffer:
         self.total += len(piece.ticks)
 
     def join(self) -> None:
-        """Put the pieces together."""
+        """Join the pieces."""
         if self._waiting:
             self.ticks = np.concatenate([self.ticks, *(piece.ticks for piece in self._waiting)])
             self.values = np.concatenate([self.values, *(piece.values for piece in self._waiting)])
@@ -154,7 +154,7 @@ def on_one_clock(
         ready = clock.count if piece is None else whole
         ended = piece is None
         if clock.count > _PATIENCE and whole < clock.count // 2:
-            # A stream that has ended does not hold up the others; one that is only late has half of them as a margin.
+            # A stream that has ended does not delay the others; a late one may lag by half of the waiting samples.
             ended = True
             ready = clock.count // 2
             done = max(done, int(clock.ticks[:ready].max()))
@@ -187,7 +187,7 @@ def _with_end(pieces: Iterable[Piece]) -> Iterator[Piece | None]:
 
 
 def _refuse_late(buffer: _Buffer, clock: _Buffer, name: str) -> None:
-    """Refuse a stream whose samples come when the clock's samples of that time have long gone out without them."""
+    """Refuse a stream whose samples come after the clock's rows of that time were written without them."""
     raise ReadError(
         f"{name}: the samples of the {buffer.stream.what} lie more than {_PATIENCE // 2} samples behind those of the "
         f"{clock.stream.what} in the file; expected streams written side by side, as they are recorded"
@@ -195,7 +195,7 @@ def _refuse_late(buffer: _Buffer, clock: _Buffer, name: str) -> None:
 
 
 def _ready(clock: _Buffer, others: list[_Buffer]) -> int:
-    """How many samples of the clock have their neighbours in all other streams."""
+    """Return how many samples of the clock have their neighbours in all other streams."""
     if not others:
         return clock.count
     if any(other.count == 0 for other in others):
@@ -207,7 +207,7 @@ def _ready(clock: _Buffer, others: list[_Buffer]) -> int:
 
 
 def _bounds(clock: _Buffer, other: _Buffer, *, ended: bool) -> tuple[float, float]:
-    """Return the ticks between which the clock's rows are kept, for a stream that begins later or ends earlier.
+    """Return the first and last tick of the clock's rows, for a stream that begins later or ends earlier.
 
     Rows before it are left out where they are few, and kept without its values where they are many.
     """
@@ -263,7 +263,7 @@ def _left_out(clock: _Buffer, others: list[_Buffer]) -> list[str]:
 
 
 def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
-    """Say by how much the first stream that ends ends before the others, and warn where that is much of them."""
+    """Return a note by how much the first stream to end ends before the others; a warning if that is a large part."""
     timed = [(b.last, b.first, b) for b in buffers if b.last is not None and b.first is not None and b.stream.bounds]
     end, _, first = min(timed, key=lambda ending: ending[0])
     messages = []
@@ -281,7 +281,7 @@ def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
 
 
 def _placements(clock: _Buffer, others: list[_Buffer], rows: int, per_second: int) -> list[str]:
-    """Say of each stream that was not interpolated how many of its samples stand in how many rows."""
+    """Return notes on streams that were not interpolated: how many samples stand in how many rows."""
     notes: list[str] = []
     for other in others:
         if not other.stream.placed or (other.exact and other.total == other.rows == rows):
@@ -297,7 +297,7 @@ def _placements(clock: _Buffer, others: list[_Buffer], rows: int, per_second: in
 
 
 def _placed(buffer: _Buffer, step: float, ticks: Ticks, following: int | None) -> Array:
-    """Values of a stream in the rows nearest in time to each sample, shape (n, columns), NaN in the other rows.
+    """Return the values of a stream in the rows nearest in time to each sample, (n, columns), NaN in other rows.
 
     Samples further than a step of the clock from any row have none, nor have those whose time runs backwards; of
     several in one row the nearest stays.
@@ -323,7 +323,7 @@ def _placed(buffer: _Buffer, step: float, ticks: Ticks, following: int | None) -
 
 
 def _check_rising(buffer: _Buffer, origin: int, per_second: int, name: str) -> None:
-    """Refuse a stream whose time runs backwards: nothing could be looked up in it."""
+    """Refuse a stream whose time runs backwards, which cannot be interpolated."""
     step = np.diff(buffer.ticks)
     if step.size and step.min() < 0:
         index = int(np.argmax(step < 0))
@@ -335,7 +335,7 @@ def _check_rising(buffer: _Buffer, origin: int, per_second: int, name: str) -> N
 
 
 def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, name: str) -> tuple[Array, bool]:
-    """Values of a stream at the clock's ticks, shape (n, columns), and whether any had to be interpolated."""
+    """Return the values of a stream at the clock's ticks, (n, columns), and whether any were interpolated."""
     if buffer.count == 0:
         return np.full((len(ticks), buffer.values.shape[1]), np.nan), False
     _check_rising(buffer, origin, per_second, name)
@@ -346,10 +346,10 @@ def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, n
     met = buffer.ticks[right] == ticks
     left = np.clip(right - 1, 0, None)
     if not buffer.stream.slow and not np.isnan(buffer.step):
-        # Across a gap there is no reading: that is not invented.
+        # No readings are made up across a gap.
         values[~met & (buffer.ticks[right] - buffer.ticks[left] > WIDEST_GAP * buffer.step)] = np.nan
     values[outside] = np.nan
-    # The sample before the last tick stays: the next block may begin right behind it.
+    # The sample before the last tick is kept, because the next block may begin right after it.
     buffer.drop(max(int(np.searchsorted(buffer.ticks, ticks.max(), side="right")) - 1, 0))
     return values, not met.all()
 
@@ -365,14 +365,14 @@ def _note(buffer: _Buffer, clock: _Buffer, per_second: int) -> str:
     )
 
 
-# Recordings of one unit whose sensors have a file each, as phones and the x-IMU3 write them, to one recording.
+# Recordings with a file for each sensor, as of phones and the x-IMU3.
 
 
 _PER_SECOND = 10**9  # ticks that times are joined by: 1 ns
 
 
 def join_recordings(recording: Recording, others: Sequence[Recording]) -> Recording:
-    """Join recordings of one unit's sensors, whose times count from the same instant, on the clock of the first.
+    """Return one recording from several of a unit's sensors, with times from one instant, on the clock of the first.
 
     Magnetometers are not interpolated: each sample stands in the row nearest in time, other rows hold NaN. All else is
     interpolated linearly, but not across gaps; rows end with the first recording that ends.
@@ -427,7 +427,7 @@ def join_recordings(recording: Recording, others: Sequence[Recording]) -> Record
         )
         ticks = np.rint(time * _PER_SECOND).astype(np.int64)
         pieces.append(Piece(number, ticks, np.column_stack([part.columns[name] for name in names])))
-    # The first comes last, when all that its rows need is there.
+    # The first recording comes last, when all samples that its rows need have been read.
     blocks = list(
         on_one_clock(
             streams,
@@ -455,7 +455,7 @@ def _check_overlap(first: Recording, other: Recording) -> None:
 
 
 def file_and_layout(text: str) -> tuple[str, str | None]:
-    """Split ``FILE@LAYOUT``; a file whose own name holds an @ is taken as it is.
+    """Return file and layout of ``FILE@LAYOUT``; a file whose name contains an @ is used as it is.
 
     Raises
     ------

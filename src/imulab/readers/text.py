@@ -29,17 +29,17 @@ from imulab.readers.layout import BackwardsError, Readings
 from imulab.recording import CORRECTED_BY, Layout, Recording
 from imulab.writers import powers_of_five
 
-# The bytes of a text file as lines: one by one for the head, whole blocks of them below.
+# Lines of a file: one by one for the head, in whole blocks below.
 
 
 _BLOCK_BYTES = 1 << 21  # read at once
 WORTH_SHARING = 1 << 19  # bytes from which a block is shared among threads
 _MOST_THREADS = 8  # that parse one file
-LONGEST_LINE = 1 << 20  # bytes: what has no end of line for longer is no text
+LONGEST_LINE = 1 << 20  # bytes: a longer line without an end is no text
 
 
 class ParserThreads:
-    """Threads to parse with, as many as there are processors; started when there is work for them.
+    """Threads of the parser, as many as processors; they are started when there is work.
 
     OMP_NUM_THREADS limits them as it does the linear algebra, so that workers beside each other do not compete.
     """
@@ -51,7 +51,7 @@ class ParserThreads:
         self._pool: ThreadPoolExecutor | None = None
 
     def begin(self, job: Callable[[], tuple[int, int, int]]) -> Callable[[], tuple[int, int, int]]:
-        """Give a thread its work; what comes back waits for the answer."""
+        """Start work on a thread, and return a function that waits for the result."""
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self.size)
         return self._pool.submit(job).result
@@ -65,14 +65,14 @@ class ParserThreads:
 
 
 class Hash:
-    """SHA-256 of what is read, taken in a thread of its own where there is much of it."""
+    """SHA-256 of the bytes read, computed in its own thread for large files."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
         self._pool: ThreadPoolExecutor | None = None
 
     def update(self, data: bytes) -> None:
-        """Go on with these bytes."""
+        """Add these bytes."""
         if self._pool is None and len(data) < WORTH_SHARING:
             self._hash.update(data)
             return
@@ -130,7 +130,7 @@ class Lines:
 
     @property
     def waiting(self) -> int:
-        """Bytes that were read and not yet taken."""
+        """Number of bytes that were read and not yet used."""
         return len(self._rest) - self._at
 
     def sha256(self) -> str:
@@ -141,12 +141,12 @@ class Lines:
         return self._hash.hexdigest()
 
     def drain(self) -> None:
-        """Read on to the end, so that the hash is that of the whole file."""
+        """Read to the end, so that the hash is that of the whole file."""
         while not self._ended:
             self._next_bytes()
 
     def block(self, blanks: bytes) -> bytes | None:
-        """Take whole lines of about a block's size, without lines of `blanks` at the end of the file; None at its end.
+        """Return whole lines of about a block's size, without blank lines at the end of the file; None at its end.
 
         A line that is too long ends the file, and `overlong` is set.
         """
@@ -155,7 +155,7 @@ class Lines:
             end = self._rest.rfind(b"\n") + 1
             if end:
                 lines, self._rest = self._rest[:end], self._rest[end:]
-                # Blank lines may be the end of the file: they wait for what follows.
+                # Blank lines may be the end of the file: they wait for the lines after them.
                 kept = lines.rstrip(blanks)
                 if kept:
                     self._rest = lines[len(kept) :].partition(b"\n")[2] + self._rest
@@ -179,7 +179,7 @@ class Lines:
         return lines or None
 
     def next_line(self) -> bytes:
-        """Return the next line without taking it, or as much of it as a line may have; empty at the end."""
+        """Return the next line without consuming it, or as much as a line may have; empty at the end."""
         end = self._rest.find(b"\n", self._at)
         while end < 0 and not self._ended and self.waiting <= LONGEST_LINE:
             self._rest, self._at = self._rest[self._at :], 0
@@ -189,7 +189,7 @@ class Lines:
         return self._rest[self._at : end if end >= 0 else len(self._rest)]
 
     def first(self) -> bytes:
-        """Return the first line that is neither blank nor a comment without taking it; empty where there is none."""
+        """Return the first line that is neither blank nor a comment without consuming it; empty if there is none."""
         while True:
             lines = self._rest[self._at :].split(b"\n")
             whole = lines if self._ended or self.waiting > LONGEST_LINE else lines[:-1]
@@ -199,7 +199,7 @@ class Lines:
             self._read_more()
 
     def line(self, encoding: str = "utf-8", errors: str = "strict", hint: str = "") -> str | None:
-        """Take one line of the head, None at the end of the file; comments may be of any encoding.
+        """Return one line of the head, None at the end of the file; comments may have any encoding.
 
         Raises
         ------
@@ -223,7 +223,7 @@ class Lines:
             raise ReadError(f"{place}: expected {shown} text{hint}") from None
 
     def is_blank(self) -> bool:
-        """Return whether nothing but blanks follows; reads on until that is known."""
+        """Return whether only blank lines follow; reads on until that is known."""
         while not self._rest[self._at :].strip() and not self._ended:
             self._read_more()
         return not self._rest[self._at :].strip()
@@ -244,7 +244,7 @@ class Lines:
 
 
 def _is_file(stream: BinaryIO) -> bool:
-    """Whether the stream is an open file, whose size is known."""
+    """Return whether the stream is an open file with a known size."""
     try:
         return stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
     except (OSError, ValueError):
@@ -252,7 +252,7 @@ def _is_file(stream: BinaryIO) -> bool:
 
 
 def _is_pipe(stream: BinaryIO) -> bool:
-    """Whether lines come as they are made, so that none may be held back."""
+    """Return whether lines arrive one by one, so that none may be delayed."""
     try:
         return not stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
     except (OSError, ValueError):
@@ -264,7 +264,7 @@ def _is_pipe(stream: BinaryIO) -> bool:
 
 _text.prepare(powers_of_five())
 _TITLE = re.compile(r"[^,\[\]]+\[[^,\[\]]+\]")
-_DATE = 1 << 30  # flag, beyond any column's number, of a column that holds dates
+_DATE = 1 << 30  # flag of a column of dates, beyond any column's number
 _NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE = 1, 2, 3  # problems that the parser in C reports
 _MOST_ABOVE = 100  # lines above the titles
 _UNENDED = Note("the last line has no line end: if the file was cut there, its last number is short")
@@ -320,7 +320,7 @@ class TextFile:
             self._pass_last_delimiter()
 
     def blocks(self) -> Iterator[Recording]:
-        """Yield the rows as recordings; there is at least one row, or the file is refused."""
+        """Yield the rows as recordings; a file without rows is refused."""
         last, noted = None, False
         for block in self._blocks():
             if not self._skips:
@@ -346,7 +346,7 @@ class TextFile:
                 lines = self._lines.block(self._blanks)
                 if lines is not None:
                     waiting.append(self._begin(lines, threads))
-                # A file is read ahead while threads parse what has come; a pipe's lines go on at once.
+                # A file is read ahead while threads parse; lines of a pipe are passed on at once.
                 while waiting and (lines is None or live or len(waiting) > threads.size):
                     job = waiting.popleft()
                     rows, problem, field = job.answer()
@@ -358,7 +358,7 @@ class TextFile:
                         raise
                     if self._lines.unended and not waiting:
                         recording = replace(recording, notes=(*recording.notes, _UNENDED))
-                    # The good rows of a stream are not lost with the bad one behind them.
+                    # The good rows of a stream are kept if a bad one follows them.
                     if rows and (live or not problem):
                         yield recording
                     if problem:
@@ -383,7 +383,7 @@ class TextFile:
     # --- head --------------------------------------------------------------------------------------------------
 
     def _comments(self) -> str | None:
-        """Take the comment lines and return the first line that is none."""
+        """Read the comment lines and return the first other line."""
         while (line := self._lines.line()) is not None:
             if line.startswith("#"):
                 self._note(line)
@@ -392,7 +392,7 @@ class TextFile:
         return None
 
     def _note(self, comment: str) -> None:
-        """Keep a comment ``# key: value``; what a layout says goes before."""
+        """Store a comment ``# key: value``; an entry of the layout has precedence."""
         key, colon, value = comment.lstrip("# ").partition(":")
         if colon and key.strip() and not (self._layout and key.strip() in (self._layout.metadata or {})):
             if key.strip() == CORRECTED_BY:
@@ -460,7 +460,7 @@ class TextFile:
         return list(layout.columns), layout.units, slots
 
     def _pass_last_delimiter(self) -> None:
-        """Allow an empty field more than there are titles, in every row, where the first row ends with a delimiter."""
+        """Allow an empty field more than there are titles, in every row, if the first row ends with a delimiter."""
         line = self._lines.next_line().decode("utf-8", "replace").rstrip("\r")
         titles = self._most_fields or len(self._slots)
         if self._delimiter == " " or self._prefix or not line.endswith(self._delimiter):
@@ -471,7 +471,7 @@ class TextFile:
                 self._slots = np.append(self._slots, np.int32(-1))
 
     def _first_fields(self, layout: Layout) -> int:
-        """Return how many fields the rows have: as the first, or as many as are asked for where rows may lack some."""
+        """Return the number of fields in a row: as in the first, or as asked for where rows may lack some."""
         line = self._lines.next_line()
         while self._lines.waiting and (line.startswith(b"#") or not self._has_prefix(line)):
             comment = self._lines.line(layout.encoding, "replace") or ""
@@ -493,7 +493,7 @@ class TextFile:
         )
 
     def _layout_titles(self, layout: Layout) -> list[str]:
-        """Take the line of titles, which may itself begin with #, and lines above it; comments among these are kept."""
+        """Read the line of titles, which may begin with #, and the lines above it; their comments are kept."""
         wanted = {column.origin for column in layout.columns.values() if isinstance(column.origin, str)}
         hint = '; the layout says of which encoding it is, such as encoding = "gbk"'
         best: list[str] = []
@@ -524,13 +524,13 @@ class TextFile:
     # --- rows --------------------------------------------------------------------------------------------------
 
     def _begin(self, lines: bytes, threads: ParserThreads) -> _Job:
-        """Begin to parse a block of whole lines."""
+        """Start parsing a block of whole lines."""
         rows = lines
         if self._layout and self._layout.decimal == ",":
             rows = rows.replace(b",", b".")
         if self._chooses:
             rows, _ = self._chosen(rows, -1)
-        # A whole row has at least a sign for each of its fields; the first that has not is refused.
+        # A row has at least one character for each of its fields; a shorter one is refused.
         capacity = min(rows.count(b"\n"), len(rows) // len(self._slots) + 1) + 1
         room, first = self._place_for(capacity, len(lines))
         job = partial(_text.parse, rows, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
@@ -538,7 +538,7 @@ class TextFile:
         return _Job(lines, rows, room[:, first : first + capacity], answer)
 
     def _chosen(self, lines: bytes, most: int) -> tuple[bytes, int]:
-        """Return the rows that prefix and skip_incomplete leave, at most so many, and how many lines that took."""
+        """Return the rows that prefix and skip_incomplete leave, at most so many, and the number of lines for them."""
         out = bytearray(len(lines) + 1)
         size, _, count, incomplete = _text.choose(
             lines, self._delimiter, out, self._prefix, self._slots, self._skips, self._most_fields, most
@@ -600,17 +600,17 @@ class TextFile:
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
-    """Split a line as the C module does: blanks are spaces and tabs, nothing else."""
+    """Return the fields of a line as the C module splits it: blanks are spaces and tabs only."""
     return re.split(r"[ \t]+", line.strip(" \t\r")) if delimiter == " " else line.split(delimiter)
 
 
 def titles_of(line: str, delimiter: str) -> list[str]:
-    """Split a line of titles, which may begin with # and hold them in quotes."""
+    """Return the titles in a line, which may begin with # and have them in quotes."""
     return [title.strip().strip('"') for title in _fields(line.lstrip("# "), delimiter)]
 
 
 def is_native(line: str) -> bool:
-    """Return whether a line is one of titles with units, such as ``time [s],accel_x [g]``."""
+    """Return whether a line has titles with units, such as ``time [s],accel_x [g]``."""
     return all(_TITLE.fullmatch(title.strip().strip('"')) for title in line.lstrip("\ufeff").split(","))
 
 

@@ -1,4 +1,4 @@
-"""PX4 ULog: sensor_accel and sensor_gyro, or sensor_combined where that has plainly more samples, and sensor_mag.
+"""PX4 ULog: sensor_accel and sensor_gyro, or sensor_combined where that has clearly more samples, and sensor_mag.
 
 Source: the file format in the PX4 user guide ("ULog File Format", version 1): a header of 16 bytes, then messages
 u16 size, u8 type, payload. Time is ``timestamp_sample`` (``timestamp`` where a log has none), microseconds since boot.
@@ -41,10 +41,10 @@ _TOPICS = ("sensor_accel", "sensor_gyro", "sensor_combined")
 _ACCEL = dict.fromkeys(triad("accel"), "m/s^2")
 _GYRO = dict.fromkeys(triad("gyro"), "rad/s")
 _MAGS = ("sensor_mag", "vehicle_magnetometer")
-"""Magnetometers, gauss: as measured, and as PX4 has corrected and turned them."""
+"""Magnetometers, gauss: as measured, and as corrected and rotated by PX4."""
 _MAG = dict.fromkeys(triad("mag"), "gauss")
 _VECTORS = ("gyro_rad", "accelerometer_m_s2", "magnetometer_ga")
-_NO_ACCEL = 2**31 - 1  # relative time by which PX4 marks a sample without acceleration
+_NO_ACCEL = 2**31 - 1  # relative time that marks a sample without acceleration
 _KEPT = {"sys_name": "autopilot", "ver_hw": "hardware", "sys_uuid": "autopilot_uuid"}
 
 
@@ -57,7 +57,7 @@ class _Field:
 
 @dataclass(slots=True)
 class _Contents:
-    """What a first pass over the file finds."""
+    """Result of a first pass over the file."""
 
     formats: dict[str, str] = field(default_factory=dict)
     subscriptions: dict[int, tuple[str, int]] = field(default_factory=dict)
@@ -126,7 +126,7 @@ def _survey(path: Path, name: str) -> _Contents:
 
 
 def _end_of_log(first: bytes, size: int, name: str) -> int:
-    """Return where the log ends: the first message tells whether other data were appended behind it (after a crash)."""
+    """Return the end of the log; the first message states whether other data were appended (after a crash)."""
     if len(first) < 43 or first[2:3] != b"B":
         return size
     flags, appended = first[11:19], int.from_bytes(first[19:27], "little")
@@ -161,7 +161,7 @@ def _define(contents: _Contents, kind: str, payload: bytes, name: str) -> None:
 def _choose(
     contents: _Contents, selection: Selection, name: str
 ) -> tuple[list[LoggedStream], dict[int, tuple[int, str, dict[str, _Field]]]]:
-    """Return the streams, and for each subscription its stream, its topic and where its fields are."""
+    """Return the streams, and for each subscription its stream, its topic and the places of its fields."""
     topic, magnetometer = selection.beside(_MAGS[0])
     if topic is not None and topic not in _TOPICS:
         raise OptionError(f"{name}: topic {topic!r}; of a ULog these can be read: {' '.join(_TOPICS)} {_MAGS[0]}:N")
@@ -216,7 +216,7 @@ def _choose(
 
 
 def _magnetometer(contents: _Contents, wanted: int | None, instance: int, name: str) -> list[tuple[str, int]]:
-    """Return the magnetometer's topic and number, none where the log has none; note which of several it is.
+    """Return the magnetometer's topic and number, or None, and note which of several it is.
 
     `wanted` is the instance that was asked for; where none was, it is that of the accelerometer, or else the first.
     """
@@ -242,7 +242,7 @@ def _magnetometer(contents: _Contents, wanted: int | None, instance: int, name: 
 
 
 def _raw_or_combined(samples: dict[str, int], raw: list[str], notes: list[str]) -> list[str]:
-    """Return the topics to read: `raw` or, where that has plainly more samples, sensor_combined; note which and why."""
+    """Return the topics to read: `raw` or, if it has clearly more samples, sensor_combined; note the choice."""
     combined = samples.pop("sensor_combined")
     few = " and ".join(f"{count} of {title}" for title, count in samples.items())
     if not any(combined > logs.PLAINLY_MORE * count for count in samples.values()):
@@ -254,7 +254,7 @@ def _raw_or_combined(samples: dict[str, int], raw: list[str], notes: list[str]) 
 
 
 def _fields(contents: _Contents, title: str, name: str) -> dict[str, _Field]:
-    """Return where the fields that we need are in a message."""
+    """Return the places of the needed fields in a message."""
     if title not in contents.formats:
         raise ReadError(f"{name}: {title} is logged, but its format is not in the file")
     layout: dict[str, _Field] = {}
@@ -312,7 +312,7 @@ def _pieces(
 
 
 def _combined(got: dict[str, np.ndarray], slot: int) -> Iterator[Piece]:
-    """Split sensor_combined: the accelerometer has its own time, relative to the gyroscope's."""
+    """Return sensor_combined as two streams: the accelerometer has its own time, relative to the gyroscope's."""
     stamp = got["timestamp"].astype(np.int64)
     relative = got.get("accelerometer_timestamp_relative", np.zeros_like(stamp)).astype(np.int64)
     there = relative != _NO_ACCEL

@@ -302,7 +302,7 @@ def compare_methods(
     memory: str | float = "growing",
     count_from: int = 1,
 ) -> Comparison:
-    """Return the figures of all seven methods over a recording; memory and `count_from` are memory and start of `FuseOptions`.
+    """Return the figures of all seven methods over a recording; `memory` and `count_from` as in `FuseOptions`.
 
     The truth is the column ``truth_rate`` (or ``truth_rate_x`` ..); without it the unit must be still, or still for a
     stretch of 5 s or more: the figures are then of the longest such stretch, and the truth there is 0. With six gyros
