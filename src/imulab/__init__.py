@@ -167,7 +167,7 @@ __all__ = ["__version__", *_HOME]
 
 
 def _views() -> Views:
-    """Return what shows, applies and exports recordings and records, whose methods ask for it."""
+    """Return the functions that show, apply and export recordings and records; their methods call them."""
     from imulab.procedures import views
 
     return views

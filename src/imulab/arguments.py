@@ -1,4 +1,4 @@
-"""What a function is called with, held to its annotations: a wrong type or an unknown keyword ends in one sentence."""
+"""Checks of a call's arguments against its annotations: a wrong type or an unknown keyword ends in one sentence."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Folder: TypeAlias = Annotated[str | PathLike[str], "the name of a folder"]
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function that refuses, before it does anything, arguments of other types than its annotations have.
+    """Return a function that first refuses arguments of other types than its annotations state.
 
     What may be a number or a text is left to the function, which knows its unit, and so is what is annotated with a
     type that stands for anything. ``Annotated[TYPE, "a list of ..."]`` says what a message calls a type.
@@ -44,7 +44,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def check(value: object, hint: Any, called: str) -> None:
-    """Refuse a value of another type; `called` is how the message names it; errors as for `checked`."""
+    """Refuse a value of another type; `called` is its name in messages; errors as for `checked`."""
     kinds = set(members(hint))
     if (str in kinds and kinds & {float, int}) or _fits(value, hint):
         return
@@ -56,14 +56,14 @@ def check(value: object, hint: Any, called: str) -> None:
 
 
 def check_fields(instance: Any) -> None:
-    """Refuse fields of a dataclass that have other types than its annotations; errors as for `checked`."""
+    """Refuse fields of a dataclass with other types than its annotations state; errors as for `checked`."""
     kind: Any = type(instance)
     for name, hint in hints(kind).items():
         check(getattr(instance, name), hint, name)
 
 
 class Unknown:
-    """Stands for a name of an annotation that is imported for type checkers alone."""
+    """Stands for a name in an annotation that is imported for type checkers only."""
 
     def __class_getitem__(cls, _: Any) -> type[Unknown]:
         return cls
@@ -71,7 +71,7 @@ class Unknown:
 
 @cache
 def types_of(owner: Any) -> dict[str, Any]:
-    """Return the types of a function's parameters or a class's fields; `Unknown` for names that are not there."""
+    """Return the types of a function's parameters or a class's fields; `Unknown` for names that do not exist."""
     owner = inspect.unwrap(owner)
     names, types = _Names(vars(sys.modules[owner.__module__])), {}
     for name, text in inspect.get_annotations(owner).items():
@@ -92,7 +92,7 @@ class _Names(dict[str, Any]):
 
 @cache
 def hints(owner: Any) -> dict[str, Any]:
-    """Return the types that the annotations of a function or class name, where they are known at run time."""
+    """Return the types in the annotations of a function or class, as far as known at run time."""
     return {name: hint for name, hint in types_of(owner).items() if not _is_unknown(hint)}
 
 
@@ -101,7 +101,7 @@ def _is_unknown(hint: Any) -> bool:
 
 
 def metadata(hint: Any) -> tuple[Any, ...]:
-    """Return what ``Annotated`` says of a type, the outermost first, or of the members of a union."""
+    """Return the arguments of ``Annotated``, the outermost first, or those of the members of a union."""
     if get_origin(hint) is Annotated:
         inner, *more = get_args(hint)
         return (*reversed(more), *metadata(inner))
@@ -109,7 +109,7 @@ def metadata(hint: Any) -> tuple[Any, ...]:
 
 
 def members(hint: Any) -> tuple[Any, ...]:
-    """Return the types of a union, without None and without what is said of them."""
+    """Return the types of a union, without None and without arguments of ``Annotated``."""
     if get_origin(hint) is Annotated:
         return members(get_args(hint)[0])
     parts = _union(hint)
@@ -121,7 +121,7 @@ def _union(hint: Any) -> tuple[Any, ...]:
 
 
 def described(value: object) -> str:
-    """Return what was found in place of something else, for a message."""
+    """Return a value in the words of a message."""
     kind = type(value)
     if kind.__name__ == "Calibration":
         return f"a {getattr(value, 'procedure', '')} record (arguments in the wrong order?)"
@@ -155,7 +155,7 @@ def _check_call(function: Callable[..., Any], args: tuple[Any, ...], kwargs: Map
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Return whether a value has a type, as far as that can be told from the value."""
+    """Return whether a value has a type, as far as the value shows it."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind is Annotated:
         return _fits(value, inner[0])
@@ -182,7 +182,7 @@ def _fits(value: object, hint: Any) -> bool:
 
 
 def _fits_list(value: Iterable[object], inner: tuple[Any, ...]) -> bool:
-    """Return whether what is iterated over is a list whose items have a type, or these types one after the other."""
+    """Return whether an iterable is a list whose items have a type, or these types one after the other."""
     if isinstance(value, str | bytes | Mapping):
         return False
     if hasattr(value, "__array__") and not {*members(inner[0])} <= {float, int, str}:  # samples or a data frame
@@ -217,7 +217,7 @@ def _expected(hint: Any) -> str:
 
 
 def _word(hint: Any) -> str:
-    """Return one type in words, nothing for that of a path."""
+    """Return one type in words, an empty text for a path."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if isinstance(kind, type) and issubclass(kind, PathLike):
         return ""
@@ -232,6 +232,6 @@ def _word(hint: Any) -> str:
 
 
 def _named(kind: Any) -> str:
-    """Return what a message calls a class: ``a fused`` for Fused, ``a record`` for what is one."""
+    """Return the name of a class in messages: ``a fused`` for Fused, ``a record`` for Calibration."""
     name = getattr(kind, "__name__", str(kind))
     return _NAMES.get(name) or "a " + re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()

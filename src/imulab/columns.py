@@ -12,7 +12,7 @@ from imulab.units import parse_unit
 
 
 class Kind(Struct, frozen=True):
-    """What columns of one name measure (None: any unit passes), a unit for messages, and what such sensors are called.
+    """The quantities of columns of one name (None: any unit passes), a unit for messages, and the sensor's name.
 
     `triad`: the sensors have three axes, which may come as one array of shape (n, 3).
     """
@@ -33,17 +33,17 @@ KINDS = {
     "temperature": Kind("temperature", "degC"),
     "table_angle": Kind("angle", "deg"),
 }
-"""The vocabulary: a column is called by one of these names, or by one with ``_`` and more behind it."""
+"""The vocabulary: the name of a column is one of these, or begins with one and ``_``."""
 TRIADS = tuple(name for name, kind in KINDS.items() if kind.triad)
 INERTIAL = tuple(name for name, kind in KINDS.items() if kind.quantity in ("acceleration", "rate"))
 """The sensors whose noise a recording at rest shows."""
 _ELEMENT = re.compile(rf"(?:{'|'.join(TRIADS)})(?:_[xyz])?_(\d+)")
 _CLOCK = re.compile(r"(?:t|time|timestamp|seconds)(?:(?: ?\(|[ _.])(s|ms|us|ns|min|h)\)?)?")
-"""What loggers call the time, and the unit in it."""
+"""Names of time columns in loggers, with their units."""
 
 
 def kind_of(column: str) -> str | None:
-    """Return the name in the vocabulary that a column such as ``gyro_x_3`` is of, None for others."""
+    """Return the name in the vocabulary that a column such as ``gyro_x_3`` begins with, None for others."""
     return next((name for name in KINDS if column == name or column.startswith(f"{name}_")), None)
 
 
@@ -53,13 +53,13 @@ def triad(sensor: str) -> list[str]:
 
 
 def element_number(column: str, stem: str = "") -> int | None:
-    """Return which of several IMUs a column such as ``accel_x_7`` (of the stem ``accel_x``) is of, None for others."""
+    """Return the number of the IMU of a column such as ``accel_x_7`` (with the stem ``accel_x``), None for others."""
     match = _ELEMENT.fullmatch(column)
     return int(match[1]) if match and column.startswith(f"{stem}_" if stem else "") else None
 
 
 def parse_column_title(title: str, file: str) -> tuple[str, str]:
-    """Split ``name [unit]``; a name outside the vocabulary may come without a unit.
+    """Return name and unit of ``name [unit]``; a name outside the vocabulary may have no unit.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def parse_column_title(title: str, file: str) -> tuple[str, str]:
 
 
 def check_name(name: str, title: str, file: str) -> None:
-    """Refuse what is meant as a name of the vocabulary but is not one."""
+    """Refuse a name that is probably a misspelt name of the vocabulary."""
     if has_hidden(title.replace("\t", "")):
         raise UnitError(f"{file}: column title {quoted(title.strip())}: expected plain text, found a control character")
     if ";" in title or "\t" in title or title.count("[") > 1:
@@ -103,7 +103,7 @@ def check_name(name: str, title: str, file: str) -> None:
 
 
 def expected_quantities(name: str) -> tuple[str, ...] | None:
-    """Return what a column of the vocabulary measures, or may; None for other columns."""
+    """Return the quantities that a column of the vocabulary may measure; None for other columns."""
     kind = kind_of(_measured(name))
     quantity = None if kind is None else KINDS[kind].quantity
     return None if quantity is None else ("time",) if quantity == "time" else (quantity, "output")
@@ -115,12 +115,12 @@ def example_unit(name: str) -> str:
 
 
 def _measured(name: str) -> str:
-    """Return the column that a truth or a standard deviation is of."""
+    """Return the column that a truth or a standard deviation belongs to."""
     return name.removeprefix("truth_").removeprefix("std_")
 
 
 def check_unit(name: str, unit: str, file: str) -> None:
-    """Check that a column of the vocabulary has a unit of its quantity.
+    """Refuse a unit of another quantity in a column of the vocabulary.
 
     Raises
     ------

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, Literal
 
-# Texts that files bring along, made safe to print: no character that ends a line, moves the cursor or turns text.
+# Texts from files, made safe to print: no character that ends a line, moves the cursor or reverses text.
 
 
 _HIDDEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
@@ -27,12 +27,12 @@ _PLAIN = bytes([*b"\t\n\r", *range(0x20, 0x7F)])
 
 
 def has_hidden(text: str) -> bool:
-    """Return whether a text holds a control or bidirectional character."""
+    """Return whether a text has a control or bidirectional character."""
     return _HIDDEN.search(text) is not None
 
 
 def may_hide(data: bytes) -> bool:
-    r"""Return whether the texts of a JSON file may hold a control or bidirectional character: one, or a ``\``."""
+    r"""Return whether the texts of a JSON file may have a control or bidirectional character: one, or a ``\``."""
     others = data.translate(None, _PLAIN)
     return b"\\" in data or (bool(others) and has_hidden(others.decode("utf-8")))
 
@@ -49,7 +49,7 @@ def printable(text: str, *, lines: bool = False) -> str:
 
 
 def first_hidden(value: Any, where: str = "") -> str | None:
-    """Return where in plain JSON values the first text or key with a hidden character stands, or None."""
+    """Return the place in plain JSON values of the first text or key with a hidden character, or None."""
     if isinstance(value, str):
         return where.lstrip(".") if has_hidden(value) else None
     if isinstance(value, Mapping):
@@ -66,16 +66,16 @@ def first_hidden(value: Any, where: str = "") -> str | None:
     return None
 
 
-# Results that are no records, as they show themselves: a headline and a table, as text or as HTML.
+# Results that are no records, shown as a headline and a table, in text or HTML.
 
 
 LINES = 12
 """Of a result, as Python shows it."""
-WIDTH = 150  # characters of a line that a notebook shows
+WIDTH = 150  # most characters of a line in a notebook
 
 
 class Shown:
-    """A result that shows itself as `shown` has it."""
+    """A result that prints itself as `shown` returns it."""
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
         """Return a headline, the titles of a table, and its rows."""
@@ -104,7 +104,7 @@ def html_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def aligned(titles: list[str], rows: list[list[str]]) -> list[str]:
-    """Return a table as lines of text; texts to the left, numbers to the right."""
+    """Return a table as lines of text, with texts to the left and numbers to the right."""
     table = [titles, *rows]
     widths = [max(len(row[i]) for row in table) for i in range(len(titles))]
     numeric = _numeric_columns(rows, len(titles))
@@ -126,7 +126,7 @@ def _numeric(text: str) -> bool:
     return text in ("–", "not stated", "in noise") or text.lstrip("+-")[:1].isdigit()
 
 
-# The verdict on a result: can it be used as it is, should a person look first, or must it not be used.
+# The verdict on a result: usable as it is, to be looked at first, or not usable.
 
 
 State = Literal["good", "look", "bad"]
@@ -171,7 +171,7 @@ def verdict_of(findings: Iterable[str]) -> Verdict:
 
 
 def as_judged(findings: Iterable[str], verdict: Verdict) -> tuple[str, ...]:
-    """Return findings, read back as plain texts, as what they were when they led to a verdict.
+    """Return findings, read back as plain texts, with the classes that led to a verdict.
 
     What is no reason is a `Note`; the first reason of a bad verdict is `Bad` (the others cannot be told apart).
     """

@@ -1,4 +1,4 @@
-"""The errors that imulab raises for what a person can get wrong.
+"""The errors that imulab raises for mistakes of the user.
 
 Every message is one line that names the place (file, column, row or time), what was expected and what was
 found. The command line prints the message alone and exits with 2.
@@ -12,19 +12,19 @@ from contextlib import contextmanager
 
 
 def listed(known: Iterable[str], word: object) -> str:
-    """Return the known words for a message, and which of them was meant: ``square huber; did you mean 'huber'?``."""
+    """Return the known words for a message, and the likely one: ``square huber; did you mean 'huber'?``."""
     names = list(known)
     return " ".join(names) + meant(names, word)
 
 
 def quoted(value: object, longest: int = 60) -> str:
-    """Return what was found for a message: as Python writes it, cut where it is long."""
+    """Return a value for a message, as Python writes it, cut if it is long."""
     text = repr(value)
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
 def several(words: Iterable[str], longest: int = 300) -> str:
-    """Return words for a message, as many as a line has room for."""
+    """Return words for a message, as many as fit in a line."""
     text = " ".join(words)
     return text if len(text) <= longest else text[: longest - 4] + " ..."
 
@@ -36,7 +36,7 @@ def first_of(names: Sequence[str], most: int, between: str = ", ") -> str:
 
 
 def meant(known: Iterable[str], word: object, alike: float = 0.6) -> str:
-    """Return ``; did you mean 'huber'?`` where a word nearly is one of those known, else nothing.
+    """Return ``; did you mean 'huber'?`` if a word is nearly one of the known ones, else nothing.
 
     `alike` is how much of two words must agree, from 0 to 1.
     """
@@ -107,7 +107,7 @@ class OptionError(ImulabError):
 
 @contextmanager
 def readable(name: object, kind: type[ImulabError] = ReadError) -> Iterator[None]:
-    """Turn what the system says of a file that cannot be read into one line that names it."""
+    """Raise an error of the system on reading a file as one line that names the file."""
     try:
         yield
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, and TOML read entry by entry, each refused with its place where it cannot be."""
+"""Files: written whole or not at all, and TOML read entry by entry, with the place of an entry in each refusal."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def real_path(path: str | Path) -> Path:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
-    """Open a new file beside `path` that takes its place when the block ends well, and vanishes otherwise.
+    """Yield a new file beside `path` that replaces it if the block ends without error, and is deleted otherwise.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         try:
             with target.open("wb") as stream:
                 yield stream
-        except BrokenPipeError:  # its reader has had enough, which is no failure
+        except BrokenPipeError:  # its reader has ended, which is no failure
             raise
         except OSError as error:
             raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
@@ -79,7 +79,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def check_no_paper(path: str | Path) -> None:
-    """Check that no file is asked for that promises a picture or a printed page.
+    """Refuse the name of a file that promises a picture or a printed page.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def _umask() -> int:
-    with _UMASK:  # there is no way to look without setting it: one thread at a time, and never wider meanwhile
+    with _UMASK:  # it can only be read by setting it: one thread at a time, and never wider meanwhile
         mask = os.umask(0o077)
         os.umask(mask)
     return mask
@@ -120,7 +120,7 @@ _WIDEST = 1 << 63  # TOML's integers have 64 bits
 
 
 def load_toml(path: str | Path, name: str, what: str) -> dict[str, Any]:
-    """Return the table of a TOML file; messages call the file `name`, and `what` is the kind that it should be.
+    """Return the table of a TOML file; `name` and `what` are its name and kind in messages.
 
     Raises
     ------
@@ -184,12 +184,12 @@ def _has_wide(value: Any) -> bool:
     return isinstance(value, int) and not -_WIDEST <= value < _WIDEST
 
 
-# Entries of TOML files: keys, numbers, units and scale factors, each refused with its place where it cannot be.
+# Entries of TOML files: keys, numbers, units and scale factors.
 
 
 @dataclass(frozen=True, slots=True)
 class ScaleFactor:
-    """Output per unit of what is measured: its value, and the units of both."""
+    """Output per measured quantity: value, and the units of both."""
 
     value: float
     output: Unit
@@ -197,7 +197,7 @@ class ScaleFactor:
 
 
 def scale_factor_of(entry: Any, place: str, example: str) -> ScaleFactor:
-    """Return a scale factor ``{ value = 0.02, unit = "V/(deg/s)" }``; `example` is how the whole line is written."""
+    """Return a scale factor ``{ value = 0.02, unit = "V/(deg/s)" }``; `example` is the line as it should be."""
     value, unit = value_and_unit(entry, place, example)
     if value == 0:
         raise ReadError(f"{place}: expected a value other than 0")
@@ -209,14 +209,14 @@ def scale_factor_of(entry: Any, place: str, example: str) -> ScaleFactor:
 
 
 def value_and_unit(entry: Any, place: str, example: str) -> tuple[float, str]:
-    """Return both of ``{ value = 2.5, unit = "V" }``; `example` is how the whole line is written."""
+    """Return value and unit of ``{ value = 2.5, unit = "V" }``; `example` is the line as it should be."""
     if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
         raise ReadError(f"{place}: expected {example}, found {quoted(entry)}")
     return number_of(entry["value"], place), str(entry["unit"])
 
 
 def check_keys(table: Mapping[str, Any], keys: tuple[str, ...], place: str) -> None:
-    """Refuse a key that is none of `keys`: a misspelt one must not pass."""
+    """Refuse a key that is not among `keys`, because it may be misspelt."""
     for key in table:
         if key not in keys:
             raise ReadError(f"{place}: unknown key {quoted(key)}; known keys: {listed(keys, key)}")

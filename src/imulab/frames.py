@@ -1,4 +1,4 @@
-"""Arrays and data frames to the columns of a recording, and back; pandas and polars are used, neither is needed."""
+"""Conversion of arrays and data frames to the columns of a recording, and back; pandas and polars are optional."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from imulab.errors import DataError, OptionError, UnitError, listed, meant, quot
 from imulab.units import parse_unit
 
 DEFAULT_UNITS = {"time": "s", "temperature": "degC"}
-"""Units of arrays that are given without one; a data frame states all its units."""
+"""Units of arrays without a stated one; a data frame states all its units."""
 _LIBRARIES = ("pandas", "polars")
 _WORDS = (*TRIADS, "temperature", "time", "rate", "unit", "units", "metadata", "name")
 _OF_SENSORS = ("acceleration", "rate", "magnetic field", "output")
@@ -31,7 +31,7 @@ Columns = dict[str, NDArray[np.float64]]
 
 
 class Frame(Protocol):
-    """What pandas and polars data frames have in common."""
+    """Methods that pandas and polars data frames have in common."""
 
     columns: Any
 
@@ -40,7 +40,7 @@ class Frame(Protocol):
 
 
 class Units(Struct):
-    """The units that were given: for single columns or sensors, and one for all sensors whose quantity it measures.
+    """Stated units: for single columns or sensors, and one for all sensors of its quantity.
 
     ``where`` is how a message says to state a unit that is missing, with ``{name}``, ``{sensor}`` and ``{unit}``.
     """
@@ -61,7 +61,7 @@ class Units(Struct):
             parse_unit(self.common, _OF_SENSORS)
 
     def of(self, column: str, stated: str | None = None) -> str:
-        """Return the unit of a column; `stated` is that of its title."""
+        """Return the unit of a column; `stated` is that in its title."""
         stem = next((key for key in _stems(column) if key in self.each), None)
         if stem is not None:
             self.used.add(stem)
@@ -87,7 +87,7 @@ class Units(Struct):
         raise UnitError(f"{self.name}: column {column} has no unit; expected {how}{other}")
 
     def check_used(self, columns: Iterable[str]) -> None:
-        """Refuse a unit that is of no column."""
+        """Refuse a stated unit that belongs to no column."""
         known = list(dict.fromkeys(stem for column in columns for stem in _stems(column)))
         for key in self.each:
             if key not in self.used:
@@ -99,7 +99,7 @@ class Units(Struct):
             )
 
     def _known(self, column: str, symbol: str) -> str:
-        """Return the unit as it is written here; of a column outside the vocabulary it may be any."""
+        """Return a unit as it is spelt here; a column outside the vocabulary may have any."""
         try:
             return parse_unit(symbol, expected_quantities(column) or ()).symbol
         except UnitError as error:
@@ -168,12 +168,12 @@ def columns_of_frame(
     entries = [(*_title(title, name), _column(frame[at], title, name)) for at, title in titles.items()]
     index = getattr(frame, "index", None)
     if index is not None and not any(key == "time" for key, _, _ in entries):
-        entries[:0] = _times_of(index, name, stated=rate is not None)
+        entries[:0] = _index_times(index, name, stated=rate is not None)
     return _put_together(entries, known_units, rate)
 
 
 def is_frame(value: object) -> bool:
-    """Return whether something is a data frame, to this module's purposes."""
+    """Return whether an object has the methods of a data frame that are used here."""
     return hasattr(value, "shape") and hasattr(value, "columns") and hasattr(value, "__getitem__")
 
 
@@ -201,7 +201,7 @@ def data_frame(columns: Mapping[str, Any], library: str | None = None) -> Any:
 
 
 def _stems(column: str) -> list[str]:
-    """``truth_gyro_x_3`` and what it is a part of: ``truth_gyro_x``, ``truth_gyro``, and the same of ``gyro_x_3``."""
+    """Return ``truth_gyro_x_3`` and its beginnings: ``truth_gyro_x``, ``truth_gyro``, and those of ``gyro_x_3``."""
     stems = []
     for whole in dict.fromkeys((column, re.sub("^(truth|std)_", "", column))):
         parts = whole.split("_")
@@ -215,7 +215,7 @@ def _joined(title: Any) -> str:
 
 
 def _title(title: str, name: str) -> tuple[str, str | None]:
-    """Split ``name [unit]``."""
+    """Return name and unit of a title ``name [unit]``."""
     key, bracket, rest = title.strip().partition("[")
     key = key.strip()
     check_name(key, title, name)
@@ -251,7 +251,7 @@ def _numbers(column: Any, title: str, name: str) -> NDArray[Any]:
         elif values.dtype.kind == "O" and hasattr(column, "array") and _dtype(column) not in _TEXTS:
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)  # pandas' own numbers, some of them missing
         elif values.dtype.kind == "O":
-            values = _of_objects(values)
+            values = _convert_objects(values)
     except (TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{name}: column {title}: expected numbers ({error})") from None
     if values.dtype.kind in _LIKE_NUMBERS:
@@ -262,14 +262,14 @@ def _numbers(column: Any, title: str, name: str) -> NDArray[Any]:
 
 
 def unmasked(values: Any) -> NDArray[Any]:
-    """Return an array, with NaN in the place of what a masked array leaves out."""
+    """Return an array with NaN for the masked values of a masked array."""
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         return np.ma.filled(values.astype(np.float64), np.nan)
     return np.asarray(values)
 
 
-def _of_objects(values: NDArray[Any]) -> NDArray[Any]:
-    """Return what Python's own objects stand for, numbers or dates; texts, and what is neither, stay as they are."""
+def _convert_objects(values: NDArray[Any]) -> NDArray[Any]:
+    """Return an array of Python objects as numbers or dates; texts and other objects stay."""
     kinds = {type(value) for value in values.flat}
     if any(issubclass(kind, str | bytes) for kind in kinds):
         return values
@@ -286,8 +286,8 @@ def _column(column: Any, title: str, name: str) -> NDArray[Any]:
     return values
 
 
-def _times_of(index: Any, name: str, *, stated: bool) -> list[tuple[str, str | None, NDArray[Any]]]:
-    """Return the times that an index holds as a column, none where it only counts the rows.
+def _index_times(index: Any, name: str, *, stated: bool) -> list[tuple[str, str | None, NDArray[Any]]]:
+    """Return the times in an index as a column, or None where it only counts the rows.
 
     Raises
     ------
@@ -308,7 +308,7 @@ def _times_of(index: Any, name: str, *, stated: bool) -> list[tuple[str, str | N
 
 
 def _dtype(column: Any) -> str:
-    """Return what a library calls the type of a column."""
+    """Return the name of a column's type."""
     return str(getattr(column, "dtype", "object")).lower()
 
 
@@ -319,7 +319,7 @@ def _kind(column: Any, values: NDArray[Any]) -> str:
 def _put_together(
     entries: list[tuple[str, str | None, NDArray[Any]]], units: Units, rate: float | None
 ) -> tuple[Columns, dict[str, str]]:
-    """Return columns and units of one length, with a time of the stated rate."""
+    """Return columns and units of equal length, with a time of the stated rate."""
     columns: Columns = {}
     symbols: dict[str, str] = {}
     for key, stated, values in entries:

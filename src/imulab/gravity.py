@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from imulab.recording import Recording
 
 
-# Local gravity: as stated, as normal gravity on and above the WGS 84 ellipsoid, or as a recording's head says.
+# Local gravity.
 
 
 _EQUATORIAL_GRAVITY = 9.7803253359  # m/s^2
@@ -38,14 +38,14 @@ _M = 0.00344978650684  # omega^2 a^2 b / GM
 ANOMALY = 3.5e-4
 """Standard uncertainty of normal gravity, m/s^2: 35 mGal, about the rms of free-air anomalies over the Earth."""
 _UNKNOWN_HEIGHT = 400.0
-"""Standard uncertainty of a height that is not given, m: most people live lower than 500 m."""
+"""Standard uncertainty of an unstated height, m: most people live lower than 500 m."""
 _FREE_AIR = 3.086e-6  # 1/s^2
 _ANYWHERE = 0.0265 / math.sqrt(3)
 """Standard uncertainty of standard gravity, m/s^2: all values from equator to pole (9.780 to 9.832) are possible."""
 _TOLD_APART = 3e-6
 """Relative; far below any scale factor's uncertainty; a height of 10 m."""
 _POSSIBLE = (0.5, 50.0)
-"""What the gravity of some place may be, m/s^2: a small moon's, twice Jupiter's."""
+"""Range of the gravity of any place, m/s^2: from a small moon's to twice Jupiter's."""
 _ON_EARTH = (9.76, 9.84)  # m/s^2, with mountains and the poles
 _ROUNDED = 1e-5  # m/s^2: half of the last digit of a value that is stated well enough to count as exact
 _USELESS = 0.01
@@ -54,7 +54,7 @@ _TO_MICRO = 1e6  # to ppm
 
 
 class Gravity(Struct, frozen=True):
-    """Local gravity and its standard uncertainty, m/s^2, where the value comes from, and what is to be said of it."""
+    """Local gravity and its standard uncertainty, m/s^2, the origin of the value, and remarks."""
 
     value: float
     origin: str
@@ -63,7 +63,7 @@ class Gravity(Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """What records share that rest on this gravity: its error is the same in all of them."""
+        """Name that records with this gravity share: its error is the same in all of them."""
         return f"gravity {self.value!r} +- {self.standard_uncertainty!r} m/s^2"
 
 
@@ -77,7 +77,7 @@ Height: TypeAlias = Annotated[float | str | None, text("M", unit="m"), _GROUP]
 
 
 def local_gravity(stated: float | str | Gravity | None, recording: Recording) -> Gravity:
-    """Return what was given, else what the head of the recording says, else standard gravity.
+    """Return the stated gravity, else that in the recording's head, else standard gravity.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def local_gravity(stated: float | str | Gravity | None, recording: Recording) ->
         The value cannot be the gravity of any place.
     """
     if stated is None:
-        local = _of_head(recording) or Gravity(
+        local = _gravity_in_head(recording) or Gravity(
             STANDARD_GRAVITY,
             "standard gravity, none given",
             _ANYWHERE,
@@ -112,8 +112,8 @@ def _check_possible(value: float) -> None:
 
 
 def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
-    """Return what a user must know of the gravity that was used, a sentence each."""
-    head = _of_head(recording)
+    """Return findings on the gravity that was used, a sentence each."""
+    head = _gravity_in_head(recording)
     if head is not None:
         allowed = _TOLD_APART * head.value + 2 * gravity.standard_uncertainty
         if abs(gravity.value - head.value) > allowed:
@@ -134,7 +134,7 @@ def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
 def gravity_option(
     gravity: str | None, latitude: str | None, height: str | None, label: str, *, beside: bool = False
 ) -> Gravity | None:
-    """Return the gravity that options state, or None; `label` is how messages call an option (``"--{}"``).
+    """Return the gravity that options state, or None; `label` makes the name of an option in messages (``"--{}"``).
 
     `beside` as for `at_place`.
 
@@ -159,7 +159,7 @@ def at_place(
     *,
     beside: bool = False,
 ) -> Given | Gravity:
-    """Return normal gravity at a place where one is given, else `gravity`; errors as for `gravity_option`.
+    """Return normal gravity at a stated place, else `gravity`; errors as for `gravity_option`.
 
     Latitude in rad and height in m, or texts; the last digit of a text counts as rounded. `beside` says that the
     latitude tells the Earth's rate too, and so may stand beside a gravity, which then counts.
@@ -240,15 +240,15 @@ def stated_gravity(text: str, option: str) -> Gravity:
 
 
 def _half_digit(text: str, kind: str, unit: str) -> float:
-    """Half of the last digit of a number with a unit, in SI; 0 for one with an exponent."""
+    """Return half of the last digit of a number with a unit, in SI; 0 for one with an exponent."""
     match = re.fullmatch(r"\s*[-+]?\d*\.?(\d*)\s*([^\d\s].*)?", text)
     if match is None:
         return 0.0
     return quantity(f"{0.5 * 10.0 ** -len(match[1]):.20f}{match[2] or ''}", "", kind, unit)
 
 
-def _of_head(recording: Recording) -> Gravity | None:
-    """Return what a comment ``# gravity: 9.81362 m/s^2`` of the recording says."""
+def _gravity_in_head(recording: Recording) -> Gravity | None:
+    """Return the gravity in a comment ``# gravity: 9.81362 m/s^2`` of the recording, or None."""
     text = recording.metadata.get("gravity")
     if text is None:
         return None
@@ -267,7 +267,7 @@ def _of_head(recording: Recording) -> Gravity | None:
 
 
 def checked_latitude(latitude: float, name: str = "latitude") -> float:
-    """Return a latitude, rad; refuse what is none in the words of `normal_gravity`, under this name."""
+    """Return a latitude, rad; a wrong one is refused with the words of `normal_gravity`, under this name."""
     if not isinstance(latitude, numbers.Real):
         raise OptionError(f"{name} {quoted(latitude)}: expected a number, in rad and m")
     if not abs(latitude) <= math.pi / 2 * (1 + 1e-12):
@@ -343,16 +343,16 @@ class EarthRate(Struct, frozen=True):
 
     @property
     def vertical(self) -> float:
-        """Its part along up, rad/s."""
+        """Its upward part, rad/s."""
         return EARTH * math.sin(self.latitude)
 
     @property
     def level(self) -> float:
-        """The size of its level part, to the north, rad/s."""
+        """Size of its level part, which points north, rad/s."""
         return EARTH * math.cos(self.latitude)
 
     def note(self) -> Note:
-        """Return what a record says of it."""
+        """Return its entry in a record."""
         vertical, level = (f"{from_si(rate, 'deg/h'):.1f} deg/h" for rate in (self.vertical, self.level))
         return Note(
             f"gyro: of the Earth's rate at latitude {math.degrees(self.latitude):.4g} deg the vertical part, "

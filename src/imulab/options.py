@@ -25,7 +25,7 @@ from imulab import arguments
 from imulab.errors import OptionError, listed
 from imulab.quantities import number, quantity, whole_number
 
-# What docstrings in numpy's style say, also where Python threw them away (``python -OO``).
+# Contents of docstrings in numpy's style, also where Python has removed them (``python -OO``).
 
 
 _ENTRY = re.compile(r"^(\S[^\n]*)\n((?:[ ]+\S[^\n]*\n|\n(?=[ ]))+)", re.M)
@@ -46,13 +46,13 @@ def summary(owner: Any) -> str:
 
 
 def description(owner: Any) -> str:
-    """Return what a docstring says before its sections."""
+    """Return the text of a docstring before its sections."""
     return re.split(r"\n\n\w+\n-+\n", docstring(owner))[0]
 
 
 @cache
 def parameters(owner: Any) -> dict[str, str]:
-    """Return the first sentence that the docstring of a function says of each parameter, or of a class of each field.
+    """Return the first sentence on each parameter in a function's docstring, or on each field in a class's.
 
     A ``TypedDict`` says of its further fields alone; those of the ones that it extends are theirs.
     """
@@ -68,7 +68,7 @@ def parameters(owner: Any) -> dict[str, str]:
 
 
 def _extended(owner: Any) -> list[Any]:
-    """Return a function or class, after the typed dictionaries that it extends, which Python forgets."""
+    """Return a function or class, after the typed dictionaries that it extends, which Python does not keep."""
     if not is_typeddict(owner):
         return [owner]
     others = vars(sys.modules[owner.__module__]).values()
@@ -97,26 +97,26 @@ def _from_source(owner: Any) -> str:
 
 
 FLAG = "--{}"
-"""How the command line calls an option in its messages."""
+"""Name of an option in messages of the command line."""
 GROUPS = ("model", "gravity", "further triads", "reading", "output", "all commands")
-"""In which help and forms list options."""
+"""Order in which help and forms list options."""
 _SWITCH = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
 Read = Callable[[str, str], Any]
 """The text of an option, and how messages call it, to its value; raises OptionError."""
 
 
 class Program(NamedTuple):
-    """Marks what is for programs alone."""
+    """Marks an option for programs only."""
 
 
 class Group(NamedTuple):
-    """The group of an option, where it is not that of the model."""
+    """Group of an option that does not belong to the model."""
 
     name: str
 
 
 class Reads(NamedTuple):
-    """How the text of an option is read, and what help shows for it.
+    """Reader of the text of an option, and its placeholder in help.
 
     `words` are offered to complete it; where there are no `other` ones, they are all that it takes. `unit` is that of a
     bare number; `off` the option that says the opposite of a switch.
@@ -142,12 +142,12 @@ COMMON = Group("all commands")
 
 
 def text(shows: str = "TEXT", words: Sequence[str] | Callable[[], Sequence[str]] = (), **more: Any) -> Reads:
-    """Return how a text is read that stays one."""
+    """Return the reader of an option whose value is the text."""
     return Reads(None, shows, words, **more)
 
 
 def choice(words: Sequence[str], **more: Any) -> Reads:
-    """Return how one of a few words is read."""
+    """Return the reader of one of a few words."""
 
     def read(word: str, called: str) -> str:
         if word not in words:
@@ -158,7 +158,7 @@ def choice(words: Sequence[str], **more: Any) -> Reads:
 
 
 def measure(kind: str, unit: str, shows: str = "", **more: Any) -> Reads:
-    """Return how a number with a unit of a kind is read; a bare number is in `unit`."""
+    """Return the reader of a number with a unit of a kind; a bare number is in `unit`."""
     return Reads(
         lambda given, called: quantity(given, called, kind, unit), shows or kind.upper().split()[0], unit=unit, **more
     )
@@ -216,12 +216,12 @@ class Option:
 
     @property
     def name(self) -> str:
-        """Its name in manifests; the command line has dashes instead of underscores."""
+        """Name in manifests; the command line has dashes instead of underscores."""
         return self.keyword.rstrip("_")
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """What the command line calls it, the short one first."""
+        """Names on the command line, the short one first."""
         return self.reads.flags or ("--" + self.name.replace("_", "-"),)
 
     @property
@@ -231,7 +231,7 @@ class Option:
 
     @property
     def shows(self) -> str:
-        """What stands for its value in help."""
+        """Placeholder of its value in help."""
         default = self.default or ""
         if self.reads.shows or not default[:1].isdigit():
             return self.reads.shows or "VALUE"
@@ -245,23 +245,23 @@ class Option:
 
     @property
     def spelling(self) -> str:
-        """Its names on the command line, and what stands for its value."""
+        """Names on the command line, and the placeholder of its value."""
         names = ", ".join(self.flags) + (f" / {self.opposite}" if self.opposite else "")
         return f"{names} {self.shows}" if self.takes_value else names
 
     @property
     def opposite(self) -> str:
-        """What the command line calls the option that turns it off; empty where there is none."""
+        """Flag that turns it off; empty where there is none."""
         return f"--{self.reads.off}" if self.reads.off else ""
 
     @property
     def rank(self) -> int:
-        """The place of its group among all."""
+        """Place of its group among all."""
         return GROUPS.index(self.group)
 
     @cached_property
     def help(self) -> str:
-        """What it does, in a sentence."""
+        """Its effect, in a sentence."""
         text = self.reads.help or parameters(self.owner).get(self.keyword, "")
         if elsewhere := re.fullmatch(r"As for (\w+)\.", text):
             function = getattr(import_module("imulab"), elsewhere[1])
@@ -270,11 +270,11 @@ class Option:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The words that complete it."""
+        """Words that complete it."""
         return tuple(self.reads.words() if callable(self.reads.words) else self.reads.words)
 
     def value(self, typed: str, called: str) -> Any:
-        """Return what a text says.
+        """Return the value of a text.
 
         Raises
         ------
@@ -290,7 +290,7 @@ class Option:
 
 @cache
 def options_of(owner: Any) -> tuple[Option, ...]:
-    """Return the options that the signature of a function has, or the fields of a typed dictionary."""
+    """Return the options in the signature of a function, or in the fields of a typed dictionary."""
     owner = inspect.unwrap(owner)
     types = arguments.types_of(owner)
     options: list[Option] = []
@@ -324,7 +324,7 @@ def _option(owner: Any, name: str, kind: Any, default: Any) -> Option | None:
 
 
 def _by_type(kinds: Sequence[Any]) -> Reads:
-    """Return how a text is read that stands for one of these types."""
+    """Return the reader of a text for one of these types."""
     if kinds == (bool,):
         return Reads(words=("yes", "no"), other=False)
     if int in kinds:
@@ -335,7 +335,7 @@ def _by_type(kinds: Sequence[Any]) -> Reads:
 
 
 def _text(default: Any) -> str | None:
-    """Return the default of a signature as one types it."""
+    """Return the default of a signature as it is typed."""
     if default in (None, (), inspect.Parameter.empty):
         return None
     if isinstance(default, bool):
@@ -346,7 +346,7 @@ def _text(default: Any) -> str | None:
 
 
 def read_options(options: Sequence[Option], texts: Mapping[str, str | None], label: str) -> dict[str, Any]:
-    """Return the values of all options, from the texts of those given; `label` is how messages call one (`FLAG`).
+    """Return the values of all options, from the stated texts; `label` makes the name of one in messages (`FLAG`).
 
     Raises
     ------
@@ -363,7 +363,7 @@ def read_options(options: Sequence[Option], texts: Mapping[str, str | None], lab
 
 
 def names_of_columns(typed: str, called: str) -> list[str]:
-    """Return ``gyro_x,gyro_y`` as names.
+    """Return the names in ``gyro_x,gyro_y``.
 
     Raises
     ------

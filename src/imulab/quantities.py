@@ -1,4 +1,4 @@
-"""Texts of options, as a person writes them on the command line or in a manifest, to values in SI."""
+"""Texts of options, from the command line or a manifest, to values in SI."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from imulab.units import parse_unit, to_si
 _BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
 _FRACTIONS = {"1": 1.0, "%": 1e-2, "ppm": 1e-6}
 RANDOM_WALK = {"deg/sqrt(h)": 0.01745329251994329577 / 60, "deg/√h": 0.01745329251994329577 / 60, "rad/sqrt(s)": 1.0}
-"""Units of an angle random walk that texts have, in SI."""
+"""Units of an angle random walk in texts, in SI."""
 _BETWEEN = re.compile(r"\s+to\s+|[:,]")
-"""What stands between the ends of an interval: a colon; a comma or "to" are read as well."""
+"""Separators of an interval's ends: a colon; a comma or "to" are read as well."""
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*)?")
 
 
@@ -44,13 +44,13 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
 
 
 def with_uncertainty(text: str) -> tuple[str, str | None]:
-    """Part ``9.81362+-0.00002`` (``+/-``, ``±``) into value and standard uncertainty, None where there is none."""
+    """Return value and standard uncertainty of ``9.81362+-0.00002`` (``+/-``, ``±``), None without one."""
     first, sign, second = re.sub(r"\+/?-|±", "±", text).partition("±")
     return first, second if sign else None
 
 
 def split_quantity(text: str, option: str, example: str) -> tuple[float, str]:
-    """Return the number of a text such as ``0.3 deg/sqrt(h)`` and what stands behind it.
+    """Return the number of a text such as ``0.3 deg/sqrt(h)`` and the text after it.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def interval(text: str, option: str) -> tuple[float, float]:
 
 @contextmanager
 def labelled(label: str, names: Iterable[str]) -> Iterator[None]:
-    """Put an option's label before a refusal that begins with its bare name; `label` is ``"--{}"`` or the like."""
+    """Replace an option's bare name at the beginning of a refusal by its label; `label` is ``"--{}"`` or the like."""
     try:
         yield
     except (OptionError, RecordError) as error:

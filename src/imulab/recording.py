@@ -1,4 +1,4 @@
-"""Recording: the samples of one test, as they were read, with their units.
+"""Recording: the samples of one test as read, with their units; and how a caller describes data.
 
 The temperature at power-on and how data are to be understood; the columns of large ones in temporary files.
 
@@ -150,7 +150,7 @@ class Recording:
         return name in self.columns
 
     def place(self, index: int) -> str:
-        """Return how messages name sample `index`: ``row 50 (line 51)``."""
+        """Return the name of sample `index` in messages: ``row 50 (line 51)``."""
         row = self.first_row + int(index)
         return f"row {row}" if self.lines_before is None else f"row {row} (line {row + self.lines_before})"
 
@@ -404,7 +404,7 @@ def check_time(recording: Recording) -> Array:
     return time
 
 
-# Columns of large recordings in temporary files: what has to look at a whole column has one at a time in memory.
+# Columns of large recordings in temporary files: only one whole column is in memory at a time.
 
 
 LARGE = 1 << 28
@@ -412,7 +412,7 @@ LARGE = 1 << 28
 
 
 def is_large(file: str | PathLike[str] | None) -> bool:
-    """Return whether a file is so large that its rows are not kept in memory."""
+    """Return whether the rows of a file are too many to be kept in memory."""
     if file is None or not (path := Path(file)).is_file():
         return False
     return path.stat().st_size > LARGE
@@ -442,7 +442,7 @@ def on_disk(blocks: Iterator[Recording]) -> Recording:
 
 
 def stored_as(values: Array, like: Array) -> Array:
-    """Return values, shape (n,), in a temporary file where `like` is in one; else as they are."""
+    """Return values, shape (n,), in a temporary file if `like` is in one; else unchanged."""
     base: Any = like
     while base is not None and not isinstance(base, np.memmap):
         base = getattr(base, "base", None)
@@ -475,7 +475,7 @@ def _mapped(file: IO[bytes]) -> Array:
         return np.memmap(file, np.float64, "r") if file.tell() else np.empty(0)
 
 
-# What a file says about a power cycle: its temperature, and that its time counts from power-on.
+# Power cycles: temperature at power-on, and time that counts from power-on.
 
 
 TAKEN_FROM = "power_on_temperature_from"
@@ -483,11 +483,11 @@ TAKEN_FROM = "power_on_temperature_from"
 LATEST_START = 5.0
 """A first sample later than this after power-on is refused, s."""
 _SLOWEST, _FASTEST = 4.0, 2e-5
-"""Sampling periods, s, that no recording of a warm-up has."""
+"""Limits of the sampling period of a warm-up recording, s."""
 
 
 def check_start(recording: Recording, first: float, latest: float) -> None:
-    """Check that time counts from power-on.
+    """Refuse time that does not count from power-on.
 
     Raises
     ------
@@ -507,7 +507,7 @@ def check_start(recording: Recording, first: float, latest: float) -> None:
 
 
 def check_clock(recording: Recording, time: Array) -> None:
-    """Check that times, s, are not of another unit than their column's title says.
+    """Refuse times, s, that are probably in another unit than their column's title states.
 
     Raises
     ------
@@ -546,7 +546,7 @@ def first_reading(recording: Recording) -> float | None:
 
 
 def with_power_on_temperature(blocks: Iterable[Recording]) -> Iterator[Recording]:
-    """Pass blocks on; where the head states no power-on temperature, the first reading of the first block stands in.
+    """Yield blocks; where the head states no power-on temperature, the first reading replaces it.
 
     Raises
     ------
@@ -590,7 +590,7 @@ def head_temperature(recording: Recording, key: str) -> float | None:
     return to_si(value, unit.symbol)
 
 
-# How data are to be understood, as a caller says it: the layout of a foreign file, a part of it, units of arrays.
+# Description of data by a caller: layout of a foreign file, a part of it, units of arrays.
 
 
 Data: TypeAlias = str | os.PathLike[str] | Recording | Frame | ArrayLike | Mapping[str, ArrayLike]
@@ -659,7 +659,7 @@ class Layout:
         )
 
     def behind_prefix(self, fields: list[str]) -> list[str] | None:
-        """Return the fields of a line behind the prefix, None where it does not begin with it."""
+        """Return the fields of a line after the prefix, None where it does not begin with it."""
         first = fields[0].strip()
         if not self.prefix:
             return fields
@@ -669,7 +669,7 @@ class Layout:
         return [first.removeprefix(self.prefix), *fields[1:]] if glued else None
 
     def skipped(self, count: int, *, so_far: bool = False) -> str:
-        """Say how many rows were skipped by ``skip_incomplete``."""
+        """Return a note on how many rows were skipped by ``skip_incomplete``."""
         what, lack = ("rows were", "lack") if count > 1 else ("row was", "lacks")
         columns, far = " ".join(self.columns), " so far" if so_far else ""
         return f"{count} {what}{far} skipped that {lack} a reading of {columns} (skip_incomplete in {self.name})"

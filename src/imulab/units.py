@@ -146,7 +146,7 @@ def parse_unit(text: str, quantities: Iterable[str] = ()) -> Unit:
 
 
 def parse_scale_factor(text: str) -> tuple[Unit, Unit]:
-    """Return the two units of a scale factor such as ``V/(deg/s)``: that of the output, and that of what is measured.
+    """Return the units of output and measured quantity of a scale factor such as ``V/(deg/s)``.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def from_si(values: float | NDArray[np.float64], unit: str) -> float | NDArray[n
 
 
 def si_unit(symbol: str) -> str:
-    """Return the unit that `to_si` gives values of a unit in: counts and volts keep theirs.
+    """Return the unit of values that `to_si` returns: counts and volts keep theirs.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What recordings and records show of themselves and are used for, handed down from the rooms above them.
+"""Functions that show, apply and export recordings and records, handed down from the modules above them.
 
 A person asks a `Recording` or a `Calibration` to plot, to correct or to export; what does so knows every procedure and
 lies above them. The face of the package says where it is to be had, and the methods ask `views` for it. It stands alone
@@ -30,7 +30,7 @@ class AnyPlot(Protocol):
 
 
 class AnyPlots(Protocol):
-    """Several figures, by number or by words of their titles; `imulab.report.plots.Plots` says more."""
+    """Several figures, by number or by words of their titles; see `imulab.report.plots.Plots`."""
 
     def __getitem__(self, which: int | str) -> AnyPlot:
         """Return a figure by its number, or by its title or words of it."""
@@ -39,7 +39,7 @@ class AnyPlots(Protocol):
         """Yield the figures."""
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of figures."""
 
     @property
     def names(self) -> list[str]:
@@ -50,7 +50,7 @@ class AnyPlots(Protocol):
 
 
 class Views(Protocol):
-    """The functions of `imulab.procedures.views`; what is a record or a recording is seen from above alone."""
+    """The functions of `imulab.procedures.views`, which know every procedure."""
 
     def load(self, path: Path) -> Any:
         """Return the record in a file."""
@@ -84,7 +84,7 @@ _LOADERS: list[Callable[[], Views]] = []
 
 
 def hand_down(load: Callable[[], Views]) -> None:
-    """Say what returns the views; it is called when something is first shown, applied or exported."""
+    """Set the function that returns the views; it is called when something is first shown, applied or exported."""
     _LOADERS[:] = [load]
 
 

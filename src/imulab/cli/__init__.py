@@ -15,7 +15,7 @@ _INTERRUPTED, _INTERRUPTED_PIPE, _TERMINATED = 130, 141, 143  # 128 + the signal
 
 
 class _TerminatedError(BaseException):
-    """The process was asked to end."""
+    """The process got a signal to end."""
 
 
 def main(arguments: Sequence[str] | None = None, *, project: bool = True) -> int:
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None, *, project: bool = True) -> int
 
 
 def _print_version() -> int:
-    """Print the version before anything is imported: programs ask for it to find out whether imulab is there."""
+    """Print the version before anything is imported, because programs ask for it to see whether imulab is installed."""
     try:
         print(f"imulab {VERSION}", flush=True)
     except OSError as error:
@@ -80,7 +80,7 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 def _complete(asked: str) -> int:
-    """Tell a shell what completes a word, or how to ask."""
+    """Print the completions of a word, or the shell's script for them."""
     from imulab.cli.app import ROOT_OPTIONS, find, listed_commands
     from imulab.cli.completion import answer
 
@@ -91,7 +91,7 @@ def _complete(asked: str) -> int:
 
 
 def _stop_writing(error: OSError) -> int:
-    """Return the status of a command whose output nobody takes any more, or that cannot be written."""
+    """Return the exit status of a command whose output has no reader any more, or cannot be written."""
     if isinstance(error, BrokenPipeError):  # the reader has gone; nothing more can be said there
         sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
         return _INTERRUPTED_PIPE
@@ -118,7 +118,7 @@ def run() -> None:
 
 
 def _open_closed() -> set[str]:
-    """Put something in the place of standard streams that are closed, which files opened later would get; return which.
+    """Open substitutes for closed standard streams, which files opened later would replace; return their names.
 
     Input and output still refuse to be used, as closed ones do; what is said on standard error is lost.
     """

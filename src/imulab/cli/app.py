@@ -1,4 +1,4 @@
-"""The commands: where each is, and how the words that were typed find it."""
+"""The commands: the module of each, and the search for the command that was typed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _WHERE = {
     **{"convert": "records", "export": "records", "allan": "noise", "live": "live", "open": "live"},
     **{name: name for name in ("tumble", "array", "centrifuge", "warmup", "noise", "thermal", "rate", "fleet")},
 }
-"""The first word of a command to the module that has it."""
+"""Module of each first word of a command."""
 
 
 def commands(first: str = "") -> list[Command]:
@@ -43,7 +43,7 @@ def commands(first: str = "") -> list[Command]:
 
 
 def find(words: Sequence[str]) -> Command | str:
-    """Return the command that words begin with; of others, how much of them names a group, maybe nothing.
+    """Return the command that words begin with, and otherwise how many of them name a group.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def _no_command(word: str, group: str) -> OptionError:
 
 
 def _answered(group: str, words: list[str]) -> bool:
-    """Take the options of the root or of a group from the beginning of the words, and print what they ask for."""
+    """Consume the options of the root or of a group from the words, and print the answers to them."""
     known = {flag: lambda: print(_group_help(group)) for flag in HELP.flags} | ({} if group else _ANSWERS)
     asked = [] if words else [*HELP.flags]
     while words and words[0].startswith("-") and words[0] != "-":
@@ -156,7 +156,7 @@ _ANSWERS = dict(zip(dict(ROOT_OPTIONS), (_version, _install_completion, _show_co
 
 
 def typed_words() -> list[str]:
-    """Return the words of this process; on Windows, where no shell does it, with names of files for patterns."""
+    """Return the words of this process; on Windows, where no shell does it, with patterns replaced by file names."""
     words = sys.argv[1:]
     if os.name != "nt":
         return words

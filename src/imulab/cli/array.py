@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 
-# What the array commands print.
+# Output of the commands.
 
 
 _TITLE = {
@@ -111,7 +111,7 @@ def describe_comparison(comparison: Comparison) -> str:
 
 
 def _gyros_of_mean(names: Sequence[str], working: Sequence[str]) -> str:
-    """Return which gyros the mean single gyro is the mean of."""
+    """Return the gyros that the mean single gyro is the mean of."""
     if len(working) == len(names):
         return "all"
     failed = " ".join(name for name in names if name not in working)
@@ -249,7 +249,7 @@ def _load_any(name: str) -> Calibration | Blob:
 
 
 def _flushed(first: Recording, rest: Iterator[Recording]) -> Iterator[Recording]:
-    """Pass blocks on; each is out before the next is read."""
+    """Yield blocks, each written out before the next is read."""
     yield first
     sys.stdout.buffer.flush()
     for block in rest:
@@ -258,7 +258,7 @@ def _flushed(first: Recording, rest: Iterator[Recording]) -> Iterator[Recording]
 
 
 def _print_findings(fuser: Fuser, *, verdict: bool) -> None:
-    """Print what there is to know of what was fused; the verdict first, where standard output is not the rate."""
+    """Print the findings on a fusion; the verdict first, unless standard output is the rate."""
     from imulab.cli.show import verdict_line
     from imulab.display import verdict_of
 

@@ -1,4 +1,4 @@
-"""Commands: each a function here and the public functions whose options it has, and words to the values of both."""
+"""Commands: a function of the command line and the public functions that its options come from; and parsing."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from imulab.options import COMMON, READING, Option, Reads, options_of
 
 NAME = "imulab.toml"
 KEYS = ("gravity", "latitude", "height", "layout", "limits", "limit")
-"""The project file, and the options that it may say."""
-ALIKE = 0.75  # --threshold is no misspelt --hold
+"""The project file, and the options that it may state."""
+ALIKE = 0.75  # least likeness of a misspelt word: --threshold is no misspelt --hold
 
 
 class Argument(NamedTuple):
@@ -39,7 +39,7 @@ class Positional:
 
 
 def option(shows: str, help: str, *flags: str, **more: Any) -> Reads:  # noqa: A002
-    """Return what marks a parameter of a command's function as an option that no public function has."""
+    """Return the mark of a command's parameter as an option that no public function has."""
     return Reads(None, shows, help=help, flags=flags, **more)
 
 
@@ -54,11 +54,11 @@ def _common(
         str | None, option("SIZE", "How much a compressed file may unpack to, such as 20GB."), READING
     ] = None,
 ) -> None:
-    """Stand for the options that every command has."""
+    """Declares the options that every command has."""
 
 
 def _help(*, help: Annotated[bool, option("", "Show this message and exit.", "-h", "--help"), COMMON] = False) -> None:  # noqa: A002
-    """Stand for the option that is answered at once."""
+    """Declares the option that is answered at once."""
 
 
 (HELP,) = options_of(_help)
@@ -88,17 +88,17 @@ class Command:
 
     @property
     def summary(self) -> str:
-        """What lists of commands say of it."""
+        """Line in lists of commands."""
         return docstrings.summary(self.function)
 
     @property
     def help(self) -> str:
-        """What it does, in paragraphs."""
+        """Description in paragraphs."""
         return docstrings.description(self.function)
 
     @cached_property
     def arguments(self) -> tuple[Positional, ...]:
-        """What is given without an option, in order."""
+        """Arguments without an option, in order."""
         types, positionals = arguments.types_of(self.function), []
         for name, parameter in inspect.signature(self.function).parameters.items():
             for marker in arguments.metadata(types[name]):
@@ -110,7 +110,7 @@ class Command:
 
     @cached_property
     def options(self) -> tuple[Option, ...]:
-        """Its options, in the order of help."""
+        """Options, in the order of help."""
         function_options = options_of(self.function)
         taken = {
             *self.without,
@@ -126,7 +126,7 @@ class Command:
 
 
 def values_of(command: Command, words: Sequence[str]) -> tuple[dict[str, Any], set[str]] | None:
-    """Return the values of a command's parameters, and which of them were typed; None where help is asked for.
+    """Return the values of a command's parameters, and which of them were typed; None if help is asked for.
 
     Raises
     ------

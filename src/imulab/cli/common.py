@@ -1,4 +1,4 @@
-"""What every command has: the project file, how much it says, and the size of what it unpacks."""
+"""What every command does: reading the project file, setting verbosity and the limit of unpacking."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from imulab.cli.options import choose, note, speech, tell
 from imulab.errors import OptionError, listed, quoted
 from imulab.files import load_toml
 
-# The project file ``imulab.toml``: what one would otherwise type with every command.
+# The project file ``imulab.toml``, which replaces options of every command.
 
 
 OFF = "IMULAB_NO_PROJECT"
@@ -22,7 +22,7 @@ _GRAVITY, _PATHS = KEYS[:3], KEYS[3:5]
 
 
 def find(folder: Path) -> Path | None:
-    """Return the project file of a folder: there or above, up to the root of its repository or the home folder."""
+    """Return the project file of a folder: in it or above, up to the root of its repository or the home folder."""
     if os.environ.get(OFF):
         return None
     try:
@@ -38,7 +38,7 @@ def find(folder: Path) -> Path | None:
 
 
 def load(path: Path, shown: str) -> dict[str, str]:
-    """Return what a project file says, as the texts that one would type; `shown` is what messages call it.
+    """Return the content of a project file as texts of options; `shown` is its name in messages.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def _file(key: str, value: str, shown: str) -> str:
 
 
 def _check_values(settings: Mapping[str, str], shown: str) -> None:
-    """Check gravity and limit as if they were typed, whether or not this command takes them."""
+    """Check gravity and limit as if they were typed, whether or not this command has them."""
     from imulab.gravity import gravity_option
     from imulab.quantities import quantity
 
@@ -91,7 +91,7 @@ def _check_values(settings: Mapping[str, str], shown: str) -> None:
 
 
 def additions(settings: Mapping[str, str], typed: Mapping[str, object], files: Sequence[str]) -> dict[str, str]:
-    """Return what a project file adds to the options of a command.
+    """Return the options that a project file adds to a command.
 
     `typed` are the options that the command has, None where not given; `files` what it reads. Options of gravity count
     together: one that is typed leaves out those of the file. A layout is left out where all files say themselves what
@@ -110,7 +110,7 @@ def additions(settings: Mapping[str, str], typed: Mapping[str, object], files: S
 
 
 def _describes_itself(file: str) -> bool:
-    """Return whether a file is a record, a blob, native CSV or a log, which need no layout."""
+    """Return whether a file is a record, a blob, native CSV or a log, which needs no layout."""
     from imulab.device.unit import is_blob
     from imulab.readers import is_pipe
     from imulab.readers.formats import TEXT, recognised
@@ -132,11 +132,11 @@ def _describes_itself(file: str) -> bool:
     return is_native(next((line for line in lines if line.strip() and not line.startswith("#")), ""))
 
 
-# What every command has: how much it says, the project file, and the size of what it unpacks.
+# The run of a command.
 
 
 def run_command(command: Command, values: dict[str, Any], typed: set[str]) -> int | None:
-    """Run a command, with what a project file says put where nothing was typed; return its exit status."""
+    """Run a command, with options of the project file where none were typed; return its exit status."""
     quiet, verbose, no_project = (values.pop(name, False) for name in ("quiet", "verbose", "no_project"))
     if quiet and verbose:
         raise OptionError("--quiet together with --verbose: expected one or the other")

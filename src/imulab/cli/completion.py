@@ -1,4 +1,4 @@
-"""What a shell asks while a line is typed, and what tells the shell to ask.
+"""Completion of words in a shell, and its installation.
 
 The names of environment variables and the forms of answers are those that earlier versions installed.
 """
@@ -65,7 +65,7 @@ _SCRIPTS["pwsh"] = _SCRIPTS["powershell"]
 
 
 def script(shell: str) -> str:
-    """Return what a shell is to run to complete words.
+    """Return the script with which a shell completes words.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def script(shell: str) -> str:
 
 
 def install(shell: str) -> Path:
-    """Have a shell complete words from its next start on; return the file that says how; errors as for `script`."""
+    """Install completion for a shell, and return the file that was changed; errors as for `script`."""
     text, home = script(shell), Path.home()
     if shell == "bash":
         path = home / ".bash_completions" / "imulab.sh"
@@ -122,7 +122,7 @@ def answer(
     listed: Callable[[str], Iterable[tuple[str, str]]],
     options: Sequence[tuple[str, str]],
 ) -> tuple[str, int]:
-    """Return what a shell is told, and the exit status, from the instruction and the variables that it set.
+    """Return the answer to a shell, and the exit status, from the instruction and the variables that it set.
 
     `find` takes whole words to the command that they begin with, or to the group that they name; `listed` a group to
     its commands and a line on each; `options` are those of the root.
@@ -134,7 +134,7 @@ def answer(
     words, incomplete = _typed(shell)
     place = find(words)
     if isinstance(place, Command):
-        completions = _of_command(place, words[len(place.path.split()) :], incomplete)
+        completions = _complete_word(place, words[len(place.path.split()) :], incomplete)
     elif incomplete.startswith("-"):
         known = [*([] if place else options), *((flag, HELP.help) for flag in HELP.flags)]
         completions = (each for each in known if each[0].startswith(incomplete))
@@ -158,7 +158,7 @@ def _escaped(text: str) -> str:
 
 
 def _typed(shell: str) -> tuple[list[str], str]:
-    """Return the whole words behind ``imulab``, and the one that is still typed."""
+    """Return the whole words after ``imulab``, and the word that is being typed."""
     if shell == "bash":
         words, index = _split(os.environ["COMP_WORDS"]), int(os.environ["COMP_CWORD"])
         return words[1:index], words[index] if index < len(words) else ""
@@ -171,7 +171,7 @@ def _typed(shell: str) -> tuple[list[str], str]:
 
 
 def _split(line: str) -> list[str]:
-    """Return the words of a line, the last of which may be in an open quotation."""
+    """Return the words of a line; the last one may have an open quotation mark."""
     lexer = shlex.shlex(line, posix=True)
     lexer.whitespace_split, lexer.commenters = True, ""
     words: list[str] = []
@@ -182,8 +182,8 @@ def _split(line: str) -> list[str]:
     return words
 
 
-def _of_command(command: Command, words: list[str], incomplete: str) -> Iterator[tuple[str, str]]:
-    """Yield what the word that is typed behind a command may become, and what it means."""
+def _complete_word(command: Command, words: list[str], incomplete: str) -> Iterator[tuple[str, str]]:
+    """Yield the completions of a word after a command, with their meanings."""
     if incomplete == "=":
         incomplete = ""
     elif incomplete.startswith("-") and "=" in incomplete:

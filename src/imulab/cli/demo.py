@@ -127,7 +127,7 @@ _LIVE = (
 
 
 def run(folder: str | Path, main: Callable[[list[str]], int]) -> str:
-    """Run the scenarios in `folder`, with an index page; return what was found, as text.
+    """Run the scenarios in `folder`, with an index page; return the results as text.
 
     `main` is the command line: it takes the words behind ``imulab`` and returns the exit status.
 

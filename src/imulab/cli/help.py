@@ -1,4 +1,4 @@
-"""Help texts of commands, apart from the commands since only `--help` needs them."""
+"""Help texts of commands, separate because only `--help` needs them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TITLES = {GROUPS[0]: "Options", GROUPS[-1]: "Options of all commands"}
 
 
 def command_help(command: Command) -> str:
-    """Return what ``--help`` prints of a command: usage, what it does, and its options in their groups."""
+    """Return the text of ``--help`` for a command: usage, description, and options in their groups."""
     usage = " ".join([f"Usage: imulab {command.path} [OPTIONS]", *(each.shows for each in command.arguments)])
     lines = [*_wrapped(usage, " " * 7, first=""), "", *_paragraphs(command.help)]
     argument_rows = [(each.shows, f"{each.help}{' [required]' if each.required else ''}") for each in command.arguments]
@@ -29,7 +29,7 @@ def command_help(command: Command) -> str:
 
 
 def group_help(usage: str, text: str, options: Iterable[tuple[str, str]], commands: Iterable[tuple[str, str]]) -> str:
-    """Return what ``--help`` prints of a group of commands."""
+    """Return the text of ``--help`` for a group of commands."""
     lines = [f"Usage: {usage} [OPTIONS] COMMAND [ARGS]...", "", *_paragraphs(text)]
     for title, rows in (("Options", [*options, (", ".join(HELP.flags), HELP.help)]), ("Commands", [*commands])):
         lines += _list(title, rows, _column([term for term, _ in rows]))
@@ -57,7 +57,7 @@ def _column(terms: Sequence[str]) -> int:
 
 
 def _list(title: str, rows: Sequence[tuple[str, str]], column: int) -> list[str]:
-    """Return rows of a term and what is said of it, below a title; nothing of no rows."""
+    """Return the lines of terms with their descriptions below a title; nothing without rows."""
     if not rows:
         return []
     lines = ["", f"{title}:"]

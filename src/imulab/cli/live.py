@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 
-# What `imulab live --page` and `imulab open` share: the options of the page, and a session that is shown there.
+# Common to `imulab live --page` and `imulab open`: options of the page, and a session on it.
 
 
 FOLDER = "imulab-files"
@@ -56,7 +56,7 @@ def checked_host(text: str | None) -> str | None:
 
 
 def checked_page(page: bool, port: str | None, host: str | None, *, no_browser: bool, plain: bool) -> int | None:
-    """Return the port of the page, None where there is to be none."""
+    """Return the port of the page, or None without a page."""
     if not page:
         for value, name in ((port, "--port"), (host, "--host"), (no_browser or None, "--no-browser")):
             if value is not None:
@@ -102,7 +102,7 @@ def on_page(
     host: str | None,
     browser: bool,
 ) -> None:
-    """Show a session on the page, the workbench beside it, until it is ended there or by Ctrl-C.
+    """Show a session on the page, with the workbench, until it is ended there or by Ctrl-C.
 
     `outputs` are the names of the record, None where none was given, and of the other files to be written.
 
@@ -216,13 +216,13 @@ def live(
     values = TASK.values({name: text for name, text in options.items() if text is not None}, FLAG)
     planned = _number_of_attitudes(attitudes, target)
     session = Session(values["order"], values["gravity"], read_targets(target), planned)
-    check_outputs([save, output, report], [name for name in (_replayed(source), layout) if name])
+    check_outputs([save, output, report], [name for name in (_source_name(source), layout) if name])
     fitted = {**options, "layout": None}
     known = _layout(layout)
     runner = Runner.open(lambda: open_source(source, layout, follow=follow), session, save, known, resume=resume)
     made = partial(_make_record, save, fitted, output, report)
     plain = plain or not sys.stdout.isatty()
-    with _offering(), closing(runner):
+    with _offer_layout(), closing(runner):
         try:
             if listened is not None:
                 command_again = partial(again, save, fitted, output)
@@ -245,7 +245,7 @@ def _make_record(save: str, fitted: dict[str, str | None], output: str | None, r
 
 
 def _all_triads(save: str, fitted: dict[str, str | None]) -> tuple[Calibration, list[str], list[str]]:
-    """Fit a recording; a further triad that is refused is left out, so that no session is in vain. Return why, too."""
+    """Return the record of a recording, without further triads that are refused, and the reasons for these."""
     from imulab.live.view import fit_triads, further_triads
     from imulab.procedures.registry import run_task
     from imulab.readers import read
@@ -258,13 +258,13 @@ def _all_triads(save: str, fitted: dict[str, str | None]) -> tuple[Calibration, 
 
 def _in_terminal(runner: Runner, made: Callable[[], Calibration], *, plain: bool, typed: bool) -> None:
     """Guide the test in the terminal, make its record, and show corrected readings until the end."""
-    (_plain if plain else _drawn)(runner, typed=typed)
+    (_print_events if plain else _draw_view)(runner, typed=typed)
     runner.recorder.close()
     if wrong := runner.session.view().counts.summary():
         note(f"of what came beside {runner.recorder.rows} samples: {wrong}")
     record = made()
     if not plain and typed:
-        _corrected(runner, record)
+        _show_corrected(runner, record)
 
 
 def _number_of_attitudes(text: str | None, target: str | None) -> int | None:
@@ -277,14 +277,14 @@ def _number_of_attitudes(text: str | None, target: str | None) -> int | None:
 
 
 def _say_how(save: str, further: list[str], why: list[str]) -> None:
-    """Say which command makes the same record, and why it has no gyroscopes or magnetometers where it should."""
+    """Print the command that makes the same record, and why it lacks gyroscopes or magnetometers."""
     others = f" --with {','.join(further)}" if further else ""
     note(f"the recording is {save}; imulab tumble fit {save}{others} makes the same record")
     for each in why:
         note(each)
 
 
-def _replayed(source: str) -> str:
+def _source_name(source: str) -> str:
     """Return the file, port or settings that a source names, without its speed."""
     name = source.partition(":")[2]
     return name.rpartition("@")[0] or name
@@ -311,8 +311,8 @@ def _list_ports() -> None:
 
 
 @contextmanager
-def _offering() -> Iterator[None]:
-    """Show the first lines of an unknown stream, and a layout to start from."""
+def _offer_layout() -> Iterator[None]:
+    """Print the first lines of an unknown stream, and a layout to start from."""
     from imulab.live.formats import UnknownFormatError
 
     try:
@@ -326,8 +326,8 @@ def _offering() -> Iterator[None]:
         raise
 
 
-def _corrected(runner: Runner, record: Calibration) -> None:
-    """Show what the record makes of the readings that still come, until a key is pressed or the stream ends."""
+def _show_corrected(runner: Runner, record: Calibration) -> None:
+    """Show readings corrected by the record until a key is pressed or the stream ends."""
     from time import monotonic
 
     from rich.live import Live
@@ -348,15 +348,15 @@ def _corrected(runner: Runner, record: Calibration) -> None:
                 drawn = monotonic()
 
 
-def _plain(runner: Runner, *, typed: bool) -> None:
-    """Print a line for each event, until it is enough or the stream ends."""
+def _print_events(runner: Runner, *, typed: bool) -> None:
+    """Print a line for each event, until the target is met or the stream ends."""
     while not runner.ended and not runner.session.enough:
         for event in runner.step(_WAIT):
             print(f"{event.time:8.1f} s  {event.text}", flush=True)
 
 
-def _drawn(runner: Runner, *, typed: bool) -> None:
-    """Draw the view until a person finishes or the stream ends."""
+def _draw_view(runner: Runner, *, typed: bool) -> None:
+    """Draw the view until the user finishes or the stream ends."""
     from time import monotonic
 
     from rich.live import Live

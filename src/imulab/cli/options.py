@@ -1,4 +1,4 @@
-"""Options that several commands take, and what commands say on standard error beside their results."""
+"""Options common to several commands, and messages of commands on standard error."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 
-# What a command says on standard error beside its result, how much of it, and in which colours.
+# Messages on standard error: how many, and in which colours.
 
 
 _COLOURS = {"good": 32, "pass": 32, "look": 33, "warning": 33, "bad": 31, "fail": 31}
@@ -33,7 +33,7 @@ _COLOURS = {"good": 32, "pass": 32, "look": 33, "warning": 33, "bad": 31, "fail"
 
 @dataclass
 class Speech:
-    """What one run of a command has said and still holds back."""
+    """Messages of one run of a command, and those that it still holds back."""
 
     quiet: bool = False
     verbose: bool = False
@@ -50,7 +50,7 @@ _SPEECH: ContextVar[Speech] = ContextVar("speech")
 
 
 def speech() -> Speech:
-    """Return that of the command that runs."""
+    """Return the messages of the running command."""
     try:
         return _SPEECH.get()
     except LookupError:  # a function of the command line that is called by itself
@@ -60,7 +60,7 @@ def speech() -> Speech:
 
 @contextmanager
 def begin(*, project: bool) -> Iterator[None]:
-    """Begin a command, maybe within another: nothing has been said."""
+    """Start a command, perhaps within another, with no messages."""
     now = Speech(project=project)
     token = _SPEECH.set(now)
     try:
@@ -71,7 +71,7 @@ def begin(*, project: bool) -> Iterator[None]:
 
 
 def choose(*, quiet: bool, verbose: bool, project: bool) -> None:
-    """Set how much is said, and whether a project file counts."""
+    """Set how many messages are printed, and whether a project file is used."""
     now = speech()
     now.quiet, now.verbose, now.project = quiet, verbose, now.project and project
     if verbose:
@@ -79,7 +79,7 @@ def choose(*, quiet: bool, verbose: bool, project: bool) -> None:
 
 
 def _listen() -> Callable[[], None]:
-    """Begin to print what the readers tell of their work; return what ends it."""
+    """Start to print the readers' log; return a function that stops it."""
     import logging
 
     class Told(logging.Handler):
@@ -105,14 +105,14 @@ def tell(message: str) -> None:
 
 
 def note(message: str) -> None:
-    """Print one line on standard error that is worth knowing and no warning; nothing with ``--quiet``."""
+    """Print one line on standard error that is no warning; nothing with ``--quiet``."""
     release()
     if not speech().quiet:
         print(printable(f"imulab: note: {message}"), file=sys.stderr)
 
 
 def warn(message: str) -> None:
-    """Print one line on standard error, after what was held; a `Note` is called one."""
+    """Print one line on standard error, after the lines that were held; a `Note` is printed as a note."""
     if isinstance(message, Note):
         if message not in speech().released:
             note(message)
@@ -123,12 +123,12 @@ def warn(message: str) -> None:
 
 
 def hold(name: str, message: str) -> None:
-    """Keep a warning about a file until it is known what becomes of the file."""
+    """Hold a warning about a file until it is known whether the file is refused."""
     speech().held.setdefault(name, message)
 
 
 def release() -> None:
-    """Print the warnings held so far: the work went on."""
+    """Print the held warnings, because the work went on."""
     now = speech()
     for name in list(now.held):
         message = f"{name}: {now.held.pop(name)}"
@@ -137,7 +137,7 @@ def release() -> None:
 
 
 def explained(message: str) -> str:
-    """Return a refusal with what is held about the file that it speaks of, so that one mistake makes one line."""
+    """Return a refusal with the held warnings about its file, so that one mistake makes one line."""
     held = speech().held
     about = [name for name in held if name in message] or (list(held) if len(held) == 1 else [])
     notes = "; ".join(held[name] if name in message else f"{name}: {held[name]}" for name in about)
@@ -146,7 +146,7 @@ def explained(message: str) -> str:
 
 
 def coloured(word: str, stream: TextIO | None = None) -> str:
-    """Return a word such as ``good`` in its colour where the stream is a terminal that has colours.
+    """Return a word such as ``good`` in its colour if the stream is a terminal with colours.
 
     ``NO_COLOR`` turns them off (no-color.org). The word alone carries the meaning.
     """
@@ -160,7 +160,7 @@ def _warning(message: str) -> None:
     print(f"imulab: {coloured('warning', sys.stderr)}: {printable(message)}", file=sys.stderr)
 
 
-# What several commands take, and what they say.
+# Reading and checks that several commands share.
 
 
 Result = TypeVar("Result")
@@ -174,7 +174,7 @@ AsJson = Annotated[bool, option("", "Print the result as JSON, and nothing else.
 def with_notes(
     blocks: Iterable[Recording], *, notes: bool = True, tell: Callable[[str, str], object] | None = None
 ) -> Iterator[Recording]:
-    """Pass blocks on, and say on standard error what the reader did to the data, each thing once.
+    """Yield blocks, and print the reader's notes on the data, each once.
 
     `tell` takes a file's name and what is wrong with it; a warning at once if not given.
     """
@@ -191,7 +191,7 @@ def with_notes(
 
 
 def read_recording(file: str, **how: Any) -> Recording:
-    """Read a recording as a whole, and warn where it was cut, in the line of a refusal if there is one."""
+    """Return a recording as a whole; a warning that it was cut is part of the line of a refusal, if there is one."""
     from imulab.readers import read
 
     recording = read(file, **how)
@@ -206,14 +206,14 @@ def call(function: Callable[..., Result], *arguments: Any, **options: Any) -> Re
 
 
 def how_to_read() -> Any:
-    """Return what says how a recording is read; it is not imported for lists of commands."""
+    """Return the class of reading options; it is not imported for lists of commands."""
     from imulab.recording import Reading
 
     return Reading
 
 
 def reading(options: dict[str, Any]) -> dict[str, Any]:
-    """Return the options of `imulab.read` that a command has, and take them out of its options."""
+    """Return the options of `imulab.read` that a command has, removed from its options."""
     chosen = [option for option in options_of(how_to_read()) if option.keyword in options]
     return read_options(chosen, {option.name: options.pop(option.keyword) for option in chosen}, FLAG)
 
@@ -247,7 +247,7 @@ class GivenFiles:
 
 
 def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
-    """Check before the work that each output has a folder to go to, and is no input nor another output.
+    """Refuse, before the work, an output without a folder, or one that is an input or another output.
 
     Raises
     ------
@@ -273,7 +273,7 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
 
 @contextmanager
 def naming(file: str) -> Iterator[None]:
-    """Put the name of a file in front of what is refused for its sake, where the message does not have it."""
+    """Add the name of a file to a refusal that lacks it."""
     try:
         yield
     except ImulabError as error:
@@ -284,7 +284,7 @@ def naming(file: str) -> Iterator[None]:
 
 @contextmanager
 def progress_bar(title: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show how far long work has come, on standard error and only where that is a terminal."""
+    """Show the progress of long work on standard error, if that is a terminal."""
     if total is None or speech().quiet or not sys.stderr.isatty():
         yield lambda _: None
         return

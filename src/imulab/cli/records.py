@@ -163,19 +163,19 @@ def apply(
 
 @dataclass
 class _Rows:
-    """How many rows went through."""
+    """Counter of rows."""
 
     count: int = 0
 
     def counted(self, blocks: Iterable[Recording]) -> Iterator[Recording]:
-        """Pass blocks on and count their rows."""
+        """Yield blocks and count their rows."""
         for block in blocks:
             self.count += len(block)
             yield block
 
 
 def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
-    """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
+    """Yield blocks; print warnings after the first, and at the end what lay beyond the test."""
     from imulab.display import Note
     from imulab.procedures.apply import results_in, warnings_of
     from imulab.recording import TAKEN_FROM

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from imulab.records.comparison import RecordComparison
 
 
-# What every fit does with its result: write it, print it, say what a user must know.
+# Results of fits: written, printed, and their findings.
 
 
 def write_both(record: Calibration, output: str | None, report: str | None) -> None:
@@ -48,7 +48,7 @@ def finish(
     json: bool,
     describe: Callable[[Calibration], str] | None = None,
 ) -> None:
-    """Write a record and its report, both or none, and say what was found, in full or as `describe` has it."""
+    """Write a record and its report, both or none, and print the result, in full or as `describe` returns it."""
     write_both(record, output, report)
     if json:
         print(record.to_json(), end="")
@@ -101,11 +101,11 @@ def finish_plan(plan: PlannedTest, output: str | None, report: str | None = None
         warn(message)
 
 
-# What every command that tests a record does with the result.
+# Results of tests of a record.
 
 
 def notes_on_data(held: Calibration, recordings: Sequence[Recording]) -> list[str]:
-    """Return what a user should know of recordings that a record is tested by."""
+    """Return notes on the recordings that a record is tested with."""
     corrected = [
         f"{recording.name}: was corrected before, by {entry}; a record is checked by what the unit puts out, so the "
         "test means nothing here"
@@ -153,7 +153,7 @@ _GAP = 1.5  # of the usual step: a longer one is counted as a gap, as where reco
 
 
 def describe_record(record: Calibration, *, provenance: bool = True) -> str:
-    """Return what a record holds: its verdict, its headline, its tables, and where it comes from."""
+    """Return a record in lines: its verdict, headline, tables, and origin."""
     from imulab.procedures.views import exhibits_of
     from imulab.report.traces import ReportTable
 
@@ -185,7 +185,7 @@ def verdict_line(verdict: Verdict) -> str:
 
 
 def describe_blob(blob: Blob) -> str:
-    """Return what a blob holds: its unit, its size, and the columns and units of each section."""
+    """Return a blob in lines: its unit, size, and the columns and units of each section."""
     serial = blob.text["sensor"].get("serial", "a unit without serial number")
     lines = [f"blob of {serial}: {len(blob.data)} bytes, float numbers, written by {blob.text['software']}"]
     for section in blob.text["sections"]:
@@ -200,7 +200,7 @@ def _joined(value: object) -> str:
 
 
 def describe_changes(first: str, second: str, comparison: RecordComparison, record: Calibration) -> str:
-    """Return what changed from one record to the other, which is of the procedure and units of `record`."""
+    """Return the changes from one record to the other; `record` gives the procedure and units."""
     from imulab.procedures.views import TITLES, change_rows, verdict
 
     lines = [f"{second} less {first}: {verdict(comparison)}", "", *aligned(TITLES, change_rows(comparison))]
@@ -219,7 +219,7 @@ def describe_changes(first: str, second: str, comparison: RecordComparison, reco
 
 
 class _Column(Struct):
-    """Range of a column, as its blocks pass by."""
+    """Range of a column, updated by each block."""
 
     low: float = inf
     high: float = -inf
@@ -252,7 +252,7 @@ class _Column(Struct):
 
 
 class _Clock(Struct):
-    """Duration, rate and gaps, as the blocks pass by; the usual step is that of the first block."""
+    """Duration, rate and gaps, updated by each block; the usual step is that of the first block."""
 
     first: float | None = None
     last: float = 0.0
@@ -292,7 +292,7 @@ class _Clock(Struct):
 
 
 class _Contents(Struct):
-    """What a recording holds, as its blocks have told it."""
+    """Content of a recording, updated by each block."""
 
     last: Recording
     columns: dict[str, _Column]
@@ -318,7 +318,7 @@ def _contents(blocks: Iterable[Recording]) -> _Contents:
 
 
 def describe_recording(blocks: Iterable[Recording]) -> str:
-    """Return what a recording holds: samples, rate, gaps, duration, and each column's range."""
+    """Return a recording in lines: samples, rate, gaps, duration, and each column's range."""
     contents = _contents(blocks)
     last = contents.last
     lines = [f"{printable(last.name)}: {contents.samples} samples"]
@@ -332,7 +332,7 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
 
 
 def recording_json(blocks: Iterable[Recording]) -> str:
-    """Return the same as JSON, each column in its own unit; null where there is nothing to tell."""
+    """Return the same as JSON, each column in its own unit; null for unknown values."""
     from imulab.records.calibration import json_text
 
     contents = _contents(blocks)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 
-# ``imulab tumble check``: what a test of a record by fresh attitudes found, for people and for scripts.
+# ``imulab tumble check``: the result as text and as JSON.
 
 
 # Calibrate an accelerometer triad with gravity alone.
@@ -116,12 +116,12 @@ def gyro(
         output,
         report,
         json=json,
-        describe=lambda both: _of_gyroscopes(both, accel),
+        describe=lambda both: _describe_gyroscopes(both, accel),
     )
 
 
-def _of_gyroscopes(record: Calibration, accelerometers: str) -> str:
-    """Return what a fit of the gyroscopes found, without the accelerometers, whose record it rests on."""
+def _describe_gyroscopes(record: Calibration, accelerometers: str) -> str:
+    """Return the result of the gyroscopes' fit, without the accelerometers, whose record it uses."""
     from imulab.cli.show import verdict_line
     from imulab.display import aligned
     from imulab.procedures.tumble.figures import gyro_headline

@@ -372,7 +372,7 @@ _PER_SECOND = 10**9  # ticks that times are joined by: 1 ns
 
 
 def join_recordings(recording: Recording, others: Sequence[Recording]) -> Recording:
-    """Return one recording from several of a unit's sensors, with times from one instant, on the clock of the first.
+    """Join recordings of one unit's sensors, whose times count from the same instant, on the clock of the first.
 
     Magnetometers are not interpolated: each sample stands in the row nearest in time, other rows hold NaN. All else is
     interpolated linearly, but not across gaps; rows end with the first recording that ends.
