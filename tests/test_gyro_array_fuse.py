@@ -434,7 +434,7 @@ def test_a_saved_stream_goes_on_in_another_process_to_the_last_bit(kind, tmp_pat
     if kind == "blob":
         blob = Blob("unit.blob", make_blob([record], tables_of(record)), {})
         settings = ArraySettings("robust", 6, 1, rate=100.0)
-        whole, first = (Stream.of_blob(blob.data, settings) for _ in range(2))
+        whole, first = (Stream.from_blob(blob.data, settings) for _ in range(2))
         readings = np.radians(readings)
     else:
         options = FuseOptions(method=kind, calibration=None if kind == "feedback" else record)

@@ -160,27 +160,27 @@ def choice(words: Sequence[str], **more: Any) -> Reads:
 def measure(kind: str, unit: str, shows: str = "", **more: Any) -> Reads:
     """Return the reader of a number with a unit of a kind; a bare number is in `unit`."""
     return Reads(
-        lambda given, called: quantity(given, called, kind, unit), shows or kind.upper().split()[0], unit=unit, **more
+        lambda value, called: quantity(value, called, kind, unit), shows or kind.upper().split()[0], unit=unit, **more
     )
 
 
 def parsed(read: Read, shows: str, words: Sequence[str] = (), **more: Any) -> Reads:
-    """Return how a text is read by a function of its own."""
+    """Return the reader of a text that another function reads."""
     return Reads(read, shows, tuple(words), **more)
 
 
 def file(shows: str = "FILE", **more: Any) -> Reads:
-    """Return how the name of a file is read."""
+    """Return the reader of the name of a file."""
     return Reads(None, shows, file=True, **more)
 
 
 def either(off: str, **more: Any) -> Reads:
-    """Return how a switch is read that is on, off, or neither; `off` is the option that turns it off."""
+    """Return the reader of a switch that is on, off, or neither; `off` is the option that turns it off."""
     return Reads(off=off, **more)
 
 
 def repeated(shows: str, **more: Any) -> Reads:
-    """Return how an option is read that may be given several times."""
+    """Return the reader of an option that may be repeated."""
     return Reads(None, shows, repeated=True, **more)
 
 

@@ -322,7 +322,7 @@ def compare(
         warn(message)
 
 
-def _of_calibrate() -> list[Any]:
+def _calibrate_functions() -> list[Any]:
     from imulab.procedures.gyro_array.procedure import Older
 
     return [il.calibrate_array, Older]
@@ -331,7 +331,7 @@ def _of_calibrate() -> list[Any]:
 COMMANDS = (
     Command("array simulate", simulate, lambda: [il.simulate_array]),
     Command("array merge", merge, lambda: [il.merge_array], without=("element",)),
-    Command("array calibrate", calibrate, _of_calibrate, without=("element",)),
+    Command("array calibrate", calibrate, _calibrate_functions, without=("element",)),
     Command("array fuse", fuse, lambda: [il.fuse], without=("element",)),
     Command("array compare", compare, lambda: [il.compare_methods], without=("element",)),
 )

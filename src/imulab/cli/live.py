@@ -80,15 +80,15 @@ def again(save: str, texts: Mapping[str, str | None], output: str | None, record
     return shlex.join(["imulab", "tumble", "fit", save, *typed, *others, *(["-o", output] if output else [])])
 
 
-def workbench(given: Sequence[str] = (), later: Sequence[str] = ()) -> tuple[Workbench, FolderFiles]:
-    """Return the workbench and its files: those of its folder, those given, and those that may come later."""
+def workbench(named: Sequence[str] = (), later: Sequence[str] = ()) -> tuple[Workbench, FolderFiles]:
+    """Return the workbench and its files: those of its folder, those named, and those that may come later."""
     from imulab.cli.app import commands
     from imulab.live.page.bench import Workbench
     from imulab.live.page.files import FolderFiles
     from imulab.live.page.jobs import forms
 
     offered = [each for each in commands() if not each.path.startswith(_NOT_OFFERED)]
-    files = FolderFiles(Path(FOLDER), given, later)
+    files = FolderFiles(Path(FOLDER), named, later)
     return Workbench(files, forms(offered)), files
 
 

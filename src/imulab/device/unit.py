@@ -235,7 +235,7 @@ class Stream:
         self.settings = settings
 
     @classmethod
-    def of_blob(cls, blob: bytes, settings: ArraySettings) -> Stream:
+    def from_blob(cls, blob: bytes, settings: ArraySettings) -> Stream:
         """Return the stream of an exported blob, as the unit runs it; `settings` repeat its method, elements and axes.
 
         Raises
@@ -321,7 +321,7 @@ class Stream:
         content = json.loads(state[at : at + size])
         blob = content.pop("blob", None)
         settings = ArraySettings(**content)
-        stream = cls(settings) if blob is None else cls.of_blob(bytes.fromhex(blob), settings)
+        stream = cls(settings) if blob is None else cls.from_blob(bytes.fromhex(blob), settings)
         inner = state[at + size : -4]
         if len(inner) != len(stream._state):
             raise RecordError("the state of the stream is of another build of the core")

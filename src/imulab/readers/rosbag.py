@@ -513,11 +513,11 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
 
 def _choose(topics: list[Topic], wanted: str | None, name: str) -> tuple[list[str], str | None]:
     """Return the topics of an Imu, one or two, and that of a magnetometer if one is asked for."""
-    there = _of_type(topics, _IMU)
+    there = _names_of_type(topics, _IMU)
     if not there:
         known = ", ".join(dict.fromkeys(f"{t.name} ({t.type})" for t in topics)) or "none"
         raise ReadError(f"{name}: no topic of sensor_msgs/Imu; topics found: {known}")
-    fields = _of_type(topics, _FIELD)
+    fields = _names_of_type(topics, _FIELD)
     entries = wanted.split(",") if wanted is not None else []
     named = [entry if entry.startswith("/") or entry in (*there, *fields) else f"/{entry}" for entry in entries]
     field = next((entry for entry in named if entry in fields), None)
@@ -536,13 +536,13 @@ def _choose(topics: list[Topic], wanted: str | None, name: str) -> tuple[list[st
     return chosen, field
 
 
-def _of_type(topics: list[Topic], kind: str) -> list[str]:
+def _names_of_type(topics: list[Topic], kind: str) -> list[str]:
     return list(dict.fromkeys(topic.name for topic in topics if topic.type == kind))
 
 
 def _beside(topics: list[Topic], kind: str, chosen: list[str], what: str, notes: list[str]) -> str | None:
     """Return the topic of a type that belongs to the chosen ones, if any: in their namespace, or the only one."""
-    names = _of_type(topics, kind)
+    names = _names_of_type(topics, kind)
     near = [name for name in names if name.rpartition("/")[0] == chosen[0].rpartition("/")[0]]
     near = near or [name for name in names if name.startswith(f"{chosen[0]}/")] or names
     if len(near) == 1:

@@ -68,8 +68,8 @@ class Selection:
         return (others or None), (int(number) if number else None)
 
     def of(self, blocks: Iterator[Recording], name: str) -> Iterator[Recording]:
-        """Yield the rows of the element within the window; errors as for `of_element` and `windowed`."""
-        return windowed(of_element(blocks, self.element, name), self.ends, name)
+        """Yield the rows of the element within the window; errors as for `keep_element` and `windowed`."""
+        return windowed(keep_element(blocks, self.element, name), self.ends, name)
 
     def refuse(self, name: str, kind: str, *, topic: bool = True, instance: bool = True) -> None:
         """Refuse choices that a kind of file cannot offer."""
@@ -116,7 +116,7 @@ def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Ite
         )
 
 
-def of_element(blocks: Iterator[Recording], element: int | None, name: str) -> Iterator[Recording]:
+def keep_element(blocks: Iterator[Recording], element: int | None, name: str) -> Iterator[Recording]:
     """Yield the columns of one IMU of several (``accel_x_7`` as ``accel_x``), with those common to all.
 
     Raises

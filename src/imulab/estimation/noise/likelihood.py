@@ -265,7 +265,7 @@ def information(bins: Bins, values: Array) -> Array:
 
 
 def fit(bins: Bins, models: Flags, limits: tuple[float, float], power: Array, freedom: Array) -> Fits:
-    """Return the fits of every model to every spectrum; rows count models, then spectra.
+    """Return the fits of every model to every spectrum, the minima of `deviance`; rows count models, then spectra.
 
     Parameters
     ----------

@@ -79,7 +79,7 @@ class CurveFit:
 
 
 def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") -> CurveFit:
-    """Return K(a) fitted by generalised least squares.
+    """Return K(a) fitted by generalised least squares: ``p = (A' V^-1 A)^-1 A' V^-1 K``, A the columns 1, a, a^2.
 
     A term is taken where it lowers chi-square by more than the 5 % point of chi-square with one degree of freedom;
     where even the largest model leaves more scatter than the covariance explains, chi-square counts in units of that
@@ -472,6 +472,7 @@ def _covariance(items: tuple[Level, ...], common: Array, width: int) -> Array:
 
 
 def _magnitude(level: Level, index: int, axis: int, size: int, width: int, name: str, method: str) -> _Row:
+    """Return ``K_i = |Z|``, less ``sigma^2 / 2 |Z|`` of the noise (Rice), with its derivative by the level's line."""
     line = level.line[axis]
     modulus = max(abs(line), 1e-300)
     derivative = np.zeros(size)
@@ -484,6 +485,7 @@ def _magnitude(level: Level, index: int, axis: int, size: int, width: int, name:
 
 
 def _zeta(row: _Row, first: _Row, name: str) -> _Row:
+    """Return ``zeta_i = K_i / K_1 - 1`` with its derivative by the levels' lines."""
     ratio = row.value / first.value
     return _Row(name, ratio - 1, "1", row.derivative / first.value - ratio / first.value * first.derivative, 0.0)
 

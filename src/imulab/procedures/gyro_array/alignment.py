@@ -53,6 +53,9 @@ def at_rest(
 ) -> tuple[AtRest, list[str]]:
     """Return biases and noise of readings at rest, shape (m, axes, n), rad/s, at a rate, Hz, and notes.
 
+    The uncertainty of a bias is that of a mean over the duration t, averaged over noise models:
+    ``u^2 = N^2/t + (2 ln 2/pi) B^2 + K^2 t/3 + ...`` (`terms.mean_terms`).
+
     Raises
     ------
     RecordError
@@ -182,7 +185,10 @@ def _moments(stacked: Array, truth: Array | None) -> Array:
 
 
 def _solve(moments: Array, sigma: Array, axes: int, n: int, *, known: bool) -> Array:
-    """Return A_i, shape (n, axes, axes)."""
+    """Return A_i, shape (n, axes, axes): ``A = sigma U G``, U the largest eigenvectors of ``moments / sigma sigma'``.
+
+    G is the convention of `align`. With a known truth w, A_i is the regression ``sum z w' (sum w w')^-1``.
+    """
     size = n * axes
     if known:
         inner = moments[size:, size:]

@@ -449,6 +449,7 @@ def rate_figures(error: Array, rate: float) -> tuple[float, float, float, float]
 
 
 def _figures(error: Array, rate: float, single: Singles, bandwidth: float, split_half: float | None) -> MethodRow:
+    """Return the figures of a method on one axis, as `MethodRow` defines them, from its error of the rate, (m,)."""
     std, largest, angle_std, angle_max = rate_figures(error, rate)
     noise = float(np.diff(error[np.isfinite(error)]).std() / math.sqrt(2))
     if std <= _NOTHING * single.noise:  # rounding only: the method follows a dead gyro

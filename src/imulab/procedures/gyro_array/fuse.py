@@ -332,7 +332,7 @@ def blob_stream(blob: Blob, elements: Elements, recording: str) -> _InUnits:
             raise UnitError(f"{recording}: column {row[0]} is in {unit}; the blob {blob.name} is in rad/s")
     factor = np.array([conversion_factor(unit, "rad/s") for unit in elements.units])
     settings = ArraySettings(section["method"], elements.count, len(elements.axes), rate=section["rate"])
-    return _InUnits(Stream.of_blob(blob.data, settings), factor)
+    return _InUnits(Stream.from_blob(blob.data, settings), factor)
 
 
 def _array_section(blob: Blob) -> Any:

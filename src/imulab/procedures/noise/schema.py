@@ -334,8 +334,8 @@ def _integral(text: str) -> tuple[float, str] | None:
     if text in _INTEGRALS:
         level, factor = _INTEGRALS[text]
         return factor, level
-    if text.endswith(" s") and (found := _level(text[:-2])):
-        return found
+    if text.endswith(" s") and (factor_and_level := _level(text[:-2])):
+        return factor_and_level
     try:
         unit = parse_unit(text)
     except UnitError:

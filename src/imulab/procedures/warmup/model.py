@@ -336,7 +336,10 @@ class Statistics:
     total: Array
 
     def mean_square(self, coefficients: Array) -> Array:
-        """Return the mean squared residual of each cycle, shape (c, axes), for coefficients (c, axes, p)."""
+        """Return the mean squared residual of each cycle: ``(sum w y^2 - 2 c' sum w b y + c' N c) / sum w``, (c, axes).
+
+        N is `normal`; the coefficients c have shape (c, axes, p).
+        """
         cross = np.einsum("cap,cpa->ca", coefficients, self.moment)
         fitted = np.einsum("cap,cpq,caq->ca", coefficients, self.normal, coefficients)
         square: Array = np.maximum(self.square - 2 * cross + fitted, 0.0) / self.weight[:, None]
@@ -398,6 +401,9 @@ def solve(
     curves: Curves, model: str, scales: Sequence[float], sums: Statistics, weights: Array, knots: Index | None = None
 ) -> CurveSolution:
     """Return the table fitted to the cycles with positive weight, at all calibration temperatures or at some.
+
+    ``sum_l (sum_c w h_k h_l N) c_l = sum_c w h_k m``: N and m are the `normal` and `moment` of a cycle, h_k its weights
+    at the knots (`hats`) or intervals (`membership`), w the weights of the cycles.
 
     Parameters
     ----------
