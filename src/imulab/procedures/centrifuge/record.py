@@ -16,7 +16,7 @@ from imulab.procedures.centrifuge.run import LoadedRun, StaticRun
 from imulab.recording import Array, Source
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
-_LOST = 1e-4  # of the amplitude: method fourier loses less without a word
+_LOST = 1e-4  # of the amplitude: a larger loss by method fourier is reported
 
 
 def make_record(
@@ -32,7 +32,7 @@ def make_record(
     sources: Sequence[Source] = (),
     temperature: float | None = None,
 ) -> Calibration:
-    """Turn the estimates, the error budget and what it found into the record."""
+    """Return the record of the estimates, the error budget and the findings."""
     method = str(options["method"])
     sigma = np.sqrt(np.maximum(np.diagonal(estimates.covariance), 0.0))
     model: dict[str, Any] = {
@@ -70,7 +70,7 @@ def _fit(
     budget: Sequence[Mapping[str, Any]],
     method: str,
 ) -> dict[str, Any]:
-    """How the parameters were found, and how well the lines agree with them."""
+    """Return the section ``fit``: methods, and how well the lines agree with the parameters."""
     repeated = levels.repeatability
     return {
         "method": method,
@@ -225,7 +225,7 @@ def _static(static: StaticRun) -> dict[str, Any]:
 
 
 def _spectra(runs: Sequence[LoadedRun], levels: Levels) -> list[dict[str, Any]]:
-    """Spectra around the table line, of the first run at each level."""
+    """Return spectra around the table line, of the first run at each level."""
     shown = []
     by_index = {run.index: run for run in runs}
     for level in levels.items:
@@ -249,7 +249,7 @@ def _spectra(runs: Sequence[LoadedRun], levels: Levels) -> list[dict[str, Any]]:
 
 
 def _rounded(values: Array, digits: int) -> list[float]:
-    """Numbers with so many significant digits: a picture needs no more."""
+    """Return numbers with so many significant digits, as many as a figure needs."""
     return [float(f"{value:.{digits}g}") for value in values.tolist()]
 
 

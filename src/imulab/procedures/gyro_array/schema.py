@@ -124,7 +124,7 @@ class ArrayRecord(Part):
 
     @property
     def white_noise(self) -> Array:
-        """The angle random walk of each element, rad/s s^1/2, shape (axes, n).
+        """Return the angle random walk of each element, rad/s s^1/2, shape (axes, n).
 
         Where it is not determined, or next to nothing, it is what the covariance at its averaging time would be as
         white noise: a weight needs a size.
@@ -164,7 +164,7 @@ class HealthCurves(Part):
 
     @property
     def known(self) -> bool:
-        """Whether it holds anything."""
+        """Whether there are any."""
         return holds(self, "time")
 
 

@@ -84,7 +84,7 @@ class TestOfFit(Part):
 
 
 class ColumnDrift(Part):
-    """How a column follows time or temperature."""
+    """Dependence of a column on time or temperature."""
 
     follows: str
     slope: Quantity
@@ -163,7 +163,7 @@ class Noise(Part):
 
 @dataclass(frozen=True)
 class ColumnFigures:
-    """What the figures of a column are drawn from."""
+    """Data of the figures of a column."""
 
     spectra: list[BinnedSpectrum]
     allan: Allan
@@ -181,7 +181,7 @@ def fit_of(record: Calibration) -> NoiseSummary:
 
 
 def drawn_of(record: Calibration, column: str) -> ColumnFigures:
-    """Return what the figures of a column are drawn from.
+    """Return the data of the figures of a column.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def drawn_of(record: Calibration, column: str) -> ColumnFigures:
     return ColumnFigures(spectra, read_section(Allan, held.get("allan"), f"{where}.allan"))
 
 
-# Noise coefficients as people write them: 0.3 deg/sqrt(h), 100 ug/sqrt(Hz), 5 deg/h, and so on.
+# Texts of noise coefficients: 0.3 deg/sqrt(h), 100 ug/sqrt(Hz), 5 deg/h, and so on.
 
 
 Markov: TypeAlias = str | tuple[float | str, float | str]
@@ -216,7 +216,7 @@ EXAMPLES = {
 _LEVELS = ("rate", "acceleration", "output", "number")
 _INTEGRALS = {"m/s": ("m/s^2", 1.0), "mm/s": ("m/s^2", 1e-3)}
 _HOUR = math.sqrt(3600.0)
-# What follows the unit of a level, or of its integral, and the factor that it makes.
+# Endings of a unit after that of a level, or of its integral, with their factors.
 _OF_LEVEL = {
     "white": {"/sqrt(Hz)": 1.0},
     "walk": {"/s/sqrt(Hz)": 1.0, "/sqrt(h)": 1 / _HOUR, "/sqrt(s)": 1.0},
@@ -233,7 +233,7 @@ _SPELLINGS = (
 
 @dataclass(frozen=True)
 class GivenTerms:
-    """Noise that was given by its coefficients: SI, shape (8,) in the order of `NAMES`, and the unit of its level."""
+    """Stated noise: coefficients in SI, shape (8,) in the order of `NAMES`, and the SI unit of its level."""
 
     values: Array
     unit: str
@@ -248,7 +248,7 @@ def given_terms(
     quantisation: float | str | None,
     gm: Markov | Sequence[Markov] | None,
 ) -> GivenTerms:
-    """Return noise given by coefficients; numbers are in SI, texts have units.
+    """Return noise from its stated coefficients; numbers are in SI, texts have units.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ def given_terms(
 
 
 def coefficient(value: float | str, option: str, term: str) -> tuple[float, str | None]:
-    """Return a coefficient in SI, and the SI unit of the level that it belongs to, None for a bare number.
+    """Return a coefficient in SI, and the SI unit of its level, None for a bare number.
 
     Raises
     ------
@@ -312,7 +312,7 @@ def coefficient(value: float | str, option: str, term: str) -> tuple[float, str 
 
 
 def _unit(text: str, term: str, called: str) -> tuple[float, str]:
-    """Factor to SI of a coefficient's unit, and the SI unit of the level."""
+    """Return the factor to SI of a coefficient's unit, and the SI unit of the level."""
     for pattern, instead in _SPELLINGS:
         text = pattern.sub(instead, text)
     for endings, read in ((_OF_LEVEL, _level), (_OF_INTEGRAL, _integral)):
@@ -362,11 +362,11 @@ def _is_pair(value: object) -> bool:
 
 
 def by_name(values: Array) -> Mapping[str, float]:
-    """Return the terms that there are, SI, by the names of `NAMES`."""
+    """Return the terms that are not 0, SI, by the names of `NAMES`."""
     return {name: float(value) for name, value in zip(NAMES, values, strict=True) if value}
 
 
-# What people call the terms of a noise model, and the units in which they read them.
+# Usual names and reading units of the terms.
 
 
 _LONGEST_FIRST = sorted([*NAMES, "ramp"], key=len, reverse=True)
@@ -381,12 +381,12 @@ def term_unit(term: str, unit: str) -> str:
 
 
 def term_reading(term: str, unit: str) -> ReadingUnit:
-    """Return how a term of a column in `unit` is read."""
+    """Return the reading unit of a term of a column in `unit`."""
     return reading_unit(term_unit(term, unit), f"column_{term}")
 
 
 def label(term: str, unit: str) -> str:
-    """Return what people call a term of a column in `unit`."""
+    """Return the usual name of a term of a column in `unit`."""
     accel = unit == "m/s^2"
     names = {
         "white": "velocity random walk" if accel else "angle random walk",

@@ -29,7 +29,7 @@ def make_record(
     worst: Worst | None,
     options: Mapping[str, Any],
 ) -> Calibration:
-    """Turn a fitted table and what is known of its errors into a record."""
+    """Return the record of a fitted table and its errors."""
     parameters, names, matrix = _parameters(curves, chosen, spread, worst)
     serials = sorted({cycle.serial for cycle in curves.cycles if cycle.serial})
     models = sorted({cycle.sensor_model for cycle in curves.cycles if cycle.sensor_model})
@@ -82,7 +82,7 @@ def make_record(
 def _parameters(
     curves: Curves, chosen: Judged, spread: CycleSpread, worst: Worst | None
 ) -> tuple[dict[str, Parameter], tuple[str, ...], Array]:
-    """Return T_M, time scales, and per axis what cycles repeat to and the model leaves; names and covariance."""
+    """Return T_M, time scales, and per axis the repeatability and the model's errors; names and covariance."""
     parameters = {"settling_time": Parameter(curves.settling_time, None, "s")}
     blocks: list[tuple[tuple[str, ...], Array]] = []
     scales = chosen.solution.scales if chosen.solution else ()
@@ -137,7 +137,7 @@ def _row(row: Judged, chosen: bool) -> dict[str, Any]:
 
 
 def _data(curves: Curves) -> dict[str, Any]:
-    """Each cycle as the figures draw it: binned, referenced to its settled mean."""
+    """Return the data of the figures: each cycle in bins, relative to its settled mean."""
     middle = (curves.shares * curves.nodes).sum(axis=2)
     cycles = []
     for i, cycle in enumerate(curves.cycles):
@@ -164,7 +164,7 @@ def _data(curves: Curves) -> dict[str, Any]:
 
 
 def misfit(curves: Curves, table: WarmupTable) -> dict[str, Any]:
-    """Return what the model cannot follow of the mean curves: rms over the temperatures in each bin of time.
+    """Return the rms of the mean curves' residuals over the temperatures in each bin of time, without white noise.
 
     White noise is taken off. To be added to the variance of a curve from ``coefficient_covariance``, which holds what
     does not repeat.
@@ -190,7 +190,7 @@ def misfit(curves: Curves, table: WarmupTable) -> dict[str, Any]:
 
 
 def _numbers(values: Array) -> Any:
-    """Numbers for figures and tables, to seven digits, null where there is none."""
+    """Return numbers for figures and tables with seven digits, null for unknown ones."""
     if values.ndim > 1:
         return [_numbers(row) for row in values]
     return [float(f"{x:.{_DIGITS}g}") if np.isfinite(x) else None for x in values.tolist()]
