@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -40,6 +41,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         further = [item for item in items if item.get_closest_marker("further")]
         config.hook.pytest_deselected(items=further)
         items[:] = [item for item in items if not item.get_closest_marker("further")]
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Import the tests, each worker from another place on: what one has compiled the others find compiled.
+
+    Of a fresh checkout the rewriting of assertions takes longer than all imports, and workers that go through the
+    files together would each do it all.
+    """
+    config, worker = session.config, os.environ.get("PYTEST_XDIST_WORKER", "")
+    if worker and config.args == config.getini("testpaths"):
+        names = sorted(path.stem for path in Path(__file__).parent.glob("test_*.py"))
+        begin = int(worker.removeprefix("gw")) * len(names) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+        for name in names[begin:] + names[:begin]:
+            with contextlib.suppress(Exception, pytest.skip.Exception):  # the collection reports it
+                importlib.import_module(name)
 
 
 def some_of(quick: int, values: Sequence[Any]) -> list[Any]:
