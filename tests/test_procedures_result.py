@@ -453,3 +453,20 @@ def test_plans_of_chamber_and_centrifuge_are_drawn():
     assert predicted["x"] == pytest.approx([1, 2, 5])
     assert predicted["y"] == [100 * level.relative for level in plan.levels]
     assert wanted["y"] == [100 * plan.wanted] * 2
+
+
+def test_plans_for_scripts_add_up():
+    """In SI: a chamber's steps fill its duration, and levels follow from arm rates by a = w^2 r, runs from levels."""
+    chamber = json.loads(json.dumps(il.plan_warmup(cycles=3).content()))
+    steps = chamber["steps"]
+    assert sum(step["duration"] for step in steps) == chamber["duration"]["value"]
+    assert sum(step["action"] == "power on and record" for step in steps) == 3 * len(chamber["temperatures"])
+    arm = json.loads(json.dumps(il.plan_centrifuge("1,10", radius="2 m", cycles=1).content()))
+    forces, rates = ([level[name] for level in arm["levels"]] for name in ("specific_force", "arm_rate"))
+    assert {(force["unit"], rate["unit"]) for force, rate in zip(forces, rates, strict=True)} == {("m/s^2", "rad/s")}
+    assert [2.0 * rate["value"] ** 2 for rate in rates] == pytest.approx([9.80665, 98.0665])
+    assert [force["value"] for force in forces] == pytest.approx([9.80665, 98.0665])
+    assert arm["total"]["value"] == arm["static_duration"]["value"] + 2 * arm["duration"]["value"]
+    table = json.loads(json.dumps(il.plan_rate("0,100", arw="0.3 deg/sqrt(h)", uncertainty="10 ppm").content()))
+    assert [rate["rate"]["value"] for rate in table["rates"]] == pytest.approx(np.radians([0, 100]).tolist())
+    assert all(rate["uncertainty"]["value"] <= rate["wanted"]["value"] for rate in table["rates"])
