@@ -393,7 +393,7 @@ def test_the_covariance_by_parts_is_that_of_bell_and_mccaffrey():
         expected += np.outer(score, score)
     found = moments(count, lambda part: x[part].T, [y])
     columns = [0, 1, 2]
-    covariance = found.covariance(columns, columns, 0, found.fitted(columns, 0))
+    covariance = found.covariance(columns, columns, 0, found.fit(columns, 0))
     np.testing.assert_allclose(covariance, expected, rtol=1e-9)
 
 

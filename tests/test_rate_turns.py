@@ -9,7 +9,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.rate.turns import _scattered
+from imulab.procedures.rate.turns import _uncertainty_of_slopes
 from reference import rate as reference
 from test_rate_axes import ARM, SCALE, TURN, G, accel, of_another_unit
 from test_rate_axes import BIAS as BIAS_ACCEL
@@ -430,7 +430,7 @@ def test_turns_without_noise_state_what_is_left_and_divide_by_nothing():
     count = np.array([3.0, -3.0, 5.0])
     left = np.array([[0.0, 1e-6, 2e-16], [0.0, -2e-6, 0.0], [0.0, 1e-6, 0.0]])
     with np.errstate(all="raise"):
-        found = _scattered(left, count, np.zeros((3, 3)))
+        found = _uncertainty_of_slopes(left, count, np.zeros((3, 3)))
     assert (found > 0).all()
     assert (found[[0, 2]] < 1e-11).all()
     # no weights but the turns made, which the least uncertainty follows: chi-square of left / count

@@ -151,6 +151,11 @@ def density_unit(unit: str) -> ReadingUnit:
     return ReadingUnit(*known.get(unit, (f"{unit}/√Hz", 1.0)))
 
 
+def text_in(value: float, unit: str, digits: int = 3) -> str:
+    """Return a value in SI as the text of its number in another unit, with so many significant digits."""
+    return f"{from_si(value, unit):.{digits}g}"
+
+
 def small_text(value: float, unit: str, digits: int = 3) -> str:
     """Return a drift or residual with its unit as text."""
     read = small_unit(unit)

@@ -1,6 +1,6 @@
-"""Gyroscopes on a rate table and by whole turns.
+"""Gyroscopes on a rate table and by whole turns: bias, scale factor, misalignment and nonlinearity.
 
-Bias, scale factor, misalignment and nonlinearity; and the words and numbers that the options take.
+This file holds the names of axes and the words and numbers of options, which the command line needs before NumPy.
 """
 
 from __future__ import annotations
@@ -15,20 +15,16 @@ from imulab.units import to_si
 if TYPE_CHECKING:
     from imulab.recording import Array
 
-
-# The words and numbers that the options of a rate test take.
-
-
 AXES = "xyz"
 MOUNTINGS = tuple(sign + axis for axis in AXES for sign in "+-")
 GAINS = ("gyro_bias", "gyro_scale_factor", "gyro_misalignment", "gyro_g_sensitivity", "gyro_k")
-"""How the parameters begin that a unit computes with; others are figures of the test."""
+"""Prefixes of the parameters that a unit computes with; others are figures of the test."""
 ORDERS = ("auto", "1", "2", "3", "4", "5")
 RATES = "0,10,50,100,200,300"
 FENCE = "0.5 deg"
 
 
-def rates_of(text: str, option: str) -> tuple[float, ...]:
+def parse_rates(text: str, option: str) -> tuple[float, ...]:
     """Return ``0,10,-10`` (deg/s) as rates in rad/s.
 
     Raises
@@ -45,7 +41,7 @@ def rates_of(text: str, option: str) -> tuple[float, ...]:
     return rates
 
 
-def part_of_one(value: float | str, option: str) -> float:
+def parse_fraction(value: float | str, option: str) -> float:
     """Return an uncertainty as a fraction of 0 or more and below 1.
 
     Raises
@@ -59,6 +55,6 @@ def part_of_one(value: float | str, option: str) -> float:
     return share
 
 
-def gyros_of(samples: Array) -> Mapping[str, Array]:
+def name_gyroscopes(samples: Array) -> Mapping[str, Array]:
     """Return an array without names as a triad of gyroscopes, or the one about z."""
     return {"gyro": samples} if samples.shape[1] == 3 else {"gyro_z": samples[:, 0]}

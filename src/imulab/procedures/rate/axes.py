@@ -1,13 +1,14 @@
-"""What accelerometers say of the table axis, and an earlier record of the same gyroscopes beside a new one.
+"""The table axis in the body by accelerometers, and an earlier record of the same gyroscopes as prior knowledge.
 
-Over whole turns a table that is off level reads ``f = g a - w^2 r``, a the table axis and r the lever arm across it, so
-that the intercept of the mean of f over w^2 is along a. Where the rate changes all the time, what w' adds, and what a
-table off level adds with cosine and sine of its angle, are found beside it. Source: rotation about a fixed axis; least
-squares.
+Table axis (`find_axes`): over whole turns the mean specific force is ``f = g a - w^2 r``, a the table axis and r the
+lever arm across it, also on a table off level. The intercept of f over w^2 therefore points along a. In a sweep, terms
+in w' and in cosine and sine of the table's angle are fitted beside it.
 
-With the difference d of what both hold, ``z - cov(z, d) cov(d)^-1 d`` is generalised least squares of both together:
-the Kalman update. Biases are left out, since they change from power-on to power-on. What both have of one table or one
-clock is common to both, and no average makes it smaller.
+Prior (`with_prior`): z are the new parameters, d their difference from the prior's. ``z - cov(z, d) cov(d)^-1 d`` is
+generalised least squares of both records together (the Kalman update). Biases are left out, since they change from
+power-on to power-on. The error of a table or a clock that both records share does not average out.
+
+Source: rotation about a fixed axis; least squares.
 """
 
 from __future__ import annotations
@@ -32,17 +33,16 @@ from imulab.records.sections import Measured, entries
 from imulab.report.parameters import reading_unit
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
-# What accelerometers say of the table axis: its direction in the body, free of the table's level and the lever arm.
+# The direction of the table axis in the body, free of the table's level and of the lever arm.
 
 
 BY_ACCELEROMETERS = "that of the accelerometers"
 """The frame of a record's misalignments."""
-_FACE = np.cos(np.radians(30))
-_POWER_CYCLE = 3e-3 * STANDARD_GRAVITY
-"""Standard uncertainties, and m/s^2 that biases may move by until they are switched on again, of |f| about g."""
-_PIECE = 0.02  # s
+_FACE = np.cos(np.radians(30))  # cosine of the largest angle between the table axis and its face
+_POWER_CYCLE = 3e-3 * STANDARD_GRAVITY  # m/s^2 by which biases may change until they are switched on again
+_PIECE = 0.02  # s over which a sweep is averaged
 _BATCHES, _FEWEST = 32, 8
-"""Parts of a sweep, and pieces in each."""
+"""Batches of a sweep, and fewest pieces in each."""
 _TRIAD = tuple(f"accel_{axis}" for axis in AXES)
 
 
@@ -53,20 +53,18 @@ class TableAxes:
     Attributes
     ----------
     direction
-        Upwards, of unit length, shape (m, 3).
-    force
-        Specific force at rate 0, m/s^2, shape (m, 3), and what it gains with the rate squared, m, shape (m, 3).
-    arm
-        See `force`.
+        Unit vector along the table axis, upwards, shape (m, 3).
+    force, arm
+        Specific force at rate 0, m/s^2, and its slope over the rate squared, m, shape (m, 3).
     spread
-        Standard uncertainty of each component of a direction by the scatter of the dwells, or of parts of a sweep, rad,
+        Standard uncertainty of each component of a direction by the scatter of dwells, or of batches of a sweep, rad,
         shape (m,).
     changes
-        What one standard uncertainty of each of p parameters of the accelerometers does to it, shape (p, m, 3).
+        Change of the direction by one standard uncertainty of each of p accelerometer parameters, shape (p, m, 3).
     correlation
-        Of these parameters, shape (p, p).
+        Correlation of these parameters, shape (p, p).
     length_uncertainty
-        Standard uncertainty of the magnitude of a force by both, m/s^2, shape (m,).
+        Standard uncertainty of the magnitude of a force by scatter and parameters, m/s^2, shape (m,).
     """
 
     direction: Array
@@ -81,7 +79,7 @@ class TableAxes:
 def find_axes(
     test: RateTest, recordings: Sequence[Recording], dwells: Sequence[Dwells], accel: Calibration
 ) -> TableAxes:
-    """Find the table axis of each run by the accelerometers of its recording, calibrated by their record.
+    """Return the table axis of each run by the accelerometers of its recording, calibrated by their record.
 
     Raises
     ------
@@ -93,15 +91,15 @@ def find_axes(
     if "bias_x" not in accel.parameters:
         raise RecordError(f"accel: a {accel.procedure} record without accelerometers; expected one of tumble fit")
     pairs = zip(recordings, dwells, strict=True)
-    runs_seen = [_seen(recording, axes, test.place(k)) for k, (recording, axes) in enumerate(pairs)]
+    runs_seen = [_outputs_and_columns(recording, axes, test.place(k)) for k, (recording, axes) in enumerate(pairs)]
     unit = recordings[0].triad_unit("accel")
     outputs = np.vstack([each[0] for each in runs_seen])
     runs = np.repeat(np.arange(len(runs_seen)), [len(each[0]) for each in runs_seen])
 
     def axes_by(record: Calibration) -> list[tuple[Array, Array, float]]:
-        force = corrected_means(record, outputs, unit)
+        force = correct_means(record, outputs, unit)
         swept = [axes.sweep is not None for axes in dwells]
-        return [_intercept(force[runs == k], each[1], swept[k]) for k, each in enumerate(runs_seen)]
+        return [_fit_intercept(force[runs == k], each[1], swept[k]) for k, each in enumerate(runs_seen)]
 
     axes = axes_by(accel)
     force = np.array([each[0] for each in axes])
@@ -109,9 +107,11 @@ def find_axes(
     direction = force / length[:, None]
     for k, run in enumerate(test.runs):
         if run.sign * direction[k, run.axis] < _FACE:
-            raise DataError(f"{test.place(k)}: by the accelerometers {_up(direction[k])} points up: is mounting wrong?")
+            raise DataError(
+                f"{test.place(k)}: by the accelerometers {_upward_axis(direction[k])} points up: is mounting wrong?"
+            )
 
-    shifts, correlation = moved_by_parameters(accel, lambda record: np.array([each[0] for each in axes_by(record)]))
+    shifts, correlation = parameter_sensitivity(accel, lambda record: np.array([each[0] for each in axes_by(record)]))
     spread = np.array([each[2] for each in axes])
     return TableAxes(
         direction=direction,
@@ -124,7 +124,7 @@ def find_axes(
     )
 
 
-def corrected_means(record: Calibration, outputs: Array, unit: str) -> Array:
+def correct_means(record: Calibration, outputs: Array, unit: str) -> Array:
     """Return mean outputs of the accelerometers as specific force by their record, m/s^2, shape (n, 3)."""
     columns = {"time": np.arange(len(outputs), dtype=np.float64), **dict(zip(_TRIAD, outputs.T, strict=True))}
     units = {name: "s" if name == "time" else unit for name in columns}
@@ -138,13 +138,13 @@ def unit_vectors(vectors: Array) -> Array:
 
 
 def length_uncertainty(force: Array, shifts: Array, correlation: Array) -> Array:
-    """Return the standard uncertainty of |f| of m forces (m, 3) by their record, from `moved_by_parameters`; (m,)."""
+    """Return the standard uncertainty of |f| of m forces (m, 3) by their record, from `parameter_sensitivity`; (m,)."""
     along = np.sum(shifts * unit_vectors(force), axis=2)
     return np.asarray(np.sqrt(np.maximum(np.einsum("pm,pq,qm->m", along, correlation, along), 0.0)))
 
 
-def moved_by_parameters(accel: Calibration, forces: Callable[[Calibration], Array]) -> tuple[Array, Array]:
-    """Return what one standard uncertainty of each of p parameters does to m forces, and the correlation.
+def parameter_sensitivity(accel: Calibration, forces: Callable[[Calibration], Array]) -> tuple[Array, Array]:
+    """Return the change of m forces by one standard uncertainty of each of p parameters, and their correlation.
 
     Shapes (p, m, 3) and (p, p).
     """
@@ -161,7 +161,7 @@ def moved_by_parameters(accel: Calibration, forces: Callable[[Calibration], Arra
     return np.array(changes).reshape(len(names), len(at), 3), matrix / np.outer(known, known)
 
 
-def _outputs(recording: Recording, place: str) -> tuple[Array, Array]:
+def _accelerometer_outputs(recording: Recording, place: str) -> tuple[Array, Array]:
     """Return time, s, and the outputs of the accelerometers, shapes (n,) and (n, 3)."""
     missing = [name for name in _TRIAD if name not in recording]
     if missing:
@@ -172,20 +172,21 @@ def _outputs(recording: Recording, place: str) -> tuple[Array, Array]:
     return time, outputs
 
 
-def _means(recording: Recording, dwells: Dwells, place: str) -> Array:
+def _dwell_means(recording: Recording, dwells: Dwells, place: str) -> Array:
     """Return the mean outputs of the accelerometers over each dwell, shape (n, 3)."""
-    time, outputs = _outputs(recording, place)
+    time, outputs = _accelerometer_outputs(recording, place)
     first, last = np.searchsorted(time, dwells.start), np.searchsorted(time, dwells.stop, side="right")
     return np.array([outputs[a:b].mean(axis=0) for a, b in zip(first, last, strict=True)])
 
 
-def _seen(recording: Recording, dwells: Dwells, place: str) -> tuple[Array, Array]:
-    """Return mean outputs of the accelerometers, shape (n, 3), and the columns that they are made of, (n, c).
+def _outputs_and_columns(recording: Recording, dwells: Dwells, place: str) -> tuple[Array, Array]:
+    """Return mean outputs of the accelerometers, shape (n, 3), and the columns of their model, shape (n, c).
 
-    The columns are 1, w^2, and what else adds to them, all times the root of their weight.
+    The columns are 1 and w^2, of a sweep also w', cosine and sine; times the square root of the weight, for dwells the
+    number of turns.
     """
     if dwells.sweep is not None:
-        return _seen_in_a_sweep(recording, place)
+        return _sweep_outputs_and_columns(recording, place)
     turns = np.abs(dwells.rate) * (dwells.stop - dwells.start) / (2 * np.pi)
     which = turns >= 1
     squares = dwells.rate[which] ** 2
@@ -194,13 +195,13 @@ def _seen(recording: Recording, dwells: Dwells, place: str) -> tuple[Array, Arra
             f"{place}: the table axis by accelerometers needs dwells of a whole turn or more at two sizes of rate; "
             f"expected longer dwells, found {int(which.sum())}"
         )
-    root = np.sqrt(turns[which])[:, None]  # what is left of a tilt falls with the turns
-    return _means(recording, dwells, place)[which], np.column_stack([np.ones(len(squares)), squares]) * root
+    root = np.sqrt(turns[which])[:, None]  # the effect of a tilt on a mean falls with the number of turns
+    return _dwell_means(recording, dwells, place)[which], np.column_stack([np.ones(len(squares)), squares]) * root
 
 
-def _seen_in_a_sweep(recording: Recording, place: str) -> tuple[Array, Array]:
-    """Return the same over pieces of 0.02 s of a run whose rate changes all the time."""
-    time, outputs = _outputs(recording, place)
+def _sweep_outputs_and_columns(recording: Recording, place: str) -> tuple[Array, Array]:
+    """Return what `_outputs_and_columns` does over pieces of 0.02 s of a sweep."""
+    time, outputs = _accelerometer_outputs(recording, place)
     rate = recorded_rate(recording, time)
     assert rate is not None
     angle = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(time))])
@@ -220,11 +221,13 @@ def _seen_in_a_sweep(recording: Recording, place: str) -> tuple[Array, Array]:
     return force, np.column_stack([np.ones(count), *columns])
 
 
-def _intercept(force: Array, columns: Array, swept: bool) -> tuple[Array, Array, float]:
-    """Return mean force at rate 0 and its slope over the rate squared, and the uncertainty of a component of it.
+def _fit_intercept(force: Array, columns: Array, swept: bool) -> tuple[Array, Array, float]:
+    """Return mean force at rate 0, its slope over the rate squared, and the uncertainty of a component of the first.
 
-    Dwells are independent of one another. Pieces of a sweep are not, where noise is filtered or vibration goes on from
-    piece to piece: there the scores of longer parts tell. Source: Liang and Zeger, Biometrika 73 (1986) 13.
+    Dwells are independent of one another. Pieces of a sweep are not, where noise is filtered or vibration lasts longer
+    than a piece: there the scores of longer batches give the variance.
+
+    Source: Liang and Zeger, Biometrika 73 (1986) 13.
     """
     root, largest = columns[:, :1], np.abs(columns).max(axis=0)
     scaled = columns / largest
@@ -241,31 +244,34 @@ def _intercept(force: Array, columns: Array, swept: bool) -> tuple[Array, Array,
     return coefficients[0] / largest[0], coefficients[1] / largest[1], float(np.sqrt(variance)) / largest[0]
 
 
-def _up(direction: Array) -> str:
+def _upward_axis(direction: Array) -> str:
+    """Return the body axis that is nearest to a direction, such as ``+z``."""
     k = int(np.argmax(np.abs(direction)))
     return f"{'+' if direction[k] > 0 else '-'}{AXES[k]}"
 
 
-def faces_said(test: RateTest, recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> list[str]:
-    """Return where accelerometers without a record see another face up than the manifest says."""
+def warn_faces(test: RateTest, recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> list[str]:
+    """Return a warning for each run in which uncalibrated accelerometers see another face up than the manifest says."""
     messages = []
     for k, (recording, run_dwells) in enumerate(zip(recordings, dwells, strict=True)):
         if all(name in recording for name in _TRIAD):
-            mean = _means(recording, run_dwells, test.place(k)).mean(axis=0)
-            if _up(mean) != test.runs[k].mounting:
+            mean = _dwell_means(recording, run_dwells, test.place(k)).mean(axis=0)
+            if _upward_axis(mean) != test.runs[k].mounting:
                 place = test.place(k)
-                messages.append(f"{place}: the accelerometers see {_up(mean)} up: is mounting wrong, or their sign?")
+                messages.append(
+                    f"{place}: the accelerometers see {_upward_axis(mean)} up: is mounting wrong, or their sign?"
+                )
     return messages
 
 
-def other_unit_said(record: Calibration, sensor: Mapping[str, str], option: str) -> list[str]:
-    """Say where the record that an option gave is of another unit than the recordings, by what both state."""
+def warn_other_unit(record: Calibration, sensor: Mapping[str, str], option: str) -> list[str]:
+    """Return a warning where the record of an option is of another unit than the recordings, by serial or element."""
     other = different_units(("the record", record.sensor), ("the recordings", sensor), keys=("serial", "element"))
     return [f"{option}: {other}: is it of this unit?"] if other else []
 
 
-def length_said(accel: Calibration, force: Array, uncertainty: Array, places: Sequence[str]) -> list[str]:
-    """Say where |f| of m forces (m, 3), m/s^2, is not g, by more than the record and a power cycle explain."""
+def warn_force_length(accel: Calibration, force: Array, uncertainty: Array, places: Sequence[str]) -> list[str]:
+    """Return a warning where |f| of m forces (m, 3), m/s^2, is off g by more than record and power cycle explain."""
     off = np.linalg.norm(force, axis=1) - float(accel.model["gravity"]["value"])
     beyond = np.abs(off) - LENGTH_AT_REST_OFF.limit * uncertainty - _POWER_CYCLE
     k = int(np.argmax(beyond))
@@ -279,9 +285,9 @@ def length_said(accel: Calibration, force: Array, uncertainty: Array, places: Se
 
 
 def with_accelerometers(accel: Calibration, record: Calibration, remarks: Sequence[str] = ()) -> Calibration:
-    """Return the accelerometers' record with the gyroscopes of a rate record; those it had are replaced.
+    """Return the accelerometers' record with the gyroscopes of a rate record in place of its own.
 
-    What the recordings state of the unit is the unit's, and `remarks` is what was found of the accelerometers.
+    `remarks` are warnings about the accelerometers. Where records and recordings name the unit, the recordings count.
     """
     accel_parameters = {name: p for name, p in accel.parameters.items() if not name.startswith("gyro_")}
     names = [name for name in accel.covariance.names if not name.startswith("gyro_")]
@@ -293,7 +299,7 @@ def with_accelerometers(accel: Calibration, record: Calibration, remarks: Sequen
     kept = ("gyro_order", "gyro_output_unit", "largest_rate")
     return replace(
         accel,
-        parameters=accel_parameters | {name: _with_interval(name, p) for name, p in record.parameters.items()},
+        parameters=accel_parameters | {name: _add_interval(name, p) for name, p in record.parameters.items()},
         covariance=Covariance((*names, *record.covariance.names), tuple(map(tuple, joined.tolist()))),
         model={**accel.model, **{name: record.model[name] for name in kept if name in record.model}},
         fit={**{name: part for name, part in accel.fit.items() if name != "gyro"}, "rate": dict(record.fit)},
@@ -305,33 +311,34 @@ def with_accelerometers(accel: Calibration, record: Calibration, remarks: Sequen
     )
 
 
-def lean_said(axes: TableAxes, test: RateTest) -> list[str]:
-    """Return by how much the table axis leaned from the faces."""
+def note_lean(axes: TableAxes, test: RateTest) -> list[str]:
+    """Return the note that says by how much the table axis leaned from the faces."""
     cosines = [run.sign * axes.direction[k, run.axis] for k, run in enumerate(test.runs)]
     most = float(np.arccos(np.clip(min(cosines), -1, 1)))
     degrees = from_si(most, "deg")
     return [Note(f"the table axis leaned from the faces by up to {degrees:.2g} deg, by the accelerometers")]
 
 
-def _with_interval(name: str, p: Parameter) -> Parameter:
-    """Return a parameter with the interval that its uncertainty gives, as the accelerometers' beside it have one."""
+def _add_interval(name: str, p: Parameter) -> Parameter:
+    """Return a parameter with the interval of its uncertainty, as the accelerometers' parameters have one."""
     if p.interval_95 is not None or not p.standard_uncertainty or not name.startswith(GAINS):
         return p
     half = coverage_factor(None) * p.standard_uncertainty
     return replace(p, interval_95=(p.value - half, p.value + half))
 
 
-# An earlier record of the same gyroscopes beside a new one: whether they agree, and both as one fit.
+# An earlier record of the same gyroscopes as prior knowledge: whether both agree, and both as one fit.
 
 
-_TINY = 1e-12  # of the largest eigenvalue: what two records share without any uncertainty
-_APART = 5.0  # K, beyond which a thermal record counts temperatures as different
+_TINY = 1e-12  # of the largest eigenvalue: smaller ones are of combinations that are known exactly
+_APART = 5.0  # K that recordings may differ by to be at one temperature of a thermal record
 
 
 def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Calibration:
-    """Return a rate record with a prior's knowledge; one of both triads where that holds accelerometers in its frame.
+    """Return the fit of a rate record and a prior together: ``z - cov(z, d) cov(d)^-1 d``.
 
-    `frame` is that of the record's misalignments, None where it has none.
+    It is a record of both triads where the prior holds accelerometers and `record` has no misalignments. `frame` is
+    that of the record's misalignments, None where it has none.
 
     Raises
     ------
@@ -364,12 +371,12 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
         raise RecordError("prior: it holds none of the parameters found here; expected gyroscopes of the same axes")
     # a record without misalignments of its own takes over what it lacks
     further = [name for name in known if name not in test_names] if frame is None else []
-    comparison = compared(_part(prior, common), _part(record, common))
-    values, matrix = _updated(record, prior, test_names, common, further)
+    comparison = compared(_restrict_to(prior, common), _restrict_to(record, common))
+    values, matrix = _update_by_prior(record, prior, test_names, common, further)
     parameters: dict[str, Parameter] = {}
     for name, value, u in zip(test_names + further, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), strict=True):
         source = record.parameters.get(name) or prior.parameters[name]
-        parameters[name] = Parameter(value, u, source.unit, interval_95=_interval(source, value, u))
+        parameters[name] = Parameter(value, u, source.unit, interval_95=_scale_interval(source, value, u))
     axes = "".join(axis for axis in AXES if f"gyro_scale_factor_{axis}" in parameters)
     updated = replace(
         record,
@@ -377,15 +384,15 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
         covariance=Covariance((*test_names, *further), tuple(map(tuple, matrix.tolist()))),
         model={
             **record.model,
-            "gyro_order": _order(parameters),
+            "gyro_order": _highest_power(parameters),
             "axes": axes,
         },
-        fit={**record.fit, "prior": entries(_both_alone(prior, record, common, comparison.probability))},
+        fit={**record.fit, "prior": entries(_prior_section(prior, record, common, comparison.probability))},
         sources=tuple({source.file: source for source in (*prior.sources, *record.sources)}.values()),
         warnings=(
             *record.warnings,
-            *other_unit_said(prior, record.sensor, "prior"),
-            _said(comparison.probability, comparison.changes),
+            *warn_other_unit(prior, record.sensor, "prior"),
+            _state_agreement(comparison.probability, comparison.changes),
         ),
         verdict=UNJUDGED,
     )
@@ -423,12 +430,12 @@ def prior_at(prior: Calibration, recordings: Sequence[Recording]) -> Calibration
     return gyros_at_temperature(prior, whole, recordings[0].name)
 
 
-def _order(parameters: Mapping[str, Parameter]) -> int:
+def _highest_power(parameters: Mapping[str, Parameter]) -> int:
     return max((int(name[6]) for name in parameters if name.startswith("gyro_k")), default=1)
 
 
-def _part(record: Calibration, names: list[str]) -> Calibration:
-    """Return a record of these parameters alone, as two are compared."""
+def _restrict_to(record: Calibration, names: list[str]) -> Calibration:
+    """Return a record of some of the parameters alone, for a comparison."""
     matrix = record.covariance.block(names)
     return replace(
         record,
@@ -439,8 +446,8 @@ def _part(record: Calibration, names: list[str]) -> Calibration:
     )
 
 
-def _shared(record: Calibration) -> dict[str, float]:
-    """Return what all scale factors of a record have in common, a fraction, by whose it is."""
+def _common_uncertainties(record: Calibration) -> dict[str, float]:
+    """Return the relative uncertainty that all scale factors of a record share, under ``table`` or ``clock``."""
     fit: Any = record.fit.get("rate", record.fit)
     if "fence" in fit:  # of turns by hand
         return {"clock": fit.get("clock") or 0.0}
@@ -449,12 +456,15 @@ def _shared(record: Calibration) -> dict[str, float]:
     return {"clock": fit.get("gyro", {}).get("clock", {}).get("standard_uncertainty") or 0.0}
 
 
-def _updated(
+def _update_by_prior(
     record: Calibration, prior: Calibration, test_names: list[str], common: list[str], further: list[str]
 ) -> tuple[Array, Array]:
-    """Return values and covariance of `test_names` and `further` parameters by both records as one fit."""
+    """Return values and covariance of `test_names` and `further` parameters by the fit of both records together.
+
+    ``z - K d`` and ``cov(z) - K cov(z, d)'``, ``K = cov(z, d) cov(d)^-1``, d the difference of the `common` parameters.
+    """
     mine, its = record.covariance.array(), prior.covariance.block(common + further)
-    both = {name: _shared(record).get(name, 0.0) * u for name, u in _shared(prior).items()}
+    both = {name: _common_uncertainties(record).get(name, 0.0) * u for name, u in _common_uncertainties(prior).items()}
     scales = [
         np.array([source.parameters[name].value if name.startswith("gyro_scale_factor") else 0.0 for name in names])
         for source, names in ((record, test_names), (prior, common + further))
@@ -476,30 +486,31 @@ def _updated(
     return values - gain @ (values[:n][at] - other), (matrix + matrix.T) / 2
 
 
-def _interval(source: Parameter, value: float, u: float) -> tuple[float, float] | None:
-    """Return the interval of a parameter, as many standard uncertainties wide as before."""
+def _scale_interval(source: Parameter, value: float, u: float) -> tuple[float, float] | None:
+    """Return a parameter's interval about a new value, as many standard uncertainties wide as before."""
     if source.interval_95 is None or not source.standard_uncertainty:
         return None
     wide = (source.interval_95[1] - source.interval_95[0]) / 2 / source.standard_uncertainty * u
     return value - wide, value + wide
 
 
-def _both_alone(prior: Calibration, record: Calibration, names: list[str], probability: float | None) -> RatePrior:
-    """Return ``fit.prior``: what each record says of the parameters of both, alone."""
+def _prior_section(prior: Calibration, record: Calibration, names: list[str], probability: float | None) -> RatePrior:
+    """Return ``fit.prior``: the parameters that both records hold, by each alone."""
     return RatePrior(
         probability=probability,
         parameters={
-            name: PriorParameter(prior=_measured(prior.parameters[name]), test=_measured(record.parameters[name]))
+            name: PriorParameter(prior=_as_measured(prior.parameters[name]), test=_as_measured(record.parameters[name]))
             for name in names
         },
     )
 
 
-def _measured(parameter: Parameter) -> Measured:
+def _as_measured(parameter: Parameter) -> Measured:
     return Measured(value=parameter.value, standard_uncertainty=parameter.standard_uncertainty, unit=parameter.unit)
 
 
-def _said(probability: float | None, changes: Any) -> str:
+def _state_agreement(probability: float | None, changes: Any) -> str:
+    """Return the note or warning that says whether prior and test agree, and which parameter differs most."""
     chance = "" if probability is None else f" (probability {probability:.2g})"
     differing = [change for change in changes if change.significant]
     if not differing and probability is not None and probability < RATE_PRIOR_CONTRADICTED.level:

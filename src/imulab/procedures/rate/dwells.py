@@ -1,17 +1,17 @@
-"""The runs of a rate test: dwells at one rate, each with its mean, and sweeps whose rate changes all the time.
+"""The runs of a rate test as means by rate: dwells at one rate, and sweeps whose rate changes all the time.
 
-The means y of 64 parts of a recording, freed of a line over time, have the covariance ``a I + c F``, F that of noise
-whose density falls as one over the frequency, of Allan variance 1 at any time; a and c are those of the largest
-restricted likelihood. The mean of all has the variance a / 64, and c, the Allan variance to which no longer recording
-brings it. What lies below the lowest frequency of a recording has no part in that: no recording shows it. Source:
-Patterson and Thompson, Biometrika 58 (1971) 545; Barnes et al., IEEE Trans. Instrum. Meas. IM-20 (1971) 105.
+Dwells: a stretch in which the table turns at one rate gives the mean of each gyroscope over it (`find_dwells`).
 
-Sums of products of the columns and the outputs, apart for each batch of the run, say all that is asked: coefficients,
-what they leave of a column, and their covariance by the scores of the batches.
+Sweeps (`reduce_sweep`): the output is ``M = S (w - tau w' + c w'' ...)``, w the table's rate, fitted by least squares
+with derivatives up to the fourth. The scale factor S is that at frequency 0, tau is the delay, and the amplitude falls
+as ``1 - (c - tau^2 / 2) (2 pi f)^2``. Of a single sine ``w''`` is proportional to w, so that it shows amplitude and
+phase at its own frequency alone.
 
-``M = S (w - tau w' + c w'' ...)`` by least squares, to fourth order in the frequency: the delay tau and the fall of the
-amplitude, ``1 - (c - tau^2 / 2) (2 pi f)^2``, come apart from the scale factor S, which is that at frequency 0. Of one
-sine ``w''`` is w: amplitude and phase at its frequency are all that it shows.
+Variance of a mean over a whole run (`variance_of_mean`): 64 means y of equal parts, without a line over time, have the
+covariance ``a I + c F``, F that of flicker noise with Allan variance 1. With a and c of largest restricted likelihood
+the mean of all varies by ``a / 64 + c``. Noise below the lowest frequency of the recording does not show in it.
+
+Sources: Patterson and Thompson, Biometrika 58 (1971) 545; Barnes et al., IEEE Trans. Instrum. Meas. IM-20 (1971) 105.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ from imulab.errors import DataError, SegmentError
 from imulab.procedures.rate import AXES
 from imulab.procedures.rate.schema import RateTest
 from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.report.parameters import text_in
 from imulab.units import from_si, parse_unit, to_si
 
-# How far the mean of a zero over a recording is from that over the next: white noise, and what wanders (1/f).
+# The variance of a mean over a whole run, by white and flicker noise.
 
 
-PARTS = 64  # of a record over which white noise and random walk are told apart
+PARTS = 64  # of a recording, over which white and flicker noise differ
 _RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 121)])
 
 
 def variance_of_mean(means: Array) -> float:
-    """Return half the mean square by which the mean over such a recording differs from that over the next.
+    """Return the Allan variance of the mean over such a recording, ``a / 64 + c``.
 
     Parameters
     ----------
@@ -56,9 +57,9 @@ def variance_of_mean(means: Array) -> float:
 
 @cache
 def _contrasts() -> tuple[Array, Array]:
-    """Return contrasts of the parts that neither noise correlates, and their variances over a, by the ratio c / a.
+    """Return contrasts of the parts that are uncorrelated under both noises, and their variances over a.
 
-    Shapes (62, 64) and (122, 62).
+    Shapes (62, 64), and (122, 62): a row for each ratio c / a.
     """
     lag = np.abs(np.arange(-1.0, PARTS + 1))
     curve = lag**2 * np.log(np.maximum(lag, 1.0))
@@ -70,16 +71,16 @@ def _contrasts() -> tuple[Array, Array]:
     return (free @ turn).T, 1 + _RATIOS[:, None] * spread
 
 
-# Least squares over a sweep, block by block: what a run of 10^7 samples takes is a few columns of memory.
+# Least squares over a sweep, block by block, so that a run of 10^7 samples takes a few columns of memory.
 
 
 ONE, TIME, RATE, SQUARE, CUBE, TURN, BOW, *DERIVATIVES = range(11)
-"""Places of the columns of `regressors`: 1, time from its mean, s, the rate, its powers, 1 where it rises and -1 where
-it falls, that times the square of the rate over its largest, and its four derivatives."""
+"""Places of the columns of `sweep_moments`: 1; time from its mean, s; the rate, its square and cube; +1 where the rate
+rises and -1 where it falls; that sign times ``(rate / largest rate)^2``; four derivatives of the rate."""
 WHOLE = 8.8
-"""Steps that eight steps take at most where no sample is missing."""
-# Parts of a sweep by whose scatter uncertainties are known; samples at once, to bound memory
+"""Median steps that eight steps span at most where no sample is missing."""
 _SWEEP_BATCHES, _SWEEP_BLOCK = 32, 1 << 15
+"""Batches of a sweep whose scatter gives the uncertainties; samples held at once, which bounds memory."""
 _POWERS = np.vander(np.arange(-4.0, 5.0), increasing=True).T
 KERNELS = np.linalg.solve(_POWERS, np.diag([1.0, 1.0, 2.0, 6.0, 24.0, 0.0, 0.0, 0.0, 0.0]))[:, 1:5].T
 """Four derivatives of polynomials of degree 8, over the spacing to the power of their order, shape (4, 9)."""
@@ -87,18 +88,18 @@ KERNELS = np.linalg.solve(_POWERS, np.diag([1.0, 1.0, 2.0, 6.0, 24.0, 0.0, 0.0, 
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of a sweep, n of them, that have four neighbours on either side, without a gap between.
+    """The n samples of a sweep that have four neighbours on either side, without a gap between.
 
     Attributes
     ----------
     time, outputs
-        s, and of each gyroscope, shape (n,).
+        Times, s, and outputs of each gyroscope, shape (n,).
     rate
-        Of the table, of all samples, rad/s.
+        Rate of the table at all samples, rad/s.
     first
-        Which sample of `rate` the first neighbour of each is, shape (n,); None where they follow one another.
+        Index in `rate` of the first neighbour of each sample, shape (n,); None where the samples have no gap.
     side, spacing
-        Samples, and time, s, from neighbour to neighbour.
+        Samples and time, s, from neighbour to neighbour.
     """
 
     time: Array
@@ -109,14 +110,14 @@ class Samples:
     spacing: float
 
     def neighbours(self, part: slice) -> Array:
-        """Return the rate at the nine neighbours of each of n samples, the middle one itself, shape (9, n)."""
+        """Return the rate at each of n samples and its eight neighbours, shape (9, n)."""
         shifts = [k * self.side for k in range(9)]
         if self.first is None:
             return np.array([self.rate[part.start + shift : part.stop + shift] for shift in shifts])
         return np.array([self.rate[self.first[part] + shift] for shift in shifts])
 
 
-def with_neighbours(time: Array, rate: Array, outputs: Sequence[Array], side: int, step: float) -> Samples:
+def take_with_neighbours(time: Array, rate: Array, outputs: Sequence[Array], side: int, step: float) -> Samples:
     """Return the samples that have neighbours `side` samples apart, without a gap between."""
     whole = time[8 * side :] - time[: len(rate) - 8 * side] < WHOLE * side * step
     first = None if whole.all() else np.flatnonzero(whole)
@@ -149,19 +150,19 @@ class Moments:
         whole = self.whole
         return float(whole[column, column] / whole[0, 0] - (whole[column, 0] / whole[0, 0]) ** 2)
 
-    def fitted(self, columns: Sequence[int], output: int) -> Array:
-        """Return the coefficients of columns that make up an output."""
-        return self._solved(columns, self.columns + output)
+    def fit(self, columns: Sequence[int], output: int) -> Array:
+        """Return the least-squares coefficients of an output by columns."""
+        return self._solve(columns, self.columns + output)
 
-    def left_of(self, column: int, others: Sequence[int]) -> float:
-        """Return the sum of squares that others leave of a column."""
-        return float(self.whole[column, column] - self.whole[column, others] @ self._solved(others, column))
+    def residual_square(self, column: int, others: Sequence[int]) -> float:
+        """Return the sum of squares of a column's residual in its fit by others."""
+        return float(self.whole[column, column] - self.whole[column, others] @ self._solve(others, column))
 
     def covariance(self, columns: Sequence[int], fitted: Sequence[int], output: int, coefficients: Array) -> Array:
-        """Return the covariance of coefficients of columns, by what `coefficients` of columns `fitted` leave.
+        """Return the covariance of coefficients of columns, by the residual of `coefficients` of columns `fitted`.
 
-        By the scores of parts of the run, so that what is left may be correlated; each score stands for what the fit
-        took from its part, too. Source: Bell and McCaffrey, Survey Methodology 28 (2002) 169.
+        By the scores of the batches, so that the residual may be correlated within them; each score is enlarged by
+        what the fit took from its batch. Source: Bell and McCaffrey, Survey Methodology 28 (2002) 169.
         """
         both = self.batches[:, columns]
         size, normal = self._normal(columns)
@@ -174,19 +175,19 @@ class Moments:
         return np.asarray(scores.T @ scores)
 
     def _normal(self, columns: Sequence[int]) -> tuple[Array, Array]:
-        """Return the size of columns, and the inverse of the sums of their products over it."""
+        """Return the root sum of squares of each column, and the inverse of the normal matrix over these sizes."""
         whole = self.whole[np.ix_(columns, columns)]
         size = np.sqrt(np.diag(whole))
         size = np.where(size > 0, size, 1.0)
         return size, np.linalg.pinv(whole / np.outer(size, size))
 
-    def _solved(self, columns: Sequence[int], column: int) -> Array:
+    def _solve(self, columns: Sequence[int], column: int) -> Array:
         size, normal = self._normal(columns)
         return np.asarray(normal @ (self.whole[columns, column] / size) / size)
 
 
 def moments(count: int, columns: Callable[[slice], Sequence[Array] | Array], outputs: Sequence[Array]) -> Moments:
-    """Return the sums of products of what `columns` returns for each part of `count` samples, and the outputs."""
+    """Return the sums of products of outputs and columns; `columns` makes these for each part of `count` samples."""
     whole, number = None, 0
     for batch, part in blocks(count):
         made = columns(part)
@@ -198,10 +199,10 @@ def moments(count: int, columns: Callable[[slice], Sequence[Array] | Array], out
     return Moments(whole, number)
 
 
-def regressors(samples: Samples, felt: Array | None = None) -> Moments:
-    """Return the sums of products of the rate's powers, branches and derivatives, a constant, time, and the outputs.
+def sweep_moments(samples: Samples, felt: Array | None = None) -> Moments:
+    """Return the sums of products of the columns ``ONE`` to ``DERIVATIVES`` and the outputs.
 
-    The branches are those of the rate as the gyroscopes felt it, where that is known.
+    The rate rises or falls as the gyroscopes felt it, where `felt` is known, else as the table turned.
     """
     middle, largest = float(samples.time.mean()), float(np.abs(samples.rate).max())
     rises = None if felt is None else rising(felt)
@@ -226,7 +227,7 @@ def rising(rate: Array) -> NDArray[np.bool_]:
     return rises
 
 
-def felt_rate(samples: Samples, weights: Array) -> Array:
+def weigh_derivatives(samples: Samples, weights: Array) -> Array:
     """Return the rate and its four derivatives, each times its weight (5,), at each of n samples, shape (n,)."""
     taps = (weights[1:] * samples.spacing ** -np.arange(1.0, 5.0)) @ KERNELS
     taps[4] += weights[0]
@@ -236,48 +237,49 @@ def felt_rate(samples: Samples, weights: Array) -> Array:
     return rate
 
 
-# A run whose rate changes all the time: what the gyroscopes' delay and bandwidth do to it, and means by rate.
+# A run whose rate changes all the time: delay and bandwidth of the gyroscopes, and means by rate.
 
 
-_BINS, _FEWEST_BLOCKS = 20, 10  # of the rate in which residuals are averaged; samples of one at least
-# Shares of the spectrum: below its end, and within so many bins of a sine's peak
+_BINS, _FEWEST_BLOCKS = 20, 10  # bins of the rate in which outputs are averaged; samples in one at least
 _POWER, _SINE, _BESIDE = 0.999, 0.998, 3
+"""Share of the power below the end of the band; of a sine, share of it within so many bins of the peak."""
 _PER_PERIOD = 16  # pieces of a period of the fastest motion, over which samples are averaged
 _BESIDE_NOISE = 8  # samples on both sides over which noise is averaged
 _SMOOTH = 0.02  # of the largest step of the rate: it changes all the time if more steps than half exceed this
 _LONGEST = 1 << 17  # samples that are analysed; more are thinned
-_SHOWN = 3.0  # standard uncertainties that the square of the lag beyond a delay must exceed
+_SHOWN = 3.0  # standard uncertainties that ``2 c - tau^2`` must exceed for a bandwidth to be stated
 _OWN, _CLEAR = 1e-3, 100
-"""Share of a derivative's power that is its own, not the rate's and lower ones', and how far that exceeds noise."""
+"""A derivative counts if rate and lower derivatives leave this share of its power, so many times that of its noise."""
 _TOLD = 0.05
 """Share of the power of w' that no function of rate and branch has; of one sine 0.01, of a chirp from 0 Hz 0.25."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a run says of the gyroscope along the table axis; values with standard uncertainties.
+    """Delay and bandwidth of the gyroscope along the table axis, and what they leave uncertain; value and uncertainty.
 
     Attributes
     ----------
     delay
-        s.
+        Delay, s.
     bandwidth
-        Where a first-order lag with the same fall of amplitude is at -3 dB, Hz; None where none shows.
+        Frequency at which a first-order lag with the same fall of amplitude is at -3 dB, Hz; None where it is beyond
+        what the run shows.
     beyond
-        What the bandwidth exceeds with 95 % where none shows, Hz; None where it cannot be told.
+        Lower limit of such a bandwidth, 95 %, Hz; None for a single sine.
     frequency
-        Of the one sine that the rate is, Hz; None of a sweep.
+        Frequency of the single sine that the rate is, Hz; None for a sweep.
     scale_error
-        What not knowing delay, bandwidth and drift adds to the scale factor, a fraction.
+        Standard uncertainty of the scale factor by delay, bandwidth and drift, a fraction.
     loop_error
-        What not knowing the delay adds to rising less falling at rate 0, a fraction of the largest rate; None where
-        loop and delay cannot be told apart.
+        Standard uncertainty of rising less falling at rate 0 by the delay, a fraction of the largest rate; None where
+        loop and delay cannot be distinguished.
     zero_error
-        What the zero of each of g gyroscopes wanders beyond the noise of the means by rate, output, shape (g,).
+        Wander of the zero of each of g gyroscopes beyond the noise of the means by rate, output, shape (g,).
     largest
-        Largest rate of the table, beyond the means by rate, rad/s.
+        Largest rate of the table, rad/s; the means by rate lie within it.
     rising
-        Number of the means by rate at which it rises; they come first.
+        Number of means at rising rates; they come first.
     """
 
     delay: tuple[float, float]
@@ -293,20 +295,20 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Binned:
-    """Means by rate, rising rates first and then falling ones, n of them, of g gyroscopes.
+    """The outputs of g gyroscopes averaged in n bins of the rate, rising rates first.
 
     Attributes
     ----------
     rising
         Number of rising rates.
     rate
-        Of the table, as the gyroscopes feel it, rad/s, shape (n,).
+        Rate of the table as the gyroscopes feel it, rad/s, shape (n,).
     duration
         Time spent at it, s, shape (n,).
     middle
         Mean time, s, shape (n,).
     mean, variance
-        Of the outputs, and of those means by the passes through each rate, shape (n, g).
+        Mean outputs, and variances of these means by the passes through each rate, shape (n, g).
     wander
         Variance of the mean over the whole run, shape (g,).
     """
@@ -339,40 +341,40 @@ def rate_of_angle(angle: Array, time: Array) -> Array:
 
 
 def reduce_sweep(time: Array, rate: Array, outputs: list[Array], main: int) -> tuple[Sweep, Binned]:
-    """Return delay and bandwidth of gyroscope number `main`, and the means of all by rate.
+    """Return delay and bandwidth of gyroscope number `main`, and the means of all outputs by rate.
 
     Parameters
     ----------
     time, rate
-        s, and the table's rate about the body axis, rad/s, shape (n,).
+        Times, s, and the table's rate about the body axis, rad/s, shape (n,).
     outputs
-        Of each gyroscope, shape (n,).
+        Output of each gyroscope, shape (n,).
     """
     step = float(np.median(np.diff(time[:10_001])))
-    top, frequency = _spectrum(rate, step)
+    top, frequency = _find_band(rate, step)
     many = _PER_PERIOD if frequency is None else 2 * _PER_PERIOD
     side = max(1, round(1 / (many * top * step)))
-    samples = with_neighbours(time, rate, outputs, side, step)
-    sums = regressors(samples)
-    noise = _noise(time, rate, step, side * step)
-    count = _apart(sums, noise)
+    samples = take_with_neighbours(time, rate, outputs, side, step)
+    sums = sweep_moments(samples)
+    noise = _derivative_noise(time, rate, step, side * step)
+    count = _count_derivatives(sums, noise)
     if frequency is None and count < 2:  # a part of one period, whose spectrum has no peak
         frequency = float(np.sqrt(sums.variance(DERIVATIVES[0]) / sums.variance(RATE)) / (2 * np.pi))
     largest, derivatives = float(np.abs(rate).max()), DERIVATIVES[: 1 if frequency is not None else count]
-    loop = [TURN, BOW] if frequency is None and _loop_told(sums, noise[0]) else []
-    sweep, weights = _regressed(sums, main, derivatives, loop, frequency, largest)
-    felt = felt_rate(samples, weights)
+    loop = [TURN, BOW] if frequency is None and _is_loop_observable(sums, noise[0]) else []
+    sweep, weights = _fit_lag(sums, main, derivatives, loop, frequency, largest)
+    felt = weigh_derivatives(samples, weights)
     if loop:  # the branches change when the gyroscope feels it
-        sums = regressors(samples, felt)
-        sweep, weights = _regressed(sums, main, derivatives, loop, frequency, largest)
-        felt = felt_rate(samples, weights)
+        sums = sweep_moments(samples, felt)
+        sweep, weights = _fit_lag(sums, main, derivatives, loop, frequency, largest)
+        felt = weigh_derivatives(samples, weights)
     rises = rising(felt)
-    curve = _curve(samples.time, felt, rises, samples.outputs)
-    sweep = replace(sweep, scale_error=float(np.hypot(sweep.scale_error, curve.by_drift(main))))
-    binned = _by_rate(samples.time, felt, rises, curve, step)
+    curve = _fit_curve(samples.time, felt, rises, samples.outputs)
+    sweep = replace(sweep, scale_error=float(np.hypot(sweep.scale_error, curve.drift_error(main))))
+    binned = _average_by_rate(samples.time, felt, rises, curve, step)
     if sweep.frequency is not None:
         factor = max(1, min(side, len(felt) // _LONGEST))
-        binned = replace(binned, variance=binned.variance * _colour(samples.time, felt, curve, binned, factor))
+        binned = replace(binned, variance=binned.variance * _colour_factors(samples.time, felt, curve, binned, factor))
     known = np.mean(binned.variance * binned.duration[:, None], axis=0) / binned.duration.sum()
     zero = np.sqrt(np.maximum(binned.wander - known, 0.0))
     return replace(sweep, zero_error=zero, rising=binned.rising), binned
@@ -380,18 +382,18 @@ def reduce_sweep(time: Array, rate: Array, outputs: list[Array], main: int) -> t
 
 @dataclass(frozen=True)
 class _Curve:
-    """Outputs of g gyroscopes as a constant, a drift over time, powers of the rate over its largest, and a loop.
+    """The outputs of g gyroscopes as a constant, a drift over time, powers of the rate over its largest, and a loop.
 
     Attributes
     ----------
     columns
-        Of these seven, for a part of the samples, shape (7, n): 1, time, and what `_by_branch` returns.
+        Returns the seven columns for a part of the samples, shape (7, n): 1, time, and `_branch_columns`.
     fits
         Coefficients of each gyroscope, shape (g, 7).
     sums
-        Of the products of the columns and the outputs.
+        Sums of products of columns and outputs.
     outputs
-        Of each gyroscope, shape (n,).
+        Output of each gyroscope, shape (n,).
     """
 
     columns: Callable[[slice], Array]
@@ -399,42 +401,42 @@ class _Curve:
     sums: Moments
     outputs: list[Array]
 
-    def left(self, k: int) -> Array:
-        """Return what the curve of gyroscope number `k` leaves of its output, shape (n,)."""
+    def residual(self, k: int) -> Array:
+        """Return the output of gyroscope number `k` less its curve, shape (n,)."""
         residual = np.empty(len(self.outputs[k]))
         for _, part in blocks(len(residual)):
             residual[part] = self.outputs[k][part] - self.fits[k] @ self.columns(part)
         return residual
 
-    def by_drift(self, k: int) -> float:
-        """Return what the error of the drift does to the scale factor, as far as the rate drifts, too, a fraction."""
+    def drift_error(self, k: int) -> float:
+        """Return the scale factor's uncertainty by that of the drift, as far as the rate drifts too, a fraction."""
         every, whole = range(self.sums.columns), self.sums.whole
         drift = float(np.sqrt(self.sums.covariance(every, every, k, self.fits[k])[1, 1]))
         together = (whole[1, 2] - whole[0, 1] * whole[0, 2] / whole[0, 0]) / whole[0, 0]
-        line = self.sums.fitted([0, 2], k)[1]
+        line = self.sums.fit([0, 2], k)[1]
         return drift * float(together / line) / self.sums.variance(2)
 
 
-def _curve(time: Array, felt: Array, rises: NDArray[np.bool_], outputs: list[Array]) -> _Curve:
+def _fit_curve(time: Array, felt: Array, rises: NDArray[np.bool_], outputs: list[Array]) -> _Curve:
     middle, span, largest = float(time.mean()), float(np.ptp(time)), float(np.abs(felt).max())
 
     def columns(part: slice) -> Array:
         rate = felt[part] / largest
-        return np.array([np.ones(len(rate)), (time[part] - middle) / span, *_by_branch(rate, rises[part])])
+        return np.array([np.ones(len(rate)), (time[part] - middle) / span, *_branch_columns(rate, rises[part])])
 
     sums = moments(len(felt), columns, outputs)
-    fits = np.array([sums.fitted(range(sums.columns), k) for k in range(len(outputs))])
+    fits = np.array([sums.fit(range(sums.columns), k) for k in range(len(outputs))])
     return _Curve(columns, fits, sums, outputs)
 
 
-def _by_branch(rate: Array, rises: NDArray[np.bool_]) -> list[Array]:
-    """Return three powers of a rate, 1 where it rises and -1 where it falls, and that times the square."""
+def _branch_columns(rate: Array, rises: NDArray[np.bool_]) -> list[Array]:
+    """Return a rate, its square and cube, +1 where it rises and -1 where it falls, and that sign times the square."""
     square, turn = rate**2, np.where(rises, 1.0, -1.0)
     return [rate, square, square * rate, turn, turn * square]
 
 
-def _spectrum(rate: Array, step: float) -> tuple[float, float | None]:
-    """Return the frequency below which the rate's power lies, Hz, and that of the one sine that it is, if it is one."""
+def _find_band(rate: Array, step: float) -> tuple[float, float | None]:
+    """Return the frequency below which the rate's power lies, Hz, and that of the rate if it is a single sine."""
     factor = max(1, len(rate) // _LONGEST)
     values = rate[: len(rate) // factor * factor].reshape(-1, factor).mean(axis=1) if factor > 1 else rate
     values = values - values.mean()
@@ -449,37 +451,38 @@ def _spectrum(rate: Array, step: float) -> tuple[float, float | None]:
     return top, float(power[beside] @ frequency[beside] / power[beside].sum()) if single_line else None
 
 
-def _noise(time: Array, rate: Array, step: float, spacing: float) -> list[float]:
-    """Return the variances of four derivatives by the noise of the rate itself, as its eighth differences show it.
+def _derivative_noise(time: Array, rate: Array, step: float, spacing: float) -> list[float]:
+    """Return the variances of four derivatives by the noise of the recorded rate, from its eighth differences.
 
-    What differs across a gap is no noise.
+    Differences across a gap are left out. White noise of variance s^2 has eighth differences of variance 12870 s^2.
     """
     whole = time[8:_LONGEST] - time[: _LONGEST - 8][: len(time) - 8] < WHOLE * step
     of_rate = float(np.mean(np.diff(rate[:_LONGEST], n=8)[whole] ** 2)) / 12870
     return [of_rate * float(kernel @ kernel) / spacing ** (2 * k) for k, kernel in enumerate(KERNELS, 1)]
 
 
-def _apart(moments: Moments, noise: list[float]) -> int:
-    """Return the number of derivatives of a rate before that, beyond the first, which those before it make up.
+def _count_derivatives(moments: Moments, noise: list[float]) -> int:
+    """Return how many derivatives of the rate can be fitted.
 
-    Or which is the noise of the rate, by more than a hundredth.
+    From the second on one cannot where rate and lower derivatives leave less than a thousandth of its power, or where
+    its power is noise of the recorded rate by more than a hundredth.
     """
     count = float(moments.whole[ONE, ONE])
     for number, column in enumerate(DERIVATIVES[1:], 1):
-        left = moments.left_of(column, [ONE, TIME, RATE, *DERIVATIVES[:number]])
+        left = moments.residual_square(column, [ONE, TIME, RATE, *DERIVATIVES[:number]])
         if left < max(_OWN * float(moments.whole[column, column]), _CLEAR * noise[number] * count):
             return number
     return len(DERIVATIVES)
 
 
-def _loop_told(moments: Moments, noise: float) -> bool:
-    """Return whether w' differs from pass to pass at one rate, as no loop does; its noise does not count."""
+def _is_loop_observable(moments: Moments, noise: float) -> bool:
+    """Return whether w' differs from pass to pass at the same rate beyond its noise, as a loop does not."""
     slope, count = DERIVATIVES[0], float(moments.whole[ONE, ONE])
-    left = moments.left_of(slope, [ONE, TIME, RATE, TURN, BOW])
+    left = moments.residual_square(slope, [ONE, TIME, RATE, TURN, BOW])
     return left - noise * count > _TOLD * float(moments.whole[slope, slope])
 
 
-def _regressed(
+def _fit_lag(
     moments: Moments,
     main: int,
     derivatives: Sequence[int],
@@ -487,10 +490,14 @@ def _regressed(
     frequency: float | None,
     largest: float,
 ) -> tuple[Sweep, Array]:
-    """Return what a gyroscope says of delay and bandwidth, and the weights of rate and derivatives in what it felt."""
+    """Return delay and bandwidth of a gyroscope, and the weights of rate and derivatives in the rate that it felt.
+
+    Of ``S (w - tau w' + c w'')``: delay tau; ``2 c - tau^2 = 1 / (2 pi f)^2``, f the corner of the first-order lag with
+    the same fall of amplitude.
+    """
     still = [RATE, *loop, ONE, TIME, SQUARE, *([] if frequency is not None else [CUBE])]
     columns = [RATE, *derivatives, *still[1:]]
-    coefficients = moments.fitted(columns, main)
+    coefficients = moments.fit(columns, main)
     spread = moments.covariance(columns, columns, main, coefficients)
     scale, weights = float(coefficients[0]), np.zeros(5)
     known = moments.covariance(still, columns, main, coefficients)
@@ -522,16 +529,15 @@ def _regressed(
     return Sweep(delay, bandwidth, beyond, None, more, of_loop, np.zeros(0), largest, 0), weights
 
 
-def _colour(time: Array, felt: Array, curve: _Curve, binned: Binned, factor: int) -> Array:
-    """Return by what to multiply the variances of means by rate, as if independent, for noise that has a colour.
+def _colour_factors(time: Array, felt: Array, curve: _Curve, binned: Binned, factor: int) -> Array:
+    """Return the factor of the variances of means by rate, of each gyroscope, for noise that is not white.
 
-    What enters the scale factor at one frequency is the noise near that frequency. With d the rate, over its largest,
-    freed of the columns of bias, drift and square, and D and R the spectra of d and of what the fit left, the variance
-    of the slope is ``mean(|D|^2 |R|^2) / (d d)^2``, |R|^2 averaged over the frequencies beside each. The fit took
-    from R about one frequency; without that correction the mean over 2 n + 1 of them would be low by 1 / (2 n + 1).
-    Of long runs means of `factor` samples serve, far fewer than a period has.
+    The scale factor at one frequency takes up the noise near that frequency. With d the rate over its largest, less
+    its fit by bias, drift and square, and D and R the spectra of d and of the residual, the variance of the slope is
+    ``mean(|D|^2 |R|^2) / (d d)^2``, |R|^2 averaged over 2 n neighbouring frequencies: the fit took out about one.
+    Long runs are averaged over `factor` samples first, far fewer than a period has.
     """
-    rate, trend = _thin(felt, factor), _thin(time, factor)
+    rate, trend = _average_samples(felt, factor), _average_samples(time, factor)
     largest = float(np.abs(felt).max())
     others = np.column_stack([np.ones(len(rate)), (trend - trend.mean()) / np.ptp(trend), (rate / largest) ** 2])
     along = rate / largest - others @ (np.linalg.pinv(others.T @ others) @ (others.T @ rate / largest))
@@ -545,7 +551,7 @@ def _colour(time: Array, felt: Array, curve: _Curve, binned: Binned, factor: int
     apart = binned.rate - length @ binned.rate / length.sum()
     factors = []
     for k in range(len(curve.fits)):
-        power = np.abs(np.fft.rfft(_thin(curve.left(k), factor)))[1:] ** 2
+        power = np.abs(np.fft.rfft(_average_samples(curve.residual(k), factor)))[1:] ** 2
         beside = np.convolve(power, window, mode="same") / count / size
         variance = float(lines[1:] @ beside) / float(along @ along) / largest**2
         each = float(np.mean(binned.variance[:, k] * length))  # pooled, for 1 s
@@ -553,15 +559,15 @@ def _colour(time: Array, felt: Array, curve: _Curve, binned: Binned, factor: int
     return np.array(factors)
 
 
-def _thin(values: Array, factor: int) -> Array:
-    """Return means of `factor` values that follow one another."""
+def _average_samples(values: Array, factor: int) -> Array:
+    """Return the means of successive groups of `factor` values."""
     return values if factor == 1 else values[: len(values) // factor * factor].reshape(-1, factor).mean(axis=1)
 
 
-def _by_rate(time: Array, felt: Array, rises: NDArray[np.bool_], curve: _Curve, step: float) -> Binned:
-    """Return the means of outputs by rate, each moved along its curve to the middle of its bin, without their drift."""
+def _average_by_rate(time: Array, felt: Array, rises: NDArray[np.bool_], curve: _Curve, step: float) -> Binned:
+    """Return the mean outputs by rate, without drift; each is moved along the fitted curve to the middle of its bin."""
     low, high = float(felt.min()), float(felt.max())
-    number = _bins(felt, rises, low, high)
+    number = _number_bins(felt, rises, low, high)
     middle = low + (np.arange(_BINS) + 0.5) / _BINS * (high - low)
     middle = np.concatenate([middle, middle[::-1]])
     count = np.bincount(number, minlength=2 * _BINS)
@@ -573,11 +579,11 @@ def _by_rate(time: Array, felt: Array, rises: NDArray[np.bool_], curve: _Curve, 
 
     starts = np.concatenate([[0], np.flatnonzero(number[1:] != number[:-1]) + 1])
     place = number[starts]
-    powers = np.array(_by_branch(middle[which] / max(abs(low), abs(high)), which < _BINS))
+    powers = np.array(_branch_columns(middle[which] / max(abs(low), abs(high)), which < _BINS))
     parts = np.linspace(0, len(felt), PARTS, endpoint=False).astype(np.int64)
     means, variances, wander = [], [], []
     for k, fit in enumerate(curve.fits):
-        rest = curve.left(k)
+        rest = curve.residual(k)
         means.append(mean(rest) + fit[0] + fit[2:] @ powers)
         passes = np.add.reduceat(rest, starts) ** 2
         variances.append(np.bincount(place, passes, minlength=2 * _BINS)[which] / size**2)
@@ -593,8 +599,8 @@ def _by_rate(time: Array, felt: Array, rises: NDArray[np.bool_], curve: _Curve, 
     )
 
 
-def _bins(felt: Array, rises: NDArray[np.bool_], low: float, high: float) -> NDArray[np.int64]:
-    """Return the number of each sample's rate: of its bin where it rises, and on beyond those where it falls."""
+def _number_bins(felt: Array, rises: NDArray[np.bool_], low: float, high: float) -> NDArray[np.int64]:
+    """Return the bin of each sample: 0 to 19 by its rate where this rises, and 39 down to 20 where it falls."""
     number = np.empty(len(felt), dtype=np.int64)
     for _, part in blocks(len(felt)):
         number[part] = (felt[part] - low) / (high - low) * _BINS
@@ -607,40 +613,42 @@ def _bins(felt: Array, rises: NDArray[np.bool_], low: float, high: float) -> NDA
 
 
 _BLOCK, _SIDE, _SETTLING, _LEAST = 0.1, 5, 3, 10
-"""s, and numbers of such blocks: compared on either side, left out at either end, and the shortest dwell."""
+"""Length of a block, s; blocks compared on either side, left out at either end, and in the shortest dwell."""
 _SIGMAS, _OF_STEP, _OF_COLUMN, _RIPPLE = 6.0, 1 / 20, 2e-5, 2e-3
-"""Changes that count: of the noise, the smallest listed step, the largest recorded rate, and the rate itself."""
+"""A change counts from so many sigma of the noise, plus this share of the smallest listed step (or of the largest
+recorded rate), plus this share of the rate itself."""
 _BATCHES = 8  # parts of a dwell by whose scatter its mean is known
 _FEWEST_LEVELS, _OF_RANGE, _SWEEP, _FLAT = 3, 0.02, 500, 0.03
-"""Rates of steps; share of the range that a step keeps to; samples of a sweep; share of its range at one output."""
-_NEXT_TO = 0.3  # of the gap between listed rates: dwells nearer to one are of it
+"""Fewest rates of steps; share of the range that a step keeps to; fewest samples of a sweep; share of the range that a
+sweep passes at one output where that is saturated."""
+_NEXT_TO = 0.3  # of the gap between listed rates: a dwell that is nearer to one belongs to it
 _ALIKE, _OUT = 5e-3, 5.0
-"""Of the largest rate, and of what is usual: by how much visits of one rate differ at most."""
-_STANDS = 0.2  # of the usual scatter: an end that scatters less is a table that stands
-_WRONG = 0.5  # of the largest span: the axis that the manifest names spans less, so another was turned
-_ROUNDING = 1e-9  # of the largest reading: scatter below it is none
-_ROBUST = 0.6745 * np.sqrt(2)
+"""Visits of one rate differ at most by this share of the largest rate, or so many times their median difference."""
+_STANDS = 0.2  # of the usual scatter: a dwell at an end of the range that scatters less is saturated
+_WRONG = 0.5  # of the largest span: where the axis that the manifest names spans less, another was turned
+_ROUNDING = 1e-9  # of the largest reading: smaller scatter is rounding
+_ROBUST = 0.6745 * np.sqrt(2)  # median of the absolute difference of two normal values, over their sigma
 
 
 @dataclass(frozen=True)
 class Dwells:
-    """Dwells of one run, n of them, of g gyroscopes; SI except for the outputs.
+    """The n dwells of one run of g gyroscopes; SI except for the outputs.
 
     Attributes
     ----------
     start, stop
-        s, shape (n,).
+        Times, s, shape (n,).
     rate
-        Of the table, rad/s, shape (n,).
+        Rate of the table, rad/s, shape (n,).
     mean, variance
-        Of the outputs, and of that mean by its batches, shape (n, g).
+        Mean outputs, and variances of these means by batches, shape (n, g).
     level
         Mean cosine and sine of the table's angle, shape (n, 2).
     recorded
         Whether the rates are those of a column of the recording.
     sweep
-        Delay and bandwidth of the gyroscope along the table axis where the rate changed all the time, and the dwells
-        are means by rate, rising ones first; else None.
+        For a run whose rate changed all the time: delay and bandwidth of the gyroscope along the table axis; the dwells
+        are then means by rate, rising ones first. Else None.
     """
 
     start: Array
@@ -659,7 +667,7 @@ def gyro_columns(recording: Recording) -> list[str]:
 
 
 def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
-    """Find the dwells of one run.
+    """Return the dwells of run `index` of a test, found in its recording.
 
     Raises
     ------
@@ -686,15 +694,15 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
     signal = output if column is None else column
     size = _block_size(time)
     blocks = _block_means(signal, size)
-    stretches = _stretches(blocks, size, None if recorded else _smallest_step(run.rates or (), output))
+    stretches = _find_stretches(blocks, size, None if recorded else _smallest_step(run.rates or (), output))
     if run.sweep and column is None:
         raise SegmentError(
             f"{place}: a sweep needs the table's rate at every sample: expected table_rate or table_angle"
         )
     if column is not None and (
-        run.sweep or (_levels(blocks, stretches, size) < _FEWEST_LEVELS and is_smooth(column, blocks))
+        run.sweep or (_count_levels(blocks, stretches, size) < _FEWEST_LEVELS and is_smooth(column, blocks))
     ):
-        return _swept(recording, time, column, outputs, names, main, place)
+        return _reduce_swept_run(recording, time, column, outputs, names, main, place)
     if len(stretches) < 3:
         raise SegmentError(
             f"{place}: {len(stretches)} stretches of a steady rate found, expected 3 or more of 2 s or longer: are the "
@@ -705,31 +713,31 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
     _check_ends(recording, main, output, stretches, reading, place)
     _check_axis(names, mean, main, place)
     if column is None:
-        rate, zero, scale = _listed_rates(reading, stretches, time, run.rates or (), recording, main, place)
+        rate, zero, scale = _assign_listed_rates(reading, stretches, time, run.rates or (), recording, main, place)
         blocks = (blocks - zero) / scale
     else:
         rate = np.array([column[a:b].mean() for a, b in stretches])
-    cosine, sine = _level(time, blocks, size)
+    cosine, sine = _mean_cosine_and_sine(time, blocks, size)
     return Dwells(
         start=np.array([time[a] for a, _ in stretches]),
         stop=np.array([time[b - 1] for _, b in stretches]),
         rate=rate,
         mean=mean,
-        variance=np.array([[_variance(values[a:b]) for values in outputs] for a, b in stretches]),
+        variance=np.array([[_variance_by_batches(values[a:b]) for values in outputs] for a, b in stretches]),
         level=np.array([[part[a // size : b // size].mean() for part in (cosine, sine)] for a, b in stretches]),
         recorded=recorded,
     )
 
 
-def _levels(blocks: Array, stretches: list[tuple[int, int]], size: int) -> int:
-    """Return the number of different rates at which a run rests; of a slow sine there are two, at its ends."""
+def _count_levels(blocks: Array, stretches: list[tuple[int, int]], size: int) -> int:
+    """Return the number of different rates at which a run rests; a slow sine has two, at its ends."""
     within = _OF_RANGE * float(np.ptp(blocks))
     parts = [blocks[a // size : b // size] for a, b in stretches]
     rests = np.sort([part.mean() for part in parts if np.ptp(part) < within])
     return int(np.sum(np.diff(rests, prepend=-np.inf) > within))
 
 
-def _swept(
+def _reduce_swept_run(
     recording: Recording, time: Array, rate: Array, outputs: list[Array], names: list[str], main: str, place: str
 ) -> Dwells:
     """Return the means by rate of a run whose rate changed all the time."""
@@ -746,7 +754,7 @@ def _swept(
                 "is saturated; expected rates within its range"
             )
     half, size = reduced.duration / 2, _block_size(time)
-    level = [part.mean() for part in _level(time, _block_means(rate, size), size)]
+    level = [part.mean() for part in _mean_cosine_and_sine(time, _block_means(rate, size), size)]
     return Dwells(
         start=reduced.middle - half,
         stop=reduced.middle + half,
@@ -789,15 +797,15 @@ def _block_means(signal: Array, size: int) -> Array:
     return np.asarray(signal[: count * size].reshape(count, size).mean(axis=1))
 
 
-def _level(time: Array, rate: Array, size: int) -> tuple[Array, Array]:
-    """Return the mean cosine and sine of the table's angle over each block, which turns at one rate, shape (n,)."""
+def _mean_cosine_and_sine(time: Array, rate: Array, size: int) -> tuple[Array, Array]:
+    """Return the mean cosine and sine of the table's angle over each block, taken as turning evenly, shape (n,)."""
     edges = time[: (len(rate) + 1) * size : size]
     step = rate * np.diff(edges, append=time[-1])[: len(rate)]
     middle, part = np.cumsum(step) - step / 2, np.sinc(step / (2 * np.pi))
     return np.cos(middle) * part, np.sin(middle) * part
 
 
-def _stretches(blocks: Array, size: int, step: float | None) -> list[tuple[int, int]]:
+def _find_stretches(blocks: Array, size: int, step: float | None) -> list[tuple[int, int]]:
     """Return first sample and end of each stretch in which the means of 0.5 s do not change."""
     count = len(blocks)
     if count < 2 * _SIDE + 1:
@@ -823,14 +831,14 @@ def _stretches(blocks: Array, size: int, step: float | None) -> list[tuple[int, 
             first -= 1
         while last < min(count, b + _SIDE) and abs(blocks[last] - middle) < near:
             last += 1
-        first, last = first + _SETTLING, last - _SETTLING  # what moves within it is left out, too
+        first, last = first + _SETTLING, last - _SETTLING
         if last - first >= _LEAST:
             stretches.append((first * size, last * size))
     return stretches
 
 
-def _variance(values: Array) -> float:
-    """Return the variance of the mean of an output by the means of its batches."""
+def _variance_by_batches(values: Array) -> float:
+    """Return the variance of the mean of an output, by the scatter of batch means."""
     size = len(values) // _BATCHES
     return float(values[: size * _BATCHES].reshape(_BATCHES, size).mean(axis=1).var(ddof=1) / _BATCHES)
 
@@ -863,7 +871,7 @@ def _check_axis(names: list[str], mean: Array, main: str, place: str) -> None:
         raise DataError(f"{place}: the table's rates are seen by {most}, not by {main}: expected mounting +{most[-1]}")
 
 
-def _listed_rates(
+def _assign_listed_rates(
     reading: Array,
     stretches: list[tuple[int, int]],
     time: Array,
@@ -872,7 +880,7 @@ def _listed_rates(
     main: str,
     place: str,
 ) -> tuple[Array, float, float]:
-    """Return the listed rate of each stretch, and zero and scale of the output that lead to it."""
+    """Return the listed rate of each stretch, and zero and scale of the line from rates to outputs."""
     listed = np.unique(rates)
     scale = float(np.ptp(reading) / np.ptp(listed))
     nominal = parse_unit(recording.units[main])
@@ -897,7 +905,7 @@ def _listed_rates(
         scale, zero = np.polyfit(nearest, reading, 1).tolist()
     off = np.abs((reading - zero) / scale - nearest)
     worst = int(np.argmax(off))
-    if off[worst] <= _NEXT_TO * gap:  # what one listed rate was taken for is one rate
+    if off[worst] <= _NEXT_TO * gap:  # visits that were assigned to one listed rate must agree with each other
         off = np.abs(read_rates - np.array([np.median(read_rates[nearest == rate]) for rate in nearest]))
         worst, gap = int(np.argmax(off)), max(_ALIKE * np.abs(listed).max(), _OUT * float(np.median(off))) / _NEXT_TO
     if off[worst] > _NEXT_TO * gap:
@@ -926,4 +934,4 @@ def _listed_rates(
 
 
 def _degrees(rate: float) -> str:
-    return f"{from_si(rate, 'deg/s'):.5g}"
+    return text_in(rate, "deg/s", 5)

@@ -1,4 +1,4 @@
-"""A rate test to the calibration of its gyroscopes."""
+"""The fit of a rate test, from recordings to the record; the mathematics is in `dwells`, `solve` and `axes`."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
 from imulab.gravity import EARTH, checked_latitude
 from imulab.options import choice, measure, parsed
-from imulab.procedures.rate import AXES, MOUNTINGS, ORDERS, gyros_of, part_of_one, rates_of
+from imulab.procedures.rate import AXES, MOUNTINGS, ORDERS, name_gyroscopes, parse_fraction, parse_rates
 from imulab.procedures.rate.axes import (
     TableAxes,
     find_axes,
-    length_said,
-    other_unit_said,
     prior_at,
+    warn_force_length,
+    warn_other_unit,
     with_accelerometers,
     with_prior,
 )
@@ -34,9 +34,9 @@ from imulab.procedures.rate.solve import (
     RateSolution,
     choose_orders,
     g_sensitivity,
-    linearity_of,
+    measure_linearity,
     solve,
-    without_lean,
+    subtract_lean,
 )
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.quantities import in_si
@@ -54,9 +54,9 @@ class RateFit(Result):
     calibration
         The record: bias, scale factor, misalignment and nonlinearity of each gyroscope, in SI.
     dwells
-        Those of each run.
+        The dwells of each run.
     linearity
-        What a line leaves, by body axis.
+        Nonlinearity, asymmetry and hysteresis, by body axis.
 
     Examples
     --------
@@ -74,11 +74,11 @@ class RateFit(Result):
 def fit_rate(
     data: Data | RateRecordings,
     *,
-    rates: Annotated[str | Sequence[float] | None, parsed(rates_of, "R,R,...", unit="deg/s")] = None,
+    rates: Annotated[str | Sequence[float] | None, parsed(parse_rates, "R,R,...", unit="deg/s")] = None,
     axis: Annotated[str, choice(MOUNTINGS)] = "+z",
     order: Annotated[int | str, choice(ORDERS)] = "auto",
     latitude: Annotated[float | str | None, measure("angle", "deg")] = None,
-    table_uncertainty: Annotated[float | str | None, parsed(part_of_one, "FRACTION")] = None,
+    table_uncertainty: Annotated[float | str | None, parsed(parse_fraction, "FRACTION")] = None,
     accel: Record | None = None,
     prior: Record | None = None,
     **reading: Unpack[Reading],
@@ -137,7 +137,7 @@ def fit_rate(
     if highest not in ORDERS:
         raise OptionError(f"order {highest!r}: expected one of {listed(ORDERS, highest)}")
     place = None if latitude is None else checked_latitude(in_si(latitude, "latitude", "angle", "deg"))
-    common = None if table_uncertainty is None else part_of_one(table_uncertainty, "table_uncertainty")
+    common = None if table_uncertainty is None else parse_fraction(table_uncertainty, "table_uncertainty")
     manifest = isinstance(data, str | os.PathLike) and os.fspath(data).lower().endswith(".toml")
     if isinstance(data, RateRecordings) or manifest:
         if rates is not None or axis != "+z":
@@ -153,9 +153,9 @@ def fit_rate(
             raise OptionError(f"axis {axis!r}: expected one of {listed(MOUNTINGS, axis)}")
         if isinstance(data, str | os.PathLike):
             refuse_folder(Path(os.fspath(data)), os.fspath(data))
-        recordings = [as_recording(data, reading, fit_rate, gyros_of)]
-        stated_rates = rates_of(rates, "rates") if isinstance(rates, str) else None if rates is None else tuple(rates)
-        test = RateTest((Run(recordings[0].name, axis, stated_rates),), name=recordings[0].name)
+        recordings = [as_recording(data, reading, fit_rate, name_gyroscopes)]
+        steps = parse_rates(rates, "rates") if isinstance(rates, str) else None if rates is None else tuple(rates)
+        test = RateTest((Run(recordings[0].name, axis, steps),), name=recordings[0].name)
     if place is not None:
         test = replace(test, latitude=place)
     if common is not None:
@@ -175,20 +175,20 @@ def fit_test(
     prior: Calibration | None = None,
 ) -> RateFit:
     """Calibrate the gyroscopes of a test from the recordings of its runs; what is raised is as for `fit_rate`."""
-    names, unit = _alike(test, recordings)
+    names, unit = _check_recordings(test, recordings)
     dwells = [find_dwells(recording, test, index) for index, recording in enumerate(recordings)]
-    problem, axes = _problem(test, dwells, names), None
+    problem, axes = _join_dwells(test, dwells, names), None
     if accel is not None:
         axes = find_axes(test, recordings, dwells, accel)
-        problem = _leaning(test, problem, axes)
+        problem = _apply_table_axes(test, problem, axes)
     _check_rates(test, problem, 1 if order == "auto" else int(order))
     first = solve(problem, (1,) * len(names)) if order == "auto" and axes is not None else None
     orders = (int(order) if order != "auto" else 1,) * len(names)
     if order == "auto":
-        orders = choose_orders(problem if first is None else _upright(problem, first))
+        orders = choose_orders(problem if first is None else _subtract_lean(problem, first))
     solution = solve(problem, orders)
     felt = None if axes is None else g_sensitivity(problem, solution)
-    if axes is not None and felt is not None:  # what the lever arm adds with the rate squared is no power of the rate
+    if axes is not None and felt is not None:  # w^2 times the lever arm acts by g-sensitivity, and is no k2
         pull = problem.table[:, None] ** 2 * axes.arm[problem.run]
         problem = replace(problem, mean=problem.mean - pull @ felt.T)
         solution = solve(problem, orders)
@@ -197,24 +197,24 @@ def fit_test(
     linearity = {}
     for i in measured:
         scale = float(solution.coefficients[i][problem.faces.index(problem.gyros[i])])
-        linearity[AXES[problem.gyros[i]]] = linearity_of(_upright(problem, solution), i, scale, orders[i])
+        linearity[AXES[problem.gyros[i]]] = measure_linearity(_subtract_lean(problem, solution), i, scale, orders[i])
     record = make_record(test, recordings, dwells, problem, solution, linearity, unit, order, axes)
     if prior is not None:
         record = with_prior(record, prior_at(prior, recordings), str(record.model["frame"]))
     if accel is not None and axes is not None:
         places = [test.place(k) for k in range(len(test.runs))]
-        remarks = length_said(accel, axes.force, axes.length_uncertainty, places)
-        record = with_accelerometers(accel, record, [*other_unit_said(accel, record.sensor, "accel"), *remarks])
+        remarks = warn_force_length(accel, axes.force, axes.length_uncertainty, places)
+        record = with_accelerometers(accel, record, [*warn_other_unit(accel, record.sensor, "accel"), *remarks])
     return RateFit(record, tuple(dwells), linearity)
 
 
-def _upright(problem: RateProblem, solution: RateSolution) -> RateProblem:
-    """Return the problem without what the lean of the table axis adds about other axes."""
+def _subtract_lean(problem: RateProblem, solution: RateSolution) -> RateProblem:
+    """Return the problem less what the lean of the table axis adds through misalignment."""
     gains = [row[: len(problem.faces)] for row in solution.coefficients]
-    return replace(problem, mean=without_lean(problem, gains))
+    return replace(problem, mean=subtract_lean(problem, gains))
 
 
-def _leaning(test: RateTest, problem: RateProblem, axes: TableAxes) -> RateProblem:
+def _apply_table_axes(test: RateTest, problem: RateProblem, axes: TableAxes) -> RateProblem:
     """Return the problem with the table axes as the accelerometers see them."""
     if len(problem.faces) < 3 or len(problem.gyros) < 3:
         raise ObservabilityError(f"{test.name}: accel needs runs about x, y and z, and three gyroscopes")
@@ -225,7 +225,7 @@ def _leaning(test: RateTest, problem: RateProblem, axes: TableAxes) -> RateProbl
     )  # fmt: skip
 
 
-def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], str]:
+def _check_recordings(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], str]:
     """Return the gyroscopes and the unit that all recordings of a test share."""
     first = gyro_columns(recordings[0])
     if not first:
@@ -254,7 +254,8 @@ def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], 
     return first, unit
 
 
-def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> RateProblem:
+def _join_dwells(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> RateProblem:
+    """Return the dwells of all runs as one problem; the Earth's rate is added where the latitude is known."""
     counts = [len(run_dwells.rate) for run_dwells in dwells]
     each: dict[str, Any] = {
         key: np.repeat([getattr(run, key) for run in test.runs], counts) for key in ("axis", "sign")
@@ -269,9 +270,9 @@ def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> Rate
         rate=each["sign"] * (table + earth),
         table=table,
         mean=np.vstack([run_dwells.mean for run_dwells in dwells]),
-        variance=np.vstack([_pooled(run_dwells) for run_dwells in dwells]),
+        variance=np.vstack([_pool_variance(run_dwells) for run_dwells in dwells]),
         level=np.vstack([run_dwells.level for run_dwells in dwells]),
-        rate_uncertainty=test.spread_of(table),
+        rate_uncertainty=test.rate_spread(table),
         scale_error=np.repeat(
             [0.0 if run_dwells.sweep is None else run_dwells.sweep.scale_error for run_dwells in dwells], counts
         ),
@@ -287,31 +288,32 @@ def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> Rate
         reach=np.repeat(
             [0.0 if run_dwells.sweep is None else run_dwells.sweep.largest for run_dwells in dwells], counts
         ),
-        branch=np.concatenate([_branch(run_dwells) for run_dwells in dwells]),
+        branch=np.concatenate([_rising_or_falling(run_dwells) for run_dwells in dwells]),
     )
 
 
-def _branch(dwells: Dwells) -> NDArray[np.int64]:
+def _rising_or_falling(dwells: Dwells) -> NDArray[np.int64]:
+    """Return 1 for each mean of a sweep at a rising rate, -1 at a falling one, 0 for steps."""
     if dwells.sweep is None:
         return np.zeros(len(dwells.rate), dtype=np.int64)
     return np.where(np.arange(len(dwells.rate)) < dwells.sweep.rising, 1, -1)
 
 
 def _loop_error(dwells: Dwells) -> float:
-    """Return what a run's delay adds to its loop; steps know none, and sweeps that do not tell it no loop."""
+    """Return `Sweep.loop_error`: 0 for steps, infinite for sweeps that do not distinguish loop and delay."""
     if dwells.sweep is None:
         return 0.0
     return float(np.inf) if dwells.sweep.loop_error is None else dwells.sweep.loop_error
 
 
-def _pooled(dwells: Dwells) -> Any:
+def _pool_variance(dwells: Dwells) -> Any:
     """Return the variances of the means, pooled over the dwells of a run in proportion to one over their length."""
     length = (dwells.stop - dwells.start)[:, None]
     return np.mean(dwells.variance * length, axis=0) / length
 
 
 def _check_rates(test: RateTest, problem: RateProblem, order: int) -> None:
-    """Refuse rates that do not tell bias, scale factor and asymmetry, or powers of the rate, apart."""
+    """Refuse rates that do not separate bias, scale factor, asymmetry and powers of the rate."""
     for face in problem.faces:
         if face not in problem.gyros:
             continue
@@ -331,6 +333,7 @@ def _check_rates(test: RateTest, problem: RateProblem, order: int) -> None:
 
 
 def _check_signs(test: RateTest, problem: RateProblem, solution: RateSolution, measured: list[int]) -> None:
+    """Refuse a gyroscope whose output falls where the table's rate rises."""
     for i in measured:
         axis = problem.gyros[i]
         if solution.coefficients[i][problem.faces.index(axis)] < 0:

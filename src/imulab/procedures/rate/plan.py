@@ -1,9 +1,7 @@
-"""How long a rate table must stay at each rate, or how many turns by hand are needed.
-
-What the test will then give.
+"""How long a rate table must stay at each rate, or how many turns by hand are needed, and the resulting uncertainties.
 
 The mean of a dwell of length T has the variance ``N^2 / T + (0.664 B)^2``, N the angle random walk and B the bias
-instability (IEEE Std 952). What the test gives is the covariance of its fit, `solve`, at dwells of that variance.
+instability (IEEE Std 952). The predicted uncertainties are those of the fit, `solve`, at dwells of that variance.
 """
 
 from __future__ import annotations
@@ -20,18 +18,18 @@ from imulab.errors import ObservabilityError, OptionError, RecordError, listed
 from imulab.files import write_text
 from imulab.gravity import EARTH, checked_latitude
 from imulab.options import measure, parsed, text
-from imulab.procedures.rate import FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
+from imulab.procedures.rate import FENCE, MOUNTINGS, ORDERS, RATES, parse_fraction, parse_rates
 from imulab.procedures.rate.schema import RateTest, Run, manifest_text
 from imulab.procedures.rate.solve import RateProblem, model_parameters, solve
 from imulab.procedures.result import PlannedTest, Record, amount, as_record
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole, whole_number
 from imulab.recording import Array
-from imulab.report.parameters import ReadingUnit, reading_unit
+from imulab.report.parameters import ReadingUnit, reading_unit, text_in
 from imulab.report.plots import Plot
-from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis, plain_number, short_log_axis
+from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis, plain_number, scatter, short_log_axis
 from imulab.units import from_si
 
-# How many whole turns by hand against a fence reach a wanted uncertainty of scale factors.
+# Turns by hand against a fence.
 
 
 _TURNS = 1000  # on and back that a plan asks for at most
@@ -44,9 +42,9 @@ class TurnPlan(PlannedTest):
     Attributes
     ----------
     turns
-        n.
+        Turns on, and as many back.
     wanted
-        Of the scale factor, relative.
+        Wanted relative standard uncertainty of the scale factor.
     reached
         Relative standard uncertainty for 1 to n turns on and as many back, shape (n,).
     """
@@ -87,19 +85,33 @@ class TurnPlan(PlannedTest):
     def plot(self) -> Plot:
         """Return the uncertainty over the number of turns, beside the wanted one."""
         number = list(range(1, self.turns + 1))
-        traces: list[dict[str, Any]] = [
-            {"type": "scatter", "mode": "lines+markers", "name": "reached", "x": number,
-             "y": (1e6 * self.reached).tolist(), "line": {"color": GOOD, "width": 2}},
-            {"type": "scatter", "mode": "lines", "name": "wanted", "x": number, "y": [1e6 * self.wanted] * self.turns,
-             "line": {"color": BAD, "width": 1.5, "dash": "dash"}},
-        ]  # fmt: skip
-        layout = {
-            "xaxis": figure_axis("turns each way", dtick=max(1, round(self.turns / 20))),
-            "yaxis": short_log_axis("u(S)/S, ppm"),
-            "legend": LEGEND,
-        }
-        caption = "u(S)/S: relative standard uncertainty of the scale factor."
-        return Plot(Figure("Turns by hand", caption, traces, layout, message=f"{self.shown()[0]}."), "Plan of turns")
+        figure = _plan_figure(
+            "Turns by hand",
+            "u(S)/S: relative standard uncertainty of the scale factor.",
+            (figure_axis("turns each way", dtick=max(1, round(self.turns / 20))), number),
+            "u(S)/S, ppm",
+            {"reached": (1e6 * self.reached).tolist(), "wanted": [1e6 * self.wanted] * self.turns},
+            f"{self.shown()[0]}.",
+        )
+        return Plot(figure, "Plan of turns")
+
+
+def _plan_figure(
+    title: str,
+    caption: str,
+    x: tuple[dict[str, Any], list[Any]],
+    y_title: str,
+    curves: dict[str, list[float]],
+    message: str,
+) -> Figure:
+    """Return the predicted curve and the wanted one, dashed, over `x`, an axis and its values."""
+    lines = ({"color": GOOD, "width": 2}, {"color": BAD, "width": 1.5, "dash": "dash"})
+    traces = [
+        scatter(x[1], values, mode, name=name, line=line)
+        for (name, values), mode, line in zip(curves.items(), ("lines+markers", "lines"), lines, strict=True)
+    ]
+    layout = {"xaxis": x[0], "yaxis": short_log_axis(y_title), "legend": LEGEND}
+    return Figure(title, caption, traces, layout, message=message)
 
 
 def plan_turns(wanted: float, fence: float) -> TurnPlan:
@@ -118,29 +130,29 @@ def plan_turns(wanted: float, fence: float) -> TurnPlan:
     )
 
 
-# How long a rate table must stay at each rate, and what the test will then give.
+# A rate table.
 
 
 _OF = ("full", "reading")
 _FLOOR = 0.664
 """Allan deviation of flicker noise over B (IEEE Std 952)."""
 _LEAST, _SETTLING = 5.0, 0.6
-"""s: the shortest dwell, and what `find_dwells` leaves out of a dwell at its ends."""
+"""Shortest dwell, and the part of a dwell that `find_dwells` leaves out at its ends, s."""
 _LONGEST, _LONGEST_TURN = 600.0, 60.0  # s of a dwell, and of a whole turn, that a plan asks for
 
 
 @dataclass(frozen=True)
 class PlannedRate:
-    """One size of rate.
+    """The stay at one rate.
 
     Attributes
     ----------
     rate
-        rad/s.
+        Rate, rad/s.
     duration
-        Of each stay, s, what settles at its ends included.
+        Duration of each stay, the settling at its ends included, s.
     uncertainty, wanted
-        Standard uncertainty of the mean of a stay, rad/s.
+        Predicted and wanted standard uncertainty of the mean of a stay, rad/s.
     """
 
     rate: float
@@ -150,7 +162,7 @@ class PlannedRate:
 
     @property
     def turns(self) -> float:
-        """Turns of the table in a stay, without what settles at its ends."""
+        """Turns of the table in a stay, without the settling at its ends."""
         return self.rate * (self.duration - _SETTLING) / (2 * math.pi)
 
 
@@ -163,13 +175,13 @@ class RatePlan(PlannedTest):
     test
         Its manifest.
     rates
-        By size, ascending.
+        The stays, by size of rate, ascending.
     duration
-        Of one run, s, without what the table takes between rates.
+        Duration of one run without the time between rates, s.
     predicted
         Standard uncertainty of each parameter, SI, under the names of the record.
     warnings
-        What is out of reach, with what to do.
+        Wanted uncertainties that are out of reach, with what to do.
     """
 
     test: RateTest
@@ -179,11 +191,11 @@ class RatePlan(PlannedTest):
     warnings: tuple[str, ...]
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return how long the test takes and what it will give, and the stay at each rate."""
+        """Return the duration and the predicted uncertainties in a sentence, and the stay at each rate as a table."""
         largest = self.rates[-1].rate
         rows = [
             [
-                f"{from_si(each.rate, 'deg/s'):.6g}",
+                text_in(each.rate, "deg/s", 6),
                 f"{each.duration:.1f}",
                 f"{each.turns:.1f}",
                 f"{1e6 * each.uncertainty / largest:.3g}",
@@ -194,11 +206,12 @@ class RatePlan(PlannedTest):
         total = len(self.test.runs) * self.duration
         head = (
             f"{len(self.test.runs)} runs of {self.duration / 60:.1f} min, {total / 3600:.1f} h at the table's rates; "
-            f"predicted standard uncertainties at most: {self._predicted()}"
+            f"predicted standard uncertainties at most: {self._predicted_text()}"
         )
         return head, ["rate, deg/s", "stay, s", "turns", "u, ppm of full", "wanted"], rows
 
-    def _predicted(self) -> str:
+    def _predicted_text(self) -> str:
+        """Return the largest predicted uncertainty of each kind of parameter, and what the plan does not know."""
         kinds = (
             ("gyro_scale_factor", "scale factors", ReadingUnit("ppm", 1e6)),
             ("gyro_misalignment", "misalignments", reading_unit("rad")),
@@ -239,38 +252,36 @@ class RatePlan(PlannedTest):
         """
         stay = {each.rate: each.duration for each in self.rates}
         if not str(path).lower().endswith(".csv"):
-            stays = ", ".join(f"{from_si(rate, 'deg/s'):.6g}: {time:.1f} s" for rate, time in stay.items())
-            comments = [f"Stay at each rate, deg/s, either way round: {stays}.", f"Predicted: {self._predicted()}."]
+            stays = ", ".join(f"{text_in(rate, 'deg/s', 6)}: {time:.1f} s" for rate, time in stay.items())
+            comments = [
+                f"Stay at each rate, deg/s, either way round: {stays}.",
+                f"Predicted: {self._predicted_text()}.",
+            ]
             write_text(path, manifest_text(self.test, comments, to_fill_in=True))
             return
         lines = ["run,file,mounting,rate [deg/s],stay [s]"]
         for number, run in enumerate(self.test.runs, 1):
             lines += [
-                f"{number},{run.file},{run.mounting},{from_si(rate, 'deg/s'):.9g},{stay[abs(rate)]:.1f}"
+                f"{number},{run.file},{run.mounting},{text_in(rate, 'deg/s', 9)},{stay[abs(rate)]:.1f}"
                 for rate in run.rates or ()
             ]
         write_text(path, "\n".join(lines) + "\n")
 
     def plot(self) -> Plot:
         """Return the uncertainty of one stay at each rate, beside the wanted one."""
-        sizes = [from_si(each.rate, "deg/s") for each in self.rates]
         largest = self.rates[-1].rate
-        traces: list[dict[str, Any]] = [
-            {"type": "scatter", "mode": "lines+markers", "name": "predicted", "x": sizes,
-             "y": [1e6 * each.uncertainty / largest for each in self.rates], "line": {"color": GOOD, "width": 2}},
-            {"type": "scatter", "mode": "lines", "name": "wanted", "x": sizes,
-             "y": [1e6 * each.wanted / largest for each in self.rates],
-             "line": {"color": BAD, "width": 1.5, "dash": "dash"}},
-        ]  # fmt: skip
-        layout = {
-            "xaxis": figure_axis("rate, deg/s"),
-            "yaxis": short_log_axis("u, ppm of full scale"),
-            "legend": LEGEND,
-        }
-        caption = "u: standard uncertainty of the mean of one stay; full scale is the largest rate."
-        return Plot(
-            Figure("What each stay will give", caption, traces, layout, message=f"{self.shown()[0]}."), "Rate plan"
+        figure = _plan_figure(
+            "What each stay will give",
+            "u: standard uncertainty of the mean of one stay; full scale is the largest rate.",
+            (figure_axis("rate, deg/s"), [from_si(each.rate, "deg/s") for each in self.rates]),
+            "u, ppm of full scale",
+            {
+                "predicted": [1e6 * each.uncertainty / largest for each in self.rates],
+                "wanted": [1e6 * each.wanted / largest for each in self.rates],
+            },
+            f"{self.shown()[0]}.",
         )
+        return Plot(figure, "Rate plan")
 
 
 def plan_rate(
@@ -344,7 +355,7 @@ def plan_rate(
     """
     if turn is not None:
         return plan_turns(fraction(turn, "turn"), in_si(fence, "fence", "angle", "deg"))
-    listed_rates = np.asarray(rates_of(rates, "rates") if isinstance(rates, str) else rates, dtype=np.float64)
+    listed_rates = np.asarray(parse_rates(rates, "rates") if isinstance(rates, str) else rates, dtype=np.float64)
     sizes = np.unique(np.abs(listed_rates))
     if sizes.size < 2:
         raise OptionError(f"rates {rates!r}: expected two sizes of rates or more")
@@ -360,15 +371,15 @@ def plan_rate(
     wanted = fraction(uncertainty, "uncertainty")
     if not 0 < wanted < 1:
         raise OptionError(f"uncertainty {wanted:g}: expected more than 0 and less than 1, such as 20 ppm")
-    walk, floor = _noise(arw, bias_instability, noise)
-    planned = tuple(_stay(float(rate), sizes, wanted, of, walk, floor) for rate in sizes)
+    walk, floor = _read_noise(arw, bias_instability, noise)
+    planned = tuple(_plan_stay(float(rate), sizes, wanted, of, walk, floor) for rate in sizes)
     way = np.concatenate([sizes, sizes[-2::-1], -sizes[sizes > 0], -sizes[-2::-1]])
     runs = tuple(
         Run(f"{'p' if word[0] == '+' else 'n'}{word[1]}_{cycle}.csv", word, tuple((way + 0.0).tolist()))
         for word in words
         for cycle in range(1, count + 1)
     )
-    common = None if table_uncertainty is None else part_of_one(table_uncertainty, "table_uncertainty")
+    common = None if table_uncertainty is None else parse_fraction(table_uncertainty, "table_uncertainty")
     place = None if latitude is None else checked_latitude(in_si(latitude, "latitude", "angle", "deg"))
     test = RateTest(runs, common, latitude=place, name="plan")
     stay = {each.rate: each.duration for each in planned}
@@ -376,12 +387,12 @@ def plan_rate(
         test=test,
         rates=planned,
         duration=float(sum(stay[abs(rate)] for rate in way.tolist())),
-        predicted=_predicted(test, {each.rate: each for each in planned}, int(order)),
-        warnings=tuple(_warnings(planned, floor, common, wanted)),
+        predicted=_predict(test, {each.rate: each for each in planned}, int(order)),
+        warnings=tuple(_warn_out_of_reach(planned, floor, common, wanted)),
     )
 
 
-def _noise(arw: float | str | None, instability: float | str | None, noise: Record | None) -> tuple[float, float]:
+def _read_noise(arw: float | str | None, instability: float | str | None, noise: Record | None) -> tuple[float, float]:
     """Return angle random walk, rad/sqrt(s), and the floor that bias instability sets to a mean, rad/s."""
     if noise is None:
         if arw is None:
@@ -404,9 +415,12 @@ def _noise(arw: float | str | None, instability: float | str | None, noise: Reco
     return walk, _FLOOR * level
 
 
-def _stay(rate: float, sizes: Array, share: float, basis: str, walk: float, floor: float) -> PlannedRate:
-    """Return how long to stay at a rate, s."""
-    reading = rate if rate > 0 else float(sizes[sizes > 0][0])  # a part of no rate cannot be reached
+def _plan_stay(rate: float, sizes: Array, share: float, basis: str, walk: float, floor: float) -> PlannedRate:
+    """Return the stay at a rate: ``T = N^2 / (u^2 - (0.664 B)^2)``, at least 5 s and whole turns.
+
+    `share` is the wanted uncertainty as a fraction of the largest rate, or of the rate itself with `basis` "reading".
+    """
+    reading = rate if rate > 0 else float(sizes[sizes > 0][0])  # no mean reaches a fraction of rate 0
     wanted = share * (float(sizes[-1]) if basis == "full" else reading)
     room = wanted**2 - floor**2
     length = min(max(_LEAST, walk**2 / room if room > 0 else _LONGEST), _LONGEST)
@@ -416,7 +430,7 @@ def _stay(rate: float, sizes: Array, share: float, basis: str, walk: float, floo
     return PlannedRate(rate, length + _SETTLING, math.hypot(walk / math.sqrt(length), floor), wanted)
 
 
-def _predicted(test: RateTest, planned: dict[float, PlannedRate], order: int) -> dict[str, float]:
+def _predict(test: RateTest, planned: dict[float, PlannedRate], order: int) -> dict[str, float]:
     """Return the standard uncertainties that the fit of such a test states."""
     rows: dict[str, list[Any]] = {name: [] for name in ("run", "axis", "sign", "table", "variance", "level")}
     for number, run in enumerate(test.runs):
@@ -436,17 +450,18 @@ def _predicted(test: RateTest, planned: dict[float, PlannedRate], order: int) ->
     variance = np.repeat(np.array(rows["variance"])[:, None], len(gyros), axis=1)
     problem = RateProblem(
         gyros=gyros, run=np.array(rows["run"]), axis=axis, sign=sign, rate=body, table=table, mean=mean,
-        variance=variance, level=np.array(rows["level"]), rate_uncertainty=test.spread_of(table),
+        variance=variance, level=np.array(rows["level"]), rate_uncertainty=test.rate_spread(table),
     )  # fmt: skip
     names, _, matrix, _, _ = model_parameters(test, problem, solve(problem, (order,) * len(gyros)), "rad/s")
     return dict(zip(names, np.sqrt(np.diag(matrix)).tolist(), strict=True))
 
 
-def _warnings(planned: Sequence[PlannedRate], floor: float, common: float | None, wanted: float) -> list[str]:
+def _warn_out_of_reach(planned: Sequence[PlannedRate], floor: float, common: float | None, wanted: float) -> list[str]:
+    """Return warnings of wanted uncertainties that the plan does not reach, and why."""
     messages, largest = [], planned[-1].rate
     short = [each for each in planned if each.uncertainty > 1.001 * each.wanted]
     if short:
-        at = ", ".join(f"{from_si(each.rate, 'deg/s'):.6g}" for each in short)
+        at = ", ".join(text_in(each.rate, "deg/s", 6) for each in short)
         worst = max(short, key=lambda each: each.uncertainty / each.wanted)
         why = (
             f"bias instability alone makes {1e6 * floor / largest:.3g} ppm of full scale"

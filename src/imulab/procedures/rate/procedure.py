@@ -1,4 +1,4 @@
-"""The rate test in the registry: its options, its fit from files, and what its record gives."""
+"""The rate test as the registry knows it: its fit from files, and what its record gives."""
 
 from __future__ import annotations
 
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
     from imulab.report.traces import Exhibits
-
-
-# A rate test from its manifest, which names the recordings, or from one recording.
 
 
 def _function() -> Callable[..., RateFit]:
@@ -73,9 +70,6 @@ TASK = Task(
 )
 
 
-# The test of gyroscopes at known rates or by whole turns, as the registry knows it.
-
-
 class RateSection(Section):
     """Bias, scale factor, misalignment and nonlinearity of gyroscopes."""
 
@@ -116,9 +110,9 @@ class RateProcedure(Procedure):
         return exhibits(record)
 
     def joined(self, record: Calibration) -> Exhibits:
-        from imulab.procedures.rate.figures import exhibits_of_joined
+        from imulab.procedures.rate.figures import exhibit_gyroscopes
 
-        return exhibits_of_joined(record)
+        return exhibit_gyroscopes(record)
 
     def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
         from imulab.procedures.rate.device import tables_of

@@ -1,4 +1,7 @@
-"""The calibration record of a rate test, and what it holds of sweeps."""
+"""The calibration record of a rate test: parameters, what its figures need, and its warnings.
+
+Parameters have the names of the gyroscopes in a tumble record. The mathematics is in `solve` and `dwells`.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from imulab.estimation.decisions import DWELLS_SCATTER, HYSTERESIS, LINE_BENDS, 
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
 from imulab.gravity import EARTH
 from imulab.procedures.rate import AXES
-from imulab.procedures.rate.axes import BY_ACCELEROMETERS, TableAxes, faces_said, lean_said
+from imulab.procedures.rate.axes import BY_ACCELEROMETERS, TableAxes, note_lean, warn_faces
 from imulab.procedures.rate.dwells import Dwells
 from imulab.procedures.rate.schema import (
     AxisFit,
@@ -28,14 +31,14 @@ from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
 from imulab.records.sections import Quantity, entries
-from imulab.report.traces import ReportTable, format_uncertain, plain_number
-from imulab.units import from_si, parse_unit
+from imulab.report.parameters import text_in
+from imulab.units import parse_unit
 
-# What a rate record holds of its sweeps: delay and bandwidth of each gyroscope, and a sine's frequency.
+# Sweeps in a rate record: delay and bandwidth of each gyroscope, and the frequency of a single sine.
 
 
-def dynamics_of(test: RateTest, dwells: Sequence[Dwells]) -> dict[str, Parameter]:
-    """Return ``gyro_delay_i`` and ``gyro_bandwidth_i`` of the gyroscopes that were swept, runs by inverse variance."""
+def delays_and_bandwidths(test: RateTest, dwells: Sequence[Dwells]) -> dict[str, Parameter]:
+    """Return ``gyro_delay_i`` and ``gyro_bandwidth_i`` of each gyroscope with sweeps, averaged by inverse variance."""
     parameters: dict[str, Parameter] = {}
     for kind, unit in (("delay", "s"), ("bandwidth", "Hz")):
         for number, axis in enumerate(AXES):
@@ -54,14 +57,14 @@ def dynamics_of(test: RateTest, dwells: Sequence[Dwells]) -> dict[str, Parameter
     return parameters
 
 
-def motion_of(dwells: Sequence[Dwells]) -> str:
+def describe_motion(dwells: Sequence[Dwells]) -> str:
     """Return how the table moved, ``model.from`` of the record."""
     kinds = {run_dwells.sweep is None for run_dwells in dwells}
     return "steps" if kinds == {True} else "sweeps" if kinds == {False} else "steps and sweeps"
 
 
-def swept(test: RateTest, dwells: Sequence[Dwells]) -> list[SweptRun]:
-    """Return ``fit.sweeps``: of each run that was one its file, and what it says."""
+def summarize_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[SweptRun]:
+    """Return ``fit.sweeps``: file, axis, delay and bandwidth of each run that was a sweep."""
     return [
         SweptRun(
             file=run.file,
@@ -78,8 +81,8 @@ def swept(test: RateTest, dwells: Sequence[Dwells]) -> list[SweptRun]:
     ]
 
 
-def of_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
-    """Say of each run at one frequency that its scale factor is the amplitude there, and which tell no hysteresis."""
+def note_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
+    """Return a note for each sweep that does not show hysteresis, or is of a single frequency."""
     messages = []
     for index, run in enumerate(dwells):
         if run.sweep is None or run.sweep.loop_error is not None:
@@ -87,8 +90,8 @@ def of_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
         place = test.place(index)
         if run.sweep.frequency is None:
             messages.append(
-                f"{place}: the rate passes each value always equally fast: hysteresis cannot be told from the delay, "
-                "which holds it; a sweep of frequencies, or steps, tells it"
+                f"{place}: the rate sweeps at one speed, so that the delay contains the hysteresis; a sweep of "
+                "frequencies, or steps, shows it"
             )
         else:
             messages.append(
@@ -99,32 +102,11 @@ def of_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
     return [Note(line) for line in messages]
 
 
-def sweep_table(sweeps: Sequence[SweptRun]) -> ReportTable:
-    """Return the table of the sweeps of a record."""
-    rows = []
-    for sweep in sweeps:
-        delay, u = format_uncertain(1e3 * sweep.delay, 1e3 * sweep.delay_uncertainty)
-        width, of_width = ("–", "–")
-        if sweep.bandwidth is not None:
-            width, of_width = format_uncertain(sweep.bandwidth, sweep.bandwidth_uncertainty)
-        elif sweep.bandwidth_beyond is not None:
-            width = f"> {plain_number(sweep.bandwidth_beyond, 2)}"
-        at = "–" if sweep.frequency is None else plain_number(sweep.frequency, 4)
-        rows.append([sweep.file, sweep.axis, at, delay, u, width, of_width])
-    return ReportTable(
-        "Sweeps",
-        "Delay of the gyroscope behind the table, and the frequency where a first-order lag with the same fall of "
-        "amplitude is at -3 dB. Of one sine, whose frequency is given, the scale factor is the amplitude there.",
-        ["file", "gyro", "sine, Hz", "delay, ms", "u", "bandwidth, Hz", "u"],
-        rows,
-    )
-
-
-# The calibration record of a rate test: parameters under tumble gyro's names, in SI, and what its figures need.
+# The record.
 
 
 _MATTERS = 3.0  # times the uncertainty of a bias: the Earth's rate is warned of if it is larger
-_LARGEST = ("nonlinearity", "hysteresis")
+_LARGEST = ("nonlinearity", "hysteresis")  # maxima of absolute values
 
 
 def make_record(
@@ -138,11 +120,11 @@ def make_record(
     order: str,
     axes: TableAxes | None = None,
 ) -> Calibration:
-    """Turn a solution into the record."""
+    """Return the record of a solution."""
     names, values, matrix, units, freedoms = model_parameters(test, problem, solution, unit, axes)
     if solution.cycle_freedom is not None:
         cycles = solution.cycle_freedom
-        freedoms |= _of_cycles(test, cycles, names, values.tolist(), np.diag(matrix).tolist())
+        freedoms |= _scale_factor_freedoms(test, cycles, names, values.tolist(), np.diag(matrix).tolist())
     parameters = {}
     for name, value, u, parameter_unit in zip(
         names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True
@@ -151,9 +133,9 @@ def make_record(
         parameters[name] = Parameter(
             value, u, parameter_unit, interval_95=None if wide is None else (value - wide, value + wide)
         )
-    figures = _figures(linearity) | dynamics_of(test, dwells)
+    figures = _linearity_parameters(linearity) | delays_and_bandwidths(test, dwells)
     figures |= temperature_slopes(recordings, dwells, problem, solution)
-    joint = _with_figures(names, matrix, figures)
+    joint = _join_covariance(names, matrix, figures)
     heads = [recording.metadata for recording in recordings]
     sensor = {key: text for head in heads for key in ("serial", "model", "element") if (text := head.get(key))}
     temperatures = [t for recording in recordings if (t := recording.mean_temperature()) is not None]
@@ -161,9 +143,9 @@ def make_record(
         gyro_order=max(solution.orders),
         gyro_output_unit=unit,
         axes="".join(linearity),
-        from_=motion_of(dwells),
+        from_=describe_motion(dwells),
         frame="the faces on which the unit was mounted" if axes is None else BY_ACCELEROMETERS,
-        largest_rate=Quantity(value=_largest(problem), unit="rad/s"),
+        largest_rate=Quantity(value=_largest_rate(problem), unit="rad/s"),
         temperature=Quantity(value=float(np.mean(temperatures)), unit="degC") if temperatures else None,
     )
     return Calibration(
@@ -171,27 +153,27 @@ def make_record(
         parameters=parameters | figures,
         covariance=joint,
         model=entries(model),
-        fit=entries(_summary(test, problem, solution, linearity, dwells)),
+        fit=entries(_summarize_fit(test, problem, solution, linearity, dwells)),
         options={"order": order if order == "auto" else int(order)},
-        data=entries(RateEvidence(dwells=_dwells(linearity))),
+        data=entries(RateEvidence(dwells=_dwell_residuals(linearity))),
         sensor={**sensor, **test.sensor},
         sources=tuple(recording.source for recording in recordings if recording.source is not None),
         warnings=(
-            *_of_sensor(test, recordings),
-            *_of_unit(parameters, unit),
-            *_of_table(test, parameters, axes is not None, any("table_angle" in source for source in recordings)),
-            *_of_line(linearity, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True)), order),
-            *_of_scatter(problem, solution),
-            *(faces_said(test, recordings, dwells) if axes is None else lean_said(axes, test)),
-            *of_sweeps(test, dwells),
+            *_warn_other_unit(test, recordings),
+            *_warn_output_unit(parameters, unit),
+            *_warn_table(test, parameters, axes is not None, any("table_angle" in source for source in recordings)),
+            *_warn_line(linearity, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True)), order),
+            *_note_scatter(problem, solution),
+            *(warn_faces(test, recordings, dwells) if axes is None else note_lean(axes, test)),
+            *note_sweeps(test, dwells),
         ),
     )
 
 
-def _with_figures(names: Sequence[str], matrix: Array, figures: Mapping[str, Parameter]) -> Covariance:
-    """Return the covariance of parameters and figures, as if these depended on nothing.
+def _join_covariance(names: Sequence[str], matrix: Array, figures: Mapping[str, Parameter]) -> Covariance:
+    """Return the covariance of parameters and figures; figures are taken as uncorrelated.
 
-    Noise lifts the largest of several: outside the covariance it is shown by comparisons, and not judged.
+    Maxima are left out, since noise raises them: comparisons show these, and do not judge them.
     """
     known = {
         name: u
@@ -203,14 +185,15 @@ def _with_figures(names: Sequence[str], matrix: Array, figures: Mapping[str, Par
     return Covariance((*names, *known), tuple(map(tuple, joined.tolist())))
 
 
-def _largest(problem: RateProblem) -> float:
+def _largest_rate(problem: RateProblem) -> float:
+    """Return the largest rate of the table, rad/s."""
     return max(float(np.abs(problem.table).max()), 0.0 if problem.reach is None else float(problem.reach.max()))
 
 
-def _of_cycles(
+def _scale_factor_freedoms(
     test: RateTest, freedom: int, names: Sequence[str], values: Sequence[float], variances: Sequence[float]
 ) -> dict[str, float]:
-    """Return the degrees of freedom of scale factors: cycles show all but what the table states (Satterthwaite)."""
+    """Return the degrees of freedom of scale factors (Satterthwaite): the table's share has infinitely many."""
     freedoms = {}
     for name, value, variance in zip(names, values, variances, strict=True):
         if name.startswith("gyro_scale_factor"):
@@ -219,8 +202,8 @@ def _of_cycles(
     return freedoms
 
 
-def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
-    """Return the figures of each axis; the uncertainty of the largest of several is that of the one that is largest."""
+def _linearity_parameters(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
+    """Return nonlinearity, asymmetry, hysteresis and threshold of each axis, from `measure_linearity`."""
     parameters = {}
     for kind, unit in (("nonlinearity", "1"), ("asymmetry", "1"), ("hysteresis", "1"), ("threshold", "rad/s")):
         for axis, axis_linearity in linearity.items():
@@ -230,14 +213,14 @@ def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
     return parameters
 
 
-def _summary(
+def _summarize_fit(
     test: RateTest,
     problem: RateProblem,
     solution: RateSolution,
     linearity: Mapping[str, Linearity],
     dwells: Sequence[Dwells],
 ) -> RateSummary:
-    """Return how the lines were fitted, and how well."""
+    """Return ``fit``: how the lines were fitted, and how well."""
     return RateSummary(
         runs=len(dwells),
         dwells=len(problem.rate),
@@ -251,14 +234,15 @@ def _summary(
         mounting_uncertainty=test.mounting_uncertainty,
         latitude=test.latitude,
         axes={
-            axis: _axis_fit(line, solution, problem.gyros.index(AXES.index(axis))) for axis, line in linearity.items()
+            axis: _summarize_axis(line, solution, problem.gyros.index(AXES.index(axis)))
+            for axis, line in linearity.items()
         },
-        sweeps=swept(test, dwells) or None,
+        sweeps=summarize_sweeps(test, dwells) or None,
     )
 
 
-def _axis_fit(line: Linearity, solution: RateSolution, number: int) -> AxisFit:
-    """Return how well the line of one gyroscope fits; `number` is its place among those that were fitted."""
+def _summarize_axis(line: Linearity, solution: RateSolution, number: int) -> AxisFit:
+    """Return ``fit.axes`` of one gyroscope; `number` is its place among those that were fitted."""
     fitted_loop, repeatability = line.fitted_loop or (None, None), line.repeatability or (None, None)
     return AxisFit(
         probability=line.probability,
@@ -274,8 +258,8 @@ def _axis_fit(line: Linearity, solution: RateSolution, number: int) -> AxisFit:
     )
 
 
-def _dwells(linearity: Mapping[str, Linearity]) -> DwellResiduals:
-    """Return each dwell about the axis of a gyroscope, as the figures draw it."""
+def _dwell_residuals(linearity: Mapping[str, Linearity]) -> DwellResiduals:
+    """Return ``data.dwells``: each dwell about the axis of a gyroscope, as the figures draw it."""
     words: tuple[Direction, ...] = ("falling", "turning", "rising")
     lines = linearity.values()
     return DwellResiduals(
@@ -287,12 +271,14 @@ def _dwells(linearity: Mapping[str, Linearity]) -> DwellResiduals:
     )
 
 
-def _of_sensor(test: RateTest, recordings: Sequence[Recording]) -> list[str]:
+def _warn_other_unit(test: RateTest, recordings: Sequence[Recording]) -> list[str]:
+    """Return a warning where a recording and the manifest name different units."""
     pairs = (different_units((r.name, r.metadata), ("the manifest", test.sensor)) for r in recordings)
     return [f"{other}: which is the unit?" for other in pairs if other][:1]
 
 
-def _of_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
+def _warn_output_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
+    """Return a warning where scale factors are so far off that the output must be in another unit."""
     nominal = parse_unit(unit)
     if nominal.quantity != "rate":
         return []
@@ -303,7 +289,8 @@ def _of_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
     return [Bad(f"the scale factors are off by {offs}: is the unit ({unit}) right, or that of the table's rates?")]
 
 
-def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool, by_angle: bool) -> list[str]:
+def _warn_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool, by_angle: bool) -> list[str]:
+    """Return what the stated uncertainties do not cover: the table's rates, the mounting, and the Earth's rate."""
     messages: list[str] = []
     if test.relative_uncertainty is None:
         clock = ", with that of the recorder's clock by which table_angle became a rate," if by_angle else ""
@@ -323,15 +310,15 @@ def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool
         )
     least = min(p.standard_uncertainty or 0.0 for n, p in parameters.items() if n.startswith("gyro_bias"))
     if test.latitude is None and _MATTERS * least < EARTH:
-        hourly = from_si(EARTH, "deg/h")
         messages.append(
-            f"the Earth's rate, up to {hourly:.0f} deg/h, stays in the biases: their uncertainty of "
-            f"{from_si(least, 'deg/h'):.2g} deg/h does not hold it; state the latitude (--latitude)"
+            f"the Earth's rate, up to {text_in(EARTH, 'deg/h', 2)} deg/h, stays in the biases: their uncertainty of "
+            f"{text_in(least, 'deg/h', 2)} deg/h does not cover it; state the latitude (--latitude)"
         )
     return messages
 
 
-def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], asked: str) -> list[str]:
+def _warn_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], asked: str) -> list[str]:
+    """Return warnings of what the chosen powers of the rate do not compensate: bends, kinks and hysteresis."""
     messages: list[str] = []
     for axis, line in linearity.items():
         if asked != "auto" and line.probability < LINE_BENDS.level and line.by_polynomial > line.by_noise:
@@ -361,14 +348,15 @@ def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], aske
     return messages
 
 
-def _of_scatter(problem: RateProblem, solution: RateSolution) -> list[str]:
+def _note_scatter(problem: RateProblem, solution: RateSolution) -> list[str]:
+    """Return notes where dwells or scale factors scatter beyond their noise."""
     messages: list[str] = []
     if chi_square_probability(solution.chi_square, solution.freedom) < DWELLS_SCATTER.level:
         ratio = solution.chi_square / max(solution.freedom, 1)
         messages.append(
             Note(
-                f"the dwells scatter more than their noise (reduced chi-square {ratio:.3g}); the uncertainties hold "
-                "what was added"
+                f"the dwells scatter more than their noise (reduced chi-square {ratio:.3g}); the uncertainties cover "
+                "the added scatter"
             )
         )
     if solution.cycle:

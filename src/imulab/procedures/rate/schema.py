@@ -1,8 +1,7 @@
-"""What a rate test and its record hold.
+"""The sections of a rate record, with types, and the manifest of a rate test.
 
-The manifest, the record's sections with types, and the units in which people read them.
-
-TOML; the keys are those of docs/rate.md. An unknown key is refused by name, so that a misspelt one does not pass.
+The manifest is TOML with the keys of docs/rate.md. An unknown key is refused by name, so that a misspelt one does not
+pass.
 """
 
 from __future__ import annotations
@@ -21,11 +20,9 @@ from imulab.procedures.rate import AXES, MOUNTINGS
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.sections import Measured, Part, Quantity, Size, part
-from imulab.report.parameters import reading_unit
-from imulab.report.traces import ReportTable
 from imulab.units import from_si, to_si
 
-# What a rate record holds, with types: filled by those who write it, checked as it is read.
+# The record.
 
 
 T = TypeVar("T")
@@ -52,7 +49,7 @@ class RateModel(TurnsModel):
 
 
 class ModelSection(Part):
-    """The part of a record that one of steps and one of turns share."""
+    """The section that records of steps and of turns share."""
 
     model: RateModel
 
@@ -86,14 +83,14 @@ class SweptRun(Part):
 
 
 class PriorParameter(Part):
-    """One parameter of ``fit.prior``: what the prior says of it, and the test without that."""
+    """One parameter of ``fit.prior``: by the prior, and by the test without it."""
 
     prior: Measured
     test: Measured
 
 
 class RatePrior(Part):
-    """``fit.prior``: what each record says of the parameters of both, alone."""
+    """``fit.prior``: the parameters that both records hold, by each alone."""
 
     probability: Size | None
     parameters: dict[str, PriorParameter]
@@ -119,7 +116,7 @@ class RateSummary(Part):
 
 
 class DwellResiduals(Part):
-    """``data.dwells``: of each its gyroscope, rate, rad/s, and what is left of the line, a fraction of the largest."""
+    """``data.dwells``: gyroscope, rate, rad/s, and residual of the line, a fraction of the largest rate."""
 
     axis: PerDwell[str]
     rate: PerDwell[float]
@@ -194,7 +191,7 @@ def model_of(record: Calibration) -> RateModel:
 
 
 def rate_of(record: Calibration) -> RateRecord:
-    """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
+    """Return the sections of a record; raises RecordError for a wrong part, for a missing one when it is asked for."""
     return part(record, RateRecord)
 
 
@@ -203,27 +200,7 @@ def turns_of(record: Calibration) -> TurnsRecord:
     return part(record, TurnsRecord)
 
 
-# An earlier rate record beside a new test, as a table.
-
-
-def prior_table(prior: RatePrior, record: Calibration) -> ReportTable:
-    """Return what the prior, the test without it, and both as one fit say of each parameter."""
-    rows = []
-    for name, parameter in prior.parameters.items():
-        read = reading_unit(parameter.test.unit, name)
-        estimates = (parameter.prior, parameter.test, record.parameter(name))
-        rows.append([name, *(" ± ".join(read.texts(p.value, p.standard_uncertainty)) for p in estimates), read.symbol])
-    chance = "" if prior.probability is None else f" Probability of such differences: {prior.probability:.2g}."
-    return ReportTable(
-        "The earlier record and this test",
-        "Each alone, and both as one fit, the result, ± standard uncertainties. What all rates of one table, or "
-        f"one clock, have in common does not fall with a second test.{chance}",
-        ["parameter", "earlier", "this test", "both", "unit"],
-        rows,
-    )
-
-
-# The manifest of a rate test: which file was recorded with which body axis along the table's, at which rates.
+# The manifest: which file was recorded with which body axis along the table's, at which rates.
 
 
 _KEYS = ("rates", "mounting", "latitude", "sensor", "run")
@@ -240,9 +217,9 @@ _MOUNTING = 'mounting = { standard_uncertainty = 0.3, unit = "mrad" }'
 
 @dataclass(frozen=True)
 class Run:
-    """One recording: the body axis along the table's (``+z``), the rates of the table, rad/s, None if recorded.
+    """One recording: the body axis along the table's (``+z``), and its rates, rad/s, None if recorded.
 
-    And whether the rate changes all the time, which is found out where it is not said.
+    `sweep` states that the rate changes all the time; if it is not stated, the recording shows it.
     """
 
     file: str
@@ -268,17 +245,17 @@ class RateTest:
     Attributes
     ----------
     runs
-        A recording each.
+        The recordings.
     relative_uncertainty
-        Standard uncertainty that all rates have in common, a fraction; None where the manifest does not say.
+        Standard uncertainty that all rates have in common, a fraction; None where the manifest does not state it.
     rate_uncertainty
-        Of each commanded rate, the same at every visit, rad/s.
+        Standard uncertainty of each commanded rate, the same error at every visit, rad/s.
     proportional_uncertainty
-        Likewise, and beside it, a fraction of that rate.
+        Further standard uncertainty of each commanded rate, a fraction of it.
     mounting_uncertainty
-        Of the table axis across each face, rad; None where the manifest does not say.
+        Standard uncertainty of the table axis across each face, rad; None where the manifest does not state it.
     latitude
-        rad; None where the manifest does not say.
+        Latitude, rad; None where the manifest does not state it.
     """
 
     runs: tuple[Run, ...]
@@ -290,21 +267,18 @@ class RateTest:
     name: str = "test"
     proportional_uncertainty: float = 0.0
 
-    def spread_of(self, rate: Array) -> Array:
-        """Return the standard uncertainty of commanded rates beside what all have in common, rad/s, shape (n,).
-
-        A table that stands still has none.
-        """
+    def rate_spread(self, rate: Array) -> Array:
+        """Return the standard uncertainty of single commanded rates, rad/s, shape (n,); 0 for a table at rest."""
         return np.where(rate == 0, 0.0, np.hypot(self.rate_uncertainty, self.proportional_uncertainty * rate))
 
     def place(self, index: int) -> str:
-        """Return how messages name run `index`, counted from 0."""
+        """Return the name of run `index`, counted from 0, for messages."""
         run = self.runs[index]
         return f"{run.file} ({run.mounting} along the table axis)"
 
 
 def load_test(path: str | Path, name: str | None = None) -> RateTest:
-    """Read a manifest; `name` is what messages call it.
+    """Return the test of a manifest; `name` is what messages call it.
 
     Raises
     ------
@@ -322,7 +296,9 @@ def load_test(path: str | Path, name: str | None = None) -> RateTest:
     sizes = ("relative_standard_uncertainty", "standard_uncertainty", "proportional_standard_uncertainty")
     check_keys(rates, ("unit", *sizes), f"{name}: rates")
     unit = unit_of(rates["unit"], "rate", f"{name}: rates")
-    relative, each, part = (None if key not in rates else _size(rates[key], f"{name}: rates: {key}") for key in sizes)
+    relative, each, part = (
+        None if key not in rates else _read_size(rates[key], f"{name}: rates: {key}") for key in sizes
+    )
     entries = table.get("run")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise ReadError(f"{name}: run: expected tables [[run]], one for each file")
@@ -330,11 +306,11 @@ def load_test(path: str | Path, name: str | None = None) -> RateTest:
     if not isinstance(sensor, dict) or not all(isinstance(value, str | int | float) for value in sensor.values()):
         raise ReadError(f'{name}: sensor: expected texts such as serial = "SN42"')
     return RateTest(
-        runs=tuple(_run(entry, f"{name}: run {number}", unit) for number, entry in enumerate(entries, 1)),
+        runs=tuple(_read_run(entry, f"{name}: run {number}", unit) for number, entry in enumerate(entries, 1)),
         relative_uncertainty=relative,
         rate_uncertainty=to_si(each or 0.0, unit),
-        mounting_uncertainty=_mounting(table.get("mounting"), f"{name}: mounting"),
-        latitude=_latitude(table.get("latitude"), f"{name}: latitude"),
+        mounting_uncertainty=_read_mounting(table.get("mounting"), f"{name}: mounting"),
+        latitude=_read_latitude(table.get("latitude"), f"{name}: latitude"),
         sensor={key: str(value) for key, value in sensor.items()},
         name=name,
         proportional_uncertainty=part or 0.0,
@@ -342,12 +318,12 @@ def load_test(path: str | Path, name: str | None = None) -> RateTest:
 
 
 def refuse_folder(path: Path, name: str) -> None:
-    """Refuse a folder that holds a manifest, which says what its recordings are.
+    """Refuse a folder with a manifest in place of a recording.
 
     Raises
     ------
     ReadError
-        See above; the message names the manifest.
+        It is one; the message names the manifest.
     """
     manifests = sorted(path.glob("*.toml")) if path.is_dir() else []
     if manifests:
@@ -357,23 +333,23 @@ def refuse_folder(path: Path, name: str) -> None:
         )
 
 
-def _size(value: Any, place: str) -> float:
+def _read_size(value: Any, place: str) -> float:
     number = number_of(value, place)
     if number < 0:
         raise ReadError(f"{place}: expected 0 or more, found {value!r}")
     return number
 
 
-def _mounting(entry: Any, place: str) -> float | None:
+def _read_mounting(entry: Any, place: str) -> float | None:
     if entry is None:
         return None
     if not isinstance(entry, dict) or set(entry) != {"standard_uncertainty", "unit"}:
         raise ReadError(f"{place}: expected {_MOUNTING}, found {quoted(entry)}")
     unit = unit_of(entry["unit"], "angle", place)
-    return to_si(_size(entry["standard_uncertainty"], place), unit)
+    return to_si(_read_size(entry["standard_uncertainty"], place), unit)
 
 
-def _latitude(entry: Any, place: str) -> float | None:
+def _read_latitude(entry: Any, place: str) -> float | None:
     if entry is None:
         return None
     value, unit = value_and_unit(entry, place, 'latitude = { value = 48.1, unit = "deg" }')
@@ -383,7 +359,7 @@ def _latitude(entry: Any, place: str) -> float | None:
     return latitude
 
 
-def _run(entry: Mapping[str, Any], place: str, unit: str) -> Run:
+def _read_run(entry: Mapping[str, Any], place: str, unit: str) -> Run:
     file, mounting, rates = entry.get("file"), entry.get("mounting"), entry.get("rates")
     if not isinstance(file, str) or not file:
         raise ReadError(f'{place}: expected file = "NAME.csv", found {quoted(file)}')
@@ -406,7 +382,7 @@ def _run(entry: Mapping[str, Any], place: str, unit: str) -> Run:
 def manifest_text(test: RateTest, comments: Sequence[str] = (), to_fill_in: bool = False) -> str:
     """Return the manifest of a test as TOML, rates in deg/s, under lines of comment.
 
-    What the test does not state is left out, or `to_fill_in` behind a ``#``, with a usual size.
+    Keys that the test does not state are left out, or with `to_fill_in` written as comments with usual values.
     """
     parts = ['unit = "deg/s"']
     if test.relative_uncertainty is not None:

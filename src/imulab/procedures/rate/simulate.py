@@ -1,6 +1,6 @@
-"""A simulated unit on a rate table: a run for each face and cycle, with its truth.
+"""A simulated unit on a rate table: a run for each face and cycle, with its true parameters.
 
-The forward model is written here on its own, apart from the fit.
+The equation of the model stands here a second time, so that fit and simulation do not share errors.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from imulab.errors import OptionError, readable
 from imulab.files import write_text
 from imulab.gravity import EARTH, checked_latitude
 from imulab.options import measure, text
-from imulab.procedures.rate import AXES, RATES, rates_of
+from imulab.procedures.rate import AXES, RATES, parse_rates
 from imulab.procedures.rate.schema import RateTest, Run, manifest_text
 from imulab.quantities import fraction, in_si, whole
 from imulab.recording import Array, Recording
@@ -38,11 +38,11 @@ class RateRecordings(Shown):
     Attributes
     ----------
     test
-        As its manifest states it.
+        The test as its manifest states it.
     recordings
-        One for each run.
+        The recording of each run.
     truth
-        Parameters by the names that the record has.
+        True parameters under the names of the record.
     """
 
     test: RateTest
@@ -130,7 +130,7 @@ def simulate_rate(
     >>> len(il.simulate_rate(cycles=2, hold="1 s").recordings)
     6
     """
-    sizes = np.unique(np.abs(rates_of(rates, "rates") if isinstance(rates, str) else np.asarray(rates, dtype=float)))
+    sizes = np.unique(np.abs(parse_rates(rates, "rates") if isinstance(rates, str) else np.asarray(rates, dtype=float)))
     words = faces.split(",")
     if not all(len(word) == 2 and word[0] in "+-" and word[1] in AXES for word in words):
         raise OptionError(f"faces {faces!r}: expected body axes such as +x,+y,+z")
@@ -158,7 +158,7 @@ def simulate_rate(
         for cycle in range(1, whole(cycles, "cycles") + 1):
             axis, sign = AXES.index(word[1]), 1.0 if word[0] == "+" else -1.0
             time, table_rate, rising = (
-                _profile(way, duration, period) if swept is None else _sweep(float(sizes[-1]), swept, period)
+                _step_through(way, duration, period) if swept is None else _sweep_sine(float(sizes[-1]), swept, period)
             )
             body = np.zeros((len(time), 3))
             body[:, axis] = sign * (table_rate * (1 + off) + EARTH * np.sin(place))
@@ -168,15 +168,17 @@ def simulate_rate(
             along = body @ turn.T
             along = along + k3 * along**3
             along[:, axis] += sign * split * sizes[-1] / 2 * rising * (1 - (table_rate / sizes[-1]) ** 2)
-            output = scale * (_lagging(along, constant, period) + zero) + spread * rng.standard_normal(along.shape)
+            output = scale * (_lag(along, constant, period) + zero) + spread * rng.standard_normal(along.shape)
             name = f"{'np'[sign > 0]}{word[1]}_{cycle}.csv"
             recordings.append(_recording(time, output, name, None if swept is None else table_rate))
             runs.append(Run(name, word, tuple(way.tolist()) if swept is None else None, sweep=swept is not None))
     test = RateTest(tuple(runs), common, 0.0, 0.0, place, name="test.toml")
-    return RateRecordings(test, tuple(recordings), _truth(scale, zero, turn, k3, None if swept is None else constant))
+    return RateRecordings(
+        test, tuple(recordings), _name_truth(scale, zero, turn, k3, None if swept is None else constant)
+    )
 
 
-def _profile(way: Array, hold: float, period: float) -> tuple[Array, Array, Array]:
+def _step_through(way: Array, hold: float, period: float) -> tuple[Array, Array, Array]:
     """Return time, the table's rate and whether it rose (1) or fell (-1) last, at a bounded acceleration."""
     times, rates = [0.0], [way[0]]
     for number, target in enumerate(way):
@@ -191,15 +193,15 @@ def _profile(way: Array, hold: float, period: float) -> tuple[Array, Array, Arra
     return time, np.asarray(table), np.asarray(step[np.minimum(part, len(step) - 1)])
 
 
-def _sweep(largest: float, duration: float, period: float) -> tuple[Array, Array, Array]:
+def _sweep_sine(largest: float, duration: float, period: float) -> tuple[Array, Array, Array]:
     """Return time, the rate of a swept sine, whose frequency rises evenly, and whether it rises (1) or falls (-1)."""
     time = np.asarray(np.arange(int(duration / period)) * period, dtype=np.float64)
     phase = 2 * np.pi * (_LOWEST * time + (_HIGHEST - _LOWEST) * time**2 / (2 * duration))
     return time, np.asarray(largest * np.sin(phase)), np.sign(np.cos(phase))
 
 
-def _lagging(rate: Array, constant: float, period: float) -> Array:
-    """Return what a first-order lag makes of smooth rates (n, 3), by straight lines between finer samples of them."""
+def _lag(rate: Array, constant: float, period: float) -> Array:
+    """Return smooth rates (n, 3) behind a first-order lag, by straight lines between finer samples."""
     if not constant:
         return rate
     from scipy.interpolate import CubicSpline
@@ -220,7 +222,7 @@ def _recording(time: Array, output: Array, name: str, table: Array | None) -> Re
     return Recording(columns, {key: "s" if key == "time" else "deg/s" for key in columns}, {"serial": "SIM"}, name=name)
 
 
-def _truth(scale: Array, zero: Array, turn: Array, k3: float, delay: float | None) -> dict[str, float]:
+def _name_truth(scale: Array, zero: Array, turn: Array, k3: float, delay: float | None) -> dict[str, float]:
     parameters = {f"gyro_bias_{a}": float(zero[i]) for i, a in enumerate(AXES)}
     parameters |= {f"gyro_scale_factor_{a}": float(from_si(scale[i], "deg/s")) for i, a in enumerate(AXES)}
     parameters |= {

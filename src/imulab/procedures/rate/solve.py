@@ -1,22 +1,20 @@
-"""Dwells to bias, scale factor, misalignment and nonlinearity.
+"""Dwells to bias, scale factor, misalignment and nonlinearity, by generalised least squares.
 
-The least squares, the choice of the order, and what the scale factors make of the temperature.
+Model of gyroscope i: ``M_i = S_i (A_i + b_i)``, ``A_i = s_i + k2_i s_i^2 + ...``, ``s = T w``, w the rate.
 
-M_i = S_i (A_i + b_i),  A_i = s_i + k2_i s_i^2 + ...,  s = T w
+Fit (`solve`): in a run whose table axis is body axis j the mean output is ``B_ij w``, ``B = diag(S) T``, plus the zero
+of that run, and for j = i powers of w. The covariance of the means is the sum of their noise; of the errors of
+commanded rates, which all visits and all gyroscopes share; of the horizontal part of the Earth's rate, as far as the
+table's turning does not average it; and of an added variance where the dwells scatter beyond these.
 
-Of gyroscope i in run m, whose table axis is body axis j, the means follow ``B_ij w`` plus a zero of that run, and
-for j = i the powers of w; ``B = diag(S) T``. The covariance of the means holds their noise, the errors of single rates,
-which all visits and all gyroscopes share, the level part of the Earth's rate that the table's turning does not average,
-and what scatters beyond that. Source: generalised least squares (Aitken 1935); added variance: Mandel and Paule, Anal.
-Chem. 42 (1970) 1194.
+Order (`choose_orders`): residuals are compared rate by rate, since all visits share the error of a commanded rate and
+are no further evidence of a bend.
 
-What dwells leave of a polynomial is compared rate by rate: an error of one commanded rate is shared by all its visits,
-which therefore are no further evidence of a bend. Source: F-test of nested models; leave-one-out prediction.
+Nonlinearity, asymmetry, hysteresis (`measure_linearity`) are fractions of the largest rate or of the scale factor, so
+that the uncertainty that all rates share drops out; docs/rate.md defines them.
 
-All are fractions of the largest rate or of the scale factor, so that the uncertainty that all rates share drops out.
-Terms: IEEE Std 528; definitions in docs/rate.md.
-
-``M = S (1 + c (t - mean t)) s + ...``: a column ``w (t - mean t)`` beside those of the fit, weighted least squares.
+Sources: IEEE Std 528 (terms); Aitken (1935), generalised least squares; Mandel and Paule, Anal. Chem. 42 (1970) 1194,
+added variance; F-test of nested models and leave-one-out prediction.
 """
 
 from __future__ import annotations
@@ -51,44 +49,40 @@ from imulab.units import STANDARD_GRAVITY, parse_unit
 # All dwells of a test to bias, scale factor, misalignment and nonlinearity, by generalised least squares.
 
 
-_HALVINGS = 60  # of a bracket, which ends before at 0.1 %
-EXACT = 1e-10  # of the largest reading: noise that data without noise are given
-_MOST_POWERS = 5  # of the rate that scatter is judged beside
+_HALVINGS = 60  # of a bracket, at most; 0.1 % of its end is enough
+EXACT = 1e-10  # of the largest reading: noise that is assumed of data without noise
+_MOST_POWERS = 5  # powers of the rate in the model by which scatter is judged
 
 
 @dataclass(frozen=True)
 class RateProblem:
-    """All dwells of a test, n of them, of g gyroscopes.
+    """The n dwells of all runs of a test, of g gyroscopes.
 
     Attributes
     ----------
     gyros
         Body axis of each gyroscope, shape (g,).
     run, axis, sign
-        Of each dwell: its run, the body axis along the table's, and 1 where that points up, -1 where down, shape (n,).
+        Run of each dwell, body axis along the table's, and 1 where that points up, -1 where down, shape (n,).
     rate
-        About the body axis, the Earth's included, rad/s, shape (n,).
+        Rate about the body axis, the Earth's included, rad/s, shape (n,).
     table
         Rate of the table as commanded or recorded, rad/s, shape (n,).
     mean, variance
-        Of the outputs, shape (n, g).
+        Mean outputs and their variances, shape (n, g).
     level
         Mean cosine and sine of the table's angle, shape (n, 2).
     rate_uncertainty
-        Of the commanded rate of each dwell, which all visits of it share, rad/s, shape (n,).
-    scale_error
-        What each dwell's run adds to its scale factor, which delay and bandwidth share with it, shape (n,).
-    zero_error
-        What it adds to the zeros of its outputs, shape (n, g).
-    loop_error
-        What it adds to rising less falling at rate 0, a fraction of the largest rate; infinite where a loop cannot be
-        told from a delay, shape (n,).
+        Standard uncertainty of the commanded rate of each dwell, which all its visits share, rad/s, shape (n,).
+    scale_error, zero_error, loop_error
+        `Sweep.scale_error`, `zero_error` and `loop_error` of each dwell's run, shapes (n,), (n, g) and (n,); the last
+        is infinite where a loop cannot be distinguished from a delay.
     reach
-        Largest rate of its run, beyond all means by rate, rad/s, shape (n,); 0 for steps.
+        Largest rate of its run if that is a sweep, rad/s, shape (n,); 0 for steps.
     branch
         1 where the rate of a sweep rises, -1 where it falls, shape (n,); 0 for steps.
     lean
-        Of the table axis: its components over that along the body axis, shape (n, 3); None along the body axis.
+        Components of the table axis over that along the body axis, shape (n, 3); None if it lies along the body axis.
     force
         Specific force at rate 0 in each run, m/s^2, shape (m, 3); None for g along the faces.
     """
@@ -129,19 +123,19 @@ class RateSolution:
     Attributes
     ----------
     coefficients
-        Gyroscope to slopes over the rates about each face, powers of the rate about its own axis, zeros of the runs.
+        For each gyroscope: slopes over the rates about each face, powers of the rate about its axis, zeros of the runs.
     covariance
-        Of all of them, one gyroscope after the other.
+        Covariance of all coefficients, one gyroscope after the other.
     orders
         Highest power of the rate of each gyroscope.
     scatter
-        Standard deviation that was added to each dwell, of each gyroscope, output.
+        Standard deviation that was added to each dwell, for each gyroscope, output.
     cycle
         Relative standard deviation of scale factors from run to run of one axis; 0 where noise explains it.
     cycle_freedom
         Runs of one axis beyond the first, summed over the axes; None where `cycle` is 0.
     chi_square, freedom
-        Of the model with most powers, before anything was added.
+        Chi-square and degrees of freedom of the model with most powers, before any variance was added.
     """
 
     coefficients: list[Array]
@@ -155,7 +149,7 @@ class RateSolution:
 
 
 def design(problem: RateProblem, gyro: int, order: int) -> Array:
-    """Return the columns of gyroscope number `gyro`: slopes by face, powers of its own axis's rate, zeros of runs."""
+    """Return the design matrix of gyroscope number `gyro`: slopes by face, powers of the rate, zeros of the runs."""
     on_axis = problem.axis == problem.gyros[gyro]
     if problem.lean is None:
         columns = [np.where(problem.axis == face, problem.rate, 0.0) for face in problem.faces]
@@ -168,41 +162,45 @@ def design(problem: RateProblem, gyro: int, order: int) -> Array:
 
 
 def solve(problem: RateProblem, orders: Sequence[int]) -> RateSolution:
-    """Fit all gyroscopes together, each with powers of the rate up to its order."""
+    """Return the fit of all gyroscopes together, each with powers of the rate up to its order.
+
+    ``x = (A' C^-1 A)^-1 A' C^-1 M``, A the columns of `design` and C the covariance that the module describes.
+    """
     count = len(problem.gyros)
     rates = min(len(np.unique(np.round(problem.rate[problem.axis == face], 9))) for face in problem.faces)
     most = max(*orders, min(_MOST_POWERS, rates - 2))
     slopes = [
-        _weighted(design(problem, i, orders[i]), problem.mean[:, i], problem.variance[:, i]) for i in range(count)
+        _fit_weighted_slopes(design(problem, i, orders[i]), problem.mean[:, i], problem.variance[:, i])
+        for i in range(count)
     ]
     gains = [estimates[: len(problem.faces)] for estimates in slopes]
-    blocks = _shared_blocks(problem, gains)
+    blocks = _shared_covariance(problem, gains)
     variance = problem.variance + (EXACT * np.abs(problem.mean).max()) ** 2
     scatter, chi_square, freedom = np.zeros(count), 0.0, 0
     for i in range(count):
         columns = design(problem, i, most)
         base = np.diag(variance[:, i]) + blocks[i, i]
-        scatter[i], axis_chi_square = _scatter(columns, problem.mean[:, i], base)
+        scatter[i], axis_chi_square = _fit_scatter(columns, problem.mean[:, i], base)
         chi_square, freedom = chi_square + axis_chi_square, freedom + len(columns) - columns.shape[1]
     variance = variance + scatter**2
-    cycle, cycle_freedom = _cycles(problem, most, variance, gains)
+    cycle, cycle_freedom = _fit_run_scatter(problem, most, variance, gains)
     for i in range(count):
-        own_rate = np.where(problem.axis == problem.gyros[i], problem.rate * _own(problem, gains, i), 0.0)
+        own_rate = np.where(problem.axis == problem.gyros[i], problem.rate * _own_scale_factor(problem, gains, i), 0.0)
         same = problem.run[:, None] == problem.run
         of_run = cycle**2 if problem.scale_error is None else cycle**2 + problem.scale_error**2
         blocks[i, i] = blocks[i, i] + of_run * same * np.outer(own_rate, own_rate) + np.diag(variance[:, i])
         if problem.zero_error is not None:
             blocks[i, i] += same * np.outer(problem.zero_error[:, i], problem.zero_error[:, i])
     whole = np.block([[blocks[i, k] for k in range(count)] for i in range(count)])
-    columns = _diagonal([design(problem, i, orders[i]) for i in range(count)])
-    estimates, matrix, _ = _general(columns, problem.mean.T.ravel(), whole)
+    columns = _join_diagonally([design(problem, i, orders[i]) for i in range(count)])
+    estimates, matrix, _ = _fit_generalised(columns, problem.mean.T.ravel(), whole)
     ends = np.cumsum([0, *(design(problem, i, orders[i]).shape[1] for i in range(count))])
     coefficients = [estimates[a:b] for a, b in pairwise(ends)]
     return RateSolution(coefficients, matrix, tuple(orders), scatter, cycle, cycle_freedom, chi_square, freedom)
 
 
-def without_lean(problem: RateProblem, gains: Sequence[Array]) -> Array:
-    """Return the means of runs about a gyroscope's own axis without what their table's lean adds, shape (n, g)."""
+def subtract_lean(problem: RateProblem, gains: Sequence[Array]) -> Array:
+    """Return the mean outputs less what the lean of the table axis adds through misalignment, shape (n, g)."""
     if problem.lean is None:
         return problem.mean
     means = problem.mean.copy()
@@ -214,14 +212,18 @@ def without_lean(problem: RateProblem, gains: Sequence[Array]) -> Array:
     return means
 
 
-def _own(problem: RateProblem, gains: list[Array], gyro: int) -> float:
-    """Scale factor of a gyroscope, 0 where the table never turned about its axis."""
+def _own_scale_factor(problem: RateProblem, gains: list[Array], gyro: int) -> float:
+    """Return the scale factor of a gyroscope, 0 where the table never turned about its axis."""
     axis = problem.gyros[gyro]
     return float(gains[gyro][problem.faces.index(axis)]) if axis in problem.faces else 0.0
 
 
-def _shared_blocks(problem: RateProblem, gains: list[Array]) -> dict[tuple[int, int], Array]:
-    """Return what the means of two gyroscopes share: errors of single rates, and the Earth's level part."""
+def _shared_covariance(problem: RateProblem, gains: list[Array]) -> dict[tuple[int, int], Array]:
+    """Return the covariance of the means of each two gyroscopes by errors of single rates and by the Earth's rate.
+
+    Errors of a commanded rate are common to all its visits and all gyroscopes. The Earth's horizontal rate has a
+    variance of half its square about a random direction, as far as the turning of the table does not average it.
+    """
     face = np.array([problem.faces.index(axis) for axis in problem.axis.tolist()])
     alike = np.isclose(problem.table[:, None], problem.table, rtol=1e-9, atol=1e-9).astype(np.float64)
     alike *= np.outer(problem.rate_uncertainty, problem.rate_uncertainty)
@@ -236,14 +238,14 @@ def _shared_blocks(problem: RateProblem, gains: list[Array]) -> dict[tuple[int, 
     return blocks
 
 
-def _weighted(columns: Array, values: Array, variance: Array) -> Array:
+def _fit_weighted_slopes(columns: Array, values: Array, variance: Array) -> Array:
     weight = 1 / np.sqrt(variance + (EXACT * np.abs(values).max()) ** 2 + 1e-300)
     size = np.abs(columns).max(axis=0)
     scaled = np.linalg.lstsq(columns / size * weight[:, None], values * weight, rcond=None)[0]
     return np.asarray(scaled / size)
 
 
-def _general(columns: Array, values: Array, covariance: Array) -> tuple[Array, Array, float]:
+def _fit_generalised(columns: Array, values: Array, covariance: Array) -> tuple[Array, Array, float]:
     """Return coefficients, their covariance and chi-square of generalised least squares."""
     spread = np.sqrt(np.diag(covariance))
     lower = np.linalg.cholesky(covariance / np.outer(spread, spread))
@@ -256,18 +258,18 @@ def _general(columns: Array, values: Array, covariance: Array) -> tuple[Array, A
     return estimate / size, inverse @ inverse.T / np.outer(size, size), float(left @ left)
 
 
-def _scatter(columns: Array, values: Array, base: Array) -> tuple[float, float]:
+def _fit_scatter(columns: Array, values: Array, base: Array) -> tuple[float, float]:
     """Return the standard deviation to add to each dwell so that chi-square is as expected, and chi-square before."""
     freedom = len(columns) - columns.shape[1]
-    chi_square = _general(columns, values, base)[2]
+    chi_square = _fit_generalised(columns, values, base)[2]
     if freedom < 1 or chi_square_probability(chi_square, freedom) > DWELLS_SCATTER.level:
         return 0.0, chi_square
     high = float(np.diag(base).mean()) * chi_square
-    added = _root(lambda x: _general(columns, values, base + x * np.eye(len(base)))[2] - freedom, high)
+    added = _find_root(lambda x: _fit_generalised(columns, values, base + x * np.eye(len(base)))[2] - freedom, high)
     return float(np.sqrt(added)), chi_square
 
 
-def _root(excess: Callable[[float], float], high: float) -> float:
+def _find_root(excess: Callable[[float], float], high: float) -> float:
     """Return where a falling function is 0, between 0 and `high`."""
     low = 0.0
     for _ in range(_HALVINGS):
@@ -278,11 +280,14 @@ def _root(excess: Callable[[float], float], high: float) -> float:
     return high
 
 
-def _cycles(problem: RateProblem, order: int, variance: Array, gains: list[Array]) -> tuple[float, int | None]:
-    """Return by how much scale factors differ from run to run of one axis, relative, all gyroscopes pooled."""
-    groups, mean = [], without_lean(problem, gains)
+def _fit_run_scatter(problem: RateProblem, order: int, variance: Array, gains: list[Array]) -> tuple[float, int | None]:
+    """Return the relative standard deviation of scale factors over runs of one axis, and its degrees of freedom.
+
+    All gyroscopes are pooled; 0 and None where the noise explains the scatter (chi-square).
+    """
+    groups, mean = [], subtract_lean(problem, gains)
     for i, axis in enumerate(problem.gyros):
-        scale = _own(problem, gains, i)
+        scale = _own_scale_factor(problem, gains, i)
         by_run = []
         for run in sorted(set(problem.run[problem.axis == axis].tolist())):
             which = problem.run == run
@@ -293,7 +298,7 @@ def _cycles(problem: RateProblem, order: int, variance: Array, gains: list[Array
             )  # fmt: skip
             columns = design(part, 0, 1)
             if len(columns) > columns.shape[1]:
-                estimate, matrix, _ = _general(columns, part.mean[:, 0], np.diag(variance[which, i]))
+                estimate, matrix, _ = _fit_generalised(columns, part.mean[:, 0], np.diag(variance[which, i]))
                 by_run.append((estimate[0] / scale, matrix[0, 0] / scale**2))
         if len(by_run) > 1:
             groups.append(np.array(by_run))
@@ -312,10 +317,10 @@ def _cycles(problem: RateProblem, order: int, variance: Array, gains: list[Array
     if chi_square_probability(before, freedom) > RUNS_SCATTER.level:
         return 0.0, None
     high = max(float(group[:, 1].max()) for group in groups) * before
-    return float(np.sqrt(_root(lambda x: chi_square(x) - freedom, high))), freedom
+    return float(np.sqrt(_find_root(lambda x: chi_square(x) - freedom, high))), freedom
 
 
-def _diagonal(blocks: list[Array]) -> Array:
+def _join_diagonally(blocks: list[Array]) -> Array:
     rows, columns = (sum(block.shape[k] for block in blocks) for k in (0, 1))
     joined = np.zeros((rows, columns))
     a = b = 0
@@ -325,23 +330,23 @@ def _diagonal(blocks: list[Array]) -> Array:
     return joined
 
 
-# Which powers of the rate a gyroscope's output supports: by F-test, and by each rate predicted from the others.
+# The order that a gyroscope's dwells support: by F-test, and by each rate predicted from the others.
 
 
 HIGHEST = 5  # power of the rate, as in the C core
 
 
 def choose_orders(problem: RateProblem) -> tuple[int, ...]:
-    """Return the highest power of the rate of each gyroscope that its dwells support; 1 where none was turned about.
+    """Return the highest power of the rate of each gyroscope that its dwells support; 1 where its axis was not turned.
 
-    A higher order is taken if its gain is more than noise and the scatter of the rates explain (chi-square and F-test,
-    1 %), against the order chosen so far and that below it, and if it predicts each rate from the others better, by
-    more than the standard error of that comparison.
+    A higher order is taken if it lowers chi-square by more than noise and the scatter of the rates explain (chi-square
+    and F-test), against the order chosen so far and against the next lower one, and if it predicts each rate from the
+    others better by more than the standard error of that comparison.
     """
-    return tuple(_order_of(problem, i) for i in range(len(problem.gyros)))
+    return tuple(_choose_order(problem, i) for i in range(len(problem.gyros)))
 
 
-def _order_of(problem: RateProblem, gyro: int) -> int:
+def _choose_order(problem: RateProblem, gyro: int) -> int:
     on_axis = problem.axis == problem.gyros[gyro]
     if not on_axis.any():
         return 1
@@ -378,7 +383,7 @@ def _order_of(problem: RateProblem, gyro: int) -> int:
     costs = {p: max(cost(columns) - within, 0.0) for p, columns in models.items()}
     chosen, best = 1, predicted(models[1])
     for order in range(2, len(models) + 1):
-        if not all(_significant(costs, below, order, count) for below in {chosen, order - 1}):
+        if not all(_is_significant(costs, below, order, count) for below in {chosen, order - 1}):
             continue
         squares = predicted(models[order])
         gain = best - squares
@@ -387,56 +392,60 @@ def _order_of(problem: RateProblem, gyro: int) -> int:
     return chosen
 
 
-def _significant(costs: Mapping[int, float], below: int, order: int, count: int) -> bool:
+def _is_significant(costs: Mapping[int, float], below: int, order: int, count: int) -> bool:
     by_noise = chi_square_probability(costs[below] - costs[order], order - below)
     if chi_square_probability(costs[order], count - order - 1) > RATES_SCATTER_AS_NOISE.level:
         return by_noise < RATE_POWER.level
     return max(by_noise, f_test(costs[below], below + 1, costs[order], order + 1, count)) < RATE_POWER.level
 
 
-# What a straight line leaves of a gyroscope's output over the rate: nonlinearity, asymmetry and hysteresis.
+# The residual of a straight line over the rate: nonlinearity, asymmetry and hysteresis.
 
 
 _ONE_SIDED = 1.645  # standard uncertainties: 95 % of normal values lie below
-_SMALL = 1e-3  # of the largest rate: if smaller ones all show, the threshold is below them
+_SMALL = 1e-3  # of the largest rate: if all rates show and none is smaller, the threshold is not known
 _BY_PARTS = 15
-"""Degrees of freedom of what the parts of a sweep say of its delay: half of them, since frequencies differ."""
+"""Degrees of freedom of a delay by the batches of a sweep: half their number, since each has other frequencies."""
 _RATES, _POWERS = 7, 5
-"""Different rates that tell a kink from powers of the rate, such powers, and standard uncertainties of 1 in 1000."""
+"""Fewest different rates that distinguish a kink from powers of the rate, and these powers."""
 
 
 @dataclass(frozen=True)
 class Linearity:
-    """Of one gyroscope; fractions, with standard uncertainties.
+    """How far one gyroscope is from linear: fractions of the largest rate or scale factor, with uncertainties.
 
     Attributes
     ----------
     rate, residual, uncertainty
-        Of each dwell about its axis: rad/s, and what is left of the line, a fraction of the largest rate, shape (n,).
+        Rate of each dwell about its axis, rad/s, and the residual of the line with its standard uncertainty, a fraction
+        of the largest rate, shape (n,).
     direction
         1 where the rate was rising, -1 where it was falling, 0 at turning points, shape (n,).
-    nonlinearity, hysteresis
-        Largest of several, and the standard uncertainty of that one; the largest itself is never 0, nor normal.
+    nonlinearity
+        Largest residual of a rate in absolute value, and the standard uncertainty of that residual. A maximum of
+        absolute values is never 0, nor normal.
+    hysteresis
+        Largest difference of rising less falling at one rate, and the standard uncertainty of that difference.
     asymmetry
-        Value and standard uncertainty.
+        Slope of positive less slope of negative rates, ``(S+ - S-) / S``, and its standard uncertainty.
     probability
-        That noise alone leaves as much of the line.
+        Probability that noise alone leaves such residuals of the line.
     by_noise
-        What the largest residual stays below with 95 % by noise alone.
+        Limit that the largest residual stays below with 95 % by noise alone.
     loop
         Probability that noise alone makes the loop between rising and falling rates; None where no rate was visited
         both ways.
     fitted_loop
-        Rising less falling at rate 0 by all rates, the loop as ``1 - (w/w_max)^2``, and its standard uncertainty.
+        Rising less falling at rate 0, of the loop ``1 - (w/w_max)^2`` fitted to all rates, and its uncertainty.
     repeatability
-        Standard deviation of the scale factor over runs, and what noise makes of it; None with one run.
+        Standard deviation of the scale factor over runs, and that which noise makes; None with one run.
     threshold
-        Least rate that shows, and its standard uncertainty by the rates below it, rad/s; None without small rates.
+        Least rate that shows in the output, and its standard uncertainty, rad/s; None without small rates.
     by_polynomial
-        Largest residual of the powers of the rate that were taken.
+        Largest residual of a rate beside the powers of the rate that were chosen.
     kink
-        By how much the slopes of positive and negative rates differ beside five powers of the rate, where noise alone
-        does that less than once in a thousand tests; else None.
+        Difference of the slopes of positive and negative rates beside five powers of the rate, where noise alone makes
+        it in less than one test of a thousand; else None.
     """
 
     rate: Array
@@ -456,8 +465,12 @@ class Linearity:
     kink: float | None
 
 
-def linearity_of(problem: RateProblem, gyro: int, scale: float, order: int) -> Linearity:
-    """Return what a line, and powers up to `order`, leave of gyroscope number `gyro` over the rates about its axis."""
+def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int) -> Linearity:
+    """Return nonlinearity, asymmetry, hysteresis and threshold of gyroscope number `gyro`, and the residuals behind.
+
+    ``r = M / S - w - zero of the run``, by weighted least squares of a line over the rates about its axis. Nonlinearity
+    is the largest absolute mean of r at one rate over the largest rate; its uncertainty is that of this mean.
+    """
     on_axis = problem.axis == problem.gyros[gyro]
     rate, runs = problem.rate[on_axis], problem.run[on_axis]
     values = problem.mean[on_axis, gyro] / scale
@@ -466,7 +479,7 @@ def linearity_of(problem: RateProblem, gyro: int, scale: float, order: int) -> L
     of_rate = problem.rate_uncertainty[on_axis] ** 2
     zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
     largest = max(float(np.abs(rate).max()), 0.0 if problem.reach is None else float(problem.reach[on_axis].max()))
-    left, _ = _fitted(np.column_stack([rate, zeros]), values, variance)
+    left, _ = _fit_weighted(np.column_stack([rate, zeros]), values, variance)
     means = np.array(
         [
             [left[key == k].mean(), variance[key == k].sum() / (key == k).sum() ** 2 + of_rate[key == k].mean()]
@@ -484,12 +497,12 @@ def linearity_of(problem: RateProblem, gyro: int, scale: float, order: int) -> L
         if problem.branch is None
         else problem.branch[on_axis] * problem.sign[on_axis]
     )
-    direction = np.where(branch != 0, branch, _directions(rate, runs))
+    direction = np.where(branch != 0, branch, _find_directions(rate, runs))
     powers = np.column_stack([*(rate**power for power in range(1, order + 1)), zeros])
-    rest = _fitted(powers, values, variance)[0]
-    beyond = _beyond_noise(key, direction, zeros, values, variance)
+    rest = _fit_weighted(powers, values, variance)[0]
+    beyond = _test_visits(key, direction, zeros, values, variance)
     error = np.zeros(len(rate)) if problem.loop_error is None else problem.loop_error[on_axis]
-    loop, fitted_loop, hysteresis = _hysteresis(
+    loop, fitted_loop, hysteresis = _fit_hysteresis(
         left / largest, variance / largest**2, key, runs, direction, rate / largest, error, beyond
     )
     return Linearity(
@@ -498,21 +511,21 @@ def linearity_of(problem: RateProblem, gyro: int, scale: float, order: int) -> L
         uncertainty=np.sqrt(variance) / largest,
         direction=direction,
         nonlinearity=(float(abs(means[worst, 0])) / largest, float(spread[worst]) / largest),
-        asymmetry=_asymmetry(rate, values, variance, zeros, direction, of_rate),
+        asymmetry=_fit_asymmetry(rate, values, variance, zeros, direction, of_rate),
         hysteresis=hysteresis,
         probability=probability,
         by_noise=reach * float(spread.max()) / largest,
         loop=loop,
         fitted_loop=fitted_loop,
-        repeatability=_repeatability(rate, values, variance, runs),
-        threshold=_threshold(rate, problem.table[on_axis], left, variance, key),
+        repeatability=_measure_repeatability(rate, values, variance, runs),
+        threshold=_find_threshold(rate, problem.table[on_axis], left, variance, key),
         by_polynomial=max(abs(float(rest[key == k].mean())) for k in np.unique(key)) / largest,
-        kink=_kink(rate / largest, values / largest, (variance + of_rate) / largest**2, zeros, len(means)),
+        kink=_fit_kink(rate / largest, values / largest, (variance + of_rate) / largest**2, zeros, len(means)),
     )
 
 
-def _fitted(columns: Array, values: Array, variance: Array) -> tuple[Array, Array]:
-    """Return what is left of a weighted fit, and its coefficients with their covariance, shape (p, p + 1)."""
+def _fit_weighted(columns: Array, values: Array, variance: Array) -> tuple[Array, Array]:
+    """Return the residual of a weighted fit, and its coefficients with their covariance, shape (p, p + 1)."""
     weight, size = 1 / np.sqrt(variance), np.abs(columns).max(axis=0)
     scaled = columns / size * weight[:, None]
     inverse = np.linalg.pinv(scaled)
@@ -520,7 +533,7 @@ def _fitted(columns: Array, values: Array, variance: Array) -> tuple[Array, Arra
     return values - columns @ coefficients, np.column_stack([coefficients, inverse @ inverse.T / np.outer(size, size)])
 
 
-def _directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
+def _find_directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return whether the rate rose (1) or fell (-1) into and out of each dwell, 0 elsewhere."""
     directions = np.zeros(len(rate), dtype=np.int64)
     for run in np.unique(runs):
@@ -531,7 +544,7 @@ def _directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
     return directions
 
 
-def _asymmetry(
+def _fit_asymmetry(
     rate: Array, values: Array, variance: Array, zeros: Array, direction: NDArray[np.int64], of_rate: Array
 ) -> tuple[float, float] | None:
     """Return (S+ - S-)/S by two slopes and one zero, beside the loop of hysteresis; None for rates of one sign."""
@@ -542,31 +555,31 @@ def _asymmetry(
     came = np.where(first, 0.0, np.sign(np.round(np.diff(rate, prepend=0.0), 6)))
     if direction.any():  # the branch of a loop that the first dwell of a run is on is not known
         columns += [came * (1 - (rate / np.abs(rate).max()) ** 2), first.astype(np.float64)]
-    fitted = _fitted(np.column_stack(columns), values, variance + of_rate)[1]
+    fitted = _fit_weighted(np.column_stack(columns), values, variance + of_rate)[1]
     u = np.sqrt(max(fitted[0, 1] + fitted[1, 2] - 2 * fitted[0, 2], 0.0))
     return float(fitted[0, 0] - fitted[1, 0]), float(u)
 
 
-def _kink(rate: Array, values: Array, variance: Array, zeros: Array, count: int) -> float | None:
+def _fit_kink(rate: Array, values: Array, variance: Array, zeros: Array, count: int) -> float | None:
     """Return the difference of slopes beside powers of the rate, all over the largest, where it is significant."""
     if count < _RATES:
         return None
     powers = range(1, min(_POWERS, count - 3) + 1)
     columns = np.column_stack([np.abs(rate), *(rate**power for power in powers), zeros])
-    left, fitted = _fitted(columns, values, variance)
+    left, fitted = _fit_weighted(columns, values, variance)
     freedom = len(values) - np.linalg.matrix_rank(columns)
     beyond = max(float(np.sum(left**2 / variance)) / freedom, 1.0) if freedom > 0 else 1.0
     return 2 * float(fitted[0, 0]) if abs(fitted[0, 0]) > SLOPES_KINK.limit * np.sqrt(fitted[0, 1] * beyond) else None
 
 
-def _beyond_noise(
+def _test_visits(
     key: NDArray[Any], direction: NDArray[np.int64], zeros: Array, values: Array, variance: Array
 ) -> tuple[float, int] | None:
-    """Return chi-square and degrees of freedom of visits of one rate from one side, where they scatter beyond noise."""
+    """Return chi-square and degrees of freedom of visits of one rate from one side; None where noise explains them."""
     cells = np.unique(3 * key + direction, return_inverse=True)[1]
     columns = np.column_stack([cells[:, None] == np.arange(cells.max() + 1), zeros]).astype(np.float64)
     freedom = len(values) - int(np.linalg.matrix_rank(columns))
-    chi_square = float(np.sum(_fitted(columns, values, variance)[0] ** 2 / variance))
+    chi_square = float(np.sum(_fit_weighted(columns, values, variance)[0] ** 2 / variance))
     return (
         (chi_square, freedom)
         if freedom and chi_square_probability(chi_square, freedom) < HYSTERESIS_SCATTERS.level
@@ -574,7 +587,7 @@ def _beyond_noise(
     )
 
 
-def _hysteresis(
+def _fit_hysteresis(
     left: Array,
     variance: Array,
     key: NDArray[Any],
@@ -584,9 +597,10 @@ def _hysteresis(
     error: Array,
     beyond: tuple[float, int] | None,
 ) -> tuple[float | None, tuple[float, float] | None, tuple[float, float] | None]:
-    """Return the probability of a loop by noise, that loop, and the largest rising less falling, over the largest rate.
+    """Return `Linearity.loop`, `fitted_loop` and `hysteresis`, all over the largest rate.
 
-    `error` is what not knowing the delay of a sweep adds to a loop at rate 0, infinite where it tells no loop.
+    The loop ``h (1 - (w/w_max)^2)`` is fitted to rising less falling at each rate by weighted least squares. `error` is
+    the standard uncertainty of h by the delay of a sweep, infinite where the two cannot be distinguished.
     """
     rows = []
     for k in np.unique(key):
@@ -622,26 +636,29 @@ def _hysteresis(
     return max(chances), (slope, float(np.sqrt(max(wide) / spread + table[:, 3].max()))), size
 
 
-def _repeatability(rate: Array, values: Array, variance: Array, runs: NDArray[np.int64]) -> tuple[float, float] | None:
+def _measure_repeatability(
+    rate: Array, values: Array, variance: Array, runs: NDArray[np.int64]
+) -> tuple[float, float] | None:
     """Return the standard deviation of the scale factor over runs, relative, and that which noise makes."""
     rows = []
     for run in np.unique(runs):
         which = runs == run
-        if which.sum() > 2:
+        if which.sum() > 2:  # a line through two dwells leaves no scatter
             columns = np.column_stack([rate[which], np.ones(int(which.sum()))])
-            rows.append(_fitted(columns, values[which], variance[which])[1][0, :2])
+            rows.append(_fit_weighted(columns, values[which], variance[which])[1][0, :2])
     if len(rows) < 2:
         return None
     table = np.array(rows)
     return float(table[:, 0].std(ddof=1)), float(np.sqrt(table[:, 1].mean()))
 
 
-def _threshold(
+def _find_threshold(
     rate: Array, table: Array, left: Array, variance: Array, key: NDArray[Any]
 ) -> tuple[float, float] | None:
-    """Return the least rate from which on the output exceeds half of what the line says, by 95 %, and its uncertainty.
+    """Return the least rate from which on the output exceeds half of the line with 95 %, and its uncertainty, rad/s.
 
-    None where no rate of the table is below a thousandth of the largest and all of them show.
+    The true threshold lies between this rate and the next lower one: their distance over sqrt(12). None where no rate
+    of the table is below a thousandth of the largest and all of them show.
     """
     zero = 1 / float(np.sum(1 / variance))
     rows = []
@@ -660,26 +677,26 @@ def _threshold(
     return float(sizes[first]), float(sizes[first] - below) / np.sqrt(12)
 
 
-# How scale factors follow the temperature, where a column of it spans enough and does not merely follow time.
+# Scale factors over temperature, where the recordings span enough of it and it does not merely follow time.
 
 
-_SPAN = 5.0  # K
+_SPAN = 5.0  # K, the least range of temperature from which a slope is stated
 _FOLLOWS = 0.9
-"""Share of the temperature's variance that a line over time explains, beyond which the two cannot be told apart."""
+"""Share of the temperature's variance that a line over time explains, from which the two cannot be distinguished."""
 
 
 def temperature_slopes(
     recordings: Sequence[Recording], dwells: Sequence[Dwells], problem: RateProblem, solution: RateSolution
 ) -> dict[str, Parameter]:
-    """Return ``gyro_scale_factor_slope_i``, 1/K, of each gyroscope whose runs tell it from a drift over time.
+    """Return ``gyro_scale_factor_slope_i``, 1/K, of each gyroscope whose runs distinguish it from a drift over time.
 
     It is c of ``mean output = S (1 + c dT) w + d dT + ...``, w the rate, dT the temperature less its mean, and the dots
     the columns of `design`; by least squares over the dwells, weighted by their noise.
     """
-    temperature = _temperatures(recordings, dwells)
+    temperature = _mean_temperatures(recordings, dwells)
     if temperature is None:
         return {}
-    means = without_lean(problem, [row[: len(problem.faces)] for row in solution.coefficients])
+    means = subtract_lean(problem, [row[: len(problem.faces)] for row in solution.coefficients])
     time = np.arange(len(temperature), dtype=np.float64)  # of dwells in order: runs have clocks of their own
     slopes = {}
     for i, axis in enumerate(problem.gyros):
@@ -687,7 +704,7 @@ def temperature_slopes(
         if (
             not on_axis.any()
             or np.ptp(temperature[on_axis]) < _SPAN
-            or _explained(temperature[on_axis], time[on_axis]) > _FOLLOWS
+            or _share_explained(temperature[on_axis], time[on_axis]) > _FOLLOWS
         ):
             continue
         warmer = temperature[on_axis] - temperature[on_axis].mean()
@@ -710,7 +727,7 @@ def temperature_slopes(
     return slopes
 
 
-def _temperatures(recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> Array | None:
+def _mean_temperatures(recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> Array | None:
     """Return the mean temperature of each dwell, degC; None where a recording has no column of it."""
     temperatures = []
     for recording, run_dwells in zip(recordings, dwells, strict=True):
@@ -722,19 +739,19 @@ def _temperatures(recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> 
     return np.array(temperatures) if np.isfinite(temperatures).all() else None
 
 
-def _explained(values: Array, time: Array) -> float:
+def _share_explained(values: Array, time: Array) -> float:
     return float(np.corrcoef(values, time)[0, 1] ** 2)
 
 
 # From the coefficients of a rate test to bias, scale factor, misalignment, powers of the rate and g-sensitivity.
 
 
-_APART = 0.3  # singular value of ones and gravity on the faces: below it bias and g-sensitivity are not told apart
+_APART = 0.3  # singular value of ones and gravity on the faces: below it bias and g-sensitivity are one
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """A parameter: its derivative by all coefficients, what the table's common error does to it, and the mounting's."""
+    """A parameter, its derivative by all coefficients, and by the common error of the table and of the mounting."""
 
     name: str
     unit: str
@@ -744,14 +761,14 @@ class _Entry:
     mounted: float = 0.0
 
 
-def _entries(problem: RateProblem, solution: RateSolution, i: int, unit: str) -> list[_Entry]:
-    """Return the parameters of gyroscope number `i`: quotients of its coefficients by its scale factor."""
+def _derive_parameters(problem: RateProblem, solution: RateSolution, i: int, unit: str) -> list[_Entry]:
+    """Return the parameters of gyroscope number `i`: its coefficients over its scale factor, and that itself."""
     faces, size, coefficients, order = problem.faces, len(problem.faces), solution.coefficients[i], solution.orders[i]
     axis, first = AXES[problem.gyros[i]], sum(map(len, solution.coefficients[:i]))
     on_axis, count = faces.index(problem.gyros[i]), sum(map(len, solution.coefficients))
     scale = float(coefficients[on_axis])
     unity = np.eye(len(coefficients))
-    zeros = [np.concatenate([np.zeros(size + order - 1), row]) for row in _of_zeros(problem)[0]]
+    zeros = [np.concatenate([np.zeros(size + order - 1), row]) for row in _weigh_zeros(problem)[0]]
 
     def spread(part: Array) -> Array:
         return np.concatenate([np.zeros(first), part, np.zeros(count - first - len(part))])
@@ -784,10 +801,13 @@ def model_parameters(
 ) -> tuple[list[str], Array, Array, list[str], dict[str, float]]:
     """Return names, values, covariance and units of bias, scale factor, misalignment and powers of the rate.
 
-    And the degrees of freedom of those whose uncertainty few faces show.
+    ``S = B_ii``, ``T_ij = B_ij / S``, ``b = zero / S``, ``k_p = c_p / S`` of the coefficients of `solve`, with the
+    covariance ``J C J'``, J the derivatives of these. To it are added what the table states for all rates, the mounting
+    of each face, and the scatter of zeros between faces. Last come the degrees of freedom of parameters whose
+    uncertainty rests on that scatter.
     """
     measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
-    entries = [entry for i in measured for entry in _entries(problem, solution, i, unit)]
+    entries = [entry for i in measured for entry in _derive_parameters(problem, solution, i, unit)]
     entries.sort(key=lambda entry: _ORDER.index(entry.name.rpartition("_")[0]))
     jacobian = np.array([entry.line for entry in entries])
     shared = np.array([entry.common for entry in entries]) * (test.relative_uncertainty or 0.0)
@@ -797,7 +817,7 @@ def model_parameters(
     few: dict[str, tuple[float, float]] = {}
     for i in measured:
         axis = AXES[problem.gyros[i]]
-        added, freedom = _between_faces(problem, solution, problem.gyros[i])
+        added, freedom = _variance_between_faces(problem, solution, problem.gyros[i])
         of_zeros = [f"gyro_bias_{axis}", *(f"gyro_g_sensitivity_{axis}{b}" for b in AXES)]
         for name, value in zip(of_zeros, added.tolist(), strict=False):
             added_variance[names.index(name)] = value
@@ -807,17 +827,17 @@ def model_parameters(
         jacobian @ solution.covariance @ jacobian.T + np.outer(shared, shared) + np.diag(added_variance)
     )
     if axes is not None:
-        matrix += _by_axes(problem, entries, axes)
+        matrix += _covariance_by_axes(problem, entries, axes)
     values = np.array([entry.value for entry in entries])
-    # Welch and Satterthwaite: the share that few faces show has few degrees of freedom
+    # Welch and Satterthwaite: of the variance only the part between faces has few degrees of freedom
     variance = dict(zip(names, np.diag(matrix).tolist(), strict=True))
     freedoms = {name: nu * (variance[name] / added) ** 2 for name, (added, nu) in few.items()}
     return names, values, matrix, [entry.unit for entry in entries], freedoms
 
 
-def _by_axes(problem: RateProblem, entries: Sequence[_Entry], axes: TableAxes) -> Array:
-    """Return the covariance that the table axes' own makes: ``dT = -T dA A^-1``, columns of A the axes of the faces."""
-    groups = _faces_of_runs(problem)
+def _covariance_by_axes(problem: RateProblem, entries: Sequence[_Entry], axes: TableAxes) -> Array:
+    """Return the parameters' covariance by that of the table axes: ``dT = -T dA A^-1``, columns of A these axes."""
+    groups = _group_runs_by_face(problem)
     sides = {axis: sum(1 for other, _ in groups if other == axis) for axis, _ in groups}
 
     def faces(directions: Array) -> Array:
@@ -860,8 +880,8 @@ _ORDER = ["gyro_bias", "gyro_scale_factor", "gyro_misalignment", *(f"gyro_k{powe
           "gyro_g_sensitivity"]  # fmt: skip
 
 
-def _faces_of_runs(problem: RateProblem) -> dict[tuple[int, int], list[int]]:
-    """Return the runs of each face: body axis along the table's, and which way it points."""
+def _group_runs_by_face(problem: RateProblem) -> dict[tuple[int, int], list[int]]:
+    """Return the runs of each face; a face is the body axis along the table's and its sign."""
     by_face: dict[tuple[int, int], list[int]] = {}
     for run in range(problem.runs):
         first = int(np.argmax(problem.run == run))
@@ -869,12 +889,13 @@ def _faces_of_runs(problem: RateProblem) -> dict[tuple[int, int], list[int]]:
     return by_face
 
 
-def _of_zeros(problem: RateProblem) -> tuple[Array, float]:
-    """Return the weights of the runs' zeros in the bias and, where the faces tell them apart, in G, and the freedom.
+def _weigh_zeros(problem: RateProblem) -> tuple[Array, float]:
+    """Return the weights of the runs' zeros in the bias and the g-sensitivity G, and the degrees of freedom.
 
-    Every face counts alike, and its runs alike; shape (4, runs), or (1, runs) where the bias holds the mean of G f.
+    ``zero = b + G f`` by least squares over faces, f the specific force; every face counts alike, and its runs alike.
+    Shape (4, runs), or (1, runs) where the faces cannot distinguish them, and the bias contains the mean of G f.
     """
-    groups = list(_faces_of_runs(problem).values())
+    groups = list(_group_runs_by_face(problem).values())
     first = [int(np.argmax(problem.run == runs[0])) for runs in groups]
     force = np.array(
         [STANDARD_GRAVITY * problem.sign[at] * np.eye(3)[problem.axis[at]] for at in first]
@@ -896,17 +917,18 @@ def _of_zeros(problem: RateProblem) -> tuple[Array, float]:
 
 
 def g_sensitivity(problem: RateProblem, solution: RateSolution) -> Array | None:
-    """Return S G of each gyroscope, output per m/s^2, shape (g, 3); None where the faces do not tell it from b."""
-    weights, _ = _of_zeros(problem)
+    """Return S G of each gyroscope, output per m/s^2, shape (g, 3); None where the faces do not show it beside b."""
+    weights, _ = _weigh_zeros(problem)
     if len(weights) < 4:
         return None
     return np.array([weights[1:] @ row[len(row) - problem.runs :] for row in solution.coefficients])
 
 
-def _between_faces(problem: RateProblem, solution: RateSolution, axis: int) -> tuple[Array, float]:
-    """Return what faces scatter beyond noise adds to the variances of b and G of a gyroscope, and its freedom.
+def _variance_between_faces(problem: RateProblem, solution: RateSolution, axis: int) -> tuple[Array, float]:
+    """Return the variances of b and G of a gyroscope by the scatter of faces beyond noise, and degrees of freedom.
 
-    (rad/s)^2 .., shape (k,): the expected share of the noise is taken off, so that it does not count twice.
+    Shape (1,) or (4,), (rad/s)^2 for b. The noise's expected share of the scatter is subtracted, so that noise does not
+    count twice.
     """
     i = problem.gyros.index(axis)
     coefficients, first = solution.coefficients[i], sum(map(len, solution.coefficients[:i]))
@@ -915,8 +937,8 @@ def _between_faces(problem: RateProblem, solution: RateSolution, axis: int) -> t
     noise = (
         solution.covariance[first + at : first + len(coefficients), first + at : first + len(coefficients)] / scale**2
     )
-    weights, freedom = _of_zeros(problem)
-    groups = list(_faces_of_runs(problem).values())
+    weights, freedom = _weigh_zeros(problem)
+    groups = list(_group_runs_by_face(problem).values())
     if freedom < 1:
         return np.zeros(len(weights)), 0
     mean = np.zeros((len(groups), problem.runs))

@@ -1,14 +1,16 @@
-"""Whole turns by hand against a fence.
+"""Scale factors and misalignments of gyroscopes from whole turns by hand, with a rest against a fence between them.
 
-The rests between them, the scale factors of gyroscopes, their axes, what spoils a turn, and the record.
+Scale factor (`_fit_scale`): between two rests at the fence the unit turned n times, so that the angle stated by the
+gyroscopes, integrated over the turn, is ``2 pi n S``. Each stop is off the fence by its own error, which the turns
+before and after share with opposite signs: ``u(S)/S = u_stop / (2 pi sqrt(sum (j_k - mean j)^2))``, j_k the turns made
+at stop k.
 
-Of turn k about the vertical, n_k times round, the gyroscopes' integrals are ``2 pi n_k B a_k``, ``B = diag(S) T``, with
-a_k the axis in the body: the mean of f, weighted by the rate, of ``f = g a + c cos + s sin + w^2 r + w' q``, in which
-the lever arm and the tilt of the table come apart from it. Source: rotation about a fixed axis; least squares.
+Misalignment (`add_misalignments`): the integrals of turn k about the vertical, n_k times round, are
+``2 pi n_k B a_k``, ``B = diag(S) T``, with a_k the vertical in the body. That is the direction of g a in
+``f = g a + c cos + s sin + w^2 r + w' q``, fitted to the accelerometers over the turn; the other terms hold the tilt of
+the table and the lever arm.
 
-Between two rests at the fence the unit went through a whole number of turns n, so that the turns which the gyroscopes
-state, composed, miss by ``2 pi n dS/S``. Each stop lies at the fence but for its own error, and belongs to the turn
-before and to that after: ``u(S)/S = u_stop / (2 pi sqrt(sum (j_k - mean j)^2))``, j_k the turns made at stop k.
+Source: rotation about a fixed axis; least squares; Bortz, IEEE Trans. AES-7 (1971) 61.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated, Any, Unpack
+from typing import Annotated, Unpack
 
 import numpy as np
 
@@ -25,51 +27,37 @@ from imulab.errors import DataError, ObservabilityError, OptionError, RecordErro
 from imulab.estimation.decisions import SCALE_OFF_UNIT, TURNS_ACROSS_SCATTER, TURNS_SCATTER
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
 from imulab.options import measure, text
-from imulab.procedures.rate import AXES, FENCE, gyros_of, part_of_one
+from imulab.procedures.rate import AXES, FENCE, name_gyroscopes, parse_fraction
 from imulab.procedures.rate.axes import (
     BY_ACCELEROMETERS,
-    corrected_means,
-    length_said,
+    correct_means,
     length_uncertainty,
-    moved_by_parameters,
-    other_unit_said,
+    parameter_sensitivity,
     prior_at,
     unit_vectors,
+    warn_force_length,
+    warn_other_unit,
     with_accelerometers,
     with_prior,
 )
-from imulab.procedures.rate.schema import TurnsEvidence, TurnsModel, TurnsSummary, WholeTurns, prior_table, turns_of
+from imulab.procedures.rate.schema import TurnsEvidence, TurnsModel, TurnsSummary, WholeTurns
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.quantities import in_si
 from imulab.recording import Array, Data, Reading, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Quantity, entries
-from imulab.report.parameters import parameters_table, rows_of
-from imulab.report.traces import (
-    BAD,
-    GOOD,
-    INK,
-    LEGEND,
-    Exhibits,
-    Figure,
-    ReportTable,
-    figure_axis,
-    plain_number,
-    rounded,
-    scatter,
-)
 from imulab.units import from_si, parse_unit, to_si
 
-# What spoils a turn by hand unseen: stamps that come in bursts, gaps in the turning, and an output at its end.
+# Defects of a recording: time stamps in bursts, gaps within a turn, and saturated outputs.
 
 
-_QUICK, _SHARE_IN_BURSTS = 0.25, 0.25  # of the mean step; share of such steps from which stamps come in bursts
-_KEEPS = 0.1  # s
+_QUICK, _SHARE_IN_BURSTS = 0.25, 0.25  # of the mean step; share of such short steps from which stamps come in bursts
+_KEEPS = 0.1  # s by which such stamps are off a straight line at most
 _GAP = 3.0  # usual steps: within a longer one motion may be hidden
 _SHAKE = (2 * np.pi * 2.0) ** 2 / 12
-"""Of a rate that a hand varies at 2 Hz, what a straight line across a gap leaves: times the rate and the gap cubed."""
-_STILL_SAMPLES = 10  # samples in a row that repeat exactly: a sensor that hangs
-_QUIET = 0.5  # share of repeats from which repeating is usual for the output
+"""Angle error across a gap, over rate and gap cubed: a straight line in place of a rate that a hand varies at 2 Hz."""
+_STILL_SAMPLES = 10  # equal samples in a row from which an output stands still
+_QUIET = 0.5  # share of equal neighbours at rest from which this is usual for the output
 
 
 def even_stamps(time: Array, name: str) -> tuple[Array, list[str]]:
@@ -94,7 +82,7 @@ def even_stamps(time: Array, name: str) -> tuple[Array, list[str]]:
 
 
 def check_motions(time: Array, rate: Array, rests: list[tuple[int, int]], fence: float, name: str) -> None:
-    """Refuse a gap inside a turn that may hide more than the fence, and an output that stands still at its end.
+    """Refuse a gap inside a turn that may hide more motion than the fence, and an output that is saturated.
 
     Raises
     ------
@@ -126,15 +114,16 @@ def check_motions(time: Array, rate: Array, rests: list[tuple[int, int]], fence:
                 )
 
 
-# Rests of a recording of turns by hand, and how far the unit turned between them.
+# Rests, and how far the unit turned between them.
 
 
 _BLOCK = 0.1  # s
-_LEAST, _TRIM = 6, 1  # blocks of a rest; blocks that are cut off at both its ends
-# Times the quiet scatter; of the largest rate; sigma of a block's mean; and what lies off the middle of a rest by so
-# many medians, over up to 10 blocks, is no rest
-_STILL, _OF_LARGEST, _NOISE, _OUT, _OUT_WIDE, _WIDEST = 5.0, 0.02, 4.0, 3.0, 2.0, 10
-_TURNED = np.radians(15)
+_LEAST, _TRIM = 6, 1  # fewest blocks of a rest; blocks that are cut off at both its ends
+_STILL, _OF_LARGEST, _NOISE = 5.0, 0.02, 4.0
+"""A block is at rest if its scatter is below so many quiet ones, and its mean below this share of the largest rate or
+so many sigma of a quiet mean."""
+_OUT, _OUT_WIDE, _WIDEST = 3.0, 2.0, 10
+"""Ends of a rest are cut off whose mean is off by so many medians: over one block, and over several, up to 10."""
 
 
 @dataclass(frozen=True)
@@ -146,13 +135,13 @@ class AxisTurns:
     count, angle
         Turns made, signed, and the angle that the gyroscope states, rad, shape (k,).
     residual, uncertainty
-        What is left of each angle by the scale factor found, and its standard uncertainty, rad, shape (k,).
+        Residual of each angle under the scale factor, and its standard uncertainty, rad, shape (k,).
     scale, scale_uncertainty
-        Stated over true angle.
+        Stated over true angle, and its standard uncertainty.
     freedom
         Turns less one where they scatter beyond the fence, and that scatter is in the uncertainty; else None.
     motion
-        Number of each turn among the motions, shape (k,).
+        Index of each turn among the motions, shape (k,).
     """
 
     count: Array
@@ -167,30 +156,30 @@ class AxisTurns:
 
 @dataclass(frozen=True)
 class Motions:
-    """What happened between rests, m of them.
+    """The m motions between rests.
 
     Attributes
     ----------
     start, stop
         End of the rest before and start of the rest after, s, shape (m,).
     angle
-        Net turn by the gyroscopes as they state it, whole turns included, about each body axis, rad, shape (m, 3).
+        Integral of each gyroscope's output over the motion, whole turns included, rad, shape (m, 3).
     closing
         Rotation vector from the attitude before to that after, rad, shape (m, 3).
     zero
-        Standard uncertainty of the angle by that of the zero between both rests, rad, shape (m, 3).
+        Standard uncertainty of the angle by that of the zero at both rests, rad, shape (m, 3).
     before, after
         Mean specific force at the rests, m/s^2, shape (m, 3); None without accelerometers.
     steps
-        Turns of each sample of a motion, rad, one array of shape (n, 3) each.
+        For each motion the small turns from sample to sample, rad, shape (n, 3).
     span
         First and last sample of each motion.
     period
         Usual time between two samples, s.
-    bias
-        Mean output at rest, rad/s, shape (3,), and its standard uncertainty.
+    bias, bias_uncertainty
+        Mean output at rest and its standard uncertainty, rad/s, shape (3,).
     notes
-        What was done to the recording.
+        Notes on changes to the recording, such as evened time stamps.
     """
 
     start: Array
@@ -209,7 +198,7 @@ class Motions:
 
 
 def find_motions(recording: Recording, fence: float) -> Motions:
-    """Find rests, and what the gyroscopes say of the motion between each two.
+    """Return the motions between the rests of a recording.
 
     Raises
     ------
@@ -226,7 +215,7 @@ def find_motions(recording: Recording, fence: float) -> Motions:
         raise DataError(f"{recording.name}: gyroscopes in {unit}; turns are counted in a unit of rate, such as deg/s")
     rate = to_si(recording.triad("gyro"), unit)
     force = to_si(recording.triad("accel"), recording.triad_unit("accel")) if "accel_x" in recording else None
-    rests = _rests(time, rate)
+    rests = _find_rests(time, rate)
     if len(rests) < 2:
         raise SegmentError(
             f"{recording.name}: {len(rests)} rests of 0.5 s found, expected one before and one after each turn: lay "
@@ -234,7 +223,7 @@ def find_motions(recording: Recording, fence: float) -> Motions:
         )
     check_motions(time, rate, rests, fence, recording.name)
     zero = np.array([rate[a:b].mean(axis=0) for a, b in rests])
-    spread = np.array([_of_mean(rate[a:b]) for a, b in rests])
+    spread = np.array([_uncertainty_of_mean(rate[a:b]) for a, b in rests])
     middle = np.array([(time[a] + time[b - 1]) / 2 for a, b in rests])
     rows = []
     for k in range(len(rests) - 1):
@@ -249,7 +238,7 @@ def find_motions(recording: Recording, fence: float) -> Motions:
         start=np.array([row[0] for row in rows]),
         stop=np.array([row[1] for row in rows]),
         angle=np.array([row[2].sum(axis=0) for row in rows]),
-        closing=np.array([rotation_vector(composed(row[2])) for row in rows]),
+        closing=np.array([rotation_vector(compose_turns(row[2])) for row in rows]),
         zero=np.array([row[3] for row in rows]),
         before=None if means is None else means[:-1],
         after=None if means is None else means[1:],
@@ -262,7 +251,7 @@ def find_motions(recording: Recording, fence: float) -> Motions:
     )
 
 
-def _rests(time: Array, rate: Array) -> list[tuple[int, int]]:
+def _find_rests(time: Array, rate: Array) -> list[tuple[int, int]]:
     """Return first sample and end of each stretch in which the gyroscopes are still."""
     size = max(2, round(_BLOCK / float(np.median(np.diff(time)))))
     count = len(rate) // size
@@ -276,12 +265,12 @@ def _rests(time: Array, rate: Array) -> list[tuple[int, int]]:
     off = np.linalg.norm(means - zero, axis=1)
     still = calm & (off < max(_OF_LARGEST * float(off.max()), _NOISE * np.sqrt(quiet / size)))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
-    steady = [_steady(means, a, b) for a, b in edges.tolist() if b - a >= _LEAST]
+    steady = [_trim_rest(means, a, b) for a, b in edges.tolist() if b - a >= _LEAST]
     return [((a + _TRIM) * size, (b - _TRIM) * size) for a, b in steady if b - a >= _LEAST]
 
 
-def _steady(means: Array, first: int, last: int) -> tuple[int, int]:
-    """Return first block and end of a rest without what at its ends stands out of it, as a turn that begins slowly."""
+def _trim_rest(means: Array, first: int, last: int) -> tuple[int, int]:
+    """Return first block and end of a rest without ends that are off it, as where a turn begins slowly."""
     width = int(np.clip((last - first) // 5, 1, _WIDEST))
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(means[first:last], axis=0)])
     part = (sums[width:] - sums[:-width]) / width
@@ -290,20 +279,21 @@ def _steady(means: Array, first: int, last: int) -> tuple[int, int]:
     return first + int(usual[0]), first + int(usual[-1]) + width
 
 
-def _of_mean(rate: Array) -> Array:
-    """Return the standard uncertainty of a mean by those of its four quarters, or by the middle two, shape (3,).
+def _uncertainty_of_mean(rate: Array) -> Array:
+    """Return the standard uncertainty of a mean over a rest, shape (3,).
 
-    By these where the mean lies further from theirs, as a slow start or end of a turn in the rest makes it.
+    By the scatter of its four quarters, or by its distance from the mean of the middle two if that is larger, as where
+    the rest holds the slow start or end of a turn.
     """
     quarter = len(rate) // 4
     means = rate[: 4 * quarter].reshape(4, quarter, 3).mean(axis=1)
     return np.asarray(np.maximum(means.std(axis=0, ddof=1) / 2, np.abs(means.mean(axis=0) - means[1:3].mean(axis=0))))
 
 
-def composed(steps: Array) -> Array:
-    """Return the quaternion of small turns one after the other, rad, shape (n, 3), by halving their number.
+def compose_turns(steps: Array) -> Array:
+    """Return the quaternion of successive small turns, rad, shape (n, 3), by composing neighbours until one is left.
 
-    Each is taken from its integrated rates by the turn before (Bortz, IEEE Trans. AES-7 (1971) 61): ``a x b / 12``.
+    A small turn is the integral b of the rates plus ``a x b / 12``, a that before (Bortz, IEEE Trans. AES-7 (1971) 61).
     """
     steps = steps + np.vstack([np.zeros(3), np.cross(steps[:-1], steps[1:]) / 12])
     size = np.linalg.norm(steps, axis=1, keepdims=True)
@@ -325,20 +315,20 @@ def rotation_vector(quaternion: Array) -> Array:
     return np.asarray(q[1:] * (2 * np.arctan2(size, q[0]) / max(size, 1e-300)))
 
 
-def carried(quaternion: Array, direction: Array) -> Array:
-    """Return what a fixed direction becomes in body components through a turn of the body, shape (3,)."""
+def carry_direction(quaternion: Array, direction: Array) -> Array:
+    """Return a fixed direction in body components after a turn of the body, shape (3,)."""
     w, v = quaternion[0], -quaternion[1:]
     return np.asarray(direction + 2 * w * np.cross(v, direction) + 2 * np.cross(v, np.cross(v, direction)))
 
 
-# Misalignment from whole turns by hand, whose axis in the body accelerometers tell.
+# Misalignments, from the axis of each turn in the body by accelerometers.
 
 
 _TURN = 2 * np.pi  # rad
-_SMOOTH = 0.05  # s
-_BATCHES = 8  # parts of a turn by whose scatter angles across it are known
-_FACE = np.cos(np.radians(30))
-_EXACT = 1e-12  # of a turn: noise that data without noise are given
+_SMOOTH = 0.05  # s over which the rate of a turn is averaged
+_BATCHES = 8  # parts of a turn whose scatter gives the uncertainty of its axis
+_FACE = np.cos(np.radians(30))  # cosine of the largest angle between a turn's axis and its body axis
+_EXACT = 1e-12  # of a turn: noise that is assumed of data without noise
 
 
 def check_accel(accel: Calibration, recording: Recording) -> None:
@@ -356,10 +346,13 @@ def check_accel(accel: Calibration, recording: Recording) -> None:
             raise DataError(f"{recording.name}: no column {name}; the axis of turns by accelerometers needs all three")
 
 
-def with_axes(
+def add_misalignments(
     record: Calibration, recording: Recording, motions: Motions, axis_turns: Mapping[str, AxisTurns], accel: Calibration
 ) -> Calibration:
     """Return the record of turns with scale factors and misalignments in the frame of the accelerometers.
+
+    ``B A = Y``: a column of A is the mean axis of the turns about one body axis, that of Y their integrals over
+    ``2 pi n``.
 
     Raises
     ------
@@ -377,22 +370,24 @@ def with_axes(
     turned = [(axis, k) for axis in range(3) for k in axis_turns[AXES[axis]].motion]
     outputs = recording.triad("accel")
     count = np.concatenate([axis_turns[axis].count for axis in AXES])
-    rests = [_upright(outputs, motions, k, axis, n) for (axis, k), n in zip(turned, count.tolist(), strict=True)]
+    rests = [
+        _fit_upright_output(outputs, motions, k, axis, n) for (axis, k), n in zip(turned, count.tolist(), strict=True)
+    ]
     force, spread = np.array([mean for mean, _ in rests]), np.array([u for _, u in rests])
     unit = recording.triad_unit("accel")
 
     def corrected(by: Calibration) -> Array:
-        return corrected_means(by, force, unit)
+        return correct_means(by, force, unit)
 
     seen_force = corrected(accel)
-    direction = _axes(seen_force, turned, motions, recording.name)
-    shifts, correlation = moved_by_parameters(accel, corrected)
+    direction = _find_axes(seen_force, turned, motions, recording.name)
+    shifts, correlation = parameter_sensitivity(accel, corrected)
     sign = np.sign(np.sum(direction * seen_force, axis=1))[:, None]
     changes = sign * unit_vectors(seen_force + shifts) - direction
     of_length = np.linalg.norm(seen_force, axis=1) * np.linalg.norm(spread, axis=1)
     of_length = np.hypot(of_length, length_uncertainty(seen_force, shifts, correlation))
     places = [f"the turn at {motions.start[k]:.1f} to {motions.stop[k]:.1f} s" for _, k in turned]
-    remarks = length_said(accel, seen_force, of_length, places)
+    remarks = warn_force_length(accel, seen_force, of_length, places)
     scale = np.array([axis_turns[axis].scale for axis in AXES])
     u_scale = np.array([axis_turns[axis].scale_uncertainty for axis in AXES])
     across = np.array([motions.angle[k] for _, k in turned]) / _TURN
@@ -401,8 +396,8 @@ def with_axes(
     groups = [np.array([axis == j for axis, _ in turned]) for j in range(3)]
 
     def gains(directions: Array, c: Array, y: Array) -> Array:
-        """Return B from the axes, what the composed turns say along their own axis, and the integrals across."""
-        sides = np.column_stack([_by_count(directions[members], count[members]) for members in groups])
+        """Return B from the axes, the composed turns c along their own axes, and the integrals y across these."""
+        sides = np.column_stack([_average_axes(directions[members], count[members]) for members in groups])
         felt = y.copy()
         for j in range(3):
             felt[j, j] = np.sqrt(c[j] ** 2 - np.sum(np.delete(y[:, j], j) ** 2))
@@ -415,13 +410,16 @@ def with_axes(
     u_crossed = np.zeros((3, 3))
     for j, members in enumerate(groups):
         left = across[members] - count[members][:, None] * (direction[members] @ matrix.T)
-        u_crossed[:, j] = _scattered(left, count[members], noise[members])
-    covariance = _covariance(gains, direction, scale, crossed, u_scale, u_crossed, changes, correlation)
-    return replace(_extended(record, matrix, covariance), warnings=(*record.warnings, *remarks), verdict=UNJUDGED)
+        u_crossed[:, j] = _uncertainty_of_slopes(left, count[members], noise[members])
+    covariance = _propagate(gains, direction, scale, crossed, u_scale, u_crossed, changes, correlation)
+    return replace(_extend_record(record, matrix, covariance), warnings=(*record.warnings, *remarks), verdict=UNJUDGED)
 
 
-def _upright(outputs: Array, motions: Motions, k: int, axis: int, count: float) -> tuple[Array, Array]:
-    """Return the mean output along the axis of a turn, shape (3,), and its uncertainty over g by parts of the turn."""
+def _fit_upright_output(outputs: Array, motions: Motions, k: int, axis: int, count: float) -> tuple[Array, Array]:
+    """Return the output of the accelerometers due to g a in turn k, shape (3,), and its uncertainty over g.
+
+    By least squares of 1, cos, sin, w^2 and w', weighted by the rate; the uncertainty is by the scores of 8 batches.
+    """
     first, last = motions.span[k]
     step, size = motions.steps[k], np.linalg.norm(motions.steps[k], axis=1)
     angle = np.cumsum(step[:, axis])
@@ -443,7 +441,7 @@ def _upright(outputs: Array, motions: Motions, k: int, axis: int, count: float) 
     return estimate[0], np.sqrt(np.sum(shift**2, axis=0)) / float(np.linalg.norm(estimate[0]))
 
 
-def _axes(force: Array, turned: list[tuple[int, int]], motions: Motions, name: str) -> Array:
+def _find_axes(force: Array, turned: list[tuple[int, int]], motions: Motions, name: str) -> Array:
     """Return the axis of each turn in the body, of unit length, along the positive axis that it is next to."""
     direction = force / np.linalg.norm(force, axis=1)[:, None]
     for (axis, k), along in zip(turned, direction, strict=True):
@@ -457,14 +455,14 @@ def _axes(force: Array, turned: list[tuple[int, int]], motions: Motions, name: s
     return np.asarray(direction * np.array(signs)[:, None])
 
 
-def _by_count(direction: Array, count: Array) -> Array:
-    """Return the mean of axes, weighted as the integrals of the turns about them are."""
+def _average_axes(direction: Array, count: Array) -> Array:
+    """Return the mean of axes, weighted by the square of the turns made about each."""
     return np.asarray(count**2 @ direction / (count @ count))
 
 
-def _scattered(left: Array, count: Array, noise: Array) -> Array:
-    """Return the uncertainty of slopes over turns made, of three gyroscopes; by the scatter where it exceeds noise."""
-    noise = np.maximum(noise, _EXACT * np.abs(count)[:, None])  # data without noise leave rounding
+def _uncertainty_of_slopes(left: Array, count: Array, noise: Array) -> Array:
+    """Return the standard uncertainty of three slopes over turns made; by their scatter where it exceeds the noise."""
+    noise = np.maximum(noise, _EXACT * np.abs(count)[:, None])  # the scatter of data without noise is rounding
     variance = (count**2 @ noise**2) / (count @ count) ** 2
     freedom = len(count) - 1
     if not freedom:
@@ -476,41 +474,43 @@ def _scattered(left: Array, count: Array, noise: Array) -> Array:
     return np.asarray(np.sqrt(variance * np.where(beyond, chi_square / freedom, 1.0)))
 
 
-def _values(matrix: Array) -> Array:
+def _scale_and_misalignment(matrix: Array) -> Array:
     """Return scale factors and then misalignments of ``B = diag(S) T``, shape (9,)."""
     scale = np.diag(matrix)
     turn = matrix / scale[:, None]
     return np.concatenate([scale, turn[~np.eye(3, dtype=bool)]])
 
 
-def _covariance(
+def _propagate(
     gains: Callable[[Array, Array, Array], Array], direction: Array, scale: Array, crossed: Array, u_scale: Array,
     u_crossed: Array, changes: Array, correlation: Array,
 ) -> Array:  # fmt: skip
-    """Return the covariance of `_values` by stops, by integrals across, and by the accelerometers' record."""
-    at = _values(gains(direction, scale, crossed))
+    """Return the covariance of `_scale_and_misalignment`: of stops, of integrals across, and of the accelerometers."""
+    at = _scale_and_misalignment(gains(direction, scale, crossed))
     rows = []
     for j in range(3):
         moved = scale.copy()
         moved[j] += u_scale[j]
-        rows.append(_values(gains(direction, moved, crossed)) - at)
+        rows.append(_scale_and_misalignment(gains(direction, moved, crossed)) - at)
         for i in range(3):
             if i != j:
                 other = crossed.copy()
                 other[i, j] += u_crossed[i, j]
-                rows.append(_values(gains(direction, scale, other)) - at)
+                rows.append(_scale_and_misalignment(gains(direction, scale, other)) - at)
     by_scale = np.array(rows)
-    of_record = np.array([_values(gains(direction + change, scale, crossed)) - at for change in changes])
+    of_record = np.array(
+        [_scale_and_misalignment(gains(direction + change, scale, crossed)) - at for change in changes]
+    )
     of_record = of_record.reshape(-1, len(at))
     return np.asarray(by_scale.T @ by_scale + of_record.T @ correlation @ of_record)
 
 
-def _extended(record: Calibration, matrix: Array, covariance: Array) -> Calibration:
+def _extend_record(record: Calibration, matrix: Array, covariance: Array) -> Calibration:
     """Return the record of turns with these scale factors, misalignments and their covariance."""
     unit = str(record.model["gyro_output_unit"])
     clock = float(record.fit["clock"] or 0.0)
-    values = _values(matrix) * np.concatenate([np.full(3, from_si(1.0, unit)), np.ones(6)])
-    factor = values / _values(matrix)
+    values = _scale_and_misalignment(matrix) * np.concatenate([np.full(3, from_si(1.0, unit)), np.ones(6)])
+    factor = values / _scale_and_misalignment(matrix)
     names = [f"gyro_scale_factor_{a}" for a in AXES]
     names += [f"gyro_misalignment_{a}{b}" for a in AXES for b in AXES if a != b]
     common = np.where(np.arange(9) < 3, values, 0.0) * clock
@@ -536,16 +536,13 @@ def _extended(record: Calibration, matrix: Array, covariance: Array) -> Calibrat
     )
 
 
-# The calibration record of whole turns, and what its report shows.
-
-
-_LOOKS = {"x": ("circle", INK), "y": ("diamond", GOOD), "z": ("square", BAD)}
+# The calibration record of whole turns.
 
 
 def turns_record(
     recording: Recording, motions: Motions, axis_turns: Mapping[str, AxisTurns], fence: float, clock: float | None
 ) -> Calibration:
-    """Turn the scale factors found into the record."""
+    """Return the record of the scale factors and biases."""
     unit = recording.triad_unit("gyro")
     nominal = float(from_si(1.0, unit))
     parameters = {
@@ -594,11 +591,12 @@ def turns_record(
         data=entries(TurnsEvidence(turns=turns)),
         sensor={key: text for key in ("serial", "model", "element") if (text := recording.metadata.get(key))},
         sources=() if recording.source is None else (recording.source,),
-        warnings=(*motions.notes, *_findings(axis_turns, clock)),
+        warnings=(*motions.notes, *_warn_turns(axis_turns, clock)),
     )
 
 
-def _findings(axis_turns: Mapping[str, AxisTurns], clock: float | None) -> list[str]:
+def _warn_turns(axis_turns: Mapping[str, AxisTurns], clock: float | None) -> list[str]:
+    """Return warnings and notes about scale factors: off the unit, scattered, turned one way, or per clock."""
     messages: list[str] = []
     for a, turned_axis in axis_turns.items():
         if abs(turned_axis.scale - 1) > SCALE_OFF_UNIT:
@@ -626,71 +624,17 @@ def _findings(axis_turns: Mapping[str, AxisTurns], clock: float | None) -> list[
     return messages
 
 
-def turns_exhibits(record: Calibration) -> Exhibits:
-    """Return the figures and tables of a record of turns."""
-    turns_section = turns_of(record)
-    turn_rows = turns_section.data.turns
-    worst = max(
-        (p.standard_uncertainty or 0.0) / abs(p.value) for n, p in record.parameters.items() if "scale_factor" in n
-    )
-    degrees = [
-        [float(np.degrees(v)) for v in c] for c in (turn_rows.angle, turn_rows.residual, turn_rows.standard_uncertainty)
-    ]
-    table = [
-        [a, f"{start:.1f}", f"{stop:.1f}", f"{count:+.0f}", f"{angle:.2f}", f"{left:+.3f}", f"{u:.2g}"]
-        for a, start, stop, count, angle, left, u in zip(
-            turn_rows.axis, turn_rows.start, turn_rows.stop, turn_rows.count, *degrees, strict=True
-        )
-    ]
-    number = list(range(1, len(table) + 1))
-    traces: list[dict[str, Any]] = []
-    for name, (symbol, colour) in _LOOKS.items():
-        which = [k for k, axis_name in enumerate(turn_rows.axis) if axis_name == name]
-        if which:
-            rest, bars = (rounded([degrees[k][j] for j in which]) for k in (1, 2))
-            traces.append(
-                scatter(
-                    [number[j] for j in which], rest, "markers", name=f"gyro_{name}",
-                    marker={"color": colour, "symbol": symbol, "size": 8},
-                    error_y={"type": "data", "array": bars, "thickness": 1, "width": 2},
-                )
-            )  # fmt: skip
-    several = len(table) > len(set(turn_rows.axis))  # of one turn about each axis nothing is left
-    figure = Figure(
-        title="What is left of each turn",
-        caption="By the scale factor of these turns. Bars: one standard uncertainty, of both stops and of the zero.",
-        traces=traces,
-        layout={"xaxis": figure_axis("turn", dtick=1), "yaxis": figure_axis("residual, deg"), "legend": LEGEND},
-    )
-    fence = float(np.degrees(turns_section.fit.fence.value))
-    return Exhibits(
-        f"{turns_section.fit.turns} turns against a fence of {plain_number(fence, 2)} deg: scale factors are known to "
-        f"{plain_number(1e6 * worst, 3)} ppm or better.",
-        [("turns", str(turns_section.fit.turns)), ("fence", f"{plain_number(fence, 2)} deg")],
-        [
-            parameters_table(rows_of(record), "Per clock where no uncertainty of it was stated."),
-            *([] if turns_section.fit.prior is None else [prior_table(turns_section.fit.prior, record)]),
-            ReportTable(
-                "Turns",
-                "Stated angle of each, and what is left of it by the scale factor of these turns.",
-                ["gyro", "from, s", "to, s", "turns", "angle, deg", "residual, deg", "u, deg"],
-                table,
-            ),
-            *([figure] if several else []),
-        ],
-    )  # fmt: skip
+# The fit.
 
 
-# Whole turns by hand against a fence to the scale factors of gyroscopes.
-
-
-_SAME, _OTHER = np.radians(10), np.radians(30)
+_SAME, _OTHER = np.radians(10), np.radians(30)  # angle of gravity between rests: the same, and another attitude
 _PART, _WHOLE, _FIRST, _OFF = 0.4, 0.12, 0.2, 0.1
-"""Parts of a turn: less is none; what whole turns miss by at most, and the first that tell the scale; of the scale."""
+"""Parts of a turn: a smaller motion is no turn; whole turns miss by this at most, the first ones by that; and the
+scale factor is off by this share at most."""
 _ASKEW = 0.4
-"""Turn about a second axis over that about the first, beyond which the axes of a turn cannot be told."""
-_FACTORS = np.geomspace(0.4, 2.5, 41)
-_CARRIES = np.radians(15)
+"""Angle about a second axis over that about the first, from which the turn is about no one body axis."""
+_FACTORS = np.geomspace(0.4, 2.5, 41)  # by which the stated sample rate may be wrong
+_CARRIES = np.radians(15)  # by which gravity is missed at most under the right sample rate
 
 
 @dataclass(frozen=True, repr=False)
@@ -728,7 +672,7 @@ def fit_turns(
     prior: Record | None = None,
     **reading: Unpack[Reading],
 ) -> TurnsFit:
-    """Find the scale factors of gyroscopes from whole turns by hand, with a rest against a fence before and after each.
+    """Calibrate gyroscopes by whole turns by hand, with a rest against a fence before and after each.
 
     ``S = sum of stated angles / (2 pi sum of turns)``, by generalised least squares over stops that two turns share.
 
@@ -782,15 +726,15 @@ def fit_turns(
     width = in_si(fence, "fence", "angle", "deg")
     if not 0 < width < 1:
         raise OptionError(f"fence {fence}: expected the uncertainty of the difference of two stops, such as 0.5 deg")
-    of_clock = None if clock is None else part_of_one(clock, "clock")
-    stated = None if turns is None else _counts(turns)
+    of_clock = None if clock is None else parse_fraction(clock, "clock")
+    stated = None if turns is None else _parse_counts(turns)
     held = None if accel is None else as_record(accel, "fit_turns: accel")
-    recording = as_recording(data, reading, fit_turns, gyros_of)
+    recording = as_recording(data, reading, fit_turns, name_gyroscopes)
     if held is not None:
         check_accel(held, recording)
     motions = find_motions(recording, width)
     _check_sample_rate(motions, recording.name)
-    which = _turning(motions, recording.name)
+    which = _select_turns(motions, recording.name)
     if stated is not None and len(stated) != len(which):
         raise OptionError(f"turns: {len(stated)} given, {len(which)} found in {recording.name}; expected one for each")
     axis_turns = {}
@@ -801,21 +745,22 @@ def fit_turns(
             stated_counts = (
                 None if stated is None else np.array([stated[which.index(k)] for k in members], dtype=np.float64)
             )
-            count = _numbered(angle, motions, members, recording.name) if stated_counts is None else stated_counts
+            count = _count_turns(angle, motions, members, recording.name) if stated_counts is None else stated_counts
             _check_counts(angle / _TURN, count, motions, members, recording.name)
-            axis_turns[AXES[axis]] = _scale(motions, members, axis, angle, count, width)
+            axis_turns[AXES[axis]] = _fit_scale(motions, members, axis, angle, count, width)
     record = turns_record(recording, motions, axis_turns, width, of_clock)
     if held is not None:
-        record = with_axes(record, recording, motions, axis_turns, held)
+        record = add_misalignments(record, recording, motions, axis_turns, held)
     if prior is not None:
         frame = None if held is None else BY_ACCELEROMETERS
         record = with_prior(record, prior_at(as_record(prior, "fit_turns: prior"), [recording]), frame)
     if held is not None:
-        record = with_accelerometers(held, record, other_unit_said(held, record.sensor, "accel"))
+        record = with_accelerometers(held, record, warn_other_unit(held, record.sensor, "accel"))
     return TurnsFit(record, axis_turns)
 
 
-def _counts(turns: str | Sequence[int]) -> list[int]:
+def _parse_counts(turns: str | Sequence[int]) -> list[int]:
+    """Return the stated numbers of turns, such as ``1,5,-6``."""
     try:
         counts = [int(part) for part in (turns.split(",") if isinstance(turns, str) else turns)]
     except ValueError:
@@ -825,7 +770,7 @@ def _counts(turns: str | Sequence[int]) -> list[int]:
     return counts
 
 
-def _tilt(motions: Motions, k: int) -> float:
+def _angle_between_rests(motions: Motions, k: int) -> float:
     """Return the angle between gravity at the rests before and after a motion, rad; 0 where it is not known."""
     if motions.before is None or motions.after is None:
         return 0.0
@@ -837,13 +782,13 @@ def _check_sample_rate(motions: Motions, name: str) -> None:
     """Refuse a sample rate with which the motions do not carry gravity from one attitude to the next."""
     if motions.before is None or motions.after is None:
         return
-    tipped = [k for k in range(len(motions.steps)) if _tilt(motions, k) > _OTHER]
+    tipped = [k for k in range(len(motions.steps)) if _angle_between_rests(motions, k) > _OTHER]
     if len(tipped) < 2:
         return
     before, after = (v / np.linalg.norm(v, axis=1)[:, None] for v in (motions.before, motions.after))
 
     def misses(factor: float) -> float:
-        turned = [carried(composed(motions.steps[k] * factor), before[k]) for k in tipped]
+        turned = [carry_direction(compose_turns(motions.steps[k] * factor), before[k]) for k in tipped]
         angles = [np.arccos(np.clip(v @ after[k], -1, 1)) for v, k in zip(turned, tipped, strict=True)]
         return float(np.median(angles))
 
@@ -858,12 +803,12 @@ def _check_sample_rate(motions: Motions, name: str) -> None:
         )
 
 
-def _turning(motions: Motions, name: str) -> list[int]:
-    """Return which motions are turns: from an attitude to the same, and far enough round."""
+def _select_turns(motions: Motions, name: str) -> list[int]:
+    """Return the indices of motions that are turns: they return to the same attitude, and are large enough."""
     whole = []
     for k in range(len(motions.start)):
         part = float(np.abs(motions.angle[k]).max()) / _TURN
-        if _tilt(motions, k) > _SAME or part < _PART:
+        if _angle_between_rests(motions, k) > _SAME or part < _PART:
             continue
         if part < 1 - _PART:
             raise DataError(
@@ -886,13 +831,13 @@ def _turning(motions: Motions, name: str) -> list[int]:
 
 
 def _whole_angle(motions: Motions, k: int, axis: int) -> float:
-    """Return the angle about a body axis that the composed turn states, whole turns included, rad."""
+    """Return the angle about a body axis by the composed small turns, whole turns included, rad."""
     closing, rough = float(motions.closing[k, axis]), float(motions.angle[k, axis])
     return closing + _TURN * round((rough - closing) / _TURN)
 
 
-def _numbered(angle: Array, motions: Motions, members: list[int], name: str) -> Array:
-    """Return the number of turns of each angle, signed: the smaller ones tell the scale for the larger."""
+def _count_turns(angle: Array, motions: Motions, members: list[int], name: str) -> Array:
+    """Return the signed number of turns of each angle; the smaller ones give the scale factor for the larger."""
     ratio, count, scale = angle / _TURN, np.zeros(len(angle)), 1.0
     done: list[int] = []
     for k in np.argsort(np.abs(ratio)).tolist():
@@ -935,8 +880,12 @@ def _check_counts(ratio: Array, count: Array, motions: Motions, members: list[in
         )
 
 
-def _scale(motions: Motions, members: list[int], axis: int, angle: Array, count: Array, fence: float) -> AxisTurns:
-    """Return the scale factor: turns one after the other share a stop, whose error is opposite in both."""
+def _fit_scale(motions: Motions, members: list[int], axis: int, angle: Array, count: Array, fence: float) -> AxisTurns:
+    """Return the scale factor about one axis: ``S = (t' C^-1 angle) / (t' C^-1 t)``, ``t = 2 pi count``.
+
+    C holds fence^2 and the zero's variance on the diagonal, and -fence^2 / 2 between successive turns, which share a
+    stop. Where the turns scatter beyond that (chi-square), the variance is enlarged.
+    """
     covariance = np.diag(fence**2 + motions.zero[members, axis] ** 2)
     for k in range(len(members) - 1):
         if members[k + 1] == members[k] + 1:
