@@ -12,10 +12,15 @@ import pytest
 
 import imulab as il
 from imulab.estimation.least_squares import coverage_factor
-from imulab.procedures.thermal.degrees import LagAndLoops, bias_shift_from_unobserved, drift_of, findings
+from imulab.procedures.thermal.degrees import (
+    LagAndLoops,
+    bias_shift_from_unobserved,
+    fit_lag_and_loops,
+    warn_lag_and_loops,
+)
 from imulab.procedures.thermal.figures import exhibits
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.record import predicted
+from imulab.procedures.thermal.record import predict_parameters
 from imulab.procedures.thermal.solve import ThermalProblem, solve
 from imulab.recording import Recording
 from reference import thermal as reference
@@ -79,7 +84,7 @@ def found(trials, seed, **size):
     standard, flagged, u = [], [], []
     for trial in range(trials):
         problem, _, height = driven(np.random.default_rng([seed, trial]), **size)
-        drift = drift_of(problem, solve(problem, LAWS), None)
+        drift = fit_lag_and_loops(problem, solve(problem, LAWS), None)
         spread = np.sqrt(np.diag(drift.covariance))
         standard.append((drift.values - [size.get("lag", 0.0), *height]) / spread)
         flagged.append([probability < 0.01 for probability in drift.probability])
@@ -110,11 +115,11 @@ def test_what_is_there_is_flagged_and_what_is_not_is_not(size, which, low, high,
 
 def test_exact_data_give_loop_and_lag_and_laws_without_them():
     problem, triad, height = driven(np.random.default_rng(1), loop=2e-4, noise=0.0, rough=0.0)
-    drift = drift_of(problem, solve(problem, LAWS), 0.0)
+    drift = fit_lag_and_loops(problem, solve(problem, LAWS), 0.0)
     assert np.abs(drift.values[1:] - height).max() < 1e-10
     assert abs(drift.values[0]) < 1e-6
     problem, triad, _ = driven(np.random.default_rng(1), lag=20.0, noise=0.0, rough=0.0)
-    drift = drift_of(problem, solve(problem, LAWS), 0.0)
+    drift = fit_lag_and_loops(problem, solve(problem, LAWS), 0.0)
     assert drift.values[0] == pytest.approx(20.0, abs=0.5)
     at = np.linspace(-20.0, 60.0, 9)
     true = np.array([np.array(triad.at(t)[0]) / G for t in at])
@@ -142,7 +147,7 @@ def part(problem, which):
 )
 def test_without_the_way_back_lag_and_law_are_not_told_apart(which, said):
     problem = part(driven(np.random.default_rng(2))[0], which)
-    drift = drift_of(problem, solve(problem, LAWS), None)
+    drift = fit_lag_and_loops(problem, solve(problem, LAWS), None)
     assert drift.values is None
     assert said in drift.reason
     assert "record the way back" in drift.reason
@@ -151,7 +156,7 @@ def test_without_the_way_back_lag_and_law_are_not_told_apart(which, said):
 
 def test_a_thermometer_slower_than_the_sensor_is_called_so():
     solution = solve(driven(np.random.default_rng(3))[0], LAWS)
-    said = findings(LagAndLoops(np.array([-12.0, 0, 0, 0]), np.eye(4), (1e-4, 0.5)), solution, "unit")
+    said = warn_lag_and_loops(LagAndLoops(np.array([-12.0, 0, 0, 0]), np.eye(4), (1e-4, 0.5)), solution, "unit")
     assert said[0].startswith("unit: the temperature lags the biases by 12 s (u 1 s)")
 
 
@@ -183,7 +188,7 @@ def test_a_recording_shows_its_lag_and_is_corrected_without_it(tmp_path):
     assert record.verdict.state == "look"
     at = np.linspace(-20.0, 60.0, 9)
     true = np.array([triad.at(t)[0] for t in at]).T
-    values, u = predicted(record, at)
+    values, u = predict_parameters(record, at)
     assert np.sqrt((((values[:3] - true) / u[:3]) ** 2).mean()) < 2.5
     shown = str(exhibits(record))
     assert "lag behind the thermometer" in shown
@@ -235,7 +240,7 @@ def test_what_one_ramp_does_not_tell_costs_as_much_as_is_said(reduced):
         given = one_ramp(rng, triad)
         found = solve(given, laws, tau=0.0)
         (text, *_) = bias_shift_from_unobserved(given, found, LagAndLoops(), "ramp")
-        said.append(float(re.search(r"scale factor follows .* errs biases by (\S+) mg", text)[1]))
+        said.append(float(re.search(r"scale factor follows .* shifts the biases by (\S+) mg", text)[1]))
         biases = laws.design(AT)[:, :3] @ found.coefficients
         errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.sqrt(np.mean(np.square(said))), rel=0.25)
@@ -265,14 +270,14 @@ def test_a_lag_that_fast_ramps_do_not_tell_is_said_with_what_it_costs(reduced):
     said, errors = [], []
     for problem_, triad in given:
         found = solve(problem_, laws, tau=0.0)
-        drift = drift_of(problem_, found, 0.0)
+        drift = fit_lag_and_loops(problem_, found, 0.0)
         assert "only warm" in drift.reason
         texts = [
             text
             for text in bias_shift_from_unobserved(problem_, found, drift, "ramp")
             if "behind the thermometer" in text
         ]
-        said += [float(re.search(r"errs biases by (\S+) mg", text)[1]) for text in texts]
+        said += [float(re.search(r"shifts the biases by (\S+) mg", text)[1]) for text in texts]
         biases = laws.design(AT)[:, :3] @ found.coefficients
         errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))
     assert len(said) > trials / 2
@@ -307,7 +312,7 @@ def test_degrees_that_suffice_are_not_spoken_of(chamber, degrees):
 @pytest.mark.slow
 def test_stated_degrees_of_the_truth_are_called_too_low_as_seldom_as_the_test_says(reduced):
     """At 1 %, with and without turn-on scatter; the bounds are passed by chance less than once in 200 series."""
-    from imulab.procedures.thermal.degrees import choose
+    from imulab.procedures.thermal.degrees import choose_laws
 
     trials, called = 12 if reduced else 150, 0
     for turn_on in (0.0, 1e-4):
@@ -315,14 +320,14 @@ def test_stated_degrees_of_the_truth_are_called_too_low_as_seldom_as_the_test_sa
             rng = np.random.default_rng([52, seed])
             triad = reference.Triad(rng, degrees=(2, 1, 0))
             given = problem(rng, triad, (-20, 0, 25, 45, 60), 12, turn_on=turn_on)
-            called += choose(given, Laws(-20.0, 60.0, (0, 0, 0)), (2, 1, 0), None, "five soaks").missed is not None
+            called += choose_laws(given, Laws(-20.0, 60.0, (0, 0, 0)), (2, 1, 0), None, "five soaks").missed is not None
     assert called <= (1 if reduced else 9)
 
 
 def test_six_attitudes_at_each_temperature_leave_no_room_to_step_down(reduced):
     """27 unknowns and 30 attitudes: nothing can be left out, and the F-test finds nothing significant. Steps down left
     intervals of misalignments that hold in 81 % and of scale factors in 88 %, of 25 units."""
-    from imulab.procedures.thermal.degrees import choose
+    from imulab.procedures.thermal.degrees import choose_laws
 
     laws, held = Laws(-20.0, 60.0, (3, 2, 1)), []
     design = laws.design(AT)
@@ -330,7 +335,7 @@ def test_six_attitudes_at_each_temperature_leave_no_room_to_step_down(reduced):
         rng = np.random.default_rng([61, seed])
         triad = reference.Triad(rng)
         given = problem(rng, triad, (-20, 0, 25, 45, 60), 6, turn_on=1e-4)
-        found = choose(given, laws, "auto", None, "five soaks").solution
+        found = choose_laws(given, laws, "auto", None, "five soaks").solution
         assert found.laws.degrees == (3, 2, 1)
         rows = [triad.at(t) for t in AT]
         error = design @ found.coefficients - np.array([[*(np.array(b) / G), *s, *m] for b, s, m in rows])

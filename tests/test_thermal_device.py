@@ -8,7 +8,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.apply import apply_blocks, warnings_of
+from imulab.procedures.apply import apply_blocks, warn_before_applying
 from reference import thermal as reference
 
 G = reference.G
@@ -87,7 +87,7 @@ def test_a_row_without_a_temperature_is_not_a_number(record):
     found = il.apply(record, lost).triad("accel")
     assert np.isnan(found[10]).all()
     assert np.isfinite(np.delete(found, 10, axis=0)).all()
-    said = warnings_of(record, lost)
+    said = warn_before_applying(record, lost)
     assert any("1 rows without a temperature" in each for each in said)
     assert any("of 400 rows lie outside the -19.7" in each and "as at the end of the range" in each for each in said)
 

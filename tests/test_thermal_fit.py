@@ -11,11 +11,16 @@ from scipy.optimize import least_squares
 import imulab as il
 from imulab.cli import main
 from imulab.estimation.least_squares import coverage_factor
-from imulab.procedures.thermal.degrees import clusters_of, left_out, seen, splits
+from imulab.procedures.thermal.degrees import (
+    judge_observability,
+    number_temperatures,
+    predict_left_out,
+    split_temperatures,
+)
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.record import predicted
+from imulab.procedures.thermal.record import predict_parameters
 from imulab.procedures.thermal.simulate import thermal_truth
-from imulab.procedures.thermal.solve import ThermalProblem, concluded, solve
+from imulab.procedures.thermal.solve import ThermalProblem, conclude, solve
 from reference import thermal as reference
 
 G = reference.G
@@ -110,7 +115,7 @@ def test_without_the_scatter_between_recordings_the_intervals_are_worthless():
 def predicts(fit, seed=1):
     """Errors of the parameters over their stated uncertainty at nine temperatures, against the simulator's truth."""
     record = fit.calibration
-    values, u = predicted(record, AT)
+    values, u = predict_parameters(record, AT)
     true = thermal_truth(AT, "cubic", seed)
     return np.array([(values[k] - true[name]) / u[k] for k, name in enumerate(NAMES)]), u
 
@@ -347,7 +352,9 @@ def test_records_over_other_ranges_are_compared_at_temperatures_of_both():
         at = float(change.name.split()[2])
         assert change.name.startswith("bias_x at")
         assert abs(at - temperature) < 1.0
-        (a, u), (b, v) = ([part[0, 0] for part in predicted(record, np.array([at]))] for record in (one, other))
+        (a, u), (b, v) = (
+            [part[0, 0] for part in predict_parameters(record, np.array([at]))] for record in (one, other)
+        )
         assert change.difference == pytest.approx(b - a, abs=1e-9)
         assert change.standard_uncertainty == pytest.approx(np.hypot(u, v), rel=1e-3)
 
@@ -380,7 +387,7 @@ def by_hand(rng, count):
 
 
 def of_noise_alone(found):
-    return concluded(found.laws, found.coefficients, found.rows, (0.0, np.inf), found.scatter, converged=True)
+    return conclude(found.laws, found.coefficients, found.rows, (0.0, np.inf), found.scatter, converged=True)
 
 
 @pytest.mark.slow
@@ -421,11 +428,11 @@ def test_a_temperature_left_out_is_missed_by_what_is_stated(temperatures, count,
     """Chi-square per attitude 1.01 and 1.00 (250 units); rms 1.44 and 1.24 of an attitude's noise."""
     trials, margin = (20, 0.25) if reduced else (250, 0.1)
     squares, errors = [], []
-    cluster = clusters_of(np.repeat(np.array(temperatures, float), count))
+    cluster = number_temperatures(np.repeat(np.array(temperatures, float), count))
     for trial in range(trials):
         rng = np.random.default_rng([21, trial, count])
         found = solve(problem(rng, reference.Triad(rng), temperatures, count), LAWS, tau=0.0)
-        held = left_out(splits(of_noise_alone(found), cluster), np.ones(LAWS.size, dtype=np.bool_))
+        held = predict_left_out(split_temperatures(of_noise_alone(found), cluster), np.ones(LAWS.size, dtype=np.bool_))
         assert len(held) == len(temperatures) - 2
         squares += [each.chi_square for each in held]
         errors += [each.rms**2 for each in held]
@@ -500,7 +507,7 @@ def test_what_counts_as_observable_is_known_as_stated_and_what_does_not_is_not(r
                     triad = reference.Triad(rng, degrees)
                     found = solve(problem(rng, triad, (-20, 0, 25, 45, 60), count, noise=noise), laws, tau=0.0)
                     u = np.sqrt(np.einsum("tpc,cd,tpd->tp", design, found.covariance, design))
-                    accepted = found.converged and seen(found).rank == laws.size
+                    accepted = found.converged and judge_observability(found).rank == laws.size
                     error = np.abs(design @ found.coefficients - truth(triad))
                     error = error / np.maximum(u, 1e-12)
                     ratios[accepted].append(np.mean(error**2))

@@ -12,7 +12,7 @@ from imulab.cli import main
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.apply import apply_blocks
 from imulab.procedures.thermal.gyro import RatesAtRest, fit_gyroscopes
-from imulab.procedures.thermal.record import gyro_predicted
+from imulab.procedures.thermal.record import predict_gyro_bias
 from reference import thermal_gyro as reference
 from reference.thermal import directions, natural_spline
 
@@ -54,7 +54,7 @@ def fitted(chamber):
 def test_laws_and_sensitivities_of_exact_data_come_back(chamber, fitted):
     _, gyros, _ = chamber
     places = np.linspace(-20, 60, 9)
-    values, spread = gyro_predicted(fitted, places)
+    values, spread = predict_gyro_bias(fitted, places)
     # A sample's noise of 1e-6 rad/s leaves some 1e-8 of a law; the Earth's rate, which is not there, is allowed for.
     assert np.abs(values - gyros.bias_at(places).T).max() < 2e-7
     assert spread.max() < 3 * 7.3e-5 / np.sqrt(3 * 8)
@@ -183,7 +183,7 @@ def test_a_hold_that_turns_about_the_vertical_is_left_out_and_named(chamber, fit
     assert all(each.startswith("gyro: soak_3.csv, ") for each in said)
     assert record.fit["gyro"]["holds"] == fitted.fit["gyro"]["holds"] - 2
     places = np.linspace(-20, 60, 9)
-    assert np.abs(gyro_predicted(record, places)[0] - chamber[1].bias_at(places).T).max() < 4e-7
+    assert np.abs(predict_gyro_bias(record, places)[0] - chamber[1].bias_at(places).T).max() < 4e-7
 
 
 def test_too_few_recordings_need_the_turn_on_scatter_stated(chamber):
@@ -237,7 +237,7 @@ def off(record, gyros, temperature):
         for j, b in enumerate("xyz"):
             if i != j:
                 matrix[i, j] = record.value(f"gyro_misalignment_{a}{b}")
-    bias, _ = gyro_predicted(record, places)
+    bias, _ = predict_gyro_bias(record, places)
     return np.array(scale).T - gyros.scale_at(places), matrix - gyros.matrix, bias.T - gyros.bias_at(places)
 
 
@@ -442,7 +442,7 @@ def test_splines_of_exact_data_come_back():
     found = np.array([[record.value(f"gyro_bias_{a}_at_{k}") for k in range(1, 8)] for a in "xyz"])
     # A sample's noise of 1e-6 rad/s leaves some 1e-8 of a mean; the Earth's rate, which is not there, is allowed for.
     assert np.abs(found - gyros.values).max() < 2e-7
-    values, spread = gyro_predicted(record, FINE)
+    values, spread = predict_gyro_bias(record, FINE)
     assert np.abs(values - gyros.bias_at(FINE).T).max() < 2e-7
     assert np.abs(values - by_hand(record, FINE).T).max() < 1e-15
     assert spread.max() < 7.3e-5
@@ -461,7 +461,9 @@ def test_auto_takes_the_spline_at_a_kink_and_a_cubic_of_a_cubic_law(kinked):
     assert any("gyro:" in each and "an upper bound: come back to temperatures" in each for each in record.warnings)
     cubic = il.fit_thermal(made, gravity=G, with_="gyro", degrees="3,2,1").calibration
     assert "knots" not in cubic.model["gyro"]
-    errors = [np.sqrt(np.mean((gyro_predicted(one, FINE)[0].T - gyros.bias_at(FINE)) ** 2)) for one in (record, cubic)]
+    errors = [
+        np.sqrt(np.mean((predict_gyro_bias(one, FINE)[0].T - gyros.bias_at(FINE)) ** 2)) for one in (record, cubic)
+    ]
     assert errors[0] < 0.6 * errors[1]
     rng = np.random.default_rng(3)
     smooth = at_rest(rng, reference.Gyros(rng), KNOTS, 8, np.radians(0.01), NOISE)
@@ -576,7 +578,7 @@ def test_shown_compared_reported_and_checked(kinked, tmp_path, monkeypatch, caps
     assert len(both) == 7
     for name in both:
         place = float(name.removeprefix("gyro_bias_y at ").removesuffix(" degC"))
-        first, second = by_hand(record, np.array([place]))[0, 1], gyro_predicted(plain, np.array([place]))[0][1, 0]
+        first, second = by_hand(record, np.array([place]))[0, 1], predict_gyro_bias(plain, np.array([place]))[0][1, 0]
         assert told[name]["difference"] == pytest.approx(second - first, abs=1e-12)
     assert main(["report", "bent.json", "-o", "bent.html"], project=False) == 0
     page = (tmp_path / "bent.html").read_text(encoding="utf-8")

@@ -7,8 +7,8 @@ import imulab as il
 from conftest import some_of
 from imulab.cli import main
 from imulab.display import Note
-from imulab.procedures.thermal.holds import find_holds, stretches_at_rest, wandering
-from imulab.procedures.thermal.record import predicted
+from imulab.procedures.thermal.holds import find_holds, find_stretches_at_rest, fit_wander
+from imulab.procedures.thermal.record import predict_parameters
 from imulab.recording import Recording
 from imulab.writers import write
 from reference import thermal as reference
@@ -71,7 +71,7 @@ def test_the_size_of_a_random_walk_is_found_and_none_where_there_is_none(reduced
     def found(size):
         walk = np.cumsum(size * rng.standard_normal((76, 2)), axis=0) + 6e-5 * rng.standard_normal((76, 2))
         smooth = 0.01 * np.sin(temperature / 40.0) + 0.05
-        return wandering(np.column_stack([walk[:, 0] + smooth, walk[:, 1], np.ones(76)]), temperature, time)
+        return fit_wander(np.column_stack([walk[:, 0] + smooth, walk[:, 1], np.ones(76)]), temperature, time)
 
     assert np.mean([found(0.0) > 0 for _ in range(trials)]) < 0.03
     variances = np.array([found(1e-4) for _ in range(trials // 2)])
@@ -87,7 +87,7 @@ def bench(seed, **knocks):
     made += [recording(*ramp(triad, rng, up, **knocks), f"ramp_{k}.csv") for k, up in enumerate(UP)]
     record = il.fit_thermal(made, degrees="3,2,1").calibration
     at = np.linspace(LOW + 1, HIGH - 1, 9)  # the measured range ends a little inside
-    values, u = predicted(record, at)
+    values, u = predict_parameters(record, at)
     true = np.array([triad.at(t)[0] for t in at]).T
     return (values[:3] - true) / G, u[:3] / G, record
 
@@ -114,10 +114,10 @@ def test_one_knock_is_found_and_a_turn_is_none():
     rng = np.random.default_rng(3)
     triad = reference.Triad(rng)
     time, output, _ = ramp(triad, rng, UP[0], knocked=0.1, every=1200.0)
-    found = stretches_at_rest(output, time)
+    found = find_stretches_at_rest(output, time)
     assert len(found) == 2
     assert time[found[0, 1]] < 600.0 < time[found[1, 0]] < 610.0
-    assert stretches_at_rest(*tumble(triad, rng, 25.0)[1::-1]) is None
+    assert find_stretches_at_rest(*tumble(triad, rng, 25.0)[1::-1]) is None
 
 
 def test_rows_that_are_no_readings_are_left_out_of_the_holds():

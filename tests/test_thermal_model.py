@@ -9,9 +9,9 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.thermal.degrees import choose, clusters_of, left_out, splits
+from imulab.procedures.thermal.degrees import choose_laws, number_temperatures, predict_left_out, split_temperatures
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.record import predicted
+from imulab.procedures.thermal.record import predict_parameters
 from imulab.procedures.thermal.solve import solve
 from reference import thermal as reference
 from test_thermal_device import wandering
@@ -66,8 +66,8 @@ def test_a_temperature_left_out_is_predicted_as_by_a_spline_without_its_knot():
     given = problem(rng, reference.BentTriad(rng, "kink"), KNOTS, 12)
     laws = Laws(-20.0, 60.0, (3, 2, 1), KNOTS)
     whole = solve(given, laws, tau=1e-4)
-    cluster = clusters_of(given.temperature)
-    held = left_out(splits(whole, cluster), np.ones(laws.size, dtype=bool))
+    cluster = number_temperatures(given.temperature)
+    held = predict_left_out(split_temperatures(whole, cluster), np.ones(laws.size, dtype=bool))
     for number, each in enumerate(held, 1):
         others = cluster != number
         part = replace(
@@ -110,7 +110,7 @@ def test_auto_takes_the_spline_at_a_kink_and_polynomials_of_a_cubic_law(kinked):
     assert not any("upper bound" in each for each in twice.calibration.warnings)
     plain = il.fit_thermal(made, gravity=G, degrees="3,2,1").calibration
     errors = [
-        np.sqrt(np.mean((predicted(one, FINE)[0][:3].T / G - truth(triad, FINE)[:, :3]) ** 2))
+        np.sqrt(np.mean((predict_parameters(one, FINE)[0][:3].T / G - truth(triad, FINE)[:, :3]) ** 2))
         for one in (record, plain)
     ]
     assert errors[0] < 0.6 * errors[1]
@@ -261,7 +261,7 @@ def worst(law, count, attitudes, trials, turn_on):
         given = problem(rng, triad, np.linspace(-20.0, 60.0, count), attitudes, turn_on=turn_on)
         true, row = truth(triad, FINE)[:, :3], []
         for wanted, spline in (((3, 2, 1), False), ((3, 2, 1), True), ("auto", False)):
-            found = choose(given, BASE, wanted, None, "test", spline=spline).solution
+            found = choose_laws(given, BASE, wanted, None, "test", spline=spline).solution
             own = found.laws.design(FINE)[:, :3] @ found.coefficients[: found.laws.size]
             row.append(np.mean((own - true) ** 2))
         errors.append(row)

@@ -9,7 +9,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.procedures.thermal.gyro import fit_gyroscopes
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.plan import Design, exchange, nodes, way
+from imulab.procedures.thermal.plan import Design, exchange_attitudes, legendre_nodes, order_soaks
 from imulab.procedures.thermal.solve import ThermalProblem, solve
 from imulab.procedures.tumble.plan import sphere_candidates
 from reference import thermal as reference
@@ -25,15 +25,15 @@ LAWS = Laws(-20.0, 60.0, (3, 2, 1))
 
 def test_temperatures_are_ends_and_extrema_of_the_legendre_polynomial():
     """P4 = (35 x^4 - 30 x^2 + 3) / 8 has its extrema at 0 and +-sqrt(3/7): -20, -6, 20, 46 and 60 degC."""
-    assert nodes(5) == pytest.approx([-1, -np.sqrt(3 / 7), 0, np.sqrt(3 / 7), 1], abs=1e-12)
+    assert legendre_nodes(5) == pytest.approx([-1, -np.sqrt(3 / 7), 0, np.sqrt(3 / 7), 1], abs=1e-12)
     plan = il.plan_thermal("-20,60", time="6 h", turn_on_scatter=0.0)
     assert sorted({round(soak.temperature, 1) for soak in plan.soaks}) == [-20.0, -6.2, 20.0, 46.2, 60.0]
 
 
 def test_soaks_beyond_the_temperatures_come_back_to_inner_ones_from_the_other_side():
-    assert way(5, 6) == [0, 1, 2, 3, 4, 2]
-    assert way(5, 8) == [0, 1, 2, 3, 4, 3, 2, 1]
-    assert way(5, 12) == [0, 1, 2, 3, 4, 3, 2, 1, 0, 1, 2, 3]
+    assert order_soaks(5, 6) == [0, 1, 2, 3, 4, 2]
+    assert order_soaks(5, 8) == [0, 1, 2, 3, 4, 3, 2, 1]
+    assert order_soaks(5, 12) == [0, 1, 2, 3, 4, 3, 2, 1, 0, 1, 2, 3]
     soaks = il.plan_thermal(time="8 h").soaks
     assert [soak.warming for soak in soaks] == [False, True, True, True, True, False, False, False]
 
@@ -53,14 +53,16 @@ def worst(temperatures, sets=None, tau=0.0):
     found = (
         [design.covariance(sets)]
         if sets
-        else [exchange(design, sphere_candidates(), [8] * len(temperatures), seed)[1] for seed in (1, 2, 3, 4)]
+        else [
+            exchange_attitudes(design, sphere_candidates(), [8] * len(temperatures), seed)[1] for seed in (1, 2, 3, 4)
+        ]
     )
     return min(design.deviations(each).max() for each in found)
 
 
 def test_exchange_does_what_was_found_for_it():
     """5 temperatures, 8 attitudes: 0.98 of an attitude's noise at worst, evenly spaced 1.03, spirals 1.08 to 1.33."""
-    at = LAWS.middle + LAWS.half * nodes(5)
+    at = LAWS.middle + LAWS.half * legendre_nodes(5)
     assert worst(at) == pytest.approx(0.98, abs=0.015)
     assert worst(np.linspace(-20, 60, 5)) == pytest.approx(1.03, abs=0.015)
     rng = np.random.default_rng(1)
@@ -71,10 +73,10 @@ def test_exchange_does_what_was_found_for_it():
 
 def test_recordings_count_more_than_attitudes_where_biases_scatter():
     """tau 0.1 mg, 60 ug: 5x60 is worth 100 ug at its worst, 9 temperatures with 8 each 91 to 93."""
-    at, tau = LAWS.middle + LAWS.half * nodes(5), 100 / 60
+    at, tau = LAWS.middle + LAWS.half * legendre_nodes(5), 100 / 60
     rng = np.random.default_rng(1)
     assert 60 * worst(at, [reference.directions(rng, 60) for _ in at], tau) == pytest.approx(100, abs=2)
-    assert 60 * worst(LAWS.middle + LAWS.half * nodes(9), tau=tau) == pytest.approx(92, abs=2)
+    assert 60 * worst(LAWS.middle + LAWS.half * legendre_nodes(9), tau=tau) == pytest.approx(92, abs=2)
 
 
 @pytest.mark.parametrize("tau", [pytest.param(0.0, marks=pytest.mark.slow), 1e-4])

@@ -43,7 +43,7 @@ def test_a_prior_and_the_rest_are_the_joint_fit(seed, step, monkeypatch):
 
     Each fit finds an excess of its own beyond the noise, which is left out here.
     """
-    monkeypatch.setattr(solving, "excess_of", lambda *_: (0.0, np.inf))
+    monkeypatch.setattr(solving, "fit_excess", lambda *_: (0.0, np.inf))
     rng = np.random.default_rng([6, seed])
     whole = problem(rng, reference.Triad(rng), step=step)
     middle = whole.recording == 2
@@ -86,10 +86,10 @@ def test_a_thermal_record_is_the_prior_of_a_tumble_test_at_its_temperature(made)
 
 def test_a_thermal_prior_holds_the_laws_and_the_scatter_at_that_temperature(made):
     from imulab.procedures.thermal.device import at_temperature
-    from imulab.procedures.thermal.record import predicted
+    from imulab.procedures.thermal.record import predict_parameters
 
     record, _ = made
-    values, u = (each[:, 0] for each in predicted(record, np.array([33.0])))
+    values, u = (each[:, 0] for each in predict_parameters(record, np.array([33.0])))
     held = at_temperature(record, 33.0, "x.csv")
     names = list(held.parameters)
     assert [held.value(name) for name in names] == pytest.approx(values, rel=1e-12)

@@ -6,7 +6,7 @@ import pytest
 import imulab as il
 from conftest import some_of
 from imulab.cli import main
-from imulab.procedures.thermal.record import deviation_of_force, gyro_scale_predicted
+from imulab.procedures.thermal.record import deviation_of_force, predict_gyro_scale
 from imulab.recording import Recording
 from imulab.writers import write
 from reference import thermal as reference
@@ -200,7 +200,7 @@ def test_scale_factors_of_gyroscopes_are_drawn_over_temperature(tmp_path):
     made = il.simulate_thermal((-20, 0, 20, 40, 60), attitudes=14, gyro=True, seed=3)
     record = il.fit_thermal(list(made), with_="gyro").calibration
     at = np.array(record.model["range"])
-    values, u = gyro_scale_predicted(record, at)
+    values, u = predict_gyro_scale(record, at)
     for k, axis in enumerate("xyz"):
         names = [n for n in record.parameters if n.startswith(f"gyro_scale_factor_{axis}")]
         powers = (at - record.model["reference_temperature"]["value"])[:, None] ** np.arange(len(names))

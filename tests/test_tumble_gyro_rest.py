@@ -8,7 +8,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.thermal.record import gyro_predicted
+from imulab.procedures.thermal.record import predict_gyro_bias
 from reference import thermal_gyro as reference
 
 G, EARTH = reference.G, reference.EARTH
@@ -62,7 +62,7 @@ def test_over_temperature_the_g_sensitivity_is_free_of_the_vertical_part(latitud
     # Along up nothing else of the Earth's rate is unknown, but for axes askew: such gyroscopes gain a lot by it.
     places = np.linspace(-20, 60, 9)
     for record in (plain, known):
-        values, u = gyro_predicted(record, places)
+        values, u = predict_gyro_bias(record, places)
         assert u.max() < 0.03 * EARTH
         assert (np.abs(values - gyros.bias_at(places).T) < 3 * u).all()
 
@@ -77,7 +77,7 @@ def test_the_vertical_part_is_not_taken_for_a_g_sensitivity(latitude):
     record = il.fit_thermal(given, gravity=G, with_="gyro", gyro_turn_on_scatter=0.0).calibration
     assert record.model["gyro"]["g_sensitivity"] is False
     places = np.linspace(-20, 60, 9)
-    values, u = gyro_predicted(record, places)
+    values, u = predict_gyro_bias(record, places)
     assert (np.abs(values - gyros.bias_at(places).T) < 3.5 * u).all()
 
 

@@ -173,9 +173,7 @@ def simulate_rate(
             recordings.append(_recording(time, output, name, None if swept is None else table_rate))
             runs.append(Run(name, word, tuple(way.tolist()) if swept is None else None, sweep=swept is not None))
     test = RateTest(tuple(runs), common, 0.0, 0.0, place, name="test.toml")
-    return RateRecordings(
-        test, tuple(recordings), _name_truth(scale, zero, turn, k3, None if swept is None else constant)
-    )
+    return RateRecordings(test, tuple(recordings), _name_truth(scale, zero, turn, k3, swept and constant))
 
 
 def _step_through(way: Array, hold: float, period: float) -> tuple[Array, Array, Array]:

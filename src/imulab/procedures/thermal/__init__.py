@@ -1,4 +1,7 @@
-"""Accelerometers and gyroscopes calibrated over temperature; and the words and numbers that the options take."""
+"""Accelerometers and gyroscopes calibrated over temperature.
+
+This file holds the words and numbers of options, which the command line needs before NumPy.
+"""
 
 from __future__ import annotations
 
@@ -6,29 +9,27 @@ from collections.abc import Sequence
 
 from imulab.errors import OptionError
 
-# The words and numbers that the options of a thermal calibration take.
-
-
 LAWS = ("cubic", "rough")
 DEGREES = (3, 2, 1)
-"""Of bias, scale factor and misalignment."""
+"""Highest degrees that are tried, of bias, scale factor and misalignment."""
 HIGHEST = 5  # degree of a law
 TEMPERATURES = "-20,0,25,45,60"
 APART = 5.0
-"""K: temperatures that lie closer count as one."""
+"""Temperatures that lie closer count as one, K."""
 LEAST_SPAN = 10.0  # K between coldest and hottest: less is no test over temperature
 LEAST_KNOTS = 5
 """Temperatures from which a spline of the bias is tried."""
 SETTLE = 300.0  # s of a soak that settles a small unit in a chamber
 TURNED, FOLLOWED = 9, 3
-"""Attitudes of a recording whose turns tell scale factors of gyroscopes; temperatures at which these follow it."""
+"""Fewest attitudes of a recording whose turns give scale factors of gyroscopes, and fewest temperatures of such
+recordings that give their slope."""
 
 STRETCHES, TURNS = 1e-4, 1e-5
-"""What scale factors and misalignments of such sensors usually move by, 1/K and rad/K."""
+"""Usual slopes of scale factors and misalignments of such sensors, 1/K and rad/K."""
 
 
-def further_of(text: str | Sequence[str], option: str) -> tuple[str, ...]:
-    """Return the names of further triads, of which there is one, ``gyro``.
+def parse_further(text: str | Sequence[str], option: str) -> tuple[str, ...]:
+    """Return the names of further triads; the only one is ``gyro``.
 
     Raises
     ------
@@ -41,7 +42,7 @@ def further_of(text: str | Sequence[str], option: str) -> tuple[str, ...]:
     return names
 
 
-def degrees_of(text: str, option: str) -> str | tuple[int, int, int]:
+def parse_degrees(text: str, option: str) -> str | tuple[int, int, int]:
     """Return ``auto``, or three degrees from a text such as ``3,2,1``.
 
     Raises
@@ -49,13 +50,13 @@ def degrees_of(text: str, option: str) -> str | tuple[int, int, int]:
     OptionError
         It is neither.
     """
-    degrees, spline = laws_of(text, option)
+    degrees, spline = parse_laws(text, option)
     if spline:
         raise OptionError(f"{option} {text!r}: expected degrees such as 3,2,1; a spline is for a fit")
     return degrees
 
 
-def laws_of(text: str, option: str) -> tuple[str | tuple[int, int, int], bool]:
+def parse_laws(text: str, option: str) -> tuple[str | tuple[int, int, int], bool]:
     """Return ``auto`` or the degrees that a text states, and whether the bias is a spline: ``3,2,1``, ``spline,2,1``.
 
     Raises
@@ -76,7 +77,7 @@ def laws_of(text: str, option: str) -> tuple[str | tuple[int, int, int], bool]:
     return (int(degrees[0]), int(degrees[1]), int(degrees[2])), spline
 
 
-def degrees_text(text: str, option: str) -> str:
-    """Return a text that `laws_of` can read; raises OptionError as it does."""
-    laws_of(text, option)
+def check_degrees(text: str, option: str) -> str:
+    """Return a text unchanged if `parse_laws` can read it; raises OptionError as it does."""
+    parse_laws(text, option)
     return text

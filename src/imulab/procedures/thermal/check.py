@@ -1,4 +1,7 @@
-"""New recordings against a record over temperature, to test whether it still holds, and how that is shown."""
+"""The test whether new recordings contradict a record over temperature, and its report.
+
+The equations are in `check_thermal` and `degrees.within_and_between`.
+"""
 
 from __future__ import annotations
 
@@ -25,23 +28,23 @@ from imulab.procedures.result import (
     probability_fact,
     probability_text,
 )
-from imulab.procedures.thermal.degrees import parted
-from imulab.procedures.thermal.figures import own_points
-from imulab.procedures.thermal.gyro import RatesAtRest, notes_on_turns, rates_at_rest, rows_of, without_turns
-from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepared
+from imulab.procedures.thermal.degrees import within_and_between
+from imulab.procedures.thermal.figures import axis_groups
+from imulab.procedures.thermal.gyro import RatesAtRest, leave_out_turns, linearise_rates, note_turns, rates_at_rest
+from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepare_recordings
 from imulab.procedures.thermal.model import AXES, Laws, forces
-from imulab.procedures.thermal.record import gyro_scale_predicted, names_and_units, of_record
+from imulab.procedures.thermal.record import laws_in_g, names_and_units, predict_gyro_scale
 from imulab.procedures.thermal.schema import thermal_of
-from imulab.procedures.thermal.solve import ThermalProblem, linearise, together
+from imulab.procedures.thermal.solve import ThermalProblem, linearise, row_covariance
 from imulab.quantities import in_si
 from imulab.recording import Array, Data, Reading, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.sections import StatedGravity, entries
-from imulab.report.parameters import micro_g
-from imulab.report.traces import LEGEND, Exhibits, Figure, figure_axis, points, table, within_and_beyond
+from imulab.report.parameters import micro_g, text_in
+from imulab.report.traces import Exhibits, Figure, figure_axis, points, table, within_and_beyond
 from imulab.units import conversion_factor, from_si, parse_unit, to_si
 
-# The gyroscopes of new recordings against a record over temperature: their outputs at rest under its laws.
+# The gyroscopes: their outputs at rest under the record's laws.
 
 
 _UNSAID = (
@@ -57,7 +60,7 @@ class GyroCheck:
     Attributes
     ----------
     holds
-        Place of each tested hold among those of the check, shape (n,).
+        Index of each tested hold among those of the check, shape (n,).
     residuals, standard_uncertainty
         Law less output of each hold and axis, rad/s, shape (n, 3).
     within, between
@@ -72,7 +75,7 @@ class GyroCheck:
 
     @property
     def worst(self) -> tuple[int, int]:
-        """Hold, of those tested, and axis whose output is farthest off."""
+        """Index of the tested hold, and axis, whose output is farthest off."""
         row, axis = np.unravel_index(int(np.argmax(np.abs(self.residuals))), self.residuals.shape)
         return int(row), int(axis)
 
@@ -84,7 +87,9 @@ def check_gyros(
     turn_on_scatter: float | str | None,
     earth: EarthRate | None = None,
 ) -> tuple[GyroCheck | None, list[str]]:
-    """Test the outputs at rest under specific forces in g, shape (n, 3); return what is found, and what is to be said.
+    """Return the test of the outputs at rest under specific forces in g, shape (n, 3), and its notes.
+
+    None where the record or the recordings have no gyroscopes.
 
     Raises
     ------
@@ -104,15 +109,15 @@ def check_gyros(
         return None, [
             Note(f"{which}: no columns gyro_x gyro_y gyro_z over time, so the record's gyroscopes are not tested")
         ]
-    tau, rank = _scatter(record, turn_on_scatter)
+    tau, rank = _gyro_scatter(record, turn_on_scatter)
     fit = thermal_of(record).fit.gyro
     assert fit is not None
-    # In a record without a latitude the vertical part is in the g-sensitivities: taken off, it would count twice.
+    # Without a latitude the record's g-sensitivities hold the vertical part, which must not be subtracted twice.
     known = earth if fit.latitude is not None or not model.gyro.g_sensitivity else None
     laws = model.gyro_laws
     try:
-        held, aside = without_turns(replace(_rates(record, holds, force), earth=known), laws)
-    except DataError as error:  # faulty columns of gyroscopes say nothing against the accelerometers
+        held, aside = leave_out_turns(replace(_rates_by_record(record, holds, force), earth=known), laws)
+    except DataError as error:  # faulty gyroscopes do not keep accelerometers from being tested
         return None, [f"gyroscopes not tested: {error}"]
     names, _ = names_and_units(laws, sensitivity=model.gyro.g_sensitivity)
     size = 3 * laws.terms[0]
@@ -121,18 +126,18 @@ def check_gyros(
     inverse = np.linalg.inv(factor)
     coefficients = inverse @ np.array([record.value(name) for name in names])
     covariance = inverse @ record.cov(*names) @ inverse.T
-    rows = rows_of(held, laws, coefficients, ())
+    rows = linearise_rates(held, laws, coefficients, ())
     excess = fit.excess.value**2
-    noise = together(rows, excess, np.zeros(2))
-    whole = together(rows, excess, np.array([tau or 0.0, 0.0])) + rows.jacobian @ covariance @ rows.jacobian.T
-    within, between = parted(rows, whole, noise, np.zeros((len(whole), 0)), rank, by_share=False)
+    noise = row_covariance(rows, excess, np.zeros(2))
+    whole = row_covariance(rows, excess, np.array([tau or 0.0, 0.0])) + rows.jacobian @ covariance @ rows.jacobian.T
+    within, between = within_and_between(rows, whole, noise, np.zeros((len(whole), 0)), rank, by_share=False)
     residual, u = (each.reshape(-1, 3) for each in (rows.residual, np.sqrt(np.diag(whole))))
-    notes = [*held.notes, *notes_on_turns(holds, aside), *([_UNSAID] if tau is None else [])]
+    notes = [*held.notes, *note_turns(holds, aside), *([_UNSAID] if tau is None else [])]
     return GyroCheck(held.index, residual, u, within, between), notes
 
 
-def _rates(record: Calibration, holds: Holds, force: Array) -> RatesAtRest:
-    """Return the outputs at rest by the record's scale factors at each temperature."""
+def _rates_by_record(record: Calibration, holds: Holds, force: Array) -> RatesAtRest:
+    """Return the rates at rest by the record's scale factors at each temperature."""
     gyro = thermal_of(record).model.gyro
     assert gyro is not None
     of_rate = parse_unit(gyro.output_unit).quantity == "rate"
@@ -146,16 +151,16 @@ def _rates(record: Calibration, holds: Holds, force: Array) -> RatesAtRest:
     if gyro.scale == "nominal":
         return rates_at_rest(holds, force, np.ones(3))
     middle = np.array([record.model["reference_temperature"]["value"]])
-    nominal = gyro_scale_predicted(record, middle)[0][:, 0]
+    nominal = predict_gyro_scale(record, middle)[0][:, 0]
     size = to_si(nominal, gyro.output_unit) if of_rate else nominal
     held = rates_at_rest(holds, force, size)
-    part = (nominal[:, None] / gyro_scale_predicted(record, held.temperature)[0]).T
+    part = (nominal[:, None] / predict_gyro_scale(record, held.temperature)[0]).T
     covariance = held.covariance * part[:, :, None] * part[:, None, :]
     return replace(held, mean=held.mean * part, covariance=covariance)
 
 
-def _scatter(record: Calibration, stated: float | str | None) -> tuple[float | None, int | None]:
-    """Return the scatter of biases between power cycles, rad/s, and the rank of what told it; None where unknown."""
+def _gyro_scatter(record: Calibration, stated: float | str | None) -> tuple[float | None, int | None]:
+    """Return the scatter of biases between power cycles, rad/s, and the rank of its estimate; None where unknown."""
     if stated is not None:
         tau = in_si(stated, "gyro_turn_on_scatter", "rate", "deg/s")
         if not 0 <= tau < np.inf:
@@ -170,10 +175,10 @@ def _scatter(record: Calibration, stated: float | str | None) -> tuple[float | N
     return float(np.hypot(between.bias.value, least)), between.rank
 
 
-# The result of a test of a record over temperature: verdict, and each residual beside its uncertainty.
+# The result.
 
 
-_BEYOND_RANGE = 2.0  # standard uncertainties: what is farther off is drawn as such
+_BEYOND_RANGE = 2.0  # standard uncertainties from which a residual is drawn as beyond them
 _FAILED = (
     "|f| differs from g between attitudes or temperatures by more than the record explains",
     "an offset that whole recordings have in common is larger than power cycles explain",
@@ -189,22 +194,22 @@ class ThermalCheck(RecordCheck):
     Attributes
     ----------
     holds
-        That were tested.
+        The tested holds.
     residuals
         ``|f| - g`` of each under the record, m/s^2, shape (n,).
     standard_uncertainty
-        Of each, from the laws, the power cycle, the temperature and the hold's noise, m/s^2, shape (n,).
+        Standard uncertainty of each by laws, power cycle, temperature and noise, m/s^2, shape (n,).
     within, between
-        Probability of so large residuals, did the record hold: of what differs between the holds of a recording, and
-        of what all have in common, as an offset of the biases has. None where there is nothing to test.
+        Probabilities of such residuals if the record holds: of the differences between the holds of a recording, and of
+        what all its holds have in common, as by an offset of the biases. None where there is nothing to test.
     gravity
-        That was used.
+        Local gravity.
     limit
         Largest ``| |f| - g |`` that passes, m/s^2; None: the test alone decides.
     notes
-        What a user must know of the test, a sentence each.
+        Notes on what was and was not tested.
     gyro
-        The gyroscopes' outputs at rest under the record's laws; None where the record or the recordings have none.
+        The test of the gyroscopes; None where the record or the recordings have none.
     """
 
     holds: Holds
@@ -221,22 +226,21 @@ class ThermalCheck(RecordCheck):
     data: ClassVar[str] = "recording"
 
     def __repr__(self) -> str:
-        worst = from_si(float(self.residuals[self.worst]), "ug")
         return (
             f"ThermalCheck({'pass' if self.passed else 'fail'}, p = {self.probability:.2g}, {len(self.holds)} holds, "
-            f"the farthest off by {worst:.3g} µg)"
+            f"the farthest off by {text_in(float(self.residuals[self.worst]), 'ug')} µg)"
         )
 
     @property
     def probability(self) -> float:
-        """Of the least likely of the tests, as one of so many (Bonferroni)."""
+        """Probability of the least likely of the tests, times their number (Bonferroni)."""
         gyro = [] if self.gyro is None else [self.gyro.within, self.gyro.between]
         made: list[float] = [p for p in (self.within, self.between, *gyro) if p is not None]
         return min([1.0, *(len(made) * p for p in made)])
 
     @property
     def passed(self) -> bool:
-        """Whether the tests find no contradiction at 5 %, and every hold is within the limit, if there is one."""
+        """Whether the tests find no contradiction, and every hold is within the limit, if there is one."""
         within = self.limit is None or bool((np.abs(self.residuals) <= self.limit).all())
         return within and self.probability >= THERMAL_CHECK.level
 
@@ -272,7 +276,7 @@ class ThermalCheck(RecordCheck):
         lines = [
             f"{probability_text(self.probability)} over {len(self.holds)} holds (within recordings "
             f"{probability_text(self.within)}, common to each {probability_text(self.between)}), largest |f| - g "
-            f"{_micro(self.residuals[worst])} ug ({label(worst)})"
+            f"{_micro_text(self.residuals[worst])} ug ({label(worst)})"
         ]
         if (gyro := self.gyro) is not None:
             row, axis_number = gyro.worst
@@ -286,7 +290,7 @@ class ThermalCheck(RecordCheck):
             )
         for k, value in enumerate(self.residuals):
             beyond = "  beyond the limit" if self.limit is not None and abs(value) > self.limit else ""
-            lines.append(f"{label(k)}: {_micro(value)} ± {_micro(u[k], '')} ug{beyond}")
+            lines.append(f"{label(k)}: {_micro_text(value)} ± {_micro_text(u[k], '')} ug{beyond}")
         return lines
 
     def content(self) -> dict[str, Any]:
@@ -329,8 +333,8 @@ class ThermalCheck(RecordCheck):
             tests["gyroscopes: p of what each has in common"] = gyro.between
         columns: dict[str, Callable[[int], str]] = {
             "hold": lambda k: labels[k],
-            "|f| − g, µg": lambda k: _micro(self.residuals[k]),
-            "u, µg": lambda k: _micro(self.standard_uncertainty[k], ""),
+            "|f| − g, µg": lambda k: _micro_text(self.residuals[k]),
+            "u, µg": lambda k: _micro_text(self.standard_uncertainty[k], ""),
             "(|f| − g) / u": lambda k: f"{self.residuals[k] / self.standard_uncertainty[k]:+.1f}",
         }
         holds = table(
@@ -355,40 +359,36 @@ class ThermalCheck(RecordCheck):
             message=f"{int(far.sum())} of {len(far)} holds lie beyond twice the standard uncertainty.",
         )
         facts = [*((name, probability_fact(p)) for name, p in tests.items())]
-        facts.append(("largest |f| − g", f"{_micro(self.residuals[self.worst])} µg"))
-        return self.exhibits_with(facts, [figure, *([_gyroscopes(self, gyro)] if gyro else []), holds])
+        facts.append(("largest |f| − g", f"{_micro_text(self.residuals[self.worst])} µg"))
+        return self.exhibits_with(facts, [figure, *([_gyro_figure(self, gyro)] if gyro else []), holds])
 
 
-def _gyroscopes(check: ThermalCheck, gyro: GyroCheck) -> Figure:
-    at = check.holds.temperature[gyro.holds]
+def _gyro_figure(check: ThermalCheck, gyro: GyroCheck) -> Figure:
+    """Return law less output of each hold and axis over temperature."""
     residual, reach = from_si(gyro.residuals, "deg/h"), _BEYOND_RANGE * from_si(gyro.standard_uncertainty, "deg/h")
-    traces = [
-        own_points(at, residual[:, k], reach[:, k], k, name) | {"name": name, "showlegend": True}
-        for k, name in enumerate(AXES)
-    ]
-    return Figure(
-        title="The gyroscopes at rest under the record, over temperature",
+    return points(
+        "The gyroscopes at rest under the record, over temperature",
+        "Bars: twice the standard uncertainty, from laws, power cycle, temperature, Earth's rate and noise.",
+        ("temperature, degC", np.repeat(check.holds.temperature[gyro.holds], len(AXES))),
+        (figure_axis("law less output, deg/h", zeroline=True), residual.ravel()),
+        reach.ravel(),
+        axis_groups(len(residual)),
+        size=7,
         message=f"{int((np.abs(residual) > reach).sum())} of {residual.size} outputs lie beyond twice the standard "
         "uncertainty.",
-        caption="Bars: twice the standard uncertainty, from laws, power cycle, temperature, Earth's rate and noise.",
-        traces=traces,
-        layout={
-            "xaxis": figure_axis("temperature, degC"),
-            "yaxis": figure_axis("law less output, deg/h", zeroline=True),
-            "legend": LEGEND,
-        },
     )
 
 
-def _micro(value: float, sign: str = "+") -> str:
+def _micro_text(value: float, sign: str = "+") -> str:
+    """Return an acceleration in µg as text, three significant digits, never in powers of ten."""
     size = micro_g(value)
     return f"{size:{sign}.3g}" if abs(size) < 999.5 else f"{size:{sign}.0f}"
 
 
-# New recordings against a record over temperature, to test whether it still holds.
+# The test.
 
 
-_BEYOND = 1.0  # K outside the record's range: its laws say nothing there
+_BEYOND = 1.0  # K outside the record's range, up to which its laws are taken to hold
 
 
 def check_thermal(
@@ -466,8 +466,8 @@ def check_thermal(
     if not recordings:
         raise OptionError("check_thermal: data: expected one recording or more, found none")
     column = temperature_column or held.options.get("temperature_column")
-    recordings = prepared(
-        [_in_unit_of(held, item) for item in recordings],
+    recordings = prepare_recordings(
+        [_convert_outputs(held, item) for item in recordings],
         column if column is not None and all(column in item for item in recordings) else temperature_column,
         None if settle is None else in_si(settle, "settle", "time", "s"),
         span=0.0,
@@ -476,13 +476,13 @@ def check_thermal(
     if gyro_turn_on_scatter is not None and not has_gyroscopes:
         raise OptionError("gyro_turn_on_scatter: the record holds no gyroscopes (thermal fit --with gyro)")
     earth = at_latitude(latitude) if has_gyroscopes else None
-    local = _gravity(held, at_place(gravity, latitude, height, beside=earth is not None), recordings[0])
-    holds, notes = _inside(held, find_holds(recordings))
+    local = _choose_gravity(held, at_place(gravity, latitude, height, beside=earth is not None), recordings[0])
+    holds, notes = _select_in_range(held, find_holds(recordings))
     unit = thermal_of(held).model.output_unit
     check_holds(holds, local.value, conversion_factor(unit, "m/s^2") if unit in ("m/s^2", "g", "mg") else None)
-    leaning, tau = _sizes(tilt, turn_on_scatter, held, local.value)
+    leaning, tau = _tilt_and_scatter(tilt, turn_on_scatter, held, local.value)
     rank = None if tau is None else 0 if turn_on_scatter is not None else thermal_of(held).fit.between_recordings.rank
-    tested, force = _tested(held, holds, local, leaning, tau, rank)
+    tested, force = _run_tests(held, holds, local, leaning, tau, rank)
     if tau is None:
         notes.append(
             "the record does not say how far biases move from one power cycle to the next, so an offset that a whole "
@@ -490,11 +490,12 @@ def check_thermal(
         )
     gyro, gyro_notes = check_gyros(held, holds, force, gyro_turn_on_scatter, earth)
     notes += gyro_notes
-    notes += [*([local.note] if local.note else []), *_known(held, recordings)]
+    notes += [*([local.note] if local.note else []), *_warn_known(held, recordings)]
     return ThermalCheck(holds, *tested, local, largest, tuple(notes), gyro)
 
 
-def _in_unit_of(record: Calibration, recording: Recording) -> Recording:
+def _convert_outputs(record: Calibration, recording: Recording) -> Recording:
+    """Return the recording with accelerometers in the unit of the record."""
     unit, present = thermal_of(record).model.output_unit, recording.triad_unit("accel")
     try:
         factor = conversion_factor(present, unit)
@@ -507,8 +508,8 @@ def _in_unit_of(record: Calibration, recording: Recording) -> Recording:
     return recording.with_columns({n: recording.column(n) * factor for n in names}, dict.fromkeys(names, unit))
 
 
-def _gravity(record: Calibration, gravity: float | str | Gravity | None, recording: Recording) -> Gravity:
-    """Return what was given, else the head's, else that of the record."""
+def _choose_gravity(record: Calibration, gravity: float | str | Gravity | None, recording: Recording) -> Gravity:
+    """Return the stated gravity, else that of the recording's head, else that of the record."""
     if gravity is None and "gravity" not in recording.metadata:
         stated = record.model["gravity"]
         note = f"gravity {stated['value']:.6g} m/s^2 was taken from the record, as if measured at the same place"
@@ -517,10 +518,10 @@ def _gravity(record: Calibration, gravity: float | str | Gravity | None, recordi
     return local_gravity(gravity, recording)
 
 
-def _sizes(
+def _tilt_and_scatter(
     tilt: float | str, turn_on_scatter: float | str | None, record: Calibration, gravity: float
 ) -> tuple[float, float | None]:
-    """Return the tilt, rad, and the scatter of biases between power cycles, g; None where nobody says it."""
+    """Return the tilt, rad, and the scatter of biases between power cycles, g; None where it is unknown."""
     leaning = in_si(tilt, "tilt", "angle", "mrad")
     if not 0 < leaning < np.inf:
         raise OptionError(f"tilt {leaning:g}: expected a size above 0")
@@ -528,7 +529,7 @@ def _sizes(
     if turn_on_scatter is None:
         if between.from_ == "unknown":
             return leaning, None
-        # An estimate may be 0 by chance: with what it can tell beside it, F with its rank holds the false alarms.
+        # An estimate may be 0 by chance: with its resolution added, F with its rank keeps the rate of false alarms.
         least = 0.0 if between.resolution is None else between.resolution.value
         return leaning, float(np.hypot(between.bias.value, least)) / gravity
     tau = in_si(turn_on_scatter, "turn_on_scatter", "acceleration", "mg") / gravity
@@ -537,8 +538,8 @@ def _sizes(
     return leaning, tau
 
 
-def _inside(record: Calibration, holds: Holds) -> tuple[Holds, list[str]]:
-    """Return the holds within the record's range of temperature, and a sentence on what is not.
+def _select_in_range(record: Calibration, holds: Holds) -> tuple[Holds, list[str]]:
+    """Return the holds within the record's range of temperature, and a note on the others.
 
     Raises
     ------
@@ -556,21 +557,8 @@ def _inside(record: Calibration, holds: Holds) -> tuple[Holds, list[str]]:
             f"{holds.recordings[0].name}: all holds are at {where}, outside the {low:.1f} to {high:.1f} degC of the "
             "record, which says nothing there"
         )
-    chosen = {
-        name: getattr(holds, name)[kept]
-        for name in (
-            "mean",
-            "covariance",
-            "temperature",
-            "rate",
-            "step",
-            "shared",
-            "recording",
-            "group",
-            "start",
-            "stop",
-        )
-    }
+    columns = ("mean", "covariance", "temperature", "rate", "step", "shared", "recording", "group", "start", "stop")
+    chosen = {name: getattr(holds, name)[kept] for name in columns}
     group = chosen["group"]
     chosen["wander"] = holds.wander[np.ix_(kept, kept)]
     chosen["group"] = np.where(group >= 0, np.searchsorted(np.unique(group[group >= 0]), group), -1)
@@ -581,7 +569,8 @@ def _inside(record: Calibration, holds: Holds) -> tuple[Holds, list[str]]:
     return replace(holds, **chosen), [note]
 
 
-def _known(record: Calibration, recordings: Sequence[Recording]) -> list[str]:
+def _warn_known(record: Calibration, recordings: Sequence[Recording]) -> list[str]:
+    """Return a warning for each recording from which the record was made."""
     sources = {source.sha256 for source in record.sources}
     return [
         f"{each.name}: the record was made from this recording, which says nothing of whether it still holds"
@@ -590,32 +579,35 @@ def _known(record: Calibration, recordings: Sequence[Recording]) -> list[str]:
     ]
 
 
-def _tested(
+def _run_tests(
     record: Calibration, holds: Holds, gravity: Gravity, tilt: float, tau: float | None, rank: int | None
 ) -> tuple[tuple[Array, Array, float | None, float | None], Array]:
-    """Return residuals, their uncertainties, m/s^2, and the probabilities of the two tests; and f, g, shape (n, 3)."""
+    """Return residuals, their uncertainties, m/s^2, and the probabilities of both tests; and f in g, shape (n, 3).
+
+    The covariance is V of `solve` plus ``J C J'``, C the covariance of the record's coefficients, and gravity's.
+    """
     g, fit = gravity.value, thermal_of(record).fit
-    laws, coefficients, covariance, scale, common = of_record(record, g, gravity.standard_uncertainty)
+    laws, coefficients, covariance, scale, common = laws_in_g(record, g, gravity.standard_uncertainty)
     problem = ThermalProblem(
         holds.mean / scale, holds.covariance / (scale[:, None] * scale), holds.temperature, np.zeros(len(holds)),
         holds.step, holds.shared, holds.recording, holds.group, tilt, np.zeros(3), wander=holds.wander,
     )  # fmt: skip
-    rows = linearise(problem, laws, coefficients, _directions(problem, laws, coefficients))
+    rows = linearise(problem, laws, coefficients, _mean_directions(problem, laws, coefficients))
     excess = (fit.excess.value / g) ** 2
     of_scale = fit.between_recordings.scale_factor.value
-    noise = together(rows, excess, np.zeros(2))
+    noise = row_covariance(rows, excess, np.zeros(2))
     jacobian = rows.jacobian[:, : laws.size]
-    whole = together(rows, excess, np.array([tau or 0.0, of_scale])) + jacobian @ covariance @ jacobian.T
+    whole = row_covariance(rows, excess, np.array([tau or 0.0, of_scale])) + jacobian @ covariance @ jacobian.T
     whole += common * np.outer(rows.magnitude, rows.magnitude)
-    within, between = parted(rows, whole, noise, rows.jacobian[:, laws.size :], rank)
+    within, between = within_and_between(rows, whole, noise, rows.jacobian[:, laws.size :], rank)
     order = np.argsort(rows.owner[rows.magnitude])
     residual_u = g * np.sqrt(np.diag(whole)[rows.magnitude])[order]
     force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
     return (g * rows.residual[rows.magnitude][order], residual_u, within, between), force
 
 
-def _directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
-    """Mean direction of each unmoved group under the record, shape (G, 3)."""
+def _mean_directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
+    """Return the mean direction of each unmoved group under the record, shape (G, 3)."""
     force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
     count = int(problem.group.max(initial=-1)) + 1
     directions = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)

@@ -1,21 +1,20 @@
-"""How the degrees of the laws are chosen, whether biases lag behind the thermometer, what holds do not determine.
+"""The choice of the laws' degrees, lag and loops of the biases, and checks that recordings agree with each other.
 
-And whether the recordings agree as those of one unit do.
+Degrees (`choose_laws`): from the highest *down*, one step at a time, as long as a step is insignificant (F at 1 %) and
+interior temperatures that are left out whole are predicted no worse. (Upward selection stops too early where a law has
+a kink.) The same is done with a natural cubic spline of the bias. It is taken if its values at the knots lie on no
+cubic, by the same test, and if it predicts left-out temperatures at most a tenth worse than polynomials: without a knot
+a spline must bridge twice the distance.
 
-From the highest degrees *down*, a step at a time, where a step is insignificant (F at 1 %) and interior temperatures,
-left out whole, are predicted no worse: upward selection stops short where a law has a kink. The same is done with a
-natural cubic spline of the bias. It is taken where its values at the knots differ significantly from a cubic, as far as
-recordings tell that, and it predicts the temperatures left out at most a tenth worse than polynomials do: without one
-of its knots it must bridge twice the distance, which costs polynomials nothing.
+Lag and loops (`fit_lag_and_loops`): a lag L of the unit, ``p(T - L dT/dt)``, and a loop h of each axis,
+``h sign(dT/dt) (1 - theta^2)``, are fitted beside the laws. Lag and loops are each tested given the other (F at 1 %);
+the significant ones stay in the fit. Corrected outputs use L = 0 and h = 0, since a unit would have to differentiate
+its temperature.
 
-The *lag* L is one for the unit, ``p(T - L dT/dt)``; the *loop* h one for each axis, ``h sign(dT/dt) (1 - theta^2)``.
-All four are fitted beside the laws, and each of the two is tested, given the other, by F at 1 %; what is significant
-stays in the fit. Soaks have loops by the side that they were reached from, where heads say it. Corrected outputs use
-L = 0 and h = 0: a unit would have to differentiate its temperature.
-
-A term left out of the laws moves all others: with the Jacobian J and the derivatives A by what is left out, times its
-usual size, both whitened, coefficients err by ``-J^+ A a``, a of size 1. What of A is left beside J, B, tells a to the
-covariance ``(1 + B'B)^-1``. Where what this leaves in the biases matters beside their uncertainty, it is said.
+Missing terms (`bias_shift_from_unobserved`): a term that the holds do not show shifts all coefficients by ``-J^+ A a``,
+J the whitened Jacobian, A the whitened derivatives by the term times its usual size, and a of variance 1. The part B of
+A beside J reduces the variance of a to ``(1 + B'B)^-1``. A warning is given where the shift of the biases is large
+beside their uncertainty.
 """
 
 from __future__ import annotations
@@ -46,16 +45,16 @@ from imulab.procedures.thermal.solve import (
     Rows,
     ThermalProblem,
     ThermalSolution,
-    between,
-    excess_of,
+    fit_excess,
+    fit_turn_on_scatter,
     offset_modes,
+    row_covariance,
     solve,
-    together,
     whitener,
 )
 from imulab.recording import Array
 
-# How the degrees of the laws are chosen, and how well temperatures are predicted that were left out whole.
+# Choice of the degrees, and prediction of temperatures that were left out whole.
 
 
 Degrees = tuple[int, int, int]
@@ -64,12 +63,12 @@ _HANDICAP = 1.1
 """Error at temperatures left out, over that of polynomials, up to which a spline is taken."""
 _TOLD = 2000.0  # condition number up to which a temperature can be left out
 _TUMBLE = 9
-"""Attitudes that tell the parameters at one temperature."""
+"""Fewest attitudes that determine the parameters at one temperature."""
 
 
 @dataclass(frozen=True)
 class LeftOutCluster:
-    """One interior temperature left out whole: degC, holds, rms of | |f| - g | there in g, chi-square per hold."""
+    """An interior temperature, degC, left out whole: its holds, rms of | |f| - g | in g, chi-square per hold."""
 
     temperature: float
     holds: int
@@ -81,7 +80,7 @@ class LeftOutCluster:
 class DegreesStep:
     """Degrees that were compared: rms over the temperatures left out (g), probability of the step, whether chosen.
 
-    `knots`: how many the spline of the bias had, 0 of a polynomial.
+    `knots` is the number of knots of the bias, 0 for a polynomial.
     """
 
     degrees: Degrees
@@ -93,10 +92,10 @@ class DegreesStep:
 
 @dataclass(frozen=True)
 class ChosenLaws:
-    """Laws that were fitted: the solution, what was compared on the way, temperatures left out, what the rows tell.
+    """The fitted laws: solution, compared degrees, temperatures left out, and observability.
 
-    `missed`: higher degrees that the holds need, and how probable what these add would be by chance, where the degrees
-    were stated.
+    `missed`, where the degrees were stated too low: higher ones that the holds need, and the probability of their
+    additional coefficients by chance.
     """
 
     solution: ThermalSolution
@@ -106,8 +105,8 @@ class ChosenLaws:
     missed: tuple[Degrees, float] | None = None
 
 
-def clusters_of(temperature: Array) -> NDArray[np.int64]:
-    """Return the number of the temperature that each hold is at; those within 5 K of the first of a cluster are one."""
+def number_temperatures(temperature: Array) -> NDArray[np.int64]:
+    """Return the number of each hold's temperature, ascending; those within 5 K of the first of a cluster are one."""
     order, number, first = np.argsort(temperature, kind="stable"), -1, -np.inf
     numbers = np.empty(len(temperature), dtype=np.int64)
     for index in order.tolist():
@@ -117,8 +116,8 @@ def clusters_of(temperature: Array) -> NDArray[np.int64]:
     return numbers
 
 
-def seen(solution: ThermalSolution) -> Observability:
-    """Return what the holds tell apart, unmoved directions included; lag and loops were judged before."""
+def judge_observability(solution: ThermalSolution) -> Observability:
+    """Return rank and condition of laws and directions of unmoved holds; lag and loops are judged elsewhere."""
     rows = solution.rows
     fitted = np.s_[solution.laws.size : len(solution.coefficients)]
     return observability(np.delete(rows.jacobian, fitted, axis=1), 1 / (np.diag(rows.noise) + solution.excess**2))
@@ -126,9 +125,9 @@ def seen(solution: ThermalSolution) -> Observability:
 
 @dataclass(frozen=True)
 class Split:
-    """One temperature left out: its rows with their V, and all others whitened; the Jacobians have every column.
+    """One temperature left out: its rows with their covariance V, and all others whitened.
 
-    `untold` are the columns of a spline that has a knot there: fits to all other temperatures do without them.
+    `untold` are the columns of the spline's knot there, which fits to all other temperatures do not determine.
     """
 
     number: int
@@ -140,27 +139,27 @@ class Split:
     untold: tuple[int, ...] = ()
 
 
-def splits(solution: ThermalSolution, cluster: NDArray[np.int64]) -> list[Split]:
-    """Return the split at each interior temperature: the factor of V is what takes time, and no choice changes it."""
+def split_temperatures(solution: ThermalSolution, cluster: NDArray[np.int64]) -> list[Split]:
+    """Return the split at each interior temperature, once for all degrees, since whitening takes the time."""
     rows, parts = solution.rows, []
     whole = np.zeros(rows.jacobian.shape[1])
     whole[: len(solution.coefficients)] = solution.coefficients
     target = rows.jacobian @ whole - rows.residual
     at = np.where(rows.owner >= 0, cluster[rows.owner], -1)
     for number in range(1, int(cluster.max(initial=0))):
-        jacobian, missing = _without_knot(rows.jacobian, solution.laws, number)
+        jacobian, missing = _remove_knot(rows.jacobian, solution.laws, number)
         train, test = at != number, (at == number) & rows.magnitude
-        white = whitener(rows_where(rows, train), solution.excess**2, solution.scatter.tau)
-        test_weight = together(rows_where(rows, test), solution.excess**2, solution.scatter.tau)
+        white = whitener(select_rows(rows, train), solution.excess**2, solution.scatter.tau)
+        test_weight = row_covariance(select_rows(rows, test), solution.excess**2, solution.scatter.tau)
         rest = white(jacobian[train]), white(target[train])
         parts.append(Split(number, jacobian[test], target[test], test_weight, *rest, missing))
     return parts
 
 
-def _without_knot(jacobian: Array, laws: Laws, number: int) -> tuple[Array, tuple[int, ...]]:
-    """Return the Jacobian by the coefficients of the spline without one of its knots, and by one that bends there.
+def _remove_knot(jacobian: Array, laws: Laws, number: int) -> tuple[Array, tuple[int, ...]]:
+    """Return the Jacobian by coefficients of the spline without one of its knots, and by its bend at that knot.
 
-    The columns of the latter, one for each axis, are returned too; without a spline nothing changes.
+    Also returns the columns of the bend, one for each axis. Without a spline nothing changes.
     """
     if not laws.knots:
         return jacobian, ()
@@ -173,8 +172,11 @@ def _without_knot(jacobian: Array, laws: Laws, number: int) -> tuple[Array, tupl
     return changed, tuple(part.start + number for part in laws.parts[:3])
 
 
-def left_out(splits: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOutCluster]:
-    """Return the errors at each interior temperature under a fit, with these coefficients alone, to all others."""
+def predict_left_out(splits: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOutCluster]:
+    """Return the errors at each interior temperature under a fit of the `kept` coefficients to all others.
+
+    ``e = y - J p``, p the fit to the other temperatures with covariance P; chi-square is ``e' (V + J P J')^-1 e``.
+    """
     errors = []
     for split in splits:
         columns = np.ones(split.rest.shape[1], dtype=np.bool_)
@@ -183,7 +185,7 @@ def left_out(splits: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOutCl
         rest, jacobian = split.rest[:, columns], split.jacobian[:, columns]
         values = np.linalg.svd(rest / np.maximum(np.linalg.norm(rest, axis=0), 1e-300), compute_uv=False)
         if not values[-1] > values[0] / _TOLD or len(rest) < rest.shape[1]:
-            continue  # the only tumble is at this temperature: the others do not determine the laws
+            continue  # the other temperatures do not determine the laws: the only tumble is here
         inverse = np.linalg.pinv(rest, rcond=1e-13)
         error = split.target - jacobian @ (inverse @ split.rest_target)
         carried = jacobian @ inverse
@@ -193,7 +195,7 @@ def left_out(splits: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOutCl
     return errors
 
 
-def rows_where(rows: Rows, which: NDArray[np.bool_]) -> Rows:
+def select_rows(rows: Rows, which: NDArray[np.bool_]) -> Rows:
     """Return some of the rows, with every column."""
     return replace(
         rows,
@@ -208,18 +210,20 @@ def rows_where(rows: Rows, which: NDArray[np.bool_]) -> Rows:
     )
 
 
-def choose(
+def choose_laws(
     problem: ThermalProblem, laws: Laws, wanted: str | Degrees, tau: float | None, name: str, *, spline: bool = False
 ) -> ChosenLaws:
-    """Solve with the degrees wanted, or with those that data and prediction support; `spline` that of the bias.
+    """Return the fit with the degrees wanted, or with those that data and prediction support.
+
+    `spline`: the bias is a natural cubic spline.
 
     Raises
     ------
     ObservabilityError
         The holds cannot separate the coefficients; the message names them.
     """
-    cluster = clusters_of(problem.temperature)
-    knots = knots_at(problem.temperature, cluster, laws)
+    cluster = number_temperatures(problem.temperature)
+    knots = place_knots(problem.temperature, cluster, laws)
     limit = max(len(knots) - 2, 0)
     highest = replace(laws, degrees=(min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit)))
 
@@ -234,41 +238,43 @@ def choose(
                 f"{name}: degrees {form.spelled} at {len(knots)} temperatures (5 K apart); expected {needed}: record "
                 "at more temperatures"
             )
-        solution, view = _observable(problem, form, tau, name)
-        solution = bounded(solution, tau, solved)
-        held = left_out(splits(solution, cluster), np.ones(form.size, dtype=np.bool_))
-        missed = _missed(problem, solution, highest, tau, name)
-        return ChosenLaws(solution, [], _at(held, problem, cluster), view, missed)
-    chosen = _descended(problem, highest, cluster, tau, name)
+        solution, view = _solve_observable(problem, form, tau, name)
+        solution = bound_scatter(solution, tau, solved)
+        held = predict_left_out(split_temperatures(solution, cluster), np.ones(form.size, dtype=np.bool_))
+        missed = _find_missed_degrees(problem, solution, highest, tau, name)
+        return ChosenLaws(solution, [], _name_temperatures(held, problem, cluster), view, missed)
+    chosen = _step_down_degrees(problem, highest, cluster, tau, name)
     steps = chosen.steps
     if len(knots) >= LEAST_KNOTS:
         try:
-            bent = _descended(problem, replace(highest, knots=knots), cluster, tau, name)
+            bent = _step_down_degrees(problem, replace(highest, knots=knots), cluster, tau, name)
         except ObservabilityError:
-            pass  # the holds do not tell so many values of the bias
+            pass  # the holds do not determine so many values of the bias
         else:
             steps = steps + bent.steps
-            if bends(bent.solution, tau) and predicts(bent.left_out, chosen.left_out):
-                solution = bounded(bent.solution, tau, solved)
-                held = left_out(splits(solution, cluster), np.ones(solution.laws.size, dtype=np.bool_))
+            if law_bends(bent.solution, tau) and spline_predicts(bent.left_out, chosen.left_out):
+                solution = bound_scatter(bent.solution, tau, solved)
+                held = predict_left_out(
+                    split_temperatures(solution, cluster), np.ones(solution.laws.size, dtype=np.bool_)
+                )
                 chosen = replace(bent, solution=solution, left_out=held)
     form = chosen.solution.laws
     unique = {
         (step.degrees, step.knots): replace(step, chosen=(step.degrees, step.knots) == (form.degrees, len(form.knots)))
         for step in steps
     }
-    return replace(chosen, steps=list(unique.values()), left_out=_at(chosen.left_out, problem, cluster))
+    return replace(chosen, steps=list(unique.values()), left_out=_name_temperatures(chosen.left_out, problem, cluster))
 
 
-def _missed(
+def _find_missed_degrees(
     problem: ThermalProblem, solution: ThermalSolution, highest: Laws, tau: float | None, name: str
 ) -> tuple[Degrees, float] | None:
-    """Return the degrees that ``auto`` starts from, as far as the holds tell them, if stated ones are too low (1 %)."""
+    """Return the highest degrees that the holds determine, and their probability, if stated ones are too low."""
     stated = solution.laws
     bias, scale, misalignment = (max(pair) for pair in zip(stated.degrees, highest.degrees, strict=True))
     larger = replace(stated, degrees=(bias, scale, misalignment))
     try:
-        higher, _ = _highest(problem, larger, tau, name)
+        higher, _ = _fit_highest(problem, larger, tau, name)
     except ObservabilityError:
         return None
     added = [
@@ -278,19 +284,17 @@ def _missed(
     ]
     if not added:
         return None
-    probability = wald(higher, np.eye(higher.laws.size)[added])
+    probability = wald_probability(higher, np.eye(higher.laws.size)[added])
     return (higher.laws.degrees, probability) if probability < THERMAL_DEGREES_TOO_LOW.level else None
 
 
-def bounded(
+def bound_scatter(
     solution: ThermalSolution, tau: float | None, solved: Callable[[Laws, float | None], ThermalSolution]
 ) -> ThermalSolution:
-    """Return a spline's solution with the scatter between power cycles that polynomials leave, if it cannot tell it.
+    """Return a spline's solution with an upper bound of the scatter between power cycles, if it shows none itself.
 
-    `solved` returns the solution of laws with a scatter, or with none known.
-
-    A spline takes the offset of the only recording at a knot for the law. What polynomials leave is that scatter and
-    the bends that they do not follow: a bound.
+    A spline takes the offset of the only recording at a knot for the law. The residuals of polynomials hold that
+    scatter and the bends that they do not follow, and thus bound it. `solved` solves laws with a known scatter or None.
     """
     if not solution.laws.knots or solution.scatter.rank or tau is not None:
         return solution
@@ -299,42 +303,42 @@ def bounded(
     return replace(again, scatter=replace(scatter, bound=True)) if scatter.rank and again.converged else solution
 
 
-def knots_at(temperature: Array, cluster: NDArray[np.int64], laws: Laws) -> tuple[float, ...]:
-    """Return the temperatures that were calibrated, degC, the outer ones at the ends of the range."""
+def place_knots(temperature: Array, cluster: NDArray[np.int64], laws: Laws) -> tuple[float, ...]:
+    """Return the knots of a spline: the calibrated temperatures, degC, the outer ones at the ends of the range."""
     inner = [float(temperature[cluster == number].mean()) for number in range(1, int(cluster.max(initial=0)))]
     return (laws.low, *inner, laws.high)
 
 
-def _descended(
+def _step_down_degrees(
     problem: ThermalProblem, highest: Laws, cluster: NDArray[np.int64], tau: float | None, name: str
 ) -> ChosenLaws:
-    """Return the fit with the degrees to which steps down lead; a spline stays."""
-    solution, view = _highest(problem, highest, tau, name)
-    parts = splits(solution, cluster)
-    held = left_out(parts, np.ones(solution.laws.size, dtype=np.bool_))
-    steps = [DegreesStep(solution.laws.degrees, rms_of(held), None, knots=len(highest.knots))]
+    """Return the fit after all steps down that may be taken; a spline of the bias keeps its degree."""
+    solution, view = _fit_highest(problem, highest, tau, name)
+    parts = split_temperatures(solution, cluster)
+    held = predict_left_out(parts, np.ones(solution.laws.size, dtype=np.bool_))
+    steps = [DegreesStep(solution.laws.degrees, rms_left_out(held), None, knots=len(highest.knots))]
     while True:
         free = [group for group in range(3) if solution.laws.degrees[group] and not (group == 0 and highest.knots)]
         down = [step_down(solution, group, parts) for group in free]
         steps += down
-        fine = [step for step in down if may_be_taken(step, rms_of(held))]
+        fine = [step for step in down if may_be_taken(step, rms_left_out(held))]
         if not fine:
             return ChosenLaws(solution, steps, held, view)
         best = max(fine, key=lambda step: step.probability or 0.0)
-        solution, view = _observable(problem, replace(solution.laws, degrees=best.degrees), tau, name)
-        parts = splits(solution, cluster)
-        held = left_out(parts, np.ones(solution.laws.size, dtype=np.bool_))
+        solution, view = _solve_observable(problem, replace(solution.laws, degrees=best.degrees), tau, name)
+        parts = split_temperatures(solution, cluster)
+        held = predict_left_out(parts, np.ones(solution.laws.size, dtype=np.bool_))
 
 
-def _highest(
+def _fit_highest(
     problem: ThermalProblem, laws: Laws, tau: float | None, name: str
 ) -> tuple[ThermalSolution, Observability]:
-    """Return the fit of the highest degrees, down from those given, that the holds determine."""
+    """Return the fit of the highest degrees that the holds determine, from those of `laws` down."""
     while True:
         lowered = list(laws.degrees)
         free = [group for group in range(3) if lowered[group] and not (group == 0 and laws.knots)]
         try:
-            return _observable(problem, laws, tau, name)
+            return _solve_observable(problem, laws, tau, name)
         except ObservabilityError:
             if not free:
                 raise
@@ -342,10 +346,10 @@ def _highest(
         laws = replace(laws, degrees=(lowered[0], lowered[1], lowered[2]))
 
 
-def bends(solution: ThermalSolution, tau: float | None) -> bool:
-    """Return whether a spline's values at the knots lie on no cubic (F at 1 %), or nobody can tell.
+def law_bends(solution: ThermalSolution, tau: float | None) -> bool:
+    """Return whether a spline's values at the knots lie on no cubic (F at 1 %), or this cannot be tested.
 
-    That is where a spline takes the offset of the only recording at a knot for the law.
+    It cannot where the scatter between power cycles is not known: each offset then looks like a bend.
     """
     if not solution.scatter.rank and tau is None:
         return True
@@ -355,34 +359,37 @@ def bends(solution: ThermalSolution, tau: float | None) -> bool:
     weights = np.zeros((3 * (count - 4), 3 * count))
     for axis, part in enumerate(laws.parts[:3]):
         weights[axis * (count - 4) : (axis + 1) * (count - 4), part] = beside
-    return wald(solution, weights) < THERMAL_LAW_BENDS.level
+    return wald_probability(solution, weights) < THERMAL_LAW_BENDS.level
 
 
-def predicts(bent: Sequence[LeftOutCluster], straight: Sequence[LeftOutCluster]) -> bool:
-    """Return whether a spline predicts the temperatures that both could leave out well enough to be taken."""
+def spline_predicts(bent: Sequence[LeftOutCluster], straight: Sequence[LeftOutCluster]) -> bool:
+    """Return whether a spline predicts left-out temperatures, of those that both could leave out, well enough."""
     both = {each.temperature for each in bent} & {each.temperature for each in straight}
-    errors = [rms_of([each for each in predictions if each.temperature in both]) for predictions in (bent, straight)]
+    errors = [
+        rms_left_out([each for each in predictions if each.temperature in both]) for predictions in (bent, straight)
+    ]
     return errors[0] is not None and errors[1] is not None and errors[0] <= _HANDICAP * errors[1]
 
 
-def _observable(
+def _solve_observable(
     problem: ThermalProblem, laws: Laws, tau: float | None, name: str
 ) -> tuple[ThermalSolution, Observability]:
+    """Return the solution and its observability; raises ObservabilityError where coefficients are not determined."""
     solution = solve(problem, laws, tau=tau)
-    view = seen(solution)
+    view = judge_observability(solution)
     size = solution.rows.jacobian.shape[1] - len(problem.free)
     if view.rank < size or not solution.converged:
         names = laws.spoken() + [f"direction of unmoved hold {k // 2 + 1}" for k in range(size - laws.size)]
         confused = ", ".join(view.confused(names)[:6])
         raise ObservabilityError(
             f"{name}: {len(problem.reading)} holds determine {view.rank} of the {size} unknowns of degrees "
-            f"{laws.spelled}; they cannot separate {confused}; {_help(problem, laws)} would help"
+            f"{laws.spelled}; they cannot separate {confused}; {_suggest_recordings(problem, laws)} would help"
         )
     return solution, view
 
 
-def _help(problem: ThermalProblem, laws: Laws) -> str:
-    """Return what would tell the coefficients that these holds do not."""
+def _suggest_recordings(problem: ThermalProblem, laws: Laws) -> str:
+    """Return which further recordings would determine the coefficients."""
     if np.count_nonzero(problem.group < 0) < _TUMBLE and problem.known is None:
         return "a tumble beside the rest ramps, the unit turned through a dozen attitudes at one temperature,"
     more = "more attitudes at each temperature"
@@ -390,7 +397,7 @@ def _help(problem: ThermalProblem, laws: Laws) -> str:
 
 
 def step_down(solution: ThermalSolution, group: int, parts: Sequence[Split]) -> DegreesStep:
-    """Return what is lost where the highest power of one kind is left out: Wald's test, and the prediction."""
+    """Return the step that leaves out the highest power of one kind: its probability and its prediction."""
     laws, degrees = solution.laws, list(solution.laws.degrees)
     gone = np.array([part.stop - 1 for part in laws.parts[3 * group : 3 * group + 3]])
     size = len(solution.coefficients)
@@ -398,60 +405,67 @@ def step_down(solution: ThermalSolution, group: int, parts: Sequence[Split]) -> 
     kept[gone] = False
     degrees[group] -= 1
     lower = (degrees[0], degrees[1], degrees[2])
-    return DegreesStep(lower, rms_of(left_out(parts, kept)), wald(solution, np.eye(size)[gone]), knots=len(laws.knots))
+    return DegreesStep(
+        lower,
+        rms_left_out(predict_left_out(parts, kept)),
+        wald_probability(solution, np.eye(size)[gone]),
+        knots=len(laws.knots),
+    )
 
 
-def wald(solution: ThermalSolution, weights: Array) -> float:
-    """Return the probability of such ``weights . coefficients``, (k, first ones), if the true ones were 0."""
+def wald_probability(solution: ThermalSolution, weights: Array) -> float:
+    """Return the probability of such ``weights . coefficients``, weights (k, n), if the true ones are 0 (Wald, F)."""
     size = weights.shape[1]
     value = weights @ solution.coefficients[:size]
     covariance = weights @ solution.covariance[:size, :size] @ weights.T
     square = float(value @ np.linalg.solve(covariance, value)) / len(value)
-    return tail(square, len(value), min(solution.degrees_of_freedom(row) for row in weights))
+    return tail_probability(square, len(value), min(solution.degrees_of_freedom(row) for row in weights))
 
 
-def tail(square: float, count: int, freedom: float) -> float:
-    """Return the probability of so large a mean square of `count` terms; chi-square where the freedom is infinite."""
+def tail_probability(square: float, count: int, freedom: float) -> float:
+    """Return the probability of so large a mean square of `count` terms: F, chi-square for infinite freedom."""
     return float(f_tail(square, count, freedom) if np.isfinite(freedom) else chi_square_tail(count * square, count))
 
 
-def rms_of(errors: Sequence[LeftOutCluster]) -> float | None:
+def rms_left_out(errors: Sequence[LeftOutCluster]) -> float | None:
     """Return the rms over all holds of the temperatures left out; None where there are none."""
     total = sum(each.holds for each in errors)
     return float(np.sqrt(sum(each.holds * each.rms**2 for each in errors) / total)) if total else None
 
 
 def may_be_taken(step: DegreesStep, before: float | None) -> bool:
-    """Return whether a step down is insignificant, and temperatures left out are known to be predicted no worse.
+    """Return whether a step down is insignificant and predicts left-out temperatures no worse.
 
-    `before` is their rms without the step: an F-test alone may lack all power.
+    `before` is their rms before the step. The prediction counts too, because an F-test alone may lack power.
     """
     no_worse = step.left_out is not None and before is not None and step.left_out <= _NO_WORSE * before
     return no_worse and (step.probability or 0) > THERMAL_POWER.level
 
 
-def _at(errors: Sequence[LeftOutCluster], problem: ThermalProblem, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
-    """Return them with the temperature instead of its number."""
+def _name_temperatures(
+    errors: Sequence[LeftOutCluster], problem: ThermalProblem, cluster: NDArray[np.int64]
+) -> list[LeftOutCluster]:
+    """Return the errors with temperatures, degC, instead of their numbers."""
     return [
         replace(each, temperature=float(problem.temperature[cluster == each.temperature].mean())) for each in errors
     ]
 
 
-def spoken_degrees(degrees: Degrees, knots: int = 0) -> str:
-    """Return degrees as messages say them: ``bias 3, scale factor 2, misalignment 1``, or a spline of the bias."""
+def describe_degrees(degrees: Degrees, knots: int = 0) -> str:
+    """Return degrees in words: ``bias 3, scale factor 2, misalignment 1``, or a spline of the bias."""
     words = [f"{kind.replace('_', ' ')} {degree}" for (kind, _), degree in zip(GROUPS, degrees, strict=True)]
     return ", ".join([f"bias by a spline with {knots} knots", *words[1:]] if knots else words)
 
 
-# Whether biases lag behind the thermometer, or differ between warming and cooling.
+# Lag of the biases behind the thermometer, and loops between warming and cooling.
 
 
 _STILL = 0.05
-"""Share of the fastest change in a recording below which its sign is that of the thermometer's noise."""
+"""Share of the fastest change in a recording, below which the sign of a change is the thermometer's noise."""
 _SHARED = 0.5
 """Share of the range in which the unit must both warm and cool: elsewhere a bend of the law looks like a lag."""
 _TELLS = 0.05
-"""Share of the columns of lag and loops that must be left beside the laws and each other."""
+"""Least length of the part of lag's and loops' columns beside the laws and each other, over their length."""
 _NAMES = ("lag", *(f"loop_{axis}" for axis in AXES))
 ALL = (0, 1, 2, 3)
 """Lag and loops of x, y and z, as `ThermalProblem.free`."""
@@ -459,9 +473,9 @@ ALL = (0, 1, 2, 3)
 
 @dataclass(frozen=True)
 class LagAndLoops:
-    """Lag (s) and loops (g): values, shape (4,), covariance, probability of each of the two if there were none.
+    """Lag (s) and loops (g): values, shape (4,), covariance, and probabilities of lag and of loops by chance.
 
-    Where they cannot be told, `values` is None and `reason` says why, or is empty where the temperature never drifts.
+    Where they are not observable, `values` is None, and `reason` says why; it is empty if the temperature never drifts.
     """
 
     values: Array | None = None
@@ -471,18 +485,18 @@ class LagAndLoops:
 
     @property
     def free(self) -> tuple[int, ...]:
-        """What is significant, as `ThermalProblem.free`."""
+        """The significant ones, as `ThermalProblem.free`."""
         lag, loop = (probability < LAG_OR_LOOP.level for probability in self.probability)
         return (0,) * lag + (1, 2, 3) * loop
 
 
-def moving(holds: Holds) -> Array:
-    """Return the change of the temperature in each hold, K/s; 0 in soaks, and where it hardly moves."""
-    return moved(holds.recording, holds.temperature, holds.rate)
+def drift_rates(holds: Holds) -> Array:
+    """Return the change of the temperature in each hold, K/s; 0 in soaks, and where it hardly changes."""
+    return mask_drift_rates(holds.recording, holds.temperature, holds.rate)
 
 
-def moved(recording: NDArray[Any], temperature: Array, rate: Array) -> Array:
-    """Return `moving` of holds by the recording, temperature, degC, and its change, K/s, of each."""
+def mask_drift_rates(recording: NDArray[Any], temperature: Array, rate: Array) -> Array:
+    """Return the changes `rate` of the temperature, K/s, with 0 in soaks and where it hardly changes."""
     rate = rate.copy()
     for each in np.unique(recording):
         of_recording = recording == each
@@ -491,35 +505,37 @@ def moved(recording: NDArray[Any], temperature: Array, rate: Array) -> Array:
     return rate
 
 
-def drift_of(problem: ThermalProblem, solution: ThermalSolution, tau: float | None) -> LagAndLoops:
-    """Fit lag and loops beside the laws of a solution, and test each given the other."""
-    reason = why_lag_is_unobservable(problem.temperature, problem.rate, solution, solution.laws.size, len(problem.free))
+def fit_lag_and_loops(problem: ThermalProblem, solution: ThermalSolution, tau: float | None) -> LagAndLoops:
+    """Return lag and loops fitted beside the laws of a solution, each tested given the other."""
+    reason = explain_unobservable_lag(
+        problem.temperature, problem.rate, solution, solution.laws.size, len(problem.free)
+    )
     if reason == "" and problem.side is not None and len(np.unique(problem.side[problem.side != 0])) == 2:
-        return _of_soaks(problem, solution, tau)
+        return _fit_loops_of_soaks(problem, solution, tau)
     if reason is not None:
         return LagAndLoops(reason=reason)
     whole = solve(replace(problem, free=ALL), solution.laws, tau=tau)
     if not whole.converged:
         return LagAndLoops(reason="the fit of lag and loop beside the laws did not converge")
-    return tested(whole, solution.laws.size)
+    return judge_lag_and_loops(whole, solution.laws.size)
 
 
-def tested(whole: ThermalSolution, size: int) -> LagAndLoops:
-    """Return lag and loops of a solution whose coefficients after the first `size` they are, each tested."""
+def judge_lag_and_loops(whole: ThermalSolution, size: int) -> LagAndLoops:
+    """Return lag and loops, the coefficients after the first `size` of a solution, with their probabilities."""
     values, covariance = whole.coefficients[size:], whole.covariance[size:, size:]
     probability = []
     for part in (slice(0, 1), slice(1, 4)):
         terms = values[part]
         square = float(terms @ np.linalg.solve(covariance[part, part], terms)) / len(terms)
         freedom = min(whole.degrees_of_freedom(row) for row in np.eye(size + 4)[size:][part])
-        probability.append(tail(square, len(terms), freedom))
+        probability.append(tail_probability(square, len(terms), freedom))
     return LagAndLoops(values, covariance, (probability[0], probability[1]))
 
 
-def _of_soaks(problem: ThermalProblem, solution: ThermalSolution, tau: float | None) -> LagAndLoops:
-    """Fit loops beside the laws of soaks that were reached from either side; they say nothing of a lag."""
+def _fit_loops_of_soaks(problem: ThermalProblem, solution: ThermalSolution, tau: float | None) -> LagAndLoops:
+    """Return loops fitted beside the laws of soaks that were reached from either side; a lag does not show there."""
     size, loops = solution.laws.size, ALL[1:]
-    if not _told(solution, size, len(problem.free), loops):
+    if not _is_observable(solution, size, len(problem.free), loops):
         return LagAndLoops(reason="the soaks reached by warming and by cooling do not tell loops and laws apart")
     whole = solve(replace(problem, free=loops), solution.laws, tau=tau)
     if not whole.converged:
@@ -528,24 +544,24 @@ def _of_soaks(problem: ThermalProblem, solution: ThermalSolution, tau: float | N
     covariance[1:, 1:] = whole.covariance[size:, size:]
     square = float(terms @ np.linalg.solve(covariance[1:, 1:], terms)) / len(terms)
     freedom = min(whole.degrees_of_freedom(row) for row in np.eye(size + 3)[size:])
-    return LagAndLoops(np.append(np.nan, terms), covariance, (1.0, tail(square, len(terms), freedom)))
+    return LagAndLoops(np.append(np.nan, terms), covariance, (1.0, tail_probability(square, len(terms), freedom)))
 
 
-def why_lag_is_unobservable(
+def explain_unobservable_lag(
     temperature: Array, rate: Array, solution: ThermalSolution, size: int, free: int
 ) -> str | None:
-    """Return why lag and loop are not told: empty where the temperature never drifts, None where they are.
+    """Return why lag and loops are not observable: empty if the temperature never drifts, None if they are.
 
-    The solution's columns for what is `free` of them come after the first `size`.
+    The solution has `free` columns for them after the first `size`.
     """
-    reason = _reason(temperature, rate)
-    if reason is None and not _told(solution, size, free, ALL):
+    reason = _explain_temperatures(temperature, rate)
+    if reason is None and not _is_observable(solution, size, free, ALL):
         return "the holds in which the temperature drifts do not tell lag, loop and laws apart"
     return reason
 
 
-def _reason(temperature: Array, rate: Array) -> str | None:
-    """Return why the temperatures cannot tell lag from law: empty where they never drift, None where they can."""
+def _explain_temperatures(temperature: Array, rate: Array) -> str | None:
+    """Return why these temperatures cannot distinguish lag from law: empty if they never drift, None if they can."""
     up, down = (temperature[sign * rate > 0] for sign in (1, -1))
     if not up.size and not down.size:
         return ""
@@ -563,7 +579,8 @@ def _reason(temperature: Array, rate: Array) -> str | None:
     return None
 
 
-def _told(solution: ThermalSolution, size: int, free: int, wanted: tuple[int, ...]) -> bool:
+def _is_observable(solution: ThermalSolution, size: int, free: int, wanted: tuple[int, ...]) -> bool:
+    """Return whether the columns of the wanted lag and loops are independent of the laws and of each other."""
     rows = solution.rows
     white = whitener(rows, solution.excess**2, solution.scatter.tau)
     rest = white(np.delete(rows.jacobian, np.s_[size : size + free], axis=1))
@@ -577,8 +594,8 @@ def _told(solution: ThermalSolution, size: int, free: int, wanted: tuple[int, ..
     return bool(np.linalg.svd(columns - u @ (u.T @ columns), compute_uv=False)[-1] > _TELLS)
 
 
-def findings(drift: LagAndLoops, solution: ThermalSolution, name: str) -> list[str]:
-    """Return in words what was found, and what it means for corrected outputs."""
+def warn_lag_and_loops(drift: LagAndLoops, solution: ThermalSolution, name: str) -> list[str]:
+    """Return warnings of a significant lag or loop, with the error that corrected outputs keep."""
     if drift.values is None:
         return [Note(f"{name}: {drift.reason}")] if drift.reason else []
     assert drift.covariance is not None
@@ -602,8 +619,8 @@ def findings(drift: LagAndLoops, solution: ThermalSolution, name: str) -> list[s
     return messages
 
 
-def drift_effects(drift: LagAndLoops, scale: float, unit: str = "m/s^2") -> dict[str, TestedEffect | None]:
-    """Return ``lag``, ``loop_x`` ... of the record's fit, loops times `scale` in a unit; None where not told."""
+def list_effects(drift: LagAndLoops, scale: float, unit: str = "m/s^2") -> dict[str, TestedEffect | None]:
+    """Return ``lag``, ``loop_x`` ... of the record's fit, loops times `scale` in `unit`; None if not observable."""
     if drift.values is None:
         return dict.fromkeys(_NAMES)
     assert drift.covariance is not None
@@ -622,21 +639,21 @@ def drift_effects(drift: LagAndLoops, scale: float, unit: str = "m/s^2") -> dict
     }
 
 
-# What it may cost that the holds do not tell how scale factors follow the temperature, or how biases lag behind it.
+# Shift of the biases by slopes of scale factors, or by a lag, that the holds do not show.
 
 
 _USUAL_SLOPES = {1: (STRETCHES, f"{1e6 * STRETCHES:.0f} ppm/K"), 2: (TURNS, f"{1e6 * TURNS:.0f} urad/K")}
 _LAG = 5.0
-"""s, that a sensor on the thermometer's own board may lag behind it."""
-_PLACES = 33  # temperatures at which the largest shift of the biases is sought
+"""Lag of a sensor behind a thermometer on its own board that is assumed, s."""
+_PLACES = 33  # temperatures over which the shift of the biases is averaged
 _WORTH = 0.5
-"""Of the biases' uncertainty: what adds an eighth to it is said."""
+"""Share of the biases' uncertainty from which a shift is warned of: it adds an eighth to it."""
 
 
 def bias_shift_from_unobserved(
     problem: ThermalProblem, solution: ThermalSolution, drift: LagAndLoops, name: str
 ) -> list[str]:
-    """Return what biases may err by, for scale factor, misalignment and lag, where that adds to their uncertainty."""
+    """Return warnings of what unobserved slopes and lag shift the biases by, beside their uncertainty."""
     laws, rows = solution.laws, solution.rows
     groups = [group for group in _USUAL_SLOPES if not laws.degrees[group]]
     if not groups and not drift.reason:
@@ -649,7 +666,7 @@ def bias_shift_from_unobserved(
     stated = float(np.sqrt(np.mean(np.einsum("tpc,cd,tpd->tp", design, covariance, design))))
 
     def error_by(term: Array) -> float:
-        """Return the root mean square error of the biases, over the range, that such terms, (N, k), leave."""
+        """Return the root mean square shift of the biases over the range by terms of shape (N, k)."""
         shift = inverse @ white(term)
         beside = white(term) - jacobian @ shift
         moved = design @ shift[: laws.size]
@@ -666,35 +683,45 @@ def bias_shift_from_unobserved(
             kind = GROUPS[group][0].replace("_", " ")
             messages.append(
                 f"{name}: the holds do not tell whether {kind} follows the temperature, which is taken as constant: "
-                f"one that moves by {usual}, as is usual, errs biases by {1e3 * error:.2g} mg, where their uncertainty "
-                f"is {1e3 * stated:.2g} mg: another axis up while the temperature changes, or attitudes at another "
-                "temperature, would tell"
+                f"one that moves by {usual}, as is usual, shifts the biases by {1e3 * error:.2g} mg, where their "
+                f"uncertainty is {1e3 * stated:.2g} mg: another axis up while the temperature changes, or attitudes "
+                "at another temperature, would tell"
             )
     if drift.reason and (error := error_by(rows.drift[:, :1] * _LAG)) > stated:
         messages.append(
             f"{name}: the temperature changes fast, and the recordings do not tell a lag behind the thermometer: one "
-            f"of {_LAG:g} s errs biases by {1e3 * error:.2g} mg, where their uncertainty is {1e3 * stated:.2g} mg: let "
-            "it change more slowly, or record the way back too"
+            f"of {_LAG:g} s shifts the biases by {1e3 * error:.2g} mg, where their uncertainty is "
+            f"{1e3 * stated:.2g} mg: let it change more slowly, or record the way back too"
         )
     return messages
 
 
-# Residuals under a record parted in two: what a recording has in common, as power cycles have, and the rest.
+# Residuals under a record in two parts: what a recording has in common, as an offset of its power cycle, and the rest.
 
 
-_SEEN = 1e-6  # of the largest singular value: what is below is rounding
+_SEEN = 1e-6  # of the largest singular value: smaller ones are rounding
 
 
-def parted(
+def within_and_between(
     rows: Rows, whole: Array, noise: Array, unknown: Array, rank: int | None, *, by_share: bool = True
 ) -> tuple[float | None, float | None]:
-    """Return the probabilities of the residuals within recordings, and of what each has in common as an offset.
+    """Return the probabilities of the residuals within recordings, and of the offset that each has in common.
 
-    `whole` and `noise` are covariances with and without laws and power cycles, `unknown` the columns of what each
-    recording leaves free, (N, k). `rank` is that of the offsets that told the scatter between power cycles, 0 where it
-    was stated; where it is None nothing is known of it, and what is in common is not tested. `by_share`: the more of an
-    offset's variance is noise, the more degrees of freedom it has (Satterthwaite); a scatter that came out small by
-    chance makes that share small, too, so that it errs where power cycles move outputs by more than noise does.
+    The whitened residual r is split by an orthonormal basis Q of the offsets of power cycles: ``|r - Q Q'r|^2`` is
+    chi-square distributed, the mean square of ``Q'r`` by F, since few power cycles determined their scatter.
+
+    Parameters
+    ----------
+    whole, noise
+        Covariances with and without laws and power cycles, shape (N, N).
+    unknown
+        Columns of unknown directions, which are projected out, shape (N, k).
+    rank
+        Number of offsets that determined the scatter between power cycles; 0 if it was stated, None if it is unknown,
+        and offsets are not tested.
+    by_share
+        Degrees of freedom by Satterthwaite: the more of an offset's variance is noise, the more there are. This is
+        wrong where power cycles move outputs by more than noise does, and their scatter came out small by chance.
     """
     from scipy.linalg import solve_triangular
 
@@ -704,9 +731,9 @@ def parted(
         whitened: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
         return whitened
 
-    turns = _basis(white(unknown))
+    turns = _orthonormal_basis(white(unknown))
     offsets = white(rows.offsets[0])
-    offsets = _basis(offsets - turns @ (turns.T @ offsets))
+    offsets = _orthonormal_basis(offsets - turns @ (turns.T @ offsets))
     residual = white(rows.residual)
     residual = residual - turns @ (turns.T @ residual)
     shared = offsets.T @ residual
@@ -717,10 +744,10 @@ def parted(
     inner = white(white(noise).T)
     share = 1 - float(np.trace(offsets.T @ inner @ offsets)) / len(shared) if by_share else 1.0
     freedom = rank / max(share, 1e-3) ** 2 if rank else np.inf
-    return within, tail(float(shared @ shared) / len(shared), len(shared), freedom)
+    return within, tail_probability(float(shared @ shared) / len(shared), len(shared), freedom)
 
 
-def _basis(columns: Array) -> Array:
+def _orthonormal_basis(columns: Array) -> Array:
     """Return an orthonormal basis of the columns, shape (n, rank)."""
     if not columns.shape[1]:
         return columns
@@ -730,37 +757,37 @@ def _basis(columns: Array) -> Array:
     return basis
 
 
-# Do the recordings agree as those of one unit do? What no power cycle explains is said, with who stands apart.
+# Agreement of the recordings: warnings of differences that no power cycle explains, and of the outlier among them.
 
 
 _MOVES = 0.002
-"""What biases hardly move by from one power cycle to the next, g."""
+"""Largest plausible scatter of biases between power cycles, g."""
 _BENDS = 0.01
 """The same where few temperatures leave the bends of the law in it."""
 _STRETCHES = 0.005
-"""What scale factors hardly move by."""
+"""Largest plausible scatter of scale factors between power cycles."""
 _SCATTERS, _NOISE = 0.25e-3, 4.0
-"""Scatter of |f| within recordings that is asked about: in g, and in units of what the holds' own noise explains."""
+"""Scatter of |f| within recordings from which there is a warning: in g, and over that by the holds' own noise."""
 _FEWEST_TO_COMPARE = 5
-"""Temperatures that show the bends of a law, and recordings of which one can be told to stand apart."""
+"""Fewest temperatures that show the bends of a law, and fewest recordings among which there can be an outlier."""
 _APART = 0.4
-"""Share of their disagreement that the others keep where one recording stands apart."""
+"""Share of the disagreement, at most, that remains without the outlier."""
 _ATTITUDES = 6
-"""Of a recording whose own scale factors can be told."""
+"""Fewest attitudes of a recording that show scale factors of its own."""
 _OFF_BIAS, _OFF_SCALE = 0.5e-3, 3e-4
-"""Less than this is not asked about, in g and in 1."""
+"""Offsets below which there is no warning, g and 1."""
 _USUAL = 1e-4
-"""What scale factors may well move by from one power cycle to the next."""
+"""Usual scatter of scale factors between power cycles."""
 _HOTTEST = 125.0
-"""degC; sensors are rated to it."""
+"""Highest temperature to which sensors are rated, degC."""
 
 
-def disagreements(holds: Holds, problem: ThermalProblem, solution: ThermalSolution, name: str) -> list[str]:
-    """Return what says that recordings are hardly of one unit, mounted alike, at rest, by one thermometer."""
+def warn_disagreement(holds: Holds, problem: ThermalProblem, solution: ThermalSolution, name: str) -> list[str]:
+    """Return warnings where recordings can hardly be of one unit, mounted alike, at rest, with one thermometer."""
     bias, scale = solution.scatter.tau.tolist()
-    if not solution.scatter.rank:  # nobody measured it: it was stated
+    if not solution.scatter.rank:  # it was stated, and not measured
         bias = 0.0
-    many = int(clusters_of(problem.temperature).max(initial=0)) + 1 >= _FEWEST_TO_COMPARE
+    many = int(number_temperatures(problem.temperature).max(initial=0)) + 1 >= _FEWEST_TO_COMPARE
     differ = [
         text
         for size, text in (
@@ -772,8 +799,8 @@ def disagreements(holds: Holds, problem: ThermalProblem, solution: ThermalSoluti
     rows, messages = solution.rows, []
     noise = float(np.median(np.sqrt(np.diag(rows.noise)[rows.magnitude])))
     scattered = solution.excess > max(_SCATTERS, _NOISE * noise)
-    apart = _apart(holds, problem, solution.laws) if differ or scattered else ""
-    if differ and (apart or not solution.scatter.bound):  # a bound holds bends of the law, too
+    apart = _name_outlier(holds, problem, solution.laws) if differ or scattered else ""
+    if differ and (apart or not solution.scatter.bound):  # a bound contains bends of the law
         messages.append(
             f"{name}: from one recording to the next {' and '.join(differ)} differ, which no power cycle does: are all "
             f"of one unit, its axes named alike, its temperatures by one thermometer?{apart}"
@@ -785,7 +812,7 @@ def disagreements(holds: Holds, problem: ThermalProblem, solution: ThermalSoluti
             f"{'' if differ else apart}"
         )
     if not apart:
-        messages += _off(holds, problem, solution)
+        messages += _warn_offset(holds, problem, solution)
     if solution.laws.high > _HOTTEST:
         messages.append(
             f"{name}: temperatures up to {solution.laws.high:.0f} degC, above what sensors are rated to: are these "
@@ -794,12 +821,12 @@ def disagreements(holds: Holds, problem: ThermalProblem, solution: ThermalSoluti
     return messages
 
 
-def _apart(holds: Holds, problem: ThermalProblem, laws: Laws) -> str:
-    """Return which recording the others agree without, as a sentence; nothing where that is none or several."""
+def _name_outlier(holds: Holds, problem: ThermalProblem, laws: Laws) -> str:
+    """Return a sentence that names the one recording without which the others agree; empty if there is none."""
     numbers = np.unique(problem.recording)
     if len(numbers) < _FEWEST_TO_COMPARE:
         return ""
-    left = [_disagreement(_without(problem, problem.recording == number), laws) for number in numbers]
+    left = [_measure_disagreement(_leave_out(problem, problem.recording == number), laws) for number in numbers]
     order = np.argsort(left)
     best, second = (left[int(k)] for k in order[:2])
     if not best < min(_APART * second, _MOVES):
@@ -807,12 +834,12 @@ def _apart(holds: Holds, problem: ThermalProblem, laws: Laws) -> str:
     return f" Without {holds.recordings[int(numbers[order[0]])].name} the others agree to {1e6 * best:.0f} ug"
 
 
-def _off(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> list[str]:
-    """Return which recording lies far off the laws, by how the others, without it, scatter about theirs.
+def _warn_offset(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> list[str]:
+    """Return a warning of the recording that lies farthest off the laws, measured by the scatter of the others.
 
-    Its own offsets of bias, beside the laws, are compared with those of the others by F; of scale factors, which power
-    cycles hardly move, with what noise and the others' scatter allow. Of five recordings under a cubic the others do
-    not tell how far biases scatter: there the scale factors tell it alone.
+    The offsets of its biases are compared with those of the others by F; offsets of its scale factors, which power
+    cycles hardly change, with noise and the others' scatter. With five recordings and a cubic the others do not show
+    how far biases scatter: there the scale factors decide alone.
     """
     rows = solution.rows
     numbers, attitudes = np.unique(problem.recording, return_counts=True)
@@ -823,12 +850,12 @@ def _off(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> li
     for number in numbers[attitudes >= _ATTITUDES].tolist():
         if not problem.shared[problem.recording == number].all():
             continue
-        others = rows_where(rows, whose != number)
-        excess, freedom = excess_of(others, solution.excess**2)
-        scatter, white = between(others, excess), whitener(others, excess, np.zeros(2))
+        others = select_rows(rows, whose != number)
+        excess, freedom = fit_excess(others, solution.excess**2)
+        scatter, white = fit_turn_on_scatter(others, excess), whitener(others, excess, np.zeros(2))
         of_recording = np.s_[3 * number : 3 * number + 3]
         stretch, rank = max(float(scatter.tau[1]), _USUAL), freedom
-        if stretch > _USUAL:  # few recordings told it
+        if stretch > _USUAL:  # determined by few recordings
             bias, scale = (white(columns) for columns in others.offsets)
             rank = float(len(offset_modes(np.hstack([white(others.jacobian), bias]), scale, white(others.residual))[0]))
         tests = [(1, np.array([_BENDS, stretch]), rank, _OFF_SCALE)]
@@ -842,7 +869,7 @@ def _off(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> li
             if not len(s):
                 continue
             size = float(np.sqrt(np.sum((force / s) ** 2) / 3))
-            chance = len(numbers) * tail(float(np.mean(force**2)), len(s), rank)
+            chance = len(numbers) * tail_probability(float(np.mean(force**2)), len(s), rank)
             if chance < RECORDING_DISAGREEMENT.level and size > least:
                 by = f"{1e6 * size:.0f} ppm in scale factors" if kind else f"{1e3 * size:.2g} mg in biases"
                 asked.append((chance, f"{holds.recordings[number].name}: lies off the other recordings by {by}"))
@@ -853,7 +880,8 @@ def _off(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> li
     ]
 
 
-def _without(problem: ThermalProblem, gone: NDArray[np.bool_]) -> ThermalProblem:
+def _leave_out(problem: ThermalProblem, gone: NDArray[np.bool_]) -> ThermalProblem:
+    """Return the problem without some of its holds."""
     kept = ~gone
     group = problem.group[kept]
     tied = group >= 0
@@ -874,15 +902,15 @@ def _without(problem: ThermalProblem, gone: NDArray[np.bool_]) -> ThermalProblem
     )
 
 
-def _disagreement(problem: ThermalProblem, laws: Laws) -> float:
+def _measure_disagreement(problem: ThermalProblem, laws: Laws) -> float:
     """Return the scatter between and within recordings about polynomials of the highest degrees, g."""
-    limit = max(int(clusters_of(problem.temperature).max(initial=0)) - 1, 0)
+    limit = max(int(number_temperatures(problem.temperature).max(initial=0)) - 1, 0)
     degrees = (min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit))
     try:
-        # As if biases moved by much, which a unit among others of its own would otherwise bend the laws by.
+        # A large scatter, so that a recording of another unit does not bend the laws.
         free = solve(problem, replace(laws, degrees=degrees, knots=()), tau=_BENDS)
     except np.linalg.LinAlgError:
         return np.inf
     if not free.converged:
         return np.inf
-    return float(np.hypot(free.excess, between(free.rows, free.excess**2).tau[0]))
+    return float(np.hypot(free.excess, fit_turn_on_scatter(free.rows, free.excess**2).tau[0]))

@@ -1,7 +1,6 @@
-"""A thermal record in use.
+"""A thermal record in use: tables for the C core, correction of recordings, comparison, and prior knowledge.
 
-As the tables that the C core runs, as the correction of recordings, and at one temperature beside another record or
-as prior knowledge.
+The laws are `imulab.procedures.thermal.model`, in powers of theta for each piece (`Laws.in_pieces`).
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, output_to_si
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit, to_si
 
-# The gyroscopes of a thermal record as the table that the C core runs, and the vectors of a unit's self-test.
+# The table of the gyroscopes, and the vectors of a unit's self-test.
 
 
-_NODES = np.linspace(-1.0, 1.0, 65)
+_NODES = np.linspace(-1.0, 1.0, 65)  # theta at which scale factors are checked
 
 
-def gyro_laws_of(record: Calibration) -> Array:
+def read_gyro_laws(record: Calibration) -> Array:
     """Return biases (rad/s) and scale factors (output per rad/s) in powers of theta, shape (pieces, 6, terms).
 
     Theta goes from -1 to 1 over the range, or from each knot of the bias to the next.
@@ -74,7 +73,7 @@ def check_scale_factors(laws: Array) -> None:
 
 
 def _matrix(record: Calibration, gyro: ThermalGyroModel) -> Array:
-    """Return T, the identity where turns did not tell it."""
+    """Return T, the identity where there were no turns."""
     matrix = np.eye(3)
     if gyro.scale == "turns":
         matrix[~np.eye(3, dtype=np.bool_)] = values_of(record, MISALIGNMENTS, "rad")
@@ -82,26 +81,27 @@ def _matrix(record: Calibration, gyro: ThermalGyroModel) -> Array:
 
 
 def _sensitivity(record: Calibration) -> Array:
+    """Return the g-sensitivities, rad/s per m/s^2, shape (3, 3)."""
     return values_of(record, SENSITIVITIES, "rad/s/(m/s^2)").reshape(3, 3)
 
 
-def gyroscopes(record: Calibration) -> GyroscopeLaws | None:
-    """Return the laws as exporters take them, None where there are none; errors as for `gyro_laws_of`."""
+def gyroscope_laws(record: Calibration) -> GyroscopeLaws | None:
+    """Return the gyroscopes' laws for exporters, None where there are none; errors as for `read_gyro_laws`."""
     model = thermal_of(record).model
     if model.gyro is None:
         return None
-    laws = gyro_laws_of(record)
+    laws = read_gyro_laws(record)
     factor, unit = output_to_si(model.gyro.output_unit, "rad/s")
     laws[:, 3:] *= factor
     felt = _sensitivity(record) if model.gyro.g_sensitivity else np.zeros((3, 3))
     return GyroscopeLaws(model.gyro_laws.edges, laws, _matrix(record, model.gyro), felt, unit)
 
 
-def gyro_table_of(record: Calibration, columns: Mapping[str, Any]) -> DeviceTable:
-    """Return the table of the gyroscopes; errors as for `gyro_laws_of`."""
+def make_gyro_table(record: Calibration, columns: Mapping[str, Any]) -> DeviceTable:
+    """Return the table of the gyroscopes; errors as for `read_gyro_laws`."""
     model = thermal_of(record).model
     assert model.gyro is not None
-    laws = gyro_laws_of(record)
+    laws = read_gyro_laws(record)
     fields = [
         Field("has_sensitivity", whole(model.gyro.g_sensitivity)),
         Field("pieces", whole(len(laws))),
@@ -115,7 +115,7 @@ def gyro_table_of(record: Calibration, columns: Mapping[str, Any]) -> DeviceTabl
 
 
 def golden_gyroscopes(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
-    """Return outputs within 5 rad/s under 2 g, at temperatures within the range and beyond it, and their rates."""
+    """Return test vectors: outputs within 5 rad/s under 2 g at temperatures in and beyond the range, and rates."""
     low, high = field_of(table, "knot")[[0, -1]]
     temperature = np.repeat(rng.uniform(low - 5.0, high + 5.0, VECTORS // 2), 2)
     rates = rng.uniform(-5, 5, (VECTORS, 3))
@@ -134,10 +134,10 @@ def golden_gyroscopes(table: DeviceTable, rng: np.random.Generator) -> dict[str,
     }
 
 
-# A thermal record as the table that the C core runs, and the vectors by which an exported unit tests itself.
+# The table of the accelerometers, and the vectors of a unit's self-test.
 
 
-def laws_of(record: Calibration) -> Array:
+def read_laws(record: Calibration) -> Array:
     """Return the coefficients of the nine laws in powers of theta, SI, shape (pieces, 9, terms).
 
     Theta goes from -1 to 1 over the range, or from each knot of the bias to the next.
@@ -158,15 +158,15 @@ def laws_of(record: Calibration) -> Array:
     return coefficients
 
 
-def accelerometers(record: Calibration) -> AccelerometerLaws:
-    """Return the laws as exporters take them; errors as for `laws_of`."""
+def accelerometer_laws(record: Calibration) -> AccelerometerLaws:
+    """Return the accelerometers' laws for exporters; errors as for `read_laws`."""
     model = thermal_of(record).model
-    return AccelerometerLaws(model.laws.edges, laws_of(record), model.output_unit)
+    return AccelerometerLaws(model.laws.edges, read_laws(record), model.output_unit)
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
-    """Return the tables of a thermal record; errors as for `laws_of`."""
-    model, laws = thermal_of(record).model, laws_of(record)
+    """Return the tables of a thermal record; errors as for `read_laws`."""
+    model, laws = thermal_of(record).model, read_laws(record)
     fields = (
         Field("pieces", whole(len(laws))),
         Field("terms", whole(laws.shape[2])),
@@ -176,11 +176,11 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     column = str(record.options.get("temperature_column") or "temperature")
     known = {"temperature": column, "range": list(model.range)}
     table = DeviceTable("thermal", fields, {"output_unit": model.output_unit, **known})
-    return (table,) if model.gyro is None else (table, gyro_table_of(record, known))
+    return (table,) if model.gyro is None else (table, make_gyro_table(record, known))
 
 
 def golden_accelerometers(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
-    """Return outputs within 2 g at temperatures within the range and beyond it, and their specific forces."""
+    """Return test vectors: outputs within 2 g at temperatures in and beyond the range, and specific forces."""
     low, high = field_of(table, "knot")[[0, -1]]
     temperature = np.repeat(rng.uniform(low - 5.0, high + 5.0, VECTORS // 2), 2)
     force = rng.uniform(-2 * STANDARD_GRAVITY, 2 * STANDARD_GRAVITY, (VECTORS, 3))
@@ -197,7 +197,7 @@ def golden_accelerometers(table: DeviceTable, rng: np.random.Generator) -> dict[
     }
 
 
-# A thermal record applied by the C core: raw triads to specific force by the laws at each sample's temperature.
+# Correction of recordings by the C core, at the temperature of each sample.
 
 
 _ACCEL, _GYRO = triad("accel"), triad("gyro")
@@ -213,10 +213,10 @@ def apply_thermal(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recor
     UnitError
         The columns' unit cannot be converted to the record's.
     DataError
-        The recording has no accelerometer triad, or not the column of temperature that the record goes by.
+        The recording has no accelerometer triad, or not the column of temperature that the record needs.
     """
     outputs = outputs_of(recording, "accel", str(columns["output_unit"]))
-    force, _ = unit.thermal(_temperature(columns, recording), outputs)
+    force, _ = unit.thermal(_read_temperature(columns, recording), outputs)
     return recording.with_columns(dict(zip(_ACCEL, force, strict=True)), dict.fromkeys(_ACCEL, "m/s^2"))
 
 
@@ -228,10 +228,11 @@ def apply_gyro(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recordin
     UnitError, DataError
         As for `correct_gyroscopes`, or the recording has no such column of temperature.
     """
-    return correct_gyroscopes(unit, columns, recording, _temperature(columns, recording))
+    return correct_gyroscopes(unit, columns, recording, _read_temperature(columns, recording))
 
 
-def _temperature(columns: Mapping[str, Any], recording: Recording) -> Array:
+def _read_temperature(columns: Mapping[str, Any], recording: Recording) -> Array:
+    """Return the temperatures by which the record's laws are evaluated, degC, shape (n,)."""
     name = str(columns["temperature"])
     others = [key for key in recording.columns if key.startswith("temperature_")]
     if name == "temperature" and name not in recording and len(others) == 1:
@@ -247,19 +248,19 @@ def _temperature(columns: Mapping[str, Any], recording: Recording) -> Array:
 
 
 def remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
-    """Return what is to be known of correcting a recording: rows outside the range or without a temperature."""
-    return _remarks(columns, recording) if set(_ACCEL) <= set(recording.columns) else []
+    """Return warnings of rows outside the range or without a temperature."""
+    return _warn_temperature(columns, recording) if set(_ACCEL) <= set(recording.columns) else []
 
 
 def gyro_remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
-    """Return the same of gyroscopes, where no accelerometers beside them have it said already."""
+    """Return the same for gyroscopes, unless there are accelerometers, for which `remarks` says it."""
     there = set(recording.columns)
-    return _remarks(columns, recording) if set(_GYRO) <= there and not set(_ACCEL) <= there else []
+    return _warn_temperature(columns, recording) if set(_GYRO) <= there and not set(_ACCEL) <= there else []
 
 
-def _remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
+def _warn_temperature(columns: Mapping[str, Any], recording: Recording) -> list[str]:
     low, high = columns["range"]
-    temperature = _temperature(columns, recording)
+    temperature = _read_temperature(columns, recording)
     lost, outside = ~np.isfinite(temperature), (temperature < low) | (temperature > high)
     messages: list[str] = []
     if lost.any():
@@ -276,19 +277,19 @@ def _remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
     return messages
 
 
-# Two thermal records at temperatures of both, since each has coefficients of powers about a T0 of its own.
+# Comparison of two records at common temperatures, since each has powers about a T0 of its own.
 
 
 ON_LINE = np.arange(-60.0, 161.0, 20.0)
-"""Temperatures at which the units of a line are compared, degC: 20 degC is among them, where most are measured."""
-_SAME = 0.05  # K between reference temperatures, half of what temperatures are written to
-_LEAST = 1.0  # K that two ranges share, so that temperatures written to 0.1 degC differ
+"""Temperatures at which the units of a line are compared, degC; most are measured at 20 degC."""
+_SAME = 0.05  # K between reference temperatures that are the same, half of the last digit of temperatures
+_LEAST = 1.0  # K that two ranges must share, so that temperatures written to 0.1 degC differ
 Kind = tuple[str, tuple[str, ...], Laws, int]
-"""Of parameters: name, axes, laws, and which of these are its own."""
+"""A kind of parameters: name, axes, laws, and its group among these."""
 
 
 def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Calibration, Calibration]:
-    """Return both records with the values of their laws in place of coefficients, as many as the higher degree takes.
+    """Return both records with the values of their laws at common temperatures in place of coefficients.
 
     Raises
     ------
@@ -301,24 +302,24 @@ def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Cal
         ranges = " and ".join(f"{model.range[0]:.1f} to {model.range[1]:.1f} degC" for model in models)
         raise RecordError(f"cannot compare laws over {ranges}; expected ranges that share {_LEAST:g} K or more")
     both = all(model.gyro is not None for model in models)
-    kinds = [_laws(model, both) for model in models]
+    kinds = [_list_laws(model, both) for model in models]
     terms = [[laws.terms[group] for _, _, laws, group in each] for each in kinds]
     counts = [max(pair) for pair in zip(*terms, strict=True)]
     low, high = np.ceil(10 * low) / 10, np.floor(10 * high) / 10
     nodes = [np.linspace(low, high, count) if count > 1 else np.array([0.5 * (low + high)]) for count in counts]
     nodes = [np.round(places, 1) for places in nodes]
-    return _at(first, kinds[0], nodes), _at(second, kinds[1], nodes)
+    return _evaluate_at(first, kinds[0], nodes), _evaluate_at(second, kinds[1], nodes)
 
 
 def on_line(record: Calibration) -> OnLine:
-    """Return the values of a record's laws at those of the temperatures `ON_LINE` that lie in its range."""
+    """Return the values of a record's laws at the temperatures `ON_LINE` within its range."""
     model = thermal_of(record).model
-    about, laws = model.reference_temperature, _laws(model, model.gyro is not None)
+    about, laws = model.reference_temperature, _list_laws(model, model.gyro is not None)
     if model.gyro is not None and model.gyro.scale == "turns":
         laws.append(("gyro_scale_factor", AXES, model.gyro_laws, 1))
     low, high = model.range
     nodes = ON_LINE[(low <= ON_LINE) & (high >= ON_LINE)]
-    values = _at(record, laws, [nodes] * len(laws)) if nodes.size else replace(record, parameters={}, fit={})
+    values = _evaluate_at(record, laws, [nodes] * len(laws)) if nodes.size else replace(record, parameters={}, fit={})
     freedom = [each for each in values.fit.get("degrees_of_freedom", {}).values() if each]
     named = tuple(f"{kind}_{axis}" for kind, axes, _, _ in laws for axis in axes)
     begun = tuple(f"{name}_" for name in named)  # powers, knots, and what a spline's value and slopes are at T0
@@ -334,14 +335,14 @@ def on_line(record: Calibration) -> OnLine:
     )
 
 
-def _laws(model: ThermalModel, gyroscopes: bool) -> list[Kind]:
-    """Return the kinds of parameters that follow the temperature: name, axes, laws, and which of these are its own."""
+def _list_laws(model: ThermalModel, gyroscopes: bool) -> list[Kind]:
+    """Return the kinds of parameters that follow the temperature."""
     kinds: list[Kind] = []
     kinds += [(kind, axes, model.laws, group) for group, (kind, axes) in enumerate(GROUPS)]
     return [*kinds, ("gyro_bias", AXES, model.gyro_laws, 0)] if gyroscopes else kinds
 
 
-def _at(record: Calibration, laws: list[Kind], nodes: list[Array]) -> Calibration:
+def _evaluate_at(record: Calibration, laws: list[Kind], nodes: list[Array]) -> Calibration:
     """Return a record with the values of these laws at temperatures of each, degC, in place of coefficients."""
     sections, names = thermal_of(record), record.covariance.names
     fit, turn_on, freedom = sections.fit, sections.fit.between_recordings, record.fit.get("degrees_of_freedom")
@@ -361,7 +362,7 @@ def _at(record: Calibration, laws: list[Kind], nodes: list[Array]) -> Calibratio
             values.append(functions @ np.array([record.value(name) for name in used]))
             labels += [f"{kind}_{axis} at {temperature:.1f} degC" for temperature in places]
             units += [record.parameters[used[0]].unit] * len(places)
-        # What recordings scatter by is told by few of them, and is most of what these values are uncertain by.
+        # The scatter between recordings, of few degrees of freedom, dominates the uncertainty of these values.
         scatter, rank = scatters.get(kind, (None, 0))
         few = scatter is not None and scatter.value > 0 and rank > 0
         known |= dict.fromkeys(labels[-len(axes) * len(places) :], rank if few else freedom)
@@ -376,17 +377,17 @@ def _at(record: Calibration, laws: list[Kind], nodes: list[Array]) -> Calibratio
     return replace(record, parameters=parameters, covariance=covariance, fit=fit_section)
 
 
-# A thermal record at one temperature, as prior knowledge of a tumble test or of turns there.
+# A thermal record at one temperature, as prior knowledge of a tumble test or of turns.
 
 
-_BEYOND = 1.0  # K
+_BEYOND = 1.0  # K outside the record's range, up to which its laws are taken to hold
 _GAUGE = "x input axis along body x, y input axis in the body xy plane"
 
 
 def at_temperature(record: Calibration, temperature: float | None, name: str) -> Calibration:
     """Return a record of order 1 as a tumble test gives it, at a temperature, degC, of the recording `name`.
 
-    Biases have the variance of one power cycle in theirs, scale factors too where the record found it.
+    The variances of biases and scale factors include the scatter between power cycles.
 
     Raises
     ------
@@ -396,7 +397,7 @@ def at_temperature(record: Calibration, temperature: float | None, name: str) ->
     """
     thermal = thermal_of(record)
     between = thermal.fit.between_recordings
-    temperature = _within(record, temperature, name)
+    temperature = _check_in_range(record, temperature, name)
     if between.from_ == "unknown":
         raise RecordError(
             "the thermal record does not know how far biases move from one power cycle to the next, and cannot be a "
@@ -432,7 +433,7 @@ def at_temperature(record: Calibration, temperature: float | None, name: str) ->
 
 
 def gyros_at_temperature(record: Calibration, temperature: float | None, name: str) -> Calibration:
-    """Return a record of the gyroscopes but for their biases, at a temperature, degC, of the recording `name`.
+    """Return a record of the gyroscopes without their biases, at a temperature, degC, of the recording `name`.
 
     Raises
     ------
@@ -445,7 +446,7 @@ def gyros_at_temperature(record: Calibration, temperature: float | None, name: s
             "prior: a thermal record without scale factors of gyroscopes; expected one of thermal fit --with gyro from "
             "tumbles whose turns tell them"
         )
-    at = np.array([_within(record, temperature, name)])
+    at = np.array([_check_in_range(record, temperature, name)])
     about = thermal_of(record).model.reference_temperature.value
     low, high = thermal_of(record).model.range
     laws = Laws(low, high, (gyro.degrees.scale_factor, 0, 0))
@@ -479,8 +480,8 @@ def gyros_at_temperature(record: Calibration, temperature: float | None, name: s
     )
 
 
-def _within(record: Calibration, temperature: float | None, name: str) -> float:
-    """Return the temperature of a recording, if there is one and the record's laws hold there."""
+def _check_in_range(record: Calibration, temperature: float | None, name: str) -> float:
+    """Return the temperature of a recording if it has one within the record's range; else raise RecordError."""
     low, high = thermal_of(record).model.range
     if temperature is None:
         raise RecordError(

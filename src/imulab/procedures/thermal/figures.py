@@ -1,20 +1,26 @@
-"""What a thermal record shows: each parameter over temperature with its band, laws, and gyroscopes."""
+"""The figures and tables of a thermal record: each law over temperature with its band, and residuals."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
-from imulab.procedures.thermal.degrees import moved, spoken_degrees
+from imulab.procedures.thermal.degrees import describe_degrees, mask_drift_rates
 from imulab.procedures.thermal.model import AXES, GROUPS
-from imulab.procedures.thermal.record import deviation_of_force, gyro_predicted, gyro_scale_predicted, predicted
-from imulab.procedures.thermal.schema import ThermalRecord, thermal_of
+from imulab.procedures.thermal.record import (
+    deviation_of_force,
+    predict_gyro_bias,
+    predict_gyro_scale,
+    predict_parameters,
+)
+from imulab.procedures.thermal.schema import DegreesTried, LeftOutTemperature, ThermalRecord, thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.parameters import parameters_table, rows_of
+from imulab.report.parameters import ReadingUnit, parameters_table, reading_unit, rows_of, small_text, small_unit
 from imulab.report.traces import (
     BAD,
     DASHES,
@@ -23,23 +29,34 @@ from imulab.report.traces import (
     LEGEND,
     Exhibits,
     Figure,
+    Group,
     ReportTable,
     band,
     figure_axis,
     format_uncertain,
+    number_text,
     plain_number,
+    point_traces,
+    points,
     rounded,
     scatter,
+    table,
 )
-from imulab.units import STANDARD_GRAVITY, from_si
+from imulab.units import from_si
 
-# Laws over temperature as figures: the curves, and beneath them how well they are known and what lies off them.
+# A figure of laws: the curves above, and beneath them their uncertainty and single recordings.
 
 
 COLOURS = (GOOD, "#b58a1b", "#7a5c99")
 SYMBOLS = ("circle", "diamond", "square")
 _UPPER, _LOWER = [0.5, 1.0], [0.0, 0.38]
 """Shares of the figure's height."""
+
+
+def axis_groups(count: int) -> list[Group]:
+    """Return the looks of three axes' points, for values of `count` holds in the order of holds, then axes."""
+    axis = np.tile(np.arange(len(AXES)), count)
+    return [Group(name, axis == k, SYMBOLS[k], COLOURS[k]) for k, name in enumerate(AXES)]
 
 
 @dataclass(frozen=True)
@@ -54,7 +71,7 @@ class LawCurves:
 
 @dataclass(frozen=True)
 class Alone:
-    """What recordings give alone in the same unit: temperatures, degC (m,), values, the laws there and u, (3, m)."""
+    """The values of single recordings in the same unit: temperatures, degC (m,), values, laws there and u, (3, m)."""
 
     temperature: Array
     values: Array
@@ -70,11 +87,11 @@ def law_figure(
     Parameters
     ----------
     what, unit
-        Of the laws' axis.
+        Title and unit of the laws' axis.
     read
         How to read band and points.
     at_middle
-        The values in the middle of the range, in words: the laws are then drawn as changes from these.
+        The values in the middle of the range, in words; the laws are then drawn as changes from these.
     """
     temperature, reach = curves.temperature, 2 * curves.standard_uncertainty
     middle = len(temperature) // 2
@@ -91,8 +108,8 @@ def law_figure(
         if alone is not None:
             u = None if alone.standard_uncertainty is None else 2 * alone.standard_uncertainty[k]
             traces += [
-                own_points(alone.temperature, alone.values[k] - zero[k], None, k, name),
-                own_points(alone.temperature, alone.values[k] - alone.laws[k], u, k, name) | beneath,
+                *_alone_points(alone.temperature, alone.values[k] - zero[k], None, k, name),
+                *_alone_points(alone.temperature, alone.values[k] - alone.laws[k], u, k, name, **beneath),
             ]
     message = (
         f"The laws are known to {plain_number(float(reach.max()), 2)} {unit} or better (two standard uncertainties)"
@@ -117,33 +134,30 @@ def law_figure(
     )
 
 
-def power_cycles(known_from: str) -> str:
-    """Return what bands hold of the scatter between power cycles, known by a record's ``between_recordings.from``."""
+def describe_power_cycles(known_from: str) -> str:
+    """Return whether bands include the scatter between power cycles, from ``between_recordings.from`` of a record."""
     if known_from == "unknown":
         return "without what power cycles add, which is not known."
     return "what power cycles differ by included."
 
 
 def values_at_middle(record: Calibration, names: Sequence[str]) -> str:
-    """Return coefficients of a record in words: as those of powers of T - T0 they are values in the middle."""
+    """Return the first coefficients of laws in words: of powers of T - T0 these are the values in the middle."""
     by_name = {row.name: row for row in rows_of(record)}
     rows = [by_name[name] for name in names]
     each = (f"{row.name[-2:].lstrip('_')} {format_uncertain(row.value, row.standard_uncertainty)[0]}" for row in rows)
     return f"{', '.join(each)} {rows[0].unit}"
 
 
-def own_points(temperature: Array, values: Array, reach: Array | None, axis: int, label: str) -> dict[str, Any]:
-    """Return the values of single recordings as points with bars, beside the law of an axis."""
-    bars = {} if reach is None else {
-        "error_y": {"type": "data", "array": rounded(np.abs(reach)), "thickness": 1, "color": COLOURS[axis]}
-    }  # fmt: skip
-    marker = {"symbol": SYMBOLS[axis], "color": COLOURS[axis], "size": 7}
-    return scatter(
-        rounded(temperature), rounded(values), "markers", name=f"{label} alone", showlegend=False, marker=marker, **bars
-    )
+def _alone_points(
+    temperature: Array, values: Array, reach: Array | None, axis: int, label: str, **more: Any
+) -> list[dict[str, Any]]:
+    """Return the values of single recordings as points with bars, in the look of an axis, without a key."""
+    group = Group(f"{label} alone", np.ones(len(values), dtype=np.bool_), SYMBOLS[axis], COLOURS[axis])
+    return point_traces(temperature, values, reach, [group], size=7, **{"showlegend": False, **more})
 
 
-# What a thermal record shows of its gyroscopes: their biases over temperature with the band, and what is left.
+# Gyroscopes.
 
 
 def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[str, str]], list[Figure]]:
@@ -152,56 +166,45 @@ def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[s
     fit, data = thermal.fit.gyro, thermal.data.gyro
     assert fit is not None
     assert data is not None
-    values, spread = (from_si(each, "deg/s") for each in gyro_predicted(record, temperature))
+    values, gyro_u = predict_gyro_bias(record, temperature)
     tau = fit.between_recordings
-    words = f"{plain_number(_hourly(tau.bias.value), 2)} deg/h"
-    words = {"unknown": "not known", "polynomials": f"at most {words}"}.get(tau.from_, f"{words} ({tau.from_})")
-    left = fit.left_out_temperature
-    worst = f"{plain_number(_hourly(max(row.rms for row in left)), 2)} deg/h rms at worst" if left else "–"
     facts = [
-        ("gyroscope biases", f"known to {plain_number(float(spread.max()) * 3600, 2)} deg/h or better"),
-        ("gyroscope biases, power cycle to power cycle", words),
-        ("gyroscope biases at left-out temperatures", worst),
+        ("gyroscope biases", f"known to {small_text(float(gyro_u.max()), 'rad/s', 2)} or better"),
+        ("gyroscope biases, power cycle to power cycle", _turn_on_text(tau.from_, tau.bias.value, "rad/s")),
+        ("gyroscope biases at left-out temperatures", _left_out_text(fit.left_out_temperature, "rad/s")),
     ]
     if fit.turns is not None:
         turns = f"{fit.turns.turns}, missed by {plain_number(np.degrees(fit.turns.rms.value), 2)} deg rms"
         facts.append(("turns", turns))
         if not thermal.model.gyro_laws.degrees[1]:
             # A law that nothing could bend is no figure over temperature.
-            scale, u = gyro_scale_predicted(record, temperature)
+            scale, u = predict_gyro_scale(record, temperature)
             known = plain_number(1e6 * float((u / np.abs(scale)).max()), 2)
-            words = f"known to {known} ppm where the turns were, and taken as the same at all temperatures"
-            facts.append(("gyroscope scale factors", words))
-    residual = from_si(np.array(data.residual), "deg/h")
-    points = [
-        scatter(rounded(np.array(data.temperature)), rounded(residual[:, k], 4), "markers", name=name,
-                marker={"symbol": SYMBOLS[k], "color": COLOURS[k], "size": 7})
-        for k, name in enumerate(AXES)
-    ]  # fmt: skip
-    place = figure_axis("temperature, degC")
+            text = f"known to {known} ppm where the turns were, and taken as the same at all temperatures"
+            facts.append(("gyroscope scale factors", text))
+    curves = LawCurves(AXES, temperature, from_si(values, "deg/s"), from_si(gyro_u, "deg/s"))
+    read = describe_power_cycles(tau.from_) + " Points: the mean of each recording that stayed at its temperature."
     figures = [
         law_figure(
-            "Bias of the gyroscopes over temperature",
-            "bias",
-            "deg/s",
-            LawCurves(AXES, temperature, values, spread),
-            _recordings(record),
-            read=power_cycles(tau.from_) + " Points: the mean of each recording that stayed at its temperature.",
+            "Bias of the gyroscopes over temperature", "bias", "deg/s", curves, _steady_means(record), read=read
         ),
-        Figure(
-            title="What the laws leave of the gyroscopes at rest",
-            caption="Law less output of each hold. A recording whose points lie together away from zero is a power "
+        points(
+            "What the laws leave of the gyroscopes at rest",
+            "Law less output of each hold. A recording whose points lie together away from zero is a power "
             "cycle whose biases are offset; within it they scatter by noise, the Earth's rate (15 deg/h) and drift.",
-            traces=points,
-            layout={"xaxis": place, "yaxis": figure_axis("law less output, deg/h"), "legend": LEGEND},
+            ("temperature, degC", np.repeat(data.temperature, len(AXES))),
+            ("law less output, deg/h", from_si(np.array(data.residual).ravel(), "deg/h")),
+            None,
+            axis_groups(len(data.temperature)),
+            size=7,
         ),
     ]
     if fit.turns is not None and thermal.model.gyro_laws.degrees[1]:
-        figures.insert(1, _scale_factors(record, temperature, fit.turns.recordings))
+        figures.insert(1, _scale_factor_figure(record, temperature, fit.turns.recordings))
     return facts, figures
 
 
-def _recordings(record: Calibration) -> Alone | None:
+def _steady_means(record: Calibration) -> Alone | None:
     """Return the mean bias of each recording that stayed at its temperature, deg/s; None where there are none."""
     data = thermal_of(record).data.gyro
     assert data is not None
@@ -210,14 +213,14 @@ def _recordings(record: Calibration) -> Alone | None:
     if not len(names):
         return None
     at = np.array(data.temperature)[steady]
-    laws = gyro_predicted(record, at)[0]
+    laws = predict_gyro_bias(record, at)[0]
     values = laws - np.array(data.residual).reshape(-1, 3)[steady].T
     mean = np.array([np.bincount(index, weights=each) for each in (at, *values, *laws)]) / np.bincount(index)
     return Alone(mean[0], from_si(mean[1:4], "deg/s"), from_si(mean[4:], "deg/s"))
 
 
-def _scale_factors(record: Calibration, temperature: Array, recordings: int) -> Figure:
-    values, spread = gyro_scale_predicted(record, temperature)
+def _scale_factor_figure(record: Calibration, temperature: Array, recordings: int) -> Figure:
+    values, spread = predict_gyro_scale(record, temperature)
     factors = 1e6 / np.abs(values[:, [len(temperature) // 2]])
     return law_figure(
         "Scale factor of the gyroscopes over temperature",
@@ -230,23 +233,24 @@ def _scale_factors(record: Calibration, temperature: Array, recordings: int) -> 
     )
 
 
-def _hourly(rate: float) -> float:
-    return float(from_si(rate, "deg/h"))
+def _turn_on_text(known_from: str, scatter: float, unit: str) -> str:
+    """Return the scatter of biases between power cycles, SI, as a fact, with how it is known."""
+    text = small_text(scatter, unit, 2)
+    return {"unknown": "not known", "polynomials": f"at most {text}"}.get(known_from, f"{text} ({known_from})")
 
 
-# What a thermal record shows: each parameter over temperature with its band, what is left, and how it predicts.
+# The record.
 
 
 _POINTS = 81  # of a curve
 _POINTS_DRAWN_ALONE, _PARTS, _FEWEST = 60, 9, 3
-"""Holds whose bars hide one another; the parts that they are averaged in, an odd number, since a soak in the middle is
-not to be parted; and the fewest of one."""
+"""Most holds that are drawn with bars; parts of the range in which more are averaged, an odd number so that a soak in
+the middle is not divided; and the fewest holds of a part."""
 _READ = (
-    ("bias", 1e3 / STANDARD_GRAVITY, "mg"),
-    ("scale factor", 1e6, "ppm"),
-    ("misalignment", 1e3, "mrad"),
+    ("bias", reading_unit("m/s^2")),
+    ("scale factor", ReadingUnit("ppm", 1e6)),
+    ("misalignment", reading_unit("rad")),
 )
-_MICRO_G = 1e6 / STANDARD_GRAVITY  # to µg
 
 
 def exhibits(record: Calibration) -> Exhibits:
@@ -254,71 +258,63 @@ def exhibits(record: Calibration) -> Exhibits:
     thermal = thermal_of(record)
     low, high = thermal.model.range
     temperature = np.linspace(low, high, _POINTS)
-    _, spread = predicted(record, temperature)
+    _, spread = predict_parameters(record, temperature)
     fit = thermal.fit
-    worst = float(spread[:3].max()) * _MICRO_G
-    laws, rms = thermal.model.laws, plain_number(fit.rms.value * _MICRO_G, 3)
+    laws, tau = thermal.model.laws, fit.between_recordings
     kind = "degrees " + ", ".join(map(str, laws.degrees))
     if laws.knots:
-        kind = spoken_degrees(laws.degrees, len(laws.knots))
+        kind = describe_degrees(laws.degrees, len(laws.knots))
     headline = (
-        f"{low:.0f} to {high:.0f} degC, {kind}: |f| - g is {rms} µg rms over {fit.holds} holds; "
-        f"biases are known to {plain_number(worst, 2)} µg or better."
+        f"{low:.0f} to {high:.0f} degC, {kind}: |f| - g is {small_text(fit.rms.value, 'm/s^2')} rms over {fit.holds} "
+        f"holds; biases are known to {small_text(float(spread[:3].max()), 'm/s^2', 2)} or better."
     )
-    tau = fit.between_recordings
-    words = f"{plain_number(tau.bias.value * _MICRO_G, 2)} µg"
-    words = {
-        "unknown": "not known",
-        "polynomials": f"at most {words}",
-    }.get(tau.from_, f"{words} ({tau.from_})")
     facts = [
         ("recordings", str(fit.recordings)),
         ("temperatures", str(fit.temperatures)),
-        ("biases, power cycle to power cycle", words),
-        ("left-out temperatures", _left(thermal)),
-        *_drift(thermal),
+        ("biases, power cycle to power cycle", _turn_on_text(tau.from_, tau.bias.value, "m/s^2")),
+        ("left-out temperatures", _left_out_text(fit.left_out_temperature, "m/s^2")),
+        *_lag_and_loop_facts(thermal),
     ]
     items: list[Figure | ReportTable] = [
-        _coefficients(record),
-        *(_over_temperature(k, record, temperature) for k in range(3)),
-        _of_force(record, thermal, temperature),
-        _residuals(thermal),
+        _coefficients_table(record),
+        *(_parameter_figure(k, record, temperature) for k in range(3)),
+        _force_figure(record, thermal, temperature),
+        _residual_figure(thermal),
     ]
     if thermal.model.gyro is not None:
         gyro_facts, gyro_items = gyro_exhibits(record, temperature)
         facts += gyro_facts
         items += gyro_items
     if fit.left_out_temperature:
-        items.append(_predicted(thermal))
+        items.append(_left_out_table(thermal))
     if fit.degrees:
-        items.append(_compared(thermal))
+        items.append(_degrees_table(thermal))
     return Exhibits(headline, facts, items)
 
 
-def _drift(thermal: ThermalRecord) -> list[tuple[str, str]]:
-    """Return lag and loops as facts, where the recordings tell them."""
+def _lag_and_loop_facts(thermal: ThermalRecord) -> list[tuple[str, str]]:
+    """Return lag and loops as facts, where they are observable."""
     fit, facts = thermal.fit, []
-    for label, tested, factor, unit in (
-        ("lag behind the thermometer", fit.lag, 1.0, "s"),
-        *(
-            (f"loop of {name}", loop, _MICRO_G, "µg")
-            for name, loop in zip(AXES, (fit.loop_x, fit.loop_y, fit.loop_z), strict=True)
-        ),
+    loops = zip(AXES, (fit.loop_x, fit.loop_y, fit.loop_z), strict=True)
+    for label, tested in (
+        ("lag behind the thermometer", fit.lag),
+        *((f"loop of {name}", loop) for name, loop in loops),
     ):
         if tested is not None and tested.standard_uncertainty is not None:
-            value, u = format_uncertain(tested.value * factor, tested.standard_uncertainty * factor)
-            facts.append(
-                (label, f"{value} {unit} (u {u}), " + ("taken out of the laws" if tested.fitted else "not significant"))
-            )
+            read = small_unit(tested.unit)
+            value, u = read.texts(tested.value, tested.standard_uncertainty)
+            verdict = "taken out of the laws" if tested.fitted else "not significant"
+            facts.append((label, f"{value} {read.symbol} (u {u}), {verdict}"))
     return facts
 
 
-def _left(thermal: ThermalRecord) -> str:
-    rows = thermal.fit.left_out_temperature
-    return f"{plain_number(max(row.rms for row in rows) * _MICRO_G, 2)} µg rms at worst" if rows else "–"
+def _left_out_text(rows: Sequence[LeftOutTemperature], unit: str) -> str:
+    """Return the largest error at a left-out temperature, SI, as a fact."""
+    return f"{small_text(max(row.rms for row in rows), unit, 2)} rms at worst" if rows else "–"
 
 
-def _coefficients(record: Calibration) -> ReportTable:
+def _coefficients_table(record: Calibration) -> ReportTable:
+    """Return the coefficients of all laws."""
     reference = record.model["reference_temperature"]["value"]
     model = thermal_of(record).model
     splines = [("bias_x", model.knots), ("gyro_bias_x", None if model.gyro is None else model.gyro.knots)]
@@ -335,37 +331,44 @@ def _coefficients(record: Calibration) -> ReportTable:
     )
 
 
-def _over_temperature(group: int, record: Calibration, temperature: Array) -> Figure:
-    name, factor, unit = _READ[group]
+def _parameter_figure(group: int, record: Calibration, temperature: Array) -> Figure:
+    """Return the law of one kind of parameters over temperature, with the calibrations of single recordings."""
+    name, read_unit = _READ[group]
     kind, axes = GROUPS[group]
     part = slice(3 * group, 3 * group + 3)
     thermal = thermal_of(record)
-    values, u = (each[part] for each in predicted(record, temperature))
+    values, u = (each[part] for each in predict_parameters(record, temperature))
     # Scale factors are read relative to those in the middle of the range.
-    factors = factor / np.abs(values[:, [len(temperature) // 2]]) if group == 1 else np.full((3, 1), factor)
+    nominal = np.abs(values[:, [len(temperature) // 2]]) if group == 1 else np.ones((3, 1))
+    factors = read_unit.factor / nominal
     calibrations, alone = thermal.data.calibrations, None
     if calibrations is not None:
         at = np.array(calibrations.temperature)
         each, reach = (
             factors * np.array(rows).T[part] for rows in (calibrations.values, calibrations.standard_uncertainty)
         )
-        alone = Alone(at, each, factors * predicted(record, at)[0][part], reach)
-    read = power_cycles(thermal.fit.between_recordings.from_)
+        alone = Alone(at, each, factors * predict_parameters(record, at)[0][part], reach)
+    read = describe_power_cycles(thermal.fit.between_recordings.from_)
     if alone is not None:
         read += " Points: what each recording at a steady temperature gives alone, bars two of its own."
     at_middle = values_at_middle(record, [f"{kind}_{axis}" for axis in axes]) if group else ""
     curves = LawCurves(axes, temperature, factors * values, factors * u)
     title = f"{name.capitalize()} over temperature"
-    return law_figure(title, name, unit, curves, alone, read=read, at_middle=at_middle)
+    return law_figure(title, name, read_unit.symbol, curves, alone, read=read, at_middle=at_middle)
 
 
-def _of_force(record: Calibration, thermal: ThermalRecord, temperature: Any) -> Figure:
+def _force_figure(record: Calibration, thermal: ThermalRecord, temperature: Array) -> Figure:
+    """Return the standard deviation of the corrected force over temperature, without and with power cycles."""
     laws, between = deviation_of_force(record, temperature), thermal.fit.between_recordings
     cycle = np.hypot(between.bias.value, thermal.model.gravity.value * between.scale_factor.value / np.sqrt(3))
     known = between.from_ != "unknown"
     traces = [
         scatter(
-            rounded(temperature), rounded(each * _MICRO_G, 4), "lines", name=name, line={"color": colour, "dash": dash}
+            rounded(temperature),
+            rounded(from_si(each, "ug"), 4),
+            "lines",
+            name=name,
+            line={"color": colour, "dash": dash},
         )
         for name, each, colour, dash in (
             ("by the laws", laws, GOOD, "solid"),
@@ -389,93 +392,99 @@ def _of_force(record: Calibration, thermal: ThermalRecord, temperature: Any) -> 
     )
 
 
-def _residuals(thermal: ThermalRecord) -> Figure:
-    held = thermal.data.holds
-    temperature, residual, u = (np.array(each) for each in (held.temperature, held.residual, held.standard_uncertainty))
-    rate = moved(np.array(held.recording), temperature, np.array(held.rate))
-    many, edges = len(residual) > _POINTS_DRAWN_ALONE, np.linspace(temperature.min(), temperature.max(), _PARTS + 1)
-    traces = []
-    for label, which, symbol, colour in (
-        ("warming", rate > 0, "triangle-up", BAD),
-        ("cooling", rate < 0, "triangle-down", GOOD),
-        ("steady", rate == 0, "circle", INK),
-    ):
-        if which.any():
-            at, left = temperature[which], residual[which] * _MICRO_G
-            marker = {"symbol": symbol, "color": colour, "size": 5 if many else 7, "opacity": 0.5 if many else 1}
-            bars = {"type": "data", "array": rounded(u[which] * _MICRO_G, 3), "thickness": 1, "visible": not many}
-            points = scatter(rounded(at), rounded(left, 4), "markers", name=label, marker=marker, error_y=bars)
-            traces += [points, *([_means(at, left, edges, label, marker)] if many else [])]
-    return Figure(
-        title="Residual |f| - g of each hold over temperature",
-        caption=(
+def _residual_figure(thermal: ThermalRecord) -> Figure:
+    """Return the residual |f| - g of each hold over temperature, warming and cooling apart; with means if many."""
+    holds = thermal.data.holds
+    temperature, rate = np.array(holds.temperature), np.array(holds.rate)
+    rate = mask_drift_rates(np.array(holds.recording), temperature, rate)
+    residual, u = (from_si(np.array(values), "ug") for values in (holds.residual, holds.standard_uncertainty))
+    groups = [
+        Group("warming", rate > 0, "triangle-up", BAD),
+        Group("cooling", rate < 0, "triangle-down", GOOD),
+        Group("steady", rate == 0, "circle", INK),
+    ]
+    many = len(residual) > _POINTS_DRAWN_ALONE
+    figure = points(
+        "Residual |f| - g of each hold over temperature",
+        (
             "Large marks: means of holds in a ninth of the range, bars two standard uncertainties by their scatter. "
             if many
             else "Bars: the hold's own standard uncertainty. "
         )
         + "Where warming and cooling differ, the unit lags behind its thermometer, or does not come back; a lag or "
         "loop that is significant is taken out here, while corrected outputs keep it.",
-        traces=traces,
-        layout={
-            "xaxis": figure_axis("temperature, degC"),
-            "yaxis": figure_axis("|f| - g, µg"),
-            "legend": LEGEND,
-            "showlegend": True,
-        },
+        ("temperature, degC", temperature),
+        ("|f| - g, µg", residual),
+        None if many else u,
+        groups,
+        size=5 if many else 7,
+        opacity=0.5 if many else 1,
+        showlegend=True,
     )
+    means = [trace for group in groups for trace in _mean_traces(temperature, residual, group)] if many else []
+    return replace(figure, traces=figure.traces + means)
 
 
-def _means(temperature: Array, values: Array, edges: Array, label: str, marker: dict[str, Any]) -> dict[str, Any]:
-    """Return the means of points between edges, with twice their standard uncertainty by the scatter."""
-    number = np.searchsorted(edges[1:-1], temperature)
+def _mean_traces(temperature: Array, values: Array, group: Group) -> list[dict[str, Any]]:
+    """Return the means of a group's points in parts of the range, with two standard uncertainties by their scatter."""
+    edges = np.linspace(temperature.min(), temperature.max(), _PARTS + 1)[1:-1]
+    at, members = temperature[group.members], values[group.members]
+    number = np.searchsorted(edges, at)
     count = np.bincount(number, minlength=_PARTS)
     enough = count >= _FEWEST
-    at, mean, square = (
-        np.bincount(number, weights=each, minlength=_PARTS)[enough] / count[enough]
-        for each in (temperature, values, values**2)
+    place, mean, square = (
+        np.bincount(number, weights=weights, minlength=_PARTS)[enough] / count[enough]
+        for weights in (at, members, members**2)
     )
     u = np.sqrt(np.maximum(square - mean**2, 0) / (count[enough] - 1))
-    bars = {"type": "data", "array": rounded(2 * u, 3), "thickness": 2}
-    marker = marker | {"size": 11, "opacity": 1}
-    name = f"{label}, means"
-    return scatter(rounded(at), rounded(mean, 4), "markers", name=name, marker=marker, error_y=bars)
+    marks = Group(f"{group.name}, means", np.ones(len(place), dtype=np.bool_), group.symbol, group.colour)
+    return point_traces(place, mean, 2 * u, [marks], size=11)
 
 
-def _predicted(thermal: ThermalRecord) -> ReportTable:
-    rows = [
-        [f"{row.temperature:.1f}", str(row.holds), plain_number(row.rms * _MICRO_G, 3), f"{row.chi_square:.2f}"]
-        for row in thermal.fit.left_out_temperature
-    ]
-    return ReportTable(
+def _left_out_table(thermal: ThermalRecord) -> ReportTable:
+    """Return the errors at temperatures that were left out of the fit."""
+    read = small_unit("m/s^2")
+    columns: dict[str, Callable[[LeftOutTemperature], str]] = {
+        "degC": lambda row: f"{row.temperature:.1f}",
+        "holds": lambda row: str(row.holds),
+        f"rms, {read.symbol}": lambda row: number_text(row.rms, read.factor),
+        "chi-square": lambda row: f"{row.chi_square:.2f}",
+    }
+    return table(
         "Temperatures left out",
         "| |f| - g | at each interior temperature under the fit to all others; chi-square per hold is about 1 where "
         "the stated uncertainty holds there.",
-        ["degC", "holds", "rms, µg", "chi-square"],
-        rows,
+        columns,
+        thermal.fit.left_out_temperature,
     )
 
 
-def _compared(thermal: ThermalRecord) -> ReportTable:
-    rows, chosen = [], None
-    for number, row in enumerate(thermal.fit.degrees):
-        chosen = number if row.chosen else chosen
-        rows.append(
-            [
-                ", ".join(
-                    [f"spline with {row.knots} knots" if row.knots else str(row.degrees[0]), *map(str, row.degrees[1:])]
-                ),
-                "–" if row.left_out is None else plain_number(row.left_out * _MICRO_G, 3),
-                "–" if row.probability is None else "< 0.001" if row.probability < 0.001 else f"{row.probability:.3f}",
-            ]
-        )
-    return ReportTable(
+def _degrees_table(thermal: ThermalRecord) -> ReportTable:
+    """Return the degrees that were compared, with the chosen ones highlighted."""
+    read, tried = small_unit("m/s^2"), thermal.fit.degrees
+
+    def name(row: DegreesTried) -> str:
+        bias = f"spline with {row.knots} knots" if row.knots else str(row.degrees[0])
+        return ", ".join([bias, *map(str, row.degrees[1:])])
+
+    def chance(row: DegreesTried) -> str:
+        p = row.probability
+        return "–" if p is None else "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+    columns: dict[str, Callable[[DegreesTried], str]] = {
+        "degrees": name,
+        f"error at temperatures left out, {read.symbol}": lambda row: number_text(row.left_out, read.factor),
+        "probability that the power left out is chance": chance,
+    }
+    chosen = [number for number, row in enumerate(tried) if row.chosen]
+    return table(
         "Degrees compared",
         f"Of {', '.join(kind.replace('_', ' ') for kind, _ in GROUPS)} on axes {' '.join(AXES)}. A step leaves "
         "the highest power of one kind out, and is "
         "taken where that power is insignificant (probability above 0.01) and left-out temperatures are predicted "
         "no worse; a spline of the bias where it is no cubic (the same test, as far as recordings tell) and predicts "
         "them at most a tenth worse, since it then lacks a knot.",
-        ["degrees", "error at temperatures left out, µg", "probability that the power left out is chance"],
-        rows,
-        highlight=chosen,
+        columns,
+        tried,
+        highlight=chosen[-1] if chosen else None,
     )

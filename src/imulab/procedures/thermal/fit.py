@@ -1,4 +1,7 @@
-"""Recordings at several temperatures to one calibration over temperature."""
+"""The fit of recordings at several temperatures, from files to the record.
+
+The mathematics is in `solve` (least squares), `degrees` (choice of the laws) and `gyro`.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,15 @@ from imulab.estimation.least_squares import Observability
 from imulab.gravity import EarthRate, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
 from imulab.options import FURTHER_TRIADS, measure, parsed, text
 from imulab.procedures.result import Record, Result, as_record, as_recording
-from imulab.procedures.thermal import degrees_text, further_of, laws_of
-from imulab.procedures.thermal.degrees import Degrees, DegreesStep, LeftOutCluster, choose, drift_of, moving
+from imulab.procedures.thermal import check_degrees, parse_further, parse_laws
+from imulab.procedures.thermal.degrees import (
+    Degrees,
+    DegreesStep,
+    LeftOutCluster,
+    choose_laws,
+    drift_rates,
+    fit_lag_and_loops,
+)
 from imulab.procedures.thermal.gyro import (
     check_gyroscopes,
     fit_gyroscopes,
@@ -23,7 +33,7 @@ from imulab.procedures.thermal.gyro import (
     rates_at_rest,
     scale_from_turns,
 )
-from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepared, sides
+from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepare_recordings, read_sides
 from imulab.procedures.thermal.model import GROUPS, Laws, forces
 from imulab.procedures.thermal.record import make_record, with_gyroscopes
 from imulab.procedures.thermal.solve import ThermalProblem, ThermalSolution
@@ -48,7 +58,7 @@ class ThermalFit(Result):
     degrees
         The degrees that were compared, where they were chosen from the data.
     left_out
-        The error at each interior temperature, predicted from all others, m/s^2.
+        The error at each interior temperature under the fit to all others, g.
 
     Examples
     --------
@@ -67,12 +77,12 @@ class ThermalFit(Result):
 def fit_thermal(
     data: Data | Sequence[Data],
     *,
-    degrees: Annotated[str | Degrees, parsed(degrees_text, "auto|B,S,M", ("auto",))] = "auto",
+    degrees: Annotated[str | Degrees, parsed(check_degrees, "auto|B,S,M", ("auto",))] = "auto",
     gravity: LocalGravity = None,
     latitude: Latitude = None,
     height: Height = None,
     prior: Record | None = None,
-    with_: Annotated[str | Sequence[str], parsed(further_of, "gyro", ("gyro",)), FURTHER_TRIADS] = (),
+    with_: Annotated[str | Sequence[str], parsed(parse_further, "gyro", ("gyro",)), FURTHER_TRIADS] = (),
     tilt: Annotated[float | str, measure("angle", "mrad")] = "0.2 mrad",
     turn_on_scatter: Annotated[float | str | None, measure("acceleration", "mg", "SIZE")] = None,
     gyro_turn_on_scatter: Annotated[float | str | None, measure("rate", "deg/s", "SIZE"), FURTHER_TRIADS] = None,
@@ -132,11 +142,12 @@ def fit_thermal(
     >>> fit.calibration.model["degrees"]["bias"]
     3
     """
-    items = _several(data)
-    further = further_of(with_, "with_")
-    wanted, spline = laws_of(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
+    items = _as_list(data)
+    further = parse_further(with_, "with_")
+    wanted, spline = parse_laws(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
     settling = None if settle is None else in_si(settle, "settle", "time", "s")
-    recordings = prepared([as_recording(item, reading, fit_thermal) for item in items], temperature_column, settling)
+    recordings = [as_recording(item, reading, fit_thermal) for item in items]
+    recordings = prepare_recordings(recordings, temperature_column, settling)
     if further:
         check_gyroscopes(recordings)
     earth = at_latitude(latitude) if further else None
@@ -144,21 +155,21 @@ def fit_thermal(
     holds = find_holds(recordings)
     nominal = conversion_factor(holds.unit, "m/s^2") if parse_unit(holds.unit).quantity == "acceleration" else None
     check_holds(holds, local.value, nominal)
-    scale, zero = _scaling(holds, local.value, nominal)
-    leaning = _leaning(tilt)
-    scatter = _scatter(turn_on_scatter, "turn_on_scatter", "acceleration", "mg", local.value)
+    scale, zero = _nominal_scale(holds, local.value, nominal)
+    leaning = _read_tilt(tilt)
+    scatter = _read_scatter(turn_on_scatter, "turn_on_scatter", "acceleration", "mg", local.value)
     if gyro_turn_on_scatter is not None and not further:
         raise OptionError("gyro_turn_on_scatter: no gyroscopes are fitted; expected --with gyro beside it")
-    rates = _scatter(gyro_turn_on_scatter, "gyro_turn_on_scatter", "rate", "deg/s")
-    known = None if prior is None else _known(as_record(prior, "fit_thermal: prior"), holds, local.value, scale)
-    problem = _problem(holds, scale, zero, leaning, known)
+    rates = _read_scatter(gyro_turn_on_scatter, "gyro_turn_on_scatter", "rate", "deg/s")
+    known = None if prior is None else _read_prior(as_record(prior, "fit_thermal: prior"), holds, local.value, scale)
+    problem = _make_problem(holds, scale, zero, leaning, known)
     laws = Laws(float(holds.temperature.min()), float(holds.temperature.max()), (0, 0, 0))
     name = recordings[0].name + (f" and {len(recordings) - 1} more" if len(recordings) > 1 else "")
-    choice = choose(problem, laws, wanted, scatter, name, spline=spline)
-    drift = drift_of(problem, choice.solution, scatter)
+    choice = choose_laws(problem, laws, wanted, scatter, name, spline=spline)
+    drift = fit_lag_and_loops(problem, choice.solution, scatter)
     if drift.free:
         problem = replace(problem, free=drift.free)
-        choice = choose(problem, laws, wanted, scatter, name, spline=spline)
+        choice = choose_laws(problem, laws, wanted, scatter, name, spline=spline)
     options = {
         "degrees": wanted if isinstance(wanted, str) else ["spline", *wanted[1:]] if spline else list(wanted),
         "gravity": local.value,
@@ -177,7 +188,7 @@ def fit_thermal(
     return ThermalFit(record, choice.view, tuple(choice.steps), tuple(choice.left_out))
 
 
-def _several(data: Data | Sequence[Data]) -> list[Any]:
+def _as_list(data: Data | Sequence[Data]) -> list[Any]:
     """Return the recordings as a list."""
     single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
     items: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
@@ -208,16 +219,16 @@ def _with_gyroscopes(
     return with_gyroscopes(record, holds, gyros, turned, name)
 
 
-def _leaning(tilt: float | str) -> float:
-    """Return how far a hold tips, rad."""
+def _read_tilt(tilt: float | str) -> float:
+    """Return the standard deviation of a hold's tilt, rad."""
     angle = in_si(tilt, "tilt", "angle", "mrad")
     if not 0 < angle < np.inf:
         raise OptionError(f"tilt {angle:g}: expected a size above 0")
     return angle
 
 
-def _scatter(stated: float | str | None, name: str, quantity: str, unit: str, size: float = 1.0) -> float | None:
-    """Return a stated scatter between power cycles, in units of `size`, SI."""
+def _read_scatter(stated: float | str | None, name: str, quantity: str, unit: str, size: float = 1.0) -> float | None:
+    """Return a stated scatter between power cycles in SI over `size`, None where it is not stated."""
     if stated is None:
         return None
     value = in_si(stated, name, quantity, unit)
@@ -226,7 +237,7 @@ def _scatter(stated: float | str | None, name: str, quantity: str, unit: str, si
     return value / size
 
 
-def _scaling(holds: Holds, gravity: float, nominal: float | None) -> tuple[Array, Array]:
+def _nominal_scale(holds: Holds, gravity: float, nominal: float | None) -> tuple[Array, Array]:
     """Return the nominal scale factor, output per g, and the biases to start from, in g."""
     if nominal is not None:
         return np.full(3, gravity / nominal), np.zeros(3)
@@ -235,14 +246,15 @@ def _scaling(holds: Holds, gravity: float, nominal: float | None) -> tuple[Array
     return scale, (high + low) / 2 / scale
 
 
-def _problem(
+def _make_problem(
     holds: Holds, scale: Array, zero: Array, tilt: float, known: tuple[float, Array, Array] | None
 ) -> ThermalProblem:
+    """Return the holds in units of g."""
     return ThermalProblem(
         holds.mean / scale,
         holds.covariance / (scale[:, None] * scale),
         holds.temperature,
-        moving(holds),
+        drift_rates(holds),
         holds.step,
         holds.shared,
         holds.recording,
@@ -250,12 +262,12 @@ def _problem(
         tilt,
         zero,
         known,
-        side=sides(holds),
+        side=read_sides(holds),
         wander=holds.wander,
     )
 
 
-def _known(record: Calibration, holds: Holds, gravity: float, scale: Array) -> tuple[float, Array, Array]:
+def _read_prior(record: Calibration, holds: Holds, gravity: float, scale: Array) -> tuple[float, Array, Array]:
     """Return the parameters of a tumble record at its temperature, with their covariance, in units of g."""
     if record.procedure != "tumble" or not record.covariance.names or record.model.get("order") != 1:
         raise RecordError("prior: expected a tumble record of order 1 that states uncertainties (tumble fit --order 1)")

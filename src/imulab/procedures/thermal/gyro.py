@@ -1,23 +1,17 @@
-"""The gyroscopes over temperature.
+"""The gyroscopes over temperature: biases from holds at rest, scale factors and misalignments from turns.
 
-Their bias from holds at rest, with the Earth's rate, and scale factors and misalignment from turns.
+Biases (`fit_gyroscopes`): ``M / S = b(T) + G f + W + offset of the power cycle``, b(T) as in
+`imulab.procedures.thermal.model`, with the covariance of `imulab.procedures.thermal.solve`. The g-sensitivity G, the
+same at all temperatures, is fitted where it is significant (F). A turn about the vertical does not show in the
+accelerometers, so the gyroscopes' own scatter decides which samples are at rest.
 
-Its vertical part v is the same along up in all holds, as a g-sensitivity is. Without a latitude v is one unknown of
-all, of variance EARTH^2 / 3: the mean over all directions of the Earth's axis. The level part takes another heading in
-each attitude; it is known by its size alone.
+The Earth's rate W (`model_earth_rate`): its vertical part v is along up in all holds, as a g-sensitivity is. Without a
+latitude v is one unknown of variance EARTH^2 / 3, the mean over all directions of the Earth's axis. The horizontal part
+has another heading in each attitude; only its size is known.
 
-A turn about the vertical moves no accelerometer, so the gyroscopes' own stillness decides which samples count.
-
-M / S = b(T) + G f + W + offset of the power cycle,   b(T) as in `imulab.procedures.thermal.model`
-
-W is the Earth's rate: what is known of it, and what counts as random, is in `imulab.procedures.thermal.gyro`.
-Errors of the temperature, offsets between power cycles (tau) and what holds scatter by beyond their noise are those of
-`imulab.procedures.thermal.solve`. The g-sensitivity G, the same at all temperatures, is fitted where it is significant
-at 1 % (F).
-
-Each tumble tells them at its temperature as `imulab.fit_gyro` does, with their covariance. Polynomials through these,
-each weighed by it, are the joint estimate: recordings share no turn. Misalignment is constant, the scale factor too,
-or of degree 1 where there are turns at three temperatures.
+Scale factors and misalignments (`scale_from_turns`): each tumble gives them at its temperature as `imulab.fit_gyro`
+does. Polynomials are fitted to these by weighted least squares; recordings share no turn. Misalignments are constant,
+scale factors too, or of degree 1 where there are turns at three temperatures.
 """
 
 from __future__ import annotations
@@ -42,32 +36,32 @@ from imulab.procedures.thermal.degrees import (
     Degrees,
     LagAndLoops,
     LeftOutCluster,
-    bends,
-    bounded,
-    clusters_of,
-    knots_at,
-    left_out,
+    bound_scatter,
+    drift_rates,
+    explain_unobservable_lag,
+    judge_lag_and_loops,
+    law_bends,
     may_be_taken,
-    moving,
-    predicts,
-    rms_of,
-    splits,
+    number_temperatures,
+    place_knots,
+    predict_left_out,
+    rms_left_out,
+    spline_predicts,
+    split_temperatures,
     step_down,
-    tested,
-    wald,
-    why_lag_is_unobservable,
+    wald_probability,
 )
 from imulab.procedures.thermal.device import tables_of
-from imulab.procedures.thermal.holds import Cut, Holds, averaged, pooled
+from imulab.procedures.thermal.holds import Cut, Holds, average_cut, pool_covariance
 from imulab.procedures.thermal.model import AXES, Laws, forces
 from imulab.procedures.thermal.solve import (
     Rows,
     Scatter,
     ThermalProblem,
     ThermalSolution,
-    between,
-    concluded,
-    excess_of,
+    conclude,
+    fit_excess,
+    fit_turn_on_scatter,
     one_hot,
     whitener,
 )
@@ -79,43 +73,45 @@ from imulab.recording import Array, Recording, check_finite
 from imulab.records.calibration import Calibration
 from imulab.units import parse_unit, to_si
 
-# The Earth's rate in gyroscopes at rest: what is known of it, what all holds share, and what is new in each
-# attitude.
+# The Earth's rate in gyroscopes at rest.
 
 
 VERTICAL = EARTH / np.sqrt(3)
-"""Standard deviation of v without a latitude, rad/s; that of each level component is as large."""
+"""Standard deviation of v without a latitude, rad/s; that of each horizontal component is as large."""
 _ASKEW_SHARE = 0.03
-"""Part of the Earth's rate that is sensed across itself: gyroscopes are askew, or their scale factors off, by that."""
+"""Error of the Earth's rate as sensed, over that rate, by misalignments and scale factors that are not known yet."""
 
 
-def new_in_each(up: Array, earth: EarthRate | None) -> Array:
-    """Return columns of unit variance for what each attitude has of its own, rad/s, shape (n, 3, 3); `up` is (n, 3)."""
+def attitude_columns(up: Array, earth: EarthRate | None) -> Array:
+    """Return the columns, of unit variance, of the unknown Earth's rate in each attitude, rad/s, shape (n, 3, 3).
+
+    They hold the horizontal part and the error of the vertical part as sensed; `up` is the direction up, (n, 3).
+    """
     along = up[:, :, None] * up[:, None, :]
     level = VERTICAL if earth is None else earth.level / np.sqrt(2)
     columns: Array = level * (np.eye(3) - along) + _ASKEW_SHARE * EARTH * along
     return columns
 
 
-def earth_at_rest(force: Array, attitude: NDArray[np.int64], earth: EarthRate | None) -> tuple[Array, Array]:
-    """Return what is known of the Earth's rate, (3 n,), and columns of unit variance for what is not, (3 n, k).
+def model_earth_rate(force: Array, attitude: NDArray[np.int64], earth: EarthRate | None) -> tuple[Array, Array]:
+    """Return the known part of the Earth's rate, (3 n,), and columns of unit variance for the unknown, (3 n, k).
 
     Under specific forces (n, 3); `attitude` is the number of the attitude of each hold, (n,).
     """
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
-    by_attitude = np.einsum("nk,nij->nikj", one_hot(attitude), new_in_each(up, earth)).reshape(up.size, -1)
+    by_attitude = np.einsum("nk,nij->nikj", one_hot(attitude), attitude_columns(up, earth)).reshape(up.size, -1)
     if earth is None:
         return np.zeros(up.size), np.hstack([by_attitude, VERTICAL * up.reshape(-1, 1)])
     return (earth.vertical * up).ravel(), by_attitude
 
 
-# The gyroscopes in the holds of the accelerometers: mean outputs while they, too, were still.
+# Mean outputs of the gyroscopes in the holds of the accelerometers, while the gyroscopes were still too.
 
 
 _COLUMNS = triad("gyro")
-_FEWEST = 12  # still samples that have a mean and a scatter
+_FEWEST = 12  # fewest still samples of a hold
 _LARGEST = np.radians(60.0)
-"""No gyroscope that anyone calibrates has a larger bias, rad/s."""
+"""Largest plausible bias, rad/s."""
 
 
 @dataclass(frozen=True)
@@ -135,11 +131,11 @@ class RatesAtRest:
     index
         Place among the holds, shape (n,).
     unit
-        Of the outputs, as read.
+        Unit of the outputs as read.
     size
-        Nominal output per rad/s that the means are in units of, shape (3,): 1 where the unit is one of rate.
+        Nominal output per rad/s, by which outputs were divided, shape (3,): 1 for a unit of rate.
     notes
-        What a user should know of how they were found.
+        Notes on samples and holds that were left out.
     earth
         The Earth's rate, where the latitude is known.
     """
@@ -203,14 +199,14 @@ def check_gyroscopes(recordings: Sequence[Recording]) -> str:
     return first
 
 
-def output_in(recording: Recording, size: Array) -> Array:
-    """Return the outputs in rad/s by nominal scale factors, output per rad/s for what is no rate, shape (n, 3)."""
+def scale_output(recording: Recording, size: Array) -> Array:
+    """Return the outputs over the nominal scale factors, rad/s, shape (n, 3); `size` is output per rad/s."""
     unit, output = recording.triad_unit("gyro"), recording.triad("gyro")
     return (to_si(output, unit) if parse_unit(unit).quantity == "rate" else output) / size
 
 
 def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
-    """Average the gyroscopes over the holds, under specific forces in g, shape (n, 3), by nominal scale factors (3,).
+    """Return the mean rates over the holds, under specific forces in g, shape (n, 3), by nominal scale factors (3,).
 
     Raises
     ------
@@ -225,9 +221,9 @@ def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
     for number, recording in enumerate(holds.recordings):
         check_finite(recording, _COLUMNS)
         left_out = leave_out(recording, _COLUMNS)
-        output = output_in(left_out.recording, size)
+        output = scale_output(left_out.recording, size)
         members = np.flatnonzero(holds.recording == number)
-        rest, hold_averages, moved = _still_cuts(holds, members, output, recording)
+        rest, hold_averages, moved = _average_still(holds, members, output, recording)
         notes += [f"gyro: {recording.name}: {note}" for note in left_out.notes(rest)] + moved
         for index, cut in zip(members.tolist(), hold_averages, strict=True):
             cuts[index] = cut
@@ -246,15 +242,16 @@ def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
     alone = holds.group < 0
     attitude = np.where(alone, len(holds) + np.arange(len(holds)), holds.group)
     return RatesAtRest(
-        mean, pooled(averages), force[kept], holds.temperature[kept], moving(holds)[kept], holds.step[kept],
-        holds.shared[kept], holds.recording[kept], attitude[kept], np.flatnonzero(kept), unit, size, tuple(notes),
+        mean, pool_covariance(averages), force[kept], holds.temperature[kept], drift_rates(holds)[kept],
+        holds.step[kept], holds.shared[kept], holds.recording[kept], attitude[kept], np.flatnonzero(kept), unit, size,
+        tuple(notes),
     )  # fmt: skip
 
 
-def _still_cuts(
+def _average_still(
     holds: Holds, members: NDArray[np.intp], output: Array, recording: Recording
 ) -> tuple[NDArray[np.bool_], list[Cut | None], list[str]]:
-    """Return the samples at rest, the average of each hold of a recording or None where it turned, and what is said."""
+    """Return the samples at rest, the mean of each hold of a recording (None where it turned), and notes on these."""
     time, temperature = recording.time, recording.si("temperature")
     assert time is not None
     first = np.searchsorted(time, holds.start[members])
@@ -279,25 +276,25 @@ def _still_cuts(
             cuts.append(None)
             continue
         kept = np.flatnonzero(still) + piece.start
-        cuts.append(averaged(output[kept], temperature[kept], time[kept], 0, len(kept), index))
+        cuts.append(average_cut(output[kept], temperature[kept], time[kept], 0, len(kept), index))
     return rest, cuts, notes
 
 
-# The gyroscopes over temperature: the bias from all holds at rest, linear, with the accelerometers' nuisances.
+# Biases over temperature from all holds at rest.
 
 
-_PASSES = 4  # with weights that bound the influence of a hold
+_PASSES = 4  # of weights, or of excess and scatter
 _TELL = 4
-"""Holds of a recording that tell which of them differs."""
-_RANK = 1e-7  # singular value that rounding leaves of columns that are alike
+"""Fewest holds of a recording of which one can be an outlier."""
+_RANK = 1e-7  # relative singular value below which columns are dependent
 
 
 @dataclass(frozen=True)
 class ThermalGyroscopes:
-    """What was found: the holds, and the solution whose coefficients are those of the biases and then G, rad/s per g.
+    """The fit of the biases: holds, and solution with the coefficients of the biases and then G, rad/s per g.
 
-    `probability` is that of so large a G if there were none, None where the attitudes do not tell it; `aside` are the
-    holds, of all, that differ from the others of their recording by a turn.
+    `probability` is that of so large a G by chance, None where the attitudes do not determine it; `aside` are the
+    indices of holds that were left out since the unit turned.
     """
 
     held: RatesAtRest
@@ -312,15 +309,15 @@ class ThermalGyroscopes:
         """Return the biases at temperatures (n,), rad/s, shape (n, 3)."""
         laws = self.solution.laws
         rows = self.solution.coefficients[: self.size].reshape(3, -1)
-        biases: Array = laws.of_bias(temperature) @ rows.T
+        biases: Array = laws.bias_functions(temperature) @ rows.T
         return biases
 
     def sensitivities(self, gravity: float) -> Array:
         """Return G, rad/s per m/s^2, shape (3, 3)."""
         return self.solution.coefficients[self.size : self.size + 9].reshape(3, 3) / gravity
 
-    def again(self, held: RatesAtRest) -> ThermalGyroscopes:
-        """Return the same terms fitted to other means of the same holds, with the scatter that was found."""
+    def refit(self, held: RatesAtRest) -> ThermalGyroscopes:
+        """Return the same terms fitted to other means of the same holds, with the same scatter."""
         laws, scatter = self.solution.laws, self.solution.scatter
         refitted = solve(held, laws, float(scatter.tau[0]), sensitivity=self.sensitivity, free=self.drift.free)
         assert refitted is not None
@@ -328,7 +325,7 @@ class ThermalGyroscopes:
 
     @property
     def count(self) -> int:
-        """Number of coefficients but for lag and loops."""
+        """Number of coefficients without lag and loops."""
         return self.size + 9 * self.sensitivity
 
     @property
@@ -347,17 +344,17 @@ def fit_gyroscopes(
     *,
     spline: bool = False,
 ) -> ThermalGyroscopes:
-    """Fit the biases over the range of temperature, degC; `tau` is their scatter between power cycles, rad/s, if known.
+    """Return the fit of the biases over the range of temperature, degC.
 
-    `spline`: they are natural cubic splines with a knot at each temperature; `wanted` ``auto`` chooses between these
-    and polynomials.
+    `tau` is their scatter between power cycles, rad/s, if known. With `spline` they are natural cubic splines with a
+    knot at each temperature; `wanted` ``auto`` chooses between these and polynomials.
 
     Raises
     ------
     ObservabilityError
         The holds are at too few temperatures.
     """
-    count = int(clusters_of(held.temperature).max(initial=0)) + 1
+    count = int(number_temperatures(held.temperature).max(initial=0)) + 1
     degree = min(DEGREES[0], max(count - 2, 0)) if wanted == "auto" else int(wanted[0])
     least = LEAST_KNOTS if spline else degree + 1
     if count < least:
@@ -367,27 +364,27 @@ def fit_gyroscopes(
             "more temperatures, or lower --degrees"
         )
     laws = Laws(low, high, (degree, 0, 0))
-    held, aside = without_turns(held, laws)
-    cluster = clusters_of(held.temperature)
-    choice = _Search(held, cluster, tau).chosen(laws, auto=wanted == "auto", spline=spline)
+    held, aside = leave_out_turns(held, laws)
+    cluster = number_temperatures(held.temperature)
+    choice = _Search(held, cluster, tau).choose(laws, auto=wanted == "auto", spline=spline)
     solution = choice.solution
     if solution.scatter.bound:
         tau = float(solution.scatter.tau[0])
-    drift = _drift(held, solution, choice.sensitivity, tau)
+    drift = _fit_lag_and_loops(held, solution, choice.sensitivity, tau)
     if drift.free:
         solution = solve(held, solution.laws, tau, sensitivity=choice.sensitivity, free=drift.free) or solution
         if choice.solution.scatter.bound:
             solution = replace(solution, scatter=choice.solution.scatter)
     places = [
         replace(e, temperature=float(held.temperature[cluster == e.temperature].mean()), holds=e.holds // 3)
-        for e in _left_out(solution, cluster)
+        for e in _predict_left_out(solution, cluster)
     ]
     return ThermalGyroscopes(held, solution, choice.sensitivity, choice.probability, tuple(places), aside, drift)
 
 
 @dataclass(frozen=True)
 class _Solved:
-    """A solution, whether G is in it, and the probability of so large a G."""
+    """A solution, whether G is in it, and the probability of such G by chance."""
 
     solution: ThermalSolution
     sensitivity: bool
@@ -396,21 +393,21 @@ class _Solved:
 
 @dataclass(frozen=True)
 class _Search:
-    """What a choice of laws starts from: holds, the number of the temperature of each, and tau."""
+    """The choice of the laws of the biases from holds, the number of each hold's temperature, and tau."""
 
     held: RatesAtRest
     cluster: NDArray[np.int64]
     tau: float | None
 
-    def chosen(self, laws: Laws, *, auto: bool, spline: bool) -> _Solved:
-        """Return the solution of laws as stated, or that of the laws that the data support."""
-        knots = knots_at(self.held.temperature, self.cluster, laws)
+    def choose(self, laws: Laws, *, auto: bool, spline: bool) -> _Solved:
+        """Return the solution of the stated laws, or that of the laws that the data support."""
+        knots = place_knots(self.held.temperature, self.cluster, laws)
         bent = replace(laws, degrees=(DEGREES[0], 0, 0), knots=knots)
         if spline:
-            return self._bounded(_solved(self.held, bent, self.tau))
+            return self._bound(_solved(self.held, bent, self.tau))
         straight = _solved(self.held, laws, self.tau)
         while auto and straight.solution.laws.degrees[0]:
-            lower = _lower(straight.solution, self.cluster)
+            lower = _lower_degree(straight.solution, self.cluster)
             if lower is None:
                 break
             straight = _solved(self.held, lower, self.tau)
@@ -419,29 +416,31 @@ class _Search:
         try:
             by_knots = _solved(self.held, bent, self.tau)
         except ObservabilityError:
-            return straight  # the holds do not tell so many values of the bias
-        errors = (_left_out(each.solution, self.cluster) for each in (by_knots, straight))
-        return self._bounded(by_knots) if bends(by_knots.solution, self.tau) and predicts(*errors) else straight
+            return straight  # the holds do not determine so many values of the bias
+        errors = (_predict_left_out(each.solution, self.cluster) for each in (by_knots, straight))
+        return (
+            self._bound(by_knots) if law_bends(by_knots.solution, self.tau) and spline_predicts(*errors) else straight
+        )
 
-    def _bounded(self, solved_laws: _Solved) -> _Solved:
+    def _bound(self, solved_laws: _Solved) -> _Solved:
         def solved(laws: Laws, tau: float | None) -> ThermalSolution:
             solution = solve(self.held, laws, tau, sensitivity=solved_laws.sensitivity)
             assert solution is not None
             return solution
 
-        return replace(solved_laws, solution=bounded(solved_laws.solution, self.tau, solved))
+        return replace(solved_laws, solution=bound_scatter(solved_laws.solution, self.tau, solved))
 
 
-def _left_out(solution: ThermalSolution, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
-    return left_out(splits(solution, cluster), np.ones(len(solution.coefficients), dtype=np.bool_))
+def _predict_left_out(solution: ThermalSolution, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
+    return predict_left_out(split_temperatures(solution, cluster), np.ones(len(solution.coefficients), dtype=np.bool_))
 
 
 def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> _Solved:
-    """Solve with the g-sensitivity where it is told and significant, else without."""
+    """Return the solution with the g-sensitivity where it is observable and significant, else without."""
     whole = solve(held, laws, tau, sensitivity=True)
     probability = None
     if whole is not None:
-        probability = wald(whole, np.eye(len(whole.coefficients))[-9:])
+        probability = wald_probability(whole, np.eye(len(whole.coefficients))[-9:])
         if probability < BIAS_FOLLOWS_GRAVITY.level:
             return _Solved(whole, True, probability)
     plain = solve(held, laws, tau, sensitivity=False)
@@ -450,24 +449,26 @@ def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> _Solved:
     return _Solved(plain, False, probability)
 
 
-def _lower(solution: ThermalSolution, cluster: NDArray[np.int64]) -> Laws | None:
-    """Return laws of a degree less, or None where that step may not be taken."""
-    parts = splits(solution, cluster)
-    before = rms_of(left_out(parts, np.ones(len(solution.coefficients), dtype=np.bool_)))
+def _lower_degree(solution: ThermalSolution, cluster: NDArray[np.int64]) -> Laws | None:
+    """Return laws of one degree less, or None where that step may not be taken."""
+    parts = split_temperatures(solution, cluster)
+    before = rms_left_out(predict_left_out(parts, np.ones(len(solution.coefficients), dtype=np.bool_)))
     step = step_down(solution, 0, parts)
     return replace(solution.laws, degrees=step.degrees) if may_be_taken(step, before) else None
 
 
-def _drift(held: RatesAtRest, solution: ThermalSolution, sensitivity: bool, tau: float | None) -> LagAndLoops:
+def _fit_lag_and_loops(
+    held: RatesAtRest, solution: ThermalSolution, sensitivity: bool, tau: float | None
+) -> LagAndLoops:
     """Return lag and loops of the biases, each tested given the other."""
     size = len(solution.coefficients)
-    reason = why_lag_is_unobservable(held.temperature, held.rate, solution, size, 0)
+    reason = explain_unobservable_lag(held.temperature, held.rate, solution, size, 0)
     if reason is not None:
         return LagAndLoops(reason=reason)
     whole = solve(held, solution.laws, tau, sensitivity=sensitivity, free=ALL)
     if whole is None:
         return LagAndLoops(reason="the holds in which the temperature drifts do not tell lag, loop and laws apart")
-    return tested(whole, size)
+    return judge_lag_and_loops(whole, size)
 
 
 def solve(
@@ -475,18 +476,18 @@ def solve(
 ) -> ThermalSolution | None:
     """Return the least-squares solution, None where the holds do not determine the coefficients.
 
-    Those of the biases, of G where it is taken, and of what is `free` of lag and loops, as in `ThermalProblem`.
+    The coefficients are those of the biases, of G with `sensitivity`, and of lag and loops as far as `free`.
     """
     count = 3 * laws.terms[0] + 9 * sensitivity
     coefficients = np.zeros(count + len(free))
-    if free:  # a lag is the shift of laws that must be there first
+    if free:  # the derivative by a lag is the slope of laws, which must be fitted first
         begun = solve(held, laws, tau, sensitivity=sensitivity)
         if begun is None:
             return None
         coefficients[:count] = begun.coefficients
     excess, freedom, scatter = 0.0, np.inf, Scatter() if tau is None else Scatter(np.array([tau, 0.0]))
     for _ in range(_PASSES):
-        rows = rows_of(held, laws, coefficients, free)
+        rows = linearise_rates(held, laws, coefficients, free)
         white = whitener(rows, excess, scatter.tau)
         columns = white(rows.jacobian)
         size = np.linalg.norm(columns, axis=0)
@@ -494,14 +495,14 @@ def solve(
             return None
         step = np.linalg.lstsq(columns / size, white(rows.residual), rcond=None)[0] / size
         coefficients = coefficients - step
-        excess, freedom = excess_of(rows, excess)
+        excess, freedom = fit_excess(rows, excess)
         if tau is None:
-            scatter = between(rows, excess)
-    rows = rows_of(held, laws, coefficients, free)
-    return concluded(laws, coefficients, rows, (excess, freedom), scatter, converged=True)
+            scatter = fit_turn_on_scatter(rows, excess)
+    rows = linearise_rates(held, laws, coefficients, free)
+    return conclude(laws, coefficients, rows, (excess, freedom), scatter, converged=True)
 
 
-def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int, ...]) -> Rows:
+def linearise_rates(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int, ...]) -> Rows:
     """Return the rows at these coefficients, three for each hold."""
     n, size = len(held), 3 * laws.terms[0]
     jacobian = laws.design(held.temperature)[:, :3, :size].reshape(3 * n, size)
@@ -517,13 +518,13 @@ def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int,
     noise = np.zeros((n, 3, n, 3))
     noise[range(n), :, range(n), :] = held.covariance
     number = np.where(held.shared, held.recording, int(held.recording.max()) + 1 + np.arange(n))
-    heat = _spread(number) * (slope * held.step[:, None]).ravel()[:, None]
-    known, earth = earth_at_rest(held.force, held.attitude, held.earth)
+    heat = _columns_by_row(number) * (slope * held.step[:, None]).ravel()[:, None]
+    known, earth = model_earth_rate(held.force, held.attitude, held.earth)
     return Rows(
         residual=jacobian @ coefficients + known - held.mean.ravel(),
         jacobian=jacobian,
         noise=noise.reshape(3 * n, 3 * n),
-        offsets=(_by_axis(held.recording), np.zeros((3 * n, 3))),
+        offsets=(_columns_by_axis(held.recording), np.zeros((3 * n, 3))),
         errors=np.hstack([heat, earth]),
         drift=drift.reshape(3 * n, 4),
         owner=np.repeat(np.arange(n), 3),
@@ -531,25 +532,26 @@ def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int,
     )
 
 
-def _by_axis(number: NDArray[np.int64]) -> Array:
-    """Return a column for each axis of each number, shape (3 n, 3 k)."""
+def _columns_by_axis(number: NDArray[np.int64]) -> Array:
+    """Return a column for each axis of each of k different numbers (n,), shape (3 n, 3 k)."""
     columns: Array = np.asarray(np.kron(one_hot(number), np.eye(3)), dtype=np.float64)
     return columns
 
 
-def _spread(number: NDArray[np.int64]) -> Array:
+def _columns_by_row(number: NDArray[np.int64]) -> Array:
+    """Return a column for each of k different numbers (n,), shape (3 n, k)."""
     return np.repeat(one_hot(number), 3, axis=0)
 
 
-def without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[np.int64]]:
-    """Leave out holds whose outputs lie far from those of the others in their recording: a slow turn the whole time.
+def leave_out_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[np.int64]]:
+    """Return the holds without those in which the unit turned slowly, and the indices of these among all holds.
 
-    Return the others, and the places of what is left out among the holds of all recordings.
+    Such a hold is far from the others of its recording in a fit with bounded influence.
     """
     n, size = len(held), 3 * laws.terms[0]
     columns = np.hstack([
         laws.design(held.temperature)[:, :3, :size].reshape(3 * n, size),
-        _by_axis(held.recording),
+        _columns_by_axis(held.recording),
     ])  # fmt: skip
     weight: Array = np.ones(n)
     for _ in range(_PASSES):
@@ -569,29 +571,29 @@ def without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[n
     return held.part(~out), held.index[out]
 
 
-def notes_on_turns(holds: Holds, aside: NDArray[np.int64]) -> list[str]:
-    """Return what is said of the holds that `without_turns` left out."""
+def note_turns(holds: Holds, aside: NDArray[np.int64]) -> list[str]:
+    """Return a warning for each hold that `leave_out_turns` left out."""
     return [
         f"gyro: {holds.label(index)} left out: its outputs differ from the others of its recording: the unit turned"
         for index in aside.tolist()
     ]
 
 
-# Scale factors and misalignment of the gyroscopes: from the turns of each recording, then as laws of the
-# temperature.
+# Scale factors and misalignments from the turns of each recording, and their laws over temperature.
 
 
 CRYSTAL = 50e-6
-"""Standard uncertainty of the rate of the clock that all recordings are timed by."""
-_LARGE_MISS, _ASKEW = 2.0, 0.2  # deg, rad
+"""Relative standard uncertainty of the clock by which all recordings are timed."""
+_LARGE_MISS, _ASKEW = 2.0, 0.2
+"""Error of gravity's direction after turns, deg, and misalignment, rad, from which axes are swapped or reversed."""
 
 
 @dataclass(frozen=True)
 class Turned:
-    """What the turns of a recording say: scale factors and misalignments (9,), and how they miss.
+    """Scale factors and misalignments (9,) by the turns of one recording, with their covariance (9, 9).
 
-    Their covariance (9, 9), and their derivatives by what all share: the coefficients of the accelerometers' laws and
-    the g-sensitivities, (9, c).
+    `by_shared` are their derivatives by what all recordings share, the coefficients of the accelerometers' laws and the
+    g-sensitivities, (9, c); `cost` is the sum of squares of the errors of gravity's direction, rad^2.
     """
 
     values: Array
@@ -604,9 +606,10 @@ class Turned:
 
 @dataclass(frozen=True)
 class ScaleLaws:
-    """Scale factors in units of the nominal ones, then misalignments: coefficients, covariance, and how they agree.
+    """Laws of scale factors, in units of the nominal ones, and misalignments: coefficients and covariance.
 
-    `laws` have the degrees (0, that of the scale factor, 0); `freedom` is that of the chi-square of the recordings.
+    `laws` have the degrees (0, that of the scale factor, 0); `miss` is the rms error of gravity's direction after the
+    turns, rad; `chi_square` and `freedom` say how the recordings agree.
     """
 
     laws: Laws
@@ -621,7 +624,7 @@ class ScaleLaws:
 
     @property
     def degree(self) -> int:
-        """Of the scale factor."""
+        """Degree of the scale factors' laws."""
         return self.laws.degrees[1]
 
     def functions(self, temperature: Array) -> Array:
@@ -637,7 +640,7 @@ class ScaleLaws:
 
 
 def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
-    """Return the output per rad/s to start from, shape (3,): that of the unit, or of the turns where it is no rate.
+    """Return the output per rad/s to start from, shape (3,): 1 for a unit of rate, else by the turns.
 
     Raises
     ------
@@ -648,10 +651,10 @@ def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
         return np.ones(3)
     scales, why = [], "no recording has nine attitudes"
     for number, attitudes in enumerate(holds.attitudes):
-        if not _turns(attitudes):
+        if not _has_turns(attitudes):
             continue
         try:
-            solved = solve_turns(*_case(holds, number, record, np.ones(3), None, unit), "auto")
+            solved = solve_turns(*_turn_problem(holds, number, record, np.ones(3), None, unit), "auto")
         except SegmentError as error:
             why = str(error)
             continue
@@ -664,8 +667,8 @@ def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
     return np.asarray(np.mean(scales, axis=0), dtype=np.float64)
 
 
-def _turns(attitudes: Attitudes) -> bool:
-    """Whether a recording has attitudes enough for turns to tell anything; one that rests while it drifts has one."""
+def _has_turns(attitudes: Attitudes) -> bool:
+    """Return whether a recording has enough attitudes for scale factors from turns; a rest ramp has one."""
     return attitudes.pieces is not None and len(np.unique(attitudes.pieces[:, 2])) >= TURNED
 
 
@@ -677,7 +680,7 @@ def scale_from_turns(
     gyros: ThermalGyroscopes,
     reading: Array,
 ) -> ScaleLaws | None:
-    """Return the laws of scale factors and misalignments, None where no recording tells them.
+    """Return the laws of scale factors and misalignments, None where no recording has turns for them.
 
     Raises
     ------
@@ -687,7 +690,7 @@ def scale_from_turns(
     Parameters
     ----------
     record
-        Of the accelerometers.
+        Record of the accelerometers.
     gyros
         Biases and g-sensitivities at nominal scale factors.
     reading
@@ -696,9 +699,9 @@ def scale_from_turns(
     turned: list[Turned] = []
     notes: list[str] = []
     for number, attitudes in enumerate(holds.attitudes):
-        if not _turns(attitudes):
+        if not _has_turns(attitudes):
             continue
-        case, time = _case(holds, number, record, gyros.held.size, gyros, "rad/s")
+        case, time = _turn_problem(holds, number, record, gyros.held.size, gyros, "rad/s")
         try:
             solved = solve_turns(case, time, "no")
         except SegmentError as error:
@@ -709,9 +712,14 @@ def scale_from_turns(
         if freedom < 1 or not solved.converged:
             notes.append(Note(f"gyro: {case.name}: its turns do not tell scale factors and misalignment apart"))
             continue
-        temperature = _temperature(holds, number, attitudes)
+        temperature = _mean_temperatures(holds, number, attitudes)
         turned.append(
-            _turned(solved, _directions(problem, solution, attitudes, reading, temperature), temperature, freedom)
+            _evaluate_turns(
+                solved,
+                _covariance_of_directions(problem, solution, attitudes, reading, temperature),
+                temperature,
+                freedom,
+            )
         )
     if not turned:
         return None
@@ -721,11 +729,14 @@ def scale_from_turns(
         if gyros.sensitivity
         else np.zeros((9, 9)),
     )
-    return _laws(turned, known, solution.laws, notes)
+    return _fit_scale_laws(turned, known, solution.laws, notes)
 
 
-def _turned(solved: TurnSolution, directions: tuple[Array, Array], temperature: Array, freedom: int) -> Turned:
-    """Return what the turns of one recording say; `directions` as of `_directions`."""
+def _evaluate_turns(solved: TurnSolution, directions: tuple[Array, Array], temperature: Array, freedom: int) -> Turned:
+    """Return scale factors and misalignments by the turns of one recording.
+
+    `directions` are the results of `_covariance_of_directions`.
+    """
     across, moved = directions
     segments, jacobian = solved.segments, solved.jacobian
     shared = shared_covariance(segments, solved.scale, solved.theta, across, solved.rest.zero_uncertainty)
@@ -734,18 +745,18 @@ def _turned(solved: TurnSolution, directions: tuple[Array, Array], temperature: 
     values[:3] += solved.scale
     matrix = turn_covariance(solved, shared, freedom)[0]
     slope = by_directions(segments, solved.scale, solved.theta, len(moved) // 3) @ moved
-    slope = np.hstack([slope, _by_sensitivity(solved)])
+    slope = np.hstack([slope, _derivatives_by_sensitivity(solved)])
     by_coefficients = -size[:, None] * np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ slope)
     turns, cost = len(segments.start), float(solved.residual @ solved.residual)
     matrix = matrix * np.outer(size, size)
     return Turned(values, matrix, by_coefficients, float(temperature.mean()), turns, cost)
 
 
-def _by_sensitivity(solved: TurnSolution) -> Array:
-    """Return the derivatives of the residuals by the g-sensitivities that were taken off, rad per rad/s/g, (3 m, 9).
+def _derivatives_by_sensitivity(solved: TurnSolution) -> Array:
+    """Return the derivatives of the residuals by the subtracted g-sensitivities, rad per rad/s/g, shape (3 m, 9).
 
-    They act as a zero that is theirs times the force: half-way in a turn, less its mean over the holds, which is in the
-    zero at rest.
+    A g-sensitivity acts as a zero: times the force half-way in the turn less the mean force over the holds, which is in
+    the zero at rest.
     """
     segments, m = solved.segments, len(solved.segments.start)
     zero = model(segments, solved.scale, np.concatenate([solved.theta[:9], np.zeros(3)]), fit_bias=True)[1][:, 9:]
@@ -754,10 +765,13 @@ def _by_sensitivity(solved: TurnSolution) -> Array:
     return np.asarray(felt.reshape(3 * m, 9), dtype=np.float64)
 
 
-def _laws(turned: list[Turned], known: Array, over: Laws, notes: list[str]) -> ScaleLaws:
-    """Return the polynomials through what each recording says; `known` is the covariance of what all share."""
+def _fit_scale_laws(turned: list[Turned], known: Array, over: Laws, notes: list[str]) -> ScaleLaws:
+    """Return polynomials through the scale factors of each recording by weighted least squares.
+
+    `known` is the covariance of what all recordings share.
+    """
     temperature = np.array([each.temperature for each in turned])
-    degree = 1 if clusters_of(temperature).max() + 1 >= FOLLOWED else 0
+    degree = 1 if number_temperatures(temperature).max() + 1 >= FOLLOWED else 0
     laws = Laws(over.low, over.high, (0, degree, 0))
     functions = np.polynomial.chebyshev.chebvander(laws.place(temperature), degree)
     size, n = 3 * (degree + 1), len(turned)
@@ -786,7 +800,7 @@ def _laws(turned: list[Turned], known: Array, over: Laws, notes: list[str]) -> S
     common = np.concatenate([coefficients[:size], np.zeros(6)]) * CRYSTAL
     matrix = matrix + np.outer(common, common)
     if not degree:
-        notes += _constant(float(temperature.mean()), over, float(np.sqrt(np.diag(matrix)[:3].max())))
+        notes += _warn_constant(float(temperature.mean()), over, float(np.sqrt(np.diag(matrix)[:3].max())))
     middle = coefficients[: size : degree + 1] - 1
     if np.abs(middle).max() > SCALE_OFF_UNIT:
         off = " ".join(f"{100 * value:+.3g}" for value in middle)
@@ -805,8 +819,8 @@ def _laws(turned: list[Turned], known: Array, over: Laws, notes: list[str]) -> S
     return ScaleLaws(laws, coefficients, matrix, len(turned), turns, miss, square, freedom, tuple(notes))
 
 
-def _constant(temperature: float, over: Laws, stated: float) -> list[str]:
-    """Return what scale factors told at about one temperature may be off by elsewhere, if it counts beside `stated`."""
+def _warn_constant(temperature: float, over: Laws, stated: float) -> list[str]:
+    """Return a warning of the usual slope of scale factors measured at one temperature, if large beside `stated`."""
     end = max(over.low, over.high, key=lambda each: abs(each - temperature))
     off = STRETCHES * abs(end - temperature)
     if off < 0.5 * stated:
@@ -819,7 +833,7 @@ def _constant(temperature: float, over: Laws, stated: float) -> list[str]:
     ]
 
 
-def _temperature(holds: Holds, number: int, attitudes: Attitudes) -> Array:
+def _mean_temperatures(holds: Holds, number: int, attitudes: Attitudes) -> Array:
     """Return the mean temperature of each attitude, degC."""
     recording = holds.recordings[number]
     time, temperature = recording.si("time"), recording.si("temperature")
@@ -829,23 +843,23 @@ def _temperature(holds: Holds, number: int, attitudes: Attitudes) -> Array:
     return means
 
 
-def _case(
+def _turn_problem(
     holds: Holds, number: int, record: Calibration, size: Array, gyros: ThermalGyroscopes | None, unit: str
 ) -> tuple[TurnProblem, Array]:
-    """Return the turns of one recording, its biases and g-sensitivities taken off, and the times of its samples."""
+    """Return the turns of one recording, less biases and g-sensitivities, and the times of its samples."""
     recording, attitudes = holds.recordings[number], holds.attitudes[number]
     kept = leave_out(recording, triad("gyro")).recording
     time, temperature = recording.si("time"), recording.si("temperature")
     unit_of = DeviceUnit.of(tables_of(record)[0])
-    force = np.column_stack(unit_of.thermal(_temperature(holds, number, attitudes), list(attitudes.mean.T))[0])
+    force = np.column_stack(unit_of.thermal(_mean_temperatures(holds, number, attitudes), list(attitudes.mean.T))[0])
     force_at_samples = np.column_stack(unit_of.thermal(temperature, list(recording.triad("accel").T))[0])
-    output = output_in(kept, size)
+    output = scale_output(kept, size)
     if gyros is not None:
         clipped = beyond_range(output)
         output = output - gyros.at_rest(temperature)
         if gyros.sensitivity:
             output = output - force_at_samples @ gyros.sensitivities(record.model["gravity"]["value"]).T
-        output[clipped] = 2 * np.abs(output).max()  # what was cut off stays so, and is left out with its turn
+        output[clipped] = 2 * np.abs(output).max()  # a saturated sample stays one, so that its turn is left out
     knocked: NDArray[np.bool_] = np.zeros(len(attitudes), dtype=np.bool_)
     case = TurnProblem(
         recording.name, attitudes, force, time, force_at_samples, output, unit, fit_bias=False, knocked=knocked
@@ -853,12 +867,12 @@ def _case(
     return case, time
 
 
-def _directions(
+def _covariance_of_directions(
     problem: ThermalProblem, solution: ThermalSolution, attitudes: Attitudes, reading: Array, temperature: Array
 ) -> tuple[Array, Array]:
-    """Return the covariance of the attitudes' upward directions, rad^2, (3 n, 3 n), but for the accelerometers' laws.
+    """Return the covariance of the directions up, rad^2, (3 n, 3 n), and their derivatives by the laws, (3 n, c).
 
-    And how they move with the coefficients of these, (3 n, c).
+    The covariance is that of noise and offset of the power cycle, without that of the accelerometers' laws.
     """
     n, size = len(attitudes), solution.laws.size
     design = solution.laws.design(temperature)
@@ -878,19 +892,19 @@ def _directions(
     return covariance, (across @ moved).reshape(3 * n, size)
 
 
-def rescaled(gyros: ThermalGyroscopes, scale: ScaleLaws) -> ThermalGyroscopes:
-    """Return biases and g-sensitivities of outputs over these scale factors, whose uncertainty is not in them yet."""
+def rescale_gyroscopes(gyros: ThermalGyroscopes, scale: ScaleLaws) -> ThermalGyroscopes:
+    """Return biases and g-sensitivities refitted to outputs over these scale factors, without their uncertainty."""
     factor = 1 / scale.scale_at(gyros.held.temperature)
     held = replace(
         gyros.held,
         mean=gyros.held.mean * factor,
         covariance=gyros.held.covariance * factor[:, :, None] * factor[:, None, :],
     )
-    return gyros.again(held)
+    return gyros.refit(held)
 
 
 def block_diagonal(first: Array, second: Array) -> Array:
-    """Return two matrices along the diagonal of one."""
+    """Return a matrix with two blocks on its diagonal."""
     joined = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
     joined[: len(first), : first.shape[1]], joined[len(first) :, first.shape[1] :] = first, second
     return joined
@@ -901,7 +915,7 @@ def joint_covariance(gyros: ThermalGyroscopes, scale: ScaleLaws) -> Array:
     solution, held = gyros.solution, gyros.held
     white = whitener(solution.rows, solution.excess**2, solution.scatter.tau)
     inverse = np.linalg.pinv(white(solution.rows.jacobian), rcond=1e-13)
-    # db / dS: each mean moves by -mean / S for a unit of S.
+    # db / dS: each mean changes by -mean / S for a unit of S.
     functions, size = scale.functions(held.temperature), len(scale.coefficients) - 6
     moved = np.zeros((len(held), 3, len(scale.coefficients)))
     each = -(held.mean / scale.scale_at(held.temperature))[:, :, None] * functions[:, None, :]

@@ -1,15 +1,13 @@
-"""Recordings to holds.
+"""Recordings to holds, mean outputs at a known temperature; and checks that all are of one unit over temperature.
 
-Mean outputs at a known temperature, recordings at rest, and whether all are of one unit over temperature.
+Holds (`find_holds`): a hold in which the temperature drifts is cut where it has changed by 1 K, so that the curvature
+within a cut adds less than 0.1 ug. The cuts of a hold are *unmoved*: the unit was not turned between them.
+Interruptions and invalid rows are left out of the means. The variance of a mean comes from batch means after their
+regression on the temperature, as in `imulab.procedures.tumble.attitudes`.
 
-A bench that is knocked or walked around tips a little each time and does not tip back, so that the error of the
-direction is a random walk. Beside what is smooth in the temperature, polynomials of degree 8, and a part that is new in
-each hold, its size follows by restricted maximum likelihood (Patterson and Thompson, Biometrika 58 (1971) 545).
-
-A hold in which the temperature drifts is cut where it has moved by 1 K: the curvature within a cut then leaves less
-than 0.1 ug. The cuts of a hold are *unmoved*: nothing was turned between them. What interrupts a hold, and rows that
-are no readings, are left out of its means. The scatter of a mean comes from batch
-means after their regression on the temperature, as in `imulab.procedures.tumble.attitudes`.
+Wander (`fit_wander`): a bench that is knocked or walked around tips a little each time and does not tip back, so that
+the error of the direction is a random walk. Its size is estimated beside a polynomial of degree 8 in the temperature
+and white noise, by restricted maximum likelihood (Patterson and Thompson, Biometrika 58 (1971) 545).
 """
 
 from __future__ import annotations
@@ -32,34 +30,31 @@ from imulab.recording import Array, Recording, check_finite
 from imulab.records.comparison import different_units
 from imulab.units import parse_unit
 
-# Recordings at rest while the temperature drifts: what knocks leave of them, and how far their direction wanders.
+# Recordings at rest while the temperature drifts: knocks, and wander of the direction.
 
 
 _SHARE_IN_TAILS, _TURNED = 0.005, 0.1
-"""A recording whose outputs but for a few move by less than this share of g is one at rest."""
+"""A recording is at rest if its outputs, without this share at either end, change by less than that share of g."""
 _BLOCK, _SHAKEN, _OFF, _BESIDE = 0.5, 4.0, 8.0, 5
-"""A knock: blocks (s) that scatter with so many times the usual variance, or lie so many standard deviations off the
-median of those beside, so many on each side."""
+"""A knock is a block (s) with so many times the usual variance, or so many standard deviations off the median of its
+neighbours, so many on each side."""
 _LEAST_BLOCK, _MOSTLY = 8, 0.5
-"""Samples of a block, and share of the time that knocks leave of a recording at rest."""
+"""Fewest samples of a block, and share of the time that must remain without knocks."""
 _SMOOTH = 8  # degree of the polynomial in temperature that a direction at rest may follow
 _RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e4, 81)])
 
 
-def stretches_at_rest(outputs: Array, time: Array) -> NDArray[np.int64] | None:
-    """Return the stretches of a unit that rests throughout, rows (first, last + 1); None where it is turned.
-
-    Knocks lie between them; a change of its direction does not end one.
-    """
-    still = _between_knocks(outputs, time)
+def find_stretches_at_rest(outputs: Array, time: Array) -> NDArray[np.int64] | None:
+    """Return the stretches between knocks of a unit at rest, rows (first, last + 1); None where it is turned."""
+    still = _exclude_knocks(outputs, time)
     ends = np.quantile(outputs[still], [_SHARE_IN_TAILS, 1 - _SHARE_IN_TAILS], axis=0)
     if np.ptp(ends, axis=0).max() > _TURNED * np.linalg.norm(ends.mean(axis=0)):
         return None
     return np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
 
 
-def _between_knocks(outputs: Array, time: Array) -> NDArray[np.bool_]:
-    """Return which samples lie in no knock, nor beside one, shape (n,); all, where little would be left."""
+def _exclude_knocks(outputs: Array, time: Array) -> NDArray[np.bool_]:
+    """Return which samples lie in no knock nor beside one, shape (n,); all of them if few would remain."""
     every = np.ones(len(time), dtype=np.bool_)
     size = max(_LEAST_BLOCK, round(_BLOCK * (len(time) - 1) / (time[-1] - time[0])))
     count = len(time) // size
@@ -78,15 +73,15 @@ def _between_knocks(outputs: Array, time: Array) -> NDArray[np.bool_]:
     return still if still.mean() > _MOSTLY else every
 
 
-def wandering(direction: Array, temperature: Array, time: Array) -> float:
+def fit_wander(direction: Array, temperature: Array, time: Array) -> float:
     """Return the variance per second of the random walk of a direction, rad^2/s, 0 where none is significant.
 
     Parameters
     ----------
     direction
-        Mean outputs of holds that were not moved between, in units of their length, shape (n, 3).
+        Mean outputs of unmoved holds over their length, shape (n, 3).
     temperature, time
-        Of each hold, shape (n,).
+        Temperature and time of each hold, shape (n,).
     """
     count = len(direction)
     if count < 2 * _SMOOTH:
@@ -99,7 +94,7 @@ def wandering(direction: Array, temperature: Array, time: Array) -> float:
     begun = time - time.min()
     sizes, modes = np.linalg.eigh(free.T @ np.minimum(begun[:, None], begun) @ free)
     squares = ((modes.T @ free.T @ direction @ across.T) ** 2).sum(axis=1)
-    # Variances c (1 + r s) of two components each: c has its most likely value at every ratio r.
+    # Variances c (1 + r s) of two components each; c takes its most likely value at every ratio r.
     unit = float(np.median(sizes))
     relative = 1 + _RATIOS[:, None] * np.maximum(sizes, 0.0) / unit
     level = (squares / relative).mean(axis=1) / 2
@@ -110,13 +105,13 @@ def wandering(direction: Array, temperature: Array, time: Array) -> float:
     return float(level[best] * _RATIOS[best] / unit)
 
 
-# Recordings to holds: mean outputs at a known temperature, and which of them lie in one direction.
+# Holds.
 
 
 _CUT = 1.0  # K
-_BATCHES = 10  # parts of a hold by whose scatter its mean is known
+_BATCHES = 10  # parts of a hold whose scatter gives the variance of its mean
 _FEWEST = 20
-"""Samples of a cut: what is shorter joins the one before."""
+"""Fewest samples of a cut."""
 _SIDES = {"warming": 1.0, "cooling": -1.0}
 
 
@@ -137,17 +132,17 @@ class Holds:
     recording, group
         Number of the recording, and of the unmoved group or -1, shape (n,).
     start, stop
-        s, shape (n,).
+        Times, s, shape (n,).
     unit
-        Of the outputs.
+        Unit of the outputs.
     recordings
-        As they were given, after the settling time.
+        The recordings after their settling time.
     attitudes
-        Those of each recording; one where it rests throughout.
+        Attitudes of each recording; one where it rests throughout.
     wander
-        Covariance of their directions by what tips a unit that is not moved, rad^2, shape (n, n).
+        Covariance of the holds' directions by tipping of the bench, rad^2, shape (n, n).
     notes
-        What a user should know of how they were found.
+        Notes on samples that were left out, and on wander.
     """
 
     mean: Array
@@ -170,14 +165,14 @@ class Holds:
         return len(self.mean)
 
     def label(self, index: int) -> str:
-        """Return how messages name a hold."""
+        """Return the name of a hold for messages: recording, times and temperature."""
         name = self.recordings[int(self.recording[index])].name
         return f"{name}, {self.start[index]:.0f} to {self.stop[index]:.0f} s, {self.temperature[index]:.1f} degC"
 
 
 @dataclass(frozen=True)
 class Cut:
-    """One stretch: its means, covariance of the mean, batches behind it, temperature and change, times, attitude."""
+    """A stretch of a hold: mean, covariance of the mean and its degrees of freedom, temperature and change, times."""
 
     mean: Array
     covariance: Array
@@ -190,7 +185,7 @@ class Cut:
 
 
 def find_holds(recordings: Sequence[Recording]) -> Holds:
-    """Find the holds of recordings that have a column temperature.
+    """Return the holds of recordings that have a column temperature.
 
     Raises
     ------
@@ -205,17 +200,17 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
         temperature = item.si("temperature")
         at_rest = find_attitudes(item)
         if at_rest.trace is None:
-            stretches = _of_rows(at_rest, temperature)
+            stretches = _cut_table(at_rest, temperature)
         else:
             columns = triad("accel")
             read = leave_out(item, columns).recording
             outputs = np.column_stack([read.column(name) for name in columns])
-            at_rest = _at_rest(at_rest, outputs)
-            stretches = _of_time(at_rest, outputs, temperature)
+            at_rest = _join_rest(at_rest, outputs)
+            stretches = _cut_recording(at_rest, outputs, temperature)
         attitudes.append(at_rest)
         cuts += stretches
         owner += [number] * len(stretches)
-        steps += [_step(temperature)] * len(stretches)
+        steps += [_reading_uncertainty(temperature)] * len(stretches)
     recording = np.array(owner)
     attitude = np.array([cut.attitude for cut in cuts])
     group, shared = np.full(len(cuts), -1), np.ones(len(cuts), dtype=np.bool_)
@@ -225,10 +220,10 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
             if len(members) > 1:
                 group[members] = group.max() + 1
                 shared[members] = False
-    wander, drift_notes = _wander(cuts, group, [recordings[number].name for number in owner])
+    wander, drift_notes = _wander_covariance(cuts, group, [recordings[number].name for number in owner])
     return Holds(
         mean=np.array([cut.mean for cut in cuts]),
-        covariance=pooled(cuts),
+        covariance=pool_covariance(cuts),
         temperature=np.array([cut.temperature for cut in cuts]),
         rate=np.array([cut.rate for cut in cuts]),
         step=np.array(steps),
@@ -252,8 +247,8 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
     )
 
 
-def _wander(cuts: Sequence[Cut], group: NDArray[np.int64], names: Sequence[str]) -> tuple[Array, list[Note]]:
-    """Return the covariance of the holds' directions by the random walk of each unmoved group, and what is said."""
+def _wander_covariance(cuts: Sequence[Cut], group: NDArray[np.int64], names: Sequence[str]) -> tuple[Array, list[Note]]:
+    """Return the covariance of the holds' directions by the random walk of each unmoved group, and notes on it."""
     covariance, notes = np.zeros((len(cuts), len(cuts))), []
     for number in range(int(group.max(initial=-1)) + 1):
         members = np.flatnonzero(group == number)
@@ -263,7 +258,7 @@ def _wander(cuts: Sequence[Cut], group: NDArray[np.int64], names: Sequence[str])
             np.array([(cut.start + cut.stop) / 2 for cut in members_cuts]),
         )
         direction = mean / np.linalg.norm(mean, axis=1).mean()
-        density = wandering(direction, np.array([cut.temperature for cut in members_cuts]), time)
+        density = fit_wander(direction, np.array([cut.temperature for cut in members_cuts]), time)
         if not density:
             continue
         begun = time - time[0]
@@ -277,11 +272,11 @@ def _wander(cuts: Sequence[Cut], group: NDArray[np.int64], names: Sequence[str])
     return covariance, notes
 
 
-def _at_rest(attitudes: Attitudes, outputs: Array) -> Attitudes:
-    """Return one hold where the unit rests throughout: drift must not cut it, nor do knocks, which are left out."""
+def _join_rest(attitudes: Attitudes, outputs: Array) -> Attitudes:
+    """Return a single attitude if the unit rests throughout, without knocks; else the attitudes unchanged."""
     time = attitudes.recording.time
     assert time is not None
-    edges = stretches_at_rest(outputs, time)
+    edges = find_stretches_at_rest(outputs, time)
     if edges is None:
         return attitudes
     notes = attitudes.notes
@@ -294,8 +289,8 @@ def _at_rest(attitudes: Attitudes, outputs: Array) -> Attitudes:
     return replace(attitudes, pieces=np.column_stack([edges, np.zeros(len(edges), dtype=np.int64)]), notes=notes)
 
 
-def _of_rows(rests: Attitudes, temperature: Array) -> list[Cut]:
-    """Rows of a table of attitudes, whose noise its columns std_* state."""
+def _cut_table(rests: Attitudes, temperature: Array) -> list[Cut]:
+    """Return the rows of a table of attitudes as cuts, with the noise of its columns std_*."""
     if rests.covariance is None:
         raise DataError(
             f"{rests.recording.name}: a table of attitudes without columns std_accel_x, std_accel_y and std_accel_z; "
@@ -307,8 +302,8 @@ def _of_rows(rests: Attitudes, temperature: Array) -> list[Cut]:
     ]
 
 
-def _of_time(attitudes: Attitudes, outputs: Array, temperature: Array) -> list[Cut]:
-    """Stretches of each attitude, what interrupted it left out, in which the temperature moves by 1 K at most."""
+def _cut_recording(attitudes: Attitudes, outputs: Array, temperature: Array) -> list[Cut]:
+    """Return the cuts of each attitude, in which the temperature changes by 1 K at most, without interruptions."""
     whole = attitudes.recording.time
     assert whole is not None
     assert attitudes.pieces is not None
@@ -319,12 +314,12 @@ def _of_time(attitudes: Attitudes, outputs: Array, temperature: Array) -> list[C
         drift = abs(np.polyfit(time, read, 1)[0]) * (time[-1] - time[0])
         count = int(max(1, min(np.ceil(drift / _CUT), len(samples) // _FEWEST)))
         edges = np.linspace(0, len(samples), count + 1).astype(np.int64)
-        cuts += [averaged(output, read, time, a, b, attitude) for a, b in pairwise(edges.tolist())]
+        cuts += [average_cut(output, read, time, a, b, attitude) for a, b in pairwise(edges.tolist())]
     return cuts
 
 
-def averaged(outputs: Array, temperature: Array, time: Array, first: int, last: int, attitude: int) -> Cut:
-    """Return the means of outputs (n, 3) from sample `first` to before `last`, and how well they are known."""
+def average_cut(outputs: Array, temperature: Array, time: Array, first: int, last: int, attitude: int) -> Cut:
+    """Return the mean of outputs (n, 3) from sample `first` to before `last`, with its covariance by batches."""
     batches = max(3, min(_BATCHES, (last - first) // 4))
     edges = np.linspace(first, last, batches + 1).astype(np.int64)[:-1]
     counts = np.diff(np.append(edges, last))[:, None]
@@ -341,8 +336,8 @@ def averaged(outputs: Array, temperature: Array, time: Array, first: int, last: 
     )  # fmt: skip
 
 
-def pooled(cuts: Sequence[Cut]) -> Array:
-    """Covariance of each mean, shrunk towards what all holds have for their length: few batches are poor weights."""
+def pool_covariance(cuts: Sequence[Cut]) -> Array:
+    """Return the covariance of each mean, shrunk towards the usual one for its length, since batches are few."""
     covariance = np.array([cut.covariance for cut in cuts])
     freedom = np.array([cut.freedom for cut in cuts])
     if np.isinf(freedom).any():
@@ -359,21 +354,21 @@ def pooled(cuts: Sequence[Cut]) -> Array:
     return shrunk
 
 
-def _step(temperature: Array) -> float:
-    """Return the standard uncertainty that the step of the reading leaves, K: of its digits, or its values if less."""
+def _reading_uncertainty(temperature: Array) -> float:
+    """Return the standard uncertainty of a thermometer by the step of its readings, K: step / sqrt(12)."""
     values = np.unique(np.round(temperature, 6))
     digits = next((k for k in range(6) if np.array_equal(np.round(values, k), values)), 6)
     step = min(10.0**-digits, float(np.diff(values).min()) if len(values) > 1 else np.inf)
     return step / float(np.sqrt(12))
 
 
-def sides(holds: Holds) -> Array:
-    """Return whether each hold is of a soak that was reached by warming (1) or cooling (-1), as its head says; else 0.
+def read_sides(holds: Holds) -> Array:
+    """Return 1 for holds of a soak that was reached by warming, -1 by cooling, as its head says; else 0.
 
     Raises
     ------
     DataError
-        A head says something else.
+        A head says neither.
     """
     signs = []
     for recording in holds.recordings:
@@ -385,26 +380,26 @@ def sides(holds: Holds) -> Array:
     return which
 
 
-# Are these recordings of one unit over temperature? One clear sentence for each way in which they may not be.
+# Checks that recordings are of one unit over temperature.
 
 
-_KELVIN = 150.0  # degC; no unit is calibrated above it, and every kelvin above -120 degC is
-_JUMP, _QUICK = 5.0, 2.0  # K; s
+_KELVIN = 150.0  # degC; no unit is calibrated above it, and all kelvins above -120 degC are larger
+_JUMP, _QUICK = 5.0, 2.0  # K within so many s that no thermometer of a unit changes by
 _COLDEST = -120.0  # degC
 _STUCK, _SHORT, _READINGS, _STEPS = 200, 20.0, 20, 1.5
-"""A reading that stays for so many samples, so many times as long as nearly all others, of which there are so many, and
-that changes by so many steps otherwise."""
+"""A thermometer is stuck if one reading lasts so many samples, and so many times as long as 95 % of the others, and if
+there are so many others, which change by more than so many steps."""
 _LATER = (1.5, 1.25)
-"""How many times as long as the one before the last step to a reading takes, and the one before it, if it settles."""
+"""Ratios of the last steps' durations from which readings settle exponentially."""
 _SHARED, _DISTINCT = 0.3, 0.9
-"""Share of rows that are in another recording, too, which is one by chance where rows hardly repeat in either."""
+"""Two recordings overlap if they share more than this share of rows, and that share of rows is unique in both."""
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
-def prepared(
+def prepare_recordings(
     recordings: Sequence[Recording], column: str | None, settle: float | None, *, span: float = LEAST_SPAN
 ) -> list[Recording]:
-    """Return recordings with a column temperature that spans `span` K, without what lies inside the settling time.
+    """Return recordings with a column temperature that spans `span` K, without their settling time.
 
     Raises
     ------
@@ -413,11 +408,11 @@ def prepared(
     OptionError
         The settling time is less than 0.
     """
-    with_temperature = [_with_temperature(recording, column) for recording in recordings]
+    with_temperature = [_choose_temperature(recording, column) for recording in recordings]
     _check_together(with_temperature)
     for recording in with_temperature:
         _check_temperature(recording)
-    with_temperature = _with_constant_named(with_temperature)
+    with_temperature = _note_constant(with_temperature)
     low = min(float(recording.si("temperature").min()) for recording in with_temperature)
     high = max(float(recording.si("temperature").max()) for recording in with_temperature)
     if high - low < span:
@@ -430,10 +425,10 @@ def prepared(
             f"{where}: column temperature: spans {high - low:.1f} K ({low:.1f} to {high:.1f} degC); expected at least "
             f"{span:g} K: imulab tumble fit calibrates at one temperature"
         )
-    return [_settled(recording, settle) for recording in with_temperature]
+    return [_skip_settling(recording, settle) for recording in with_temperature]
 
 
-def _with_temperature(recording: Recording, column: str | None) -> Recording:
+def _choose_temperature(recording: Recording, column: str | None) -> Recording:
     """Return the recording with the chosen column as its temperature."""
     candidates = [
         name
@@ -446,27 +441,27 @@ def _with_temperature(recording: Recording, column: str | None) -> Recording:
             raise DataError(
                 f"{recording.name}: column {column}: expected a temperature, found {recording.units[column]}"
             )
-        return recording.with_columns(
-            {"temperature": recording.column(column)}, {"temperature": recording.units[column]}
-        )
+        return _use_temperature(recording, column)
     if len(candidates) > 1:
         raise DataError(
             f"{recording.name}: {len(candidates)} columns of temperature: {' '.join(candidates)}; expected one, that "
             "of the unit's own sensor: choose it with --temperature-column"
         )
     if candidates:
-        return _called(recording, candidates[0])
+        return _use_temperature(recording, candidates[0])
     raise DataError(
         f"{recording.name}: no column temperature; found {' '.join(recording.columns)}: expected what the unit's own "
         "thermometer says (--temperature-column NAME where it is called otherwise)"
     )
 
 
-def _called(recording: Recording, column: str) -> Recording:
+def _use_temperature(recording: Recording, column: str) -> Recording:
+    """Return the recording with a column as its temperature."""
     return recording.with_columns({"temperature": recording.column(column)}, {"temperature": recording.units[column]})
 
 
 def _check_together(recordings: Sequence[Recording]) -> None:
+    """Refuse recordings of two units, with outputs in two units, or with rows that another has too."""
     first = recordings[0]
     if apart := different_units(*((r.name, r.metadata) for r in recordings), keys=("serial", "element")):
         raise DataError(f"{apart}; expected recordings of one unit")
@@ -478,11 +473,11 @@ def _check_together(recordings: Sequence[Recording]) -> None:
                 f"{recording.name}: columns accel_x accel_y accel_z are in {other}, but in {unit} in {first.name}; "
                 "expected one unit"
             )
-        row_marks = np.sort(_marks(recording))
+        row_marks = np.sort(_hash_rows(recording))
         for before, marks in earlier:
             if np.array_equal(row_marks, marks):
                 raise DataError(f"{recording.name}: the same recording as {before}, which would count twice")
-            shared = _share(row_marks, marks)
+            shared = _shared_rows(row_marks, marks)
             if shared > _SHARED and min(len(np.unique(each)) / len(each) for each in (row_marks, marks)) > _DISTINCT:
                 raise DataError(
                     f"{recording.name}: {100 * shared:.0f} % of its rows are in {before}, too, and would count twice; "
@@ -491,16 +486,16 @@ def _check_together(recordings: Sequence[Recording]) -> None:
         earlier.append((recording.name, row_marks))
 
 
-def _share(marks: NDArray[np.uint64], other: NDArray[np.uint64]) -> float:
-    """Return the share of rows that are in another recording, from a few thousand of them, both in order."""
+def _shared_rows(marks: NDArray[np.uint64], other: NDArray[np.uint64]) -> float:
+    """Return the share of rows that another recording has too, by a few thousand of them; both are sorted."""
     if not (len(marks) and len(other)):
         return 0.0
     few = marks[:: max(1, len(marks) // 4000)]
     return float((other[np.searchsorted(other, few).clip(max=len(other) - 1)] == few).mean())
 
 
-def _marks(recording: Recording) -> NDArray[np.uint64]:
-    """Return a number for each row of outputs, shape (n,), the same for the same row alone."""
+def _hash_rows(recording: Recording) -> NDArray[np.uint64]:
+    """Return a hash of each row of outputs, shape (n,)."""
     hashes = np.zeros(len(recording), dtype=np.uint64)
     for name in triad("accel"):
         bits = np.ascontiguousarray(recording.column(name), dtype=np.float64).view(np.uint64)
@@ -510,6 +505,7 @@ def _marks(recording: Recording) -> NDArray[np.uint64]:
 
 
 def _check_temperature(recording: Recording) -> None:
+    """Refuse temperatures that cannot be: kelvins, too cold, stuck, or with a jump."""
     check_finite(recording, ["temperature"])
     values, time = recording.si("temperature"), recording.time
     if not values.size:
@@ -538,11 +534,11 @@ def _check_temperature(recording: Recording) -> None:
 
 
 def _check_stuck(recording: Recording, values: Array) -> None:
-    """Refuse a thermometer that stops: one reading for long, where others change every few samples."""
+    """Refuse a thermometer that is stuck: one long reading, where others change every few samples."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
     runs, changes = np.diff(edges), np.abs(np.diff(values[edges[:-1]]))
     longest = int(np.argmax(runs))
-    # A reading whose steps are larger than its noise goes from one to the next, and rests at one where nothing warms.
+    # Readings with steps larger than their noise rest at one value wherever the temperature is steady.
     if not changes.size or np.median(changes) < _STEPS * changes.min():
         return
     if len(runs) < _READINGS or runs[longest] < max(_STUCK, _SHORT * np.quantile(np.delete(runs, longest), 0.95)):
@@ -558,10 +554,10 @@ def _check_stuck(recording: Recording, values: Array) -> None:
 
 
 def _settles(before: Array, value: float) -> bool:
-    """Return whether readings came to rest at a value step by step, each step later than the one before it.
+    """Return whether readings approached a value exponentially, each step later than the one before it.
 
-    An exponential approach takes at least 1.71 and 1.41 times as long for its last step and the one before as for that
-    before these; a thermometer that stops while it drifts took as long for each.
+    Then the last step takes at least 1.71 times as long as the one before, and that at least 1.41 times as long as its
+    predecessor. Readings that stop within a drift have steps of one length.
     """
     away = np.round(np.abs(before - value), 6)
     levels = np.unique(away[away > 0])[: len(_LATER) + 2]
@@ -572,8 +568,8 @@ def _settles(before: Array, value: float) -> bool:
     return bool(np.all(steps[:-1] > np.array(_LATER) * steps[1:]))
 
 
-def _with_constant_named(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the same, with a note on each that has one temperature throughout while that of others changes."""
+def _note_constant(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the recordings with a note on each whose temperature is constant while that of others changes."""
     counts = [
         0 if recording.time is None else len(np.unique(recording.column("temperature"))) for recording in recordings
     ]
@@ -586,8 +582,8 @@ def _with_constant_named(recordings: Sequence[Recording]) -> list[Recording]:
     ]
 
 
-def _settled(recording: Recording, settle: float | None) -> Recording:
-    """Return what lies after the settling time: by default where the head says that time counts from power-on."""
+def _skip_settling(recording: Recording, settle: float | None) -> Recording:
+    """Return the recording after the settling time, by default 300 s if its time counts from power-on."""
     time = recording.time
     if settle is not None and not settle >= 0:
         raise OptionError(f"settle {settle:g} s: expected 0 s or more")
@@ -609,12 +605,12 @@ def _settled(recording: Recording, settle: float | None) -> Recording:
 
 
 def check_holds(holds: Holds, gravity: float, nominal: float | None) -> None:
-    """Check that the holds can be those of accelerometers under `gravity`, m/s^2, `nominal` m/s^2 per output.
+    """Refuse holds that cannot be those of accelerometers under `gravity`, m/s^2, with `nominal` m/s^2 per output.
 
     Raises
     ------
     DataError
-        The magnitudes are nowhere near it, or an axis is dead.
+        A magnitude is below half or above twice gravity, or an axis is dead.
     """
     if nominal is not None:
         length = np.linalg.norm(holds.mean, axis=1) * nominal

@@ -1,11 +1,11 @@
 """Tumble's error model with parameters that follow the temperature, and the specific force with its derivatives.
 
-    M = S(T) (A + b(T)),  A = s,  s = [[1, 0, 0], [m_yx(T), 1, 0], [m_zx(T), m_zy(T), 1]] f
+    M = S(T) (s + b(T)),  s = [[1, 0, 0], [m_yx(T), 1, 0], [m_zx(T), m_zy(T), 1]] f
 
 Each parameter is a polynomial of ``theta = (T - T0) / H`` from -1 to 1, T0 the middle of the measured range and H half
-of it; the fit works in Chebyshev polynomials, records hold powers of T - T0. The bias may be a natural cubic spline
-instead, whose coefficients are its values at the knots. Outside the range the law's value at its end is held. A turn of
-the whole triad by heat is not seen (gauge).
+of it. The fit works in Chebyshev polynomials; records hold powers of T - T0. The bias may be a natural cubic spline
+instead, whose coefficients are its values at the knots. Outside the range each law keeps its value at the end. A
+rotation of the whole triad with temperature is not observable (gauge).
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ if TYPE_CHECKING:
 AXES = ("x", "y", "z")
 MISALIGNMENTS = tuple(f"gyro_misalignment_{a}{b}" for a in AXES for b in AXES if a != b)
 SENSITIVITIES = tuple(f"gyro_g_sensitivity_{a}{b}" for a in AXES for b in AXES)
-"""Of gyroscopes, in the order of their parameters."""
+"""Parameters of gyroscopes, in their order."""
 GROUPS = (("bias", AXES), ("scale_factor", AXES), ("misalignment", ("yx", "zx", "zy")))
 """Kinds of parameters, three each, in the order of the parameter vector."""
 SHARES = np.repeat([1.0, 1 / 3, 1 / 3], len(AXES)) / len(AXES)
-"""Of their variances in that of a component of the corrected force, in g: the mean over components and directions."""
+"""Shares of the parameters' variances in that of a component of the corrected force, in g, the mean over components
+and directions."""
 
 
 @dataclass(frozen=True)
 class Laws:
-    """The range of temperature, degC, and the degrees of the polynomials of bias, scale factor and misalignment.
+    """The nine laws: range of temperature, degC, and degrees of bias, scale factor and misalignment.
 
     With `knots`, degC, from one end of the range to the other, the bias is a natural cubic spline, of degree 3.
     """
@@ -68,13 +69,13 @@ class Laws:
 
     @property
     def parts(self) -> list[slice]:
-        """Where the coefficients of each of the nine laws stand."""
+        """Places of the coefficients of each of the nine laws."""
         ends = np.cumsum(np.repeat(self.terms, 3)).tolist()
         return [slice(start, stop) for start, stop in zip([0, *ends], ends, strict=False)]
 
     @property
     def spelled(self) -> str:
-        """The laws as the option ``--degrees`` states them: ``3,2,1`` or ``spline,2,1``."""
+        """The laws in the words of the option ``--degrees``: ``3,2,1`` or ``spline,2,1``."""
         bias, *others = map(str, self.degrees)
         return ",".join(["spline" if self.knots else bias, *others])
 
@@ -84,12 +85,12 @@ class Laws:
         return place
 
     def design(self, temperature: Array) -> Array:
-        """Return the derivatives of the nine parameters by the coefficients, shape (n, 9, size)."""
+        """Return the matrices from the fit's coefficients to the parameters at temperatures, shape (n, 9, size)."""
         functions = np.asarray(chebyshev.chebvander(self.place(temperature), max(self.degrees)), np.float64)
-        return self._spread(functions, self.of_bias(temperature))
+        return self._spread(functions, self.bias_functions(temperature))
 
-    def of_bias(self, temperature: Array) -> Array:
-        """Return what the coefficients of a bias are multiplied by in the fit, shape (n, terms)."""
+    def bias_functions(self, temperature: Array) -> Array:
+        """Return the functions of a bias's law in the fit, shape (n, terms)."""
         if self.knots:
             return self.cardinal(temperature)
         return np.asarray(chebyshev.chebvander(self.place(temperature), self.degrees[0]), np.float64)
@@ -102,28 +103,29 @@ class Laws:
         return self._spread(values, self.cardinal(temperature, derivative=1) if self.knots else values)
 
     def cardinal(self, temperature: Array, derivative: int = 0) -> Array:
-        """Return the splines that are 1 at one knot and 0 at all others, or a derivative of them, shape (n, knots)."""
+        """Return the splines that are 1 at one knot and 0 at all others, or their derivatives, shape (n, knots)."""
         splines: Array = cardinal_spline(self.knots)(np.clip(temperature, self.low, self.high), derivative)
         return splines
 
-    def _spread(self, functions: Array, of_bias: Array) -> Array:
+    def _spread(self, functions: Array, bias_functions: Array) -> Array:
+        """Return the functions of all laws at the places of their coefficients, shape (n, 9, size)."""
         design = np.zeros((len(functions), 9, self.size))
         for law, part in enumerate(self.parts):
-            design[:, law, part] = (of_bias if law < 3 else functions)[:, : part.stop - part.start]
+            design[:, law, part] = (bias_functions if law < 3 else functions)[:, : part.stop - part.start]
         return design
 
     def constant(self, parameters: Array) -> Array:
-        """Return the coefficients of laws that keep these nine parameters at every temperature."""
+        """Return the coefficients of laws that are constant at these nine parameters."""
         coefficients = np.zeros(self.size)
         for law, part in enumerate(self.parts):
-            of_spline = law < 3 and self.knots
-            coefficients[part if of_spline else part.start] = parameters[law]
+            is_spline = law < 3 and self.knots
+            coefficients[part if is_spline else part.start] = parameters[law]
         return coefficients
 
     def to_powers(self) -> Array:
         """Return the matrix from the fit's coefficients to a record's, shape (size, size).
 
-        Those are of powers of T - T0 in K, or the values at knots.
+        A record's are coefficients of powers of T - T0 in K, or values at knots.
         """
         matrix = np.zeros((self.size, self.size))
         for law, part in enumerate(self.parts):
@@ -132,6 +134,7 @@ class Laws:
         return matrix
 
     def _powers(self, count: int) -> Array:
+        """Return the matrix from Chebyshev coefficients of one law to those of powers of T - T0."""
         block = np.zeros((count, count))
         for k in range(count):
             block[: k + 1, k] = chebyshev.cheb2poly([0.0] * k + [1.0])
@@ -139,7 +142,7 @@ class Laws:
         return block
 
     def recorded(self, group: int, temperature: Array, about: float) -> Array:
-        """Return what a record's coefficients of one law are multiplied by at temperatures, shape (n, terms).
+        """Return the functions of one law of a record at temperatures, shape (n, terms).
 
         `about` is the record's reference temperature, degC.
         """
@@ -151,7 +154,7 @@ class Laws:
 
     @property
     def edges(self) -> Array:
-        """Temperatures between which each piece of the laws holds, degC: the range, or the bias's knots."""
+        """Ends of the pieces of the laws, degC: of the range, or the bias's knots."""
         return np.array(self.knots or (self.low, self.high))
 
     def in_pieces(self, group: int, coefficients: Array, about: float) -> Array:
@@ -159,12 +162,12 @@ class Laws:
 
         `about` is the record's reference temperature, degC.
         """
-        edges, of_spline = self.edges.tolist(), bool(group == 0 and self.knots)
+        edges, is_spline = self.edges.tolist(), bool(group == 0 and self.knots)
         pieces = np.zeros((len(edges) - 1, self.degrees[group] + 1))
         for piece, (start, stop) in enumerate(pairwise(edges)):
             middle, half = 0.5 * (start + stop), 0.5 * (stop - start)
-            cubic = cardinal_spline(self.knots).c[::-1, piece] @ coefficients if of_spline else coefficients
-            law = Polynomial(cubic)(Polynomial([middle - (start if of_spline else about), half])).coef
+            cubic = cardinal_spline(self.knots).c[::-1, piece] @ coefficients if is_spline else coefficients
+            law = Polynomial(cubic)(Polynomial([middle - (start if is_spline else about), half])).coef
             pieces[piece, : len(law)] = law
         return pieces
 
@@ -184,7 +187,7 @@ class Laws:
         return law_names(law, "", self.degrees[group])[0]
 
     def spoken(self) -> list[str]:
-        """Return what messages call the coefficients."""
+        """Return the names of the coefficients in messages."""
         changes = ("", "change of {} with temperature", "curvature of {} with temperature")
         words = []
         for group, (kind, axes) in enumerate(GROUPS):

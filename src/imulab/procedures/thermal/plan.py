@@ -1,13 +1,12 @@
-"""Which soaks and attitudes a test over temperature needs, what it will give, and the plan as its user has it.
+"""The plan of a test over temperature: its soaks and attitudes, and the predicted uncertainties.
 
-The information of an attitude is the gradient of ``|f|`` for a nominal sensor, whose nine parameters are polynomials of
-the temperature. The offsets of the biases in each power cycle are unknowns beside them, known to a standard deviation
-tau; everything is in units of the noise of ``|f|`` in one attitude. Attitudes are exchanged one by one (Fedorov 1972)
-for those that lower the mean variance of the corrected force over temperature and direction most.
+Accelerometers (`exchange_attitudes`): an attitude adds the information of the gradient of ``|f|`` of a nominal sensor,
+whose nine parameters are polynomials of the temperature. The offsets of the biases in each power cycle are unknowns of
+standard deviation tau. Everything is in units of the noise of ``|f|`` in one attitude. Attitudes are exchanged one by
+one (Fedorov 1972) for those that lower the mean variance of the corrected force over temperature and direction most.
 
-As `imulab.procedures.thermal.gyro` fits them: the laws of the biases, the g-sensitivities and offsets of each power
-cycle, from means at rest whose noise is that of the angle random walk and of the Earth's rate, whose vertical part the
-g-sensitivities take up.
+Gyroscopes (`plan_gyroscopes`): the covariance of laws, g-sensitivities and offsets as `imulab.procedures.thermal.gyro`
+fits them, from means at rest with the noise of the angle random walk and of the Earth's rate.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from numpy.polynomial import legendre
 from imulab.errors import ObservabilityError, OptionError
 from imulab.options import FURTHER_TRIADS, measure, parsed, text
 from imulab.procedures.result import PlannedAttitudes, amount
-from imulab.procedures.thermal import APART, DEGREES, FOLLOWED, LEAST_SPAN, TURNED, degrees_of, further_of
-from imulab.procedures.thermal.degrees import spoken_degrees
-from imulab.procedures.thermal.gyro import VERTICAL, new_in_each
+from imulab.procedures.thermal import APART, DEGREES, FOLLOWED, LEAST_SPAN, TURNED, parse_degrees, parse_further
+from imulab.procedures.thermal.degrees import describe_degrees
+from imulab.procedures.thermal.gyro import VERTICAL, attitude_columns
 from imulab.procedures.thermal.model import SHARES, Laws, forces
 from imulab.procedures.tumble.plan import (
     STARTS,
@@ -39,11 +38,12 @@ from imulab.procedures.tumble.plan import (
 )
 from imulab.quantities import RANDOM_WALK, in_si, of_units, temperature_list
 from imulab.recording import Array, Data, Recording
+from imulab.report.parameters import text_in
 from imulab.report.plots import Plot
-from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis
+from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis, rounded, scatter
 from imulab.units import STANDARD_GRAVITY, from_si
 
-# Which temperatures and attitudes show the laws best: the search behind a plan.
+# The search for temperatures and attitudes.
 
 
 _PLACES = 41  # temperatures over which the uncertainty of a plan is averaged
@@ -55,17 +55,17 @@ _RIDGE = 1e-6
 _UNDETERMINED = 1e4  # variance of a coefficient, in that of one attitude, that a plan does not determine
 
 
-def nodes(count: int) -> Array:
+def legendre_nodes(count: int) -> Array:
     """Return -1, the extrema of the Legendre polynomial of degree `count` - 1, and 1, shape (count,)."""
     polynomial = np.eye(count)[-1]
     inner = np.sort(legendre.legroots(legendre.legder(polynomial)).real)
     return np.concatenate([[-1.0], inner, [1.0]])
 
 
-def way(count: int, soaks: int) -> list[int]:
-    """Return the order of soaks at `count` temperatures: up through all, then back and forth through what is left.
+def order_soaks(count: int, soaks: int) -> list[int]:
+    """Return the order of soaks at `count` temperatures: up through all, then back and forth with the others.
 
-    The way back takes inner temperatures first, spread over the range: they are what can be reached from either side.
+    The way back takes inner temperatures first, spread over the range, since these can be reached from either side.
     """
     order, last = list(range(min(count, soaks))), count - 1
     while len(order) < soaks:
@@ -89,7 +89,7 @@ class Design:
 
     @cached_property
     def carried(self) -> Array:
-        """Derivatives of the nine parameters in each soak by coefficients and offsets, shape (K, 9, c + 3 K)."""
+        """Derivatives of the nine parameters in each of K soaks by coefficients and offsets, shape (K, 9, c + 3 K)."""
         design, count = self.laws.design(self.temperatures), len(self.temperatures)
         derivatives = np.zeros((count, 9, self.laws.size + 3 * count))
         derivatives[:, :, : self.laws.size] = design
@@ -120,7 +120,7 @@ class Design:
         return mean
 
     def covariance(self, sets: Sequence[Array]) -> Array:
-        """Covariance of coefficients and offsets with these attitudes, in units of the noise of an attitude squared."""
+        """Return the covariance of coefficients and offsets with these attitudes, over the variance of an attitude."""
         information = np.diag(np.append(np.full(self.laws.size, _RIDGE), np.ones(3 * len(self.temperatures))))
         for by_soak, directions in zip(self.carried, sets, strict=True):
             rows = gradients(directions) @ by_soak
@@ -128,7 +128,7 @@ class Design:
         return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
     def cost(self, covariance: Array) -> float:
-        """Mean variance of a component of the corrected force; infinite where attitudes do not determine the laws."""
+        """Return the mean variance of a component of the corrected force, infinite if the laws are not determined."""
         of_laws = covariance[: self.laws.size, : self.laws.size]
         return (
             np.inf
@@ -137,7 +137,7 @@ class Design:
         )
 
     def deviations(self, covariance: Array) -> Array:
-        """Standard deviation of a component of the corrected force at each place, its mean over directions."""
+        """Return the standard deviation of a component of the corrected force at each place, rms over directions."""
         of_laws = covariance[: self.laws.size, : self.laws.size]
         sd: Array = np.sqrt(np.einsum("tab,ba->t", self.weights, of_laws))
         return sd
@@ -151,8 +151,8 @@ def gradients(directions: Array) -> Array:
     return rows
 
 
-def exchange(design: Design, points: Array, counts: Sequence[int], seed: int) -> tuple[list[Array], Array]:
-    """Choose attitudes of each soak among `points`, shape (m, 3), and return them with the covariance they give."""
+def exchange_attitudes(design: Design, points: Array, counts: Sequence[int], seed: int) -> tuple[list[Array], Array]:
+    """Return attitudes of each soak, chosen among `points`, shape (m, 3), and the resulting covariance."""
     rng = np.random.default_rng(seed)
     rows = gradients(points)
     products = (rows[:, :, None] * rows[:, None, :]).reshape(len(points), 81)
@@ -165,7 +165,7 @@ def exchange(design: Design, points: Array, counts: Sequence[int], seed: int) ->
             taken = (points @ points[selected].T > _CLOSEST).sum(axis=1)
             for place in range(len(selected)):
                 old = int(selected[place])
-                covariance = _added(covariance, rows[old] @ carried, -1.0)
+                covariance = _update_covariance(covariance, rows[old] @ carried, -1.0)
                 taken -= points @ points[old] > _CLOSEST
                 by_point = carried @ covariance
                 known = by_point[:, : design.laws.size]
@@ -176,7 +176,7 @@ def exchange(design: Design, points: Array, counts: Sequence[int], seed: int) ->
                 best = best if gain[best] > gain[old] * (1 + 1e-9) else old
                 moved |= best != old
                 selected[place] = best
-                covariance = _added(covariance, rows[best] @ carried, 1.0)
+                covariance = _update_covariance(covariance, rows[best] @ carried, 1.0)
                 taken += points @ points[best] > _CLOSEST
         if not moved:
             break
@@ -184,14 +184,14 @@ def exchange(design: Design, points: Array, counts: Sequence[int], seed: int) ->
     return sets, design.covariance(sets)
 
 
-def _added(covariance: Array, row: Array, sign: float) -> Array:
-    """Return the covariance with one row of information more, or less."""
+def _update_covariance(covariance: Array, row: Array, sign: float) -> Array:
+    """Return the covariance with one row of information more (`sign` 1) or less (-1)."""
     carried = covariance @ row
     updated: Array = covariance - np.outer(carried, carried) / (sign + row @ carried)
     return updated
 
 
-# What a schedule over temperature gives of the gyroscopes: rates at rest, and the turns that scale factors take.
+# Prediction for the gyroscopes: rates at rest, and turns for scale factors.
 
 
 NOISE, TURN_ON_SCATTER = "0.3 deg/sqrt(h)", "0.01 deg/s"
@@ -199,7 +199,7 @@ NOISE, TURN_ON_SCATTER = "0.3 deg/sqrt(h)", "0.01 deg/s"
 
 @dataclass(frozen=True)
 class GyroPlan:
-    """What a plan over temperature will give of the gyroscopes.
+    """Predicted uncertainty of the gyroscopes.
 
     Attributes
     ----------
@@ -209,10 +209,10 @@ class GyroPlan:
     noise
         Angle random walk, rad/sqrt(s).
     turn_on_scatter
-        Of the biases from one power cycle to the next, rad/s.
+        Standard deviation of the biases between power cycles, rad/s.
     turns, turned_at
-        Turns between attitudes that tell scale factors, and at how many temperatures: of soaks of nine attitudes or
-        more.
+        Turns between attitudes from which scale factors follow, in soaks of nine attitudes or more, and the number of
+        their temperatures.
     needed
         Time in which each soak has nine attitudes, s.
     """
@@ -240,18 +240,20 @@ class GyroPlan:
             "turned_at": self.turned_at,
         }
 
-    def said(self, temperature: Array) -> str:
-        """Return what the plan predicts in sentences; `temperature` as of the plan, degC."""
+    def sentences(self, temperature: Array) -> str:
+        """Return the prediction in sentences; `temperature` as of the plan, degC."""
         worst = int(np.argmax(self.deviation))
-        known = f"{hourly(self.mean)} deg/h, {hourly(self.deviation[worst])} deg/h where they are worst"
+        rates = (self.mean, self.deviation[worst], self.turn_on_scatter)
+        mean, largest, scatter_text = (f"{text_in(rate, 'deg/h')} deg/h" for rate in rates)
         walk = f"{self.noise / RANDOM_WALK['deg/sqrt(h)']:.3g} deg/sqrt(h)"
         return (
-            f"The gyroscopes' laws will give a component of the rate at rest to {known}, at "
-            f"{temperature[worst]:.0f} degC, by an angle random walk of {walk}, {hourly(self.turn_on_scatter)} deg/h "
-            f"of turn-on scatter and the Earth's rate from unknown directions. {self._turned()}"
+            f"The gyroscopes' laws will give a component of the rate at rest to {mean}, {largest} where they are "
+            f"worst, at {temperature[worst]:.0f} degC, by an angle random walk of {walk}, {scatter_text} of turn-on "
+            f"scatter and the Earth's rate from unknown directions. {self._turns_sentence()}"
         )
 
-    def _turned(self) -> str:
+    def _turns_sentence(self) -> str:
+        """Return a sentence on the turns for scale factors."""
         if not self.turns:
             return (
                 f"No soak has the {TURNED} attitudes whose turns tell scale factors: these soaks with as many take "
@@ -262,12 +264,7 @@ class GyroPlan:
         return f"{self.turns} turns at {self.turned_at} {at} will tell scale factors, {follow}."
 
 
-def hourly(rate: float) -> str:
-    """Return a rate in deg/h, as text."""
-    return f"{from_si(float(rate), 'deg/h'):.3g}"
-
-
-def noise_and_scatter(
+def read_noise_and_scatter(
     noise: float | str | None, turn_on_scatter: float | str | None, *, asked: bool
 ) -> tuple[float, float] | None:
     """Return the angle random walk, rad/sqrt(s), and the scatter of biases between power cycles, rad/s.
@@ -277,7 +274,7 @@ def noise_and_scatter(
     Raises
     ------
     OptionError
-        One is out of range, or given where they are not asked for.
+        One is out of range, or stated without gyroscopes.
     """
     if not asked:
         for name, value in (("gyro_noise", noise), ("gyro_turn_on_scatter", turn_on_scatter)):
@@ -298,27 +295,27 @@ def noise_and_scatter(
 def plan_gyroscopes(
     laws: Laws, places: Array, soaks: Sequence[tuple[float, Array]], times: tuple[float, float], walk: float, tau: float
 ) -> GyroPlan:
-    """Predict what soaks give of gyroscopes.
+    """Return the predicted uncertainty of gyroscopes in these soaks.
 
     Parameters
     ----------
     laws
-        Of the accelerometers, whose degree of the bias the gyroscopes' have too.
+        Laws of the accelerometers; the gyroscopes' biases have the same degree.
     places
         Temperatures at which to predict, degC, shape (m,).
     soaks
         Temperature, degC, and upward directions, (n, 3), of each.
     times
-        Of a soak, and of an attitude, all of which counts as rest, s.
+        Time of a soak, and of an attitude, all of which counts as rest, s.
     walk, tau
-        As of `noise_and_scatter`.
+        Results of `read_noise_and_scatter`.
     """
     size, walked = laws.degrees[0] + 1, walk**2 / times[1] * np.eye(3)
     information = np.zeros((3 * (size + 3), 3 * (size + 3)))
     for temperature, up in soaks:
         law = np.tile(laws.design(np.array([temperature]))[0, 0, :size], (len(up), 1))
         rows = np.einsum("nc,ij->nijc", np.hstack([law, up]), np.eye(3)).reshape(len(up), 3, -1)
-        new_columns = new_in_each(up, None)
+        new_columns = attitude_columns(up, None)
         weight = np.linalg.inv(walked + new_columns @ np.swapaxes(new_columns, 1, 2))
         common = np.einsum("nij,njc->ic", weight, rows)  # by an offset of the power cycle
         share = tau**2 * np.linalg.inv(np.eye(3) + tau**2 * weight.sum(axis=0))
@@ -327,7 +324,7 @@ def plan_gyroscopes(
     covariance = np.einsum("iaib->ab", blocks) / 3
     functions = laws.design(places)[:, 0, :size]
     at_rest = np.einsum("ma,ab,mb->m", functions, covariance[:size, :size], functions)
-    # Each of the three g-sensitivities along its own axis holds the vertical part of the Earth's rate.
+    # Each of the three g-sensitivities along its own axis contains the vertical part of the Earth's rate.
     felt = (np.trace(covariance[size:, size:]) + VERTICAL**2) / 3
     counts = [len(up) for _, up in soaks]
     enough = [(temperature, count) for (temperature, _), count in zip(soaks, counts, strict=True) if count >= TURNED]
@@ -341,7 +338,7 @@ def plan_gyroscopes(
     )
 
 
-# A plan over temperature as its user has it: what it predicts, its CSV to measure by, its sheet, its figure.
+# The plan: prediction, CSV to measure by, sheet and figure.
 
 
 _ROWS = 9  # temperatures of the printed table
@@ -355,13 +352,13 @@ class PlannedSoak:
     Attributes
     ----------
     temperature
-        degC.
+        Temperature, degC.
     warming
         Whether it is reached from below.
     directions
         Upward directions in the body frame, in the order that turns least, shape (n, 3).
     start, duration
-        Of soak and attitudes, s.
+        Start and duration of soak and attitudes, s.
     """
 
     temperature: float
@@ -373,7 +370,7 @@ class PlannedSoak:
 
 @dataclass(frozen=True)
 class Tried:
-    """A number of soaks that the time allows, attitudes in each, and sd of the corrected force, m/s^2."""
+    """A number of soaks that the time allows, attitudes in each, and deviations of the corrected force, m/s^2."""
 
     soaks: int
     attitudes: int
@@ -383,31 +380,31 @@ class Tried:
 
 @dataclass(frozen=True, repr=False)
 class ThermalPlan(PlannedAttitudes):
-    """Soaks and attitudes of a calibration over temperature, and what they will give.
+    """Soaks and attitudes of a calibration over temperature, and the predicted uncertainty.
 
     Attributes
     ----------
     soaks
-        In their order.
+        The soaks in their order.
     degrees
-        Of bias, scale factor and misalignment.
+        Degrees of bias, scale factor and misalignment.
     temperature, deviation
         Temperatures over the range, degC, and the standard deviation of a component of the corrected force there, root
         mean square over directions, m/s^2, shape (m,).
     mean
-        Root of the mean of its square, m/s^2.
+        Root mean square of `deviation`, m/s^2.
     noise
-        Of ``|f|`` in one attitude, m/s^2.
+        Noise of ``|f|`` in one attitude, m/s^2.
     noise_from
-        What said so, in brackets; empty where it was given as a number.
+        Its source, in brackets; empty for a stated number.
     turn_on_scatter
-        Of the biases from one power cycle to the next, m/s^2.
+        Standard deviation of the biases between power cycles, m/s^2.
     time
-        That was available, s.
+        Available time, s.
     tried
         The numbers of soaks that were compared.
     gyro
-        What is predicted of the gyroscopes, None unless it was asked for.
+        Prediction for the gyroscopes, None unless it was asked for.
     """
 
     sheet_title: ClassVar[str] = "Thermal plan"
@@ -425,30 +422,32 @@ class ThermalPlan(PlannedAttitudes):
 
     @property
     def duration(self) -> float:
-        """Of all soaks and attitudes, s."""
+        """Duration of all soaks and attitudes, s."""
         return self.soaks[-1].start + self.soaks[-1].duration
 
     @property
     def lead(self) -> str:
-        """What the plan is and predicts."""
+        """The plan and its prediction in a few sentences."""
         counts = [len(soak.directions) for soak in self.soaks]
         each = f"{counts[0]}" if min(counts) == max(counts) else f"{min(counts)} or {max(counts)}"
         again = len(self.soaks) - len({soak.temperature for soak in self.soaks})
         places = len(self.soaks) - again
-        spoken = spoken_degrees(self.degrees)
+        spoken = describe_degrees(self.degrees)
         back = f" ({again} of them back at one)" if again else ""
         low, high = self.temperature[[0, -1]]
         worst = int(np.argmax(self.deviation))
         free = 3 * (len(self.soaks) - self.degrees[0] - 1)  # beside laws of the biases
+        forces = (self.noise, self.turn_on_scatter, self.mean, self.deviation[worst])
+        noise, turn_on, mean, largest = (f"{text_in(force, 'ug')} ug" for force in forces)
         return (
             f"{len(self.soaks)} soaks, a power cycle each, at {places} temperatures{back}, {each} attitudes in each "
-            f"({sum(counts)} in all), {_hours(self.duration)} of {_hours(self.time)}. For degrees {spoken}, a "
-            f"noise of {_ug(self.noise)} ug in |f| per attitude{self.noise_from} and {_ug(self.turn_on_scatter)} ug of "
-            f"turn-on scatter the laws will give a component of the force to {_ug(self.mean)} ug (standard deviation, "
-            f"mean over {low:g} to {high:g} degC), {_ug(self.deviation[worst])} ug where they are worst, at "
+            f"({sum(counts)} in all), {_hours_text(self.duration)} of {_hours_text(self.time)}. For degrees {spoken}, "
+            f"a noise of {noise} in |f| per attitude{self.noise_from} and {turn_on} of "
+            f"turn-on scatter the laws will give a component of the force to {mean} (standard deviation, "
+            f"mean over {low:g} to {high:g} degC), {largest} where they are worst, at "
             f"{self.temperature[worst]:.0f} degC; the turn-on offset of each later power cycle comes on top. "
             f"{free} independent offsets will tell the turn-on scatter."
-            + ("" if self.gyro is None else f" {self.gyro.said(self.temperature)}")
+            + ("" if self.gyro is None else f" {self.gyro.sentences(self.temperature)}")
         )
 
     @property
@@ -456,24 +455,32 @@ class ThermalPlan(PlannedAttitudes):
         """Standard deviation of the corrected force, and rate, at temperatures over the range: name, text and unit."""
         places = np.linspace(0, len(self.temperature) - 1, _ROWS).round().astype(int).tolist()
         at = [f"at {self.temperature[k]:.0f} degC" for k in places]
-        rows = [(f"corrected force {place}", _ug(self.deviation[k]), "ug") for place, k in zip(at, places, strict=True)]
+        rows = [
+            (f"corrected force {place}", text_in(self.deviation[k], "ug"), "ug")
+            for place, k in zip(at, places, strict=True)
+        ]
         if self.gyro is not None:
             rates = self.gyro.deviation[places].tolist()
-            rows += [(f"corrected rate {place}", hourly(u), "deg/h") for place, u in zip(at, rates, strict=True)]
+            rows += [
+                (f"corrected rate {place}", text_in(u, "deg/h"), "deg/h") for place, u in zip(at, rates, strict=True)
+            ]
         return rows
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
         """Return the plan in a few sentences, and the schedule."""
         rows = [
-            [str(k), f"{soak.temperature:.1f}", _side(soak), str(len(soak.directions)), _hours(soak.start),
-             _hours(soak.start + soak.duration)]
+            [str(k), f"{soak.temperature:.1f}", _side_text(soak), str(len(soak.directions)), _hours_text(soak.start),
+             _hours_text(soak.start + soak.duration)]
             for k, soak in enumerate(self.soaks, 1)
         ]  # fmt: skip
         return self.lead, ["soak", "degC", "reached by", "attitudes", "from, h:min", "to, h:min"], rows
 
     def tables(self) -> list[tuple[list[str], list[list[str]]]]:
-        """Return the numbers of soaks that were compared, and what the corrected force, and rate, will be off by."""
-        rows = [[str(each.soaks), str(each.attitudes), _ug(each.mean), _ug(each.worst)] for each in self.tried]
+        """Return the numbers of soaks that were compared, and the predicted deviations of force and rate."""
+        rows = [
+            [str(each.soaks), str(each.attitudes), text_in(each.mean, "ug"), text_in(each.worst, "ug")]
+            for each in self.tried
+        ]
         return [
             (["soaks", "attitudes in each", "mean sd, ug", "worst sd, ug"], rows),
             (["predicted sd of", "value", "unit"], [list(row) for row in self.predicted]),
@@ -511,7 +518,7 @@ class ThermalPlan(PlannedAttitudes):
         }
 
     def recording(self) -> Recording:
-        """Return the same as a table."""
+        """Return the attitudes of all soaks as a table."""
         counts = [len(soak.directions) for soak in self.soaks]
         up = np.vstack([soak.directions for soak in self.soaks])
 
@@ -536,59 +543,56 @@ class ThermalPlan(PlannedAttitudes):
         """Return what the sheet shows of each attitude, soak by soak."""
         pictures = []
         for number, soak in enumerate(self.soaks, 1):
-            heading = f"Soak {number}: {soak.temperature:.1f} degC, reached by {_side(soak)}, {_hours(soak.start)}"
+            heading = (
+                f"Soak {number}: {soak.temperature:.1f} degC, reached by {_side_text(soak)}, {_hours_text(soak.start)}"
+            )
             for index, up in enumerate(soak.directions):
                 of_soak = {"heading": "" if index else heading}
                 pictures.append(of_soak | attitude_entry(f"{number}.{index + 1}", up))
         return pictures
 
     def plot(self) -> Plot:
-        """Return the standard deviation of the corrected force, and rate, over temperature, and where soaks are."""
-        at = np.array([soak.temperature for soak in self.soaks])
-        traces: list[dict[str, Any]] = [
-            {"type": "scatter", "mode": "lines", "name": "predicted", "x": np.round(self.temperature, 3).tolist(),
-             "y": [float(_ug(value)) for value in self.deviation], "line": {"color": GOOD, "width": 2}},
-            {"type": "scatter", "mode": "markers", "name": "soaks", "x": np.round(at, 2).tolist(),
-             "y": [float(_ug(value)) for value in np.interp(at, self.temperature, self.deviation)],
-             "marker": {"color": BAD, "size": 8}},
-        ]  # fmt: skip
+        """Return the standard deviation of the corrected force, and rate, over temperature, with the soaks."""
+        places, at = rounded(self.temperature), np.array([soak.temperature for soak in self.soaks])
+        deviation = from_si(self.deviation, "ug")
+        at_soaks = np.interp(at, self.temperature, deviation)
+        name, line = "predicted" if self.gyro is None else "force", {"color": GOOD, "width": 2}
+        traces = [
+            scatter(places, rounded(deviation, 3), "lines", name=name, line=line),
+            scatter(rounded(at), rounded(at_soaks, 3), "markers", name="soaks", marker={"color": BAD, "size": 8}),
+        ]
         layout = {
             "xaxis": figure_axis("temperature, degC"),
             "yaxis": figure_axis("sd of the corrected force, ug", rangemode="tozero"),
             "legend": LEGEND,
         }
         if self.gyro is not None:
-            traces[0]["name"] = "force"
-            rate_sd = [float(hourly(value)) for value in self.gyro.deviation]
+            rate = rounded(from_si(self.gyro.deviation, "deg/h"), 3)
             line = {"color": _RATE, "width": 2, "dash": "dash"}
-            traces.insert(1, {**traces[0], "name": "rate at rest", "y": rate_sd, "yaxis": "y2", "line": line})
+            traces.insert(1, scatter(places, rate, "lines", name="rate at rest", line=line, yaxis="y2"))
             right = figure_axis("sd of the rate at rest, deg/h", rangemode="tozero", overlaying="y", side="right")
             layout |= {"yaxis2": {**right, "showgrid": False}, "margin": {"r": 75}}
         caption = "Of a component, root mean square over directions, without the turn-on offset of the day."
         return Plot(Figure("What the laws will give", caption, traces, layout, message=self.lead), "Thermal plan")
 
 
-def _side(soak: PlannedSoak) -> str:
+def _side_text(soak: PlannedSoak) -> str:
     return "warming" if soak.warming else "cooling"
 
 
-def _ug(value: float) -> str:
-    return f"{from_si(float(value), 'ug'):.3g}"
-
-
-def _hours(seconds: float) -> str:
+def _hours_text(seconds: float) -> str:
     minutes = round(seconds / 60)
     return f"{minutes // 60}:{minutes % 60:02d} h"
 
 
-# How many soaks at which temperatures, and which attitudes in each: what a time in the chamber gives.
+# The best plan for a time in the chamber.
 
 
 _FEWEST, _MOST, _SOAKS = 3, 40, 24
-"""Attitudes of a soak; soaks."""
+"""Fewest and most attitudes of a soak; most soaks."""
 _SCANNED = 12
-"""Attitudes of a soak by which numbers of soaks are compared: more of them change sizes, not the order."""
-_STARTS, _AS_GOOD = 4, 1.02  # of the search; plans within 2 % of the best are as good, and the simplest is taken
+"""Attitudes of a soak by which numbers of soaks are compared: more of them change the sizes, not their order."""
+_STARTS, _AS_GOOD = 4, 1.02  # starts of the search; plans within 2 % of the least mean variance count as good
 _ROOM = 23.0  # degC, from which the chamber starts
 
 
@@ -656,19 +660,19 @@ def plan_thermal(
     >>> len(plan.soaks), [round(soak.temperature) for soak in plan.soaks][:5]
     (8, [-20, -6, 20, 46, 60])
     """
-    laws, count = _laws(temperatures, degrees)
+    laws, count = _read_laws(temperatures, degrees)
     sizes = {
-        name: _above(in_si(value, name, "time", "min"), name)
+        name: _check_positive(in_si(value, name, "time", "min"), name)
         for name, value in (("time", time), ("soak", soak), ("attitude", attitude))
     }
     sigma, source = noise_of(noise)
     tau = in_si(turn_on_scatter, "turn_on_scatter", "acceleration", "mg") / STANDARD_GRAVITY
     if not 0 <= tau < 1:
         raise OptionError(f"turn_on_scatter {turn_on_scatter!r}: expected 0 or more, less than 1 g")
-    further = noise_and_scatter(gyro_noise, gyro_turn_on_scatter, asked=bool(further_of(with_, "with_")))
+    further = read_noise_and_scatter(gyro_noise, gyro_turn_on_scatter, asked=bool(parse_further(with_, "with_")))
     stated = candidates_of(from_)
     points = sphere_candidates() if stated is None else stated
-    options = _allowed(count, **sizes)
+    options = _soaks_in_time(count, **sizes)
     best = [(each, _scan(laws, count, each, tau / sigma, points)) for each in options]
     if not np.isfinite([cost for _, (cost, _) in best]).any():
         where = from_ if isinstance(from_, str) else "from_"
@@ -678,11 +682,11 @@ def plan_thermal(
             "candidates"
         )
     (soaks, _), _ = min(best, key=lambda each: each[1][0])
-    design = _design(laws, count, soaks, tau / sigma)
-    covariance, sets = _best(design, points, _counts(design, **sizes))
+    design = _make_design(laws, count, soaks, tau / sigma)
+    covariance, sets = _search_attitudes(design, points, _count_attitudes(design, **sizes))
     deviation = sigma * STANDARD_GRAVITY * design.deviations(covariance)
     unit = sigma * STANDARD_GRAVITY
-    soaks_of = tuple(_scheduled(design, sets, sizes["soak"], sizes["attitude"]))
+    soaks_of = tuple(_schedule(design, sets, sizes["soak"], sizes["attitude"]))
     gyro = None
     if further is not None:
         placed = [(each.temperature, each.directions) for each in soaks_of]
@@ -704,20 +708,20 @@ def plan_thermal(
     )
 
 
-def _laws(temperatures: Sequence[float] | str, degrees: Any) -> tuple[Laws, int]:
-    """Return the laws that a plan is for, and at how many temperatures."""
+def _read_laws(temperatures: Sequence[float] | str, degrees: Any) -> tuple[Laws, int]:
+    """Return the laws of a plan, and the number of its temperatures."""
     ends = temperature_list(temperatures, "temperatures")
     if len(ends) != 2 or not -100 <= ends[0] < ends[1] <= 150 or ends[1] - ends[0] < LEAST_SPAN:
         raise OptionError(
             f"temperatures {temperatures!r}: expected the lowest and the highest temperature, -100 to 150 degC, "
             f"{LEAST_SPAN:g} K or more apart, such as -20,60"
         )
-    wanted = degrees_of(degrees if isinstance(degrees, str) else ",".join(map(str, degrees)), "degrees")
+    wanted = parse_degrees(degrees if isinstance(degrees, str) else ",".join(map(str, degrees)), "degrees")
     if isinstance(wanted, str):
         raise OptionError("degrees 'auto': a plan needs degrees, such as 3,2,1, the highest that auto tries")
     count = max(wanted) + 2
     laws = Laws(ends[0], ends[1], wanted)
-    if np.diff(nodes(count)).min() * laws.half <= APART:
+    if np.diff(legendre_nodes(count)).min() * laws.half <= APART:
         raise OptionError(
             f"temperatures {temperatures!r}: {count} temperatures, which degree {max(wanted)} takes, would lie within "
             f"{APART:g} K of each other: expected a wider range, or lower degrees"
@@ -725,14 +729,15 @@ def _laws(temperatures: Sequence[float] | str, degrees: Any) -> tuple[Laws, int]
     return laws, count
 
 
-def _above(value: float, name: str) -> float:
+def _check_positive(value: float, name: str) -> float:
+    """Return a time, s, if it is above 0."""
     if not 0 < value < 1e8:
         raise OptionError(f"{name} {value:g} s: expected more than 0 s")
     return value
 
 
-def _allowed(count: int, time: float, soak: float, attitude: float) -> list[tuple[int, int]]:
-    """Return the numbers of soaks that the time allows, each with its attitudes in the mean."""
+def _soaks_in_time(count: int, time: float, soak: float, attitude: float) -> list[tuple[int, int]]:
+    """Return the numbers of soaks that the time allows, each with its mean number of attitudes."""
     most = min(int((time + 1e-6) // (soak + _FEWEST * attitude)), _SOAKS)
     if most < count:
         least = count * (soak + _FEWEST * attitude)
@@ -743,21 +748,22 @@ def _allowed(count: int, time: float, soak: float, attitude: float) -> list[tupl
     return [(k, min(int((time + 1e-6 - k * soak) // (k * attitude)), _MOST)) for k in range(count, most + 1)]
 
 
-def _design(laws: Laws, count: int, soaks: int, tau: float) -> Design:
-    return Design(laws, (laws.middle + laws.half * nodes(count))[way(count, soaks)], tau)
+def _make_design(laws: Laws, count: int, soaks: int, tau: float) -> Design:
+    """Return the design of soaks at `count` temperatures."""
+    return Design(laws, (laws.middle + laws.half * legendre_nodes(count))[order_soaks(count, soaks)], tau)
 
 
 def _scan(laws: Laws, count: int, option: tuple[int, int], tau: float, points: Array) -> tuple[float, float]:
-    """Return mean variance and worst deviation that a number of soaks gives, by fewer and better attitudes if many."""
+    """Return mean variance and largest deviation for a number of soaks, by at most 12 attitudes of less noise."""
     soaks, attitudes = option
     used = min(attitudes, _SCANNED, len(points))
-    design = replace(_design(laws, count, soaks, tau), variance=used / attitudes)
-    _, covariance = exchange(design, points, [used] * soaks, 1)
+    design = replace(_make_design(laws, count, soaks, tau), variance=used / attitudes)
+    _, covariance = exchange_attitudes(design, points, [used] * soaks, 1)
     return design.cost(covariance), float(design.deviations(covariance).max())
 
 
-def _counts(design: Design, time: float, soak: float, attitude: float) -> list[int]:
-    """Return the attitudes of each soak: as many as there is time for, what is left over at the ends first."""
+def _count_attitudes(design: Design, time: float, soak: float, attitude: float) -> list[int]:
+    """Return the number of attitudes of each soak that the time allows; a remainder goes to the ends first."""
     soaks = len(design.temperatures)
     whole = min(int((time + 1e-6 - soaks * soak) // attitude), soaks * _MOST)
     far = np.argsort(-np.abs(design.laws.place(design.temperatures)), kind="stable")
@@ -766,18 +772,18 @@ def _counts(design: Design, time: float, soak: float, attitude: float) -> list[i
     return [int(n) for n in counts]
 
 
-def _best(design: Design, points: Array, counts: Sequence[int]) -> tuple[Array, list[Array]]:
-    """Return covariance and attitudes of several starts: the least at its worst of those as good in the mean."""
+def _search_attitudes(design: Design, points: Array, counts: Sequence[int]) -> tuple[Array, list[Array]]:
+    """Return covariance and attitudes of the best of several starts: of the good ones that of the least maximum."""
     counts = [min(count, len(points)) for count in counts]
-    best = [exchange(design, points, counts, seed) for seed in range(1, _STARTS + 1)]
+    best = [exchange_attitudes(design, points, counts, seed) for seed in range(1, _STARTS + 1)]
     least = min(design.cost(covariance) for _, covariance in best)
     good = [each for each in best if design.cost(each[1]) <= _AS_GOOD * least]
     sets, covariance = min(good, key=lambda each: float(design.deviations(each[1]).max()))
     return covariance, sets
 
 
-def _scheduled(design: Design, sets: Sequence[Array], soak: float, attitude: float) -> list[PlannedSoak]:
-    """Return the soaks in their order, with the side that each temperature is reached from."""
+def _schedule(design: Design, sets: Sequence[Array], soak: float, attitude: float) -> list[PlannedSoak]:
+    """Return the soaks in their order, and whether each is reached by warming."""
     soaks, start, before = list[PlannedSoak](), 0.0, _ROOM
     for temperature, directions in zip(design.temperatures.tolist(), sets, strict=True):
         duration = soak + len(directions) * attitude

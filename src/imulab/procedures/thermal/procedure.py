@@ -1,4 +1,4 @@
-"""The calibration over temperature in the registry: its options, its fit from files, and what its record gives."""
+"""The calibration over temperature as the registry knows it: its fit from files, and what its record gives."""
 
 from __future__ import annotations
 
@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
     from imulab.records.triads import AccelerometerLaws, GyroscopeLaws
     from imulab.report.traces import Exhibits
-
-
-# The accelerometer triad of a unit over temperature, from recordings that are a power cycle each.
 
 
 def _fit(
@@ -62,9 +59,6 @@ TASK = Task(
     values=_values,
     fit=_fit,
 )
-
-
-# The calibration of accelerometers and gyroscopes over temperature, as the registry knows it.
 
 
 class AccelerometerLawsSection(Section):
@@ -149,11 +143,11 @@ class ThermalProcedure(Procedure):
         return tables_of(record)
 
     def laws(self, record: Calibration) -> AccelerometerLaws:
-        from imulab.procedures.thermal.device import accelerometers
+        from imulab.procedures.thermal.device import accelerometer_laws
 
-        return accelerometers(record)
+        return accelerometer_laws(record)
 
     def gyro_laws(self, record: Calibration) -> GyroscopeLaws | None:
-        from imulab.procedures.thermal.device import gyroscopes
+        from imulab.procedures.thermal.device import gyroscope_laws
 
-        return gyroscopes(record)
+        return gyroscope_laws(record)

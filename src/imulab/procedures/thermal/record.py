@@ -1,4 +1,4 @@
-"""The calibration record of a thermal test: coefficients in SI, those of the gyroscopes too."""
+"""The calibration record of a thermal test: coefficients in SI, what its figures need, and its warnings."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from imulab.procedures.thermal.degrees import (
     ChosenLaws,
     LagAndLoops,
     bias_shift_from_unobserved,
-    clusters_of,
-    disagreements,
-    drift_effects,
-    findings,
-    spoken_degrees,
+    describe_degrees,
+    list_effects,
+    number_temperatures,
+    warn_disagreement,
+    warn_lag_and_loops,
 )
 from imulab.procedures.thermal.gyro import (
     ScaleLaws,
     ThermalGyroscopes,
     block_diagonal,
     joint_covariance,
-    notes_on_turns,
-    rescaled,
+    note_turns,
+    rescale_gyroscopes,
 )
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import AXES, GROUPS, MISALIGNMENTS, SENSITIVITIES, SHARES, Laws, law_names
@@ -56,19 +56,20 @@ from imulab.procedures.thermal.solve import (
     ThermalProblem,
     ThermalSolution,
     own_calibrations,
-    together,
+    row_covariance,
 )
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, StatedGravity, entries
+from imulab.report.parameters import text_in
 from imulab.units import from_si, parse_unit
 
-# The calibration record of a thermal test: coefficients in SI, and what its figures need.
+# Accelerometers.
 
 
 _MOST_NAMED = 6  # holds that warnings name
 _SAME = 1e-9
-"""Of two values of gravity that are one."""
+"""Relative difference up to which two values of gravity are the same."""
 _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every temperature"
 
 
@@ -82,18 +83,18 @@ def make_record(
     options: Mapping[str, Any],
     name: str,
 ) -> Calibration:
-    """Turn a solution in units of g into the record."""
+    """Return the record of a solution in units of g."""
     solution, g = chosen.solution, gravity.value
     laws = solution.laws
-    values, matrix = in_si_powers(solution, gravity, scale)
+    values, matrix = convert_to_si(solution, gravity, scale)
     names, units = laws.names(), laws.units(holds.unit)
     freedom = [solution.degrees_of_freedom(row) for row in laws.to_powers()]
     parameters = {
-        key: Parameter(float(value), float(u), unit, interval_95=interval_of(float(value), float(u), nu))
+        key: Parameter(float(value), float(u), unit, interval_95=student_interval(float(value), float(u), nu))
         for key, value, u, unit, nu in zip(names, values, np.sqrt(np.diag(matrix)), units, freedom, strict=True)
     }
     if laws.knots:
-        parameters = at_reference(laws, values, matrix, "bias", "m/s^2") | parameters
+        parameters = biases_at_reference(laws, values, matrix, "bias", "m/s^2") | parameters
     residual, uncertainty = _residuals(problem, solution)
     sensor = {
         key: text for key in ("serial", "model", "element") for r in holds.recordings if (text := r.metadata.get(key))
@@ -115,44 +116,46 @@ def make_record(
                 gauge=_GAUGE,
             )
         ),
-        fit=entries(_summary(holds, residual, chosen, drift, options, g)),
+        fit=entries(_summarize_fit(holds, residual, chosen, drift, options, g)),
         options=dict(options),
         data=entries(
             ThermalEvidence(
                 holds=_hold_residuals(holds, g * residual, g * uncertainty),
-                calibrations=_alone(own_calibrations(problem, solution), holds, np.append(np.full(3, g), scale / g)),
+                calibrations=_own_calibrations(
+                    own_calibrations(problem, solution), holds, np.append(np.full(3, g), scale / g)
+                ),
             )
         ),
         sensor=sensor,
         sources=sources,
-        warnings=tuple(_findings(holds, problem, chosen, drift, gravity, options, name)),
+        warnings=tuple(_warn_fit(holds, problem, chosen, drift, gravity, options, name)),
     )
 
 
-def at_reference(laws: Laws, values: Array, covariance: Array, kind: str, unit: str) -> dict[str, Parameter]:
-    """Return the biases at T0 that a spline has there, by the name that those of polynomials have."""
-    weights, found = laws.cardinal(np.array([laws.middle]))[0], {}
+def biases_at_reference(laws: Laws, values: Array, covariance: Array, kind: str, unit: str) -> dict[str, Parameter]:
+    """Return the values of the biases' splines at T0, under the names of polynomials' biases."""
+    weights, parameters = laws.cardinal(np.array([laws.middle]))[0], {}
     for axis, part in zip(AXES, laws.parts[:3], strict=True):
         u = float(np.sqrt(weights @ covariance[part, part] @ weights))
-        found[f"{kind}_{axis}"] = Parameter(float(weights @ values[part]), u, unit)
-    return found
+        parameters[f"{kind}_{axis}"] = Parameter(float(weights @ values[part]), u, unit)
+    return parameters
 
 
-def _summary(
+def _summarize_fit(
     holds: Holds, residual: Array, chosen: ChosenLaws, drift: LagAndLoops, options: Mapping[str, Any], g: float
 ) -> ThermalSummary:
-    """Return how the laws were chosen, and how well they fit."""
-    solution, effects = chosen.solution, drift_effects(drift, g)
+    """Return ``fit``: how the laws were chosen, and how well they fit."""
+    solution, effects = chosen.solution, list_effects(drift, g)
     return ThermalSummary(
         recordings=len(holds.recordings),
         holds=len(holds),
-        temperatures=int(clusters_of(holds.temperature).max(initial=0)) + 1,
+        temperatures=int(number_temperatures(holds.temperature).max(initial=0)) + 1,
         rms=Length(value=g * float(np.sqrt(np.mean(residual**2))), unit="m/s^2"),
         excess=Length(value=g * solution.excess, unit="m/s^2"),
         chi_square=solution.chi_square,
         degrees_of_freedom=solution.freedom,
         condition_number=chosen.view.condition,
-        between_recordings=_turn_on(solution, options, g),
+        between_recordings=_turn_on_section(solution, options, g),
         left_out_temperature=[
             LeftOutTemperature(
                 temperature=each.temperature, holds=each.holds, rms=g * each.rms, chi_square=each.chi_square
@@ -177,7 +180,7 @@ def _summary(
 
 
 def _hold_residuals(holds: Holds, residual: Array, uncertainty: Array) -> HoldResiduals:
-    """Return each hold as the figures draw it; residual and uncertainty of |f| - g in m/s^2."""
+    """Return ``data.holds``; residual and uncertainty of |f| - g in m/s^2."""
     return HoldResiduals(
         recording=[holds.recordings[k].name for k in holds.recording.tolist()],
         start=holds.start.tolist(),
@@ -191,8 +194,8 @@ def _hold_residuals(holds: Holds, residual: Array, uncertainty: Array) -> HoldRe
     )
 
 
-def _alone(calibrations: list[OwnCalibration], holds: Holds, factor: Array) -> OwnCalibrations | None:
-    """Return what each recording gives alone; `factor` makes biases and scale factors SI, shape (6,)."""
+def _own_calibrations(calibrations: list[OwnCalibration], holds: Holds, factor: Array) -> OwnCalibrations | None:
+    """Return ``data.calibrations``; `factor` converts biases and scale factors to SI, shape (6,)."""
     if not calibrations:
         return None
     each = np.append(factor, np.ones(3))
@@ -205,21 +208,21 @@ def _alone(calibrations: list[OwnCalibration], holds: Holds, factor: Array) -> O
     )
 
 
-def interval_of(value: float, uncertainty: float, freedom: float) -> tuple[float, float] | None:
-    """Return the interval that holds a value with 95 % by Student's t; None where a normal distribution serves."""
+def student_interval(value: float, uncertainty: float, freedom: float) -> tuple[float, float] | None:
+    """Return the 95 % interval of a value by Student's t; None for infinite degrees of freedom."""
     if not np.isfinite(freedom):
         return None
     reach = coverage_factor(freedom) * uncertainty
     return value - reach, value + reach
 
 
-def in_si_powers(solution: ThermalSolution, gravity: Gravity, scale: Array) -> tuple[Array, Array]:
+def convert_to_si(solution: ThermalSolution, gravity: Gravity, scale: Array) -> tuple[Array, Array]:
     """Return the coefficients of powers of T - T0 in SI, and their covariance.
 
-    ``b = beta g``, ``S = scale sigma / g``; an error of gravity moves biases by dg/g and scale factors by -dg/g.
+    ``b = beta g``, ``S = scale sigma / g``; an error of gravity changes biases by dg/g and scale factors by -dg/g.
     """
     laws, g = solution.laws, gravity.value
-    factor, share = _factors(laws, g, scale)
+    factor, share = _si_factors(laws, g, scale)
     matrix = factor[:, None] * laws.to_powers()
     values = matrix @ solution.coefficients[: laws.size]
     shared = share * values * gravity.standard_uncertainty / g
@@ -227,24 +230,24 @@ def in_si_powers(solution: ThermalSolution, gravity: Gravity, scale: Array) -> t
     return values, covariance
 
 
-def _factors(laws: Laws, gravity: float, scale: Array) -> tuple[Array, Array]:
-    """Return the factor of each coefficient from units of g to SI, and what it changes by relative to gravity's."""
+def _si_factors(laws: Laws, gravity: float, scale: Array) -> tuple[Array, Array]:
+    """Return the factor of each coefficient from units of g to SI, and its relative change over that of gravity."""
     each = np.concatenate([np.full(3, gravity), scale / gravity, np.ones(3)])
     counts = np.repeat(laws.terms, 3)
     return np.repeat(each, counts), np.repeat(np.repeat([1.0, -1.0, 0.0], 3), counts)
 
 
-def of_record(record: Calibration, gravity: float, uncertainty: float) -> tuple[Laws, Array, Array, Array, float]:
-    """Return the laws of a record with coefficients and covariance in units of g, the outputs' scale, per g.
+def laws_in_g(record: Calibration, gravity: float, uncertainty: float) -> tuple[Laws, Array, Array, Array, float]:
+    """Return the laws of a record, coefficients and covariance in units of g, and the outputs' scale, per g.
 
-    Last is the variance that an error of `gravity` adds to every ``|f| / g``: none where the record rests on the same,
-    whose part is taken out of the covariance then.
+    Last is the variance that an error of `gravity` adds to every ``|f| / g``. It is 0 where the record was made with
+    the same gravity, whose error is then subtracted from the covariance.
     """
     model = thermal_of(record).model
     laws = model.laws
     names = laws.names()
     scale = np.array([gravity * abs(record.value(f"scale_factor_{axis}")) for axis in AXES])
-    factor, share = _factors(laws, gravity, scale)
+    factor, share = _si_factors(laws, gravity, scale)
     inverse = np.linalg.inv(factor[:, None] * laws.to_powers())
     values, covariance = np.array([record.value(name) for name in names]), record.cov(*names)
     stated = float(record.model["gravity"].get("standard_uncertainty") or 0.0) / model.gravity.value
@@ -257,31 +260,31 @@ def of_record(record: Calibration, gravity: float, uncertainty: float) -> tuple[
 
 
 def _residuals(problem: ThermalProblem, solution: ThermalSolution) -> tuple[Array, Array]:
-    """Return |f| - 1 less the lengthening by noise, and its standard uncertainty, of each hold, in g."""
+    """Return |f| - 1 of each hold, corrected for the lengthening by noise, and its standard uncertainty, in g."""
     rows = solution.rows
     used = rows.magnitude & (rows.owner >= 0)
     order = np.argsort(rows.owner[used])
     return rows.residual[used][order], np.sqrt(np.diag(rows.noise)[used][order])
 
 
-def _turn_on(solution: ThermalSolution, options: Mapping[str, Any], g: float) -> TurnOn:
-    """Return what biases and scale factors move by between power cycles, and how that is known."""
+def _turn_on_section(solution: ThermalSolution, options: Mapping[str, Any], g: float) -> TurnOn:
+    """Return ``fit.between_recordings``: the scatter between power cycles, and how it is known."""
     scatter = solution.scatter
     return TurnOn(
         bias=Length(value=g * float(scatter.tau[0]), unit="m/s^2"),
         scale_factor=Length(value=float(scatter.tau[1]), unit="1"),
         rank=scatter.rank,
         resolution=Length(value=g * scatter.resolution, unit="m/s^2"),
-        from_="argument" if "turn_on_scatter" in options else told_by(scatter),
+        from_="argument" if "turn_on_scatter" in options else scatter_source(scatter),
     )
 
 
-def told_by(scatter: Scatter) -> str:
-    """Return what tells the scatter between power cycles, as a record says it, where it was not stated."""
+def scatter_source(scatter: Scatter) -> str:
+    """Return how the scatter between power cycles is known, where it was not stated."""
     return "polynomials" if scatter.bound else "recordings" if scatter.rank else "unknown"
 
 
-def _findings(
+def _warn_fit(
     holds: Holds,
     problem: ThermalProblem,
     fitted: ChosenLaws,
@@ -290,13 +293,14 @@ def _findings(
     options: Mapping[str, Any],
     name: str,
 ) -> list[str]:
+    """Return the warnings and notes of a fit of the accelerometers."""
     solution = fitted.solution
     messages = [*(note for r in holds.recordings for note in r.notes), *holds.notes]
     messages += gravity_findings(gravity, holds.recordings[0])
     if not solution.scatter.rank and "turn_on_scatter" not in options:
         messages.append(
-            f"{name}: too few recordings to tell how far biases move from one power cycle to the next, so no "
-            "uncertainty holds that: record more temperatures or come back to some, or state --turn-on-scatter"
+            f"{name}: too few recordings to tell how far biases move from one power cycle to the next; no uncertainty "
+            "covers this: record more temperatures or come back to some, or state --turn-on-scatter"
         )
     if solution.scatter.bound:
         messages.append(
@@ -310,11 +314,11 @@ def _findings(
         higher, probability = fitted.missed
         messages.append(
             f"{name}: degrees {solution.laws.spelled} are too low: what {','.join(map(str, higher))} add has a "
-            f"probability of {probability:.1g} by chance, and no uncertainty holds what is missing: state higher "
-            "ones, or leave --degrees out"
+            f"probability of {probability:.1g} by chance, and the stated uncertainties do not cover what is missing: "
+            "state higher ones, or leave --degrees out"
         )
     else:
-        messages += disagreements(holds, problem, solution, name)
+        messages += warn_disagreement(holds, problem, solution, name)
     if options["degrees"] == "auto" and not solution.laws.degrees[0] and solution.scatter.tau[0] > 0:
         messages.append(
             f"{name}: the recordings' biases differ by {1e3 * solution.scatter.tau[0]:.2g} mg (standard deviation); so "
@@ -323,17 +327,17 @@ def _findings(
         )
     messages += bias_shift_from_unobserved(problem, solution, drift, name)
     if options["degrees"] == "auto":
-        messages.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
+        messages.append(Note(f"degrees chosen: {describe_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
     far = [each for each in fitted.left_out if each.chi_square > TEMPERATURE_MISSED.limit**2]
     messages += [
         f"{each.temperature:.0f} degC, left out, is missed by {1e6 * each.rms:.0f} ug rms, more than its uncertainty "
         "explains: the unit's law has a bend between the temperatures; record one more there"
         for each in far
     ]
-    messages += findings(drift, solution, name)
+    messages += warn_lag_and_loops(drift, solution, name)
     rows = solution.rows
-    # What recordings have in common is expected of power cycles, and no hold's own.
-    whole, noise = (together(rows, solution.excess**2, tau) for tau in (solution.scatter.tau, np.zeros(2)))
+    # Residuals less the part that a recording has in common, since that is due to its power cycle.
+    whole, noise = (row_covariance(rows, solution.excess**2, tau) for tau in (solution.scatter.tau, np.zeros(2)))
     left = noise @ np.linalg.solve(whole, rows.residual)
     standard = np.abs(left) / np.sqrt(np.diag(rows.noise) + solution.excess**2)
     out = np.flatnonzero((standard > HOLD_DISAGREEMENT.limit) & (rows.owner >= 0))
@@ -343,18 +347,21 @@ def _findings(
     return messages
 
 
-def law_at(record: Calibration, names: Sequence[str], functions: Array) -> tuple[Array, Array]:
-    """Return a law and its standard uncertainty, SI, shapes (n,), from what its coefficients are multiplied by."""
+def evaluate_law(record: Calibration, names: Sequence[str], functions: Array) -> tuple[Array, Array]:
+    """Return the values of a law and their standard uncertainties, SI, shapes (n,): ``F p`` and ``F C F'``.
+
+    F are its functions at n temperatures, shape (n, k), p the coefficients `names` and C their covariance.
+    """
     values: Array = functions @ np.array([record.value(each) for each in names])
     return values, np.sqrt(np.einsum("ni,ij,nj->n", functions, record.covariance.block(names), functions))
 
 
-def predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
+def predict_parameters(record: Calibration, temperature: Array) -> tuple[Array, Array]:
     """Return the nine parameters over temperature and their standard uncertainties, SI, shapes (9, n)."""
     model = thermal_of(record).model
     laws, about = model.laws, model.reference_temperature.value
     by_group = [
-        law_at(record, laws.named(group, f"{kind}_{axis}"), laws.recorded(group, temperature, about))
+        evaluate_law(record, laws.named(group, f"{kind}_{axis}"), laws.recorded(group, temperature, about))
         for group, (kind, axes) in enumerate(GROUPS)
         for axis in axes
     ]
@@ -367,41 +374,41 @@ def deviation_of_force(record: Calibration, temperature: Array) -> Array:
     Root of the mean over all directions of f, of magnitude g: the variance of the bias, and a third of those of scale
     factor and misalignment, whose covariances with it have no mean.
     """
-    values, spread = predicted(record, temperature)
+    values, spread = predict_parameters(record, temperature)
     g = thermal_of(record).model.gravity.value
     relative = np.concatenate([spread[:3] / g, spread[3:6] / np.abs(values[3:6]), spread[6:]])
     sd: Array = g * np.sqrt(SHARES @ relative**2)
     return sd
 
 
-# The gyroscopes' part of a thermal record.
+# Gyroscopes.
 
 
 def with_gyroscopes(
     record: Calibration, holds: Holds, gyros: ThermalGyroscopes, turned: ScaleLaws | None, name: str
 ) -> Calibration:
-    """Return the record with the gyroscopes' laws, their covariance (independent of the accelerometers') and data."""
-    gyros = gyros if turned is None else rescaled(gyros, turned)
+    """Return the record with the gyroscopes' laws, taken as independent of the accelerometers' ones."""
+    gyros = gyros if turned is None else rescale_gyroscopes(gyros, turned)
     laws = gyros.solution.laws
     names, units = names_and_units(laws, sensitivity=gyros.sensitivity)
-    matrix, n = _to_si(gyros, record.model["gravity"]["value"]), gyros.count
+    matrix, n = _gyro_to_si(gyros, record.model["gravity"]["value"]), gyros.count
     coefficients, covariance = gyros.solution.coefficients[:n], gyros.solution.covariance[:n, :n]
     freedom = [gyros.solution.degrees_of_freedom(row) for row in matrix]
     if turned is not None:
-        accel_names, more, their_units = scale_to_si(turned, gyros.held.size, gyros.held.unit)
+        scale_matrix, more, their_units = scale_to_si(turned, gyros.held.size, gyros.held.unit)
         names, units, freedom = names + more, units + their_units, freedom + [np.inf] * len(more)
-        matrix = block_diagonal(matrix, accel_names)
+        matrix = block_diagonal(matrix, scale_matrix)
         coefficients = np.concatenate([coefficients, turned.coefficients])
         covariance = joint_covariance(gyros, turned)
     values, covariance = matrix @ coefficients, matrix @ covariance @ matrix.T
     parameters = {
-        key: Parameter(float(value), float(u), unit, interval_95=interval_of(float(value), float(u), nu))
+        key: Parameter(float(value), float(u), unit, interval_95=student_interval(float(value), float(u), nu))
         for key, value, u, unit, nu in zip(names, values, np.sqrt(np.diag(covariance)), units, freedom, strict=True)
     }
     if laws.knots:
-        parameters = at_reference(laws, values, covariance, "gyro_bias", "rad/s") | parameters
+        parameters = biases_at_reference(laws, values, covariance, "gyro_bias", "rad/s") | parameters
     joined = block_diagonal(record.covariance.array(), covariance)
-    summary = _gyro_summary(gyros, turned, known="gyro_turn_on_scatter" in record.options)
+    summary = _summarize_gyro(gyros, turned, known="gyro_turn_on_scatter" in record.options)
     return replace(
         record,
         parameters={**record.parameters, **parameters},
@@ -420,13 +427,13 @@ def with_gyroscopes(
         },
         fit={**record.fit, "gyro": entries(summary)},
         data={**record.data, "gyro": entries(_gyro_hold_residuals(holds, gyros))},
-        warnings=(*record.warnings, *_gyro_findings(record, holds, gyros, turned, name)),
+        warnings=(*record.warnings, *_warn_gyroscopes(record, holds, gyros, turned, name)),
         verdict=UNJUDGED,
     )
 
 
-def _to_si(gyros: ThermalGyroscopes, gravity: float) -> Array:
-    """Return the matrix from the fit's coefficients to those of powers of T - T0, and of G to rad/s per m/s^2."""
+def _gyro_to_si(gyros: ThermalGyroscopes, gravity: float) -> Array:
+    """Return the matrix from the fit's coefficients to powers of T - T0, and from G to rad/s per m/s^2."""
     size, count = gyros.size, gyros.count
     matrix = np.eye(count) / gravity
     matrix[:size, :size] = gyros.solution.laws.to_powers()[:size, :size]
@@ -434,7 +441,7 @@ def _to_si(gyros: ThermalGyroscopes, gravity: float) -> Array:
 
 
 def scale_to_si(turned: ScaleLaws, size: Array, output: str) -> tuple[Array, list[str], list[str]]:
-    """Return the matrix from coefficients of scale factors to powers of T - T0, outputs per rad/s, names and units."""
+    """Return the matrix from coefficients of scale factors to powers of T - T0, output per rad/s; names and units."""
     count, width = len(turned.coefficients), turned.degree + 1
     unit = from_si(1.0, output) if parse_unit(output).quantity == "rate" else 1.0
     powers = turned.laws.to_powers()[3 : 3 + width, 3 : 3 + width]
@@ -449,8 +456,8 @@ def scale_to_si(turned: ScaleLaws, size: Array, output: str) -> tuple[Array, lis
     return matrix, names + list(MISALIGNMENTS), units + ["rad"] * len(MISALIGNMENTS)
 
 
-def _turns(turned: ScaleLaws) -> GyroTurns:
-    """Return what the turns of the recordings were, and how well they agree."""
+def _turns_section(turned: ScaleLaws) -> GyroTurns:
+    """Return ``fit.gyro.turns``: the turns of the recordings, and how well they agree."""
     return GyroTurns(
         recordings=turned.recordings,
         turns=turned.turns,
@@ -470,9 +477,9 @@ def names_and_units(laws: Laws, *, sensitivity: bool) -> tuple[list[str], list[s
     return names, units
 
 
-def _gyro_summary(gyros: ThermalGyroscopes, turned: ScaleLaws | None, *, known: bool) -> ThermalGyroSummary:
-    """Return how the gyroscopes' laws were fitted, and how well; `known` says that their turn-on scatter was stated."""
-    solution, effects = gyros.solution, drift_effects(gyros.drift, 1.0, "rad/s")
+def _summarize_gyro(gyros: ThermalGyroscopes, turned: ScaleLaws | None, *, known: bool) -> ThermalGyroSummary:
+    """Return ``fit.gyro``: how the laws were fitted, and how well; `known`: the turn-on scatter was stated."""
+    solution, effects = gyros.solution, list_effects(gyros.drift, 1.0, "rad/s")
     return ThermalGyroSummary(
         holds=len(gyros.held),
         rms=Length(value=float(np.sqrt(np.mean(solution.rows.residual**2))), unit="rad/s"),
@@ -483,7 +490,7 @@ def _gyro_summary(gyros: ThermalGyroscopes, turned: ScaleLaws | None, *, known: 
             bias=Length(value=float(solution.scatter.tau[0]), unit="rad/s"),
             rank=solution.scatter.rank,
             resolution=Length(value=solution.scatter.resolution, unit="rad/s"),
-            from_="argument" if known else told_by(solution.scatter),
+            from_="argument" if known else scatter_source(solution.scatter),
         ),
         g_sensitivity_probability=gyros.probability,
         latitude=None if gyros.held.earth is None else gyros.held.earth.latitude,
@@ -495,12 +502,12 @@ def _gyro_summary(gyros: ThermalGyroscopes, turned: ScaleLaws | None, *, known: 
             LeftOutTemperature(temperature=each.temperature, holds=each.holds, rms=each.rms, chi_square=each.chi_square)
             for each in gyros.left_out
         ],
-        turns=None if turned is None else _turns(turned),
+        turns=None if turned is None else _turns_section(turned),
     )
 
 
 def _gyro_hold_residuals(holds: Holds, gyros: ThermalGyroscopes) -> GyroHoldResiduals:
-    """Return each hold as the figures draw it; residuals in rad/s."""
+    """Return ``data.gyro``; residuals in rad/s."""
     held = gyros.held
     return GyroHoldResiduals(
         recording=[holds.recordings[k].name for k in held.recording.tolist()],
@@ -510,16 +517,17 @@ def _gyro_hold_residuals(holds: Holds, gyros: ThermalGyroscopes) -> GyroHoldResi
     )
 
 
-def _gyro_findings(
+def _warn_gyroscopes(
     record: Calibration, holds: Holds, gyros: ThermalGyroscopes, turned: ScaleLaws | None, name: str
 ) -> list[str]:
+    """Return the warnings and notes of a fit of the gyroscopes."""
     messages = [*gyros.held.notes, *([] if gyros.held.earth is None else [gyros.held.earth.note()])]
-    messages += notes_on_turns(holds, gyros.aside)
+    messages += note_turns(holds, gyros.aside)
     scatter = gyros.solution.scatter
     if not scatter.rank and "gyro_turn_on_scatter" not in record.options:
         messages.append(
-            f"gyro: {name}: too few recordings to tell how far biases move from one power cycle to the next, so no "
-            "uncertainty holds that: record more temperatures or come back to some, or state --gyro-turn-on-scatter"
+            f"gyro: {name}: too few recordings to tell how far biases move from one power cycle to the next; no "
+            "uncertainty covers this: record more temperatures or come back to some, or state --gyro-turn-on-scatter"
         )
     messages += [
         f"gyro: {each.temperature:.0f} degC, left out, is missed by {np.degrees(each.rms):.2g} deg/s rms, more than "
@@ -528,15 +536,14 @@ def _gyro_findings(
         if each.chi_square > TEMPERATURE_MISSED.limit**2
     ]
     if scatter.bound:
-        left = np.degrees(3600 * scatter.tau[0])
         messages.append(
             Note(
                 f"gyro: {name}: a spline cannot tell the offset of a power cycle from the law where a temperature has "
-                f"one recording; {left:.3g} deg/h, what polynomials of degree 3 leave, counts as the scatter between "
-                "power cycles, an upper bound: come back to temperatures to learn more"
+                f"one recording; {text_in(float(scatter.tau[0]), 'deg/h')} deg/h, what polynomials of degree 3 leave, "
+                "counts as the scatter between power cycles, an upper bound: come back to temperatures to learn more"
             )
         )
-    messages += _drifts(gyros, name)
+    messages += _warn_gyro_drift(gyros, name)
     laws = gyros.solution.laws
     bias = f"bias by a spline with {len(laws.knots)} knots" if laws.knots else f"bias of degree {laws.degrees[0]}"
     if turned is None:
@@ -545,40 +552,42 @@ def _gyro_findings(
     return [*messages, *turned.notes, Note(summary)]
 
 
-def _drifts(gyros: ThermalGyroscopes, name: str) -> list[str]:
-    """Return what lag and loop mean for corrected outputs, where they are significant."""
+def _warn_gyro_drift(gyros: ThermalGyroscopes, name: str) -> list[str]:
+    """Return warnings of a significant lag or loop, with the error that corrected outputs keep."""
     drift, messages = gyros.drift, []
     if drift.values is None or drift.covariance is None:
         return []
-    hourly, u = np.degrees(3600 * drift.values[1:]), np.sqrt(np.diag(drift.covariance))
+    u = np.sqrt(np.diag(drift.covariance))
     if 0 in drift.free:
         messages.append(
             f"gyro: {name}: biases differ from their laws by those of {drift.values[0]:.3g} s before (u {u[0]:.2g} s); "
             "corrected outputs keep that"
         )
     if 1 in drift.free:
-        each = ", ".join(f"{axis} {h:+.3g}" for axis, h in zip(AXES, hourly, strict=True))
+        loops = from_si(drift.values[1:], "deg/h")
+        each = ", ".join(f"{axis} {loop:+.3g}" for axis, loop in zip(AXES, loops, strict=True))
         messages.append(
             f"gyro: {name}: biases differ between warming and cooling: in the middle of the range they are {each} "
-            f"deg/h (u {np.degrees(3600 * u[1:].max()):.2g}) from their laws in warming, and as much the other way in "
-            "cooling, which corrected outputs keep"
+            f"deg/h (u {text_in(float(u[1:].max()), 'deg/h', 2)}) from their laws in warming, and as much the other "
+            "way in cooling, which corrected outputs keep"
         )
     return messages
 
 
-def gyro_scale_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
+def predict_gyro_scale(record: Calibration, temperature: Array) -> tuple[Array, Array]:
     """Return the three scale factors over temperature and their standard uncertainties, SI, shapes (3, n)."""
-    model = thermal_of(record).model
-    laws = model.gyro_laws
-    powers = laws.recorded(1, temperature, model.reference_temperature.value)
-    by_axis = [law_at(record, laws.named(1, f"gyro_scale_factor_{axis}"), powers) for axis in AXES]
-    return np.array([values for values, _ in by_axis]), np.array([spread for _, spread in by_axis])
+    return _predict_gyro(record, 1, "gyro_scale_factor", temperature)
 
 
-def gyro_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
+def predict_gyro_bias(record: Calibration, temperature: Array) -> tuple[Array, Array]:
     """Return the three biases over temperature and their standard uncertainties, rad/s, shapes (3, n)."""
+    return _predict_gyro(record, 0, "gyro_bias", temperature)
+
+
+def _predict_gyro(record: Calibration, group: int, kind: str, temperature: Array) -> tuple[Array, Array]:
+    """Return one kind of parameters over temperature and their standard uncertainties, SI, shapes (3, n)."""
     model = thermal_of(record).model
     laws = model.gyro_laws
-    powers = laws.recorded(0, temperature, model.reference_temperature.value)
-    by_axis = [law_at(record, laws.named(0, f"gyro_bias_{axis}"), powers) for axis in AXES]
+    functions = laws.recorded(group, temperature, model.reference_temperature.value)
+    by_axis = [evaluate_law(record, laws.named(group, f"{kind}_{axis}"), functions) for axis in AXES]
     return np.array([values for values, _ in by_axis]), np.array([spread for _, spread in by_axis])

@@ -1,4 +1,4 @@
-"""What code reads of a thermal record, with types."""
+"""The sections of a thermal record, with types: filled by those who write it, checked as it is read."""
 
 from __future__ import annotations
 
@@ -9,9 +9,6 @@ from imulab.procedures.thermal.model import Laws
 from imulab.records.calibration import Calibration
 from imulab.records.sections import Length, Measured, Part, Quantity, Size, StatedGravity, null, part
 
-# What a thermal record holds, with types: filled by those who write it, checked as it is read.
-
-
 T = TypeVar("T")
 PerHold = Annotated[list[T], "holds"]
 PerGyroHold = Annotated[list[T], "holds of gyroscopes"]
@@ -21,7 +18,7 @@ Nine = Annotated[list[T], 9]
 
 
 class LawDegrees(Part):
-    """``model.degrees``: of the laws of each kind of parameter."""
+    """``model.degrees``: the degrees of the laws of each kind of parameter."""
 
     bias: int
     scale_factor: int
@@ -29,7 +26,7 @@ class LawDegrees(Part):
 
     @property
     def each(self) -> tuple[int, int, int]:
-        """In the order of the kinds."""
+        """The degrees in the order of the kinds."""
         return self.bias, self.scale_factor, self.misalignment
 
 
@@ -99,11 +96,10 @@ class DegreesTried(Part):
 
 
 class TurnOn(Part):
-    """``fit.between_recordings``: what biases and scale factors move by from one power cycle to the next.
+    """``fit.between_recordings``: standard deviation of biases and scale factors between power cycles.
 
     `from_` says how that is known: ``recordings``, ``argument``, ``unknown``, or ``polynomials``, an upper bound.
-
-    `resolution` is the standard uncertainty of one such offset; None in records that do not say it.
+    `resolution` is the standard uncertainty of one such offset; None in older records.
     """
 
     bias: Length
@@ -114,14 +110,14 @@ class TurnOn(Part):
 
 
 class TestedEffect(Measured):
-    """``fit.lag`` in s, ``fit.loop_x`` ...: a value, its probability if there were none, whether the laws hold it."""
+    """``fit.lag`` in s, ``fit.loop_x`` ...: a value, its probability by chance, and whether it is in the fit."""
 
     probability: float
     fitted: bool
 
 
 class GyroTurnOn(Part):
-    """``fit.gyro.between_recordings``: what biases move by from one power cycle to the next, known as in `TurnOn`."""
+    """``fit.gyro.between_recordings``: standard deviation of biases between power cycles, as in `TurnOn`."""
 
     bias: Length
     rank: int
@@ -130,7 +126,7 @@ class GyroTurnOn(Part):
 
 
 class GyroTurns(Part):
-    """``fit.gyro.turns``: of how many recordings, what they miss the direction of gravity by (rms), how they agree."""
+    """``fit.gyro.turns``: numbers of recordings and turns, rms error of gravity's direction, and how they agree."""
 
     recordings: int
     turns: int
@@ -180,9 +176,9 @@ class ThermalSummary(Part):
 
 
 class HoldResiduals(Part):
-    """``data.holds``: of each its recording, edges, s, temperature, degC, its change, K/s, and what is left of |f| - g.
+    """``data.holds``: recording, edges, s, temperature, degC, its change, K/s, and residual |f| - g of each hold.
 
-    `group` numbers the rests between which the unit was not turned, None where each hold stands alone.
+    `group` numbers the holds between which the unit was not turned; None for a hold by itself.
     """
 
     recording: PerHold[str]
@@ -197,7 +193,7 @@ class HoldResiduals(Part):
 
 
 class GyroHoldResiduals(Part):
-    """``data.gyro``: of each hold its temperature, degC, its change, K/s, and what is left of the rates, rad/s."""
+    """``data.gyro``: temperature, degC, its change, K/s, and residuals of the rates, rad/s, of each hold."""
 
     recording: PerGyroHold[str]
     temperature: PerGyroHold[float]
@@ -206,9 +202,9 @@ class GyroHoldResiduals(Part):
 
 
 class OwnCalibrations(Part):
-    """``data.calibrations``: the nine parameters that each steady recording gives alone, SI, at its temperature, degC.
+    """``data.calibrations``: the nine parameters by each steady recording alone, SI, at its temperature, degC.
 
-    In the order of bias, scale factor and misalignment, as in the record's parameters.
+    In the order of bias, scale factor and misalignment.
     """
 
     recording: PerCalibration[str]
@@ -245,7 +241,7 @@ def check(record: Calibration) -> None:
 
 
 def _check_knots(model: ThermalModel, triad: ThermalModel | ThermalGyroModel, where: str) -> None:
-    """Check the knots of the biases of a triad, if they have any."""
+    """Refuse knots of a triad's biases that are no temperatures in rising order over the range."""
     (low, high), knots = model.range, triad.knots
     if knots is None:
         return
@@ -259,5 +255,5 @@ def _check_knots(model: ThermalModel, triad: ThermalModel | ThermalGyroModel, wh
 
 
 def thermal_of(record: Calibration) -> ThermalRecord:
-    """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
+    """Return the sections of a record; raises RecordError for a wrong part, for a missing one when it is asked for."""
     return part(record, ThermalRecord)

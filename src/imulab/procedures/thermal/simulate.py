@@ -1,6 +1,6 @@
-"""A simulated unit over temperature: tumbles at set points of a chamber, and rest ramps, with its truth.
+"""A simulated unit over temperature: tumbles at set points of a chamber, and rest ramps, with true parameters.
 
-The forward model is written here on its own, apart from the inverse that `imulab.procedures.thermal.model` fits with.
+The equation of the model stands here a second time, so that fit and simulation do not share errors.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY
 from imulab.writers import write_csv
 
-_ZERO = 20.0  # degC at which the laws' first coefficient holds
+_ZERO = 20.0  # degC about which the laws are powers
 _SIZES = {
     "bias": (0.05, 3e-4, 4e-6, 4e-8),  # g, g/K, ...
     "scale_factor": (0.02, 1e-4, 1e-6, 0.0),
@@ -156,7 +156,7 @@ class ThermalRecordings(Shown, Sequence[Recording]):
             return [self[k] for k in range(*index.indices(len(self)))]
         if not -len(self) <= index < len(self):
             raise IndexError(index)
-        return _recording(self, index % len(self))
+        return _simulate_recording(self, index % len(self))
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
         """Return a headline, titles and rows."""
@@ -185,7 +185,7 @@ class ThermalRecordings(Shown, Sequence[Recording]):
 
 
 def thermal_truth(temperature: Array, law: str = "cubic", seed: int = 1) -> dict[str, Array]:
-    """Return the true parameters of the simulated unit at temperatures, SI, by the names of a record."""
+    """Return the true parameters of the simulated unit at temperatures, SI, under the names of a record."""
     rng = np.random.default_rng([seed, 0])
     t, parameters = temperature - _ZERO, {}
     for kind, sizes in _SIZES.items():
@@ -200,11 +200,11 @@ def thermal_truth(temperature: Array, law: str = "cubic", seed: int = 1) -> dict
     return parameters
 
 
-def _recording(made: ThermalRecordings, index: int) -> Recording:
+def _simulate_recording(made: ThermalRecordings, index: int) -> Recording:
     rng = np.random.default_rng([made.seed, 1, index])
     tumbles = len(made) - made.ramps
     if index < tumbles:
-        time, force, turning = _tumble(made, rng)
+        time, force, turning = _simulate_tumble(made, rng)
         temperature = made.temperatures[index] + 0.3 * np.sin(time / 300.0 + rng.uniform(0, 6.28))
         again = made.temperatures[: index + 1].count(made.temperatures[index])
         name = f"tumble_{made.temperatures[index]:g}{f'_{again}' if again > 1 else ''}.csv"
@@ -230,7 +230,7 @@ def _recording(made: ThermalRecordings, index: int) -> Recording:
         columns[f"accel_{axis}"] = sensor[f"scale_factor_{axis}"] * sensed_force
     columns["temperature"] = np.round(temperature + _THERMOMETER * rng.standard_normal(len(time)), 2)
     if made.gyro:
-        columns |= _gyroscopes(made, index, temperature, turning, force)
+        columns |= _simulate_gyroscopes(made, index, temperature, turning, force)
     units = {
         "time": "s",
         **{f"gyro_{a}": "deg/s" for a in "xyz" if made.gyro},
@@ -241,10 +241,10 @@ def _recording(made: ThermalRecordings, index: int) -> Recording:
     return Recording(columns=columns, units=units, metadata=metadata, name=name)
 
 
-def _gyroscopes(
+def _simulate_gyroscopes(
     made: ThermalRecordings, index: int, temperature: Array, turning: Array, force: Array
 ) -> dict[str, Array]:
-    """Return the gyroscopes' outputs, deg/s, at the body's rates, rad/s, and specific forces, m/s^2, (n, 3) each."""
+    """Return the gyroscopes' outputs, deg/s, for rates, rad/s, and specific forces, m/s^2, shapes (n, 3)."""
     rng = np.random.default_rng([made.seed, 2, index])
     truth = thermal_gyro_truth(temperature, made.seed)
     offset = made.gyro_turn_on * rng.standard_normal(3)
@@ -261,7 +261,7 @@ def _gyroscopes(
 
 
 def thermal_gyro_truth(temperature: Array, seed: int = 1) -> dict[str, Array]:
-    """Return the true parameters of the simulated gyroscopes, SI, by a record's names; scale factors as if in rad/s."""
+    """Return the true parameters of the simulated gyroscopes, SI, under a record's names; scale factors of rad/s."""
     rng = np.random.default_rng([seed, 3])
     t, parameters = temperature - _ZERO, {}
     for axis in "xyz":
@@ -276,7 +276,7 @@ def thermal_gyro_truth(temperature: Array, seed: int = 1) -> dict[str, Array]:
     return parameters
 
 
-def _tumble(made: ThermalRecordings, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+def _simulate_tumble(made: ThermalRecordings, rng: np.random.Generator) -> tuple[Array, Array, Array]:
     """Return time, specific force, and rate: attitudes spread over the sphere, with a swayed turn between two."""
     k = np.arange(made.attitudes) + 0.5
     polar, azimuth = np.arccos(1 - 2 * k / made.attitudes), np.pi * (1 + 5**0.5) * k

@@ -1,15 +1,14 @@
-"""Least squares of ``|f(M_p, T_p)| = g`` over the holds of all recordings, and each recording by itself.
+"""Least squares of ``|f(M_p, T_p)| = g`` over the holds of all recordings, and of each recording by itself.
 
-Rows are the magnitudes of all holds and, where holds were not moved between, their components across the common
-direction u (two unknowns for each such group). Everything is in units of g.
+Rows are the magnitudes of all holds and, for holds between which the unit was not moved, their components across the
+common direction (two unknowns for each such group). Everything is in units of g.
 
-The covariance of the rows (`imulab.procedures.thermal.solve`) is
+The covariance V of the rows is the sum of the holds' noise; of an excess variance of the magnitudes; of the error of
+the temperature's reading, N(0, u_T^2), and of an offset of each bias (and scale factor) in each power cycle,
+N(0, tau^2), both of which several rows share.
 
-    V = noise + excess + sum over what several rows share: an error of the reading of the temperature, N(0, u_T^2), and
-    an offset of each bias (and scale factor) per power cycle, N(0, tau^2)
-
-tau^2 is where the generalised sum of squares exceeds that with free offsets by q, the rank that free offsets add (the
-method of moments of Mandel and Paule, for a vector). Everything is in units of g.
+tau^2 (`fit_turn_on_scatter`) is the value at which the generalised sum of squares exceeds that with free offsets by q,
+the rank that free offsets add: the method of moments of Mandel and Paule, Anal. Chem. 42 (1970) 1194, for a vector.
 """
 
 from __future__ import annotations
@@ -25,18 +24,31 @@ from imulab.estimation.least_squares import chi_square_probability, plausible_ex
 from imulab.procedures.thermal.model import Laws, forces
 from imulab.recording import Array
 
-# The rows of the least squares over temperature: residuals of holds, derivatives, and what of V they carry.
+# The rows of the least squares: residuals of holds, their derivatives, and the parts of V.
 
 
 @dataclass(frozen=True)
 class ThermalProblem:
-    """Holds in units of g: readings (n, 3), covariances of the mean (n, 3, 3), temperature, step, as in `Holds`.
+    """The holds of a fit in units of g; `temperature`, `step`, `shared`, `recording` and `group` as in `Holds`.
 
-    `rate`: change of the temperature, K/s, 0 where it counts as still; `tilt`: standard deviation of the direction of
-    an unmoved hold, rad; `zero`: biases to start from, shape (3,); `known`: a prior as rows of nine parameters,
-    ``(temperature, values (9,), covariance (9, 9))``; `free`: what is fitted beside the laws, the lag (s) as 0, the
-    loops of x, y and z (g) as 1 to 3; `side`: whether a soak was reached by warming (1) or
-    cooling (-1), 0 where nobody says; `wander`: covariance of the holds' directions beside the tilt, rad^2, (n, n).
+    Attributes
+    ----------
+    reading, covariance
+        Mean outputs over the nominal scale factor, shape (n, 3), and their covariances, shape (n, 3, 3).
+    rate
+        Change of the temperature, K/s, 0 where it counts as steady, shape (n,).
+    tilt
+        Standard deviation of the direction of an unmoved hold, rad.
+    zero
+        Biases to start from, shape (3,).
+    known
+        A prior: its temperature, nine parameters and their covariance.
+    free
+        Fitted beside the laws: the lag (s) as 0, the loops of x, y and z (g) as 1 to 3.
+    side
+        1 for a soak that was reached by warming, -1 by cooling, 0 if not stated.
+    wander
+        Covariance of the holds' directions beside the tilt, rad^2, shape (n, n).
     """
 
     reading: Array
@@ -57,11 +69,11 @@ class ThermalProblem:
 
 @dataclass(frozen=True)
 class Rows:
-    """The linearised rows at some coefficients: residuals (N,), Jacobian (N, c), own covariance as blocks.
+    """The linearised rows at some coefficients: residuals (N,), Jacobian (N, c), covariance of the noise (N, N).
 
-    `offsets` are the derivatives by an offset of bias (and scale factor) of each power cycle, (N, 3 R) each; `errors`
-    the loadings of errors of the temperature; `drift` the derivatives by lag and loops, (N, 4), fitted or not; `owner`
-    the hold of each row, -1 for a prior's; `magnitude` those that are magnitudes.
+    `offsets` are the derivatives by offsets of bias and of scale factor in each power cycle, (N, 3 R) each; `errors`
+    the derivatives by errors of the temperature, of unit variance; `drift` those by lag and loops, (N, 4), fitted or
+    not; `owner` is the hold of each row, -1 for a prior; `magnitude` marks rows that are magnitudes.
     """
 
     residual: Array
@@ -77,7 +89,7 @@ class Rows:
 def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directions: Array) -> Rows:
     """Return the rows at these coefficients; `directions` are those of the unmoved groups, shape (G, 3)."""
     n, count = len(problem.reading), int(problem.recording.max(initial=0)) + 1
-    parameters, design, drift, slope = parameters_of(problem, laws, coefficients)
+    parameters, design, drift, slope = evaluate_parameters(problem, laws, coefficients)
     force, change = forces(parameters, problem.reading)
     length = np.linalg.norm(force, axis=1)
     unit = force / length[:, None]
@@ -107,9 +119,9 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directio
         side, np.einsum("Ni,Ni->N", pick, force[owner] - base[owner]), (length - 1 - lengthening)[owner]
     )
     felt = np.einsum("Ni,Nij->Nj", pick, change[owner])
-    offsets = tuple(_per_recording(felt[:, 3 * k : 3 * k + 3], problem.recording[owner], count) for k in (0, 1))
+    offsets = tuple(_columns_by_recording(felt[:, 3 * k : 3 * k + 3], problem.recording[owner], count) for k in (0, 1))
     heat = np.einsum("Ni,Ni->N", pick, by_heat[owner]) * problem.step[owner]
-    errors = _errors(heat, owner, problem, count)
+    errors = _temperature_loadings(heat, owner, problem, count)
     by_drift = np.einsum("Nj,Njk->Nk", felt, drift[owner])
     jacobian = np.hstack([jacobian, by_drift[:, list(problem.free)], turns])
     linearised = Rows(
@@ -118,15 +130,15 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directio
     return (
         linearised
         if problem.known is None
-        else _with_prior(linearised, problem.known, laws, coefficients, problem.step.max())
+        else _add_prior(linearised, problem.known, laws, coefficients, problem.step.max())
     )
 
 
-def parameters_of(problem: ThermalProblem, laws: Laws, coefficients: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the parameters of each hold (n, 9), their derivatives by the laws' coefficients, by lag and loops, by T.
+def evaluate_parameters(problem: ThermalProblem, laws: Laws, coefficients: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the parameters of each hold (n, 9), and their derivatives by coefficients, by lag and loops, and by T.
 
-    ``p(T - L dT/dt)`` is taken to first order, which leaves p'' (L dT/dt)^2 / 2: a microgram at 20 s and 1 K/min; the
-    loop of a bias is ``h sign(dT/dt) (1 - theta^2)``, none at the ends, where the temperature turns.
+    ``p(T - L dT/dt)`` is taken to first order; the error ``p'' (L dT/dt)^2 / 2`` is a microgram at 20 s and 1 K/min.
+    The loop of a bias, ``h sign(dT/dt) (1 - theta^2)``, is 0 at the ends of the range, where the temperature turns.
     """
     size, lag_and_loops = laws.size, np.zeros(4)
     lag_and_loops[list(problem.free)] = coefficients[size:]
@@ -153,14 +165,15 @@ def _frames(unit: Array, directions: Array, group: NDArray[np.int64]) -> tuple[A
     return base, np.stack([first, np.cross(base, first)], axis=1)
 
 
-def _per_recording(felt: Array, recording: NDArray[np.int64], count: int) -> Array:
+def _columns_by_recording(felt: Array, recording: NDArray[np.int64], count: int) -> Array:
+    """Return three columns for each recording, `felt` in its own rows and 0 elsewhere, shape (N, 3 count)."""
     columns = np.zeros((len(felt), count, 3))
     columns[np.arange(len(felt)), recording] = felt
     return columns.reshape(len(felt), -1)
 
 
-def _errors(heat: Array, owner: NDArray[np.int64], problem: ThermalProblem, count: int) -> Array:
-    """Loadings of the temperature's errors: one for a recording, or for each hold of one that drifts."""
+def _temperature_loadings(heat: Array, owner: NDArray[np.int64], problem: ThermalProblem, count: int) -> Array:
+    """Return the columns of the temperature's errors: one for a recording, or for each hold of one that drifts."""
     number = np.where(problem.shared, problem.recording, count + np.arange(len(problem.recording)))[owner]
     return one_hot(number) * heat[:, None]
 
@@ -173,8 +186,8 @@ def one_hot(number: NDArray[np.int64]) -> Array:
     return columns
 
 
-def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coefficients: Array, step: float) -> Rows:
-    """Add the nine parameters of a prior at its temperature, read in steps too, which counts as one recording."""
+def _add_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coefficients: Array, step: float) -> Rows:
+    """Return the rows with nine more for the parameters of a prior at its temperature; it counts as one recording."""
     temperature, values, covariance = known
     at = np.array([temperature])
     design, heat = laws.design(at)[0], laws.slope(at)[0] @ coefficients[: laws.size] * step
@@ -199,7 +212,7 @@ def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coeff
     )
 
 
-def together(rows: Rows, excess: float, tau: Array) -> Array:
+def row_covariance(rows: Rows, excess: float, tau: Array) -> Array:
     """Return V, shape (N, N)."""
     whole = rows.noise + rows.errors @ rows.errors.T
     whole[np.diag_indices(len(whole))] += np.where(rows.owner >= 0, excess, 0.0)
@@ -210,10 +223,10 @@ def together(rows: Rows, excess: float, tau: Array) -> Array:
 
 
 def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
-    """Return what multiplies by the inverse of the Cholesky factor of V."""
+    """Return a function that multiplies by the inverse of the Cholesky factor of V."""
     from scipy.linalg import solve_triangular
 
-    factor = np.linalg.cholesky(together(rows, excess, tau))
+    factor = np.linalg.cholesky(row_covariance(rows, excess, tau))
 
     def white(columns: Array) -> Array:
         whitened: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
@@ -222,25 +235,25 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
     return white
 
 
-# Least squares of ``|f(M_p, T_p)| = g`` over the holds of all recordings, with what is common to some of them.
+# The fit.
 
 
-_PASSES, _STEPS = 4, 12  # in which scatter and solution agree; steps of Newton's method in each
+_PASSES, _STEPS = 4, 12  # passes until scatter and solution agree; Gauss-Newton steps in each
 _RESTS = 1e-10  # relative change of the coefficients that ends the steps
 _LOOSE = 0.01
-"""What temperature is taken to change, in g, while the fit starts."""
+"""Scatter that is assumed at the start, since the first fit has no laws of the temperature, g."""
 _SEEN = 1e-7
-"""Share of the largest singular value below which offsets are not told from the laws."""
+"""Share of the largest singular value, below which columns are dependent."""
 
 _TELLS = 0.1
-"""Share of what an offset moves by itself that must be left beside the laws for it to tell how far offsets go."""
+"""Least part of an offset's column beside the laws, over its length, from which it counts for the scatter."""
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Between recordings: tau of bias and scale factor, rank q that free offsets add, variance of one offset.
+    """Scatter between power cycles: tau of bias and scale factor, rank q that free offsets add, variance of an offset.
 
-    `bound`: tau is what polynomials leave, of a spline that takes the offset of each recording for the law.
+    `bound`: tau is an upper bound from the residuals of polynomials, where a spline takes offsets for the law.
     """
 
     tau: Array = field(default_factory=lambda: np.zeros(2))
@@ -251,13 +264,13 @@ class Scatter:
 
     @property
     def resolution(self) -> float:
-        """Standard uncertainty of one offset of a bias, as the recordings tell it."""
+        """Standard uncertainty of one offset of a bias as measured by the recordings."""
         return float(np.sqrt(max(self.spread[0] - self.tau[0] ** 2, 0.0)))
 
 
 @dataclass(frozen=True)
 class ThermalSolution:
-    """What was found: coefficients (c,), their covariance, rows, excess (g), tau, and degrees of freedom of each.
+    """A fit: coefficients (c,), their covariance, rows, excess (g), scatter tau, and degrees of freedom.
 
     The coefficients are those of the laws, then the lag and the loops that were fitted beside them.
     """
@@ -286,14 +299,17 @@ class ThermalSolution:
 
 
 def solve(problem: ThermalProblem, laws: Laws, *, tau: float | None = None) -> ThermalSolution:
-    """Fit the laws; `tau` is the scatter of the biases from one power cycle to the next, g, if it is known."""
+    """Return the fit of the laws; `tau` is the scatter of the biases between power cycles, g, if it is known.
+
+    Gauss-Newton steps of ``r' V^-1 r`` alternate with estimates of excess and tau, which V depends on.
+    """
     still = replace(problem, free=())
     coefficients = _start(still, laws)
-    if problem.free:  # a lag is the shift of laws that must be there first
-        begun = _directions(still, laws, coefficients)
+    if problem.free:  # the derivative by a lag is the slope of laws, which must be fitted first
+        begun = _mean_directions(still, laws, coefficients)
         coefficients = _iterate(still, laws, coefficients, begun, _LOOSE**2, np.zeros(2), 1e-6)[0]
         coefficients = np.append(coefficients, np.zeros(len(problem.free)))
-    directions = _directions(problem, laws, coefficients)
+    directions = _mean_directions(problem, laws, coefficients)
     excess, excess_freedom, scatter, converged = 0.0, np.inf, Scatter(), False
     if tau is not None:
         scatter = Scatter(np.array([tau, 0.0]))
@@ -305,18 +321,18 @@ def solve(problem: ThermalProblem, laws: Laws, *, tau: float | None = None) -> T
             break
         before = excess, scatter.tau
         if number < _PASSES - 1:
-            excess, excess_freedom = excess_of(rows, excess)
+            excess, excess_freedom = fit_excess(rows, excess)
             if tau is None:
-                scatter = between(rows, excess)
+                scatter = fit_turn_on_scatter(rows, excess)
         if number and np.allclose([excess, *scatter.tau**2], [before[0], *before[1] ** 2], rtol=1e-3, atol=1e-16):
             break
-    return concluded(laws, coefficients, rows, (excess, excess_freedom), scatter, converged=converged)
+    return conclude(laws, coefficients, rows, (excess, excess_freedom), scatter, converged=converged)
 
 
-def concluded(
+def conclude(
     laws: Laws, coefficients: Array, rows: Rows, excess: tuple[float, float], scatter: Scatter, *, converged: bool
 ) -> ThermalSolution:
-    """Return what coefficients and rows at the end of a fit say; `excess` is a variance and its degrees of freedom."""
+    """Return the solution with covariance ``(J' V^-1 J)^-1``; `excess` is a variance and its degrees of freedom."""
     white = whitener(rows, excess[0], scatter.tau)
     jacobian, residual = white(rows.jacobian), white(rows.residual)
     inverse = np.linalg.pinv(jacobian, rcond=1e-13)
@@ -331,10 +347,12 @@ def concluded(
 
 
 def _start(problem: ThermalProblem, laws: Laws) -> Array:
-    """Return the coefficients to start from: those of a fit without temperature, its outliers not told yet."""
+    """Return the coefficients to start from: those of a fit with constant parameters."""
     flat = replace(laws, degrees=(0, 0, 0), knots=())
     start = nominal(flat, problem.zero)
-    start, _, _, _ = _iterate(problem, flat, start, _directions(problem, flat, start), _LOOSE**2, np.zeros(2), 1e-3)
+    start, _, _, _ = _iterate(
+        problem, flat, start, _mean_directions(problem, flat, start), _LOOSE**2, np.zeros(2), 1e-3
+    )
     return laws.constant(start)
 
 
@@ -343,10 +361,10 @@ def nominal(laws: Laws, zero: Array) -> Array:
     return laws.constant(np.concatenate([zero, np.ones(3), np.zeros(3)]))
 
 
-def _directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
-    """Mean direction of each unmoved group at these coefficients."""
+def _mean_directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
+    """Return the mean direction of each unmoved group at these coefficients, shape (G, 3)."""
     count = int(problem.group.max(initial=-1)) + 1
-    force, _ = forces(parameters_of(problem, laws, coefficients)[0], problem.reading)
+    force, _ = forces(evaluate_parameters(problem, laws, coefficients)[0], problem.reading)
     directions = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     return directions
@@ -361,7 +379,7 @@ def _iterate(
     tau: Array,
     tolerance: float,
 ) -> tuple[Array, Array, Rows, bool]:
-    """Gauss-Newton steps with V as it is."""
+    """Return coefficients, directions and rows after Gauss-Newton steps with fixed V, and whether they converged."""
     rows = linearise(problem, laws, coefficients, directions)
     for _ in range(_STEPS):
         white = whitener(rows, excess, tau)
@@ -369,15 +387,15 @@ def _iterate(
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
         step = -np.linalg.lstsq(jacobian / scale, white(rows.residual), rcond=1e-11)[0] / scale
         coefficients = coefficients + step[: len(coefficients)]
-        directions = _directions(problem, laws, coefficients)
+        directions = _mean_directions(problem, laws, coefficients)
         rows = linearise(problem, laws, coefficients, directions)
         if np.abs(step[: laws.size]).max() < tolerance:
             return coefficients, directions, rows, True
     return coefficients, directions, rows, False
 
 
-def excess_of(rows: Rows, excess: float) -> tuple[float, float]:
-    """Return the variance that magnitudes scatter with beyond their own, whatever power cycles did, and its freedom."""
+def fit_excess(rows: Rows, excess: float) -> tuple[float, float]:
+    """Return the variance of magnitudes beyond noise, with free offsets of power cycles, and degrees of freedom."""
     white = whitener(rows, excess, np.zeros(2))
     columns = white(np.hstack([rows.jacobian, rows.offsets[0]]))
     u, values, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
@@ -392,8 +410,12 @@ def excess_of(rows: Rows, excess: float) -> tuple[float, float]:
     return float(variance[0]), float(freedom[0])
 
 
-def between(rows: Rows, excess: float) -> Scatter:
-    """Return the scatter of biases between power cycles, and of scale factors where that is significant at 5 %."""
+def fit_turn_on_scatter(rows: Rows, excess: float) -> Scatter:
+    """Return the scatter of biases between power cycles, and of scale factors where that is significant.
+
+    tau is the root of ``sum c_k^2 / (1 + s_k^2 tau^2) = q``: c_k the components of the whitened residual along the q
+    modes of offsets beside the laws, s_k their singular values.
+    """
     white = whitener(rows, excess, np.zeros(2))
     residual, laws = white(rows.residual), white(rows.jacobian)
     bias, scale = (white(columns) for columns in rows.offsets)
@@ -414,7 +436,7 @@ def between(rows: Rows, excess: float) -> Scatter:
 
 
 def offset_modes(laws: Array, offsets: Array, residual: Array) -> tuple[Array, Array]:
-    """Return the singular values of the offsets beside the laws, and what the residual has along each."""
+    """Return the singular values of the offsets' columns beside the laws, and the residual's component along each."""
     columns = laws / np.maximum(np.linalg.norm(laws, axis=0), 1e-300)
     u, values, _ = np.linalg.svd(columns, full_matrices=False)
     u = u[:, values > _SEEN * values[0]]
@@ -425,7 +447,7 @@ def offset_modes(laws: Array, offsets: Array, residual: Array) -> tuple[Array, A
 
 
 def _moments(s: Array, force: Array) -> float:
-    """Return the tau at which ``sum force^2 / (1 + s^2 tau^2)`` is the number of terms; 0 where it is less at once."""
+    """Return the tau at which ``sum force^2 / (1 + s^2 tau^2)`` is the number of terms; 0 if it is less at tau = 0."""
     if (force**2).sum() <= len(s):
         return 0.0
     low, high = 0.0, float(np.sqrt((force**2).sum())) / float(s.min())
@@ -435,13 +457,13 @@ def _moments(s: Array, force: Array) -> float:
     return 0.5 * (low + high)
 
 
-# What each recording at a steady temperature says by itself: its own calibration, to hold beside the laws.
+# The calibration of each recording at a steady temperature by itself, to be drawn beside the laws.
 
 
 _FEWEST = 12
-"""Holds, for nine parameters."""
+"""Fewest holds for nine parameters."""
 _CONDITION = 1e3
-"""Of the nine parameters' columns, each scaled to one: worse ones cannot be told apart by so few attitudes."""
+"""Largest condition number of the nine parameters' columns, each scaled to length 1."""
 
 
 @dataclass(frozen=True)
@@ -458,13 +480,12 @@ class OwnCalibration:
 
 
 def own_calibrations(problem: ThermalProblem, solution: ThermalSolution) -> list[OwnCalibration]:
-    """Return the calibration that each recording gives alone, where it can, and a prior's.
+    """Return the calibration by each recording alone, where its holds determine one, and that of a prior.
 
-    The laws at the temperature of each hold, and nine constants added to them, fitted to ``|f| = g`` of the
-    recording's holds: one Gauss-Newton step, because the laws are already near. The uncertainty holds that of the
-    temperature, which moves the point along the laws.
+    Nine constants are added to the laws and fitted to ``|f| = g`` of the recording's holds: one Gauss-Newton step,
+    since the laws are near already. The uncertainty includes that of the temperature.
     """
-    parameters, _, _, slope = parameters_of(problem, solution.laws, solution.coefficients)
+    parameters, _, _, slope = evaluate_parameters(problem, solution.laws, solution.coefficients)
     force, change = forces(parameters, problem.reading)
     length = np.linalg.norm(force, axis=1)
     columns = np.einsum("ni,nij->nj", force / length[:, None], change)
