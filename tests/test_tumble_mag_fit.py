@@ -12,8 +12,8 @@ from conftest import some_of
 from imulab.cli import main
 from imulab.columns import triad
 from imulab.errors import DataError, ObservabilityError, OptionError
-from imulab.procedures.tumble.mag.heading import law_of
-from imulab.procedures.tumble.mag.solve import stated_place
+from imulab.procedures.tumble.mag.heading import read_law
+from imulab.procedures.tumble.mag.solve import parse_place
 from imulab.recording import Recording
 from reference import magnetometer as reference
 
@@ -585,7 +585,7 @@ def test_two_records_of_one_unit_are_compared_by_what_belongs_to_the_unit(tmp_pa
 
 def test_the_report_shows_heading_over_the_attitudes_and_names_the_disturbed():
     record = il.fit_mag(disturbed(1, 0.1)[1], gravity=G, order=2).calibration
-    known, reading = law_of(record).horizontal_uncertainty(
+    known, reading = read_law(record).horizontal_uncertainty(
         G * np.array(record.data["mag"]["force"])[record.data["mag"]["used"]],
         np.array(record.data["mag"]["field"])[record.data["mag"]["used"]],
     )
@@ -672,17 +672,17 @@ def test_a_dip_of_another_place_is_refused():
 def test_what_cannot_be_is_refused_before_there_is_data(stated, said):
     arguments = {"hemisphere": None, "latitude": None, "dip": None} | stated
     with pytest.raises(OptionError, match=said):
-        stated_place(**arguments)
+        parse_place(**arguments)
     if "latitude" not in stated:
         with pytest.raises(OptionError, match=said):
             il.fit_tumble(recording(), gravity=G, order=2, with_="mag", **stated)
 
 
 def test_a_dip_near_the_magnetic_equator_is_of_either_hemisphere():
-    assert stated_place("south", None, "0.5+-0.2").hemisphere == "south"
-    assert stated_place(None, "47 deg", None).hemisphere == "north"
-    assert stated_place(None, "-15 deg", "-30").hemisphere == "south"
-    assert stated_place(None, "5 deg", None).hemisphere is None
+    assert parse_place("south", None, "0.5+-0.2").hemisphere == "south"
+    assert parse_place(None, "47 deg", None).hemisphere == "north"
+    assert parse_place(None, "-15 deg", "-30").hemisphere == "south"
+    assert parse_place(None, "5 deg", None).hemisphere is None
 
 
 def test_one_command_for_all_triads_takes_what_the_magnetometers_own_takes(tmp_path, capsys):

@@ -9,7 +9,7 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.errors import RecordError
-from imulab.procedures.tumble.mag.heading import law_of, plan_headings
+from imulab.procedures.tumble.mag.heading import plan_headings, read_law
 from imulab.procedures.tumble.plan import roll_pitch
 from imulab.recording import Recording
 from reference import magnetometer as reference
@@ -97,7 +97,7 @@ def test_uncertainties_are_those_of_a_monte_carlo_of_the_record(mag_order):
     turned = attitudes(rng, 12)
     outputs, mag = exact_outputs(truth, turned)
     found = il.apply(record, table(outputs, mag), heading=True)
-    law = law_of(record)
+    law = read_law(record)
     force, field = drawn_vectors(record, outputs, mag, rng, 4000)
     force = force + law.force_noise * rng.standard_normal(force.shape)
     field = field + law.field_noise * 48e-6 * rng.standard_normal(field.shape)
@@ -121,7 +121,7 @@ def test_whole_fits_err_by_what_the_record_predicts(reduced):
     for seed in range(trials):
         truth, record = fitted(100 + seed, dip=np.radians(0.17))
         turned = attitudes(np.random.default_rng(seed), 30)
-        law = replace(law_of(record), force_noise=0.0, field_noise=0.0)
+        law = replace(read_law(record), force_noise=0.0, field_noise=0.0)
         corrected = il.apply(record, table(*exact_outputs(truth, turned)))
         found = law.angles(corrected.triad("accel"), corrected.triad("mag") * 1e-6)
         ratios.append(np.mean((wrapped(found.heading - headings(turned)) / found.heading_uncertainty) ** 2))

@@ -14,7 +14,7 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.errors import ImulabError, OptionError, SegmentError
-from imulab.procedures.tumble.mag.heading import law_of
+from imulab.procedures.tumble.mag.heading import read_law
 from imulab.recording import Recording
 from reference import magnetometer as reference
 
@@ -70,7 +70,7 @@ def heading_errors(record, truth):
     north = m - np.einsum("ni,ni->n", m, up)[:, None] * up
     north /= np.linalg.norm(north, axis=1)[:, None]
     angle = np.arcsin(np.clip(np.einsum("ni,ni->n", np.cross(turned[:, :, 1], north), up), -1, 1))
-    stated = law_of(record).horizontal_uncertainty(f, m * (1e-6 if corrected.units["mag_x"] == "uT" else 1.0))[0]
+    stated = read_law(record).horizontal_uncertainty(f, m * (1e-6 if corrected.units["mag_x"] == "uT" else 1.0))[0]
     return float(np.std(angle)), float(np.sqrt(np.mean(stated**2)))
 
 

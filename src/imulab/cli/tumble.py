@@ -154,14 +154,14 @@ def mag(
     from imulab.gravity import gravity_option
     from imulab.procedures.registry import load
     from imulab.procedures.tumble.mag.fit import fit_mag
-    from imulab.procedures.tumble.mag.solve import stated_place
+    from imulab.procedures.tumble.mag.solve import parse_place
 
     how, accel = reading(options), options.pop("accel")
     check_outputs([output, report], [name for name in (file, accel, how["layout"]) if name])
     known = None if accel is None else load(accel)
     gravity, latitude, height = (options.pop(name) for name in ("gravity", "latitude", "height"))
     local = gravity_option(gravity, latitude, height, FLAG)
-    place = call(stated_place, hemisphere=options.pop("hemisphere"), latitude=latitude, dip=options.pop("dip"))
+    place = call(parse_place, hemisphere=options.pop("hemisphere"), latitude=latitude, dip=options.pop("dip"))
     several = {name: tuple(options.pop(name) or ()) for name in ("same_direction", "drop")}
     result = call(
         fit_mag, read_recording(file, **how), accel=known, gravity=local, hemisphere=place.hemisphere, dip=place.dip,

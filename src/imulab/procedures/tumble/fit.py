@@ -248,9 +248,9 @@ def _stated_place(
         if latitude is not None:
             in_si(latitude, "latitude", "angle", "deg")  # a wrong text is refused before data are read
         return None
-    from imulab.procedures.tumble.mag.solve import stated_place
+    from imulab.procedures.tumble.mag.solve import parse_place
 
-    return stated_place(hemisphere, latitude, dip)
+    return parse_place(hemisphere, latitude, dip)
 
 
 def _with_further(

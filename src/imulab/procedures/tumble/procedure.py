@@ -104,9 +104,9 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
             hemisphere=values["hemisphere"], dip=values["dip"],
         )  # fmt: skip
         if "mag" in values["with"]:
-            from imulab.procedures.tumble.mag.solve import stated_place
+            from imulab.procedures.tumble.mag.solve import parse_place
 
-            place = stated_place(values["hemisphere"], values["latitude"], values["dip"])
+            place = parse_place(values["hemisphere"], values["latitude"], values["dip"])
             values["hemisphere"] = place.hemisphere
     earth = at_latitude(values["latitude"], label.format("latitude")) if "gyro" in values["with"] else None
     values["place"] = None if earth is None else earth.latitude
@@ -217,9 +217,9 @@ class TumbleProcedure(Procedure):
         return tables_of(record)
 
     def heading(self, record: Calibration) -> Callable[[Recording], Recording]:
-        from imulab.procedures.tumble.mag.heading import heading_of
+        from imulab.procedures.tumble.mag.heading import make_heading_function
 
-        return heading_of(record)
+        return make_heading_function(record)
 
     def beyond(self, record: Calibration, recording: Recording) -> tuple[int, float]:
         from imulab.procedures.tumble.device import beyond_test

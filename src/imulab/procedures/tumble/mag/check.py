@@ -1,13 +1,13 @@
-"""Fresh attitudes against the magnetometers of a record, to test whether |m| and the dip still stay the same.
+"""The test whether |m| and dip of fresh attitudes are constant under a record with magnetometers.
 
-Of a place that may be another one only their constancy is tested: |m| over the record's field and the dip less the
-record's, r, with J their derivatives by the record's parameters of both triads, V its covariance, N the scatter of its
-own attitudes, and one unknown each that all |m| and all dips have in common,
+Since the place may be another one, only their constancy is tested. r holds |m| over the record's field less 1, and the
+dips less the record's; c are two unknowns that all |m| and all dips have in common. The test is
 
-    min (r - X c)' (J V J' + N)^-1 (r - X c) / (2n - 2)   against F(2n - 2, nu)
+    min over c of (r - X c)' (J V J' + N)^-1 (r - X c) / (2n - 2)   against F(2n - 2, nu)
 
-with nu the redundancy of the record's |m| and dips. With three more columns, J of the hard iron, the same says whether
-a change of hard iron alone would explain what is left, and which.
+with J the derivatives of r by the record's parameters of both triads, V their covariance, N the scatter of the record's
+own attitudes, and nu the redundancy of these. With three more columns, the derivatives by the hard iron, the same test
+shows whether a change of hard iron alone explains the residuals, and which.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from imulab.device.unit import output_factor
 from imulab.estimation.distributions import f_tail
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.device import field_in_body, specific_force
-from imulab.procedures.tumble.mag.heading import Law, law_of
-from imulab.procedures.tumble.mag.model import dips, outputs_of
+from imulab.procedures.tumble.mag.heading import Law, read_law
+from imulab.procedures.tumble.mag.model import average_outputs, dip_angles
 from imulab.procedures.tumble.schema import fit_of, mag_model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
 FEWEST = 4  # attitudes that leave |m| and dip degrees of freedom beside the place's field
-_PASSES = 5  # in which a hard iron that moved is found
-_LEAST_FREE = 3.0  # degrees of freedom: the mean of F, which is matched, exists above 2
+_PASSES = 5  # Gauss-Newton steps for a change of hard iron
+_LEAST_FREE = 3.0  # degrees of freedom; the mean of F, which is matched, exists above 2
 
 
 @dataclass(frozen=True)
@@ -40,21 +40,20 @@ class MagCheck:
     Attributes
     ----------
     magnitude, dip
-        Of each attitude, less what all have in common: parts of the field, and rad, shape (n,).
+        Residuals of each attitude beside what all have in common: parts of the field, and rad, shape (n,).
     magnitude_uncertainty, dip_uncertainty
-        Of each, from the record's covariance and scatter, shape (n,).
-    common
-        Deviations of |m| (part of the field) and dip (rad) from the record that all attitudes share: another place.
-    common_uncertainty
-        Of both.
+        Their standard uncertainties by the record's covariance and scatter, shape (n,).
+    common, common_uncertainty
+        Deviations of |m| (part of the field) and dip (rad) from the record that all attitudes share, as at another
+        place, and their standard uncertainties.
     probability
-        Of so large a scatter, did the record hold.
+        Probability of such a scatter if the record holds.
     hard_iron
-        Change of hard iron that would explain the attitudes best, in the unit of the record's biases, shape (3,).
+        Change of hard iron that explains the attitudes best, in the unit of the record's biases, shape (3,).
     explained
-        Probability of residuals as large as those that remain after such a change.
+        Probability of the residuals after such a change.
     unit
-        Of the record's biases: T, or 1 where they are parts of the field.
+        Unit of the record's biases: T, or 1 where they are parts of the field.
     """
 
     magnitude: Array
@@ -98,9 +97,9 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
     Parameters
     ----------
     record
-        With magnetometers.
+        A record with magnetometers.
     attitudes
-        Four or more, in the record's unit, of a recording with magnetometers.
+        Four attitudes or more, in the record's unit, of a recording with magnetometers.
 
     Raises
     ------
@@ -111,20 +110,20 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
     RecordError
         The record lacks a parameter or its covariance.
     """
-    law, fit, n = law_of(record), fit_of(record).mag, len(attitudes)
+    law, fit, n = read_law(record), fit_of(record).mag, len(attitudes)
     assert fit is not None
-    means = outputs_of(attitudes, np.arange(n))
+    means = average_outputs(attitudes, np.arange(n))
     factor = output_factor(attitudes.recording.name, triad("mag"), means.unit, mag_model_of(record).mag_output_unit)
     field = field_in_body(record, means.mean * factor)
     force = specific_force(record, attitudes.mean)
     length, dip = float(record.model["field"]["value"]), record.value("dip")
     slopes, _ = _slopes(law, force, field, length)
-    noise, freedom = _noise(record, n)
+    noise, freedom = _noise_variance(record, n)
     total = slopes @ law.covariance @ slopes.T + np.diag(noise)
     common: Array = np.kron(np.eye(2), np.ones((n, 1))).astype(np.float64)
     offsets, left, value, of_common = _fit_generalised(_deviations(force, field, length, dip), common, total)
     moved, after = np.zeros(3), value
-    for _ in range(_PASSES):  # |m| is not linear in a hard iron that moved far
+    for _ in range(_PASSES):  # |m| is not linear in a large change of hard iron
         there = field - moved @ np.linalg.inv(law.mag.turn).T
         design = np.hstack([common, _slopes(law, force, there, length)[1]])
         step, _, after, _ = _fit_generalised(_deviations(force, there, length, dip), design, total)
@@ -141,26 +140,27 @@ def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
 
 def _deviations(force: Array, field: Array, length: float, dip: float) -> Array:
     """Return |m| over the record's less 1, and then the dips less the record's, shape (2n,)."""
-    return np.concatenate([np.linalg.norm(field, axis=1) / length - 1, dips(field, force) - dip])
+    return np.concatenate([np.linalg.norm(field, axis=1) / length - 1, dip_angles(field, force) - dip])
 
 
 def _slopes(law: Law, force: Array, field: Array, length: float) -> tuple[Array, Array]:
-    """Return how |m| and then the dips change with all parameters, (2n, p), and with the hard iron, (2n, 3)."""
+    """Return the derivatives of |m| and then of the dips by all parameters, (2n, p), and by hard iron, (2n, 3)."""
     f_length, m_length = np.linalg.norm(force, axis=1)[:, None], np.linalg.norm(field, axis=1)[:, None]
     u, e = field / m_length, force / f_length
-    dip = dips(field, force)[:, None]
+    dip = dip_angles(field, force)[:, None]
     t, v = -(e + u * np.sin(dip)) / np.cos(dip) / m_length, -(u + e * np.sin(dip)) / np.cos(dip) / f_length
     of_mag = np.vstack([law.mag.slopes(field, u / length), law.mag.slopes(field, t)])
     of_accel = np.vstack([law.accel.slopes(force, np.zeros_like(force)), law.accel.slopes(force, v)])
     return np.hstack([of_mag, of_accel]), of_mag[:, :3]
 
 
-def _noise(record: Calibration, count: int) -> tuple[Array, float]:
-    """Variance of each |m| and dip as the record's own attitudes scatter, and its degrees of freedom.
+def _noise_variance(record: Calibration, count: int) -> tuple[Array, float]:
+    """Return the variances of |m| and dip by the scatter of the record's own attitudes, and degrees of freedom.
 
-    With a share h of an attitude in its own fit its residual has the variance (1 - h) of the noise, its leave-one-out
-    error 1 / (1 - h): the product of both root mean squares is the noise's variance, their ratio what is left of an
-    attitude. The degrees of freedom are those of one F with the mean of the two.
+    With a share h of an attitude in its own fit, its residual has 1 - h of the noise's variance, and its leave-one-out
+    error 1 / (1 - h) of it. The product of both root mean squares is therefore the variance of the noise, and their
+    ratio the share of an attitude that is free. The degrees of freedom are those of the one F whose mean is the mean of
+    the two.
     """
     fit = fit_of(record).mag
     assert fit is not None

@@ -5,18 +5,30 @@ from __future__ import annotations
 import numpy as np
 
 from imulab.estimation.rows import rms
-from imulab.procedures.tumble.mag.heading import law_of
+from imulab.procedures.tumble.mag.heading import read_law
 from imulab.procedures.tumble.schema import MagFields, MagSummary, data_of, fit_of, mag_model_of, model_of
 from imulab.records.calibration import Calibration
-from imulab.report.traces import BAD, GOOD, INK, LEGEND, QUIET, Figure, figure_axis, plain_number, rounded, scatter
+from imulab.report.traces import (
+    GOOD,
+    INK,
+    LEGEND,
+    QUIET,
+    Figure,
+    figure_axis,
+    marker,
+    number_axis,
+    plain_number,
+    rounded,
+    scatter,
+)
 
 _LABEL = "%{text}<extra></extra>"
 _PLANES = (("x", "y"), ("y", "z"), ("z", "x"))
 
 
 def mag_headline(record: Calibration) -> str:
-    """Return the result for the magnetometer triad, without a point."""
-    fit = _fit(record)
+    """Return the result for the magnetometer triad as a sentence without its full stop."""
+    fit = _read_fit(record)
     heading = np.degrees(fit.heading.standard_uncertainty.value)
     return (
         f"the field of {fit.attitudes} attitudes has one magnitude within {100 * fit.magnitude.rms:.2g} % rms and one "
@@ -25,8 +37,8 @@ def mag_headline(record: Calibration) -> str:
 
 
 def mag_facts(record: Calibration) -> list[tuple[str, str]]:
-    """Return what the report says of the magnetometers first."""
-    fit = _fit(record)
+    """Return dip, leave-one-out error of |m|, and uncertainty of heading as facts."""
+    fit = _read_fit(record)
     return [
         ("dip", f"{plain_number(float(np.degrees(record.value('dip'))), 4)} deg"),
         ("|m|, leave-one-out", f"{plain_number(100 * fit.magnitude.leave_one_out, 2)} %"),
@@ -35,28 +47,26 @@ def mag_facts(record: Calibration) -> list[tuple[str, str]]:
 
 
 def mag_figures(record: Calibration) -> list[Figure]:
-    """Return residuals of |m| and dip, the sphere before and after, and what heading is known to in each attitude."""
+    """Return residuals of |m| and dip, the sphere before and after, and the uncertainty of heading by attitude."""
     data = data_of(record).mag
     assert data is not None
-    return [_residuals(record, data), _sphere(record, data), _headings(record, data)]
+    return [_residual_figure(data), _sphere_figure(record, data), _heading_figure(record, data)]
 
 
-def _fit(record: Calibration) -> MagSummary:
+def _read_fit(record: Calibration) -> MagSummary:
     fit = fit_of(record).mag
     assert fit is not None
     return fit
 
 
-def _residuals(record: Calibration, data: MagFields) -> Figure:
+def _residual_figure(data: MagFields) -> Figure:
+    """Return the residuals of |m| and dip of each attitude, those set aside as red diamonds."""
     magnitude, dip = 100 * np.array(data.magnitude), np.degrees(data.dip)
     used = np.array(data.used)
-    colours = [GOOD if was_used else BAD for was_used in data.used]
-    shapes = ["circle" if was_used else "diamond" for was_used in data.used]
     worst = int(np.argmax(np.where(used, np.abs(dip), -1.0)))
     disturbed = [label for label, kept in zip(data.label, data.used, strict=True) if not kept]
     aside = f" Red diamonds were set aside as disturbed: {', '.join(disturbed)}." if disturbed else ""
-    marker = {"color": colours, "symbol": shapes, "size": 8}
-    texts = [f"{label}" for label in data.label]
+    look = {"marker": marker(~used, 8), "text": data.label, "xaxis": "x"}
     return Figure(
         title="Residual magnitude and dip of each attitude",
         message=f"The dip of attitude {data.number[worst]} is off most: {dip[worst]:+.2g} deg; rms "
@@ -64,15 +74,13 @@ def _residuals(record: Calibration, data: MagFields) -> Figure:
         caption="Above: |m| less the field's magnitude, in per cent. Below: dip of each attitude less the common dip. "
         f"A disturbance such as iron near shows in both, a unit that moved in the dip alone.{aside}",
         traces=[
-            scatter(data.number, rounded(magnitude), "markers", marker=marker, text=texts, xaxis="x", yaxis="y2",
-                    hovertemplate="%{text}<br>%{y:+.2f} %<extra></extra>", name="|m|"),
-            scatter(data.number, rounded(dip), "markers", marker=marker, text=texts, xaxis="x", yaxis="y",
-                    hovertemplate="%{text}<br>%{y:+.2f} deg<extra></extra>", name="dip"),
+            scatter(data.number, rounded(magnitude), "markers", **look, yaxis="y2", name="|m|",
+                    hovertemplate="%{text}<br>%{y:+.2f} %<extra></extra>"),
+            scatter(data.number, rounded(dip), "markers", **look, yaxis="y", name="dip",
+                    hovertemplate="%{text}<br>%{y:+.2f} deg<extra></extra>"),
         ],
         layout={
-            "xaxis": figure_axis(
-                "attitude", dtick=max(1, round(len(data.number) / 20)), anchor="y", range=[0.4, max(data.number) + 0.6]
-            ),
+            "xaxis": number_axis("attitude", data.number, anchor="y"),
             "yaxis": figure_axis("dip, deg", domain=[0, 0.46], zeroline=True),
             "yaxis2": figure_axis("|m|, %", domain=[0.54, 1], zeroline=True),
             "showlegend": False,
@@ -81,8 +89,8 @@ def _residuals(record: Calibration, data: MagFields) -> Figure:
     )  # fmt: skip
 
 
-def _sphere(record: Calibration, data: MagFields) -> Figure:
-    """Return outputs, scaled and renamed only, and the field after calibration, in three planes."""
+def _sphere_figure(record: Calibration, data: MagFields) -> Figure:
+    """Return the outputs, scaled and renamed alone, and the calibrated field in three planes."""
     from imulab.procedures.tumble.device import mag_axes
 
     output = np.array(data.mean) @ mag_axes(mag_model_of(record).mag_axes).T
@@ -123,10 +131,10 @@ def _sphere(record: Calibration, data: MagFields) -> Figure:
     )
 
 
-def _headings(record: Calibration, data: MagFields) -> Figure:
-    """Return the uncertainty of heading in each attitude, by the parameters, and that of one reading."""
+def _heading_figure(record: Calibration, data: MagFields) -> Figure:
+    """Return the uncertainty of heading in each attitude, by the parameters and of one reading."""
     length, gravity = float(record.model["field"]["value"]), model_of(record).gravity.value
-    known, reading = law_of(record).horizontal_uncertainty(
+    known, reading = read_law(record).horizontal_uncertainty(
         gravity * np.array(data.force), length * np.array(data.field)
     )
     known, reading = np.degrees(known), np.degrees(reading)
@@ -146,9 +154,7 @@ def _headings(record: Calibration, data: MagFields) -> Figure:
                     marker={"color": GOOD, "size": 8}, **shared),
         ],
         layout={
-            "xaxis": figure_axis(
-                "attitude", dtick=max(1, round(len(data.number) / 20)), range=[0.4, max(data.number) + 0.6]
-            ),
+            "xaxis": number_axis("attitude", data.number),
             "yaxis": figure_axis("u(heading), deg", rangemode="tozero"),
             "legend": LEGEND,
         },

@@ -1,4 +1,4 @@
-"""The magnetometer triad from what people have: data to a record of accelerometers and magnetometers together."""
+"""The fit of a magnetometer triad, from data to the record of both triads; the mathematics is in `model`, `solve`."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from imulab.procedures.tumble import HEMISPHERES, LOSSES, MAG_ORDERS
 from imulab.procedures.tumble.attitudes import TumbleData, as_attitudes
 from imulab.procedures.tumble.estimate import check_field
 from imulab.procedures.tumble.gyro.fit import with_gyro_of
-from imulab.procedures.tumble.mag.model import FEWEST, FieldMeans, mag_names, most_at_an_extreme
+from imulab.procedures.tumble.mag.model import FEWEST, FieldMeans, count_extremes, mag_names
 from imulab.procedures.tumble.mag.prepare import (
     Disturbed,
     MagObservability,
-    check_seen,
+    check_observability,
+    find_most_disturbed,
+    find_step,
     heading_uncertainty,
     judge_observability,
     leave_one_out,
-    likeliest_step,
-    most_disturbed,
     prepare,
 )
-from imulab.procedures.tumble.mag.solve import Joint, Place, Ready, solve, stated_place
+from imulab.procedures.tumble.mag.solve import Joint, Place, Ready, parse_place, solve
 from imulab.procedures.tumble.model import gravity_slope, parameter_names, parameter_units
 from imulab.procedures.tumble.record import make_record, si_parameters
 from imulab.procedures.tumble.schema import FieldAgreement, Heading, MagFields, MagModel, MagSummary, OneSample
@@ -50,23 +50,23 @@ from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, entries
 from imulab.units import parse_unit
 
-# A tumble record with the magnetometer triad added, both triads as their joint fit found them.
+# The record.
 
 
 _AXES = "xyz"
-_ATTITUDES_ASKED = 16  # attitudes below which the noise of |m| and dip is hardly told
+_ATTITUDES_ASKED = 16  # attitudes below which the noise of |m| and dip is poorly known
 _ONE_WAY = 6.0
 """Condition number from which turning the heading would halve the uncertainty, or better."""
 _LARGE_RMS, _LARGE_DIP = 0.02, np.radians(1.0)
-"""Scatter of |m| and dip that steady attitudes in one field do not have; the worst of real ones: 0.5 %, 0.3 deg."""
-_HOPELESS = 5.0  # times that
-_POINTING = np.radians(3.0)
-_OF_THE_EARTH = 22e-6, 67e-6  # T
+"""Scatter of |m| and dip, rad, that attitudes at rest in one field do not have; of real ones at most 0.5 %, 0.3 deg."""
+_HOPELESS = 5.0  # times that, from which the record is bad
+_POINTING = np.radians(3.0)  # scatter of attitudes that point the same way, from which there is a warning
+_OF_THE_EARTH = 22e-6, 67e-6  # T, least and largest magnitude of the Earth's field
 _BUILDING = 1.4
 """Factor by which iron in a building may raise or lower the field."""
 
 
-def with_mag(
+def make_mag_record(
     ready: Ready, joint: Joint, observability: MagObservability, aside: Sequence[Disturbed], options: Mapping[str, Any]
 ) -> Calibration:
     """Return the record of both triads: parameters, covariance, and residuals of |m| and dip of each attitude."""
@@ -74,10 +74,10 @@ def with_mag(
         ready.estimate, ready.gravity, ready.scaling,
         {"order": ready.order, "method": "norm", "loss": ready.loss, "gravity": ready.gravity.value},
     )  # fmt: skip
-    known = _covariance(ready, joint)
+    known = _parameter_covariance(ready, joint)
     heading = heading_uncertainty(joint, known)
-    names, values, matrix, units = _values(ready, joint, known)
-    parameters = _parameters(names, values, matrix, units, joint.freedom[: len(names)])
+    names, values, matrix, units = _convert_to_si(ready, joint, known)
+    parameters = _make_parameters(names, values, matrix, units, joint.freedom[: len(names)])
     accel_parameters = accel.parameters
     moved = {
         name: (parameters[name].value - accel_parameters[name].value) / u
@@ -92,38 +92,38 @@ def with_mag(
         accel,
         parameters=kept | {name: parameters[name] for name in mag_names(joint.pair.mag_order)},
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
-        model={**accel.model, **entries(_model(ready, joint))},
+        model={**accel.model, **entries(_model_section(ready, joint))},
         fit={
             **accel.fit,
             "mag": entries(
-                _summary(ready, joint, observability, aside, moved, heading, _sample_noise(ready, parameters))
+                _summarize_fit(ready, joint, observability, aside, moved, heading, _sample_noise(ready, parameters))
             ),
         },
         options={
             **accel.options,
             **{f"mag_{name}" if name == "loss" else name: value for name, value in options.items()},
         },
-        data={**accel.data, "mag": entries(_fields(ready, joint, aside))},
+        data={**accel.data, "mag": entries(_fields_section(ready, joint, aside))},
         warnings=(
             *accel.warnings,
             *ready.means.notes,
             *ready.notes,
-            *_warnings(ready, joint, observability, aside, moved, options, heading[0]),
+            *_warn_fit(ready, joint, observability, aside, moved, options, heading[0]),
             *_warn_stated_dip(parameters["dip"], options.get("dip")),
         ),
         verdict=UNJUDGED,
     )
 
 
-def _covariance(ready: Ready, joint: Joint) -> Array:
-    """Covariance of the scaled parameters, the accelerometers' whatever their order is, shape (p, p)."""
+def _parameter_covariance(ready: Ready, joint: Joint) -> Array:
+    """Return the covariance of the scaled parameters, with that of the accelerometers' order, shape (p, p)."""
     covariance = joint.covariance.copy()
     covariance[joint.pair.layout.of_accel, joint.pair.layout.of_accel] += _order_covariance(ready)
     return covariance
 
 
-def _values(ready: Ready, joint: Joint, known: Array) -> tuple[list[str], Array, Array, list[str]]:
-    """Names, values, covariance and units of all parameters, the magnetometers' first."""
+def _convert_to_si(ready: Ready, joint: Joint, known: Array) -> tuple[list[str], Array, Array, list[str]]:
+    """Return names, values in SI, covariance and units of all parameters, the magnetometers' first."""
     layout, order = joint.pair.layout, ready.estimate.problem.order
     g = ready.gravity.value
     of_mag, mag_slope = ready.mag.in_si(joint.theta[: layout.mag])
@@ -156,10 +156,10 @@ def _order_covariance(ready: Ready) -> Array:
     return gained
 
 
-def _parameters(
+def _make_parameters(
     names: list[str], values: Array, matrix: Array, units: list[str], freedom: Array
 ) -> dict[str, Parameter]:
-    """Parameters with intervals of Student's t, of the degrees of freedom that each variance has."""
+    """Return the parameters with 95 % intervals of Student's t, by the degrees of freedom of each variance."""
     parameters = {}
     for name, value, u, unit, nu in zip(
         names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, freedom.tolist(), strict=True
@@ -169,8 +169,8 @@ def _parameters(
     return parameters
 
 
-def _model(ready: Ready, joint: Joint) -> MagModel:
-    """Return the law of the magnetometers, and which output became which axis."""
+def _model_section(ready: Ready, joint: Joint) -> MagModel:
+    """Return ``model``: order, unit and field of the magnetometers, and which output became which axis."""
     axes = " ".join(
         f"{'+' if row[output] > 0 else '-'}{'xyz'[output]}"
         for row, output in zip(ready.mag.axes, np.abs(ready.mag.axes).argmax(axis=1).tolist(), strict=True)
@@ -184,7 +184,7 @@ def _model(ready: Ready, joint: Joint) -> MagModel:
     )
 
 
-def _summary(
+def _summarize_fit(
     ready: Ready,
     joint: Joint,
     observability: MagObservability,
@@ -193,7 +193,7 @@ def _summary(
     heading: tuple[float, float],
     one_sample: OneSample | None,
 ) -> MagSummary:
-    """Return how well magnitude and dip of the field agree over the attitudes."""
+    """Return ``fit.mag``: how well magnitude and dip of the field agree over the attitudes."""
     predicted, residuals = leave_one_out(joint), joint.found.residuals
     directed = joint.pair.held is not None
     return MagSummary(
@@ -226,8 +226,8 @@ def _sample_noise(ready: Ready, parameters: Mapping[str, Parameter]) -> OneSampl
     )
 
 
-def _fields(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> MagFields:
-    """Return of each attitude that was used its number, mean output, field (of length 1) and residuals."""
+def _fields_section(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> MagFields:
+    """Return ``data.mag``: number, mean output, field (of length 1) and residuals of each attitude."""
     used = ready.pair.mag
     layout = joint.pair.layout
     every = ready.pair if layout.mag == ready.pair.layout.mag else replace(ready.pair, mag_order=joint.pair.mag_order)
@@ -245,13 +245,13 @@ def _fields(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> MagFields
 
 
 def _warn_scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> list[str]:
-    """Say if |m| or dip scatter so much that the triads do not belong together, or the field was not steady."""
+    """Return a warning where |m| or dip scatter more than in a steady field and with triads that belong together."""
     magnitude, dip = rms(joint.found.residuals[:, 1]), rms(joint.found.residuals[:, 2])
     worst = max(magnitude / _LARGE_RMS, dip / _LARGE_DIP)
     if worst <= 1:
         return []
     kind = Bad if worst > _HOPELESS else str
-    count, axis, value = most_at_an_extreme(means.mean[used])
+    count, axis, value = count_extremes(means.mean[used])
     clipped = f", is mag_{_AXES[axis]} saturated at {value:.4g} {means.unit} ({count} attitudes)" if count > 2 else ""
     return [
         kind(
@@ -262,8 +262,8 @@ def _warn_scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> li
 
 
 def _warn_step(joint: Joint, labels: Sequence[str]) -> list[str]:
-    """Warn of a step of |m| and dip from some attitude on."""
-    step = likeliest_step(joint)
+    """Return a warning of a step of |m| and dip from some attitude on."""
+    step = find_step(joint)
     if step is None or step.probability > FIELD_STEP.level:
         return []
     return [
@@ -275,7 +275,7 @@ def _warn_step(joint: Joint, labels: Sequence[str]) -> list[str]:
 
 
 def _warn_stated_dip(dip: Parameter, stated: Sequence[float] | None) -> list[str]:
-    """Say if the dip is off what was stated, beyond the uncertainty of both."""
+    """Return a warning where the dip is off the stated one by more than the uncertainty of both."""
     if stated is None:
         return []
     off, sigma = dip.value - stated[0], float(np.hypot(dip.standard_uncertainty or 0.0, stated[1]))
@@ -289,6 +289,7 @@ def _warn_stated_dip(dip: Parameter, stated: Sequence[float] | None) -> list[str
 
 
 def _note_set_aside(label: str, off: Disturbed) -> str:
+    """Return the warning that names an attitude which was set aside, and by how much it is off."""
     return (
         f"mag: {label} set aside: |m| {100 * abs(off.magnitude):.2g} % "
         f"{'high' if off.magnitude > 0 else 'low'}, dip {np.degrees(abs(off.dip)):.2g} deg "
@@ -296,7 +297,7 @@ def _note_set_aside(label: str, off: Disturbed) -> str:
     )
 
 
-def _warnings(
+def _warn_fit(
     ready: Ready,
     joint: Joint,
     observability: MagObservability,
@@ -305,6 +306,7 @@ def _warnings(
     options: Mapping[str, Any],
     heading: float,
 ) -> list[str]:
+    """Return the warnings and notes of a fit of both triads."""
     attitudes = ready.estimate.attitudes
     messages = [_note_set_aside(attitudes.label(disturbed.index), disturbed) for disturbed in aside]
     n = len(joint.pair.mag)
@@ -368,14 +370,13 @@ def _warn_field_size(field: float, unit: str) -> str:
     )
 
 
-# The magnetometer triad from what people have: data to a record of the accelerometers and magnetometers together.
+# The fit.
 
 
-_STEEPEST = np.radians(87.0)
-_OFF = np.radians(0.5)
-_CONTRADICTS = 4.0
-"""Standard uncertainties, and rad, beyond which a stated dip is refused."""
-_GAIN = 0.9  # of the leave-one-out errors of |m| and dip, multiplied: quadratic terms must gain 10 %
+_STEEPEST = np.radians(87.0)  # dip from which headings cannot be determined
+_OFF, _CONTRADICTS = np.radians(0.5), 4.0
+"""A fitted dip is refused that is off the stated one by more than this, rad, and by so many standard uncertainties."""
+_GAIN = 0.9  # quadratic terms must lower the product of the leave-one-out errors of |m| and dip to this part
 _MOST_ASIDE = 5
 """At most one attitude of so many is set aside."""
 
@@ -391,9 +392,9 @@ class MagFit(Result):
     joint
         The fit, in units of gravity and of the field.
     seen
-        What the attitudes determine.
+        Observability of the magnetometers' parameters.
     set_aside
-        Attitudes that were left out, from 0, with how they miss the others.
+        Attitudes that were left out, from 0, with their deviations from the others.
 
     Examples
     --------
@@ -491,7 +492,7 @@ def fit_mag(
     """
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
     _check_options(loss, mag_order, order, magnitude)
-    place = stated_place(hemisphere, latitude, dip)
+    place = parse_place(hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_mag)
     known = None if accel is None else as_record(accel, "fit_mag: accel")
     ready = prepare(
@@ -505,17 +506,17 @@ def fit_mag(
     )
     name = attitudes.recording.name
     try:
-        with np.errstate(all="ignore"):  # what runs away ends in no solution
+        with np.errstate(all="ignore"):  # a diverging fit ends in LinAlgError
             joint, aside = _solve_pair(ready, loss, str(mag_order))
             what = judge_observability(joint.pair, joint.theta)
-        if same_direction and not what.enough:  # it was where the fit began
+        if same_direction and not what.enough:  # it was enough at the start of the fit
             raise np.linalg.LinAlgError
     except np.linalg.LinAlgError:
         raise DataError(
             f"{name}: the fit of both triads finds no solution: are both of the same attitudes, by one clock"
             f"{', and does one axis point the same way in those of same-direction' if same_direction else ''}?"
         ) from None
-    check_seen(what, np.delete(ready.kept, [one.index for one in aside]), name)
+    check_observability(what, np.delete(ready.kept, [one.index for one in aside]), name)
     _check_result(joint, ready, place)
     options = {
         "loss": loss, "mag_order": mag_order if mag_order == "auto" else int(mag_order),
@@ -524,7 +525,7 @@ def fit_mag(
         "same_direction": [group if isinstance(group, str) else list(group) for group in same_direction],
     }  # fmt: skip
     set_options = {name: value for name, value in options.items() if value not in (None, [])}
-    record = with_mag(ready, joint, what, aside, set_options)
+    record = make_mag_record(ready, joint, what, aside, set_options)
     if known is not None and not ready.notes:
         record = with_gyro_of(record, known)
     return MagFit(record, joint, what, aside)
@@ -540,22 +541,22 @@ def _check_options(loss: str, mag_order: int | str, order: int | str, field: flo
 
 
 def _solve_pair(ready: Ready, loss: str, mag_order: str) -> tuple[Joint, tuple[Disturbed, ...]]:
-    """Fit both triads, leave disturbed attitudes out, and take the order that is asked for."""
+    """Return the fit of both triads in the order that is asked for, and the disturbed attitudes that it leaves out."""
     robust = loss == "huber"
     joint, aside = solve(ready.pair, ready.start, robust=robust), tuple[Disturbed, ...]()
     if loss == "auto":
         joint, aside = _leave_out_disturbed(joint, ready)
     if mag_order != "1":
-        joint = _order_two(joint, mag_order, robust=robust)
+        joint = _fit_order_two(joint, mag_order, robust=robust)
     return joint, aside
 
 
 def _leave_out_disturbed(joint: Joint, ready: Ready) -> tuple[Joint, tuple[Disturbed, ...]]:
-    """Leave out the attitude that fits the others worst, and solve again, as long as one is disturbed."""
+    """Return the fit without disturbed attitudes, left out one by one, the worst first, and these attitudes."""
     aside: list[Disturbed] = []
     left = np.arange(len(ready.pair.mag))
     while len(left) > FEWEST and len(aside) < len(ready.pair.mag) // _MOST_ASIDE:
-        worst = most_disturbed(joint)
+        worst = find_most_disturbed(joint)
         if worst.probability >= FIELD_SET_ASIDE.level:
             break
         without = np.delete(left, worst.index)
@@ -567,8 +568,8 @@ def _leave_out_disturbed(joint: Joint, ready: Ready) -> tuple[Joint, tuple[Distu
     return joint, tuple(aside)
 
 
-def _order_two(joint: Joint, asked: str, *, robust: bool) -> Joint:
-    """Fit quadratic terms too; with ``auto`` keep them where they predict better and the gain is significant."""
+def _fit_order_two(joint: Joint, asked: str, *, robust: bool) -> Joint:
+    """Return the fit with quadratic terms; with ``auto`` only if it predicts better and the gain is significant."""
     pair = replace(joint.pair, mag_order=2)
     at = joint.pair.layout.dip_at
     second = solve(pair, np.insert(joint.theta, [at] * 3, 0.0), robust=robust)
@@ -586,6 +587,7 @@ def _order_two(joint: Joint, asked: str, *, robust: bool) -> Joint:
 
 
 def _check_result(joint: Joint, ready: Ready, place: Place) -> None:
+    """Refuse a fit that diverged, or whose dip is vertical, of the other hemisphere, or far off the stated one."""
     name = ready.estimate.attitudes.recording.name
     if not joint.converged and not np.isfinite(joint.theta).all():
         raise DataError(f"{name}: the fit of both triads does not converge on these attitudes")

@@ -1,19 +1,18 @@
-"""Magnetic heading and dip of each sample, and which way to face in each attitude of a plan.
+"""Magnetic heading and dip of each sample, and headings of the attitudes of a plan.
 
-With the corrected f and m, ``a = m x f`` points to magnetic east and ``n = f x a`` to magnetic north; the heading of
-the body's x axis, clockwise from north, and the dip are
+Heading (`Law.angles`): with the corrected f and m, ``a = m x f`` points to magnetic east and ``n = f x a`` to magnetic
+north. The heading of the body's x axis, clockwise from north, and the dip are
 
     heading = atan2(|f| a_x, n_x),    dip = atan2(-m.f, |a|)
 
-A sample's uncertainty is that of the record's parameters, through ``dv = T^-1 (ds - dT v)``,
-``ds = (-(A + b) dS/S - db - sum dk_j s^j) / A'(s)`` of both triads with their common covariance, of the scatter that
-the record's attitudes show, and of the noise of one sample in the recording that the record was made from. A unit that
-moves has ``|f|^2 = g^2 + a^2`` with a level acceleration a: where |f| is off g by more than 1 %, which gravity and
-calibration are not, a counts as noise of each axis of f.
+Their uncertainty is that of the parameters of both triads, by ``dv = T^-1 (ds - dT v)`` with
+``ds = (-(A + b) dS/S - db - sum dk_j s^j) / A'(s)``; of the scatter of the record's attitudes; and of the noise of one
+sample. A moving unit has ``|f|^2 = g^2 + a^2`` with a horizontal acceleration a: where |f| is off g by more than 1 %,
+more than gravity and calibration are, a counts as noise of each axis of f.
 
-An attitude is the upward direction in the body frame; which way it faces is the direction of one body axis, the one
-nearest the horizontal. Headings are exchanged one by one, from several starts, for those with the least sum of the
-variances of the magnetometers' parameters and the dip (A-optimal), the accelerometers being known.
+Plan (`plan_headings`): an attitude is the direction up in the body frame; its heading is the direction of the body axis
+that is nearest to the horizontal. Headings are exchanged one by one, from several starts, for the least sum of the
+variances of the magnetometers' parameters and the dip (A-optimal), with known accelerometers.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from imulab.procedures.tumble.mag.model import (
     MAGNETOMETERS,
     Pairs,
     ParameterLayout,
-    invariants,
+    evaluate_invariants,
     mag_names,
 )
 from imulab.procedures.tumble.mag.solve import world_axes
@@ -70,7 +69,7 @@ class Triad:
         return cls(values[:3], values[3:6], turn, pairs, values[fixed:].reshape(-1, 3))
 
     def slopes(self, vectors: Array, gradient: Array) -> Array:
-        """Return how something with a gradient by the vectors changes with the parameters; (n, 3), (n, 3) to (n, p)."""
+        """Return the derivatives by the parameters, (n, p), of a function with a `gradient` by the vectors, (n, 3)."""
         s = vectors @ self.turn.T
         along = gradient @ np.linalg.inv(self.turn)
         orders = range(2, len(self.powers) + 2)
@@ -95,7 +94,7 @@ class Angles:
 
 @dataclass(frozen=True)
 class Law:
-    """What heading and dip follow from: both triads, the covariance of their parameters, noise of f and m, gravity.
+    """Both triads, covariance of their parameters, noise of f and m, and gravity, which give heading and dip.
 
     `force_noise` is in m/s^2, `field_noise` a part of the field, each of one axis.
     """
@@ -133,10 +132,10 @@ class Law:
         return Angles(heading, np.minimum(u_heading, _UNKNOWN), dip, self._uncertainty(force, field, v, t))
 
     def horizontal_uncertainty(self, force: Array, field: Array) -> tuple[Array, Array]:
-        """Return the standard uncertainty of magnetic heading whatever axis points, rad, shape (n,): by the parameters.
+        """Return the standard uncertainty of magnetic heading of any body axis, rad: by the parameters, of a reading.
 
-        The second also holds the noise of one reading. An error dm turns the horizontal part of the field by
-        ``east . dm / |m| cos(dip)``, one df the vertical.
+        Shapes (n,). An error dm turns the horizontal part of the field by ``east . dm / |m| cos(dip)``; an error df
+        turns the vertical. That of a reading includes the noise.
         """
         east, north, up = world_axes(field, force).transpose(1, 0, 2)
         by_field = east / np.einsum("ni,ni->n", north, field)[:, None]
@@ -147,6 +146,7 @@ class Law:
         )
 
     def _uncertainty(self, force: Array, field: Array, by_force: Array, by_field: Array) -> Array:
+        """Return the standard uncertainty of an angle with these gradients by f and m, rad, shape (n,)."""
         slopes = np.hstack([self.mag.slopes(field, by_field), self.accel.slopes(force, by_force)])
         known = np.einsum("np,pq,nq->n", slopes, self.covariance, slopes, optimize=True)
         off = np.abs((force**2).sum(axis=1) - self.gravity**2)
@@ -157,7 +157,7 @@ class Law:
         return total
 
 
-def law_of(record: Calibration) -> Law:
+def read_law(record: Calibration) -> Law:
     """Return the law of heading and dip of a record with magnetometers.
 
     Raises
@@ -183,7 +183,7 @@ def law_of(record: Calibration) -> Law:
     )
 
 
-def law_of_samples(law: Law, record: Calibration) -> Law:
+def add_sample_noise(law: Law, record: Calibration) -> Law:
     """Return the law for samples of a recording, which are noisier than the means of attitudes."""
     mag = fit_of(record).mag
     if mag is None or mag.of_one_sample is None:
@@ -196,16 +196,16 @@ def law_of_samples(law: Law, record: Calibration) -> Law:
     )
 
 
-def heading_of(record: Calibration) -> Callable[[Recording], Recording]:
-    """Return what adds columns heading, std_heading, dip and std_dip, deg, to a recording that the record corrected.
+def make_heading_function(record: Calibration) -> Callable[[Recording], Recording]:
+    """Return a function that adds heading, std_heading, dip and std_dip, deg, to a recording corrected by the record.
 
     Raises
     ------
     RecordError
-        As for `law_of`.
+        As for `read_law`.
     """
-    of_means = law_of(record)
-    of_each = law_of_samples(of_means, record)
+    of_means = read_law(record)
+    of_each = add_sample_noise(of_means, record)
 
     def with_heading(recording: Recording) -> Recording:
         for name in (*triad("accel"), *triad("mag")):
@@ -226,27 +226,27 @@ def heading_of(record: Calibration) -> Callable[[Recording], Recording]:
     return with_heading
 
 
-# Which way to face in each attitude of a plan, so that magnetometers are seen as well as accelerometers.
+# Headings of the attitudes of a plan.
 
 
 QUARTERS = ("north", "east", "south", "west")
 _DIP = np.radians(67.0)
 _SCATTER = 3e-3
-"""Of |m|, as a part of the field, and of the dip, rad: what good recordings show (0.1 to 0.5 %, 0.16 to 0.29 deg)."""
-# Of the search; attitudes over all of them (with many, the first is as good); sweeps of one
+"""Scatter of |m|, as a part of the field, and of the dip, rad, in good recordings (0.1 to 0.5 %, 0.16 to 0.29 deg)."""
 _STARTS, _ATTITUDES_OVER_STARTS, _SWEEPS = 12, 600, 40
+"""Starts of the search, fewer with many attitudes: at most so many over all starts; and sweeps of one start."""
 _RIDGE = 1e-9  # keeps a design that is not determined yet invertible
 _LAYOUT = ParameterLayout(6 + len(MAGNETOMETERS), 6 + len(ACCELEROMETERS))
 
 
 @dataclass(frozen=True)
 class Headings:
-    """Which way each attitude of a plan faces, and what that gives for a magnetometer.
+    """The heading of each attitude of a plan, and the predicted uncertainty of a magnetometer.
 
     Attributes
     ----------
     axis
-        The body axis that points the way, 0 to 2, shape (n,).
+        The body axis whose heading is meant, 0 to 2, shape (n,).
     step
         Its heading, in steps of a full turn over `steps`, clockwise from north, shape (n,).
     steps
@@ -254,14 +254,15 @@ class Headings:
     north
         The direction of north in the body frame, shape (n, 3).
     covariance
-        Of biases and scale factors (parts of the field and of themselves), misalignments and dip, rad, per variance of
-        |m| and dip, shape (13, 13).
+        Covariance of biases and scale factors (parts of the field and of themselves), misalignments and dip, rad, over
+        the variance of |m| and dip, shape (13, 13).
     heading
-        Standard uncertainty of magnetic heading by the parameters, rad, per standard deviation of |m| and dip, rms.
+        Standard uncertainty of magnetic heading by the parameters, rad, over the standard deviation of |m| and dip,
+        rms over attitudes.
     condition_number
-        Of the scaled Jacobian.
+        Condition number of the scaled Jacobian.
     already
-        Number of attitudes with a known heading that were there before.
+        Number of earlier attitudes with a known heading.
     """
 
     axis: NDArray[np.int64]
@@ -285,7 +286,7 @@ class Headings:
         return dict(zip(mag_names(1), sigma.tolist(), strict=True)) | {"heading": _SCATTER * self.heading}
 
     def rows(self) -> list[tuple[str, str, str]]:
-        """Return the same as name, text and unit as people read it."""
+        """Return the same as name, text and unit."""
         kinds = {
             "mag_bias": (100.0, "% of the field"),
             "mag_scale_factor": (100.0, "%"),
@@ -299,7 +300,7 @@ class Headings:
 
     @property
     def lead(self) -> str:
-        """What the headings are for, and what they give."""
+        """The purpose of the headings, and their prediction, in a few sentences."""
         there = f", with {self.already} that were there before" if self.already else ""
         return (
             f" Every attitude faces one of four ways{there}, so that a magnetometer is seen too: condition number "
@@ -313,18 +314,18 @@ class Headings:
 def plan_headings(
     directions: Array, *, before: tuple[Array, Array] | None = None, steps: int = 4, seed: int = 1
 ) -> Headings:
-    """Choose which way each attitude faces.
+    """Return the best heading of each attitude.
 
     Parameters
     ----------
     directions
         Upward directions in the body frame, shape (n, 3).
     before
-        The same, and that of north, of attitudes already there.
+        Directions up and north of earlier attitudes.
     steps
         Headings to choose from in a full turn.
     seed
-        Of the random starts.
+        Seed of the random starts.
 
     Raises
     ------
@@ -339,11 +340,13 @@ def plan_headings(
     if count < FEWEST:
         raise OptionError(f"with_ mag: {count} attitudes; a magnetometer needs {FEWEST} or more, better 16")
     axis = np.argmin(np.abs(np.round(directions, 6)), axis=1)
-    norths = np.stack([_north(directions, axis, 2 * np.pi * step / steps) for step in range(steps)], axis=1)
+    norths = np.stack(
+        [_direction_of_north(directions, axis, 2 * np.pi * step / steps) for step in range(steps)], axis=1
+    )
     known, of_heading = _derivatives(np.repeat(directions, steps, axis=0), norths.reshape(-1, 3))
     rows = known.reshape(len(directions), steps, 2, -1)
     base = np.zeros((0, rows.shape[-1])) if before is None else _derivatives(*before)[0].reshape(-1, rows.shape[-1])
-    chosen = _exchange(rows, base, np.random.default_rng(seed))
+    chosen = _exchange_headings(rows, base, np.random.default_rng(seed))
     place = np.arange(len(directions))
     every = np.vstack([base, rows[place, chosen].reshape(-1, rows.shape[-1])])
     scaled = every / np.maximum(np.linalg.norm(every, axis=0), 1e-300)
@@ -359,7 +362,7 @@ def plan_headings(
     return Headings(axis, chosen, steps, norths[place, chosen], covariance, heading, condition, count - len(directions))
 
 
-def _north(up: Array, axis: NDArray[np.int64], heading: float) -> Array:
+def _direction_of_north(up: Array, axis: NDArray[np.int64], heading: float) -> Array:
     """Return the direction of north, (n, 3), where the horizontal part of a body axis points `heading` from it."""
     pointer = np.eye(3)[axis]
     pointer = pointer - np.einsum("ni,ni->n", pointer, up)[:, None] * up
@@ -375,14 +378,14 @@ def _derivatives(up: Array, north: Array) -> tuple[Array, Array]:
     theta[3:6] = 1.0
     theta[_LAYOUT.of_accel] = np.repeat([0.0, 1.0, 0.0], 3)
     theta[_LAYOUT.dip_at] = _DIP
-    evaluated = invariants(theta, up, field, _LAYOUT)
+    evaluated = evaluate_invariants(theta, up, field, _LAYOUT)
     east = world_axes(field, up)[:, 0]
     of_heading = np.einsum("ni,nip->np", east, evaluated.field.by_parameters) / np.cos(_DIP)
     return evaluated.by_parameters[:, 1:3, : _LAYOUT.mag + 1], of_heading
 
 
-def _exchange(rows: Array, base: Array, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Exchange headings until none helps, from several random starts; return the best set's, shape (n,)."""
+def _exchange_headings(rows: Array, base: Array, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return the best headings of several random starts, each exchanged until no exchange helps, shape (n,)."""
     count, steps, _, size = rows.shape
     each = np.einsum("nkri,nkrj->nkij", rows, rows)
     fixed = base.T @ base + _RIDGE * np.eye(size)

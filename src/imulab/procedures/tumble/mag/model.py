@@ -1,4 +1,4 @@
-"""Accelerometers and magnetometers at rest: what one attitude says of both triads, and how certain its means are.
+"""The model of accelerometers and magnetometers at rest, and the magnetometers' means in the attitudes.
 
 s = T m,  A_i = s_i (+ k2_i s_i^2),  M_i = S_i A_i + h_i          both triads, with a T of their own
 
@@ -29,7 +29,7 @@ from imulab.procedures.tumble.model import invert
 from imulab.recording import Array, Recording, check_finite
 from imulab.units import parse_unit
 
-# Accelerometers and magnetometers at rest: what one attitude says of both triads.
+# The model.
 
 
 Pairs = tuple[tuple[int, int], ...]
@@ -42,7 +42,7 @@ _AXES = "xyz"
 
 @dataclass(frozen=True)
 class Vectors:
-    """The vector that a triad measures, shape (n, 3), and what its derivatives are made of.
+    """The vector that a triad measures, shape (n, 3), and the parts of its derivatives.
 
     ``dv = T^-1 (ds - dT v)``, ``ds = (dA - sum dk_j s^j) / A'(s)``: `back` is ``T^-1``, `slope` is A'(s), `reading` A.
     """
@@ -57,9 +57,10 @@ class Vectors:
     highest: int
 
     def slopes(self, gradient: Array) -> tuple[Array, Array]:
-        """Return how something changes with parameters and outputs, of its gradients by the vector.
+        """Return the derivatives by parameters, (n, k, p), and outputs, (n, k, 3), of k functions of the vector.
 
-        Shape (n, k, 3) to (n, k, p), in the order zero (3), scale (3), misalignments, nonlinearity, and (n, k, 3).
+        `gradient` are their gradients by the vector, shape (n, k, 3). The parameters are in the order zero (3),
+        scale (3), misalignments, nonlinearity.
         """
         along = gradient @ self.back
         steep = along / self.slope[:, None, :]
@@ -75,8 +76,8 @@ class Vectors:
         return self.slopes(np.broadcast_to(np.eye(3), (len(self.vector), 3, 3)))[0]
 
 
-def triad(theta: Array, output: Array, pairs: Pairs) -> Vectors:
-    """Invert a triad's model: ``v = T^-1 s``.
+def invert_triad(theta: Array, output: Array, pairs: Pairs) -> Vectors:
+    """Return the vector that a triad measures, by the inverse of its model: ``v = T^-1 s``.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def triad(theta: Array, output: Array, pairs: Pairs) -> Vectors:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Where the parameters stand: magnetometers' (m), the dip, accelerometers' (f), and of directions held (d)."""
+    """Places of the parameters: of magnetometers, the dip, of accelerometers, and of held directions."""
 
     mag: int
     accel: int
@@ -143,7 +144,7 @@ class Invariants:
     field: Vectors
 
 
-def dips(field: Array, force: Array) -> Array:
+def dip_angles(field: Array, force: Array) -> Array:
     """Return ``atan2(-u.e, |u x e|)``, rad, shape (n,): positive where the field points against the specific force."""
     turn, back = [1, 2, 0], [2, 0, 1]
     across = field[:, turn] * force[:, back] - field[:, back] * force[:, turn]  # np.cross takes four times as long
@@ -151,7 +152,7 @@ def dips(field: Array, force: Array) -> Array:
     return angle
 
 
-def invariants(theta: Array, accel: Array, mag: Array, layout: ParameterLayout) -> Invariants:
+def evaluate_invariants(theta: Array, accel: Array, mag: Array, layout: ParameterLayout) -> Invariants:
     """Return residuals and derivatives at a parameter vector.
 
     ``dr0 = e' df``, ``dr1 = u' dm``, ``dr2 = t' dm/|m| + v' df/|f| - d(delta)`` with
@@ -166,11 +167,11 @@ def invariants(theta: Array, accel: Array, mag: Array, layout: ParameterLayout) 
     layout
         Places of the parameters.
     """
-    m = triad(theta[: layout.mag], mag, MAGNETOMETERS)
-    f = triad(theta[layout.of_accel], accel, ACCELEROMETERS)
+    m = invert_triad(theta[: layout.mag], mag, MAGNETOMETERS)
+    f = invert_triad(theta[layout.of_accel], accel, ACCELEROMETERS)
     m_length, f_length = (np.sqrt((sensed.vector**2).sum(axis=1)) for sensed in (m, f))
     u, e = m.vector / m_length[:, None], f.vector / f_length[:, None]
-    dip = dips(m.vector, f.vector)
+    dip = dip_angles(m.vector, f.vector)
     sine, cosine = np.sin(dip)[:, None], np.cos(dip)[:, None]
     t = -(e + u * sine) / cosine / m_length[:, None]
     v = -(u + e * sine) / cosine / f_length[:, None]
@@ -193,17 +194,18 @@ def mag_names(order: int) -> list[str]:
     ]
 
 
-# The magnetometers in the attitudes that the accelerometers found: means, and how certain they are.
+# Means of the magnetometers in the attitudes of the accelerometers, and their covariance.
 
 
-FEWEST = 10  # attitudes for the nine parameters of |m| and one to check
-_BATCHES = 8  # parts of a hold by whose scatter its mean is known
+FEWEST = 10  # attitudes: for nine parameters of |m|, and one to check
+_BATCHES = 8  # parts of a hold whose scatter gives the variance of its mean
 _DEAD = 1e-3  # of the largest span: an axis that spans less is dead
 _CLIPPED = 0.3
 """Share of the attitudes at one extreme of an axis from which it is taken for saturated."""
 _FLAT = 0.05  # of the largest spread: outputs that spread less across a plane lie in it
 _MAGNET_NEAR = 4.5
-"""Distance from the middle of the outputs, over its median: up to 4.1 where axes differ in scale by a factor of 2."""
+"""Distance from the middle of the outputs over its median, from which a magnet was near; up to 4.1 without, where axes
+differ in scale by a factor of 2."""
 _FIELDS = (5e-6, 2e-4)
 """Magnitudes that the field can have near the Earth's surface, T: from a quarter of the least to thrice the most."""
 
@@ -212,10 +214,10 @@ _FIELDS = (5e-6, 2e-4)
 class FieldMeans:
     """Outputs of the magnetometers in each attitude.
 
-    `mean` has shape (n, 3), `covariance` (n, 3, 3), or None for a table that does not state it, not a number where an
-    attitude was not asked for; `unit` is that of the columns, `notes` what was left out. `of_one_sample` is the
-    standard deviation of one axis of accelerometers and magnetometers at rest, each in the unit of its columns, None
-    for a table.
+    `mean` has shape (n, 3), `covariance` (n, 3, 3), not a number for attitudes that were not asked for; the latter is
+    None for a table that does not state it. `unit` is that of the columns, `notes` say what was left out.
+    `of_one_sample` is the standard deviation of one axis of accelerometers and of magnetometers at rest, each in the
+    unit of its columns; None for a table.
     """
 
     mean: Array
@@ -226,24 +228,24 @@ class FieldMeans:
 
 
 def field_means(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
-    """Return the magnetometers' outputs in the attitudes `kept`, from 0, that a fit can be made of.
+    """Return the magnetometers' mean outputs in the attitudes `kept`, from 0, checked for a fit.
 
     Raises
     ------
     DataError
         A constant or saturated axis, outputs in one plane, an attitude far from all others, too few attitudes, and as
-        for `outputs_of`.
+        for `average_outputs`.
     OptionError, UnitError
-        As for `outputs_of`.
+        As for `average_outputs`.
     """
-    means = outputs_of(attitudes, kept)
-    _check(replace(means, mean=means.mean[kept]), attitudes.recording.name, triad_of_columns("mag"))
+    means = average_outputs(attitudes, kept)
+    _check_means(replace(means, mean=means.mean[kept]), attitudes.recording.name, triad_of_columns("mag"))
     _check_far(means.mean[kept], [attitudes.label(i) for i in kept], kept, attitudes.recording.name)
     return means
 
 
-def outputs_of(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
-    """Return the magnetometers' outputs in the attitudes `kept`, from 0, of a recording that has them.
+def average_outputs(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
+    """Return the magnetometers' mean outputs in the attitudes `kept`, from 0.
 
     A magnetometer that is slower than its log has samples in some of the rows, and no numbers in the others.
 
@@ -278,6 +280,7 @@ def outputs_of(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
 
 
 def _means_of_table(attitudes: Attitudes, recording: Recording, names: list[str], unit: str) -> FieldMeans:
+    """Return the rows of a table of attitudes as means, with the covariance that it states."""
     check_finite(recording, names)
     rows = attitudes.start.astype(np.int64) - recording.first_row
     covariance = stated_covariance(recording, names, unit)
@@ -287,8 +290,8 @@ def _means_of_table(attitudes: Attitudes, recording: Recording, names: list[str]
 def _means_of_stretches(
     attitudes: Attitudes, kept: NDArray[np.intp], recording: Recording, names: list[str], unit: str
 ) -> FieldMeans:
-    """Means over the stretches at rest, and their covariance from batches, shrunk towards what all have in common."""
-    left_out, there = _readings(recording, names)
+    """Return the means over the stretches at rest, and their covariance by batches, shrunk towards the usual one."""
+    left_out, there = _read_samples(recording, names)
     samples = left_out.recording.triad("mag")
     pieces = attitudes.pieces
     assert pieces is not None
@@ -317,7 +320,7 @@ def _means_of_stretches(
     covariance = (weight * batch_covariance + POOL_DEGREES * batch_covariance[usual].mean(axis=0)) / (
         weight + POOL_DEGREES
     )
-    step = np.array([_step(samples[rest, axis]) for axis in range(3)])
+    step = np.array([_smallest_step(samples[rest, axis]) for axis in range(3)])
     covariance[:, range(3), range(3)] += np.where(
         covariance[kept][:, range(3), range(3)].mean(axis=0) < 1e-3 * step**2, step**2 / 12, 0.0
     )
@@ -325,8 +328,8 @@ def _means_of_stretches(
     return FieldMeans(mean, covariance, unit, tuple(left_out.notes(rest)), (of_accel, of_mag))
 
 
-def _readings(recording: Recording, names: list[str]) -> tuple[LeftOut, NDArray[np.bool_]]:
-    """Return what is left out among the rows that hold a sample of the magnetometers, and which rows these are."""
+def _read_samples(recording: Recording, names: list[str]) -> tuple[LeftOut, NDArray[np.bool_]]:
+    """Return the recording without invalid samples of the magnetometers, and which rows hold a sample."""
     there = np.logical_not(np.isnan(recording.triad("mag")).all(axis=1))
     filled = {name: np.where(there, recording.column(name), 0.0) for name in names}
     check_finite(recording.with_columns(filled, {}), names)
@@ -342,13 +345,14 @@ def _readings(recording: Recording, names: list[str]) -> tuple[LeftOut, NDArray[
     return LeftOut(recording.with_columns(columns, {}), left_out.names, kinds), there
 
 
-def _step(values: Array) -> float:
-    """Smallest step between the values of a channel, 0 for one value."""
+def _smallest_step(values: Array) -> float:
+    """Return the smallest step between the values of a channel, 0 for one value."""
     different = np.unique(values)
     return float(np.diff(different).min()) if len(different) > 1 else 0.0
 
 
-def _check(means: FieldMeans, name: str, names: list[str]) -> None:
+def _check_means(means: FieldMeans, name: str, names: list[str]) -> None:
+    """Refuse too few attitudes, a dead or saturated axis, and outputs in one plane."""
     n = len(means.mean)
     if n < FEWEST:
         raise DataError(f"{name}: {n} attitudes; a magnetometer needs {FEWEST} or more, better 16, at several headings")
@@ -359,7 +363,7 @@ def _check(means: FieldMeans, name: str, names: list[str]) -> None:
                 f"{name}: column {column}: the output changes by {span[axis]:.3g} {means.unit} over the {n} attitudes, "
                 f"other axes by {span.max():.3g} {means.unit}: a dead axis?"
             )
-    count, axis, extreme = most_at_an_extreme(means.mean)
+    count, axis, extreme = count_extremes(means.mean)
     if count > max(2, _CLIPPED * n):
         word = "largest" if extreme > means.mean[:, axis].mean() else "smallest"
         raise DataError(
@@ -374,15 +378,15 @@ def _check(means: FieldMeans, name: str, names: list[str]) -> None:
         )
 
 
-def most_at_an_extreme(mean: Array) -> tuple[int, int, float]:
-    """Return in how many attitudes an axis has its largest or smallest output, and which axis and output that is."""
+def count_extremes(mean: Array) -> tuple[int, int, float]:
+    """Return the most attitudes in which one axis has its largest or smallest output, that axis, and that output."""
     ends = [(axis, float(end(mean[:, axis]))) for axis in range(3) for end in (np.max, np.min)]
     near = 1e-6 * np.ptp(mean, axis=0)
     return max((int((np.abs(mean[:, axis] - value) <= near[axis]).sum()), axis, value) for axis, value in ends)
 
 
 def _check_far(mean: Array, labels: Sequence[str], kept: NDArray[np.intp], name: str) -> None:
-    """Refuse outputs of one attitude that no field of the others' magnitude gives, which would bend the whole fit."""
+    """Refuse outputs of one attitude that are far from all others, as with a magnet near."""
     distance = np.linalg.norm(mean - np.median(mean, axis=0), axis=1)
     distance /= np.median(distance)
     worst = int(np.argmax(distance))
@@ -394,7 +398,7 @@ def _check_far(mean: Array, labels: Sequence[str], kept: NDArray[np.intp], name:
 
 
 def check_magnitude(length: float, unit: str, name: str, field: float | None) -> None:
-    """Check that the magnitude that the outputs turn through, in the columns' unit, can be that of the field, T.
+    """Refuse a unit in which the magnitude of the outputs, `length`, cannot be that of the field, T.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the joint fit of both triads starts from, and what the attitudes say of the fit itself."""
+"""The start of the joint fit of both triads, its observability, and the attitudes that disagree with the others."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from imulab.procedures.tumble.mag.model import (
     FieldMeans,
     check_magnitude,
     field_means,
-    triad,
+    invert_triad,
 )
 from imulab.procedures.tumble.mag.solve import (
     Joint,
@@ -32,7 +32,7 @@ from imulab.procedures.tumble.mag.solve import (
     Ready,
     find_held_directions,
     find_start,
-    nominal_mag,
+    scale_magnetometers,
     weighted_jacobian,
     world_axes,
 )
@@ -42,16 +42,16 @@ from imulab.procedures.tumble.schema import data_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
-# What the attitudes say of the fit itself: predicted errors, attitudes that were disturbed, what cannot be seen.
+# Leave-one-out errors, disturbed attitudes, steps of the field, and observability.
 
 
 WORST_CONDITION = 30.0
-"""Attitudes that all face one way have 45 and more; within 20 deg of one way 7, at any heading 3."""
+"""Largest condition number of a fit; attitudes that all face one way have 45 and more, at any heading 3."""
 _BLIND = 1 / 2000
 """Singular value, relative to the largest, below which a combination is not determined."""
-_HELPS = 0.05  # mean square of magnetic east along a direction: below it a turn about that does not show in the dip
+_HELPS = 0.05  # mean square of magnetic east along a direction, below which a turn about it does not show in the dip
 _LEAST_PART = 3
-"""Attitudes before and after a step: of fewer each is held against all others."""
+"""Fewest attitudes before and after a step; fewer are tested one by one."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Predicted:
 
 
 def leave_one_out(joint: Joint) -> Predicted:
-    """Return ``L (I - H_pp)^-1 L^-1 r_p`` of each attitude, ``V = L L'``."""
+    """Return the errors of each attitude under the fit to all others: ``L (I - H_pp)^-1 L^-1 r_p``, ``V = L L'``."""
     n, k = joint.found.residuals.shape
     jacobian = weighted_jacobian(joint)
     q = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0][: n * k].reshape(n, k, -1)[:, :3]
@@ -91,8 +91,8 @@ class Disturbed:
     dip: float
 
 
-def most_disturbed(joint: Joint) -> Disturbed:
-    """Hold each attitude's |m| and dip against the others.
+def find_most_disturbed(joint: Joint) -> Disturbed:
+    """Return the attitude whose |m| and dip agree least with the others, and the probability of that.
 
     ``d = x' (I - H)^-1 x`` of the whitened |m| and dip, ``(d/2) / ((c - d) / (nu - 2))`` against F(2, nu - 2), with c
     and nu the sum of squares and the redundancy of all |m| and dips; p is that times the number of attitudes.
@@ -121,11 +121,11 @@ class FieldStep:
     probability: float
 
 
-def likeliest_step(joint: Joint) -> FieldStep | None:
-    """Return the split of the attitudes, in their order, at which |m| and dip change most; None of too few attitudes.
+def find_step(joint: Joint) -> FieldStep | None:
+    """Return the most significant step of |m| and dip from one attitude on, in their order; None for too few.
 
-    Both change by a number of their own, which the fit would have found beside its parameters; the gain, in the sum of
-    squares c of |m| and dips with nu degrees of freedom, is held against F(2, nu - 2), times the number of splits.
+    Each split adds two unknowns to the fit, one to |m| and one to the dips after it. By what they lower the sum of
+    squares of |m| and dips, of nu degrees of freedom, is tested by F(2, nu - 2), times the number of splits.
     """
     n, k = joint.found.residuals.shape
     splits = np.arange(_LEAST_PART, n - _LEAST_PART + 1)
@@ -153,12 +153,12 @@ def likeliest_step(joint: Joint) -> FieldStep | None:
 
 @dataclass(frozen=True)
 class MagObservability:
-    """What |m| and the dip determine of the magnetometers' parameters and the dip.
+    """Observability of the magnetometers' parameters and the dip.
 
     Attributes
     ----------
     rank, size
-        Combinations that are determined, and their number.
+        Number of determined combinations, and number of parameters.
     condition
         Largest over smallest singular value, columns scaled to length 1.
     blind
@@ -175,12 +175,12 @@ class MagObservability:
 
     @property
     def enough(self) -> bool:
-        """Whether everything is determined, and well enough to be of use."""
+        """Whether all parameters are determined, with a condition number below the largest allowed."""
         return self.rank == self.size and self.condition < WORST_CONDITION
 
 
 def judge_observability(pair: Pair, theta: Array) -> MagObservability:
-    """Return what the attitudes determine, at the start parameters or at the solution."""
+    """Return the observability of the magnetometers by these attitudes at parameters theta."""
     layout = pair.layout
     evaluated = pair.evaluate(theta)
     jacobian = evaluated.by_parameters[:, 1:3, : layout.mag + 1]
@@ -207,10 +207,8 @@ def judge_observability(pair: Pair, theta: Array) -> MagObservability:
 def heading_uncertainty(joint: Joint, covariance: Array) -> tuple[float, float]:
     """Return the standard uncertainty of magnetic heading, rad: by the parameters, rms of the attitudes; of a reading.
 
-    `covariance` is that of the parameters, shape (p, p).
-
-    An error dm of the field turns its horizontal part by ``east . dm / |m| cos(dip)``, one df of the specific force the
-    vertical.
+    An error dm of the field turns its horizontal part by ``east . dm / |m| cos(dip)``; an error df of the specific
+    force turns the vertical. `covariance` is that of the parameters, shape (p, p).
     """
     layout, evaluated = joint.pair.layout, joint.found
     m, f = evaluated.field.vector, evaluated.force.vector
@@ -228,7 +226,7 @@ def heading_uncertainty(joint: Joint, covariance: Array) -> tuple[float, float]:
     return float(np.sqrt(np.mean(known))), float(np.sqrt(reading))
 
 
-# What the joint fit of both triads starts from: the accelerometers by themselves, and where the magnetometers are.
+# The start of the joint fit: the accelerometers by themselves, and first values of the magnetometers.
 
 
 def prepare(
@@ -241,7 +239,10 @@ def prepare(
     same_direction: Sequence[str | Sequence[int]],
     drop: Sequence[int | str],
 ) -> Ready:
-    """Fit the accelerometers by themselves, find where the joint fit starts, and refuse what it cannot see."""
+    """Return both triads ready for the joint fit, with the accelerometers fitted by themselves.
+
+    Attitudes that do not determine the magnetometers are refused.
+    """
     name, count = attitudes.recording.name, len(attitudes)
     dropped = _parse_numbers(drop, count, "drop")
     kept = np.setdiff1d(np.arange(count), dropped)
@@ -249,8 +250,8 @@ def prepare(
     groups = [_parse_numbers(group, count, "same-direction") for group in same_direction]
     if known is not None:
         check_prior(known)
-    local = _gravity(gravity, known, attitudes)
-    order, loss = _order_and_loss(known, order, attitudes)
+    local = _choose_gravity(gravity, known, attitudes)
+    order, loss = _choose_order_and_loss(known, order, attitudes)
     used = attitudes.only(kept) if dropped.size else attitudes
     check_attitudes(used, local.value)
     scaling = nominal_scaling(used, local.value)
@@ -258,27 +259,27 @@ def prepare(
     kept = kept[estimate.found.aside.others(len(kept))] if estimate.found.aside.index else kept
     if len(kept) < FEWEST:
         raise DataError(f"{name}: {len(kept)} attitudes are left; a magnetometer needs {FEWEST} or more")
-    prior, notes = _prior(known, attitudes, estimate, scaling, local)
+    prior, notes = _read_prior(known, attitudes, estimate, scaling, local)
     theta = estimate.solution.theta[0]
-    force = triad(theta, estimate.problem.reading[0], ACCELEROMETERS).vector
+    force = invert_triad(theta, estimate.problem.reading[0], ACCELEROMETERS).vector
     begin = find_start(means.mean[kept], force / np.linalg.norm(force, axis=1)[:, None])
-    mag, first = nominal_mag(begin, field)
+    mag, first = scale_magnetometers(begin, field)
     check_magnitude(mag.size, means.unit, name, field)
-    pair, start = _pair(estimate, means, kept, mag, prior), np.concatenate([first, [begin.dip], theta])
+    pair, start = _make_pair(estimate, means, kept, mag, prior), np.concatenate([first, [begin.dip], theta])
     if groups:
         places = [np.flatnonzero(np.isin(kept, group)).tolist() for group in groups]
         _check_groups(places, name)
-        held, more = find_held_directions(triad(first, pair.mag, MAGNETOMETERS).vector, force, places)
+        held, more = find_held_directions(invert_triad(first, pair.mag, MAGNETOMETERS).vector, force, places)
         pair, start = replace(pair, held=held), np.concatenate([start, more])
     try:
-        check_seen(judge_observability(pair, start), kept, name)
+        check_observability(judge_observability(pair, start), kept, name)
     except np.linalg.LinAlgError:
         raise DataError(f"{name}: the attitudes determine no field: are both triads of the same attitudes?") from None
     return Ready(estimate, scaling, local, means, kept, mag, pair, start, order, loss, notes)
 
 
-def _order_and_loss(known: Calibration | None, order: int | str, attitudes: Attitudes) -> tuple[int | str, str]:
-    """Return order and loss of the accelerometers' own fit: as asked, or as their record says that they were fitted."""
+def _choose_order_and_loss(known: Calibration | None, order: int | str, attitudes: Attitudes) -> tuple[int | str, str]:
+    """Return order and loss of the accelerometers' own fit: as stated, or as in their record."""
     if known is None:
         return order if order == "auto" else int(order), "auto"
     record_order = model_of(known).order
@@ -286,13 +287,13 @@ def _order_and_loss(known: Calibration | None, order: int | str, attitudes: Atti
         raise OptionError(f"accel: a record of order {record_order}; magnetometers need one of 1 or more")
     if str(order) not in ("auto", str(record_order)):
         raise OptionError(f"order {order} with a record of order {record_order}: expected that or auto")
-    if not made_of(known, attitudes):
+    if not is_made_from(known, attitudes):
         return record_order, "auto"
     asked, loss = known.options.get("order"), known.options.get("loss")
     return "auto" if asked == "auto" else record_order, "square" if loss == "square" else "auto"
 
 
-def made_of(known: Calibration, attitudes: Attitudes) -> bool:
+def is_made_from(known: Calibration, attitudes: Attitudes) -> bool:
     """Return whether a record was made from these attitudes, or from the recording that they are from."""
     held = data_of(known).attitudes
     same = held is not None and np.array_equal(held.mean, attitudes.mean)
@@ -300,7 +301,7 @@ def made_of(known: Calibration, attitudes: Attitudes) -> bool:
 
 
 def _parse_numbers(numbers: str | Sequence[int | str], count: int, option: str) -> NDArray[np.intp]:
-    """Attitudes by their numbers from 1, or texts such as ``"8"``, ``"9-16"``, ``"3,9-16"``, as places from 0."""
+    """Return indices from 0 of attitudes by numbers from 1, or by texts such as ``"8"``, ``"9-16"``, ``"3,9-16"``."""
     indices: list[int] = []
     for entry in [numbers] if isinstance(numbers, str) else numbers:
         for part in str(entry).split(","):
@@ -317,7 +318,7 @@ def _parse_numbers(numbers: str | Sequence[int | str], count: int, option: str) 
 
 
 def _check_groups(places: Sequence[Sequence[int]], name: str) -> None:
-    """Refuse groups of attitudes from which no direction can be told."""
+    """Refuse groups of attitudes that overlap, or are too small to determine a direction."""
     every = [place for group in places for place in group]
     if len(set(every)) < len(every):
         raise OptionError(f"same-direction: an attitude of {name} is in two groups; expected each in one")
@@ -328,22 +329,24 @@ def _check_groups(places: Sequence[Sequence[int]], name: str) -> None:
         )
 
 
-def _gravity(requested: float | str | Gravity | None, known: Calibration | None, attitudes: Attitudes) -> Gravity:
-    """Gravity as given, else that of the accelerometers' record, else as for the accelerometers."""
+def _choose_gravity(
+    requested: float | str | Gravity | None, known: Calibration | None, attitudes: Attitudes
+) -> Gravity:
+    """Return the stated gravity, else that of the accelerometers' record, else that for the recording."""
     local = local_gravity(requested, attitudes.recording)
     if requested is not None or known is None:
         return local
     stated = model_of(known).gravity
-    if made_of(known, attitudes) and stated.value == local.value:
+    if is_made_from(known, attitudes) and stated.value == local.value:
         return local
     return local_gravity(Gravity(stated.value, stated.from_, stated.standard_uncertainty or 0.0), attitudes.recording)
 
 
-def _prior(
+def _read_prior(
     known: Calibration | None, attitudes: Attitudes, estimate: Estimate, scaling: Scaling, local: Gravity
 ) -> tuple[tuple[Array, Array] | None, list[str]]:
-    """Mean and rows of a record of another test as prior knowledge, unless these attitudes contradict it."""
-    if known is None or made_of(known, attitudes):
+    """Return mean and rows of another test's record as prior knowledge, None if these attitudes contradict it."""
+    if known is None or is_made_from(known, attitudes):
         return None, []
     if model_of(known).output_unit != attitudes.unit:
         raise RecordError(
@@ -365,10 +368,10 @@ def _prior(
     return (held.mean, np.linalg.inv(np.linalg.cholesky(held.covariance))), []
 
 
-def _pair(
+def _make_pair(
     estimate: Estimate, means: FieldMeans, kept: NDArray[np.intp], mag: MagScaling, prior: tuple[Array, Array] | None
 ) -> Pair:
-    """Both triads' scaled outputs, with what is known of their noise."""
+    """Return the scaled outputs of both triads, with their noise as far as it is known."""
     problem, solution = estimate.problem, estimate.solution
     n, size = problem.reading.shape[1], solution.theta.shape[1]
     variance, freedom = solution.variance[0], float(solution.freedom[0])
@@ -396,8 +399,8 @@ def _pair(
     )
 
 
-def check_seen(what: MagObservability, kept: NDArray[np.intp], name: str) -> None:
-    """Refuse attitudes that leave something blind, and say what would help."""
+def check_observability(what: MagObservability, kept: NDArray[np.intp], name: str) -> None:
+    """Refuse attitudes that do not determine all parameters; the message says which further ones would."""
     if what.enough:
         return
     blind = " and ".join(f"({', '.join(f'{part:+.2f}' for part in axis)})" for axis in what.blind)

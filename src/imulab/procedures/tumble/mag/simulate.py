@@ -1,4 +1,7 @@
-"""Simulated magnetometers on a unit that is turned by hand, written apart from the model that they are fitted with."""
+"""Simulated magnetometers on a unit that is turned by hand.
+
+The equation of the model stands here a second time, so that fit and simulation do not share errors.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ _STRONGEST = 1e-3  # T
 
 @dataclass(frozen=True)
 class HeadingTurns:
-    """How a unit is turned from attitude to attitude.
+    """The turns of a unit from attitude to attitude.
 
     Attributes
     ----------
@@ -55,15 +58,16 @@ def simulate_field(
     Parameters
     ----------
     turns
-        Of the unit.
+        Turns of the unit.
     up
         Upward direction in the body frame in the first attitude, shape (3,).
     field, dip
-        T and rad; or the field in the body frame in the first attitude, T, shape (3,), which has a dip of its own.
+        Magnitude, T, and dip, rad; or the field in the body frame in the first attitude, T, shape (3,), which implies
+        the dip.
     known
-        Parameters of the sensor by the names of a record; one without magnetometers is drawn.
+        Parameters of the sensor under the names of a record; random ones if it has no magnetometers.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
 
     Raises
     ------
@@ -88,7 +92,7 @@ def simulate_field(
         direction[k + 1] = rotate(direction[k : k + 1], turns.axis[k : k + 1], -turns.full[k : k + 1])[0]
     number = turns.number
     m = magnitude * rotate(direction[number], turns.axis[number], -turns.full[number] * turns.progress)
-    matrix, hard_iron = _sensor(known, magnitude, rng)
+    matrix, hard_iron = _make_sensor(known, magnitude, rng)
     output = m @ matrix.T + hard_iron + _NOISE * magnitude * rng.standard_normal(m.shape)
     sine = -float(direction[0] @ up) / float(np.linalg.norm(up))
     truth = {"dip": dip if np.ndim(field) == 0 else float(np.arcsin(sine))}
@@ -103,8 +107,8 @@ def simulate_field(
     return SeenField(1e6 * _RESOLUTION * np.round(output / _RESOLUTION), 1e6 * m, truth)
 
 
-def _sensor(known: Mapping[str, float], field: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return matrix and hard iron, T, of the parameters that are known, or random ones."""
+def _make_sensor(known: Mapping[str, float], field: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return matrix and hard iron, T, by the known parameters, or random ones."""
     if "mag_bias_x" in known:
         gain = 1e-6 * np.array([known[f"mag_scale_factor_{a}"] for a in "xyz"])
         turned = np.array([[known.get(f"mag_misalignment_{a}{b}", 1.0) for b in "xyz"] for a in "xyz"])
@@ -116,7 +120,7 @@ def _sensor(known: Mapping[str, float], field: float, rng: np.random.Generator) 
 
 
 def rotate(vectors: Array, axis: Array, angle: Array) -> Array:
-    """Rodrigues' rotation of each vector about its axis."""
+    """Return each vector rotated about its axis (Rodrigues)."""
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
     along = axis * np.einsum("ni,ni->n", axis, vectors)[:, None]
     turned: Array = vectors * cosine + np.cross(axis, vectors) * sine + along * (1 - cosine)

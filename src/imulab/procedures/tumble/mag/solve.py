@@ -1,27 +1,25 @@
-"""One fit of both triads.
+"""The joint fit of accelerometers and magnetometers.
 
-How outputs are scaled, where the fit starts, what is known of the field, and attitudes that point the same way.
-
-The magnitude gives hard iron h and ``U'U``, linear in the ten coefficients of an ellipsoid. With u = U (M - h) and the
-direction e of gravity the constant dip is ``e' R u + sin(dip) = 0``, linear in the ten numbers R, sin(dip): their
-direction is the least singular vector of the rows ``[e_i u_j, 1]``.
-
-Source: Papafotis and Sotiriadis, IEEE Sensors J. 19 (2019) 8241 (ellipsoid, then alignment).
-
-The rows of C are east, north and up in body components: ``up = e``, ``east = u x e / |u x e|``, ``north = up x east``.
-A body axis x that keeps its direction d in the world leaves ``C x - d``, of which the two parts across d are taken.
-
-``min sum_p r_p' V_p^-1 r_p`` over both triads and the dip. An accelerometer error is common to all dips, which is why
-the accelerometers are fitted anew, from where their own fit ended. Noise that is not known is estimated by restricted
-maximum likelihood, where i and j run over the blocks k and l,
+Fit (`solve`): ``min sum_p r_p' V_p^-1 r_p`` over both triads and the dip, r_p the residuals of `model` in attitude p.
+The accelerometers are fitted anew, from the result of their own fit, because their errors are common to all dips.
+Unknown noise is estimated by restricted maximum likelihood, where i and j run over the blocks k and l,
 
     sum_l S_kl (sigma_l'^2 - sigma_l^2) = q_k - tr_k P,   q_k = sum (P r)_i^2,   S_kl = sum P_ij^2
 
-with ``P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1`` and blocks |m|, dip and directions held. Intervals take Student's
-t with ``nu = v^2 / (a' K a)``: v the variance of a parameter, ``a_k = dv/dsigma_k^2``, K half the covariance of
-sigma_k^2.
+with ``P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1`` and blocks |m|, dip and held directions. Intervals are those of
+Student's t with ``nu = v^2 / (a' K a)``: v the variance of a parameter, ``a_k = dv/dsigma_k^2``, K half the covariance
+of sigma_k^2.
 
-Sources: Patterson and Thompson, Biometrika 58 (1971) 545 (REML); Satterthwaite, Biometrics Bulletin 2 (1946) 110.
+Start (`find_start`): the magnitude gives hard iron h and ``U'U``, linear in the ten coefficients of an ellipsoid. With
+``u = U (M - h)`` and the direction e of gravity the constant dip is ``e' R u + sin(dip) = 0``, linear in the ten
+numbers R, sin(dip): these are the least singular vector of the rows ``[e_i u_j, 1]``.
+
+Held directions (`add_held_directions`): the rows of C are east, north and up in body components, ``up = e``,
+``east = u x e / |u x e|``, ``north = up x east``. A body axis x with the same direction d in several attitudes adds the
+two components of ``C x - d`` across d.
+
+Sources: Patterson and Thompson, Biometrika 58 (1971) 545 (REML); Satterthwaite, Biometrics Bulletin 2 (1946) 110;
+Papafotis and Sotiriadis, IEEE Sensors J. 19 (2019) 8241 (ellipsoid, then alignment).
 """
 
 from __future__ import annotations
@@ -41,12 +39,18 @@ from imulab.estimation.least_squares import chi_square_probability
 from imulab.gravity import Gravity
 from imulab.procedures import tumble
 from imulab.procedures.tumble import HEMISPHERES
-from imulab.procedures.tumble.mag.model import MAGNETOMETERS, FieldMeans, Invariants, ParameterLayout, invariants
+from imulab.procedures.tumble.mag.model import (
+    MAGNETOMETERS,
+    FieldMeans,
+    Invariants,
+    ParameterLayout,
+    evaluate_invariants,
+)
 from imulab.procedures.tumble.record import Estimate, Scaling
 from imulab.quantities import in_si
 from imulab.recording import Array
 
-# What is known of the field at the place of a test, before there is data: its hemisphere and its dip.
+# Hemisphere and dip of the place, as stated.
 
 
 _EQUATOR = math.radians(20.0)
@@ -69,8 +73,8 @@ def hemisphere_at(latitude: float | str | None) -> str | None:
     return None if abs(angle) < _EQUATOR else "north" if angle > 0 else "south"
 
 
-def stated_place(hemisphere: str | None, latitude: float | str | None, dip: Dip | None) -> Place:
-    """Return what is stated of the field at a place.
+def parse_place(hemisphere: str | None, latitude: float | str | None, dip: Dip | None) -> Place:
+    """Return hemisphere and dip of a place as stated.
 
     Raises
     ------
@@ -79,7 +83,7 @@ def stated_place(hemisphere: str | None, latitude: float | str | None, dip: Dip 
     """
     if hemisphere is not None and hemisphere not in HEMISPHERES:
         raise OptionError(f"hemisphere {quoted(hemisphere)}: expected north or south")
-    known = None if dip is None else stated_dip(dip)
+    known = None if dip is None else parse_dip(dip)
     sides = {"hemisphere": hemisphere, "latitude": hemisphere_at(latitude)}
     if known is not None and abs(known[0]) > HEMISPHERE_OF_DIP.limit * known[1]:
         sides["dip"] = "north" if known[0] > 0 else "south"
@@ -94,13 +98,13 @@ def stated_place(hemisphere: str | None, latitude: float | str | None, dip: Dip 
     return Place(stated.get(first), known)
 
 
-def stated_dip(dip: Dip) -> tuple[float, float]:
+def parse_dip(dip: Dip) -> tuple[float, float]:
     """Return a dip and its standard uncertainty, rad; that of a model of the field where none is given.
 
     Raises
     ------
     OptionError
-        It is none.
+        It is no dip.
     """
     if isinstance(dip, str):
         return tumble.dip(dip, "dip")
@@ -110,8 +114,7 @@ def stated_dip(dip: Dip) -> tuple[float, float]:
     return tumble.check_dip(float(value), float(uncertainty), "dip")
 
 
-# Where the joint fit of both triads starts: an ellipsoid for the magnetometers, and the rotation that keeps the
-# dip.
+# The start: an ellipsoid for the magnetometers, and the rotation that keeps the dip constant.
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ class Start:
 
 
 def find_start(mag: Array, direction: Array) -> Start:
-    """Return where to start from.
+    """Return matrix, hard iron and dip to start from.
 
     Parameters
     ----------
@@ -135,18 +138,18 @@ def find_start(mag: Array, direction: Array) -> Start:
     """
     centre, size = mag.mean(axis=0), float(np.linalg.norm(mag.std(axis=0)))
     scaled = (mag - centre) / size
-    shape = _ellipsoid(scaled)
+    shape = _fit_ellipsoid(scaled)
     if shape is None:
-        shape = _sphere(scaled)
-        rotation, sine = _best_permutation_of_axes((scaled - shape[1]) @ shape[0].T, direction)
+        shape = _fit_sphere(scaled)
+        rotation, sine = _find_axis_permutation((scaled - shape[1]) @ shape[0].T, direction)
     else:
-        rotation, sine = _alignment((scaled - shape[1]) @ shape[0].T, direction)
+        rotation, sine = _find_alignment((scaled - shape[1]) @ shape[0].T, direction)
     upper, hard_iron = shape
     dip = float(np.arcsin(np.clip(sine, -0.999, 0.999)))
     return Start(rotation @ upper / size, centre + size * hard_iron, dip)
 
 
-def _ellipsoid(points: Array) -> tuple[Array, Array] | None:
+def _fit_ellipsoid(points: Array) -> tuple[Array, Array] | None:
     """Return U and h of ``|U (x - h)| = 1``, by algebraic least squares; None where the surface is no ellipsoid."""
     x, y, z = points.T
     design = np.column_stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z])
@@ -164,7 +167,7 @@ def _ellipsoid(points: Array) -> tuple[Array, Array] | None:
     return np.linalg.cholesky(form / level).T, h
 
 
-def _sphere(points: Array) -> tuple[Array, Array]:
+def _fit_sphere(points: Array) -> tuple[Array, Array]:
     """Return U and h of the sphere ``|x - h| = r`` through the points, by algebraic least squares."""
     design = np.column_stack([2 * points, np.ones(len(points))])
     coefficients = np.linalg.lstsq(design, (points**2).sum(axis=1), rcond=None)[0]
@@ -172,7 +175,7 @@ def _sphere(points: Array) -> tuple[Array, Array]:
     return np.eye(3) / radius, coefficients[:3]
 
 
-def _alignment(field: Array, direction: Array) -> tuple[Array, float]:
+def _find_alignment(field: Array, direction: Array) -> tuple[Array, float]:
     """Return the rotation and the sine of the dip that make ``e' R u + sin(dip)`` least; R is right-handed."""
     rows = np.column_stack([(direction[:, :, None] * field[:, None, :]).reshape(len(field), 9), np.ones(len(field))])
     coefficients = np.linalg.svd(rows, full_matrices=False)[2][-1]
@@ -184,8 +187,8 @@ def _alignment(field: Array, direction: Array) -> tuple[Array, float]:
     return rotation, float(-np.mean(np.einsum("ni,ij,nj->n", direction, rotation, field)))
 
 
-def _best_permutation_of_axes(field: Array, direction: Array) -> tuple[Array, float]:
-    """Return, of the 24 rotations that carry axes into axes, the one under which the dip varies least."""
+def _find_axis_permutation(field: Array, direction: Array) -> tuple[Array, float]:
+    """Return the rotation, of the 24 that turn axes into axes, under which the dip varies least, and its sine."""
     candidates = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         rotation = np.diag(signs)[:, order]
@@ -196,7 +199,7 @@ def _best_permutation_of_axes(field: Array, direction: Array) -> tuple[Array, fl
     return rotation, sine
 
 
-def axes_of(matrix: Array) -> Array:
+def name_axes(matrix: Array) -> Array:
     """Return the signed permutation P, shape (3, 3), that names outputs: ``sum |(D P')_ii| / |row i|`` is largest.
 
     Parameters
@@ -212,7 +215,7 @@ def axes_of(matrix: Array) -> Array:
     return named
 
 
-# Attitudes in which one axis of the body points the same way: what they say of heading beyond magnitude and dip.
+# Attitudes in which one axis of the body points the same way, which determine heading beyond magnitude and dip.
 
 
 @dataclass(frozen=True)
@@ -240,7 +243,7 @@ class HeldDirections:
         return 2 + 2 * len(self.across)
 
     def only(self, kept: NDArray[np.intp]) -> HeldDirections:
-        """Return what is held of some of the attitudes."""
+        """Return the groups of some of the attitudes, by index."""
         return replace(self, group=self.group[kept])
 
 
@@ -276,7 +279,7 @@ def world_axes(field: Array, force: Array) -> Array:
     return np.stack([east, np.cross(up, east), up], axis=1)
 
 
-def with_held_directions(
+def add_held_directions(
     evaluated: Invariants, theta: Array, layout: ParameterLayout, held: HeldDirections
 ) -> Invariants:
     """Return the invariants with two more residuals of each attitude, ``B (C x - d)``; nil outside of the groups."""
@@ -306,7 +309,7 @@ def with_held_directions(
 
 
 def _direction_derivatives(evaluated: Invariants, axes: Array, x: Array, layout: ParameterLayout) -> Array:
-    """Return how ``C x`` changes with the triads' parameters, shape (n, 3, p)."""
+    """Return the derivatives of ``C x`` by the triads' parameters, shape (n, 3, p)."""
     n = len(axes)
     du, de = np.zeros((n, 3, layout.size)), np.zeros((n, 3, layout.size))
     du[:, :, : layout.mag] = evaluated.field.by_parameters
@@ -329,22 +332,22 @@ def _perpendicular_pair(direction: Array) -> Array:
     return basis
 
 
-# One fit of both triads: every attitude's |f|, |m| and dip, each with its variance.
+# The fit: |f|, |m| and dip of every attitude, each with its variance.
 
 
 _STEPS = 60  # of Levenberg and Marquardt
-_TOLERANCE = 1e-11  # step in scaled parameters at which the fit rests
+_TOLERANCE = 1e-11  # step in scaled parameters at which the fit ends
 _CLOSE = 0.03
-"""Standard deviations of the residuals to which parameters need to be known for a pass over the variances."""
+"""Change of the whitened residuals at which a fit is close enough for an update of the variances."""
 _DAMPING, _NEAR = 1e-4, 1e-9
-"""Where a minimisation starts, and where one that was near."""
-_PASSES = 50  # in which noise and solution agree
+"""First damping of a minimisation, and that of one which begins near its end."""
+_PASSES = 50  # until noise and solution agree
 _RESTS = 1e-3
 """Chi-square probability below which attitudes scatter beyond their known noise."""
 _HUBER = 2.0  # standard deviations of |m| and dip together from which the pull of an attitude is bounded
-_LEAST = 1e-24  # variance that exact data leave, or rounding in them
+_LEAST = 1e-24  # variance that is assumed of exact data, by rounding
 _BLOCKS = np.array([0, 1, 2, 3, 3])
-"""Whose variance each residual of an attitude has: |f|, |m|, dip, direction held."""
+"""The variance that each residual of an attitude has: of |f|, |m|, dip, held direction."""
 
 
 @dataclass(frozen=True)
@@ -354,13 +357,13 @@ class Pair:
     Attributes
     ----------
     accel, mag
-        Shape (n, 3).
+        Outputs of both triads, shape (n, 3).
     noise
         Covariance of the six outputs, shape (n, 6, 6); None where the magnetometers' is not known.
     accel_variance
-        Of |f|, from the accelerometers' own fit, shape (n,).
+        Variance of |f|, from the accelerometers' own fit, shape (n,).
     lengthening
-        By how much noise makes |f| too long, shape (n,).
+        Bias of |f| by noise, shape (n,).
     accel_freedom
         Degrees of freedom of `accel_variance`, infinite where it is known.
     accel_size
@@ -368,7 +371,7 @@ class Pair:
     prior
         Mean and rows ``rows (theta - mean) = 0 ± 1`` of the accelerometers' parameters; None without.
     mag_order
-        1 or 2.
+        Order of the magnetometers' model, 1 or 2.
     held
         Attitudes in which a body axis points one way.
     """
@@ -386,7 +389,7 @@ class Pair:
 
     @property
     def layout(self) -> ParameterLayout:
-        """Where the parameters stand."""
+        """Places of the parameters."""
         return ParameterLayout(9 + 3 * self.mag_order, self.accel_size, 0 if self.held is None else self.held.size)
 
     def only(self, kept: NDArray[np.intp]) -> Pair:
@@ -403,35 +406,35 @@ class Pair:
 
     def evaluate(self, theta: Array) -> Invariants:
         """Return residuals, less the lengthening of |f|, and derivatives."""
-        evaluated = invariants(theta, self.accel, self.mag, self.layout)
+        evaluated = evaluate_invariants(theta, self.accel, self.mag, self.layout)
         evaluated.residuals[:, 0] -= self.lengthening
-        return evaluated if self.held is None else with_held_directions(evaluated, theta, self.layout, self.held)
+        return evaluated if self.held is None else add_held_directions(evaluated, theta, self.layout, self.held)
 
 
 @dataclass(frozen=True)
 class Joint:
-    """What the fit found.
+    """The joint fit.
 
     Attributes
     ----------
     pair
-        What was fitted.
+        The outputs of both triads.
     theta
-        Shape (p,), as the layout of `pair` says.
+        Parameters in the layout of `pair`, shape (p,).
     found
         Residuals and derivatives at the solution.
     information
-        V_p^-1 without Huber's weights, shape (n, k, k); nil for directions that are not held.
+        V_p^-1 without Huber's weights, shape (n, k, k); 0 for directions that are not held.
     covariance
-        Of theta, shape (p, p).
+        Covariance of theta, shape (p, p).
     freedom
         Degrees of freedom of each parameter's variance, shape (p,).
     sigma
-        Standard deviations of |m|, dip and directions held: estimated, or what was added to the known noise.
+        Standard deviations of |m|, dip and held directions: estimated, or added to the known noise.
     down_weights
         Huber's factors of |m| and dip, shape (n,).
     converged
-        Whether both loops came to rest.
+        Whether both loops converged.
     """
 
     pair: Pair
@@ -446,15 +449,15 @@ class Joint:
 
 
 def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
-    """Fit both triads from start parameters (p,); `robust` limits the pull of single attitudes on field and dip.
+    """Return the fit of both triads from start parameters (p,); `robust` limits the influence of single attitudes.
 
-    Where both are unknown, the dip's standard deviation is no smaller than the field's: magnitudes alone could
-    otherwise be bent until a few attitudes have no dip residuals at all.
+    Where both are unknown, the dip's standard deviation is not below the field's: the fit could otherwise bend the
+    magnitudes until a few attitudes have no dip residuals at all.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        The parameters run away, or end where they are not determined.
+        The parameters diverge, or end where they are not determined.
     """
     theta, down = start, np.ones(len(pair.mag))
     unknown = pair.noise is None
@@ -464,32 +467,32 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
     rested = False
     evaluated = pair.evaluate(theta)
     for number in range(_PASSES):
-        weigh = _root(_information(pair, _known_covariance(pair, evaluated), extra, down))
+        weigh = _root_of_information(_information(pair, _known_covariance(pair, evaluated), extra, down))
         theta, evaluated, settled = _minimise(pair, weigh, theta, evaluated, _NEAR if number else _DAMPING, _CLOSE)
         known = _known_covariance(pair, evaluated)
         before, weights_before = extra, down
         if number == 0 and not unknown:
             free[:2] = _exceeds_known_noise(evaluated, known)
         if free.any():
-            extra = _likelihood_pass(pair, evaluated, _information(pair, known, extra, down), extra, down, free)
+            extra = _update_variances(pair, evaluated, _information(pair, known, extra, down), extra, down, free)
         if robust:
-            down = _huber(evaluated, known, extra)
+            down = _huber_weights(evaluated, known, extra)
         rests = np.abs(extra - before) <= _RESTS * extra + _LEAST
         if settled and rests.all() and np.abs(down - weights_before).max() < _RESTS:
             rested = True
             break
-    weigh = _root(_information(pair, known, extra, down))
+    weigh = _root_of_information(_information(pair, known, extra, down))
     theta, evaluated, settled = _minimise(pair, weigh, theta, evaluated)
     known = _known_covariance(pair, evaluated)
     information = _information(pair, known, extra, np.ones(len(down)))
-    covariance, freedom = _uncertainty(pair, evaluated, _information(pair, known, extra, down), extra, free)
+    covariance, freedom = _estimate_uncertainty(pair, evaluated, _information(pair, known, extra, down), extra, free)
     if not (np.diag(covariance) > 0).all():
         raise np.linalg.LinAlgError("the fit ends where parameters are not determined")
     return Joint(pair, theta, evaluated, information, covariance, freedom, np.sqrt(extra), down, rested and settled)
 
 
 def _known_covariance(pair: Pair, evaluated: Invariants) -> Array:
-    """V_0 of |f|, |m| and dip, shape (n, 3, 3): ``B C B'``, and of |f| at least what its own fit says."""
+    """Return V_0 of |f|, |m| and dip, shape (n, 3, 3): ``B C B'``, of |f| at least the variance of its own fit."""
     v = np.zeros((len(pair.mag), 3, 3))
     if pair.noise is not None:
         v = evaluated.by_outputs @ pair.noise @ evaluated.by_outputs.transpose(0, 2, 1)
@@ -512,7 +515,7 @@ def _information(pair: Pair, known: Array, extra: Array, down: Array) -> Array:
     return whole
 
 
-def _root(information: Array) -> Array:
+def _root_of_information(information: Array) -> Array:
     """Return R with ``R' R = V^-1``, shape (n, k, k)."""
     upper = np.zeros_like(information)
     upper[:, :3, :3] = np.linalg.cholesky(information[:, :3, :3]).transpose(0, 2, 1)
@@ -521,8 +524,8 @@ def _root(information: Array) -> Array:
     return upper
 
 
-def _rows(pair: Pair, evaluated: Invariants, theta: Array, weigh: Array) -> tuple[Array, Array]:
-    """Whitened residuals and Jacobian of all attitudes, one after the other, with the rows of the prior."""
+def _whiten_rows(pair: Pair, evaluated: Invariants, theta: Array, weigh: Array) -> tuple[Array, Array]:
+    """Return whitened residuals and Jacobian of all attitudes, one after the other, and of the prior."""
     residuals = np.einsum("nij,nj->ni", weigh, evaluated.residuals).ravel()
     jacobian = (weigh @ evaluated.by_parameters).reshape(-1, len(theta))
     if pair.prior is None:
@@ -536,17 +539,17 @@ def _rows(pair: Pair, evaluated: Invariants, theta: Array, weigh: Array) -> tupl
 def _minimise(
     pair: Pair, weigh: Array, theta: Array, evaluated: Invariants, damping: float = _NEAR, close: float = 0.0
 ) -> tuple[Array, Invariants, bool]:
-    """Levenberg-Marquardt with columns scaled to length 1, until a step is below the tolerance.
+    """Return parameters and residuals of least sum of squares, and whether the iteration converged.
 
-    Or until it changes the whitened residuals by less than `close`. Returns parameters, residuals there, and whether it
-    came to rest.
+    Levenberg-Marquardt with columns scaled to length 1, until a step is below the tolerance or changes the whitened
+    residuals by less than `close`.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        The parameters run away.
+        The parameters diverge.
     """
-    residuals, jacobian = _rows(pair, evaluated, theta, weigh)
+    residuals, jacobian = _whiten_rows(pair, evaluated, theta, weigh)
     cost = float(residuals @ residuals)
     for _ in range(_STEPS):
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
@@ -556,7 +559,7 @@ def _minimise(
         step = np.linalg.lstsq(scaled, -np.append(residuals, np.zeros(len(theta))), rcond=None)[0] / scale
         with np.errstate(all="ignore"):
             there = pair.evaluate(theta + step)
-            new, slope = _rows(pair, there, theta + step, weigh)
+            new, slope = _whiten_rows(pair, there, theta + step, weigh)
         reached = float(new @ new)
         small = np.abs(step).max() < _TOLERANCE or np.linalg.norm(jacobian @ step) < close
         if reached <= cost * (1 + 1e-12):
@@ -571,7 +574,7 @@ def _minimise(
 
 def weighted_jacobian(joint: Joint) -> Array:
     """Return the Jacobian of the solution over the standard deviations of its rows, with those of the prior."""
-    return _rows(joint.pair, joint.found, joint.theta, _root(joint.information))[1]
+    return _whiten_rows(joint.pair, joint.found, joint.theta, _root_of_information(joint.information))[1]
 
 
 def _covariance(pair: Pair, evaluated: Invariants, information: Array) -> Array:
@@ -588,7 +591,7 @@ def _covariance(pair: Pair, evaluated: Invariants, information: Array) -> Array:
     return inverse
 
 
-def _blocks(information: Array, evaluated: Invariants, covariance: Array) -> tuple[Array, Array]:
+def _trace_blocks(information: Array, evaluated: Invariants, covariance: Array) -> tuple[Array, Array]:
     """Return ``tr_k P``, shape (4,), and S, shape (4, 4), without forming P."""
     k = evaluated.residuals.shape[1]
     carried = information @ evaluated.by_parameters  # V^-1 J
@@ -605,12 +608,12 @@ def _blocks(information: Array, evaluated: Invariants, covariance: Array) -> tup
     return trace, squares
 
 
-def _likelihood_pass(
+def _update_variances(
     pair: Pair, evaluated: Invariants, information: Array, extra: Array, down: Array, free: Array
 ) -> Array:
-    """One pass of restricted maximum likelihood for the variances of |m|, dip and directions held."""
+    """Return the variances of |m|, dip and held directions after one pass of restricted maximum likelihood."""
     covariance = _covariance(pair, evaluated, information)
-    trace, squares = _blocks(information, evaluated, covariance)
+    trace, squares = _trace_blocks(information, evaluated, covariance)
     carried = information @ evaluated.by_parameters
     weighted = (information @ evaluated.residuals[:, :, None])[:, :, 0]
     felt = weighted - carried @ (covariance @ np.tensordot(carried, evaluated.residuals, ((0, 1), (0, 1))))
@@ -630,27 +633,27 @@ def _likelihood_pass(
 
 
 def _exceeds_known_noise(evaluated: Invariants, known: Array) -> Array:
-    """Return whether |m|, and the dip, scatter beyond their known noise; each is charged a third of the parameters."""
+    """Return whether |m|, and the dip, scatter beyond their known noise; each loses a third of the parameters."""
     n, size = len(known), evaluated.by_parameters.shape[2]
     chi = (evaluated.residuals[:, :3] ** 2 / (np.einsum("nii->ni", known) + _LEAST))[:, 1:].sum(axis=0)
     freedom = max(n - size / 3, 1.0)
     return np.array([chi_square_probability(float(value), freedom) < FIELD_SCATTERS.level for value in chi])
 
 
-def _huber(evaluated: Invariants, known: Array, extra: Array) -> Array:
-    """``min(1, 2/d)`` with ``d^2 = r1^2/sigma_m^2 + r2^2/sigma_delta^2``, shape (n,)."""
+def _huber_weights(evaluated: Invariants, known: Array, extra: Array) -> Array:
+    """Return Huber's weights: ``min(1, 2/d)``, ``d^2 = r1^2/sigma_m^2 + r2^2/sigma_delta^2``, shape (n,)."""
     variance = np.einsum("nii->ni", known)[:, 1:] + extra[:2] + _LEAST
     d = np.sqrt((evaluated.residuals[:, 1:3] ** 2 / variance).sum(axis=1))
     weights: Array = np.minimum(1.0, _HUBER / np.maximum(d, 1e-300))
     return weights
 
 
-def _uncertainty(
+def _estimate_uncertainty(
     pair: Pair, evaluated: Invariants, information: Array, extra: Array, free: Array
 ) -> tuple[Array, Array]:
-    """Covariance of theta, and the degrees of freedom of each variance in it."""
+    """Return the covariance of theta, and the degrees of freedom of each variance in it."""
     covariance = _covariance(pair, evaluated, information)
-    squares = _blocks(information, evaluated, covariance)[1]
+    squares = _trace_blocks(information, evaluated, covariance)[1]
     carried = (information @ evaluated.by_parameters) @ covariance
     each = (carried**2).sum(axis=0)
     by_block = np.zeros((4, len(covariance)))
@@ -665,19 +668,19 @@ def _uncertainty(
     return covariance, freedom
 
 
-# How the magnetometers' outputs are scaled for the fit, and what is ready for it.
+# Scaling of the magnetometers' outputs, and both triads ready for the fit.
 
 
 @dataclass(frozen=True)
 class MagScaling:
-    """Outputs are renamed by a signed permutation, less a zero, over a size: those of a field of length 1.
+    """Scaling of outputs to those of a field of length 1: a signed permutation, less a zero, over a size.
 
     Attributes
     ----------
     axes
         Row k names the output that becomes axis k, shape (3, 3).
     zero
-        In renamed outputs, shape (3,).
+        Zero of the renamed outputs, shape (3,).
     size
         Output per unit of the field.
     field
@@ -700,7 +703,7 @@ class MagScaling:
         return scaled
 
     def in_si(self, theta: Array) -> tuple[Array, Array]:
-        """Return the parameters as they stand in a record, shape (p,), and their derivatives by theta, (p, p).
+        """Return the parameters of a record, shape (p,), and their derivatives by theta, shape (p, p).
 
         ``S = size s / F``, ``b = (zero + size z) / S``, ``k2 = theta / F``; misalignments are the same.
         """
@@ -717,10 +720,10 @@ class MagScaling:
         return values, slope
 
 
-def nominal_mag(start: Start, magnitude: float | None) -> tuple[MagScaling, Array]:
-    """Return the scaling of outputs, and the magnetometers' parameters where the fit starts, order 1, shape (12,)."""
+def scale_magnetometers(start: Start, magnitude: float | None) -> tuple[MagScaling, Array]:
+    """Return the scaling of outputs, and the magnetometers' parameters at the start, order 1, shape (12,)."""
     turned: Array = np.asarray(np.linalg.inv(start.matrix), dtype=np.float64)
-    axes = axes_of(turned)
+    axes = name_axes(turned)
     renamed = axes @ turned
     size = float(np.abs(np.diag(renamed)).mean())
     scale = np.diag(renamed) / size
@@ -735,19 +738,19 @@ class Ready:
     Attributes
     ----------
     estimate, scaling, gravity
-        The accelerometers by themselves, how they are scaled, and local gravity.
+        The accelerometers by themselves, their scaling, and local gravity.
     means
         The magnetometers' outputs in all attitudes.
     kept
-        Which of these are used, from 0.
+        Indices of the attitudes that are used, from 0.
     mag
-        How the magnetometers are scaled.
+        Scaling of the magnetometers.
     pair, start
-        What is fitted, and from where.
+        Outputs to be fitted, and start parameters.
     order, loss
-        As asked for the accelerometers by themselves.
+        Options of the accelerometers' own fit.
     notes
-        What a user should know already.
+        Notes on the prior.
     """
 
     estimate: Estimate
