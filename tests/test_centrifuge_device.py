@@ -14,7 +14,7 @@ from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.procedures.centrifuge.manifest import make_manifest
 from imulab.procedures.centrifuge.plan import plan_centrifuge
 from imulab.procedures.centrifuge.simulate import Simulation, typical_truth
-from imulab.procedures.views import exhibits_of, rendered
+from imulab.procedures.views import exhibits_of, render_record
 from imulab.recording import Recording
 from imulab.report.traces import Figure
 
@@ -252,7 +252,7 @@ def test_the_table_of_runs_says_what_differs_between_them():
     assert all(len(row) == len(table.columns) for row in table.rows)
     half = len(test.runs)
     assert [row[table.columns.index("spin axis")] for row in table.rows] == ["up"] * half + ["down"] * half
-    page = rendered(record)
+    page = render_record(record)
     assert '<th scope="col" class="text">file</th>' in page
     assert '<th scope="col">g</th>' in page
 

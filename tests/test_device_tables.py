@@ -15,7 +15,7 @@ from imulab.device.tables import KINDS, monotone_range, pack
 from imulab.device.unit import ArraySettings, Blob, DeviceUnit, array_table, is_blob, load_blob, make_blob
 from imulab.errors import RecordError
 from imulab.exporters import export
-from imulab.procedures.apply import apply, apply_blocks, loaded, tables_of, tables_of_all, warnings_of
+from imulab.procedures.apply import apply, apply_blocks, loaded, tables_of, tables_of_all, warn_before_applying
 from imulab.procedures.registry import load_any
 from imulab.procedures.warmup.device import warmup_table
 from imulab.recording import Recording
@@ -200,8 +200,8 @@ def test_blocks_by_a_blob_are_those_of_the_whole(blob, flight):
 
 def test_a_blob_of_another_unit_is_warned_of(blob, flight):
     other = Recording(flight.columns, flight.units, name="flight.csv", metadata={"serial": "SN1"})
-    assert warnings_of(load_blob(blob), other) == ["flight.csv: serial SN1, but the record was made for SN42"]
-    assert warnings_of(load_blob(blob), flight) == []
+    assert warn_before_applying(load_blob(blob), other) == ["flight.csv: serial SN1, but the record was made for SN42"]
+    assert warn_before_applying(load_blob(blob), flight) == []
 
 
 def test_a_blob_and_its_copy_hold_the_same_and_the_record_that_they_were_made_from(blob, record, data, tmp_path):

@@ -12,7 +12,7 @@ from imulab.cli import main
 from imulab.errors import DataError, OptionError, UnitError
 from imulab.estimation.noise.simulate import simulated
 from imulab.procedures.noise.figures import exhibits
-from imulab.procedures.views import rendered
+from imulab.procedures.views import render_record
 from imulab.records.calibration import sealed_text
 from noise_models import AUTO, IN_TIME
 from reference import noise as reference
@@ -119,7 +119,7 @@ def test_the_record_comes_back_from_its_file(fit, tmp_path):
     again = il.load(tmp_path / "n.json")
     assert again == fit.calibration
     assert again.parameter("gyro_x_walk").interval_95 == fit.calibration.parameter("gyro_x_walk").interval_95
-    assert rendered(again) == rendered(fit.calibration)
+    assert render_record(again) == render_record(fit.calibration)
 
 
 def test_an_interval_that_misses_its_value_is_refused(record, tmp_path):

@@ -12,7 +12,7 @@ import madeup
 from imulab.cli import main
 from imulab.device.unit import load_blob
 from imulab.errors import DataError, RecordError, UnitError
-from imulab.procedures.apply import apply, apply_blocks, loaded, warnings_of
+from imulab.procedures.apply import apply, apply_blocks, loaded, warn_before_applying
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.writers import write
@@ -218,7 +218,7 @@ MADE = {"temperature": {"value": 24.0, "unit": "degC"}}
 @pytest.mark.parametrize("mean", [3.9, 44.1, -40.0])
 def test_a_record_made_far_from_the_recordings_temperature_is_warned_of(mean):
     truth, _, _ = simulated(1, "g")
-    (message,) = warnings_of(record(truth, 1, "g", **MADE), at([mean - 1, mean + 1]))
+    (message,) = warn_before_applying(record(truth, 1, "g", **MADE), at([mean - 1, mean + 1]))
     assert message.startswith(
         f"flight.csv: temperature {mean:.1f} degC is {abs(mean - 24):.0f} K away from the 24.0 degC"
     )
@@ -229,21 +229,21 @@ def test_a_temperature_in_the_head_of_the_recording_counts_too():
     warm = Recording(
         {name: outputs[:, i] for i, name in enumerate(AXES)}, dict.fromkeys(AXES, "g"), {"temperature": "61.5 degC"}
     )
-    (message,) = warnings_of(record(truth, 1, "g", **MADE), warm)
+    (message,) = warn_before_applying(record(truth, 1, "g", **MADE), warm)
     assert "temperature 61.5 degC" in message
 
 
 @pytest.mark.parametrize("mean", [4.0, 24.0, 44.0])
 def test_twenty_kelvin_are_not_far(mean):
     truth, _, _ = simulated(1, "g")
-    assert warnings_of(record(truth, 1, "g", **MADE), at([mean])) == []
+    assert warn_before_applying(record(truth, 1, "g", **MADE), at([mean])) == []
 
 
 def test_an_unknown_temperature_is_not_warned_of():
     truth, _, _ = simulated(1, "g")
-    assert warnings_of(record(truth, 1, "g"), at([90.0])) == []
-    assert warnings_of(record(truth, 1, "g", **MADE), recording(np.zeros((2, 3)), "g")) == []
-    assert warnings_of(record(truth, 1, "g", **MADE), at([np.nan])) == []
+    assert warn_before_applying(record(truth, 1, "g"), at([90.0])) == []
+    assert warn_before_applying(record(truth, 1, "g", **MADE), recording(np.zeros((2, 3)), "g")) == []
+    assert warn_before_applying(record(truth, 1, "g", **MADE), at([np.nan])) == []
 
 
 def test_outputs_beyond_a_turning_point_have_no_specific_force():
@@ -267,7 +267,7 @@ def test_a_record_in_other_units_is_refused():
 def test_a_record_of_another_unit_is_warned_of():
     truth, _, outputs = simulated(1, "g")
     other = replace(record(truth, 1, "g"), sensor={"serial": "SN41"})
-    (message,) = warnings_of(other, recording(outputs, "g"))
+    (message,) = warn_before_applying(other, recording(outputs, "g"))
     assert message == "flight.csv: serial SN42, but the record was made for SN41"
 
 
@@ -340,8 +340,8 @@ def test_a_record_of_six_axes_corrects_the_triad_that_is_there_and_says_so():
         corrected = il.apply(record, alone)
         for name in there:
             np.testing.assert_array_equal(corrected.column(name), both.column(name))
-        assert warnings_of(record, alone) == [f"flight.csv: no {away} in it: its {words} alone are corrected"]
-    assert warnings_of(record, flight(**ACCEL, **GYRO)) == []
+        assert warn_before_applying(record, alone) == [f"flight.csv: no {away} in it: its {words} alone are corrected"]
+    assert warn_before_applying(record, flight(**ACCEL, **GYRO)) == []
 
 
 def test_gyroscopes_whose_g_sensitivity_needs_the_accelerometers_are_refused_without_them():

@@ -120,7 +120,7 @@ def apply(
 
     By one or more of them, in the order given; CSV or Parquet to OUT, CSV to standard output.
     """
-    from imulab.procedures.apply import apply_blocks, loaded, with_heading
+    from imulab.procedures.apply import add_heading, apply_blocks, loaded
     from imulab.procedures.registry import load_any
     from imulab.readers import read_blocks
     from imulab.recording import with_power_on_temperature
@@ -150,7 +150,7 @@ def apply(
                 )
             )
     if options["heading"]:
-        chain = with_heading(chain, records)
+        chain = add_heading(chain, records)
     blocks = with_notes(read_blocks(file, **how), notes=False)
     if options["temperature_column"] and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)
@@ -177,10 +177,10 @@ class _Rows:
 def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Yield blocks; print warnings after the first, and at the end what lay beyond the test."""
     from imulab.display import Note
-    from imulab.procedures.apply import results_in, warnings_of
+    from imulab.procedures.apply import list_results, warn_before_applying
     from imulab.recording import TAKEN_FROM
 
-    tests = results_in(records)
+    tests = list_results(records)
     counts, largest, name = [0] * len(tests), [0.0] * len(tests), ""
     for number, block in enumerate(blocks):
         for index, (record, procedure) in enumerate(tests):
@@ -191,7 +191,7 @@ def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording
             counts[index], largest[index], name = counts[index] + here, max(largest[index], most), block.name
         yield block
         if number == 0:  # after it was corrected: where it is refused, the refusal is the one line there is
-            messages = [message for record in records for message in warnings_of(record, block)]
+            messages = [message for record in records for message in warn_before_applying(record, block)]
             if power_on := block.metadata.get(TAKEN_FROM):
                 messages.append(Note(f"{block.name}: the power-on temperature was taken from {power_on}"))
             messages += [f"{block.name}: was corrected before, by {entry}" for entry in block.corrected_by]

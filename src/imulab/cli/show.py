@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 def write_both(record: Calibration, output: str | None, report: str | None) -> None:
     """Write a record and its report, both or none."""
-    from imulab.procedures.views import rendered
+    from imulab.procedures.views import render_record
 
     with ExitStack() as stack:
         # Both files are opened before either is finished, so that neither is left alone behind an error.
@@ -37,7 +37,7 @@ def write_both(record: Calibration, output: str | None, report: str | None) -> N
         if to_record:
             to_record.write(record.to_json().encode("utf-8"))
         if to_report:
-            to_report.write(rendered(record).encode("utf-8"))
+            to_report.write(render_record(record).encode("utf-8"))
 
 
 def finish(
@@ -112,9 +112,9 @@ def notes_on_data(held: Calibration, recordings: Sequence[Recording]) -> list[st
         for recording in recordings
         for entry in recording.corrected_by
     ]
-    from imulab.procedures.apply import warnings_of
+    from imulab.procedures.apply import warn_before_applying
 
-    return corrected + [warning for recording in recordings for warning in warnings_of(held, recording)]
+    return corrected + [warning for recording in recordings for warning in warn_before_applying(held, recording)]
 
 
 def finish_check(

@@ -16,7 +16,7 @@ from imulab.device.unit import Blob, DeviceUnit
 from imulab.display import SENTENCES, Note
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.options import measure
-from imulab.procedures.correction_order import check_after, check_order, entry, thermals_of
+from imulab.procedures.correction_order import check_after, check_order, name_correction, parse_thermals
 from imulab.procedures.procedure import Procedure, Section
 from imulab.procedures.registry import joined_of, load_any, procedure_of, section
 from imulab.procedures.result import Record, as_record, as_recording
@@ -24,13 +24,13 @@ from imulab.quantities import in_si
 from imulab.recording import Data, Reading, Recording, with_power_on_temperature
 from imulab.records.calibration import Calibration
 
-# The tables of a unit: the numbers of its records in the order of the C core's structs, and of their application.
+# The tables of a unit: the numbers of its records as the C core's structs, in the order of their application.
 
 
 def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
     """Return the tables of a record, in the order in which they are applied.
 
-    An array fuses by `fusion`; by what its record carries where that is None.
+    An array fuses by `fusion`, or as its record states where that is None.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Device
 def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[DeviceTable]:
     """Return the tables of several records of one unit, in their order; an array fuses by `fusion` where it is given.
 
-    The columns of each name its record by its SHA-256, so that what a blob corrected is known by the records in it.
+    The columns of each table hold the SHA-256 of its record, so that a blob names the records that are in it.
 
     Raises
     ------
@@ -67,10 +67,10 @@ def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) 
     return tables
 
 
-# Records and blobs to corrected recordings: the C core does the arithmetic, the registry knows each section.
+# Correction of recordings.
 
 
-_FAR_IN_TEMPERATURE = 20.0  # K between calibration and use from which the drift of usual biases is warned of
+_FAR_IN_TEMPERATURE = 20.0  # K between calibration and use, from which there is a warning of drifted biases
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,13 @@ class Loaded:
     sections
         Each section's kind and columns, in the order of application.
     name
-        What the corrected recording calls it.
+        Its name in the corrected recording.
     holds
         SHA-256 of the record; for a blob its own, then those of the records it was made from.
     again
-        Whether it is applied to a recording that it corrected before.
+        Whether it may be applied to a recording that it corrected before.
     further
-        What adds columns to the corrected recording; None where nothing does.
+        Function that adds columns to the corrected recording; None where there is none.
     """
 
     unit: DeviceUnit
@@ -107,14 +107,14 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
     Parameters
     ----------
     record
-        What corrects a recording.
+        The record or blob.
     name
-        What the corrected recording calls it; procedure and serial number, or the blob's file, if not given.
+        Its name in the corrected recording; procedure and serial number, or the blob's file, if not given.
     again
-        Whether to correct a recording a second time.
+        Whether it may correct a recording a second time.
     columns
-        What the command says to the sections: `latest_start` (a recording that starts later after power-on is refused
-        by a warm-up table, s).
+        Options of the sections: `latest_start` (a recording that starts later after power-on is refused by a warm-up
+        table, s).
 
     Raises
     ------
@@ -127,7 +127,7 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
         unknown = [kind for (kind, _), (known_section, _) in zip(entries, known, strict=True) if known_section is None]
         if unknown:
             raise RecordError(f"{record.name}: a section {unknown[0]!r} cannot be applied to a recording")
-        # The table of an array is for `array fuse`; it leaves the other columns of a recording alone.
+        # The table of an array is for `array fuse`, and corrects no columns.
         chain = tuple(
             (known_section, entry)
             for known_section, entry in known
@@ -146,8 +146,8 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
     return Loaded(DeviceUnit.of(*tables), chain, called, (record.sealed()[0],), again)
 
 
-def with_heading(chain: Sequence[Loaded], records: Sequence[Calibration | Blob]) -> list[Loaded]:
-    """Return the same, of which the last that can adds magnetic heading and dip.
+def add_heading(chain: Sequence[Loaded], records: Sequence[Calibration | Blob]) -> list[Loaded]:
+    """Return the chain, in which the last record with magnetometers adds magnetic heading and dip.
 
     Raises
     ------
@@ -239,7 +239,7 @@ def apply(
     if heading:
         if isinstance(record, Loaded):
             raise OptionError("heading: expected a record, found one that was loaded without")
-        (ready,) = with_heading([ready], [record])
+        (ready,) = add_heading([ready], [record])
     before = {each.rpartition("sha256:")[2] for each in recording.corrected_by}
     if not ready.again and before.intersection(ready.holds):
         raise DataError(
@@ -249,27 +249,27 @@ def apply(
     if temperature_column and any(part.since_power_on for part, _ in ready.sections):
         (recording,) = with_power_on_temperature([recording])
     check_after(
-        ((part.kind, columns, ready.holds) for part, columns in ready.sections), thermals_of(recording.corrected_by)
+        ((part.kind, columns, ready.holds) for part, columns in ready.sections), parse_thermals(recording.corrected_by)
     )
     corrected = recording
-    for part, columns in sections_for(ready.sections, recording):
+    for part, columns in select_sections(ready.sections, recording):
         corrected = part.apply(ready.unit, columns, corrected)
     if ready.further is not None:
         corrected = ready.further(corrected)
     if corrected is recording:
         return recording
-    return replace(corrected, corrected_by=(*recording.corrected_by, *_entries(ready)))
+    return replace(corrected, corrected_by=(*recording.corrected_by, *_name_corrections(ready)))
 
 
-def _entries(ready: Loaded) -> Iterator[str]:
-    """What a corrected recording says: a line per record; for a blob one for itself, then one per record in it."""
+def _name_corrections(ready: Loaded) -> Iterator[str]:
+    """Yield a line of `corrected_by` for each record; for a blob one for itself, then one for each record in it."""
     made = [(columns.get("record", ready.holds[0]), part.kind) for part, columns in ready.sections]
     for digest in dict.fromkeys((ready.holds[0], *(digest for digest, _ in made))):
-        yield entry(ready.name, digest, [kind for source, kind in made if source == digest])
+        yield name_correction(ready.name, digest, [kind for source, kind in made if source == digest])
 
 
 def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterable[Recording]) -> Iterator[Recording]:
-    """Correct consecutive blocks of a recording by several records in the order given.
+    """Yield consecutive blocks of a recording corrected by several records in their order.
 
     Raises
     ------
@@ -292,31 +292,32 @@ def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterabl
         for ready in chain:
             block = apply(ready, block)
         if number == 0 and block is raw:
-            raise DataError(next(iter(_why_unchanged(chain, raw)), f"{raw.name}: nothing to correct in it"))
+            raise DataError(next(iter(_explain_unchanged(chain, raw)), f"{raw.name}: nothing to correct in it"))
         yield block
 
 
-def _why_unchanged(chain: Iterable[Loaded], recording: Recording) -> Iterator[str]:
+def _explain_unchanged(chain: Iterable[Loaded], recording: Recording) -> Iterator[str]:
+    """Yield the reason of each section that does not correct a recording."""
     for ready in chain:
         for part, columns in ready.sections:
             if message := part.unchanged(columns, recording):
                 yield message
 
 
-def sections_for(
+def select_sections(
     sections: Sequence[tuple[Section, Mapping[str, Any]]], recording: Recording
 ) -> Sequence[tuple[Section, Mapping[str, Any]]]:
-    """Return the sections that a recording has the columns for, where it has those of one triad of two."""
+    """Return the sections of which a recording has columns; all of them where it has none."""
     kept = [part for part in sections if not part[0].triad or _has_any(recording, part[0].triad)]
-    return kept or sections  # with nothing to correct, the section itself says which columns it expects
+    return kept or sections  # each section then names the columns that it expects
 
 
 def _has_any(recording: Recording, sensor: str) -> bool:
     return any(name in recording for name in triad(sensor))
 
 
-def _parts(record: Calibration | Blob) -> list[tuple[Section | None, Mapping[str, Any]]]:
-    """The sections of a record or blob, with what each says of its columns."""
+def _list_sections(record: Calibration | Blob) -> list[tuple[Section | None, Mapping[str, Any]]]:
+    """Return the sections of a record or blob, each with the properties of its columns."""
     if isinstance(record, Blob):
         return [(section(str(entry["kind"])), entry) for entry in record.text["sections"]]
     if procedure_of(record).not_applied:
@@ -324,8 +325,8 @@ def _parts(record: Calibration | Blob) -> list[tuple[Section | None, Mapping[str
     return [(section(table.kind), table.columns) for table in tables_of(record)]
 
 
-def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
-    """Return what a user should know about applying this record to this recording."""
+def warn_before_applying(record: Calibration | Blob, recording: Recording) -> list[str]:
+    """Return warnings about applying a record to a recording: verdict, other unit, missing triads, temperature."""
     messages = []
     if isinstance(record, Calibration) and record.verdict.state == "bad":
         messages.append(f"the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
@@ -334,7 +335,7 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
         mine, its = sensor.get(key), recording.metadata.get(key)
         if mine and its and mine != its:
             messages.append(f"{recording.name}: {key} {its}, but the record was made for {mine}")
-    parts = [(part, columns) for part, columns in _parts(record) if part is not None]
+    parts = [(part, columns) for part, columns in _list_sections(record) if part is not None]
     triads = [part.triad for part, _ in parts if part.triad]
     absent = [triad for triad in triads if not _has_any(recording, triad)]
     if absent and len(absent) < len(triads):
@@ -354,7 +355,7 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     ]
 
 
-def results_in(records: Iterable[Calibration | Blob]) -> list[tuple[Calibration, Procedure]]:
-    """Return each record with each procedure whose results it holds; a blob does not say what it holds."""
+def list_results(records: Iterable[Calibration | Blob]) -> list[tuple[Calibration, Procedure]]:
+    """Return each record with each procedure whose results it holds; blobs are left out."""
     known = [record for record in records if isinstance(record, Calibration)]
     return [(record, procedure) for record in known for procedure in (procedure_of(record), *joined_of(record))]

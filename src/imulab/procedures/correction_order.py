@@ -1,4 +1,4 @@
-"""What corrects before what: a warm-up table comes after the thermal record that its cycles were corrected by."""
+"""The order of corrections: a warm-up table comes after the thermal record by which its cycles were corrected."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from typing import Any
 from imulab.errors import RecordError
 
 SENSORS = {"thermal": "accel", "thermal_gyro": "gyro"}
-"""What the sections of a thermal record correct."""
+"""The triad that each section of a thermal record corrects."""
 _ENTRY = re.compile(r" \(thermal: ([a-z ]+)\) sha256:([0-9a-f]{64})$")
 
 
 @dataclass(frozen=True)
 class Thermal:
-    """Laws over temperature that were applied: the SHA-256 by which their record goes, and the sensor they correct."""
+    """Laws over temperature that were applied: the SHA-256 of their record or blob, and the triad they correct."""
 
     hashes: Sequence[str]
     sensor: str
 
 
-def entry(name: str, digest: str, kinds: Iterable[str]) -> str:
-    """Return what a corrected recording says of a record: ``thermal.json (thermal: accel) sha256:...``."""
+def name_correction(name: str, digest: str, kinds: Iterable[str]) -> str:
+    """Return the line of `corrected_by` for a record: ``thermal.json (thermal: accel) sha256:...``."""
     over = " ".join(SENSORS[kind] for kind in kinds if kind in SENSORS)
     return f"{name} (thermal: {over}) sha256:{digest}" if over else f"{name} sha256:{digest}"
 
 
-def thermals_of(corrected_by: Iterable[str]) -> list[Thermal]:
-    """Return the laws over temperature that a recording says it was corrected by."""
+def parse_thermals(corrected_by: Iterable[str]) -> list[Thermal]:
+    """Return the laws over temperature in the lines of a recording's `corrected_by`."""
     matches = filter(None, map(_ENTRY.search, corrected_by))
     return [Thermal((match[2],), sensor) for match in matches for sensor in match[1].split()]
 
@@ -65,9 +65,9 @@ def check_order(kinds: Sequence[str]) -> None:
 def check_after(
     sections: Iterable[tuple[str, Mapping[str, Any], Sequence[str]]], before: Iterable[Thermal] = ()
 ) -> None:
-    """Refuse a warm-up table whose cycles were corrected by other laws over temperature than what is corrected by it.
+    """Refuse a warm-up table whose cycles were corrected by other laws over temperature than the recording.
 
-    Sections in the order of application: kind, columns, and the SHA-256 by which their record goes.
+    Sections are in the order of application: kind, columns, and the SHA-256 of their record or blob.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Records to firmware, autopilots and toolboxes, as people have them: records or their files, options as keywords."""
+"""Export of records to firmware, autopilots and toolboxes: records or their files, options as keywords."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _DEVICE_IDS = 2**32  # numbers of 32 bits
 
 
 def _nothing(message: str) -> None:
-    """Tell nobody."""
+    """Ignore a message."""
 
 
 def export(
@@ -107,7 +107,7 @@ def export(
         for item in listed_records
     ]
     names = [os.fspath(item) if isinstance(item, str | PathLike) else "the record" for item in listed_records]
-    fusion = None if method is None and memory is None else _fusion(to, method, memory, loaded)
+    fusion = None if method is None and memory is None else _choose_fusion(to, method, memory, loaded)
     if to in _FIRMWARE:
         for name, record in zip(names, loaded, strict=True):
             try:
@@ -118,14 +118,15 @@ def export(
         if record.verdict.state == "bad":
             tell(f"{name}: the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
     file = os.fspath(noise) if isinstance(noise, str | PathLike) else "the noise"
-    noise_keys: Mapping[str, Any] = _noise_of(noise, file) if isinstance(noise, Calibration) else {}
+    noise_keys: Mapping[str, Any] = _state_noise(noise, file) if isinstance(noise, Calibration) else {}
     if noise and not isinstance(noise, Calibration):
-        noise_keys = noise if isinstance(noise, Mapping) else _noise(file)
+        noise_keys = noise if isinstance(noise, Mapping) else _read_noise(file)
     options = ExportOptions(lossy, number, noise_keys, file if noise else "", fusion, mag_mount, tell)
     return exporters.export(to, loaded, Path(folder), options)
 
 
-def _fusion(to: str, method: str | None, memory: str | float | None, records: Sequence[Calibration]) -> Fusion:
+def _choose_fusion(to: str, method: str | None, memory: str | float | None, records: Sequence[Calibration]) -> Fusion:
+    """Return how the array among the records is to fuse; refuses these options without one."""
     for record in records if to in _FIRMWARE else ():
         procedure = procedure_of(record)
         if procedure.fuses:
@@ -133,14 +134,16 @@ def _fusion(to: str, method: str | None, memory: str | float | None, records: Se
     raise OptionError("method and memory say how a gyro array fuses: expected its record, and target c or blob")
 
 
-def _noise_of(record: Calibration, name: str) -> Mapping[str, Any]:
+def _state_noise(record: Calibration, name: str) -> Mapping[str, Any]:
+    """Return the noise that a record states; errors name its file."""
     try:
         return procedure_of(record).noise(record)
     except OptionError as error:
         raise OptionError(f"{name}: {error}") from None
 
 
-def _noise(file: str) -> Mapping[str, Any]:
+def _read_noise(file: str) -> Mapping[str, Any]:
+    """Return the noise in the file of a noise record, or of ``allan --json``."""
     try:
         content = json.loads(Path(file).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -148,7 +151,7 @@ def _noise(file: str) -> Mapping[str, Any]:
     except (OSError, ValueError) as error:
         raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found no JSON ({error})") from None
     if isinstance(content, dict) and "procedure" in content:
-        return _noise_of(load(file), file)
+        return _state_noise(load(file), file)
     if not isinstance(content, dict) or "columns" not in content:
         raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found JSON without 'columns'")
     return dict(content)

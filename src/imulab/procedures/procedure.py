@@ -1,7 +1,7 @@
-"""What a procedure is to the rest of the package: its fit, what its record gives a unit, and how it is shown.
+"""The base classes of procedures: a fit from files, the use of its record in a unit, and how it is shown.
 
-Each procedure's folder has a class of `Procedure` that overrides what it has, and imports the rest of its folder when
-one of its methods is called, so that the registry costs nothing.
+Each procedure's folder has a class of `Procedure` that overrides what it has. It imports the rest of its folder when
+one of its methods is called, so that the registry loads quickly.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Files(Protocol):
-    """Where a fit gets what its files hold; `name` is what the command line or the manifest calls a file."""
+    """Access to the files of a fit; `name` is that on the command line or in the manifest."""
 
     def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
         """Return a recording as a whole; options as for `imulab.read`."""
@@ -41,10 +41,10 @@ class Files(Protocol):
         """Return a recording in blocks; options as for `imulab.read_blocks`."""
 
     def path(self, name: str) -> Path:
-        """Return where a file lies on this machine."""
+        """Return the path of a file on this machine."""
 
     def beside(self, name: str, file: str) -> str:
-        """Return the name of a file that file `name` names relative to itself."""
+        """Return the name of `file`, which the file `name` states relative to itself."""
 
 
 class Task(Struct, frozen=True):
@@ -53,17 +53,18 @@ class Task(Struct, frozen=True):
     Attributes
     ----------
     files
-        What the files are, for messages.
+        Description of the files, for messages.
     count
         Fewest and most files; None for any number.
     function
-        Returns its fit, the public function whose signature says its options.
+        Returns the public function of the fit, whose signature states the options.
     values
-        Texts of options and how messages call an option (``"--{}"``) to checked values; raises OptionError.
+        Returns checked values for texts of options and the label of options in messages (``"--{}"``); raises
+        OptionError.
     fit
-        Names of the files, values, access to files and a progress callback to the record.
+        Returns the record for names of files, values, access to files and a progress callback.
     without
-        Keywords of the function that say what the files are.
+        Keywords of the function that are no options, since they are the files.
     more
         Typed dictionaries of further options.
     """
@@ -96,8 +97,7 @@ class Section:
     kind
         Name of the struct.
     triad
-        ``accel``, ``gyro`` or ``mag`` where the section corrects that triad: it is left out where a recording has none
-        of it.
+        ``accel``, ``gyro`` or ``mag`` where the section corrects that triad; it is left out for recordings without.
     corrects
         Whether it corrects columns of a recording.
     since_power_on
@@ -110,11 +110,11 @@ class Section:
     since_power_on: ClassVar[bool] = False
 
     def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
-        """Return the vectors of an exported unit's self-test: inputs, and what the core makes of them by a table."""
+        """Return the vectors of an exported unit's self-test: inputs, and the core's outputs by a table."""
         raise NotImplementedError
 
     def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-        """Return the corrected recording; `columns` is what the section says of its columns."""
+        """Return the corrected recording; `columns` are the properties of the section's columns."""
         raise NotImplementedError
 
     def unchanged(self, columns: Mapping[str, Any], recording: Recording) -> str | None:
@@ -122,22 +122,22 @@ class Section:
         return None
 
     def remarks(self, columns: Mapping[str, Any], recording: Recording) -> list[str]:
-        """Return what a user should know about correcting a recording, why it stays as it is included."""
+        """Return warnings and notes about correcting a recording, such as why it stays as it is."""
         return []
 
 
 class OnLine(Struct, frozen=True):
-    """What units of a line are compared by, where a record's parameters mean what only that record says.
+    """Parameters by which units of a line are compared, where those of a record depend on its reference temperature.
 
     Attributes
     ----------
     parameters
         Further parameters, which mean the same in every record that has them.
     about
-        What the record's own parameters are about, and its unit: ``reference_temperature``.
+        The quantity on which the record's own parameters depend, and its unit: ``reference_temperature``.
     means, tolerance
-        That number, and further ones that say what these parameters mean, as the knots of splines; records are compared
-        by them where all these agree within the tolerance.
+        That quantity, and further numbers on which they depend, such as knots of splines; records are compared by their
+        own parameters if all these agree within the tolerance.
     own
         The names of these parameters.
     freedom
@@ -158,13 +158,13 @@ class Procedure:
     Attributes
     ----------
     name
-        In records.
+        Name in records.
     command
-        On the command line and in manifests of fleets.
+        Name on the command line and in manifests of fleets.
     title
-        Of its reports.
+        Title of its reports.
     line_title
-        Of its part in the report of a fleet.
+        Title of its part in the report of a fleet.
     task
         How it is run on the files of one unit.
     sections
@@ -172,7 +172,7 @@ class Procedure:
     elsewhere
         Why another program's file cannot hold its records, where they state no triads; ``{target}`` is that program.
     not_applied
-        Why its records correct no recording by `apply`, and what takes them; empty where they do.
+        Why its records correct no recording by `apply`, and which command uses them; empty where they do.
     states_triads
         Whether its records state accelerometers and gyroscopes as matrices, which other programs' files are made from.
     over_temperature
@@ -180,7 +180,7 @@ class Procedure:
     fuses
         Whether its records say how a unit fuses several gyroscopes.
     has_heading
-        Whether a record can hold magnetometers, which tell magnetic heading and dip.
+        Whether a record can hold magnetometers, which give magnetic heading and dip.
     joins
         Whether records of other procedures can hold its results beside their own, in ``fit`` and ``data`` by its name.
     """
@@ -203,7 +203,7 @@ class Procedure:
         """Return one of its kinds of section."""
         return next(known for known in self.sections if known.kind == kind)
 
-    # What a record is and shows.
+    # Content and presentation of a record.
 
     def check(self, record: Calibration) -> None:
         """Check a record from its file; raises RecordError where its sections are not what the procedure writes."""
@@ -214,11 +214,11 @@ class Procedure:
         raise NotImplementedError
 
     def joined(self, record: Calibration) -> Exhibits:
-        """Return what a record of another procedure shows of this one's results in it."""
+        """Return the exhibits of this procedure's results in a record of another one."""
         raise NotImplementedError
 
     def summary(self, record: Calibration) -> tuple[list[str], list[list[str]]]:
-        """Return the table that a record shows of itself first, titles and rows; empty for that of all parameters."""
+        """Return titles and rows of a record's first table; empty for the table of all parameters."""
         return [], []
 
     def rows(self, record: Calibration) -> Sequence[Row]:
@@ -238,21 +238,21 @@ class Procedure:
         return first, second
 
     def on_line(self, record: Calibration) -> OnLine | None:
-        """Return what units of a line are compared by, None where a parameter means the same in all records."""
+        """Return how units of a line are compared, None where a parameter means the same in all records."""
         return None
 
-    # What a record gives a unit, and what corrects a recording.
+    # Use of a record in a unit, and for recordings.
 
     def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
         """Return the tables of a unit, in the order in which they are applied; an array fuses by `fusion`."""
         raise NotImplementedError
 
     def fusion(self, record: Calibration, method: str | None, memory: str | None) -> Fusion:
-        """Return how the unit is to fuse, by texts of method and memory; as the record carries where these are None."""
+        """Return how the unit is to fuse, by texts of method and memory, or as the record states for None."""
         raise NotImplementedError
 
     def heading(self, record: Calibration) -> Callable[[Recording], Recording]:
-        """Return what adds magnetic heading and dip to a recording that the record corrected.
+        """Return a function that adds magnetic heading and dip to a recording that the record corrected.
 
         Raises
         ------
@@ -262,17 +262,17 @@ class Procedure:
         raise NotImplementedError
 
     def beyond(self, record: Calibration, recording: Recording) -> tuple[int, float]:
-        """Return how many samples lie beyond what the record was made at, and the largest value among them, SI."""
+        """Return the number of samples beyond the range of the record's test, and the largest of them, SI."""
         return 0, 0.0
 
     def beyond_message(self, record: Calibration, count: int, largest: float) -> str:
-        """Say that so many samples, the largest of them in SI, lie beyond what the record was made at."""
+        """Return the warning of so many samples, the largest in SI, beyond the range of the record's test."""
         raise NotImplementedError
 
-    # What other programs take of a record.
+    # A record for other programs.
 
     def noise(self, record: Calibration) -> Mapping[str, Any]:
-        """Return what exporters make noise keys of, in the form of ``allan --json``.
+        """Return the noise for exporters, in the form of ``allan --json``.
 
         Raises
         ------
@@ -301,7 +301,7 @@ class Procedure:
 
 
 def source_of(access: Files, name: str, called: str | None = None) -> Source | None:
-    """Return a file as a source of a record, under the name that the record calls it; None for what is no file."""
+    """Return a file as a source of a record, under `called` or its own name; None for what is no file."""
     from imulab.recording import Source
 
     path = access.path(name)

@@ -1,10 +1,7 @@
-"""The registry of procedures, records loaded by the procedure that they name.
+"""The registry of procedures; records loaded by the procedure that they name; a procedure's fit from files and texts.
 
-A procedure's fit from files and texts.
-
-Nobody else tells procedures apart by name. A further procedure is a folder with a class, and a line here.
-
-Going through one function is what makes a fleet's parameters equal the single command's to the last bit.
+No other module distinguishes procedures by name. A further procedure is a folder with a class, and a line here.
+Commands and fleets share `run_task`, so that their parameters are equal to the last bit.
 """
 
 from __future__ import annotations
@@ -28,9 +25,6 @@ from imulab.records.calibration import Calibration
 if TYPE_CHECKING:
     from imulab.device.unit import Blob
 
-# The registry: the procedures, with all that the rest of the package asks of them.
-
-
 PROCEDURES: dict[str, Procedure] = {
     procedure.command: procedure
     for procedure in (
@@ -43,7 +37,7 @@ PROCEDURES: dict[str, Procedure] = {
         RateProcedure(),
     )
 }
-"""By the names of the command line and of fleets' manifests."""
+"""The procedures by their names on the command line and in manifests of fleets."""
 
 
 def procedure_of(record: Calibration) -> Procedure:
@@ -52,7 +46,7 @@ def procedure_of(record: Calibration) -> Procedure:
     Raises
     ------
     RecordError
-        It is not known.
+        There is no such procedure.
     """
     for procedure in PROCEDURES.values():
         if procedure.name == record.procedure:
@@ -78,7 +72,7 @@ def section(kind: str) -> Section | None:
     return next((known for known in sections() if known.kind == kind), None)
 
 
-# Calibration records from their files, each checked by the procedure that it names; records and blobs alike.
+# Records and blobs from their files; a record is checked by the procedure that it names.
 
 
 def load(path: str | Path) -> Calibration:
@@ -101,19 +95,19 @@ def load(path: str | Path) -> Calibration:
 
 
 def load_sealed(path: str | Path) -> tuple[Calibration, str]:
-    """Read a calibration record and its ``content_sha256``; errors as for `load`."""
+    """Return a calibration record and its ``content_sha256``; errors as for `load`."""
     with readable(path, RecordError):
         data = Path(file_name(path)).read_bytes()
     return loads_sealed(data, str(path))
 
 
 def loads(data: bytes, name: str) -> Calibration:
-    """Read a calibration record from the bytes of its file; errors as for `load`."""
+    """Return a calibration record from the bytes of its file; errors as for `load`."""
     return loads_sealed(data, name)[0]
 
 
 def load_any(path: str | Path) -> Calibration | Blob:
-    """Read a record or a blob; errors as for `load` and `load_blob`."""
+    """Return a record or a blob from its file; errors as for `load` and `load_blob`."""
     from imulab.device.unit import is_blob, load_blob
 
     return load_blob(path) if is_blob(path) else load(path)
@@ -133,8 +127,7 @@ def loads_sealed(data: bytes, name: str) -> tuple[Calibration, str]:
     return record, seal
 
 
-# A procedure's fit, from files and the texts of its options to a record: what single commands and the fleet both
-# run.
+# A procedure's fit from files and the texts of its options, for commands and fleets.
 
 
 def _silent(_: int) -> None:
@@ -154,9 +147,9 @@ def run_task(
     label: str = FLAG,
     progress: Callable[[int], None] = _silent,
 ) -> Calibration:
-    """Fit one unit; `options` are texts, None where not given, and of switches truth values.
+    """Return the record of one unit's fit; `options` are texts, truth values of switches, or None.
 
-    What is wrong of a record that an option names, ``prior: ...``, is said with the name of its file.
+    An error in a record that an option names, ``prior: ...``, is raised with the name of its file.
 
     Raises
     ------

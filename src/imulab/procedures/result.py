@@ -1,8 +1,4 @@
-"""What fits, checks and plans return and what they are given.
-
-Results that show themselves, files, arrays and data frames as recordings, a recording held against a record, and a
-planned test as text and JSON.
-"""
+"""The base classes of results of fits, plans and checks, and their input data as recordings."""
 
 from __future__ import annotations
 
@@ -44,10 +40,7 @@ if TYPE_CHECKING:
     from imulab.views import AnyPlot, AnyPlots
 
 
-# What a fit is given, as people have it, and what every fit returns.
-
-
-# What every fit returns, whatever the procedure: its record, and what a person does with it next.
+# Results of fits.
 
 
 class Result:
@@ -105,12 +98,12 @@ class Result:
 
 
 class Drawn(Shown):
-    """A result that is no record, and shows itself by what a report on it shows; `subject` says what it is."""
+    """A result that is no record, shown by the exhibits of its report; `subject` names it."""
 
     subject: ClassVar[str]
 
     def exhibits(self) -> Exhibits:
-        """Return what a report on it shows."""
+        """Return headline, facts, figures and tables of its report."""
         raise NotImplementedError
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
@@ -139,7 +132,7 @@ class Drawn(Shown):
         return plots if name is None else plots[name]
 
 
-# What a fit is given, as people have it: a file, a recording, a data frame, or arrays.
+# Input data: a file, a recording, a data frame, or arrays.
 
 
 Record: TypeAlias = Annotated[Calibration | Result | str | os.PathLike[str], file("RECORD")]
@@ -166,15 +159,15 @@ def as_recording(
     Parameters
     ----------
     data
-        As people have them.
+        A file, a recording, a data frame or arrays.
     reading
-        How they are to be understood.
+        Options of how to understand them.
     function
-        What was called with them, for messages.
+        The public function that was called with them, for messages.
     columns
-        Array to its columns by name, where `data` is an array without names; a triad of accelerometers if not given.
+        Returns the columns, by name, of an array without names; a triad of accelerometers if not given.
     name
-        The argument that they were given as.
+        The name of the argument.
 
     Raises
     ------
@@ -189,41 +182,43 @@ def as_recording(
     part: dict[str, Any] = {key: stated.get(key) for key in _PART}
     if isinstance(data, str | os.PathLike):
         _refuse(stated, _OF_ARRAYS, called, _TITLED)
-        return read(os.fspath(data), **_only(stated, _OF_FILES), **part)
+        return read(os.fspath(data), **_pick(stated, _OF_FILES), **part)
     _refuse(stated, _OF_FILES, called, "only files have that")
     if isinstance(data, Recording):
         _refuse(stated, _OF_ARRAYS, called, "a recording has its own")
-        return _cut(data, **part)
-    arrays = _only(stated, ("rate", "unit", "units"))
+        return _select_part(data, **part)
+    arrays = _pick(stated, ("rate", "unit", "units"))
     if is_frame(data):
         _refuse(stated, ("time",), called, "a data frame has it as the column 'time'")
-        return _cut(Recording.from_frame(data, **arrays), **part)  # type: ignore[arg-type]
+        return _select_part(Recording.from_frame(data, **arrays), **part)  # type: ignore[arg-type]
     named: Mapping[str, ArrayLike]
     if isinstance(data, Mapping):
         named = data
     else:
-        samples = _array(data, called, name)
+        samples = _as_array(data, called, name)
         named = {"accel": samples} if columns is None else columns(samples)
     whole = {"rate": None, "unit": None, "units": None, **arrays, "name": "arrays"}
-    return _cut(Recording(*columns_of_arrays({**_only(stated, ("time",)), **named}, **whole), name="arrays"), **part)
+    return _select_part(
+        Recording(*columns_of_arrays({**_pick(stated, ("time",)), **named}, **whole), name="arrays"), **part
+    )
 
 
 def as_blocks(
     data: Data, reading: Mapping[str, Any] | Reading | Sampling, function: Callable[..., Any], name: str = "data"
 ) -> tuple[Iterator[Recording], Source | None]:
-    """Return data in blocks, for what averages them, and the file that they are from; else as for `as_recording`."""
+    """Return data in blocks, for means over long files, and the source file; else as for `as_recording`."""
     if not isinstance(data, str | os.PathLike):
         whole = as_recording(data, reading, function, name=name)
         return iter((whole,)), whole.source
     check_keywords(reading, function)
     stated = {key: value for key, value in reading.items() if value is not None}
     _refuse(stated, _OF_ARRAYS, function.__name__, _TITLED)
-    part = _only(stated, _PART)
+    part = _pick(stated, _PART)
     path, source = Path(data), None
     if path.is_file():
         with path.open("rb") as stream:
             source = Source(str(data), hashlib.file_digest(stream, "sha256").hexdigest())
-    return read_blocks(path, **_only(stated, _OF_FILES), **part), source
+    return read_blocks(path, **_pick(stated, _OF_FILES), **part), source
 
 
 def as_record(record: Record, called: str) -> Calibration:
@@ -251,7 +246,7 @@ def check_keywords(keywords: Mapping[str, Any], function: Callable[..., Any]) ->
     Raises
     ------
     OptionError
-        There is one; the message says which was meant. Or one that says how data are to be read has another type.
+        There is one, and the message suggests the nearest; or an option of reading has another type.
     """
     parameters = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
     known = dict.fromkeys([*parameters, *Sampling.__annotations__, *Reading.__annotations__])
@@ -262,7 +257,7 @@ def check_keywords(keywords: Mapping[str, Any], function: Callable[..., Any]) ->
             check(keywords[key], hint, f"{function.__name__}: {key}")
 
 
-def _array(data: object, called: str, name: str) -> NDArray[Any]:
+def _as_array(data: object, called: str, name: str) -> NDArray[Any]:
     """Return samples without a name as an array of numbers."""
     if isinstance(data, np.ndarray | list | tuple) or hasattr(data, "__array__"):
         try:
@@ -276,8 +271,8 @@ def _array(data: object, called: str, name: str) -> NDArray[Any]:
     raise DataError(f"{called}: {name}: expected {_EXPECTED}, found {described(data)}")
 
 
-def _cut(recording: Recording, window: Window | None, element: int | None) -> Recording:
-    """Return one IMU of several, and what lies within a window of time."""
+def _select_part(recording: Recording, window: Window | None, element: int | None) -> Recording:
+    """Return the part of a recording within a window of time, and one IMU of several."""
     parts = list(Selection(window=window, element=element).of(iter([recording]), recording.name))
     if len(parts) == 1:
         return parts[0]
@@ -286,16 +281,18 @@ def _cut(recording: Recording, window: Window | None, element: int | None) -> Re
 
 
 def _refuse(stated: Mapping[str, Any], keys: Iterable[str], called: str, reason: str) -> None:
+    """Refuse options that do not go with the kind of data."""
     for key in keys:
         if key in stated:
             raise OptionError(f"{called}: {key} does not go with such data: {reason}")
 
 
-def _only(stated: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+def _pick(stated: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """Return the stated options among some."""
     return {key: stated[key] for key in keys if key in stated}
 
 
-# A plan of a test, and what every procedure's command prints, writes and says of it.
+# Plans.
 
 
 def amount(value: float | None, unit: str) -> dict[str, Any]:
@@ -316,7 +313,7 @@ class PlannedTest(Shown):
         return []
 
     def remarks(self) -> list[str]:
-        """Return what is said below the tables."""
+        """Return the lines below the tables."""
         return []
 
     def content(self) -> dict[str, Any]:
@@ -324,7 +321,7 @@ class PlannedTest(Shown):
         raise NotImplementedError
 
     def findings(self) -> Sequence[str]:
-        """Return what is wrong with the plan, with what to do."""
+        """Return warnings about the plan, with what to do."""
         return ()
 
     def text(self) -> str:
@@ -353,12 +350,12 @@ class PlannedAttitudes(PlannedTest):
 
     @property
     def lead(self) -> str:
-        """What the plan is and predicts, in a few sentences."""
+        """The plan and its prediction in a few sentences."""
         raise NotImplementedError
 
     @property
     def predicted(self) -> list[tuple[str, str, str]]:
-        """What the test will give, as people read it: name, text and unit."""
+        """The predicted uncertainties as name, text and unit."""
         raise NotImplementedError
 
     def recording(self) -> Recording:
@@ -366,7 +363,7 @@ class PlannedAttitudes(PlannedTest):
         raise NotImplementedError
 
     def pictures(self) -> list[dict[str, Any]]:
-        """Return what the sheet shows of each attitude."""
+        """Return the pictures of the sheet, one for each attitude."""
         raise NotImplementedError
 
     def save(self, path: str | Path) -> None:
@@ -388,11 +385,11 @@ class PlannedAttitudes(PlannedTest):
         write_page(path, self.sheet())
 
 
-# A test of a record by new data: what it means, what to do next, and what was measured, as text, JSON and report.
+# Checks of a record by new data.
 
 
 def probability_text(probability: float | None, least: float = 1e-12) -> str:
-    """Return a probability for a sentence: ``p = 0.031``; below `least` it is told as such."""
+    """Return a probability for a sentence: ``p = 0.031``, or ``p below 1e-12``."""
     if probability is None:
         return "not tested"
     return f"p = {probability:.2g}" if probability >= least else f"p below {least:g}"
@@ -412,8 +409,8 @@ def columns_as_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:
 class RecordCheck(Drawn):
     """A test of a record by new data.
 
-    A procedure's says whether it `passed`, what that means, what was measured, and what the report shows; this class
-    makes text, JSON and page of it. `data` is what the page calls a file that was tested.
+    The class of a procedure states whether it `passed`, what that means, and what was measured; this class makes text,
+    JSON and page of it. `data` is the label of a tested file on the page.
     """
 
     data: ClassVar[str]
@@ -430,11 +427,11 @@ class RecordCheck(Drawn):
         return "pass" if self.passed else "fail"
 
     def meaning(self) -> str:
-        """Return what the test says, in words."""
+        """Return the outcome in a sentence."""
         raise NotImplementedError
 
     def next_step(self, record: str, files: Sequence[str]) -> str:
-        """Return what to do, or to know, where the test failed."""
+        """Return what to do after a failed test."""
         raise NotImplementedError
 
     def measured(self) -> list[str]:
@@ -446,7 +443,7 @@ class RecordCheck(Drawn):
         raise NotImplementedError
 
     def stated(self) -> list[tuple[str, str]]:
-        """Return what was stated beside record and files, as label and value."""
+        """Return stated values beside record and files, as label and value."""
         return []
 
     def text(self, record: str, files: Sequence[str], verdict: str) -> str:
@@ -462,11 +459,11 @@ class RecordCheck(Drawn):
     def exhibits_with(
         self, facts: list[tuple[str, str]], items: Sequence[Figure | ReportTable], more: str = ""
     ) -> Exhibits:
-        """Return exhibits under the headline that all tests have; `more` ends it."""
+        """Return exhibits under the common headline of all tests; `more` ends it."""
         return Exhibits(f"{self.verdict.capitalize()}: {self.meaning()}{more}.", facts, list(items))
 
     def page(self, held: Calibration, record: str, files: Sequence[str], notes: Sequence[str]) -> str:
-        """Return the report; `held` is the record in the file `record`, `notes` are those of the command."""
+        """Return the report as HTML text; `held` is the record in the file `record`, `notes` are the command's."""
         failed = [] if self.passed else [Bad(self.meaning()), self.next_step(record, files)]
         return render_page(
             f"{self.subject}: {self.verdict}",

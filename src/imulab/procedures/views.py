@@ -1,6 +1,6 @@
-"""What recordings and records show of themselves: reports, comparisons, and what is done with them next.
+"""Views of recordings and records: reports, comparisons, texts for terminals and notebooks.
 
-`Recording` and `Calibration` lie below all procedures; their methods ask the package for this module when called.
+`Recording` and `Calibration` lie below all procedures; the package's face hands these functions down to their methods.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from imulab.report.traces import (
 if TYPE_CHECKING:
     from imulab.report.plots import Plot, Plots
 
-# What a procedure shows of a record: its report, and the comparison of two records of a unit.
+# The report of a record.
 
 
 def exhibits_of(record: Calibration) -> Exhibits:
@@ -69,7 +69,7 @@ def parameter_rows(record: Calibration) -> Sequence[Row]:
     return procedure_of(record).rows(record)
 
 
-def rendered(record: Calibration) -> str:
+def render_record(record: Calibration) -> str:
     """Return the report of a record as HTML text; errors as for `exhibits_of`."""
     return report.render(record, exhibits_of(record), procedure_of(record).title)
 
@@ -97,10 +97,10 @@ def write_report(record: Record, path: str | Path) -> None:
     >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81)
     >>> il.write_report(fit.calibration, "sn42.html")
     """
-    write_page(path, rendered(as_record(record, "write_report")))
+    write_page(path, render_record(as_record(record, "write_report")))
 
 
-# Two records of one unit beside each other, as they show themselves.
+# Comparison of two records of one unit.
 
 
 @dataclass(frozen=True, repr=False)
@@ -112,11 +112,11 @@ class Changes(Drawn, RecordComparison):
     changes
         Parameters that both have, second record less first: difference, standard uncertainty, whether significant.
     probability
-        Of differences as large as all of them together, were nothing changed; None where a covariance is missing.
+        Probability of such differences of all parameters if nothing changed; None where a covariance is missing.
     left_out
         Parameters that one record alone has, or that mean something else in the other.
     models
-        In what the two models differ, a text each: a change may come from that.
+        Differences of the two models as texts; a change may come from these.
     record
         The first of the two.
     """
@@ -131,11 +131,11 @@ class Changes(Drawn, RecordComparison):
         models = f"; the records differ in {', '.join(self.models)}" if self.models else ""
         headline = f"{verdict(self)}{together}{models}."
         table = ReportTable("Changes", "", TITLES, change_rows(self))
-        return Exhibits(headline[0].upper() + headline[1:], [], [_figure(self, table.rows), table])
+        return Exhibits(headline[0].upper() + headline[1:], [], [_changes_figure(self, table.rows), table])
 
 
 TITLES = ["parameter", "change", "u", "change / u", "unit", ""]
-"""Of `change_rows`."""
+"""Column titles of `change_rows`."""
 
 
 def compare_records(first: Record, second: Record) -> Changes:
@@ -191,7 +191,7 @@ def change_rows(comparison: RecordComparison) -> list[list[str]]:
     return rows
 
 
-def _figure(comparison: RecordComparison, rows: list[list[str]]) -> Figure:
+def _changes_figure(comparison: RecordComparison, rows: list[list[str]]) -> Figure:
     judged = [(c, row) for c, row in zip(comparison.changes, rows, strict=True) if c.deviations is not None]
     marks = [change.significant for change, _ in judged]
     trace = scatter(
@@ -217,10 +217,7 @@ def _figure(comparison: RecordComparison, rows: list[list[str]]) -> Figure:
     )
 
 
-# What a procedure shows of a record: its report, and the comparison of two records of a unit.
-
-
-# What recordings and records show of themselves, and what is done with them next: `imulab.display.Views`.
+# Texts, pages and figures of records and recordings: `imulab.display.Views`.
 
 
 _COLOURS = {"good": "#1f6f8b", "look": "#b58a1b", "bad": "#c8553d"}
@@ -228,13 +225,13 @@ _STYLE = "border-left: 4px solid {}; padding: 2px 10px; margin: 6px 0"
 
 
 def text(record: Calibration) -> str:
-    """Return a record in a few lines: what it is of, its verdict, its headline, its parameters."""
+    """Return a record in a few lines: title, verdict, headline, parameters."""
     verdict = record.verdict
-    reasons = f": {_short(verdict.reasons[0])}" if verdict.reasons else ""
+    reasons = f": {_shorten(verdict.reasons[0])}" if verdict.reasons else ""
     more = f" (and {len(verdict.reasons) - 1} more)" if len(verdict.reasons) > 1 else ""
     lines = [_title(record), f"{verdict.state}: {SENTENCES[verdict.state]}{reasons}{more}"]
     lines += [headline] if (headline := _headline(record)) else []
-    rows = [f"  {_short(line)}" for line in aligned(*table)] if (table := _summary(record))[1] else _grouped(record)
+    rows = [f"  {_shorten(line)}" for line in aligned(*table)] if (table := _summary(record))[1] else _grouped(record)
     room = LINES - len(lines)
     if len(rows) > room:
         rows = [*rows[: room - 1], f"  ... and {len(rows) - room + 1} more: to_frame() has all parameters"]
@@ -242,10 +239,10 @@ def text(record: Calibration) -> str:
 
 
 def html(record: Calibration) -> str:
-    """Return a record as HTML: what it is of, its verdict, its headline, its parameters."""
+    """Return a record as HTML: title, verdict, headline, parameters."""
     verdict = record.verdict
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
-    rows = [[row.name, *_number(row), row.unit] for row in parameter_rows(record)]
+    rows = [[row.name, *_format_row(row), row.unit] for row in parameter_rows(record)]
     table = html_table(["parameter", "value", "standard uncertainty", "unit"], rows)
     titles, first = _summary(record)
     if first:
@@ -318,7 +315,7 @@ def _title(record: Calibration) -> str:
 
 
 def _headline(record: Calibration) -> str:
-    """Return the result in a sentence; nothing of a record that lacks what it is made from."""
+    """Return the result in a sentence; empty for a record that lacks its data."""
     try:
         return exhibits_of(record).headline
     except RecordError:
@@ -326,7 +323,7 @@ def _headline(record: Calibration) -> str:
 
 
 def _summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
-    """Return the table that a record shows first; nothing of one that lacks what it is made from."""
+    """Return titles and rows of a record's first table; empty for a record that lacks its data."""
     try:
         return procedure_of(record).summary(record)
     except RecordError:
@@ -334,22 +331,22 @@ def _summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
 
 
 def _grouped(record: Calibration) -> list[str]:
-    """Return the parameters as lines, those that differ in their last part alone in one."""
+    """Return the parameters as lines; those whose names differ in the last part alone share one."""
     groups: dict[tuple[str, str], list[str]] = {}
     for row in parameter_rows(record):
         stem, _, last = row.name.rpartition("_")
         stem, last = (stem, f"{last} ") if stem and (len(last) < 3 or last.isdecimal()) else (row.name, "")
         groups.setdefault((stem, row.unit), []).append(
-            last + " ± ".join(_number(row)[: 1 if row.standard_uncertainty is None else 2])
+            last + " ± ".join(_format_row(row)[: 1 if row.standard_uncertainty is None else 2])
         )
     width = max((len(stem) for stem, _ in groups), default=0)
-    return [_short(f"  {stem:{width}}  {', '.join(texts)} {unit}") for (stem, unit), texts in groups.items()]
+    return [_shorten(f"  {stem:{width}}  {', '.join(texts)} {unit}") for (stem, unit), texts in groups.items()]
 
 
-def _number(row: Row) -> tuple[str, str]:
+def _format_row(row: Row) -> tuple[str, str]:
     value, uncertainty = format_uncertain(row.value, row.standard_uncertainty)
     return value, uncertainty
 
 
-def _short(line: str) -> str:
+def _shorten(line: str) -> str:
     return line if len(line) <= WIDTH else line[: WIDTH - 4] + " ..."

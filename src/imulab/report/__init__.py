@@ -1,4 +1,4 @@
-"""Exhibits and a record to one self-contained HTML file that opens from disk without a network."""
+"""Reports: exhibits and a record as one self-contained HTML file that opens from disk without a network."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicte
 
 
 class Card(Struct, frozen=True):
-    """What an index shows of one piece of work: question, answer, commands, a figure, the report, the verdict."""
+    """A piece of work on an index page: question, answer, commands, a figure, the report, the verdict."""
 
     question: str
     answer: str

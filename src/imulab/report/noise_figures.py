@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +13,7 @@ from imulab.estimation.distributions import chi_square_upper_quantile
 from imulab.recording import Array, Recording
 from imulab.report import render_page
 from imulab.report import traces as panels
-from imulab.report.parameters import reading_unit, small_unit
+from imulab.report.parameters import reading_unit, sample_unit, small_unit
 from imulab.report.traces import (
     BAD,
     DASHES,
@@ -31,17 +30,19 @@ from imulab.report.traces import (
     bulk,
     edge_marks,
     edge_note,
+    figure_axis,
     format_uncertain,
+    log_axis,
     plain_number,
     rounded,
     scatter,
 )
 
-# The channels of a recording over time: a figure for each sensor, thinned to what a screen can show.
+# The channels of a recording over time: a figure for each sensor, thinned to the pixels of a screen.
 
 
 _POINTS = 2000
-"""Columns of pixels that a curve is thinned to; the smallest and the largest sample of each stay."""
+"""Columns of pixels to which a curve is thinned; the smallest and the largest sample of each stay."""
 _CHANNEL_COLOURS = (GOOD, BAD, "#7a5c99", "#6f7f3f", "#2c4fa3", "#a8322f", "#2e4057", QUIET)
 _DASHES = ("solid", "dot", "dash", "dashdot")
 
@@ -55,11 +56,11 @@ def channel_figures(recording: Recording) -> list[Figure]:
             groups.setdefault((stem, unit), []).append(name)
     time = recording.time
     place = np.arange(1.0, len(recording) + 1) if time is None else time
-    return [_figure(recording, names, stem, unit, place) for (stem, unit), names in groups.items()]
+    return [_channel_figure(recording, names, stem, unit, place) for (stem, unit), names in groups.items()]
 
 
 def thinned(place: Array, values: Array, points: int = _POINTS) -> tuple[Array, Array]:
-    """Return a curve that looks the same on so many columns of pixels: smallest and largest sample of each.
+    """Return a curve of equal look on so many columns of pixels: the smallest and largest sample of each.
 
     Samples that are not finite become gaps.
     """
@@ -76,7 +77,8 @@ def thinned(place: Array, values: Array, points: int = _POINTS) -> tuple[Array, 
     return np.repeat(middle, 2), ends.ravel()
 
 
-def _figure(recording: Recording, names: list[str], stem: str, unit: str, place: Array) -> Figure:
+def _channel_figure(recording: Recording, names: list[str], stem: str, unit: str, place: Array) -> Figure:
+    """Return the columns of one sensor over time or rows."""
     over = "time, s" if "time" in recording else "row"
     thin = len(recording) > 2 * _POINTS
     traces = [_trace(*thinned(place, recording.columns[name]), name, number) for number, name in enumerate(names)]
@@ -85,8 +87,8 @@ def _figure(recording: Recording, names: list[str], stem: str, unit: str, place:
         caption="Drawn are the smallest and the largest sample of each short piece." if thin else "",
         traces=traces,
         layout={
-            "xaxis": {"title": {"text": over}, "gridcolor": "#e6eaed", "zeroline": False},
-            "yaxis": {"title": {"text": f"{stem}, {unit}"}, "gridcolor": "#e6eaed", "zeroline": False},
+            "xaxis": figure_axis(over),
+            "yaxis": figure_axis(f"{stem}, {unit}"),
             "legend": LEGEND,
             "showlegend": len(names) > 1,
         },
@@ -111,19 +113,17 @@ def _trace(place: Array, values: Array, name: str, number: int) -> dict[str, Any
 # The report of the noise of a recording at rest: coefficients, Allan curves with their intervals, and the samples.
 
 
-_HOUR = 3600.0  # s
-_DEGREE = math.pi / 180  # rad
-_BLOCKS = 400  # means of the samples that the drawing over time has
+_BLOCKS = 400  # means of the samples in the drawing over time
 _DIGITS = 5  # of the numbers in a drawing
 _COLOURS = (GOOD, BAD, "#8e6bbd", "#c99a2e", "#4f9d69", INK)
 _MOST_LINES = len(_COLOURS)
-_MOST_NAMED = 6  # columns whose numbers the caption says
+_MOST_NAMED = 6  # columns whose numbers the headline states
 _AS_NOISE = {"bias_instability": "column_flicker", "quantisation": "column_quantisation"}
-"""Coefficients whose units alone do not say that they are noise: the parameters of a noise record that they are."""
+"""Coefficients that are read in the units of these parameters of a noise record, and not by their SI units."""
 
 
 def noise_page(analysis: dict[str, Any], recording: Recording) -> str:
-    """Return the report of what `imulab.estimation.column_noise.analyse` found, and of the recording it was given."""
+    """Return the report of an analysis by `imulab.estimation.column_noise.analyse`, and of its recording, as HTML."""
     verdict = verdict_of(analysis["warnings"])
     return render_page(
         "Noise at rest",
@@ -142,7 +142,7 @@ def noise_page(analysis: dict[str, Any], recording: Recording) -> str:
 
 
 def exhibits_of_noise(analysis: dict[str, Any], recording: Recording) -> Exhibits:
-    """Return what the report shows."""
+    """Return headline, facts, tables and figures of the report."""
     length = analysis["samples"] / analysis["sample_rate"]["value"]
     kinds: dict[str, list[str]] = {}
     for name, column in analysis["columns"].items():
@@ -157,7 +157,7 @@ def exhibits_of_noise(analysis: dict[str, Any], recording: Recording) -> Exhibit
         items += [
             allan_figure(analysis["columns"], names[k : k + _MOST_LINES]) for k in range(0, len(names), _MOST_LINES)
         ]
-    items += [_samples(analysis, recording, page) for page in panels.pages(list(analysis["columns"]))]
+    items += [_samples_figure(analysis, recording, page) for page in panels.pages(list(analysis["columns"]))]
     return Exhibits(
         headline=f"At rest for {length:.4g} s; white noise, as angle or velocity random walk: "
         + (f"{'; '.join(known[:_MOST_NAMED])}{more}{lost}." if known else "not determined."),
@@ -181,7 +181,7 @@ def interval(column: dict[str, Any]) -> tuple[Array, Array]:
 
 
 def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
-    """Return the Allan curves of columns of one unit, as `imulab.estimation.column_noise.analyse` found them."""
+    """Return the Allan curves of columns of one unit, by `imulab.estimation.column_noise.analyse`."""
     unit, factor = small_unit(columns[names[0]]["unit"]).scale
     traces: list[dict[str, Any]] = []
     fitted: list[dict[str, Any]] = []
@@ -201,12 +201,11 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
                     line={"color": _COLOURS[k], "dash": DASHES[k]}, marker={"symbol": SYMBOLS[k], "size": 6},
                     hovertemplate=f"{name}<br>%{{x:.3g}} s: %{{y:.3g}} {unit}<extra></extra>"),
         ]  # fmt: skip
-        fitted += _fitted(column, factor, name, _COLOURS[k])
+        fitted += _model_curve(column, factor, name, _COLOURS[k])
     message = "All samples are the same."
     if lowest:
         level, at_time, which = min(lowest)
         message = f"The lowest point is {plain_number(level, 3)} {unit} at {plain_number(at_time, 2)} s ({which})."
-    log = {"type": "log", "dtick": 1, "exponentformat": "none", "gridcolor": "#e6eaed"}
     return Figure(
         title=f"Allan deviation, {', '.join(names)}",
         message=message,
@@ -216,8 +215,8 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
         + "Slope −1/2: white noise. Flat: bias instability. Slope +1/2: a random walk of the zero.",
         traces=traces + fitted,
         layout={
-            "xaxis": {**log, "title": {"text": "averaging time, s"}},
-            "yaxis": {**log, "title": {"text": f"Allan deviation, {unit}"}, "automargin": True},
+            "xaxis": log_axis("averaging time, s"),
+            "yaxis": log_axis(f"Allan deviation, {unit}", automargin=True),
             "legend": LEGEND,
             "margin": MARGIN,
             "showlegend": len(names) > 1,
@@ -226,8 +225,8 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
     )
 
 
-def _fitted(column: dict[str, Any], factor: float, name: str, colour: str) -> list[dict[str, Any]]:
-    """The Allan deviation of the model, where there is one."""
+def _model_curve(column: dict[str, Any], factor: float, name: str, colour: str) -> list[dict[str, Any]]:
+    """Return the Allan deviation of the model as a dotted curve; no trace without a model."""
     known = [(t, d) for t, d in zip(column["tau"], column.get("fitted") or [], strict=False) if d is not None]
     if not known:
         return []
@@ -238,16 +237,14 @@ def _fitted(column: dict[str, Any], factor: float, name: str, colour: str) -> li
     ]
 
 
-def _samples(analysis: dict[str, Any], recording: Recording, names: Sequence[str]) -> Figure:
-    """Range and mean of the samples in equal blocks, so that a spike is seen whatever the length."""
+def _samples_figure(analysis: dict[str, Any], recording: Recording, names: Sequence[str]) -> Figure:
+    """Return range and mean of the samples in equal blocks, so that spikes show in recordings of any length."""
     layout = panels.grid()
     traces: list[dict[str, Any]] = []
     beyond = 0
     rate = analysis["sample_rate"]["value"]
     for index, name in enumerate(names):
-        unit, factor = {"rad/s": ("deg/s", 1 / _DEGREE), "m/s^2": ("mg", 1e3 / 9.80665)}.get(
-            analysis["columns"][name]["unit"], (analysis["columns"][name]["unit"], 1.0)
-        )
+        unit, factor = sample_unit(analysis["columns"][name]["unit"]).scale
         values = recording.si(name)
         values = factor * (values[np.isfinite(values)] - analysis["columns"][name]["mean"])
         size = max(1, len(values) // _BLOCKS)
@@ -297,7 +294,7 @@ def coefficients_table(rows: list[list[str]]) -> ReportTable:
 
 
 def coefficient_rows(analysis: dict[str, Any]) -> list[list[str]]:
-    """Return column, coefficient, value, uncertainty and unit of everything that an analysis found."""
+    """Return column, coefficient, value, uncertainty and unit of all coefficients of an analysis."""
     rows = []
     for name, column in analysis["columns"].items():
         for key, title in (
@@ -322,5 +319,5 @@ def coefficient_rows(analysis: dict[str, Any]) -> list[list[str]]:
 
 
 def _visible(coefficient: dict[str, Any]) -> bool:
-    """Whether a coefficient is beyond three times its uncertainty."""
+    """Return whether a coefficient is beyond three times its uncertainty."""
     return coefficient["value"] is not None and bool(coefficient["value"] > 3 * coefficient["standard_uncertainty"])

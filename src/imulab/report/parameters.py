@@ -52,10 +52,10 @@ _BY_NAME = (
     (r"(.*_)?zeta_\d+", {"1": ("%", 100.0)}),
     (r"(.*_)?c[12]", {"1/(m/s^2)": ("ppm/g", 1e6 * _PER_G), "1/(m/s^2)^2": ("ppm/g²", 1e6 * _PER_G**2)}),
 )
-"""Parameters that are read otherwise than their unit alone says."""
+"""Parameters, by patterns of their names, whose reading unit differs from that of their SI unit."""
 _SENSED = {"/(m/s^2)": ("acceleration", "/g", _PER_G), "/(rad/s)": ("rate", "/(deg/s)", 1 / _DEG),
            "/T": ("magnetic field", "/uT", 1e-6)}  # fmt: skip
-"""What a scale factor is over: the quantity that a nominal one puts out, and how an output per it is read."""
+"""Denominators of scale factors: their quantity, and the reading unit of an output per it, with its factor."""
 _PER_KELVIN = re.compile(r"(.+?)(/K(?:\^\d)?)")
 _PER_KELVIN_SMALL = {"mg": ("µg", 1e3), "mrad": ("µrad", 1e3)}
 _NONLINEARITY = re.compile(r"1/\((m/s\^2|rad/s)\)(?:\^(\d))?")
@@ -63,7 +63,7 @@ _POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
 
 
 class ReadingUnit(Struct, frozen=True):
-    """How a value in SI is read: ``reading = factor value + offset``, in `symbol`."""
+    """The unit in which a value in SI is read: ``reading = factor value + offset``, in `symbol`."""
 
     symbol: str
     factor: float = 1.0
@@ -74,7 +74,7 @@ class ReadingUnit(Struct, frozen=True):
     @overload
     def of(self, value: Array) -> Array: ...
     def of(self, value: float | Array) -> float | Array:
-        """Return a value as it is read."""
+        """Return a value in this unit."""
         return value * self.factor + self.offset
 
     def texts(self, value: float, uncertainty: float | None) -> tuple[str, str]:
@@ -93,10 +93,10 @@ class ReadingUnit(Struct, frozen=True):
 
 
 class Row(Struct, frozen=True):
-    """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ...
+    """A parameter in its reading unit: bias in mg, misalignment in mrad, k2 in µg/g² ...
 
     `given_order` is the standard uncertainty if the order chosen from the data is right, None where none was chosen.
-    `interval` is the 95 % interval where the parameter has one of its own.
+    `interval` is the 95 % interval where the record states one.
     """
 
     name: str
@@ -113,7 +113,7 @@ class Row(Struct, frozen=True):
 
 @cache
 def reading_unit(unit: str, name: str = "") -> ReadingUnit:
-    """Return how a parameter is read by its SI unit, and by its name where the unit alone does not tell."""
+    """Return the reading unit of a parameter by its SI unit, and by its name where that matters."""
     for pattern, by_unit in _BY_NAME:
         if unit in by_unit and re.fullmatch(pattern, name):
             return ReadingUnit(*by_unit[unit])
@@ -141,12 +141,17 @@ def reading_unit(unit: str, name: str = "") -> ReadingUnit:
 
 
 def small_unit(unit: str) -> ReadingUnit:
-    """Return how noise, drift and residuals of a quantity are read: µg and deg/h, all others in their own unit."""
+    """Return the reading unit of noise, drift and residuals: µg and deg/h, all others in their own unit."""
     return ReadingUnit(*_SMALL.get(unit, _BY_UNIT.get(unit, (unit, 1.0))))
 
 
+def sample_unit(unit: str) -> ReadingUnit:
+    """Return the reading unit of samples less their mean: mg and deg/s, all others in their own unit."""
+    return ReadingUnit(*{"rad/s": ("deg/s", _DEG), "m/s^2": ("mg", _MG)}.get(unit, (unit, 1.0)))
+
+
 def density_unit(unit: str) -> ReadingUnit:
-    """Return how the noise density of a quantity is read, as data sheets have it."""
+    """Return the reading unit of the noise density of a quantity, as in data sheets."""
     known = {"rad/s": ("deg/s/√Hz", _DEG), "m/s^2": ("µg/√Hz", 1e3 * _MG)}
     return ReadingUnit(*known.get(unit, (f"{unit}/√Hz", 1.0)))
 
@@ -176,7 +181,7 @@ def small_g(value: float) -> str:
 
 
 def rows_of(record: Calibration) -> list[Row]:
-    """Return the parameters of a record as they are read."""
+    """Return the parameters of a record in their reading units."""
     rows = []
     for name, parameter in record.parameters.items():
         read = reading_unit(parameter.unit, name)
@@ -198,7 +203,7 @@ def rows_of(record: Calibration) -> list[Row]:
 
 
 def parameters_table(rows: Iterable[Row], caption: str, title: str = "Parameters") -> ReportTable:
-    """Return a table of parameters; a dash stands where one states no uncertainty."""
+    """Return a table of parameters, with a dash for an uncertainty that is not stated."""
     cells = []
     for row in rows:
         texts = (plain_number(row.value, 3), "–") if row.standard_uncertainty is None else row.text()

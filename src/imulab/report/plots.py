@@ -1,4 +1,4 @@
-"""The report's own figures as objects that show themselves in notebooks and are saved as pages or pictures."""
+"""The figures of a report as objects that are drawn in notebooks and saved as pages or pictures."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class Plot:
     Attributes
     ----------
     figure
-        What is drawn.
+        The figure.
     subject
-        What it is a figure of, for the page that it is saved as.
+        Its subject, for the page that it is saved as.
 
     Examples
     --------
@@ -193,13 +193,13 @@ def _picture(plot: Plot, kind: str, path: str | Path) -> bytes:
 
 
 def _untitled(figure: Figure) -> dict[str, Any]:
-    """Return a figure as the report draws it, below a title that is text of the page."""
+    """Return a figure without its title, which is text of the page."""
     margin = {**_BASE["margin"], **figure.layout.get("margin", {})}  # type: ignore[dict-item]
     return {"data": figure.traces, "layout": {**_BASE, **figure.layout, "margin": margin, "height": figure.height}}
 
 
 def _legend_height(figure: Figure) -> int:
-    """Return what a legend above the plot takes: Plotly makes room for it, but draws it over a title."""
+    """Return the height of a legend above the plot, pixels: Plotly makes room for it, but draws it over a title."""
     legend = figure.layout.get("legend", {})
     names = [trace["name"] for trace in figure.traces if "name" in trace and trace.get("showlegend", True)]
     if legend.get("orientation") != "h" or len(names) < 2:
@@ -225,15 +225,15 @@ def _html(plot: Plot) -> str:
 
 @cache
 def _packed() -> str:
-    """Return the library that draws, packed: a third of its size."""
+    """Return Plotly's library, compressed to a third of its size."""
     text = files("imulab.report").joinpath(*_LIBRARY).read_bytes()
     return b64encode(gzip.compress(text, 9, mtime=0)).decode("ascii")
 
 
 class _First:
-    """Which output of a notebook brings the library along: that of the first cell with a figure, each time it runs.
+    """The output of a notebook that includes the library: that of the first cell with a figure, each time it runs.
 
-    Where every output is a page of its own, all of them do.
+    Where every output is a page of its own, all of them include it.
     """
 
     def __init__(self) -> None:
@@ -241,7 +241,7 @@ class _First:
         self.run: Any = None
 
     def carries(self) -> bool:
-        """Return whether the output that is being made brings it."""
+        """Return whether the output that is being made includes it."""
         if "google.colab" in sys.modules:
             return True
         cell, run = _where()
@@ -255,7 +255,7 @@ _FIRST = _First()
 
 
 def _where() -> tuple[Any, Any]:
-    """Return the cell that is running, as the notebook calls it, and the number of the run; None outside of one."""
+    """Return the notebook's name of the running cell, and the number of the run; None outside of a notebook."""
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     if shell is None:
         return None, None

@@ -1,8 +1,6 @@
-"""Figures and tables of reports.
+"""Figures and tables of reports: their types, Plotly's traces and axes, and builders that all procedures share.
 
-Their types, Plotly's traces and axes, and builders of what every procedure draws alike.
-
-Figures and tables, axes, curves and bands, panels side by side, and marks for points far outside.
+A procedure makes them from a record; `imulab.report` lays them out.
 """
 
 from __future__ import annotations
@@ -19,16 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.recording import Array
 
-# What reports are made of.
-
-
-# What a report shows: figures and tables, made from a record by its procedure, laid out by `imulab.report`.
+# Types.
 
 
 GOOD, BAD, QUIET, INK = "#1f6f8b", "#c8553d", "#9aa5ad", "#22303a"
 """Colours: what holds, what stands out, what is background, text."""
 LEGEND = {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}
-"""The key of a figure: above the plot, where a second line of it pushes the plot down."""
+"""The legend of a figure: above the plot, where a second line of it pushes the plot down."""
 ALARM = 0.5
 """An observation with less than this share of its weight is drawn as standing out."""
 
@@ -57,7 +52,7 @@ class ReportTable(Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Exhibits:
-    """What a procedure shows of a record.
+    """The content of a report on a record.
 
     Attributes
     ----------
@@ -103,9 +98,8 @@ def format_uncertain(value: float, uncertainty: float | None, digits: int = 2) -
 
 
 _LEAST, _MOST = 150, 300  # height of a panel on a phone, pixels
-_GAP = 74  # pixels between panels
-_KEY_LINE = 21
-"""Height of a panel, room between panels for ticks and titles, and height of a line of the key, pixels."""
+_GAP = 74  # pixels between panels, for ticks and titles
+_KEY_LINE = 21  # height of a line of the legend, pixels
 _MOST_NUMBERS = 8  # along an axis of a narrow panel
 
 
@@ -157,7 +151,7 @@ def _domain(axis: dict[str, Any]) -> tuple[float, float]:
 
 
 def _moved(note: dict[str, Any], places: dict[tuple[float, float], float]) -> dict[str, Any]:
-    """Return a note, the title of a panel with its panel."""
+    """Return a note, moved with its panel if it is the title of one."""
     if note.get("xref") != "paper" or note.get("yref") != "paper":
         return note
     top = places.get((round(note["x"], 9), round(note["y"], 9)))
@@ -165,20 +159,21 @@ def _moved(note: dict[str, Any], places: dict[tuple[float, float], float]) -> di
 
 
 def _legend_lines(figure: Figure) -> int:
+    """Return the number of lines of a legend on a narrow screen, beyond none for a single name."""
     if figure.layout.get("showlegend") is False:
         return 0
     named = [t for t in figure.traces if t.get("name") and t.get("showlegend", True) and t["type"] != "heatmap"]
     return math.ceil(len(named) / 2) if len(named) > 1 else 0
 
 
-# What figures are made of: axes, curves and bands, the dashes and marks that tell them apart, maps of correlation.
+# Axes, curves and bands, dashes and marks, maps of correlation.
 
 
 MARGIN = {"l": 70, "r": 20, "t": 64, "b": 55}
 """A legend above the plot has room below the buttons in the corner."""
 DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "6px 2px 2px 2px", "2px 6px")
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-down", "cross")
-"""What tells lines apart without colour, by their number."""
+"""Dashes and marks that distinguish lines without colour, by their number."""
 
 
 def figure_axis(title: str, **more: Any) -> dict[str, Any]:
@@ -240,7 +235,7 @@ def correlation_map(matrix: Array, names: Sequence[str], **more: Any) -> dict[st
 
 
 def strongest_pair(matrix: Array, names: Sequence[str]) -> str:
-    """Return the two that are most correlated, and by how much, such as ``a and b, -0.93``."""
+    """Return the names of the most correlated pair with its correlation, such as ``a and b, -0.93``."""
     i, j = divmod(int(np.argmax(np.abs(np.triu(matrix, 1)))), len(names))
     return f"{names[i]} and {names[j]}, {matrix[i, j]:+.2f}"
 
@@ -248,13 +243,11 @@ def strongest_pair(matrix: Array, names: Sequence[str]) -> str:
 # Axes that show the bulk of the points, and marks at their edge for the few that lie far beyond.
 
 
-_DEVIATIONS_OFF_AXIS = (  # robust standard deviations: farther points are left out of the range of the axis
-    12.0  # standard deviations (robust) from the median: farther points are left out of the axis's range
-)
-_MOST_OUT = 0.1  # share of far points from which they are no exceptions, and all are shown
-_WORTH = 2.5  # times the usual range that the whole must have to be cut
+_DEVIATIONS_OFF_AXIS = 12.0  # robust standard deviations from the median, from which a point is far
+_MOST_OUT = 0.1  # share of far points from which all are shown
+_WORTH = 2.5  # times the usual range, from which the whole range is clipped
 _PAD = 0.08  # of the range, free at both ends
-_FEWEST = 5  # points of which a range can be usual
+_FEWEST = 5  # points that have a usual range
 _MOST_LABELS = 4  # points outside the range that are labelled
 
 
@@ -275,7 +268,7 @@ def bulk(values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.
     Parameters
     ----------
     values
-        Shape (n,); what is not finite does not count.
+        The values, shape (n,); those that are not finite do not count.
     usual
         Which values belong to the bulk, where that is known, shape (n,).
     room
@@ -309,12 +302,12 @@ def edge_marks(
 
     Parameters
     ----------
-    found, values
-        The range and the values that it was found of.
+    bulk, values
+        The range, and the values that it belongs to.
     beside
         Place of each value on the other axis.
     labels
-        What stands beside the triangle of each value: its size with the unit.
+        Label of each value: its size with the unit.
     axes
         Names of the plot's axes.
     upright
@@ -363,7 +356,7 @@ def edge_note(count: int) -> str:
     )
 
 
-# Small multiples: a grid of panels, three across, and what is drawn in them.
+# Small multiples: a grid of panels, three across.
 
 
 COLUMNS = 3  # of panels
@@ -375,7 +368,7 @@ Item = TypeVar("Item")
 
 
 def names(index: int) -> tuple[str, str]:
-    """Return what Plotly calls the axes of a panel."""
+    """Return Plotly's names of the axes of a panel."""
     return ("x", "y") if index == 0 else (f"x{index + 1}", f"y{index + 1}")
 
 
@@ -402,7 +395,7 @@ def paged(title: str, index: int, count: int) -> str:
 
 
 def grid() -> dict[str, Any]:
-    """Return the layout that panels are put into."""
+    """Return the layout of a grid without panels."""
     return {
         "showlegend": False,
         "shapes": [],
@@ -413,7 +406,7 @@ def grid() -> dict[str, Any]:
 
 
 def panel(layout: dict[str, Any], index: int, count: int, title: str, up: str = "") -> None:
-    """Put the axes and title of panel `index` of `count` into a layout; `up`: what the y axes are of."""
+    """Put the axes and title of panel `index` of `count` into a layout; `up` is the title of the y axes."""
     rows = math.ceil(count / COLUMNS)
     row, column = divmod(index, COLUMNS)
     width = (1 - _GAP_ACROSS * (COLUMNS - 1)) / COLUMNS
@@ -456,11 +449,11 @@ def line(x: str, y: str, place: float, colour: str, dash: str, height: float = 1
     }
 
 
-# Figures and tables that all procedures draw alike: points with bars, by groups, and a table by its columns.
+# Builders that all procedures share: points with bars, by groups, and a table by its columns.
 
 
 class Group(Struct, frozen=True):
-    """Points that look alike: their name in the legend, which they are, shape (n,), symbol and colour."""
+    """Points of one look: their name in the legend, which points they are, shape (n,), symbol and colour."""
 
     name: str
     members: NDArray[np.bool_]
@@ -489,11 +482,11 @@ def point_traces(
     Parameters
     ----------
     x, y, bars
-        Where they are, and the half lengths of their bars, shape (n,); None for no bars.
+        Places of the points, and half lengths of their bars, shape (n,); None for no bars.
     labels, hover
-        What each point is called, shape (n,), and how Plotly shows it on hovering.
+        Label of each point, and Plotly's template on hovering.
     more
-        Of every trace, such as its axes.
+        Further keys of every trace, such as its axes.
     """
     at, values = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     traces = []
@@ -542,7 +535,7 @@ def points(
 def table(
     title: str, caption: str, columns: Mapping[str, Callable[[Item], str]], items: Iterable[Item], **more: Any
 ) -> ReportTable:
-    """Return a table: titles to what each column says of an item, a row each; `more` goes to `ReportTable`."""
+    """Return a table with a row for each item; `columns` maps titles to functions that return an item's cell."""
     rows = [[text(item) for text in columns.values()] for item in items]
     return ReportTable(title, caption, list(columns), rows, **more)
 

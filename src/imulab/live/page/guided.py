@@ -45,7 +45,7 @@ from imulab.live.runner import Runner
 from imulab.live.session import Event
 from imulab.live.view import View, corrected_reading, in_words
 from imulab.procedures.apply import loaded
-from imulab.procedures.views import exhibits_of, parameter_rows, rendered
+from imulab.procedures.views import exhibits_of, parameter_rows, render_record
 from imulab.records.calibration import Calibration
 from imulab.report.traces import format_uncertain
 
@@ -254,7 +254,7 @@ class GuidedPart(PagePart):
             path = self._runner.recorder.path
             return FileResponse(path, filename=Path(path).name, media_type="text/csv")
         if kind == "report":
-            return report_response(rendered(self.record))
+            return report_response(render_record(self.record))
         if kind == "record":
             headers = {"content-disposition": f'attachment; filename="{_ascii(self._record_name)}"'}
             return Response(self.record.to_json(), media_type="application/json", headers=headers)

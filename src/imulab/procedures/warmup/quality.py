@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from imulab.display import Bad, Note
 from imulab.errors import DataError, first_of
 from imulab.estimation.decisions import STILL_DRIFTS
-from imulab.procedures.correction_order import thermals_of
+from imulab.procedures.correction_order import parse_thermals
 from imulab.procedures.warmup.cycles import SETTLED, Curves, Cycle
 from imulab.procedures.warmup.model import (
     SCALE_LIMIT,
@@ -603,7 +603,7 @@ def after_of(cycles: Sequence[Cycle]) -> str | None:
     """
     first = cycles[0]
     sensors = {axis.partition("_")[0] for axis in first.axes}
-    digests = [next((t.hashes[0] for t in thermals_of(c.corrected_by) if t.sensor in sensors), None) for c in cycles]
+    digests = [next((t.hashes[0] for t in parse_thermals(c.corrected_by) if t.sensor in sensors), None) for c in cycles]
     for cycle, after in zip(cycles, digests, strict=True):
         if after != digests[0]:
             mine, its = (
