@@ -195,6 +195,15 @@ def test_the_curve_is_weighted_least_squares():
     assert found.chi_square == pytest.approx(left @ W @ left, rel=1e-6)
 
 
+def test_an_error_that_all_levels_share_may_be_far_larger_than_their_noise():
+    """A covariance whose smaller part is lost in the rounding of the larger has no Cholesky factor of its own."""
+    force = G * np.array([1, 2, 5, 10, 20, 40.0])
+    common = np.outer(force, force) * 1e3
+    found = fit_curve(force, 1e-7 * np.ones(6), common - 1e-6 * np.diag(np.diagonal(common)))
+    assert np.isfinite(found.covariance).all()
+    assert found.coefficients[0] == pytest.approx(1e-7, rel=1e-3)
+
+
 def test_model_choice_takes_no_term_too_many_in_nineteen_of_twenty(reduced):
     trials = 200 if reduced else 600
     rng = np.random.default_rng(5)
@@ -313,6 +322,7 @@ def test_terms_that_were_chosen_away_are_zero_with_an_uncertainty_and_a_given_mo
     for name in ("x_c1", "x_c2"):
         assert auto.value(name) == 0.0
         assert (auto.parameters[name].standard_uncertainty or 0.0) > 0.0
+        assert auto.fit["coverage_factor_95"][name] < 2.1
     fixed = il.fit_centrifuge(test, simulation, curve="constant").calibration
     assert "x_c1" not in fixed.parameters
     given = auto.fit["curves"]["x"]["standard_uncertainty_given_model"]["K0"]

@@ -160,7 +160,10 @@ def test_a_unit_that_can_hardly_be_right_is_said(samples, unit, words):
 @pytest.mark.parametrize(
     ("unit", "size", "words"),
     [("m/s^2", 1.0, "as g would be"), ("g", 9.8, "as m/s^2 would be"), ("m/s^2", 1001.0, "as mg would be"),
-     ("m/s^2", 9.79, ""), ("g", 1.02, ""), ("m/s^2", 0.0, "")],
+     ("m/s^2", 9.79, ""), ("g", 1.02, ""), ("g", 0.85, ""), ("m/s^2", 0.0, "was it taken off"),
+     ("m/s^2", 32.17, "as ft/s^2 would be"), ("g", 0.5, "1/2 of g, as counts or another range"),
+     ("m/s^2", 19.62, "2 times g"), ("m/s^2", 16384 * 9.8, "16384 times g, as counts"),
+     ("g", 0.7, "which is no gravity; is their unit"), ("count", 0.7, "")],
 )  # fmt: skip
 def test_accelerometers_at_rest_show_gravity(unit, size, words):
     x = size * np.array([0.0, 0.6, 0.8]) + 1e-3 * white()

@@ -340,6 +340,31 @@ def test_it_goes_through_commands_and_a_fleet(tmp_path, monkeypatch, capsys):
     assert "gyro_x_white" in Path("line.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [(1 / 57.3, "no usual gyroscope has steps of"), (1.0, "")],
+)
+def test_a_doubted_unit_is_bad_and_survives_quiet(tmp_path, capsys, scale, words):
+    """A bag in deg/s and g, read as rad/s and m/s^2, gives a filter noise that is 57 and 9.8 times off."""
+    rng = np.random.default_rng(3)
+    step = 250 / 32768
+    columns = {"time": np.arange(6000) / 100}
+    for k, axis in enumerate("xyz"):
+        columns[f"gyro_{axis}"] = scale * step * np.round((0.2 + 0.05 * rng.standard_normal(6000)) / step)
+        columns[f"accel_{axis}"] = 9.81 * scale**0 * (k == 2) + 0.01 * rng.standard_normal(6000)
+    if words:
+        columns["accel_z"] = columns["accel_z"] / 9.81
+    units = {"time": "s"} | {name: "deg/s" if name[0] == "g" else "m/s^2" for name in columns if name != "time"}
+    path = tmp_path / "log.csv"
+    il.write(il.Recording(columns, units, name="log.csv"), path)
+    verdict = il.fit_noise(path).calibration.verdict
+    assert verdict.state == ("bad" if words else "good")
+    assert main(["noise", "fit", str(path), "-q", "--for", "kalibr"]) == 0
+    error = capsys.readouterr().err
+    assert (words in error) if words else not error
+    assert not words or "as g would be; is their unit, m/s^2, right?" in error
+
+
 @pytest.mark.parametrize("target", ["c", "blob", "px4", "kalibr"])
 def test_it_is_no_calibration_to_export(record, tmp_path, target, capsys):
     record.save(tmp_path / "n.json")

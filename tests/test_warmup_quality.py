@@ -82,6 +82,22 @@ def test_an_axis_of_one_value_has_no_time_constants_to_speak_of():
     assert said == [True, False]
 
 
+@pytest.mark.parametrize(("factor", "words"), [(0.5, "1/2 of g"), (1 / 9.80665, "as g would be"), (1.0, "")])
+def test_accelerometers_that_show_no_gravity_are_bad(factor, words):
+    cycles = [cycle_of(flat, t, name=f"c{t}{c}") for t in (-20, 0) for c in (1, 2)]
+    raised = {"accel_x": 0.0, "accel_y": 0.0, "accel_z": 9.80665}
+    cycles = [
+        cycle.with_columns(
+            {k: factor * (0 * cycle.column("accel_x") + g) + 1e-3 * cycle.column("accel_x") for k, g in raised.items()},
+            dict.fromkeys(raised, "m/s^2"),
+        )
+        for cycle in cycles
+    ]
+    verdict = il.fit_warmup(cycles, temperatures=[-20, 0], settling_time=END).calibration.verdict
+    assert (verdict.state == "bad") == bool(words)
+    assert words in verdict.reasons[0] if words else not any("gravity" in reason for reason in verdict.reasons)
+
+
 def test_a_unit_that_cannot_be_is_asked_about():
     cycles = [cycle_of(lambda t: 3600 * flat(t), t, name=f"c{t}{c}") for t in (-20, 0) for c in (1, 2)]
     found = il.fit_warmup(cycles, temperatures=[-20, 0], settling_time=END).calibration.warnings

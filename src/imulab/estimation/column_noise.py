@@ -186,7 +186,7 @@ def _noises(
 
 def _mended(recording: Recording, names: list[str]) -> tuple[Recording, float, list[str]]:
     """Return the rows that are readings, at one rate, Hz, and notes on the other rows."""
-    notes = [f"{recording.name}: {note}" for note in recording.notes]
+    notes = [type(note)(f"{recording.name}: {note}") for note in recording.notes]
     recording, more = bridged(recording, names)
     for sensor in dict.fromkeys(map(kind_of, names)):
         left_out = leave_out(recording, [name for name in names if kind_of(name) == sensor])

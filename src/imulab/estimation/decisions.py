@@ -195,8 +195,8 @@ LENGTH_AT_REST_OFF = Decision(
 
 # Centrifuge
 CURVE_TERM = Decision(0.05, "model", {"centrifuge": 2}, "K(a) has a term in the specific force (chi-square)")
-CURVE_MISSES = Decision(0.01, "verdict", {"centrifuge": 2}, "no curve describes K(a) within its uncertainty")
-DRIFT_DIRECTION_TURNS = Decision(0.01, "verdict", {"centrifuge": 2}, "the drift's direction turns between levels")
+CURVE_MISSES = Decision(0.005, "verdict", {"centrifuge": 2}, "no curve describes K(a) within its uncertainty")
+DRIFT_DIRECTION_TURNS = Decision(0.005, "verdict", {"centrifuge": 2}, "the drift's direction turns between levels")
 CYCLES_SCATTER = Decision(
     0.05, "uncertainty", {"centrifuge": 3}, "runs or power cycles scatter beyond their noise, in size or direction"
 )
@@ -227,7 +227,7 @@ LEVEL_STEP_PERHAPS = Decision(
     6.3e-5, "model", {"noise": 6000}, "a step is taken out before it is tested again, by noise without it", limit=4.0
 )
 FOLLOWS_COVARIATE = Decision(
-    0.0027, "verdict", {"noise": 12}, "a column follows the time or the temperature", limit=3.0
+    0.00137, "verdict", {"noise": 12}, "a column follows the time or the temperature", limit=3.2
 )
 SPECTRAL_LINE = Decision(1e-9, "note", {"noise": 1_000_000}, "a coefficient of the spectrum belongs to a line")
 BIN_OFF_MODEL = Decision(5.7e-7, "note", {"noise": 1000}, "a bin of the spectrum is off the model", limit=5.0)
@@ -238,7 +238,7 @@ NOISE_CHECK = Decision(
 # Array of gyroscopes
 READINGS_LATE = Decision(6.3e-5, "verdict", {"gyro_array": 16}, "an element's readings come late", limit=4.0)
 METHOD_FOLLOWS_LESS = Decision(
-    0.0455, "verdict", {"gyro_array": 1}, "a method follows less than 95 % of the motion", limit=2.0
+    0.0099, "verdict", {"gyro_array": 1}, "a method follows less than 95 % of the motion", limit=2.58
 )
 
 # Warm-up
@@ -269,6 +269,8 @@ MOST_FALSE_ALARMS: Mapping[tuple[str, ...], float] = {
     ("rate",): 0.04,
     ("noise",): 0.04,
     ("gyro_array",): 0.04,
+    ("centrifuge",): 0.04,
+    ("warmup",): 0.04,
     ("tumble check",): 0.05,
     ("thermal check",): 0.05,
     ("noise check",): 0.05,

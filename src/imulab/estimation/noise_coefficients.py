@@ -298,6 +298,8 @@ def _level(analysis: Analysis) -> Coefficient:
     highest = analysis.band.highest
     f = np.concatenate([frequencies(each) for each in analysis.spectra])
     top = np.where(f > highest / 4, analysis.bins.freedom, 0.0)
+    if not top.any():  # spectral lines, or frequencies off the model, take all of it
+        return _not_determined(f"no frequency from {highest / 4:.3g} to {highest:.3g} Hz is left without a line")
     value = math.sqrt(float((top * analysis.bins.power).sum() / top.sum()) * analysis.interval)
     u = value * math.hypot(_LEVELS, math.sqrt(1 / (2 * float(top.sum()))))
     return Coefficient(value, u, (value - NORMAL_95 * u, value + NORMAL_95 * u))

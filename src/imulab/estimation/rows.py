@@ -235,8 +235,7 @@ class LeftOut(Struct, frozen=True):
             left_out = rows & rest if rest is not None and kind == FAR else rows
             count = int(np.count_nonzero(left_out))
             if count:
-                # Every recording has a few knocks; zeros and repeats are faults of the logger.
-                kind_of = Note if kind == FAR and count < _SHARE_NOTED * len(left_out) else str
+                kind_of = Note if count < _SHARE_NOTED * len(left_out) else str
                 notes.append(
                     kind_of(
                         f"{count} row{'s' * (count > 1)} of {_shown(self.names)} left out: {kind}, first at "

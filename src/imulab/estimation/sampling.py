@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from imulab.display import Note
 from imulab.errors import DataError
 from imulab.estimation.rows import median, quantile
 from imulab.recording import Array, Recording, check_finite, check_time, stored_as
@@ -20,7 +21,8 @@ _BLOCKS, _SMALLEST_BLOCK = 100, 100  # blocks whose median steps show a change o
 SAME_RATE = 0.05  # relative: parts of a recording whose steps are this close have one rate
 _SLOWEST, _FASTEST = 5.0, 20_000.0  # Hz: rates at which inertial sensors are logged
 _USUAL = (10.0, 10_000.0)  # Hz: likely rates, for the guess at the right unit of time
-BRIDGED = 0.01  # largest share of rows without numbers
+BRIDGED, FEW = 0.01, 0.001
+"""Largest share of rows without numbers; share of the rows below which what is bridged or left out is only noted."""
 
 
 def usual_step(step: Array) -> tuple[float, float]:
@@ -148,14 +150,15 @@ def bridged(recording: Recording, names: list[str]) -> tuple[Recording, list[str
         if not fine.all():
             columns[name] = stored_as(np.interp(row, row[fine], columns[name][fine]), columns[name])
     first = recording.place(int(np.argmax(bad | ~timed)))
-    return replace(recording, columns=columns), [bridged_line(recording.name, count, first)]
+    return replace(recording, columns=columns), [bridged_line(recording.name, count, len(recording), first)]
 
 
-def bridged_line(name: str, count: int, first: str) -> str:
-    """Return the message of how many rows of a file hold no numbers, and where the first of them is."""
-    rows = f"{count} row{'s' if count > 1 else ''} without numbers"
+def bridged_line(name: str, count: int, rows: int, first: str) -> str:
+    """Return the finding of how many of a file's rows hold no numbers, and where the first is: a note of a few."""
+    many = f"{count} row{'s' if count > 1 else ''} without numbers"
     where = first if count == 1 else f"the first {first}"
-    return f"{name}: {rows} ({where}) bridged from their neighbours"
+    kind = Note if count == 1 or count < FEW * rows else str
+    return kind(f"{name}: {many} ({where}) bridged from their neighbours")
 
 
 def _change(recording: Recording, time: Array, start: int, stop: int) -> str:

@@ -259,7 +259,7 @@ def _choose(
         raise OptionError(f"{name}: no {topic} of instance {instance}; found {known}")
     several = sum(title == topic for title, _ in there)
     if several > 1:
-        contents.notes.append(f"instance {instance} of {several} of {topic}")
+        contents.notes.append(Note(f"instance {instance} of {several} of {topic}"))
     streams, sources = _inertial(contents, there, topic, instance)
     _add_magnetometer(contents, every, (magnetometer, instance), streams, sources, name)
     return streams, sources

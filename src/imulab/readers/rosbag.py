@@ -548,8 +548,8 @@ def _beside(topics: list[Topic], kind: str, chosen: list[str], what: str, notes:
     if len(near) == 1:
         return near[0]
     if near:
-        left = f"{what} left out: several topics could be it: {' '.join(near)}"
-        notes.append(left if kind != _FIELD else Note(f"{left}; --topic {chosen[0]},{near[0]} takes the first"))
+        how = f"; --topic {chosen[0]},{near[0]} takes the first" if kind == _FIELD else ""
+        notes.append(Note(f"{what} left out: several topics could be it: {' '.join(near)}{how}"))
     return None
 
 

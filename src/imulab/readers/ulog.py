@@ -190,7 +190,7 @@ def _choose(
         raise OptionError(f"{name}: no {' '.join(wanted)} of instance {instance}; found {known}")
     several = [f"{title} {number}" for title, number in sorted(there) if title in wanted]
     if len(several) > len(chosen):
-        contents.notes.append(f"instance {instance} of {', '.join(several)}")
+        contents.notes.append(Note(f"instance {instance} of {', '.join(several)}"))
     mag = _magnetometer(contents, magnetometer, instance, name)
     streams: list[LoggedStream] = []
     sources: dict[int, tuple[int, str, dict[str, _Field]]] = {}
@@ -249,7 +249,7 @@ def _raw_or_combined(samples: dict[str, int], raw: list[str], notes: list[str]) 
         return raw
     read = not any(count > logs.PLAINLY_MORE * combined for count in samples.values())
     how = f"is read rather than {few}" if read else f"is not read: there are {few}"
-    notes.append(f"sensor_combined, which has {combined} samples, {how}; a topic chooses")
+    notes.append(Note(f"sensor_combined, which has {combined} samples, {how}; a topic chooses"))
     return ["sensor_combined"] if read else raw
 
 

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import kind_of, triad
-from imulab.display import Note
+from imulab.display import Bad, Note
 from imulab.errors import DataError
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.rows import deviation_of_steps, distinct, median
+from imulab.estimation.sampling import FEW
 from imulab.recording import Array, Recording, stored_as
-from imulab.units import STANDARD_GRAVITY, to_si
+from imulab.units import STANDARD_GRAVITY, parse_unit, to_si
 
 # Whether the unit of samples at rest can be right: by the steps of known sensors, gravity and the Earth's rate.
 
@@ -33,18 +34,21 @@ _LOUDEST_GYRO, _QUIET = 0.3, 0.035
 _EARTH, _PLAIN_OFFSET = (4.0, 100.0), 10.0
 """deg/h that three such gyroscopes show at rest: the Earth's 15 and their offsets. Zeroed ones, whose mean is within
 ten standard uncertainties of 0, are passed over."""
-_NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit makes that unit the likely one
+_NO_GRAVITY = 0.2  # relative: |f| at rest farther than this off g is no gravity, whatever the zeros of the sensor
+_NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit or range makes that the likely one
+_OTHERS = {**{unit: to_si(1.0, unit) for unit in ("m/s^2", "g", "mg")}, "ft/s^2": 0.3048}
+"""Units that accelerometers are logged in, in m/s^2."""
 
 
 def doubtful_units(recording: Recording, names: Sequence[str], rate: float) -> list[str]:
-    """Return notes on units that are probably wrong, from the first samples of a recording at rest, at a rate, Hz."""
+    """Return findings on units that are wrong, from the first samples of a recording at rest, at a rate, Hz."""
     notes: list[str] = []
     for kind, why in (("gyro", _doubt_gyros), ("accel", _doubt_accelerometers)):
         its = [name for name in names if kind_of(name) == kind]
         if its and (reason := why(recording, its, rate)):
             named = its[0] if len(its) == 1 else f"{its[0]} .. {its[-1]}"
             unit = recording.units[its[0]]
-            notes.append(Note(f"{recording.name}: {named}: {reason}; is their unit, {unit}, right?"))
+            notes.append(Bad(f"{recording.name}: {named}: {reason}; is their unit, {unit}, right?"))
     return notes
 
 
@@ -76,16 +80,32 @@ def _doubt_gyros(recording: Recording, names: Sequence[str], rate: float) -> str
     return ""
 
 
-def _doubt_accelerometers(recording: Recording, names: Sequence[str], _: float) -> str:
-    """Return why the unit of accelerometers is doubtful, or nothing: with another unit they would show gravity."""
+def _doubt_accelerometers(recording: Recording, names: Sequence[str], rate: float) -> str:
+    """Return why the unit of accelerometers is doubtful, or nothing; |f| of each second, so that they may turn."""
     if list(names) != triad("accel"):
         return ""
-    force = math.hypot(*(float(_first(recording, name).mean()) for name in names))
-    unit = recording.units[names[0]]
-    for other in ("m/s^2", "g", "mg"):
-        if other != unit and abs(force / to_si(1.0, unit) * to_si(1.0, other) / STANDARD_GRAVITY - 1) < _NEAR_STEP:
-            return f"{force / to_si(1.0, unit):.4g} {unit} at rest are no gravity, as {other} would be"
-    return ""
+    samples = [_first(recording, name) for name in names]
+    size = max(1, min(round(rate), len(samples[0])))
+    means = [each[: len(each) // size * size].reshape(-1, size).mean(axis=1) for each in samples]
+    return no_gravity(median(np.sqrt(sum(np.square(each) for each in means))), recording.units[names[0]])
+
+
+def no_gravity(force: float, unit: str) -> str:
+    """Return why |f| at rest, SI, is no gravity, and what would make it one; nothing of gravity, counts and volts."""
+    if parse_unit(unit).quantity != "acceleration" or abs(force / STANDARD_GRAVITY - 1) <= _NO_GRAVITY:
+        return ""
+    shown = f"|f| at rest is {force / to_si(1.0, unit):.4g} {unit}, which is no gravity"
+    ratio = force / STANDARD_GRAVITY
+    for other, size in _OTHERS.items():
+        if other != unit and abs(ratio / to_si(1.0, unit) * size - 1) < _NEAR_STEP:
+            return f"{shown}, as {other} would be"
+    if ratio < _NEAR_STEP:
+        return f"{shown}: was it taken off, as of a linear acceleration?"
+    power = round(math.log2(ratio))
+    if abs(ratio / 2.0**power - 1) < _NEAR_STEP:
+        factor = f"{2**power} times" if power > 0 else f"1/{2**-power} of"
+        return f"{shown}, but {factor} g, as counts or another range of the sensor would be"
+    return shown
 
 
 def _first(recording: Recording, name: str) -> Array:
@@ -198,8 +218,10 @@ def _bridge_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Record
         mended[lost] = np.interp(row[lost], row[~lost], mended[~lost])
         columns[name] = stored_as(mended, recording.column(name))
     bad = np.logical_or.reduce(list(lost_rows.values()))
-    note = (
-        f"{recording.name}: {_columns(list(lost_rows))}: exact zeros in {int(np.count_nonzero(bad))} rows, the first "
+    count = int(np.count_nonzero(bad))
+    kind = Note if count < FEW * len(recording) else str
+    note = kind(
+        f"{recording.name}: {_columns(list(lost_rows))}: exact zeros in {count} rows, the first "
         f"{recording.place(int(np.argmax(bad)))}, in place of lost readings: bridged by straight lines"
     )
     return recording.with_columns(columns, {}), [note]

@@ -144,7 +144,7 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
     recording, notes = bridged(recording, list(names))
     recording, more = own_readings(recording, names)
     recording, trimmed = steady_part(recording)
-    notes = [*(f"{recording.name}: {note}" for note in recording.notes), *notes, *more, *trimmed]
+    notes = [*(type(note)(f"{recording.name}: {note}") for note in recording.notes), *notes, *more, *trimmed]
     if len(recording) < FEWEST:
         raise _too_few(recording, len(recording))
     rate, timing = sampling_rate(recording)
@@ -399,7 +399,7 @@ class _Log:
         if not settled or not parts or self._bad > BRIDGED * self._rows:
             raise _AsWholeError
         kept, filled = sum(part.count for part in parts), sum(part.filled for part in parts)
-        bad = [bridged_line(head.name, self._bad, self._first_bad)] if self._bad else []
+        bad = [bridged_line(head.name, self._bad, self._rows, self._first_bad)] if self._bad else []
         slow = [part.temperature for part in parts if part.temperature is not None]
         lengths = [part.count for part in parts]
         return LongRest(
@@ -408,7 +408,7 @@ class _Log:
             tuple((0, count, None) for count in lengths),
             filled,
             (
-                *(f"{head.name}: {note}" for note in self._notes),
+                *(type(note)(f"{head.name}: {note}") for note in self._notes),
                 *bad,
                 *mislabelled(head, 1 / interval),
                 *self._coarse,

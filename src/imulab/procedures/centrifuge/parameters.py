@@ -54,6 +54,8 @@ class CurveFit:
         Those of 1, a, a^2: ``K(a) = p0 + p1 a + p2 a^2``; zero where the model has no such term.
     from_levels
         Matrix from the K_i to the coefficients, shape (3, n).
+    from_levels_largest
+        The same of the largest model that the levels allow, whose noise an unchosen term would have.
     covariance
         Of the coefficients, shape (3, 3): for a stated model, given that model; for a chosen one, whichever model is
         right (`imulab.estimation.least_squares`).
@@ -71,6 +73,7 @@ class CurveFit:
     chi_square: float
     freedom: int
     tried: tuple[tuple[str, int, float, bool], ...]
+    from_levels_largest: Array
 
     @property
     def probability(self) -> float | None:
@@ -122,6 +125,7 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
         _blended(force, K, whitened, covariance, coefficients, matrix_of_noise) if model == "auto" else matrix_of_noise,
         chi_square, len(K) - 1 - len(CURVES[chosen]),
         tuple((name, 1 + len(CURVES[name]), solutions[name][2], name == chosen) for name in names),
+        solutions[max(names, key=lambda name: len(CURVES[name]))][1],
     )  # fmt: skip
 
 
@@ -145,7 +149,11 @@ def _regular(covariance: Array, K: Array) -> Array:
     """Return a covariance that stays invertible for noise-free data and keeps rounding from looking significant."""
     floor = max(float(np.diagonal(covariance).max()) * 1e-12, (_CURVE_ROUNDING * float(np.abs(K).max())) ** 2, 1e-60)
     regular: Array = covariance + floor * np.eye(len(covariance))
-    return regular
+    values, vectors = np.linalg.eigh(regular)
+    if values[0] > 0:
+        return regular
+    # One error that all levels share may be so much larger than their noise that rounding hides the noise.
+    return np.asarray((vectors * np.maximum(values, floor)) @ vectors.T)
 
 
 def _solve(force: Array, K: Array, root: Array, terms: tuple[int, ...]) -> tuple[Array, Array, float]:
@@ -333,13 +341,17 @@ _ROUNDING = 1e-7
 
 @dataclass
 class _Row:
-    """A parameter under construction: value, unit, and its derivatives by the levels' vectors and by ln R."""
+    """A parameter under construction: value, unit, and its derivatives by the levels' vectors and by ln R.
+
+    Of a term of the curve that was not chosen and is 0, `unchosen` is the derivative that it would have had.
+    """
 
     name: str
     value: float
     unit: str
     derivative: Array
     radius: float
+    unchosen: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -443,7 +455,8 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
     given_model = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     for prefix, chosen in curves.items():
         _widen(covariance, [row.name for row in rows], prefix, chosen, J, V)
-    freedom = _freedom(J, V, common, radius, levels, width)
+    spread = np.array([row.derivative if row.unchosen is None else row.unchosen for row in rows])
+    freedom = _freedom(spread, V, common, radius, levels, width)
     return Estimates(
         names=tuple(row.name for row in rows),
         units=tuple(row.unit for row in rows),
@@ -501,9 +514,9 @@ def _curve(
     for power, term in ((1, "c1"), (2, "c2")):
         if fitted.covariance[power, power] > 0:  # a term that was chosen away is 0, with an uncertainty
             value = float(p[power] / p[0])
-            rows.append(
-                _Row(f"{prefix}{term}", value, CURVE_UNITS[term], (D[power] - value * D[0]) / p[0], -power * value)
-            )
+            derivative = (D[power] - value * D[0]) / p[0]
+            unchosen = None if derivative.any() else fitted.from_levels_largest[power] @ G / p[0]
+            rows.append(_Row(f"{prefix}{term}", value, CURVE_UNITS[term], derivative, -power * value, unchosen))
     return fitted, rows
 
 

@@ -318,7 +318,7 @@ def compare_methods(
     recording = on_one_clock(recording)
     elements = find_elements(recording)
     rate, notes = sampling_rate(recording)
-    warnings = [*(f"{recording.name}: {note}" for note in recording.notes), *notes]
+    warnings = [*(type(note)(f"{recording.name}: {note}") for note in recording.notes), *notes]
     logged = elements.readings(recording)
     readings, aligned = _correct_readings(logged, recording, elements, calibration)
     for a, row in enumerate(elements.names):

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.noise.simulate import simulated
 from imulab.options import measure, repeated, text
@@ -17,7 +18,7 @@ from imulab.procedures.result import Record, as_record
 from imulab.quantities import in_si, whole
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
-from imulab.units import from_si
+from imulab.units import STANDARD_GRAVITY, from_si
 
 RATE, DURATION = "100 Hz", "1 h"
 _SHOWN = {"rad/s": "deg/s", "m/s^2": "m/s^2"}
@@ -46,11 +47,13 @@ class NoiseLog:
             for values, seed in zip(self.values.values(), seeds, strict=True)
         ]
         shown = {name: _SHOWN.get(unit, unit) for name, unit in self.units.items()}
-        start = 0
+        start, axes = 0, triad("accel")  # all three at rest show gravity
+        upright = axes[-1] if all(self.units.get(axis) == "m/s^2" for axis in axes) else None
         for parts in zip(*streams, strict=True):
             columns = {"time": np.arange(start, start + len(parts[0])) / self.rate}
             for (name, unit), part in zip(shown.items(), parts, strict=True):
-                columns[name] = from_si(part, unit) if unit in _SHOWN.values() else part
+                samples = part + STANDARD_GRAVITY if name == upright else part
+                columns[name] = from_si(samples, unit) if unit in _SHOWN.values() else samples
             yield Recording(columns, {"time": "s", **shown}, self._head(), name="simulated log at rest")
             start += len(parts[0])
 

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.columns import triad
 from imulab.display import Bad, Note
 from imulab.errors import DataError, first_of
 from imulab.estimation.decisions import STILL_DRIFTS
+from imulab.estimation.noise.readings import no_gravity
 from imulab.procedures.correction_order import parse_thermals
 from imulab.procedures.warmup.cycles import SETTLED, Curves, Cycle
 from imulab.procedures.warmup.model import (
@@ -379,6 +381,7 @@ def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]
         *_warn_ends(curves, settled),
         *_warn_starts(curves),
         *_warn_sizes(curves),
+        *_warn_gravity(curves),
         *_warn_motion(curves),
         *_warn_drifts(curves, chosen),
         *_warn_temperatures(curves),
@@ -478,6 +481,16 @@ def _warn_sizes(curves: Curves) -> list[str]:
         for axis, change, unit in zip(curves.axes, largest, curves.units, strict=True)
         if change > _IMPROBABLE.get(unit, np.inf)
     ]
+
+
+def _warn_gravity(curves: Curves) -> list[str]:
+    """Return a message on three accelerometers that, settled, show no gravity."""
+    places = [curves.axes.index(axis) for axis in triad("accel") if axis in curves.axes]
+    if len(places) < 3:
+        return []
+    unit = curves.cycles[0].file_units[places[0]]
+    reason = no_gravity(float(np.median(np.linalg.norm(curves.reference[:, places], axis=1))), unit)
+    return [Bad(f"accel_x .. accel_z: {reason}; is their unit, {unit}, right?")] if reason else []
 
 
 def _warn_motion(curves: Curves) -> list[str]:
