@@ -126,7 +126,7 @@ def test_limit_and_level_agree(name):
         (("centrifuge",), 0.0362),
         (("noise",), 0.0299),
         (("noise check",), 0.0500),
-        (("gyro_array",), 0.0109),
+        (("gyro_array",), 0.0209),
         (("warmup",), 0.0045),
         (("compare",), 0.0500),
         (("fleet",), 0.0110),

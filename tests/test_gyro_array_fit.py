@@ -273,6 +273,28 @@ def test_a_record_of_another_array_is_refused():
         fuse(simulate_array(duration=2.0), FuseOptions(calibration=tumble.calibration))
 
 
+@pytest.mark.parametrize("axes", [1, 3])
+@pytest.mark.parametrize("bend", [0.0, 1e-3, -6e-3])
+def test_an_element_that_is_not_linear_is_named_and_its_scale_factor_covered(axes, bend):
+    """The ratio of element 3 changes by `bend` at 200 deg/s: without the test errors of 11 standard uncertainties."""
+    rng = np.random.default_rng(7)
+    n, count = 6, 4000
+    sensing = np.eye(axes) + 0.01 * rng.standard_normal((n, axes, axes))
+    sensed = np.einsum("iab,tb->tai", sensing, 2 * motion(count, axes, rng))
+    sensed[:, :, 2] *= 1 + bend * (sensed[:, :, 2] / 200) ** 2
+    still, moving = (part + 0.05 * rng.standard_normal(sensed.shape) for part in (np.zeros_like(sensed), sensed))
+    recorded = [array_recording(part[:, 0] if axes == 1 else part, 100.0, "m.csv") for part in (still, moving)]
+    record = calibrate_array(*recorded).calibration
+    lines = [line for line in record.verdict.reasons if "output over rate is not the same at all rates" in line]
+    assert bool(lines) == bool(bend)
+    assert not lines or (": element 3 by" if axes == 3 else ": gyro_3 by") in lines[0]
+    truth = in_gauge(sensing)
+    key = "scale_factor" if axes == 1 else "matrix"
+    for element, own in zip(record.sections["elements"], truth, strict=True):
+        error = np.array(element[key]["value"]) - (own[0, 0] if axes == 1 else np.linalg.inv(own))
+        assert (np.abs(error) < 4 * np.array(element[key]["standard_uncertainty"])).all()
+
+
 NOISE = np.radians(0.05)
 
 

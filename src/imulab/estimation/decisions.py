@@ -237,6 +237,9 @@ NOISE_CHECK = Decision(
 
 # Array of gyroscopes
 READINGS_LATE = Decision(6.3e-5, "verdict", {"gyro_array": 16}, "an element's readings come late", limit=4.0)
+ELEMENT_BENDS = Decision(
+    0.01, "verdict", {"gyro_array": 1}, "an element's output is not linear in the rate, the worst of all of them"
+)
 METHOD_FOLLOWS_LESS = Decision(
     0.0099, "verdict", {"gyro_array": 1}, "a method follows less than 95 % of the motion", limit=2.58
 )

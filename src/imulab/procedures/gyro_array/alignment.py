@@ -6,6 +6,9 @@ span what the elements sense of it (maximum likelihood of the factor model); a c
 An element whose readings come later by tau than the others' reads ``A w(t - tau) = A w - tau A dw/dt + ...``: its
 residual from the consensus is proportional to the derivative of the consensus. The regression on that gives tau to a
 fraction of a sample. It is repeated on readings moved by tau (cubic splines) until tau no longer changes.
+
+An element that is not linear leaves a residual that bends with the rate p that it senses, ``c_2 p^2 + c_3 p^3``. What
+c_3 makes of its scale factor, ``c_3 <p^4> / <p^2>``, is in the uncertainties where it is above its noise.
 """
 
 from __future__ import annotations
@@ -20,7 +23,8 @@ from numpy.typing import NDArray
 
 from imulab.errors import ObservabilityError
 from imulab.estimation.column_noise import ColumnNoise, columns_noise
-from imulab.estimation.decisions import READINGS_LATE
+from imulab.estimation.decisions import ELEMENT_BENDS, READINGS_LATE
+from imulab.estimation.least_squares import coverage_factor
 from imulab.estimation.noise_coefficients import DeviationCurve
 from imulab.estimation.sampling import GAP
 from imulab.procedures.gyro_array.elements import Elements
@@ -113,6 +117,9 @@ class Alignment:
         Convention that fixes the frame.
     latency, latency_uncertainty
         Delay of each element's readings relative to the median's (or the truth), s, shape (n,), or None.
+    bend, bend_uncertainty
+        Change of the ratio of output to rate over the rates of the recording, from -max to max and from 0 to max, and
+        its standard uncertainty, shape (n, axes, 2).
     """
 
     sensing: Array
@@ -121,6 +128,8 @@ class Alignment:
     gauge: str
     latency: Array | None = None
     latency_uncertainty: Array | None = None
+    bend: Array | None = None
+    bend_uncertainty: Array | None = None
 
 
 def align(readings: Array, white: Array, truth: Array | None = None, *, strict: bool = True) -> Alignment:
@@ -172,9 +181,69 @@ def align(readings: Array, white: Array, truth: Array | None = None, *, strict: 
     full = sensing.reshape(n * axes, axes)
     weight = full / sigma[:, None] ** 2
     consensus = np.linalg.solve(full.T @ weight, weight.T @ stacked.T)
-    residual = (stacked - consensus.T @ full.T).std(axis=0).reshape(n, axes)
+    sensed = (consensus.T if truth is None else truth) @ full.T
+    left = stacked - sensed
+    residual = left.std(axis=0).reshape(n, axes)
+    bends = [_fit_bend(sensed[:, k], left[:, k], edges) for k in range(size)]
+    bend, bend_uncertainty, slope = (np.array([each[k] for each in bends]) for k in range(3))
+    uncertainty = _allow_for_bends(sensing, uncertainty, slope.reshape(n, axes), shared=truth is None)
     gauge = "truth_rate" if truth is not None else "mean over the elements of P_i' A_i = 1, directions of element 1"
-    return Alignment(sensing, uncertainty, residual, gauge)
+    return Alignment(
+        sensing, uncertainty, residual, gauge,
+        bend=bend.reshape(n, axes, 2), bend_uncertainty=bend_uncertainty.reshape(n, axes, 2),
+    )  # fmt: skip
+
+
+def _fit_bend(sensed: Array, left: Array, edges: NDArray[np.intp]) -> tuple[Array, Array, float]:
+    """Return how the ratio of an element's output to its rate bends, with u by jackknife, and what that adds to it.
+
+    Of the ratio: its change from -max to max, and from 0 to max, shape (2,); and its mean change over the recording,
+    0 where that is less than its noise makes of it in one of twenty recordings.
+    """
+    top = float(np.abs(sensed).max())
+    if not top > 0:
+        return np.zeros(2), np.ones(2), 0.0
+    p = sensed / top
+    columns = np.stack([np.ones_like(p), p, p**2, p**3, left / top], axis=1)
+    moments = np.array([columns[a:b].T @ columns[a:b] for a, b in pairwise(edges)])
+    total = moments.sum(axis=0)
+    coefficients = np.array([np.linalg.lstsq(each[:4, :4], each[:4, 4])[0] for each in (total, *(total - moments))])
+    blocks = len(moments)
+    u = np.sqrt((blocks - 1) / blocks * np.square(coefficients[1:] - coefficients[1:].mean(axis=0)).sum(axis=0))
+    size, u = coefficients[0, 2:] * (2.0, 1.0), np.maximum(u[2:] * (2.0, 1.0), 1e-300)
+    mean = float(size[1] * total[2, 2] / total[1, 1])
+    return size, u, mean if abs(size[1]) > coverage_factor(blocks - 1) * u[1] else 0.0
+
+
+def _allow_for_bends(sensing: Array, uncertainty: Array, slope: Array, *, shared: bool) -> Array:
+    """Return the uncertainties with what elements that are not linear make of the scale factors, shape (n, axes).
+
+    Without a truth the mean of all elements is 1, so that each takes its share of what another is off.
+    """
+    count = len(slope)
+    others = np.square(slope).sum(axis=0) / count**2 if shared else np.zeros(slope.shape[1])
+    own = np.square(slope) * ((1 - 2 / count) if shared else 1.0) + others
+    return np.sqrt(uncertainty**2 + np.square(sensing) * own[:, :, None])
+
+
+def bend_notes(alignment: Alignment, names: Sequence[str]) -> list[str]:
+    """Return a message on elements whose output is not linear in the rate, under these names."""
+    if alignment.bend is None or alignment.bend_uncertainty is None:
+        return []
+    score = np.abs(alignment.bend) / alignment.bend_uncertainty
+    limit = coverage_factor(_BLOCKS - 1, 1 - ELEMENT_BENDS.level / score.size)
+    # The others share what one element is off, a part of it each.
+    clear = (score > limit) & (np.abs(alignment.bend) > 0.5 * np.abs(alignment.bend).max(axis=0))
+    if not clear.any():
+        return []
+    listed = ", ".join(
+        f"{names[i]} by {100 * float(np.abs(alignment.bend[i])[clear[i]].max()):.2g} %"
+        for i in np.flatnonzero(clear.any(axis=(1, 2))).tolist()
+    )
+    return [
+        f"output over rate is not the same at all rates of the recording: {listed}; what that makes of the scale "
+        "factors is in u: move only as fast as the array will in use, or leave the element out"
+    ]
 
 
 def _moments(stacked: Array, truth: Array | None) -> Array:

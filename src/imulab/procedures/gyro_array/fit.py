@@ -15,7 +15,15 @@ from imulab.estimation.column_noise import noise_lines
 from imulab.estimation.noise_coefficients import COEFFICIENTS, DeviationCurve, coefficients_dict
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.estimation.sampling import sampling_rate
-from imulab.procedures.gyro_array.alignment import Alignment, AtRest, align_in_time, at_rest, latency_notes, unseen
+from imulab.procedures.gyro_array.alignment import (
+    Alignment,
+    AtRest,
+    align_in_time,
+    at_rest,
+    bend_notes,
+    latency_notes,
+    unseen,
+)
 from imulab.procedures.gyro_array.elements import (
     Checks,
     Elements,
@@ -122,8 +130,10 @@ def calibrate_array(
     covariance, used, count = _allan_covariance(readings, rest.rate, averaging_time)
     if used < averaging_time * 0.999:
         warnings.append(
-            f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} s: "
-            f"taken at {used:.3g} s"
+            Note(
+                f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} s: "
+                f"taken at {used:.3g} s"
+            )
         )
     noises = {elements.names[a][i]: gyro_noise for a, row in enumerate(rest.noise) for i, gyro_noise in enumerate(row)}
     warnings += [type(line)(f"{still.name}: {line}") for line in noise_lines(noises)]
@@ -224,7 +234,8 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
     except ObservabilityError as error:
         raise ObservabilityError(f"{moving.name}: {error}") from None
     names = its.names[0] if len(its.axes) == 1 else [f"element {i + 1}" for i in range(its.count)]
-    return alignment, [*notes, *(f"{moving.name}: {line}" for line in latency_notes(alignment, names))]
+    lines = [*latency_notes(alignment, names), *bend_notes(alignment, names)]
+    return alignment, [*notes, *(f"{moving.name}: {line}" for line in lines)]
 
 
 def _clipped_rows(readings: Array) -> np.ndarray:
