@@ -628,7 +628,7 @@ def test_a_stated_dip_changes_nothing_but_what_is_said_of_it():
 def test_a_dip_off_by_more_than_both_uncertainties_is_said_in_one_sentence(sign):
     found = fitted().parameters["dip"]
     own = found.standard_uncertainty
-    for off, said in ((1.8, False), (2.1, True)):
+    for off, said in ((3.2, False), (3.4, True)):
         both = np.hypot(own, np.radians(0.1))
         stated = (found.value - sign * off * both, np.radians(0.1))
         record = fitted(dip=stated)

@@ -5,8 +5,11 @@ The recordings are made here: a unit that is put down and turned by hand, its ou
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -194,7 +197,7 @@ def indoor(rng, share, lever):
 
 
 def test_an_indoor_gradient_is_in_the_uncertainty_where_the_unit_is_put_down_anywhere(reduced):
-    """And not where it turns about a point beside the magnetometer: 1.6 times more, as the methods document says."""
+    """And where it turns about a point beside the magnetometer, where much of it looks like hard iron."""
     trials = 12 if reduced else 24
     ratio = {}
     for lever in (False, True):
@@ -202,7 +205,7 @@ def test_an_indoor_gradient_is_in_the_uncertainty_where_the_unit_is_put_down_any
         error, stated = np.sqrt(np.mean(np.square(found), axis=0))
         ratio[lever] = error / stated
     assert 0.7 < ratio[False] < 1.2
-    assert 1.2 < ratio[True] < 2.2
+    assert 0.7 < ratio[True] < 1.3
 
 
 @pytest.mark.parametrize("most", [0.3, 3.0])
@@ -459,3 +462,57 @@ def test_each_triad_keeps_its_own_refusals(recording, folder, capsys):
     ran("tumble", "fit", folder / "rec.csv", "--with", "mag", "--method", "linearised", "-o", folder / "x", status=2)
     assert capsys.readouterr().err.startswith("imulab: --with mag does not go with method linearised: ")
     assert not (folder / "x").exists()
+
+
+def load_bench():
+    path = Path(__file__).parent.parent / "benchmarks" / "truth" / "_magnetometer_bench.py"
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+truth_bench = load_bench()
+
+
+def bench(**disturbance):
+    """The record of a simulated test by another simulator, and the error of its scale factors over their size."""
+    made = truth_bench.record(np.random.default_rng(3), truth_bench.Disturbance(**disturbance))
+    record = il.fit_mag(made.recording, gravity=G, order=1, field="48 uT").calibration
+    found = np.array([record.value(f"mag_scale_factor_{a}") for a in "xyz"])
+    return made, record, found / (1e6 * np.diag(made.matrix)) - 1
+
+
+def test_slow_magnetometers_are_carried_to_where_they_come_to_rest():
+    """Without that, a low pass at 0.3 Hz costs 1.4 % of scale factor."""
+    _, record, off = bench(corner=0.3)
+    assert np.abs(off).max() < 1e-3
+    assert record.verdict.state == "good"
+    (note,) = [warning for warning in record.warnings if "low pass near" in warning]
+    assert "0.3 Hz" in note or "0.29 Hz" in note or "0.31 Hz" in note
+    assert not any("low pass near" in warning for warning in bench()[1].warnings)
+
+
+@pytest.mark.parametrize("sway", [1e-3, 2e-3])
+def test_sway_seen_in_the_dip_does_not_widen_the_accelerometers(sway):
+    made, record, _ = bench(sway=sway)
+    alone = il.fit_tumble(made.recording, gravity=G, order=1).calibration
+    for name in made.accel:
+        u, before = (each.parameters[name].standard_uncertainty for each in (record, alone))
+        assert u < 1.1 * before  # 24 attitudes, of which the dip may set one aside
+
+
+def test_a_phone_is_told_from_poses():
+    assert any("phone" in warning for warning in bench(phone=1.0)[1].warnings)
+    assert not any("phone" in warning for warning in bench(poses=True, gradient=10.0)[1].warnings)
+
+
+def test_a_gradient_about_a_lever_is_in_the_uncertainty_of_the_hard_iron():
+    made, record, _ = bench(gradient=10.0)
+    scale = np.diag(made.matrix)
+    clean = bench()[1]
+    for i, axis in enumerate("xyz"):
+        parameter = record.parameters[f"mag_bias_{axis}"]
+        low, high = parameter.interval_95
+        assert low < 1e-6 * made.hard_iron[i] / scale[i] < high
+        assert parameter.standard_uncertainty > 3 * clean.parameters[f"mag_bias_{axis}"].standard_uncertainty

@@ -14,9 +14,11 @@ from imulab.errors import DataError, OptionError, listed, quoted
 from imulab.estimation.decisions import (
     DIP_MOVES_ACCELEROMETERS,
     DIP_OFF_STATED,
+    FIELD_DISTURBED,
     FIELD_ORDER_TWO,
     FIELD_SET_ASIDE,
     FIELD_STEP,
+    FIELD_STEP_BESIDE_POSE,
 )
 from imulab.estimation.least_squares import coverage_factor, f_test
 from imulab.estimation.rows import rms
@@ -262,16 +264,23 @@ def _warn_scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> li
 
 
 def _warn_step(joint: Joint, labels: Sequence[str]) -> list[str]:
-    """Return a warning of a step of |m| and dip from some attitude on."""
+    """Return a warning of a step of |m| and dip from some attitude on; a note where pose explains it as well."""
     step = find_step(joint)
     if step is None or step.probability > FIELD_STEP.level:
         return []
-    return [
+    what = (
         f"mag: from {labels[step.first]} on |m| is {100 * abs(step.magnitude):.2g} % "
         f"{'higher' if step.magnitude > 0 else 'lower'} and the dip {np.degrees(abs(step.dip)):.2g} deg "
-        f"{'higher' if step.dip > 0 else 'lower'} than before (p {step.probability:.1g}): was iron, such as a phone, "
-        "near in a part of the attitudes, or did the place change?"
-    ]
+        f"{'higher' if step.dip > 0 else 'lower'} than before (p {step.probability:.1g})"
+    )
+    if step.beside_pose > FIELD_STEP_BESIDE_POSE.level:
+        return [
+            Note(
+                f"{what}; the attitudes from there on point other ways than those before, so that pose explains this "
+                "as well as time: attitudes in mixed order would tell"
+            )
+        ]
+    return [f"{what}: was iron, such as a phone, near in a part of the attitudes, or did the place change?"]
 
 
 def _warn_stated_dip(dip: Parameter, stated: Sequence[float] | None) -> list[str]:
@@ -289,8 +298,9 @@ def _warn_stated_dip(dip: Parameter, stated: Sequence[float] | None) -> list[str
 
 
 def _note_set_aside(label: str, off: Disturbed) -> str:
-    """Return the warning that names an attitude which was set aside, and by how much it is off."""
-    return (
+    """Return the words that name an attitude which was set aside, and by how much it is off: a note by its chance."""
+    kind = str if off.probability < FIELD_DISTURBED.level else Note
+    return kind(
         f"mag: {label} set aside: |m| {100 * abs(off.magnitude):.2g} % "
         f"{'high' if off.magnitude > 0 else 'low'}, dip {np.degrees(abs(off.dip)):.2g} deg "
         f"{'high' if off.dip > 0 else 'low'} against the others (p {off.probability:.1g}): iron or a vehicle near?"
@@ -322,9 +332,11 @@ def _warn_fit(
         left = np.delete(ready.kept, [disturbed.index for disturbed in aside])
         which = " ".join(str(int(left[i]) + 1) for i in sorted(observability.heading))
         messages.append(
-            f"mag: the attitudes face nearly one way (condition {observability.condition:.0f}): heading is known to "
-            f"{np.degrees(heading):.2g} deg only; attitudes {which} once more, facing a quarter turn away, would help "
-            "most"
+            Note(
+                f"mag: the attitudes face nearly one way (condition {observability.condition:.0f}): heading is known "
+                f"to {np.degrees(heading):.2g} deg only; attitudes {which} once more, facing a quarter turn away, "
+                "would help most"
+            )
         )
     far = {name: value for name, value in moved.items() if abs(value) > DIP_MOVES_ACCELEROMETERS.limit}
     if far:

@@ -15,14 +15,16 @@ gravity).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad as triad_of_columns
+from imulab.display import Note
 from imulab.errors import DataError, OptionError
+from imulab.estimation.decisions import FIELD_FOLLOWS_TURNS
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes, stated_covariance
 from imulab.procedures.tumble.model import invert
@@ -199,6 +201,9 @@ def mag_names(order: int) -> list[str]:
 
 FEWEST = 10  # attitudes: for nine parameters of |m|, and one to check
 _BATCHES = 8  # parts of a hold whose scatter gives the variance of its mean
+_LAGS, _TIME_CONSTANTS = 0.01, 4.0
+"""Part of the way from the last attitude that a lag leaves at the beginning of a hold, at least; and the time constants
+that a hold must last to show where its outputs end."""
 _DEAD = 1e-3  # of the largest span: an axis that spans less is dead
 _CLIPPED = 0.3
 """Share of the attitudes at one extreme of an axis from which it is taken for saturated."""
@@ -292,40 +297,108 @@ def _means_of_stretches(
 ) -> FieldMeans:
     """Return the means over the stretches at rest, and their covariance by batches, shrunk towards the usual one."""
     left_out, there = _read_samples(recording, names)
-    samples = left_out.recording.triad("mag")
-    pieces = attitudes.pieces
+    samples = np.array(left_out.recording.triad("mag"))
+    pieces, time = attitudes.pieces, recording.time
     assert pieces is not None
-    mean, batch_covariance = np.full((len(attitudes), 3), np.nan), np.full((len(attitudes), 3, 3), np.nan)
-    freedom = np.ones(len(attitudes))
-    rest = np.zeros(len(samples), dtype=np.bool_)
+    assert time is not None
     force, scatter = recording.triad("accel"), np.empty((len(kept), 2))
+    rests: dict[int, NDArray[np.intp]] = {}
     for place, number in enumerate(kept.tolist()):
         index = np.concatenate([np.arange(a, b) for a, b, at in pieces.tolist() if at == number])
         scatter[place, 0] = force[index].var(axis=0, ddof=1).mean()
-        index = index[there[index]]
-        if len(index) < 2:
+        rests[number] = index[there[index]]
+        if len(rests[number]) < 2:
             raise DataError(
-                f"{recording.name}: {attitudes.label(number)}: {len(index)} samples of {' '.join(names)}; expected 2 "
-                f"or more: leave it out with --drop {number + 1}"
+                f"{recording.name}: {attitudes.label(number)}: {len(rests[number])} samples of {' '.join(names)}; "
+                f"expected 2 or more: leave it out with --drop {number + 1}"
             )
-        rest[index] = True
+    rest = np.isin(np.arange(len(samples)), np.concatenate(list(rests.values())))
+    notes = left_out.notes(rest)
+    step = np.array([_smallest_step(samples[rest, axis]) for axis in range(3)])
+    mean, batch_covariance = np.full((len(attitudes), 3), np.nan), np.full((len(attitudes), 3, 3), np.nan)
+    freedom = np.ones(len(attitudes))
+    if lag := _find_lag(samples, time, rests):
+        notes = [*notes, _describe_lag(lag, time, rests)]
+    for place, (number, whole) in enumerate(rests.items()):
+        index, grown = whole, 1.0
+        if lag:
+            index, samples[whole], grown = _take_lag_off(samples[whole], time[whole], whole, lag)
         mean[number] = samples[index].mean(axis=0)
         scatter[place, 1] = samples[index].var(axis=0, ddof=1).mean()
         parts = np.array_split(index, min(_BATCHES, len(index)))
         batches = np.array([samples[part].mean(axis=0) for part in parts])
-        batch_covariance[number], freedom[number] = np.cov(batches.T) / len(batches), len(batches) - 1.0
+        batch_covariance[number], freedom[number] = grown * np.cov(batches.T) / len(batches), len(batches) - 1.0
     level = np.trace(batch_covariance, axis1=1, axis2=2)
     usual = level <= 3 * np.median(level[kept])
-    weight = freedom[:, None, None]
-    covariance = (weight * batch_covariance + POOL_DEGREES * batch_covariance[usual].mean(axis=0)) / (
-        weight + POOL_DEGREES
-    )
-    step = np.array([_smallest_step(samples[rest, axis]) for axis in range(3)])
+    # One shape for all, whose inverse is hardly biased, and a size of each attitude.
+    common = batch_covariance[usual].mean(axis=0)
+    size = (freedom * level / np.trace(common) + POOL_DEGREES) / (freedom + POOL_DEGREES)
+    covariance = size[:, None, None] * common
     covariance[:, range(3), range(3)] += np.where(
         covariance[kept][:, range(3), range(3)].mean(axis=0) < 1e-3 * step**2, step**2 / 12, 0.0
     )
     of_accel, of_mag = np.sqrt(np.median(scatter, axis=0)).tolist()
-    return FieldMeans(mean, covariance, unit, tuple(left_out.notes(rest)), (of_accel, of_mag))
+    return FieldMeans(mean, covariance, unit, tuple(notes), (of_accel, of_mag))
+
+
+def _find_lag(samples: Array, time: Array, rests: Mapping[int, NDArray[np.intp]]) -> float:
+    """Return the time constant, s, by which the outputs come after the turns; 0 where they do not.
+
+    In each hold the outputs are projected on the way from the last hold, and regressed on ``exp(-t / tau)``: with a lag
+    the slopes of all holds are alike and positive. Their scatter is the noise, of whatever colour.
+    """
+    ends = {number: samples[index[-(len(index) // 3 or 1) :]].mean(axis=0) for number, index in rests.items()}
+    followed = [number for number in rests if number - 1 in ends and len(rests[number]) >= 3 * _BATCHES]
+    if len(followed) < FEWEST:
+        return 0.0
+    ways = [ends[number - 1] - ends[number] for number in followed]
+    sizes = np.array([np.linalg.norm(way) for way in ways])
+    holds = [
+        (time[rests[number]] - time[rests[number][0]], samples[rests[number]] @ way / size)
+        for number, way, size in zip(followed, ways, sizes, strict=True)
+    ]
+    usual = float(np.median([since[-1] for since, _ in holds]))
+    lag = min(usual * np.geomspace(0.02, 1.0, 25), key=lambda tau: _regress_decay(holds, tau)[0])
+    lag = min(lag * np.geomspace(0.85, 1.18, 23), key=lambda tau: _regress_decay(holds, tau)[0])
+    slopes = _regress_decay(holds, lag)[1] / sizes
+    mean = np.average(slopes, weights=sizes**2)
+    error = np.sqrt((sizes**4 * (slopes - mean) ** 2).sum()) / (sizes**2).sum()
+    return float(lag) if mean > _LAGS and mean > FIELD_FOLLOWS_TURNS.limit * error else 0.0
+
+
+def _regress_decay(holds: Sequence[tuple[Array, Array]], tau: float) -> tuple[float, Array]:
+    """Return the sum of squares that ``c + s exp(-t / tau)`` leaves of times and values of holds, and each hold's s."""
+    left, slopes = 0.0, np.empty(len(holds))
+    for place, (since, values) in enumerate(holds):
+        decay = np.exp(-since / tau)
+        decay -= decay.mean()
+        slopes[place] = decay @ values / (decay @ decay)
+        left += float(((values - values.mean() - slopes[place] * decay) ** 2).sum())
+    return left, slopes
+
+
+def _take_lag_off(
+    samples: Array, time: Array, index: NDArray[np.intp], lag: float
+) -> tuple[NDArray[np.intp], Array, float]:
+    """Return the later rows of a hold, its samples without the decay, and the factor by which their variance grows."""
+    since = time - time[0]
+    late = since >= min(2 * lag, since[-1] / 2)
+    design = np.column_stack([np.ones(len(since)), np.exp(-since / lag)])
+    inverse = np.linalg.inv(design[late].T @ design[late] + 1e-12 * np.eye(2))
+    decay = (inverse @ design[late].T @ samples[late])[1]
+    return index[late], samples - design[:, 1:] * decay, float(inverse[0, 0] * late.sum())
+
+
+def _describe_lag(lag: float, time: Array, rests: Mapping[int, NDArray[np.intp]]) -> str:
+    """Return what is said of outputs that come late: a note where the holds are long enough to tell where they end."""
+    hold = float(np.median([np.ptp(time[index]) for index in rests.values()]))
+    what = (
+        f"mag: the outputs come to rest only after the turns, with a time constant of {lag:.2g} s (a low pass near "
+        f"{1 / (2 * np.pi * lag):.2g} Hz)"
+    )
+    if hold < _TIME_CONSTANTS * lag:
+        return f"{what}, too slow for holds of {hold:.2g} s: hold each attitude for {6 * lag:.2g} s or more"
+    return Note(f"{what}; what still moved in the holds was taken off")
 
 
 def _read_samples(recording: Recording, names: list[str]) -> tuple[LeftOut, NDArray[np.bool_]]:

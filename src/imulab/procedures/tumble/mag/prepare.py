@@ -50,6 +50,9 @@ WORST_CONDITION = 30.0
 _BLIND = 1 / 2000
 """Singular value, relative to the largest, below which a combination is not determined."""
 _HELPS = 0.05  # mean square of magnetic east along a direction, below which a turn about it does not show in the dip
+_OF_POSE, _LEAST_REDUNDANCY = 1e-6, 6.0
+"""Relative singular value of a function of the pose that the fit leaves free, and redundancy that a test beside all of
+them must keep."""
 _LEAST_PART = 3
 """Fewest attitudes before and after a step; fewer are tested one by one."""
 
@@ -113,12 +116,17 @@ def find_most_disturbed(joint: Joint) -> Disturbed:
 
 @dataclass(frozen=True)
 class FieldStep:
-    """First attitude after a step of |m| and dip, the size of the step, and its probability by chance."""
+    """First attitude after a step of |m| and dip, the size of the step, and its probability by chance.
+
+    `beside_pose` is the probability of the step beside what any linear function of the pose explains; 1 where too few
+    attitudes tell the two apart.
+    """
 
     first: int
     magnitude: float
     dip: float
     probability: float
+    beside_pose: float
 
 
 def find_step(joint: Joint) -> FieldStep | None:
@@ -132,23 +140,46 @@ def find_step(joint: Joint) -> FieldStep | None:
     if not splits.size:
         return None
     jacobian = weighted_jacobian(joint)
-    q = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0][: n * k]
+    q = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0]
     root = np.zeros((n, k, 3))
     root[:, :3] = np.linalg.cholesky(joint.information[:, :3, :3]).transpose(0, 2, 1)
     whitened = np.einsum("nij,nj->ni", root, joint.found.residuals[:, :3])
     after = np.arange(n)[:, None, None, None] >= splits[:, None]
-    steps = (root[:, :, None, 1:] * after).reshape(n * k, -1)
-    columns = (steps - q @ (q.T @ steps)).reshape(n * k, len(splits), 2)
+    steps = (root[:, :, None, 1:] * after).reshape(n * k, len(splits), 2)
+    redundancy = 2 * n - joint.pair.layout.mag - 1.0
+    first, size, gain = _best_split(steps, q[: n * k], whitened.ravel())
+    p = _probability_of_split(gain, float((whitened[:, 1:3] ** 2).sum()), max(redundancy, 3.0), len(splits))
+    axes = world_axes(joint.found.field.vector, joint.found.force.vector)
+    poses = (root[:, :, 1:, None, None] * axes[:, None, None]).reshape(n * k, -1)
+    free, values, _ = np.linalg.svd(poses - q[: n * k] @ (q[: n * k].T @ poses), full_matrices=False)
+    free = free[:, values > _OF_POSE * values[0]]
+    left = whitened.ravel() - free @ (free.T @ whitened.ravel())
+    redundancy -= free.shape[1]
+    beside = 1.0
+    if redundancy > _LEAST_REDUNDANCY:
+        gain = _best_split(steps, np.hstack([q[: n * k], free]), left)[2]
+        total = float((whitened[:, 1:3] ** 2).sum()) - float(((free.T @ whitened.ravel()) ** 2).sum())
+        beside = _probability_of_split(gain, total, redundancy, len(splits))
+    return FieldStep(int(splits[first]), float(size[0]), float(size[1]), p, beside)
+
+
+def _best_split(steps: Array, known: Array, residuals: Array) -> tuple[int, Array, float]:
+    """Return the split, of (rows, splits, 2), that explains most beside orthonormal columns; its steps and its gain."""
+    rows, splits, _ = steps.shape
+    flat = steps.reshape(rows, -1)
+    columns = (flat - known @ (known.T @ flat)).reshape(rows, splits, 2)
     normal = np.einsum("rsa,rsb->sab", columns, columns)
-    moment = np.einsum("rsa,r->sa", columns, whitened.ravel())
+    normal += 1e-9 * np.trace(np.einsum("rsa,rsb->sab", steps, steps), axis1=1, axis2=2)[:, None, None] * np.eye(2)
+    moment = np.einsum("rsa,r->sa", columns, residuals)
     size = np.linalg.solve(normal, moment[:, :, None])[:, :, 0]
     gain = (size * moment).sum(axis=1)
-    total = float((whitened[:, 1:3] ** 2).sum())
-    redundancy = max(2 * n - joint.pair.layout.mag - 1.0, 3.0)
-    at = int(np.argmax(gain))
-    ratio = gain[at] / 2 / (max(total - float(gain[at]), 1e-300) / (redundancy - 2))
-    p = min(float(f_tail(ratio, 2.0, redundancy - 2)) * len(splits), 1.0)
-    return FieldStep(int(splits[at]), float(size[at, 0]), float(size[at, 1]), p)
+    best = int(np.argmax(gain))
+    return best, size[best], float(gain[best])
+
+
+def _probability_of_split(gain: float, total: float, redundancy: float, splits: int) -> float:
+    ratio = gain / 2 / (max(total - gain, 1e-300) / (redundancy - 2))
+    return min(float(f_tail(ratio, 2.0, redundancy - 2)) * splits, 1.0)
 
 
 @dataclass(frozen=True)

@@ -346,6 +346,8 @@ _RESTS = 1e-3
 """Chi-square probability below which attitudes scatter beyond their known noise."""
 _HUBER = 2.0  # standard deviations of |m| and dip together from which the pull of an attitude is bounded
 _LEAST = 1e-24  # variance that is assumed of exact data, by rounding
+_PARTS = np.linspace(0.0, 1.0, 11)
+"""Shares of the scatter beyond the known noise that a gradient of the field may have."""
 _BLOCKS = np.array([0, 1, 2, 3, 3])
 """The variance that each residual of an attitude has: of |f|, |m|, dip, held direction."""
 
@@ -486,17 +488,29 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
     known = _known_covariance(pair, evaluated)
     information = _information(pair, known, extra, np.ones(len(down)))
     covariance, freedom = _estimate_uncertainty(pair, evaluated, _information(pair, known, extra, down), extra, free)
+    if extra[:2].any():
+        gained, of_gradient = _covariance_of_gradient(pair, evaluated, information, covariance, extra)
+        before, covariance = np.diag(covariance), covariance + gained
+        with np.errstate(divide="ignore"):
+            freedom = np.diag(covariance) ** 2 / (before**2 / freedom + np.diag(gained) ** 2 / of_gradient)
     if not (np.diag(covariance) > 0).all():
         raise np.linalg.LinAlgError("the fit ends where parameters are not determined")
     return Joint(pair, theta, evaluated, information, covariance, freedom, np.sqrt(extra), down, rested and settled)
 
 
 def _known_covariance(pair: Pair, evaluated: Invariants) -> Array:
-    """Return V_0 of |f|, |m| and dip, shape (n, 3, 3): ``B C B'``, of |f| at least the variance of its own fit."""
+    """Return V_0 of |f|, |m| and dip, shape (n, 3, 3): ``B C B'``, of |f| the variance of its own fit.
+
+    Sway turns the outputs of a hold without changing |f|. It is in C, and may enter the dip, but not the
+    accelerometers' parameters beyond what their own fit allows for.
+    """
     v = np.zeros((len(pair.mag), 3, 3))
     if pair.noise is not None:
         v = evaluated.by_outputs @ pair.noise @ evaluated.by_outputs.transpose(0, 2, 1)
-    v[:, 0, 0] = np.maximum(v[:, 0, 0], pair.accel_variance) + _LEAST
+        less = np.sqrt(np.minimum(pair.accel_variance / np.maximum(v[:, 0, 0], _LEAST), 1.0))
+        v[:, 0, 1:] *= less[:, None]
+        v[:, 1:, 0] *= less[:, None]
+    v[:, 0, 0] = pair.accel_variance + _LEAST
     return v
 
 
@@ -630,6 +644,65 @@ def _update_variances(
         new[:2] = max(float(extra[:2].mean()) + change, 0.0)
     new[np.logical_not(free)] = 0.0
     return new
+
+
+def _covariance_of_gradient(
+    pair: Pair, evaluated: Invariants, information: Array, covariance: Array, extra: Array
+) -> tuple[Array, float]:
+    """Return what a gradient of the field adds to the covariance of theta, as far as it is likely, and its freedom.
+
+    A part rho of the scatter beyond the known noise may be that of a gradient G about a centre of the turns d off the
+    magnetometers, whose |m| and dips are ``a' G C_i d``: C_i the axes of the world in attitude i, a the directions of u
+    and t. With G and d in any direction, their covariance is s^2 K. Much of it looks like hard iron and leaves no
+    residual. Each rho has the weight that its restricted likelihood gives it; before, rho = 0 has half of all weight.
+    """
+    n, k = evaluated.residuals.shape
+    kernel = np.zeros((n, k, n, k))
+    kernel[:, 1:3, :, 1:3] = _gradient_kernel(evaluated)
+    white = np.zeros((n, k))
+    white[:, 1:3] = extra[:2]
+    weigh = _root_of_information(information)
+    whiten = np.zeros((n, k, n, k))
+    whiten[np.arange(n), :, np.arange(n), :] = weigh
+    whiten = whiten.reshape(n * k, n * k)
+    jacobian = whiten @ evaluated.by_parameters.reshape(n * k, -1)
+    rotated = np.linalg.qr(jacobian, mode="complete")[0]
+    free = rotated[:, jacobian.shape[1] :]
+    residual = free.T @ (whiten @ evaluated.residuals.ravel())
+    smooth = whiten @ kernel.reshape(n * k, n * k) @ whiten.T
+    rough = (whiten * white.ravel()) @ whiten.T
+    smooth_free, rough_free = free.T @ smooth @ free, free.T @ rough @ free
+    size = np.trace(rough_free) / max(float(np.trace(smooth_free)), 1e-300)
+    values, vectors = np.linalg.eigh(size * smooth_free - rough_free)
+    relative = np.maximum(1 + _PARTS[:, None] * values, 1e-9)
+    squares = ((vectors.T @ residual) ** 2 / relative).sum(axis=1)
+    likelihood = -0.5 * (np.log(relative).sum(axis=1) + len(residual) * np.log(squares))
+    weights = np.append(0.5, np.full(len(_PARTS) - 1, 0.5 / (len(_PARTS) - 1)))
+    pull = covariance @ jacobian.T  # of whitened residuals on theta
+    weights *= np.exp(likelihood - likelihood.max())
+    part = float(weights @ _PARTS / weights.sum())
+    gained: Array = part * (pull @ (size * smooth - rough) @ pull.T)
+    values, vectors = np.linalg.eigh(gained)
+    # A product of two vectors scatters as half as many numbers would.
+    freedom = max(np.trace(smooth_free) ** 2 / max(float((smooth_free**2).sum()), 1e-300) / 2, 1.0)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, dtype=np.float64), float(freedom)
+
+
+def _gradient_kernel(evaluated: Invariants) -> Array:
+    """Return K of |m| and dip of all attitudes, (n, 2, n, 2): E[(a'Gb)(c'Gd)] = a'c b'd + a'd b'c - 2/3 a'b c'd."""
+    m, f = evaluated.field.vector, evaluated.force.vector
+    u = m / np.linalg.norm(m, axis=1)[:, None]
+    axes = world_axes(m, f)
+    up = axes[:, 2]
+    t = -up - u * -np.einsum("ni,ni->n", u, up)[:, None]
+    t /= np.linalg.norm(t, axis=1)[:, None]
+    along = np.stack([u, t], axis=1)  # directions of |m| and dip in the body, (n, 2, 3)
+    inner = np.einsum("ipk,jqk->ipjq", along, along)
+    kernel: Array = np.einsum("jpk,iqk->ipjq", along, along) - 2 / 3 * inner
+    both = np.einsum("irk,jrk->ij", axes, axes)
+    for p in range(2):
+        kernel[:, p, :, p] += both
+    return kernel
 
 
 def _exceeds_known_noise(evaluated: Invariants, known: Array) -> Array:
