@@ -209,6 +209,26 @@ def test_drift_with_temperature_is_told_apart_and_taken_out():
     assert said.model["terms"]["gyro_x"] != "N"
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_temperature_in_whole_degrees_gives_the_slope_and_says_what_it_hides(seed):
+    """Regression on the steps themselves gives a thirteenth of the slope."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(40_000) / 20
+    temperature = 25 + rng.uniform() + 2 * np.sin(2 * np.pi * t / 1500 + rng.uniform(0, 6))
+    slope = 108 * DEGREE / 3600
+    rate = 0.0004 * rng.standard_normal(len(t)) + slope * temperature
+    columns = {"time": t, "gyro_x": rate, "temperature": np.round(temperature + 0.02 * rng.standard_normal(len(t)))}
+    log = il.Recording(columns, {"time": "s", "gyro_x": "rad/s", "temperature": "degC"}, name="log")
+    record = il.fit_noise(log, regress="temperature").calibration
+    (drift,) = (each for each in record.fit["columns"]["gyro_x"]["drifts"] if each["follows"] == "temperature")
+    assert abs(drift["slope"]["value"] - slope) < 3 * drift["slope"]["standard_uncertainty"]
+    assert drift["slope"]["value"] == pytest.approx(slope, rel=0.15)
+    assert any("in steps of 1 K show it: slow noise below " in reason for reason in record.verdict.reasons)
+    two = log.with_columns({"temperature": np.where(t < 900, 25.0, 26.0)}, {})
+    with pytest.raises(DataError, match="by more than one step of its readings"):
+        il.fit_noise(two, regress="temperature")
+
+
 def test_a_ramp_is_a_parameter():
     ramp = log().with_columns({"gyro_x": samples(3, white=0.005) + 1e-4 * 0.01 * np.arange(COUNT)}, {"gyro_x": "deg/s"})
     found = il.fit_noise(ramp, columns=["gyro_x"], regress="time").calibration.parameter("gyro_x_ramp")

@@ -44,6 +44,10 @@ MOST, SHARE = 16, 0.05
 """Most stretches between gaps, and how long each must be relative to the longest."""
 _PILED, _FEW_AT_END = 2, 10
 """An output is at the end of its range beyond so many times the readings at the next level, and so many more."""
+_MOST_LEVELS = 50
+"""Steps of a quantity's readings over its range from which their rounding does not matter."""
+_COARSE_KELVIN = 0.2
+"""Step of a temperature's readings from which a log is read as a whole, so that their rounding can be undone."""
 _SEEN = 100_000  # samples of which distinct values are counted
 
 
@@ -108,7 +112,13 @@ class Rest:
         samples = self.samples(name)
         if not all(np.isfinite(each).all() and float(np.ptp(each)) > 0 for each in samples):
             return None
-        return [slow_coefficients(each, self.interval) for each in samples]
+        lines = [unrounded(each) for each in samples]
+        slow = [slow_coefficients(each, self.interval) for each in lines if each is not None]
+        return slow if len(slow) == len(samples) else None
+
+    def rounding(self, name: str) -> float:
+        """Return the step of a slow quantity's readings, SI, where it is coarse for the range they take; else 0."""
+        return max(map(coarse_step, self.samples(name)), default=0.0) if name in self.recording else 0.0
 
     def _check(self, name: str) -> None:
         values, unit = self.recording.column(name), self.recording.units[name]
@@ -127,6 +137,37 @@ class Rest:
                     f"{where}: {count} samples are at its limit, {limit:.6g} {unit}{lost}; expected a range that holds "
                     "the noise of a sensor at rest"
                 )
+
+
+def coarse_step(values: Array) -> float:
+    """Return the step of readings of a slow quantity, shape (n,), that takes few levels and mostly repeats; else 0."""
+    changes = np.flatnonzero(np.diff(values))
+    step = resolution(values[np.unique(np.concatenate([[0], changes, changes + 1]))])
+    return 0.0 if 2 * len(changes) > len(values) or float(np.ptp(values)) > _MOST_LEVELS * step else step
+
+
+def unrounded(values: Array) -> Array | None:
+    """Return a slow quantity without the rounding of its readings, shape (n,); None where they show too little of it.
+
+    Where most readings repeat the one before and few levels are taken, each change of level is at the middle of both,
+    and the quantity is the line from one change to the next, held within its last level outside of them.
+    """
+    step = coarse_step(values)
+    if not step:
+        return values
+    changes = np.flatnonzero(np.diff(values))
+    middle = (values[changes] + values[changes + 1]) / 2
+    if float(np.ptp(middle)) == 0:
+        return None
+    place = changes + 0.5
+    inner = np.interp(np.arange(len(values)), place, middle)
+    for end, toward in ((slice(None, changes[0] + 1), 1), (slice(changes[-1] + 1, None), -1)):
+        ends = middle[::toward]
+        far = int(np.argmax(ends != ends[0]))
+        slope = (ends[far] - ends[0]) / (place[::toward][far] - place[::toward][0])
+        line = ends[0] + slope * (np.arange(len(values))[end] - place[::toward][0])
+        inner[end] = np.clip(line, values[end] - step / 2, values[end] + step / 2)
+    return np.asarray(inner)
 
 
 def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
@@ -281,6 +322,10 @@ class LongRest(Rest):
     def slow(self, name: str) -> list[Array] | None:
         """Return the slow coefficients of the temperature, stretch by stretch; None where it does not change."""
         return self.temperature if name == "temperature" else None
+
+    def rounding(self, name: str) -> float:
+        """Return 0: a log with coarse readings is read as a whole."""
+        return 0.0
 
 
 def long_rest(blocks: Iterable[Recording], names: Sequence[str]) -> LongRest | None:
@@ -444,6 +489,8 @@ class _Log:
         if self._warm:
             warmth = np.asarray(block.si("temperature"), dtype=np.float64)
             self._warm = bool(np.isfinite(warmth).all())
+            if self._warm and resolution(warmth) >= _COARSE_KELVIN:
+                raise _AsWholeError
             self._range = np.array([min(self._range[0], warmth.min()), max(self._range[1], warmth.max())])
             columns["temperature"] = warmth
         self._add(steps, columns)

@@ -81,13 +81,15 @@ _COVARIATE_UNITS = {"time": "s", "temperature": "K"}
 class CovariateDrift:
     """Dependence of a column on time or temperature, and the terms of its model without and with that dependence.
 
-    `taken` says whether the dependence was removed before the model was fitted.
+    `taken` says whether the dependence was removed before the model was fitted; `rounding` is the step of the
+    covariate's readings, SI, where that is coarse.
     """
 
     covariate: str
     regression: Regression
     letters: tuple[str, str]
     taken: bool
+    rounding: float = 0.0
 
     @property
     def slope(self) -> float:
@@ -280,6 +282,14 @@ def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> tuple[type[st
     per = "h" if drift.covariate == "time" else "K"
     scale = factor * (3600.0 if drift.covariate == "time" else 1.0)
     slope = f"{drift.slope * scale:.2g} ± {drift.standard_uncertainty * scale:.1g} ({unit})/{per}"
+    if drift.taken and drift.rounding:
+        hidden = _sized(abs(drift.slope) * drift.rounding / 2, column.unit)
+        return (
+            str,
+            f"follows the {drift.covariate}, {slope}, which was taken out as far as readings in steps of "
+            f"{drift.rounding:.3g} K show it: slow noise below {hidden} may be what the steps hide; log the "
+            "temperature in finer steps",
+        )
     if drift.taken:
         return Note, f"follows the {drift.covariate}, {slope}, which was taken out"
     return (
@@ -757,7 +767,10 @@ def fit_recordings(
     temperatures = [rest.slow("temperature") for rest in rests]
     if regress == "temperature" and None in temperatures:
         where = rests[temperatures.index(None)].recording.name
-        raise DataError(f"{where}: regress temperature: expected a column temperature that changes, found none")
+        raise DataError(
+            f"{where}: regress temperature: expected a column temperature that changes, by more than one step of its "
+            "readings, found none"
+        )
     horizon = min(HORIZON, longest) if horizon is None else horizon
     candidates = CANDIDATES if terms == "auto" else (terms,)
     models = {
@@ -846,7 +859,8 @@ def _fit_column(
         taken, left = covariate == regress, analysis.letters
         if regression.follows or taken:
             left = analysed(regression.residual, candidates, band).letters
-        drifts.append(CovariateDrift(covariate, regression, (analysis.letters, left), taken))
+        coarse = max(rest.rounding(covariate) for rest in rests) if covariate == "temperature" else 0.0
+        drifts.append(CovariateDrift(covariate, regression, (analysis.letters, left), taken, coarse))
     for drift in drifts:
         if drift.taken:
             analysis = analysed(drift.regression.residual, candidates, band)
