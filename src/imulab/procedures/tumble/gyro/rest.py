@@ -20,6 +20,7 @@ from imulab.estimation.least_squares import f_test
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.device import specific_force
+from imulab.procedures.tumble.gyro.windows import EFFECTIVE
 from imulab.procedures.tumble.schema import fit_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -35,6 +36,9 @@ QUIET_SHARE = 0.75  # share of still samples of a hold that tells the zero
 _FLAT_TOP = 4  # readings in a row
 _CUT_OFF = 3.0  # steps of the output
 _LATE = 0.3  # s
+_ENDS = 0.6, 0.15  # s and part of a hold at each end, where turns begin and end: the zero is that between
+_HUBER = 2.5 * MAD_TO_SIGMA  # medians of the absolute deviation, 2.5 sigma: what is beyond pulls no stronger
+_REWEIGHTED = 20  # of Huber's fit
 
 
 @dataclass(frozen=True)
@@ -61,12 +65,19 @@ class RestHolds:
 
 @dataclass(frozen=True)
 class GyroRest:
-    """Output at rest: zero (3,), change with specific force (3, 3) or None, and their standard uncertainties."""
+    """Output at rest: zero (3,), change with specific force (3, 3) or None, and their standard uncertainties.
+
+    The zero is that of all holds; a turn has that of its two holds (`zero_between`).
+    """
 
     zero: Array
     slope: Array | None
     zero_uncertainty: Array
     slope_uncertainty: Array | None
+    moved: Array | float = 0.0
+    """By how much the zero of each hold is probably another, (holds, 3): its deviation, less what noise explains."""
+    moved_variance: Array | float = 0.0
+    """Variance of that, (3,)."""
 
 
 def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> RestHolds:
@@ -136,30 +147,31 @@ def beyond_range(output: Array) -> NDArray[np.bool_]:
 
 def at_rest(
     holds: RestHolds,
+    time: Array,
     output: Array,
     force: Array,
     sensitivity: str,
+    density: Array,
+    scale: Array | None = None,
     earth: Array | float = 0.0,
     vertical: Array | None = None,
 ) -> GyroRest:
-    """Zero and g-sensitivity from the mean still outputs of each quiet hold, least squares over the holds.
+    """Return zero and g-sensitivity from the mean outputs of the quiet holds, robust least squares over the holds.
 
-    `earth` is what is known of the Earth's rate in each, as output, (n, 3), which is taken off. Where that is nothing,
+    `density` is the noise of the outputs (`noise_density`), `scale` their output per rad/s where it is known. `earth`
+    is what is known of the Earth's rate in each hold, as output, (n, 3), which is taken off. Where that is nothing,
     `vertical` is the output by all of it along up: what a part of that explains shows no g-sensitivity. Quiet is a hold
     that is still for three quarters of its samples; where fewer than half are, that half.
     """
-    edges = np.column_stack([holds.start, holds.stop]).ravel()
-    kept = np.where(holds.still[:, None], np.column_stack([output, np.ones(len(output))]), 0.0)
-    sums = np.add.reduceat(np.vstack([kept, np.zeros((1, 4))]), edges, axis=0)[::2]
-    fraction = sums[:, 3] / (holds.stop - holds.start)
+    means, fraction, length = _still_means(holds, time, output, scale)
     quiet = fraction >= min(QUIET_SHARE, float(np.median(fraction)))
-    mean, force = (sums[:, :3] / sums[:, 3:] - earth)[quiet], force[quiet]
+    every = means - earth
+    mean, turned = every[quiet], force[quiet]
     n = len(mean)
     middle = (holds.start + holds.stop)[quiet] / 2
     when = (middle - middle.mean()) / max(float(np.ptp(middle)), 1.0)
-    flat = mean - mean.mean(axis=0)
     # A zero that drifts goes with some direction of f by chance: held against, and found beside, a slope in time.
-    drift, whole = np.column_stack([np.ones(n), when]), np.column_stack([np.ones(n), force, when])
+    drift, whole = np.column_stack([np.ones(n), when]), np.column_stack([np.ones(n), turned, when])
     left, plain, known = _residuals(whole, mean), _residuals(drift, mean), 6
     if vertical is not None:
         along, known = _residuals(drift, vertical[quiet]), 7
@@ -168,14 +180,76 @@ def at_rest(
     chance = f_test(float((plain**2).sum()), known, float((left**2).sum()), 15, 3 * n) if n > 7 else 1.0
     shown = chance < BIAS_FOLLOWS_GRAVITY.level
     if sensitivity == "no" or (sensitivity == "auto" and not shown):
-        scatter: Array = np.sqrt((flat**2).sum(axis=0) / max(n - 1, 1) / n)
-        return GyroRest(mean.mean(axis=0), None, scatter, None)
-    solution = np.asarray(np.linalg.lstsq(whole, mean, rcond=None)[0], dtype=np.float64)
-    root = np.sqrt(np.diag(np.linalg.inv(whole.T @ whole)))
-    spread = np.sqrt((left**2).sum(axis=0) / max(n - 5, 1))
-    wander = np.sqrt((_residuals(whole[:, :4], mean) ** 2).sum(axis=0) / max(n - 4, 1))
-    uncertainty: Array = spread[:, None] * root[1:4]
-    return GyroRest(solution[0], solution[1:4].T, np.maximum(spread, wander) * root[0], uncertainty)
+        fit = _robust_fit(np.ones((n, 1)), mean)
+        rest = GyroRest(fit.values[0], None, fit.uncertainty[0], None)
+    else:
+        fit = _robust_fit(whole, mean)
+        flat = _robust_fit(whole[:, :4], mean)
+        zero_uncertainty = np.maximum(fit.scatter, flat.scatter) * fit.uncertainty[0] / np.maximum(fit.scatter, 1e-300)
+        rest = GyroRest(fit.values[0], fit.values[1:4].T, zero_uncertainty, fit.uncertainty[1:4])
+        every = every - force @ fit.values[1:4]
+    deviation = np.where(quiet[:, None], every - rest.zero, 0.0)
+    limit = _HUBER * np.median(np.abs(deviation[quiet]), axis=0)
+    alone = density / (EFFECTIVE * float(np.median(length[quiet])))
+    excess = np.maximum((MAD_TO_SIGMA * limit / _HUBER) ** 2 - alone, 0.0)
+    share = excess / np.maximum(excess + alone / 2, 1e-300)
+    return replace(rest, moved=share * np.clip(deviation, -limit, limit), moved_variance=share * alone)
+
+
+def _still_means(holds: RestHolds, time: Array, output: Array, scale: Array | None) -> tuple[Array, Array, Array]:
+    """Return Hann-weighted means over the still samples of holds, (n, 3), the share of these, and their duration, s.
+
+    The ends are left out, where turns begin and end slowly. A unit that trembles about two axes turns about the third
+    without getting anywhere (coning): 1/2 sum h (phi x w), phi the angle turned so far, is what the mean rate lacks.
+    """
+    first, last = time[holds.start], time[np.maximum(holds.stop - 1, holds.start)]
+    edge = np.minimum(_ENDS[0], _ENDS[1] * (last - first))
+    step = (last - first) / np.maximum(holds.stop - holds.start - 1, 1)
+    means, fraction = np.empty((len(first), 3)), np.empty(len(first))
+    length = last - first - 2 * edge + step
+    for k, (a, b) in enumerate(np.searchsorted(time, [first + edge, last - edge + step / 2]).T.tolist()):
+        a, b = (a, b) if b > a else (int(holds.start[k]), int(holds.stop[k]))
+        when, values, still = time[a:b], output[a:b], holds.still[a:b]
+        fraction[k] = np.count_nonzero(holds.still[holds.start[k] : holds.stop[k]]) / (holds.stop[k] - holds.start[k])
+        weight = 1 - np.cos(2 * np.pi * (when - when[0] + step[k] / 2) / max(when[-1] - when[0] + step[k], 1e-300))
+        weight = np.where(still, weight, 0.0) if still.any() else weight
+        weight = weight / weight.sum()
+        means[k] = weight @ values
+        if scale is not None:
+            rate = np.where(still[:, None], (values - means[k]) / scale, 0.0)
+            angle = np.cumsum(rate, axis=0) * step[k] - 0.5 * rate * step[k]
+            means[k] += scale * (weight @ np.cross(angle - weight @ angle, rate)) / 2
+    return means, fraction, length
+
+
+@dataclass(frozen=True)
+class _RobustFit:
+    """Coefficients (p, 3) of each column, their standard uncertainties, and its scatter, (3,)."""
+
+    values: Array
+    uncertainty: Array
+    scatter: Array
+
+
+def _robust_fit(design: Array, values: Array) -> _RobustFit:
+    """Return Huber's fit of each column: residuals beyond 2.5 sigma of their median pull no stronger than these.
+
+    Source: Huber and Ronchetti, Robust statistics, 2009, chapter 7; the covariance is its equation 6.5 without the
+    correction for few values.
+    """
+    n, size = design.shape
+    root = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
+    coefficients, scatter = np.empty((size, values.shape[1])), np.empty(values.shape[1])
+    for k, column in enumerate(values.T):
+        weight = np.ones(n)
+        for _ in range(_REWEIGHTED):
+            coefficients[:, k] = np.linalg.lstsq(design * weight[:, None], column * weight, rcond=None)[0]
+            left = column - design @ coefficients[:, k]
+            limit = max(_HUBER * float(np.median(np.abs(left))), 1e-12 * float(np.abs(column).max()), 1e-300)
+            weight = np.sqrt(limit / np.maximum(np.abs(left), limit))
+        inside = np.count_nonzero(np.abs(left) <= limit) / n
+        scatter[k] = np.sqrt((np.clip(left, -limit, limit) ** 2).sum() / max(n - size, 1)) / inside
+    return _RobustFit(coefficients, root[:, None] * scatter, scatter)
 
 
 def _residuals(design: Array, values: Array) -> Array:
@@ -193,15 +267,15 @@ def _resolution(output: Array) -> Array:
 # How well the directions of gravity are known that the turns of the gyroscopes are held against.
 
 
-def direction_covariance(record: Calibration, attitudes: Attitudes, output: Array, force: Array) -> Array:
-    """Return the covariance of the upward directions, rad^2, shape (3 n, 3 n).
+def direction_covariance(record: Calibration, output: Array, force: Array) -> Array:
+    """Return the covariance of the upward directions by the record's parameters, rad^2, shape (3 n, 3 n).
+
+    And by what the attitudes scatter beyond their noise, as the record says. The noise itself is not in it.
 
     Parameters
     ----------
     record
-        Of the accelerometers; where it states no covariance, only the noise counts.
-    attitudes
-        Whose covariances are in their own unit.
+        Of the accelerometers.
     output
         Means of the attitudes in the record's unit, shape (n, 3).
     force
@@ -209,13 +283,7 @@ def direction_covariance(record: Calibration, attitudes: Attitudes, output: Arra
     """
     n = len(force)
     joint = np.zeros((n, 3, n, 3))
-    if attitudes.covariance is not None:
-        unit = float(np.linalg.norm(output) / np.linalg.norm(attitudes.mean))
-        size = unit * np.sqrt(np.einsum("nii->n", attitudes.covariance).mean() / 3)
-        columns = [_slope(record, output, size * np.eye(3)[axis]) / size for axis in range(3)]
-        slope = np.stack(columns, axis=2)
-        force_covariance = slope @ (attitudes.covariance * unit**2) @ np.swapaxes(slope, 1, 2)
-        joint[range(n), :, range(n), :] = force_covariance + fit_of(record).excess.value ** 2 * np.eye(3)
+    joint[range(n), :, range(n), :] = fit_of(record).excess.value ** 2 * np.eye(3)
     names = [name for name in record.covariance.names if not name.startswith("gyro_")]
     if names:
         matrix = record.covariance.block(names)
@@ -233,12 +301,6 @@ def direction_covariance(record: Calibration, attitudes: Attitudes, output: Arra
     across = (np.eye(3) - up[:, :, None] * up[:, None, :]) / length[:, None, None]
     angular: Array = np.einsum("nij,njmk,mlk->niml", across, joint, across, optimize=True).reshape(3 * n, 3 * n)
     return angular
-
-
-def _slope(record: Calibration, output: Array, step: Array) -> Array:
-    """Half the change of the specific force from one step before the outputs to one after, shape (n, 3)."""
-    change: Array = (specific_force(record, output + step) - specific_force(record, output - step)) / 2
-    return change
 
 
 def _force_change(record: Calibration, name: str, sigma: float, output: Array) -> Array:

@@ -36,10 +36,14 @@ class Turns(Struct, frozen=True):
     weighted
         ``sum C_i' x_i dt`` for each weight x (k of them), C_i from the start to the middle of step i: an error
         ``dw = a x`` of the rate changes a carried direction v by ``C (v x sum C_i' x_i dt a)``. Shape (m, k, 3, 3).
+    squares
+        ``sum (C_i' w_i dt)(C_i' w_i dt)'``: covariance, over p, of ``sum C_i' w_i dt`` over lost steps, where each is
+        lost by itself with a small probability p. Shape (m, 3, 3), or (0, 3, 3) where it was not asked for.
     """
 
     matrix: Array
     weighted: Array
+    squares: Array
 
 
 def frame_rotations(rate: Array, time: Array, start: NDArray[np.int64], stop: NDArray[np.int64]) -> Array:
@@ -81,8 +85,8 @@ def composed_turns(angle: Array) -> Array:
     return weighted_turns(angle, np.ones(angle.shape[:2]), np.empty((*angle.shape[:2], 0))).matrix
 
 
-def weighted_turns(rate: Array, step: Array, weights: Array) -> Turns:
-    """Compose turns with their sensitivities.
+def weighted_turns(rate: Array, step: Array, weights: Array, *, squares: bool = False) -> Turns:
+    """Return composed turns with their sensitivities, and where asked with their `squares`.
 
     Parameters
     ----------
@@ -96,17 +100,19 @@ def weighted_turns(rate: Array, step: Array, weights: Array) -> Turns:
     segments, n = step.shape
     start = n * np.arange(segments)
     angle, scaled = rate * step[:, :, None], weights * step[:, :, None]
-    return _turns(angle.reshape(-1, 3), scaled.reshape(segments * n, weights.shape[2]), start, start + n)
+    return _turns(angle.reshape(-1, 3), scaled.reshape(segments * n, weights.shape[2]), start, start + n, squares)
 
 
-def _turns(angle: Array, weights: Array, start: NDArray[np.int64], stop: NDArray[np.int64]) -> Turns:
-    """Segments of one sequence of steps, shape (n, 3), with weights (n, k) that hold the durations of the steps."""
+def _turns(
+    angle: Array, weights: Array, start: NDArray[np.int64], stop: NDArray[np.int64], squares: bool = False
+) -> Turns:
+    """Return segments of one sequence of steps, (n, 3), with weights (n, k) that hold the durations of the steps."""
     m, k = len(start), weights.shape[1]
-    turns = Turns(np.empty((m, 3, 3)), np.empty((m, k, 3, 3)))
+    turns = Turns(np.empty((m, 3, 3)), np.empty((m, k, 3, 3)), np.empty((m if squares else 0, 3, 3)))
     _rotation.turns(
         np.ascontiguousarray(angle), np.ascontiguousarray(weights),
         np.ascontiguousarray(start, dtype=np.int64), np.ascontiguousarray(stop, dtype=np.int64),
-        turns.matrix, turns.weighted,
+        turns.matrix, turns.weighted, turns.squares,
     )  # fmt: skip
     return turns
 

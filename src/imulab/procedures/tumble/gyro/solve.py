@@ -1,11 +1,6 @@
 """The fit of the turns.
 
-The clock of the gyroscopes, whether their scale factors change with the rate, and which turns are left out.
-
-M = S (A + b + even_i A_i^2 / w_i + odd_i A_i^3 / w_i^2),   A = T w,  w_i the largest rate of gyro i in the turns
-
-Both terms of all three gyros are tried together beside the parameters of the fit (generalised least squares, F-test).
-They are tested and said, never fitted: turns by hand seldom vary enough in rate to tell S from them.
+The clock of the gyroscopes, and which turns are left out.
 
 A scale factor is output per angle and time: a clock that runs fast by 1000 ppm makes all three 1000 ppm too large, and
 no turn shows it. Where the accelerometers are stamped by another clock, both see the same turns. In each of them the
@@ -17,7 +12,7 @@ turn, the speed even: it does not move the delay to first order.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -28,123 +23,32 @@ from imulab.errors import DataError
 from imulab.estimation.decisions import (
     CLOCKS_DISAGREE,
     SAMPLES_COME_LATE,
-    SCALE_CHANGE,
-    SCALE_CHANGES_WITH_RATE,
     TURN_DISAGREEMENT,
 )
 from imulab.estimation.least_squares import Fit, covariance, f_test, least_squares
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.gyro.rest import GyroRest, at_rest, find_holds
-from imulab.procedures.tumble.gyro.rotation import frame_rotations, weighted_turns
-from imulab.procedures.tumble.gyro.turns import COLUMNS, ROWS, Segments, carried, find_turns, model, start_scale
+from imulab.procedures.tumble.gyro.rotation import frame_rotations
+from imulab.procedures.tumble.gyro.turns import (
+    Segments,
+    Stamps,
+    choose_turns,
+    misalignment,
+    model,
+    segments_between,
+    start_scale,
+)
+from imulab.procedures.tumble.gyro.windows import (
+    Windows,
+    hann_means,
+    hold_ends,
+    neighbouring_pairs,
+    noise_density,
+    pieces_of,
+)
 from imulab.recording import Array
 from imulab.units import parse_unit, to_si
-
-# Whether the scale factors of the gyroscopes change with the rate, from what the turns miss.
-
-
-_FEWEST_LEFT = 6  # degrees of freedom that the test must leave
-
-
-@dataclass(frozen=True)
-class Nonlinearity:
-    """Probability of the residuals if nothing changes with the rate, and what changes by how much.
-
-    Attributes
-    ----------
-    probability
-        Of so large a gain by chance (F-test).
-    odd
-        Change of the scale factor from rest to the largest rate, relative, shape (3,).
-    even
-        Half its difference between the two directions at the largest rate, relative, shape (3,).
-    odd_uncertainty, even_uncertainty
-        Their standard uncertainties, shape (3,).
-    largest
-        Largest rate about each axis in the turns, rad/s, shape (3,).
-    """
-
-    probability: float
-    odd: Array
-    even: Array
-    odd_uncertainty: Array
-    even_uncertainty: Array
-    largest: Array
-
-    def notes(self) -> list[str]:
-        """Say what changes with the rate, if it is beyond chance."""
-        if not self.probability < SCALE_CHANGES_WITH_RATE.level:
-            return []
-        phrases = []
-        for i, axis in enumerate("xyz"):
-            for what, value, u in (
-                ("from slow turns to", self.odd[i], self.odd_uncertainty[i]),
-                ("between the two directions at", 2 * self.even[i], 2 * self.even_uncertainty[i]),
-            ):
-                if abs(value) > SCALE_CHANGE.limit * u:
-                    rate = np.degrees(self.largest[i])
-                    phrases.append(f"of {axis} by {100 * value:+.2g} % (u {100 * u:.1g} %) {what} {rate:.0f} deg/s")
-        changes = "; ".join(phrases) or "of which axis, they do not tell"
-        return [
-            f"gyro: what the turns miss depends on the rate (p {self.probability:.1g}): the scale factor changes "
-            f"{changes}: the record holds for turns as fast as these; measure at the rates of use, or on a rate table"
-        ]
-
-
-def test_linearity(
-    segments: Segments, scale: Array, theta: Array, jacobian: Array, residual: Array, shared: Array, variance: float
-) -> Nonlinearity | None:
-    """Test whether what the turns miss depends on the rate; None where too few turns are left to tell.
-
-    Parameters
-    ----------
-    scale, theta
-        Output per rad/s and scaled parameters of the fit.
-    jacobian, residual
-        At the solution, (3 m, p) and (3 m,).
-    shared
-        Covariance of the residuals that directions of gravity and the zero bring, (3 m, 3 m).
-    variance
-        That each has beside, rad^2.
-    """
-    m, size = len(segments.before), theta.size
-    if 2 * m < size + 6 + _FEWEST_LEFT:
-        return None
-    t = np.eye(3)
-    t[ROWS, COLUMNS] = theta[3:9]
-    inverse = np.linalg.inv(t)
-    moved = scale * theta[9:12] if size > 9 else 0.0
-    sensed = (segments.output - moved) / (scale * (1 + theta[:3]))
-    sensed = np.where(segments.step[:, :, None] > 0, sensed, 0.0)
-    largest = np.maximum(np.abs(sensed).max(axis=(0, 1)), 1e-12)
-    weights = np.concatenate([sensed**3 / largest**2, sensed**2 / largest], axis=2)
-    turned = weighted_turns(sensed @ inverse.T, segments.step, weights).weighted
-    matrix = carried(segments, scale, theta)
-    columns = [
-        np.einsum("mij,mj->mi", matrix, np.cross(segments.before, turned[:, k] @ -inverse[:, k % 3])).ravel()
-        for k in range(6)
-    ]
-    floor = max(variance, 1e-6 * float(np.trace(shared)) / m, 1e-24)
-    root = np.linalg.cholesky(shared + floor * np.eye(3 * m))
-    whole = np.linalg.solve(root, np.column_stack([jacobian, *columns, residual]))
-    design, left = whole[:, :-1], whole[:, -1]
-    length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-    design = design / length
-
-    def solved(count: int) -> tuple[Array, float]:
-        answer = np.linalg.lstsq(design[:, :count], left, rcond=None)[0]
-        return answer, float(((left - design[:, :count] @ answer) ** 2).sum())
-
-    cost, (answer, larger) = solved(size)[1], solved(size + 6)
-    freedom = 2 * m - size - 6
-    spread = np.linalg.pinv(design.T @ design) * (larger / freedom)
-    u = np.sqrt(np.diag(spread)[size:]) / length[size:]
-    # The residual is carried less found direction: parameters that lower it have its sign reversed.
-    value = -answer[size:] / length[size:]
-    probability = f_test(cost, size, larger, size + 6, 2 * m)
-    return Nonlinearity(probability, value[:3], value[3:], u[:3], u[3:], largest)
-
 
 # The clock of the gyroscopes: how far it can be trusted, and what the accelerometers' clock says of it.
 
@@ -372,6 +276,7 @@ _UNIT_DOUBTED = np.radians(8.0)
 _STANDS_OUT = 3.0  # medians; of 30 turns whose misses are normal, none is so far out in 94 % of tests
 _REWEIGHTED = 6  # fits with bounded influence before turns are called out
 _TOO_MANY_OUT = 3  # one turn in so many
+_FEWEST_LEFT = 6  # degrees of freedom that the test of a turn must leave
 
 
 @dataclass(frozen=True)
@@ -399,13 +304,26 @@ class TurnProblem:
             return self.own_force
         return np.column_stack([np.interp(time, self.own, column) for column in self.own_force.T])
 
+    def up(self, windows: Windows, hold: NDArray[np.intp] | slice = slice(None)) -> Array:
+        """Upward directions in windows of holds, (n, 3); that of the whole hold where the accelerometers have a gap."""
+        mean = hann_means(self.own, self.own_force, windows)
+        mean = np.where(np.isfinite(mean), mean, self.force[hold])
+        return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True), dtype=np.float64)
+
 
 @dataclass(frozen=True)
 class TurnSolution:
-    """Scaled parameters (p,) that fit the turns, residuals (3 m,), Jacobian (3 m, p), and what was set aside."""
+    """Scaled parameters (p,) that fit the turns, residuals (3 m,), Jacobian (3 m, p), and what was set aside.
+
+    `within` are the turns from each window to the next in a hold, `density` is the noise of the outputs, (3,), and a
+    step between samples is read in as many `pieces`.
+    """
 
     segments: Segments
+    within: Segments
     rest: GyroRest
+    density: Array
+    pieces: int
     scale: Array
     theta: Array
     residual: Array
@@ -416,58 +334,86 @@ class TurnSolution:
 
     def rate(self, output: Array) -> Array:
         """Body rate of samples, rad/s, shape (n, 3); what acceleration adds is left in."""
-        t = np.eye(3)
-        t[ROWS, COLUMNS] = self.theta[3:9]
         moved = self.scale * self.theta[9:12] if self.theta.size > 9 else 0.0
         scaled = (output - self.rest.zero - moved) / (self.scale * (1 + self.theta[:3]))
-        return np.asarray(np.linalg.solve(t, scaled.T).T, dtype=np.float64)
+        return np.asarray(np.linalg.solve(misalignment(self.theta), scaled.T).T, dtype=np.float64)
 
     def output_of(self, rate: Array) -> Array:
         """Output that body rates, rad/s, shape (n, 3), add."""
-        t = np.eye(3)
-        t[ROWS, COLUMNS] = self.theta[3:9]
-        return self.scale * (1 + self.theta[:3]) * (rate @ t.T)
+        return self.scale * (1 + self.theta[:3]) * (rate @ misalignment(self.theta).T)
 
     @property
     def typical_miss(self) -> float:
         """Median angle by which the turns miss, rad."""
         return float(np.median(np.linalg.norm(self.residual.reshape(-1, 3), axis=1)))
 
-    def cost(self, attitudes: NDArray[np.intp]) -> float:
-        """Sum of squares, rad^2, over the turns that begin at some of the attitudes."""
-        chosen = np.isin(self.segments.attitude, attitudes)
-        return float((self.residual.reshape(-1, 3)[chosen] ** 2).sum())
+    @property
+    def cost(self) -> float:
+        """Mean square of the angles by which the turns miss, rad^2."""
+        return float(np.mean(self.residual**2)) * 3
 
 
-def solve_turns(case: TurnProblem, time: Array, sensitivity: str) -> TurnSolution:
-    """Return the fit of the turns with zero and g-sensitivity from rest; ``auto`` drops a slope that fits worse."""
-    holds = find_holds(case.attitudes, time, case.output, case.name)
+def solve_turns(case: TurnProblem, stamps: Stamps, sensitivity: str, *, rough: bool = False) -> TurnSolution:
+    """Return the fit of the turns with zero and g-sensitivity from rest; ``auto`` drops a slope that fits worse.
 
-    def solved(wanted: str) -> TurnSolution:
-        rest = at_rest(holds, case.output, case.force, wanted, case.earth, case.vertical)
-        moving = None if rest.slope is None else case.force_at(time)
-        segments, notes = find_turns(holds, time, case.output, case.force, rest, moving, case.name)
-        beside = case.knocked[segments.attitude] | case.knocked[segments.attitude + 1]
-        if beside.any():
-            numbers = " ".join(map(str, (np.flatnonzero(case.knocked) + 1).tolist()))
-            left_out = (
-                f"gyro: {int(beside.sum())} turns left out, beside attitudes that the record set aside ({numbers})"
-            )
-            segments, notes = segments.part(~beside), [*notes, Note(left_out)]
-        return _solve(case, segments, rest, notes)
+    A `rough` one is for clocks that differ by unknown delays: its turns go from the middle of a hold to that of the
+    next.
+    """
+    holds = find_holds(case.attitudes, stamps.time if rough else stamps.on_accel, case.output, case.name)
+    step = float(np.median(np.diff(case.own)))
+    ends = hold_ends(case.attitudes.start, case.attitudes.stop, step)
+    if rough:
+        middle = Windows((case.attitudes.start + case.attitudes.stop) / 2, np.full(len(case.force), step))
+        ends = replace(ends, first=middle, last=middle)
+    pieces = pieces_of(float(np.median(np.diff(stamps.time))))
+    density = noise_density(stamps.on_accel, case.output, holds.still, ends)
+    chosen, notes = choose_turns(case.attitudes, stamps, case.output, case.name)
+    beside = case.knocked[chosen] | case.knocked[chosen + 1]
+    if beside.any():
+        numbers = " ".join(map(str, (np.flatnonzero(case.knocked) + 1).tolist()))
+        left_out = f"gyro: {int(beside.sum())} turns left out, beside attitudes that the record set aside ({numbers})"
+        chosen, notes = chosen[~beside], [*notes, Note(left_out)]
+    known = parse_unit(case.unit)
+    nominal = np.full(3, 1 / to_si(1.0, known.symbol)) if known.quantity == "rate" else None
 
-    with_slope = solved(sensitivity)
+    def solved(wanted: str, scale: Array | None) -> TurnSolution:
+        rest = at_rest(holds, stamps.time, case.output, case.force, wanted, density, scale, case.earth, case.vertical)
+        output = case.output if rest.slope is None else case.output - case.force_at(stamps.on_accel) @ rest.slope.T
+        first, last, inside = neighbouring_pairs(ends)
+        moved = rest.moved * np.ones((len(case.force), 3))
+        segments = segments_between(
+            stamps, output, (ends.last.part(chosen), ends.first.part(chosen + 1)),
+            rest.zero + (moved[chosen] + moved[chosen + 1]) / 2,
+            (case.up(ends.last)[chosen], case.up(ends.first)[chosen + 1]), chosen,
+        )  # fmt: skip
+        within = segments_between(
+            stamps, output, (first, last), rest.zero + moved[inside],
+            (case.up(first, inside), case.up(last, inside)), inside,
+        )  # fmt: skip
+        start = start_scale(segments) if scale is None else scale
+        answer = _solve(case, segments, within, rest, density, start, pieces, notes)
+        # Coning is taken off the zero once the scale is known.
+        return answer if scale is not None else solved(wanted, answer.scale * (1 + answer.theta[:3]))
+
+    with_slope = solved(sensitivity, nominal)
     if sensitivity != "auto" or with_slope.rest.slope is None:
         return with_slope
-    without = solved("no")
-    both = np.intersect1d(with_slope.segments.attitude, without.segments.attitude)
-    return with_slope if with_slope.cost(both) < without.cost(both) else without
+    without = solved("no", nominal)
+    return with_slope if with_slope.cost < without.cost else without
 
 
-def _solve(case: TurnProblem, segments: Segments, rest: GyroRest, notes: list[str]) -> TurnSolution:
+def _solve(
+    case: TurnProblem,
+    segments: Segments,
+    within: Segments,
+    rest: GyroRest,
+    density: Array,
+    scale: Array,
+    pieces: int,
+    notes: list[str],
+) -> TurnSolution:
     """Fit the turns; those that stand out from all others are set aside one by one."""
     known = parse_unit(case.unit)
-    scale = np.full(3, 1 / to_si(1.0, known.symbol)) if known.quantity == "rate" else start_scale(segments)
     theta = np.zeros(12 if case.fit_bias else 9)
     residual = model(segments, scale, theta, case.fit_bias)[0].reshape(-1, 3)
     if known.quantity == "rate" and np.median(np.linalg.norm(residual, axis=1)) > _UNIT_DOUBTED:
@@ -500,7 +446,10 @@ def _solve(case: TurnProblem, segments: Segments, rest: GyroRest, notes: list[st
                 "right; record again, without knocks and without lost samples"
             )
         )
-    return TurnSolution(kept, rest, scale, theta, residual, jacobian, bool(fit.converged[0]), aside, tuple(notes))
+    return TurnSolution(
+        kept, within, rest, density, pieces, scale, theta, residual, jacobian,
+        bool(fit.converged[0]), aside, tuple(notes),
+    )  # fmt: skip
 
 
 def _fitted(segments: Segments, scale: Array, theta: Array, weights: Array) -> Fit:
@@ -540,16 +489,3 @@ def _outliers(segments: Segments, scale: Array, fit: Fit) -> tuple[NDArray[np.bo
     for k in np.flatnonzero(out).tolist():
         out[k] = m * f_test(cost + float(far[k]), size, cost, size + 2, left + size + 2) < TURN_DISAGREEMENT.level
     return out, np.linalg.norm(residual, axis=1)
-
-
-def turn_covariance(solved: TurnSolution, shared: Array, freedom: int) -> tuple[Array, float]:
-    """Return the covariance of the parameters, (p, p), and the independent variance of each residual.
-
-    `shared`, (3 m, 3 m), is the covariance that the residuals share; their independent variance is taken as equal.
-    """
-    residual, jacobian = solved.residual, solved.jacobian
-    bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]
-    pulled = jacobian.T @ shared @ jacobian
-    left = float(residual @ residual) - float(np.trace(shared)) + float(np.trace(bread @ pulled))
-    variance = max(left, 0.0) / freedom
-    return bread @ pulled @ bread + variance * bread, variance

@@ -12,29 +12,37 @@ from numpy.typing import NDArray
 
 from imulab.display import Note
 from imulab.errors import SegmentError
-from imulab.procedures.tumble.gyro.rest import GyroRest, RestHolds, beyond_range
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.gyro.rest import beyond_range
 from imulab.procedures.tumble.gyro.rotation import Turns, composed_turns, weighted_turns
+from imulab.procedures.tumble.gyro.windows import Windows, pieces_of, read_between
 from imulab.recording import Array
 
 ROWS, COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)  # of the six misalignments in their matrix
 _FEWEST_TURNS = 8  # turns that tell nine parameters, two equations each
 _LONGEST_TURN = 60.0  # s
+_AROUND = 0.1  # s: by as much segmentation may see a turn later, or end it earlier, than the gyroscopes
 # S, usual steps, and usual bursts of steps: a gap in a turn loses part of it
 _GAP_SECONDS, _GAP_STEPS, _GAP_BURSTS = 0.05, 4.5, 2.0
 _FEW_BROKEN = 0.1  # of the turns: the others are as good without them
-_COARSE = 4  # steps taken as one where a scale factor is only to be found roughly
+_COARSE = 8  # pieces of steps taken as one where a scale factor is only to be found roughly
 _START_FACTORS = np.geomspace(0.4, 1.25, 24)
 
 
 @dataclass(frozen=True)
 class Segments:
-    """Turns as steps between samples: mean output less what acceleration adds, (m, n, 3), and durations, (m, n).
+    """Turns as pieces of steps between samples: output less what acceleration adds, (m, n, 3), and durations, (m, n).
 
-    `before` and `after` are the upward directions at both ends, (m, 3), `start` and `stop` the times, s, (m,).
+    The durations are weighted by the ramp of each turn (`windows`). `before` and `after` are the upward directions at
+    both ends, (m, 3); `start` and `stop` are where the hold before ends and the next one begins, s, (m,).
     """
 
     output: Array
+    half: Array
+    """Half the difference of the two readings of the output, (m, n, 3)."""
     step: Array
+    squared: Array
+    """Integral of the squared ramp, s, (m,): by this times its density, noise of the rate moves a direction, rad^2."""
     before: Array
     after: Array
     start: Array
@@ -48,39 +56,81 @@ class Segments:
         return Segments(**values)
 
 
-def find_turns(
-    holds: RestHolds, time: Array, output: Array, force: Array, rest: GyroRest, moving: Array | None, name: str
-) -> tuple[Segments, list[str]]:
-    """Find the turns between holds that can be used, and say which cannot: clipped ones, and those with gaps.
+@dataclass(frozen=True)
+class Stamps:
+    """Times of the gyroscopes' samples, s, (n,): by the clock that measures the turns, and on the accelerometers'."""
+
+    time: Array
+    on_accel: Array
+
+
+def segments_between(
+    stamps: Stamps,
+    output: Array,
+    windows: tuple[Windows, Windows],
+    zero: Array,
+    up: tuple[Array, Array],
+    attitude: NDArray[np.intp],
+) -> Segments:
+    """Return the turns from windows to later ones, (m,) each.
 
     Parameters
     ----------
-    time, output
-        Of the gyroscopes, (n,) and (n, 3).
-    force
-        Specific force in the holds, m/s^2, shape (holds, 3).
-    moving
-        Specific force at the gyroscopes' samples, (n, 3), or None where acceleration does not move the zero.
+    output
+        Of the gyroscopes, less what acceleration adds, (n, 3).
+    zero
+        Output at rest of each turn, (m, 3).
+    up
+        Upward directions before and after, both (m, 3).
+    attitude
+        Index of the attitude before each turn, (m,).
+    """
+    (first, last), clock, final = windows, stamps.on_accel, len(stamps.time) - 1
+    begin = np.maximum(np.searchsorted(clock, first.start) - 1, 0)
+    end = np.minimum(np.searchsorted(clock, last.stop), final)
+    steps, pieces = max(int((end - begin).max()), 1), pieces_of(float(np.median(np.diff(stamps.time))))
+    readings = read_between(output, begin, steps, pieces)
+    index = begin[:, None] + np.arange(steps)
+    here, there = np.minimum(index, final), np.minimum(index + 1, final)
+    share, shape = (np.arange(pieces) + 0.5) / pieces, (len(begin), steps * pieces)
+    placed = (clock[here][:, :, None] + (clock[there] - clock[here])[:, :, None] * share).reshape(shape)
+    ramp = first.weight(placed) - last.weight(placed)
+    duration = np.where(index < end[:, None], stamps.time[there] - stamps.time[here], 0.0) / pieces
+    duration = np.repeat(duration, pieces, axis=1)
+    edges = [stamps.time[np.minimum(np.searchsorted(clock, at), final)] for at in (first.stop, last.start)]
+    return Segments(
+        readings.middle - zero[:, None, :], readings.half, ramp * duration, (ramp**2 * duration).sum(axis=1),
+        *up, edges[0], edges[1], attitude,
+    )  # fmt: skip
+
+
+def choose_turns(attitudes: Attitudes, stamps: Stamps, output: Array, name: str) -> tuple[NDArray[np.intp], list[str]]:
+    """Return the attitudes after which a turn can be used, and notes on turns that cannot: clipped ones, and gaps.
 
     Raises
     ------
     SegmentError
         Fewer than eight turns can be used.
     """
-    begin, end = holds.leave[:-1], holds.arrive[1:]
-    turns = (end > begin) & (time[end] - time[begin] <= _LONGEST_TURN)
+    leave, arrive = attitudes.stop[:-1], attitudes.start[1:]
+    final = len(stamps.time) - 1
+    begin = np.maximum(np.searchsorted(stamps.on_accel, leave - _AROUND), 0)
+    end = np.minimum(np.searchsorted(stamps.on_accel, arrive + _AROUND), final)
+    begin = np.minimum(begin, end)
+    time = stamps.time
+    turns = (end > begin) & (arrive - leave <= _LONGEST_TURN)
     clipped = _any_during(beyond_range(output), begin, end) & turns[:, None]
     step = np.diff(time)
     # What lies in a gap is taken as a straight line: no turn is known to a milliradian across a longer one.
     usual = float(np.median(step)), float(np.quantile(step, 0.99))  # the second where stamps come in bursts
     wide = step > max(_GAP_SECONDS, _GAP_STEPS * usual[0], _GAP_BURSTS * usual[1])
-    broken = _any_during(np.append(wide, False)[:, None], begin, end - 1)[:, 0] & turns
+    broken = _any_during(np.append(wide, False)[:, None], begin, np.maximum(end - 1, begin))[:, 0] & turns
     chosen = np.flatnonzero(turns & ~clipped.any(axis=1) & ~broken)
     notes: list[str] = []
 
     def times(which: NDArray[np.bool_]) -> str:
         where = np.flatnonzero(which)
-        return " ".join(f"{t:.1f}" for t in time[begin[where[:6]]].tolist()) + (" ..." if len(where) > 6 else "")
+        return " ".join(f"{t:.1f}" for t in leave[where[:6]].tolist()) + (" ..." if len(where) > 6 else "")
 
     def count(which: NDArray[np.bool_]) -> str:
         number = int(which.sum())
@@ -103,16 +153,7 @@ def find_turns(
         aside = f" ({int(clipped.any(axis=1).sum())} more are clipped)" if clipped.any() else ""
         aside += f" ({int(broken.sum())} more have gaps)" if broken.any() else ""
         raise SegmentError(f"{name}: {len(chosen)} turns between attitudes{aside}; expected at least {_FEWEST_TURNS}")
-    start, stop = begin[chosen], end[chosen]
-    index = start[:, None] + np.arange(int((stop - start).max()))
-    inside = index < stop[:, None]
-    here, there = np.where(inside, index, 0), np.where(inside, index + 1, 0)
-    mean = 0.5 * (output[here] + output[there]) - rest.zero
-    if moving is not None and rest.slope is not None:
-        mean = mean - 0.5 * (moving[here] + moving[there]) @ rest.slope.T
-    up = force / np.linalg.norm(force, axis=1, keepdims=True)
-    between = np.where(inside, time[there] - time[here], 0.0)
-    return Segments(mean, between, up[chosen], up[chosen + 1], time[start], time[stop], chosen), notes
+    return chosen, notes
 
 
 def _any_during(flags: NDArray[np.bool_], first: NDArray[np.intp], last: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -172,11 +213,21 @@ def by_directions(segments: Segments, scale: Array, theta: Array, holds: int) ->
 
 def carried(segments: Segments, scale: Array, theta: Array) -> Array:
     """Return the matrices of the turns under given parameters, shape (m, 3, 3)."""
+    return composed_turns(body_rate(segments, scale, theta) * segments.step[:, :, None])
+
+
+def body_rate(segments: Segments, scale: Array, theta: Array) -> Array:
+    """Return the body rate under given parameters, rad/s, shape (m, n, 3)."""
+    moved = scale * theta[9:12] if theta.size > 9 else 0.0
+    rate: Array = (segments.output - moved) / (scale * (1 + theta[:3])) @ np.linalg.inv(misalignment(theta)).T
+    return rate
+
+
+def misalignment(theta: Array) -> Array:
+    """Return T of scaled parameters, (3, 3)."""
     t = np.eye(3)
     t[ROWS, COLUMNS] = theta[3:9]
-    moved = scale * theta[9:12] if theta.size > 9 else 0.0
-    rate = (segments.output - moved) / (scale * (1 + theta[:3])) @ np.linalg.inv(t).T
-    return composed_turns(rate * segments.step[:, :, None])
+    return t
 
 
 def model(segments: Segments, scale: Array, theta: Array, fit_bias: bool) -> tuple[Array, Array]:
@@ -186,9 +237,7 @@ def model(segments: Segments, scale: Array, theta: Array, fit_bias: bool) -> tup
     output, the rate and a constant, so that five sums per turn hold all derivatives.
     """
     s = scale * (1 + theta[:3])
-    t = np.eye(3)
-    t[ROWS, COLUMNS] = theta[3:9]
-    inverse = np.linalg.inv(t)
+    inverse = np.linalg.inv(misalignment(theta))
     scaled = (segments.output - (scale * theta[9:12] if fit_bias else 0.0)) / s
     rate = scaled @ inverse.T
     weights = np.concatenate([scaled, rate, np.ones((*rate.shape[:2], 1))], axis=2)

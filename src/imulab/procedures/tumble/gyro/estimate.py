@@ -1,0 +1,361 @@
+"""The parameters of the gyroscopes from their turns: generalised least squares, and what each turn is uncertain by.
+
+A turn misses its direction of gravity by two angles, across the direction after it. Their covariance V is the sum of
+
+- q int w^2 dt of the noise of the rate, q from the holds by windows of the same kind (`windows.noise_density`);
+- the noise of both directions, from neighbouring windows within the holds, between which the gyroscopes say how the
+  unit moved;
+- the zero of the two holds, as far as their noise hides it, times int w dt;
+- what all turns share: the zero of all holds, the accelerometers' parameters, and theirs alone beyond the noise;
+- tau^2, what is beyond all this, such that the weighted squares equal their degrees of freedom; not below 0.
+
+To the covariance of the parameters comes what all turns of a recording have alike: half the difference of the two
+readings between samples, and the share p of samples that may be lost. A loss at random takes p off every scale factor,
+and it scatters: a sample that is lost takes the angle of its step from the turn, so that V grows by p D,
+D = sum (w dt)^2 (rho x u)(rho x u)', rho the rate. That is no noise of one size for all turns, so that restricted
+likelihood tells p from tau^2. The length of the runs of lost samples is not known: p is said and carried in the
+uncertainty, never corrected by.
+
+Source: Aitken, Proc. Roy. Soc. Edinburgh 55 (1935) 42 (generalised least squares); Harville, J. Am. Stat. Assoc. 72
+(1977) 320 (restricted likelihood); Birge, Phys. Rev. 40 (1932) 207 (squares that equal their degrees of freedom).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imulab.estimation.decisions import SAMPLES_LOST, SCALE_CHANGE, SCALE_CHANGES_WITH_RATE
+from imulab.estimation.least_squares import chi_square_limit, f_test
+from imulab.procedures.tumble.gyro.rotation import weighted_turns
+from imulab.procedures.tumble.gyro.solve import TurnSolution
+from imulab.procedures.tumble.gyro.turns import body_rate, misalignment, model, shared_covariance
+from imulab.procedures.tumble.gyro.windows import mean_of_holds
+from imulab.recording import Array
+
+_ITERATIONS = 6
+_SETTLED = 1e-9  # rad and relative: a step that is smaller changes no digit
+_LEAST = 1e-9  # rad: no direction is known better, and no rounding is larger
+_DOUBLINGS = 60
+_LOST = np.geomspace(1e-5, 0.2, 21)  # shares of samples, beside none at all
+_BEYOND = np.concatenate([[0.0], np.geomspace(0.05, 20.0, 8)])  # tau^2, in medians of the diagonal of V
+
+
+@dataclass(frozen=True)
+class TurnEstimate:
+    """What the turns say of the scaled parameters.
+
+    Attributes
+    ----------
+    solution
+        The turns with the parameters of this estimate.
+    covariance
+        Of the parameters, (p, p), without what `reading` and `lost` add.
+    gain
+        Change of the parameters with the residuals, (p, 2 m).
+    across
+        The two directions of each turn that its residuals are along, (m, 2, 3).
+    root
+        Lower triangular root of V, (2 m, 2 m).
+    beyond
+        tau^2, rad^2.
+    reading
+        Half the change of the parameters from one reading between samples to the other, (p,).
+    lost
+        Root mean square of the share of samples that may be lost.
+    lost_most_likely, lost_probability
+        The share that fits best, and how probable so good a fit is by chance where none is lost.
+    """
+
+    solution: TurnSolution
+    covariance: Array
+    gain: Array
+    across: Array
+    root: Array
+    beyond: float
+    reading: Array
+    lost: float
+    lost_most_likely: float
+    samples_lost: bool
+
+    def total(self) -> Array:
+        """Return the covariance with all that a recording has alike in all its turns, (p, p)."""
+        loss = np.zeros(len(self.covariance))
+        loss[:3] = self.lost
+        total: Array = self.covariance + np.outer(self.reading, self.reading) + np.outer(loss, loss)
+        return total
+
+    def loss_note(self) -> str:
+        """Say how many samples seem to be lost, and what to do."""
+        return (
+            f"the turns miss as if {100 * self.lost_most_likely:.2g} % of the samples were lost: the scale factors may "
+            "be low by as much, or by more if several are lost in a row, and their uncertainties are widened by it: "
+            "record with a counter, or with time stamps of the sensor"
+        )
+
+    def project(self, vectors: Array) -> Array:
+        """Return the parts of vectors, (3 m, k), along the residuals, (2 m, k)."""
+        m = len(self.across)
+        parts: Array = np.einsum("mij,mjk->mik", self.across, vectors.reshape(m, 3, -1)).reshape(2 * m, -1)
+        return parts
+
+
+def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) -> TurnEstimate:
+    """Return the estimate from turns that were found and tested with equal weights.
+
+    Parameters
+    ----------
+    directions
+        Covariance of the upward directions of all holds beside the noise in them, rad^2, (3 n, 3 n).
+    zero
+        Standard uncertainty of the output at rest, (3,), or None where the biases are fitted.
+    """
+    segments, scale, theta = solved.segments, solved.scale, solved.theta
+    fit_bias = theta.size > 9
+    across = normals(segments.after)
+    shell = TurnEstimate(
+        solved, np.empty(0), np.empty(0), across, np.empty(0), 0.0, np.zeros(theta.size), 0.0, 0.0, False
+    )
+    matrix = np.empty(0)
+    for iteration in range(_ITERATIONS):
+        left, slope = model(segments, scale, theta, fit_bias)
+        residual, jacobian = shell.project(left[:, None])[:, 0], shell.project(slope)
+        if iteration < 2:
+            matrix = _covariance_of_turns(solved, theta, shell, directions, zero)
+            beyond = _variance_beyond(matrix, jacobian, residual)
+            root = np.linalg.cholesky(matrix + beyond * np.eye(len(matrix)))
+        white = np.linalg.solve(root, np.column_stack([jacobian, residual]))
+        inverse = np.linalg.pinv(white[:, :-1])
+        step = inverse @ white[:, -1]
+        theta = theta - step
+        if np.abs(step).max() < _SETTLED:
+            break
+    gain = -inverse @ np.linalg.inv(root)
+    covariance = inverse @ inverse.T
+    left, slope = model(segments, scale, theta, fit_bias)
+    moved = model(replace(segments, output=segments.output + segments.half), scale, theta, fit_bias)[0] - left
+    solution = replace(solved, theta=theta, residual=left, jacobian=slope)
+    estimate = replace(
+        shell, solution=solution, covariance=covariance, gain=gain, root=root, beyond=beyond,
+        reading=gain @ shell.project(moved[:, None])[:, 0],
+    )  # fmt: skip
+    return _with_losses(estimate, matrix)
+
+
+def normals(directions: Array) -> Array:
+    """Return two directions across each of (m, 3) and each other, (m, 2, 3)."""
+    axis = np.eye(3)[np.abs(directions).argmin(axis=1)]
+    first = np.cross(directions, axis)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(directions, first)], axis=1)
+
+
+def _covariance_of_turns(
+    solved: TurnSolution, theta: Array, shell: TurnEstimate, directions: Array, zero: Array | None
+) -> Array:
+    """Return V without tau^2, (2 m, 2 m)."""
+    segments, scale = solved.segments, solved.scale
+    m = len(segments.start)
+    shared = shared_covariance(segments, scale, theta, directions, zero)
+    blocks = np.einsum("mij,mjnk,nlk->minl", shell.across, shared.reshape(m, 3, m, 3), shell.across, optimize=True)
+    by_rate = model(segments, scale, np.concatenate([theta[:9], np.zeros(3)]), fit_bias=True)[1][:, 9:] / scale
+    own = shell.project(by_rate).reshape(m, 2, 3)
+    blocks[range(m), :, range(m), :] += np.einsum("mij,j,mkj->mik", own, solved.rest.moved_variance * np.ones(3), own)
+    density, direction = noise_of_turns(solved, theta)
+    alone = density * segments.squared + 2 * direction + _LEAST**2
+    blocks[range(m), :, range(m), :] += alone[:, None, None] * np.eye(2)
+    return np.asarray(blocks.reshape(2 * m, 2 * m), dtype=np.float64)
+
+
+def noise_of_turns(solved: TurnSolution, theta: Array) -> tuple[float, float]:
+    """Return the density of the rates' noise, rad^2/s, and the variance that noise leaves in a direction, rad^2.
+
+    Neighbouring windows of a hold differ by both noises, once the gyroscopes have said how the unit moved in between.
+    That bounds the density where the unit sways, by which neighbouring mean rates differ too.
+    """
+    density, within = float(np.mean(solved.density / solved.scale**2)), solved.within
+    if not len(within.start):
+        return density, 0.0
+    left = model(within, solved.scale, theta, fit_bias=theta.size > 9)[0].reshape(-1, 1, 3)
+    miss = np.einsum("mij,mkj->mi", normals(within.after), left)
+    square = float(mean_of_holds((miss**2).sum(axis=1, keepdims=True) / 2, within.attitude)[0])
+    during = float(within.squared.mean())
+    return min(density, square / during), max(square - density * during, 0.0) / 2
+
+
+def _variance_beyond(matrix: Array, jacobian: Array, residual: Array) -> float:
+    """Return tau^2 >= 0 with which the weighted squares of the best fit equal 2 m - p."""
+    freedom = len(residual) - jacobian.shape[1]
+    values, vectors = np.linalg.eigh(matrix)
+    design, left = vectors.T @ jacobian, vectors.T @ residual
+
+    def squares(beyond: float) -> float:
+        weight = 1 / np.sqrt(np.maximum(values, _LEAST**2) + beyond)
+        whole, column = design * weight[:, None], left * weight
+        return float(((column - whole @ np.linalg.lstsq(whole, column, rcond=None)[0]) ** 2).sum())
+
+    if freedom < 1 or squares(0.0) <= freedom:
+        return 0.0
+    low, high = 0.0, float(residual @ residual)
+    for _ in range(_DOUBLINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if squares(middle) > freedom else (low, middle)
+    return (low + high) / 2
+
+
+def _with_losses(estimate: TurnEstimate, matrix: Array) -> TurnEstimate:
+    """Return the estimate with the share of samples that may be lost: the mean over p and tau^2 of their likelihood.
+
+    Before the data none is lost with probability 1/2; else every share from .001 to 20 % is as probable on a scale of
+    logarithms.
+    """
+    jacobian = estimate.project(estimate.solution.jacobian)
+    residual = estimate.project(estimate.solution.residual[:, None])[:, 0]
+    by_loss = loss_covariance(estimate)
+    size = float(np.median(np.diag(matrix)))
+    logs = np.empty((1 + len(_LOST), len(_BEYOND)))
+    for i, share in enumerate((0.0, *_LOST.tolist())):
+        stack = matrix + share * by_loss + (size * _BEYOND)[:, None, None] * np.eye(len(matrix))
+        logs[i] = _restricted_log_likelihood(stack, jacobian, residual)
+    likelihood = np.exp(logs - logs.max())
+    weight = likelihood.sum(axis=1)
+    prior = np.concatenate([[0.5], np.full(len(_LOST), 0.5 / len(_LOST))])
+    posterior = weight * prior / (weight @ prior)
+    profile = logs.max(axis=1)
+    best = int(profile[1:].argmax())
+    gained = 2 * float(profile[1:].max() - profile[0])
+    return replace(
+        estimate,
+        lost=float(np.sqrt(posterior[1:] @ _LOST**2)),
+        lost_most_likely=float(_LOST[best]),
+        # No share lies below 0: by chance half of all gains are 0.
+        samples_lost=gained > chi_square_limit(1, 2 * SAMPLES_LOST.level),
+    )
+
+
+def loss_covariance(estimate: TurnEstimate) -> Array:
+    """Return D, by which V grows with the share of samples that are lost one by one, (2 m, 2 m)."""
+    solved = estimate.solution
+    segments = solved.segments
+    rate = body_rate(segments, solved.scale, solved.theta)
+    turns = weighted_turns(rate, segments.step, np.empty((*rate.shape[:2], 0)), squares=True)
+    x, y, z = segments.before.T
+    cross = np.zeros((len(x), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -z, y, -x
+    cross -= np.swapaxes(cross, 1, 2)
+    arms = estimate.across @ turns.matrix @ cross
+    # Pieces of one step are lost together.
+    each = solved.pieces * arms @ turns.squares @ np.swapaxes(arms, 1, 2)
+    m = len(each)
+    whole = np.zeros((m, 2, m, 2))
+    whole[range(m), :, range(m), :] = each
+    return whole.reshape(2 * m, 2 * m)
+
+
+def _restricted_log_likelihood(stack: Array, jacobian: Array, residual: Array) -> Array:
+    """Return the restricted log likelihood under each of several covariances, (k, n, n), up to a constant, (k,)."""
+    root = np.linalg.cholesky(stack)
+    white = np.linalg.solve(root, np.column_stack([jacobian, residual])[None])
+    design, left = white[:, :, :-1], white[:, :, -1:]
+    normal = np.swapaxes(design, 1, 2) @ design
+    pulled = np.swapaxes(design, 1, 2) @ left
+    square = (left**2).sum(axis=(1, 2)) - (pulled * np.linalg.solve(normal, pulled)).sum(axis=(1, 2))
+    spread = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    logs: Array = -spread - np.linalg.slogdet(normal)[1] / 2 - square / 2
+    return logs
+
+
+# Whether the scale factors of the gyroscopes change with the rate, from what the turns miss.
+
+
+_FEWEST_LEFT = 6  # degrees of freedom that the test of linearity must leave
+
+
+@dataclass(frozen=True)
+class Nonlinearity:
+    """Probability of the residuals if nothing changes with the rate, and what changes by how much.
+
+    Attributes
+    ----------
+    probability
+        Of so large a gain by chance (F-test).
+    odd
+        Change of the scale factor from rest to the largest rate, relative, shape (3,).
+    even
+        Half its difference between the two directions at the largest rate, relative, shape (3,).
+    odd_uncertainty, even_uncertainty
+        Their standard uncertainties, shape (3,).
+    largest
+        Largest rate about each axis in the turns, rad/s, shape (3,).
+    """
+
+    probability: float
+    odd: Array
+    even: Array
+    odd_uncertainty: Array
+    even_uncertainty: Array
+    largest: Array
+
+    def notes(self) -> list[str]:
+        """Say what changes with the rate, if it is beyond chance."""
+        if not self.probability < SCALE_CHANGES_WITH_RATE.level:
+            return []
+        phrases = []
+        for i, axis in enumerate("xyz"):
+            for what, value, u in (
+                ("from slow turns to", self.odd[i], self.odd_uncertainty[i]),
+                ("between the two directions at", 2 * self.even[i], 2 * self.even_uncertainty[i]),
+            ):
+                if abs(value) > SCALE_CHANGE.limit * u:
+                    rate = np.degrees(self.largest[i])
+                    phrases.append(f"of {axis} by {100 * value:+.2g} % (u {100 * u:.1g} %) {what} {rate:.0f} deg/s")
+        changes = "; ".join(phrases) or "of which axis, they do not tell"
+        return [
+            f"gyro: what the turns miss depends on the rate (p {self.probability:.1g}): the scale factor changes "
+            f"{changes}: the record holds for turns as fast as these; measure at the rates of use, or on a rate table"
+        ]
+
+
+def test_linearity(estimate: TurnEstimate) -> Nonlinearity | None:
+    """Return whether what the turns miss depends on the rate; None where too few turns are left to tell.
+
+    M = S (A + b + even_i A_i^2 / w_i + odd_i A_i^3 / w_i^2),   A = T w,  w_i the largest rate of gyro i in the turns
+
+    Both terms of all three gyros are tried together beside the parameters of the fit (F-test). They are tested and
+    said, never fitted: turns by hand seldom vary enough in rate to tell S from them.
+    """
+    solved = estimate.solution
+    segments, scale, theta = solved.segments, solved.scale, solved.theta
+    count, size = len(estimate.root), theta.size
+    freedom = count - size - 6
+    if freedom < _FEWEST_LEFT:
+        return None
+    rate = body_rate(segments, scale, theta)
+    t = misalignment(theta)
+    sensed = np.where(segments.step[:, :, None] > 0, rate @ t.T, 0.0)
+    largest = np.maximum(np.abs(sensed).max(axis=(0, 1)), 1e-12)
+    weights = np.concatenate([sensed**3 / largest**2, sensed**2 / largest], axis=2)
+    turns = weighted_turns(rate, segments.step, weights)
+    inverse = np.linalg.inv(t)
+    columns = [
+        np.einsum("mij,mj->mi", turns.matrix, np.cross(segments.before, turns.weighted[:, k] @ -inverse[:, k % 3]))
+        for k in range(6)
+    ]
+    rows = np.column_stack([solved.jacobian, *(column.ravel() for column in columns), solved.residual])
+    whole = np.linalg.solve(estimate.root, estimate.project(rows))
+    design, left = whole[:, :-1], whole[:, -1]
+    length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    design = design / length
+
+    def fitted(columns: int) -> tuple[Array, float]:
+        answer = np.linalg.lstsq(design[:, :columns], left, rcond=None)[0]
+        return answer, float(((left - design[:, :columns] @ answer) ** 2).sum())
+
+    cost, (answer, larger) = fitted(size)[1], fitted(size + 6)
+    spread = np.linalg.pinv(design.T @ design) * (larger / freedom)
+    u = np.sqrt(np.diag(spread)[size:]) / length[size:]
+    # The residual is carried less true direction: parameters that lower it have its sign reversed.
+    value = -answer[size:] / length[size:]
+    probability = f_test(cost, size, larger, size + 6, count)
+    return Nonlinearity(probability, value[:3], value[3:], u[:3], u[3:], largest)
