@@ -150,7 +150,8 @@ def turned_by_hand(seed: int, hand: Hand) -> tuple[Any, dict[str, float]]:
     if hand.flicker:
         f = np.fft.rfftfreq(len(outputs), 1 / hand.rate)
         shape = np.concatenate([[0.0], f[1:] ** -0.5])
-        wave = np.fft.irfft(shape[:, None] * np.fft.rfft(rng.standard_normal(outputs.shape), axis=0), len(f) * 2 - 2, axis=0)
+        white = np.fft.rfft(rng.standard_normal(outputs.shape), axis=0)
+        wave = np.fft.irfft(shape[:, None] * white, len(f) * 2 - 2, axis=0)
         outputs[: len(wave)] += hand.flicker * (wave / wave.std())[: len(outputs)]
     accel = forces + hand.accel_noise * rng.standard_normal(forces.shape)
     kept = np.ones(len(outputs), dtype=bool)

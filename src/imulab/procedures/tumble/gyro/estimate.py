@@ -38,8 +38,54 @@ _ITERATIONS = 6
 _SETTLED = 1e-9  # rad and relative: a step that is smaller changes no digit
 _LEAST = 1e-9  # rad: no direction is known better, and no rounding is larger
 _DOUBLINGS = 60
+_FEWEST_LEFT = 6  # degrees of freedom that the test of linearity must leave
 _LOST = np.geomspace(1e-5, 0.2, 21)  # shares of samples, beside none at all
 _BEYOND = np.concatenate([[0.0], np.geomspace(0.05, 20.0, 8)])  # tau^2, in medians of the diagonal of V
+
+
+@dataclass(frozen=True)
+class Nonlinearity:
+    """Probability of the residuals if nothing changes with the rate, and what changes by how much.
+
+    Attributes
+    ----------
+    probability
+        Of so large a gain by chance (F-test).
+    odd
+        Change of the scale factor from rest to the largest rate, relative, shape (3,).
+    even
+        Half its difference between the two directions at the largest rate, relative, shape (3,).
+    odd_uncertainty, even_uncertainty
+        Their standard uncertainties, shape (3,).
+    largest
+        Largest rate about each axis in the turns, rad/s, shape (3,).
+    """
+
+    probability: float
+    odd: Array
+    even: Array
+    odd_uncertainty: Array
+    even_uncertainty: Array
+    largest: Array
+
+    def notes(self) -> list[str]:
+        """Say what changes with the rate, if it is beyond chance."""
+        if not self.probability < SCALE_CHANGES_WITH_RATE.level:
+            return []
+        phrases = []
+        for i, axis in enumerate("xyz"):
+            for what, value, u in (
+                ("from slow turns to", self.odd[i], self.odd_uncertainty[i]),
+                ("between the two directions at", 2 * self.even[i], 2 * self.even_uncertainty[i]),
+            ):
+                if abs(value) > SCALE_CHANGE.limit * u:
+                    rate = np.degrees(self.largest[i])
+                    phrases.append(f"of {axis} by {100 * value:+.2g} % (u {100 * u:.1g} %) {what} {rate:.0f} deg/s")
+        changes = "; ".join(phrases) or "of which axis, they do not tell"
+        return [
+            f"gyro: what the turns miss depends on the rate (p {self.probability:.1g}): the scale factor changes "
+            f"{changes}: the record holds for turns as fast as these; measure at the rates of use, or on a rate table"
+        ]
 
 
 @dataclass(frozen=True)
@@ -62,10 +108,14 @@ class TurnEstimate:
         tau^2, rad^2.
     reading
         Half the change of the parameters from one reading between samples to the other, (p,).
+    linearity
+        Whether what the turns miss depends on the rate; None where too few turns are left to tell.
     lost
         Root mean square of the share of samples that may be lost.
-    lost_most_likely, lost_probability
-        The share that fits best, and how probable so good a fit is by chance where none is lost.
+    lost_most_likely
+        The share that fits best.
+    samples_lost
+        Whether so good a fit is beyond chance.
     """
 
     solution: TurnSolution
@@ -75,9 +125,10 @@ class TurnEstimate:
     root: Array
     beyond: float
     reading: Array
-    lost: float
-    lost_most_likely: float
-    samples_lost: bool
+    linearity: Nonlinearity | None = None
+    lost: float = 0.0
+    lost_most_likely: float = 0.0
+    samples_lost: bool = False
 
     def total(self) -> Array:
         """Return the covariance with all that a recording has alike in all its turns, (p, p)."""
@@ -114,9 +165,7 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
     segments, scale, theta = solved.segments, solved.scale, solved.theta
     fit_bias = theta.size > 9
     across = normals(segments.after)
-    shell = TurnEstimate(
-        solved, np.empty(0), np.empty(0), across, np.empty(0), 0.0, np.zeros(theta.size), 0.0, 0.0, False
-    )
+    shell = TurnEstimate(solved, np.empty(0), np.empty(0), across, np.empty(0), 0.0, np.zeros(theta.size))
     matrix = np.empty(0)
     for iteration in range(_ITERATIONS):
         left, slope = model(segments, scale, theta, fit_bias)
@@ -140,7 +189,9 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
         shell, solution=solution, covariance=covariance, gain=gain, root=root, beyond=beyond,
         reading=gain @ shell.project(moved[:, None])[:, 0],
     )  # fmt: skip
-    return _with_losses(estimate, matrix)
+    columns, largest = rate_columns(estimate)
+    estimate = replace(estimate, linearity=test_linearity(estimate, columns, largest))
+    return _with_losses(estimate, matrix, columns)
 
 
 def normals(directions: Array) -> Array:
@@ -204,13 +255,16 @@ def _variance_beyond(matrix: Array, jacobian: Array, residual: Array) -> float:
     return (low + high) / 2
 
 
-def _with_losses(estimate: TurnEstimate, matrix: Array) -> TurnEstimate:
+def _with_losses(estimate: TurnEstimate, matrix: Array, columns: Array) -> TurnEstimate:
     """Return the estimate with the share of samples that may be lost: the mean over p and tau^2 of their likelihood.
 
     Before the data none is lost with probability 1/2; else every share from .001 to 20 % is as probable on a scale of
-    logarithms.
+    logarithms. Where the output seems not to be linear, the `columns` of `rate_columns` are fitted beside: what they
+    explain is no loss.
     """
-    jacobian = estimate.project(estimate.solution.jacobian)
+    linearity, jacobian = estimate.linearity, estimate.project(estimate.solution.jacobian)
+    if linearity is not None and linearity.probability < SCALE_CHANGES_WITH_RATE.level:
+        jacobian = np.column_stack([jacobian, columns])
     residual = estimate.project(estimate.solution.residual[:, None])[:, 0]
     by_loss = loss_covariance(estimate)
     size = float(np.median(np.diag(matrix)))
@@ -269,81 +323,42 @@ def _restricted_log_likelihood(stack: Array, jacobian: Array, residual: Array) -
 # Whether the scale factors of the gyroscopes change with the rate, from what the turns miss.
 
 
-_FEWEST_LEFT = 6  # degrees of freedom that the test of linearity must leave
-
-
-@dataclass(frozen=True)
-class Nonlinearity:
-    """Probability of the residuals if nothing changes with the rate, and what changes by how much.
-
-    Attributes
-    ----------
-    probability
-        Of so large a gain by chance (F-test).
-    odd
-        Change of the scale factor from rest to the largest rate, relative, shape (3,).
-    even
-        Half its difference between the two directions at the largest rate, relative, shape (3,).
-    odd_uncertainty, even_uncertainty
-        Their standard uncertainties, shape (3,).
-    largest
-        Largest rate about each axis in the turns, rad/s, shape (3,).
-    """
-
-    probability: float
-    odd: Array
-    even: Array
-    odd_uncertainty: Array
-    even_uncertainty: Array
-    largest: Array
-
-    def notes(self) -> list[str]:
-        """Say what changes with the rate, if it is beyond chance."""
-        if not self.probability < SCALE_CHANGES_WITH_RATE.level:
-            return []
-        phrases = []
-        for i, axis in enumerate("xyz"):
-            for what, value, u in (
-                ("from slow turns to", self.odd[i], self.odd_uncertainty[i]),
-                ("between the two directions at", 2 * self.even[i], 2 * self.even_uncertainty[i]),
-            ):
-                if abs(value) > SCALE_CHANGE.limit * u:
-                    rate = np.degrees(self.largest[i])
-                    phrases.append(f"of {axis} by {100 * value:+.2g} % (u {100 * u:.1g} %) {what} {rate:.0f} deg/s")
-        changes = "; ".join(phrases) or "of which axis, they do not tell"
-        return [
-            f"gyro: what the turns miss depends on the rate (p {self.probability:.1g}): the scale factor changes "
-            f"{changes}: the record holds for turns as fast as these; measure at the rates of use, or on a rate table"
-        ]
-
-
-def test_linearity(estimate: TurnEstimate) -> Nonlinearity | None:
-    """Return whether what the turns miss depends on the rate; None where too few turns are left to tell.
+def rate_columns(estimate: TurnEstimate) -> tuple[Array, Array]:
+    """Return how the residuals change with terms in the square and the cube of the rate, and the largest rates.
 
     M = S (A + b + even_i A_i^2 / w_i + odd_i A_i^3 / w_i^2),   A = T w,  w_i the largest rate of gyro i in the turns
 
-    Both terms of all three gyros are tried together beside the parameters of the fit (F-test). They are tested and
-    said, never fitted: turns by hand seldom vary enough in rate to tell S from them.
+    Returns
+    -------
+    tuple
+        Derivatives by odd_x .. odd_z, even_x .. even_z, rad, (2 m, 6), and w_i, rad/s, (3,).
     """
     solved = estimate.solution
     segments, scale, theta = solved.segments, solved.scale, solved.theta
-    count, size = len(estimate.root), theta.size
-    freedom = count - size - 6
-    if freedom < _FEWEST_LEFT:
-        return None
-    rate = body_rate(segments, scale, theta)
-    t = misalignment(theta)
+    rate, t = body_rate(segments, scale, theta), misalignment(theta)
     sensed = np.where(segments.step[:, :, None] > 0, rate @ t.T, 0.0)
     largest = np.maximum(np.abs(sensed).max(axis=(0, 1)), 1e-12)
-    weights = np.concatenate([sensed**3 / largest**2, sensed**2 / largest], axis=2)
-    turns = weighted_turns(rate, segments.step, weights)
+    turns = weighted_turns(rate, segments.step, np.concatenate([sensed**3 / largest**2, sensed**2 / largest], axis=2))
     inverse = np.linalg.inv(t)
     columns = [
         np.einsum("mij,mj->mi", turns.matrix, np.cross(segments.before, turns.weighted[:, k] @ -inverse[:, k % 3]))
         for k in range(6)
     ]
-    rows = np.column_stack([solved.jacobian, *(column.ravel() for column in columns), solved.residual])
-    whole = np.linalg.solve(estimate.root, estimate.project(rows))
+    return estimate.project(np.column_stack([column.ravel() for column in columns])), largest
+
+
+def test_linearity(estimate: TurnEstimate, columns: Array, largest: Array) -> Nonlinearity | None:
+    """Return whether what the turns miss depends on the rate; None where too few turns are left to tell.
+
+    All terms of `rate_columns` are tried together beside the parameters of the fit (F-test). They are tested and said,
+    never fitted: turns by hand seldom vary enough in rate to tell S from them.
+    """
+    count, size = len(estimate.root), estimate.solution.theta.size
+    freedom = count - size - 6
+    if freedom < _FEWEST_LEFT:
+        return None
+    own = estimate.project(np.column_stack([estimate.solution.jacobian, estimate.solution.residual]))
+    whole = np.linalg.solve(estimate.root, np.column_stack([own[:, :-1], columns, own[:, -1]]))
     design, left = whole[:, :-1], whole[:, -1]
     length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     design = design / length

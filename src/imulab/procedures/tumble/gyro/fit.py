@@ -33,7 +33,7 @@ from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.procedures.tumble import CLOCKS, SENSITIVITIES
 from imulab.procedures.tumble.attitudes import Attitudes, find_attitudes
 from imulab.procedures.tumble.device import specific_force
-from imulab.procedures.tumble.gyro.estimate import Nonlinearity, TurnEstimate, estimate_turns, test_linearity
+from imulab.procedures.tumble.gyro.estimate import Nonlinearity, TurnEstimate, estimate_turns
 from imulab.procedures.tumble.gyro.rest import clock_notes, direction_covariance, find_holds
 from imulab.procedures.tumble.gyro.solve import (
     CRYSTAL,
@@ -72,7 +72,7 @@ from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
 
 PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
-_EVENER = 0.9  # even time stamps are taken if the turns miss by this share of what they miss with those read
+_EVENER = 0.97  # even time stamps are taken if the turns miss by this share of what they miss with those read
 # Times the record's scatter, and 1 mg: attitudes that scatter more under it are of another unit
 _FOREIGN, _TOUCHED = 5.0, 1e-3 * STANDARD_GRAVITY
 
@@ -200,7 +200,7 @@ def fit_gyro_triad(
     conditioning = _observability_of_turns(solved, freedom, recording.name)
     directions = direction_covariance(record, means, case.force)
     estimate = estimate_turns(solved, directions, None if fit_bias else solved.rest.zero_uncertainty)
-    linearity = test_linearity(estimate)
+    linearity = estimate.linearity
     # Losses take the more from a turn the faster it is, as an output that is not linear does.
     notes += [] if linearity is None or estimate.samples_lost else linearity.notes()
     notes += _warn_sampling(estimate, stamps)
