@@ -87,7 +87,8 @@ def test_no_circles():
 
 
 SHARED = {
-    f"imulab.procedures.tumble.{name}" for name in ("attitudes", "plan", "gyro.rest", "gyro.solve", "gyro.turns")
+    f"imulab.procedures.tumble.{name}"
+    for name in ("attitudes", "plan", *(f"gyro.{part}" for part in ("rest", "solve", "turns", "estimate")))
 } | {"imulab.procedures.thermal.device"}
 """Attitudes at rest, plans of them and the turns between them: over temperature they are those of the tumble test; and
 what laws over temperature know of such a test."""

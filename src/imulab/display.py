@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 # Texts from files, made safe to print: no character that ends a line, moves the cursor or reverses text.
 
@@ -131,14 +131,35 @@ def _numeric(text: str) -> bool:
 
 State = Literal["good", "look", "bad"]
 
+_LOOK = "look at the figures of the report (--report FILE.html) for what the reasons name"
+_CLAUSES = re.compile(r"[:;] (?![^(]*\))")  # not those within parentheses
+_IMPERATIVE = re.compile(
+    r"(?:add|ask|calibrate|check|choose|compare|correct|cut|drop|export|find|fit|fix|give|hold|keep|leave|let|look|make|"
+    r"measure|mount|move|name|open|place|plan|put|read|record|repeat|run|see|set|simulate|start|state|take|test|turn|"
+    r"update|use|wait|warm|write)\b"
+)
 
-class Note(str):
+
+class Finding(str):
+    """What a user should know of a result; `action` is what to do about it, where the text does not end with that."""
+
+    __slots__ = ("action",)
+    action: str
+
+    def __new__(cls, text: str, action: str = "") -> Self:
+        """Return a text as a finding."""
+        finding = super().__new__(cls, text)
+        finding.action = action
+        return finding
+
+
+class Note(Finding):
     """A finding that does not lower the verdict."""
 
     __slots__ = ()
 
 
-class Bad(str):
+class Bad(Finding):
     """A finding after which the result must not be used as it is."""
 
     __slots__ = ()
@@ -146,10 +167,14 @@ class Bad(str):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """``good``, ``look`` or ``bad``, and the findings that led to it, the gravest first."""
+    """``good``, ``look`` or ``bad``, and the findings that led to it, the gravest first.
+
+    `next` holds what to do now, an action each; it is empty where the state is ``good``.
+    """
 
     state: State
     reasons: tuple[str, ...] = ()
+    next: tuple[str, ...] = ()
 
 
 UNJUDGED = Verdict("good")
@@ -167,16 +192,41 @@ def verdict_of(findings: Iterable[str]) -> Verdict:
     findings = tuple(findings)
     grave = [finding for finding in findings if isinstance(finding, Bad)]
     doubtful = [finding for finding in findings if not isinstance(finding, Bad | Note)]
-    return Verdict("bad" if grave else "look" if doubtful else "good", tuple(map(str, grave + doubtful)))
+    reasons = [*grave, *doubtful]
+    actions = tuple(dict.fromkeys(filter(None, map(action_of, reasons))))
+    state: State = "bad" if grave else "look" if doubtful else "good"
+    return Verdict(state, tuple(map(str, reasons)), actions or ((_LOOK,) if reasons else ()))
+
+
+def action_of(finding: str) -> str:
+    """Return what a finding asks for: its action, or the last clause of its text if that is one, or nothing.
+
+    A text says what is the case, how large it is and, behind its last colon or semicolon, what to do.
+    """
+    action: str = getattr(finding, "action", "")
+    if action:
+        return action
+    clause = _CLAUSES.split(finding)[-1].strip()
+    if clause.endswith("?"):
+        return f"answer this: {clause}"
+    return clause if _IMPERATIVE.match(clause) and clause != finding else ""
 
 
 def as_judged(findings: Iterable[str], verdict: Verdict) -> tuple[str, ...]:
     """Return findings, read back as plain texts, with the classes that led to a verdict.
 
-    What is no reason is a `Note`; the first reason of a bad verdict is `Bad` (the others cannot be told apart).
+    What is no reason is a `Note`; the first reason of a bad verdict is `Bad` (the others cannot be told apart). Actions
+    that are not in the texts stay with the first reason.
     """
     worst = verdict.reasons[0] if verdict.state == "bad" and verdict.reasons else None
-    return tuple(
-        Bad(finding) if finding == worst else finding if finding in verdict.reasons else Note(finding)
-        for finding in findings
-    )
+    kept = {action_of(reason) for reason in verdict.reasons}
+    further = "; ".join(action for action in verdict.next if action not in kept and action != _LOOK)
+    first = verdict.reasons[0] if verdict.reasons else None
+
+    def judged(finding: str) -> str:
+        action = further if finding == first else ""
+        if finding == worst:
+            return Bad(finding, action)
+        return Finding(finding, action) if finding in verdict.reasons else Note(finding)
+
+    return tuple(map(judged, findings))

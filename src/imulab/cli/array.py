@@ -259,12 +259,12 @@ def _flushed(first: Recording, rest: Iterator[Recording]) -> Iterator[Recording]
 
 def _print_findings(fuser: Fuser, *, verdict: bool) -> None:
     """Print the findings on a fusion; the verdict first, unless standard output is the rate."""
-    from imulab.cli.show import verdict_line
+    from imulab.cli.show import verdict_lines
     from imulab.display import verdict_of
 
     lines = fuser.notes() + (fuser.health.lines() if fuser.health is not None else [])
     if verdict:
-        print(verdict_line(verdict_of(lines)))
+        print("\n".join(verdict_lines(verdict_of(lines))))
     for line in lines:
         warn(line)
 
@@ -302,7 +302,7 @@ def compare(
             rows = run_experiment(experiment, seeds=count, progress=progress)
         print(experiment_json(experiment, count, rows) if json else describe_experiment(experiment, count, rows))
         return
-    from imulab.cli.show import verdict_line
+    from imulab.cli.show import verdict_lines
     from imulab.procedures.gyro_array.compare import compare_methods
     from imulab.procedures.gyro_array.fuse import carried, fusion_text
     from imulab.readers import read
@@ -313,7 +313,7 @@ def compare(
     comparison = compare_methods(read(str(file), **how), calibration=record, memory=kept, count_from=by.start)
     write_both(comparison.record, output, report)
     if not json:
-        print(verdict_line(comparison.record.verdict))
+        print("\n".join(verdict_lines(comparison.record.verdict)))
     print(comparison.record.to_json().rstrip("\n") if json else describe_comparison(comparison))
     for name, what in ((output, "record"), (report, "report")):
         if name and not json:

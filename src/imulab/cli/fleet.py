@@ -131,7 +131,12 @@ def _as_json(state: FleetState) -> str:
                 for row in state.failures
             ],
             "doubtful": [
-                {"serial": row.unit.serial, "verdict": row.verdict, "reasons": list(row.summary.verdict.reasons)}
+                {
+                    "serial": row.unit.serial,
+                    "verdict": row.verdict,
+                    "reasons": list(row.summary.verdict.reasons),
+                    "next": list(row.summary.verdict.next),
+                }
                 for row in state.doubtful
                 if row.summary is not None
             ],

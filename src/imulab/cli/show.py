@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
 
-from imulab.cli.options import call, check_outputs, coloured, note, warn
+from imulab.cli.options import call, check_outputs, coloured, note, speech, warn
 from imulab.display import SENTENCES, Verdict, aligned, printable
 from imulab.errors import OptionError, ReadError
 from imulab.files import replacing
@@ -59,6 +59,9 @@ def finish(
                 print(f"{what}: {name}")
     for message in record.warnings:
         (warn if message in record.verdict.reasons else note)(message)
+    if record.verdict.state == "bad" and (json or speech().quiet):
+        for action in record.verdict.next:
+            warn(f"next: {action}")
 
 
 # ``imulab tumble plan`` and ``thermal plan``: a plan to CSV, sheet and what is printed.
@@ -159,7 +162,7 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
 
     exhibits = exhibits_of(record)
     serial = record.sensor.get("serial", "unit without serial number")
-    lines = [verdict_line(record.verdict)]
+    lines = verdict_lines(record.verdict)
     lines += [f"{record.procedure} calibration of {serial}", exhibits.headline, ""]
     for item in exhibits.items:
         if isinstance(item, ReportTable):
@@ -175,13 +178,14 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
     return "\n".join(lines).rstrip()
 
 
-def verdict_line(verdict: Verdict) -> str:
-    """Return a verdict in one line: its state, the gravest reason, and how many more there are."""
+def verdict_lines(verdict: Verdict) -> list[str]:
+    """Return a verdict in lines: its state with the gravest reason and how many more there are; what to do next."""
     if not verdict.reasons:
-        return f"{coloured(verdict.state)}: {SENTENCES[verdict.state]}"
+        return [f"{coloured(verdict.state)}: {SENTENCES[verdict.state]}"]
     more = len(verdict.reasons) - 1
     others = f" (and {more} more: see the warnings)" if more else ""
-    return f"{coloured(verdict.state)}: {SENTENCES[verdict.state]}: {verdict.reasons[0]}{others}"
+    first = f"{coloured(verdict.state)}: {SENTENCES[verdict.state]}: {verdict.reasons[0]}{others}"
+    return [first, *(f"next: {action}" for action in verdict.next)]
 
 
 def describe_blob(blob: Blob) -> str:

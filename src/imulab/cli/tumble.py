@@ -122,7 +122,7 @@ def gyro(
 
 def _describe_gyroscopes(record: Calibration, accelerometers: str) -> str:
     """Return the result of the gyroscopes' fit, without the accelerometers, whose record it uses."""
-    from imulab.cli.show import verdict_line
+    from imulab.cli.show import verdict_lines
     from imulab.display import aligned
     from imulab.procedures.tumble.figures import gyro_headline
     from imulab.procedures.views import exhibits_of
@@ -133,7 +133,7 @@ def _describe_gyroscopes(record: Calibration, accelerometers: str) -> str:
     serial = record.sensor.get("serial", "unit without serial number")
     return "\n".join(
         [
-            verdict_line(record.verdict),
+            *verdict_lines(record.verdict),
             f"gyroscopes of {serial}: {gyro_headline(record)}",
             f"accelerometers: unchanged from {accelerometers}",
             "",

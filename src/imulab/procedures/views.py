@@ -230,6 +230,7 @@ def text(record: Calibration) -> str:
     reasons = f": {_shorten(verdict.reasons[0])}" if verdict.reasons else ""
     more = f" (and {len(verdict.reasons) - 1} more)" if len(verdict.reasons) > 1 else ""
     lines = [_title(record), f"{verdict.state}: {SENTENCES[verdict.state]}{reasons}{more}"]
+    lines += [f"next: {_shorten(action)}" for action in verdict.next[:1]]
     lines += [headline] if (headline := _headline(record)) else []
     rows = [f"  {_shorten(line)}" for line in aligned(*table)] if (table := _summary(record))[1] else _grouped(record)
     room = LINES - len(lines)
@@ -242,6 +243,7 @@ def html(record: Calibration) -> str:
     """Return a record as HTML: title, verdict, headline, parameters."""
     verdict = record.verdict
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
+    reasons += "".join(f"<li><b>next:</b> {escape(action)}</li>" for action in verdict.next)
     rows = [[row.name, *_format_row(row), row.unit] for row in parameter_rows(record)]
     table = html_table(["parameter", "value", "standard uncertainty", "unit"], rows)
     titles, first = _summary(record)

@@ -307,7 +307,11 @@ class Calibration:
             "covariance": {"names": self.covariance.names, "matrix": self.covariance.matrix},
             "options": self.options,
             "fit": self.fit,
-            "verdict": {"state": self.verdict.state, "reasons": list(self.verdict.reasons)},
+            "verdict": {
+                "state": self.verdict.state,
+                "reasons": list(self.verdict.reasons),
+                "next": list(self.verdict.next),
+            },
             "warnings": list(self.warnings),
             **self.sections,
             "data": self.data,

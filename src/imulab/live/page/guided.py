@@ -10,8 +10,8 @@ Messages to the page, beside those of `parts`:
 ``event``
     Something that happened: `kind`, `text`, `time`, as `Event`.
 ``done``
-    The record is made: `headline`, `verdict` (``good``, ``look`` or ``bad``), `reasons`, `parameters` as above, `files`
-    (`kind`, `name`, `href`) and `command`, which makes the same record.
+    The record is made: `headline`, `verdict` (``good``, ``look`` or ``bad``), `reasons` and `next` (what to do now),
+    `parameters` as above, `files` (`kind`, `name`, `href`) and `command`, which makes the same record.
 ``corrected``
     After that, ten times a second: `length`, `raw` and `gravity`, m/s², of the reading now.
 ``failed``
@@ -238,6 +238,7 @@ class GuidedPart(PagePart):
             "headline": exhibits_of(record).headline,
             "verdict": record.verdict.state,
             "reasons": list(record.verdict.reasons),
+            "next": list(record.verdict.next),
             "parameters": [
                 _parameter(row.name, row.value, row.standard_uncertainty, row.unit) for row in parameter_rows(record)
             ],

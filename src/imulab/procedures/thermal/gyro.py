@@ -866,7 +866,8 @@ def _covariance_of_directions(
 ) -> tuple[Array, Array]:
     """Return the covariance of the directions up, rad^2, (3 n, 3 n), and their derivatives by the laws, (3 n, c).
 
-    The covariance is that of noise and offset of the power cycle, without that of the accelerometers' laws.
+    The covariance is that of the offset of the power cycle; the noise, what scatters beyond it, and the accelerometers'
+    laws are counted elsewhere.
     """
     n, size = len(attitudes), solution.laws.size
     design = solution.laws.design(temperature)
@@ -875,7 +876,6 @@ def _covariance_of_directions(
     moved = np.einsum("nij,njc->nic", change, design)
     offset = solution.scatter.tau[0] * change[:, :, :3].reshape(3 * n, 3)
     joint = (offset @ offset.T).reshape(n, 3, n, 3)
-    joint[range(n), :, range(n), :] += solution.excess**2 * np.eye(3)
     length = np.linalg.norm(force, axis=1)
     up = force / length[:, None]
     across = (np.eye(3) - up[:, :, None] * up[:, None, :]) / length[:, None, None]

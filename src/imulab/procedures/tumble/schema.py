@@ -156,6 +156,8 @@ class GyroSummary(Part):
     clock: ClockState
     nonlinearity: RateTest | None
     set_aside: list[TurnAside] = field(default_factory=list)
+    between_samples: list[float] | None = None
+    lost_samples: float | None = None
 
 
 class FieldAgreement(Part):

@@ -21,8 +21,9 @@ export class ResultArea {
     if (this.page.others().includes("workbench")) files.push(h("a", { class: "button", href: "#workbench" }, "Firmware and other formats"));
     this.place.replaceChildren(h("section", { class: "result" },
       h("h2", {}, "The record"),
-      h("p", { class: `said ${message.verdict}` }, h("strong", {}, `${HEADS[message.verdict]} `), message.headline,
-        message.reasons.length ? h("ul", {}, message.reasons.map(text => h("li", {}, text))) : null),
+      h("div", { class: `said ${message.verdict}` }, h("strong", {}, `${HEADS[message.verdict]} `), message.headline,
+        message.reasons.length ? h("ul", {}, message.reasons.map(text => h("li", {}, text))) : null,
+        message.next.map(text => h("p", {}, h("b", {}, "next: "), text))),
       h("p", { class: "files" }, files, h("button", { onclick: () => this.quit() }, "End the session")),
       h("dl", { class: "facts" }, h("div", {}, h("dt", {}, "|f| now, corrected by the record"), this.length)),
       this.beside,

@@ -109,6 +109,10 @@ class GyroFit:
         What the time is known by that the scale factors are referred to.
     nonlinearity
         Of the scale factors over the rate.
+    between_samples
+        Half of what the two readings between samples change each scale factor by, relative, shape (3,).
+    lost_samples
+        Root mean square of the share of samples that may be lost.
     aside
         Start, stop, s, and miss, rad, of turns that stand out and were set aside, shape (k, 3).
     notes
@@ -131,6 +135,8 @@ class GyroFit:
     observability: Observability
     clock: Clock
     nonlinearity: Nonlinearity | None
+    between_samples: Array
+    lost_samples: float
     aside: Array
     notes: tuple[str, ...] = ()
     earth: EarthRate | None = None
@@ -200,11 +206,10 @@ def fit_gyro_triad(
     conditioning = _observability_of_turns(solved, freedom, recording.name)
     directions = direction_covariance(record, means, case.force)
     estimate = estimate_turns(solved, directions, None if fit_bias else solved.rest.zero_uncertainty)
-    linearity = estimate.linearity
     # Losses take the more from a turn the faster it is, as an output that is not linear does.
-    notes += [] if linearity is None or estimate.samples_lost else linearity.notes()
+    notes += [] if estimate.linearity is None or estimate.samples_lost else estimate.linearity.notes()
     notes += _warn_sampling(estimate, stamps)
-    fit = _triad_of_estimate(estimate, unit, fit_bias, conditioning, known, linearity, tuple(notes))
+    fit = _triad_of_estimate(estimate, unit, fit_bias, conditioning, known, tuple(notes))
     return _on_earth(fit, case, earth)
 
 
@@ -361,7 +366,6 @@ def _triad_of_estimate(
     fit_bias: bool,
     conditioning: Observability,
     clock: Clock,
-    linearity: Nonlinearity | None,
     notes: tuple[str, ...],
 ) -> GyroFit:
     """Turn scaled parameters into the triad."""
@@ -396,7 +400,9 @@ def _triad_of_estimate(
         fit_bias=fit_bias,
         observability=conditioning,
         clock=clock,
-        nonlinearity=linearity,
+        nonlinearity=estimate.linearity,
+        between_samples=estimate.reading[:3],
+        lost_samples=estimate.lost,
         aside=solved.aside,
         notes=notes,
     )
@@ -465,6 +471,8 @@ def _summary(fit: GyroFit, freedom: int) -> GyroSummary:
             TurnAside(start=start, stop=stop, miss=Length(value=miss, unit="rad"))
             for start, stop, miss in fit.aside.tolist()
         ],
+        between_samples=fit.between_samples.tolist(),
+        lost_samples=fit.lost_samples,
     )
 
 

@@ -20,8 +20,6 @@ from imulab.estimation.least_squares import f_test
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.device import specific_force
-from imulab.procedures.tumble.gyro.windows import EFFECTIVE
-from imulab.procedures.tumble.schema import fit_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -36,7 +34,9 @@ QUIET_SHARE = 0.75  # share of still samples of a hold that tells the zero
 _FLAT_TOP = 4  # readings in a row
 _CUT_OFF = 3.0  # steps of the output
 _LATE = 0.3  # s
-_ENDS = 0.6, 0.15  # s and part of a hold at each end, where turns begin and end: the zero is that between
+_ENDS = 0.3, 0.075  # s and part of a hold at each end, where turns begin and end: the zero is that between
+_TAPER = 0.25  # of the rest at each end, of the cosine that a tremor leaks through least
+_FLAT = 9 / 11  # 1 / int h^2 dt of such a window over its length: (1 - taper)^2 / (1 - 5 taper / 4)
 _HUBER = 2.5 * MAD_TO_SIGMA  # medians of the absolute deviation, 2.5 sigma: what is beyond pulls no stronger
 _REWEIGHTED = 20  # of Huber's fit
 
@@ -190,14 +190,14 @@ def at_rest(
         every = every - force @ fit.values[1:4]
     deviation = np.where(quiet[:, None], every - rest.zero, 0.0)
     limit = _HUBER * np.median(np.abs(deviation[quiet]), axis=0)
-    alone = density / (EFFECTIVE * float(np.median(length[quiet])))
+    alone = density / (_FLAT * float(np.median(length[quiet])))
     excess = np.maximum((MAD_TO_SIGMA * limit / _HUBER) ** 2 - alone, 0.0)
     share = excess / np.maximum(excess + alone / 2, 1e-300)
     return replace(rest, moved=share * np.clip(deviation, -limit, limit), moved_variance=share * alone)
 
 
 def _still_means(holds: RestHolds, time: Array, output: Array, scale: Array | None) -> tuple[Array, Array, Array]:
-    """Return Hann-weighted means over the still samples of holds, (n, 3), the share of these, and their duration, s.
+    """Return tapered means over the still samples of holds, (n, 3), the share of these, and their duration, s.
 
     The ends are left out, where turns begin and end slowly. A unit that trembles about two axes turns about the third
     without getting anywhere (coning): 1/2 sum h (phi x w), phi the angle turned so far, is what the mean rate lacks.
@@ -211,7 +211,8 @@ def _still_means(holds: RestHolds, time: Array, output: Array, scale: Array | No
         a, b = (a, b) if b > a else (int(holds.start[k]), int(holds.stop[k]))
         when, values, still = time[a:b], output[a:b], holds.still[a:b]
         fraction[k] = np.count_nonzero(holds.still[holds.start[k] : holds.stop[k]]) / (holds.stop[k] - holds.start[k])
-        weight = 1 - np.cos(2 * np.pi * (when - when[0] + step[k] / 2) / max(when[-1] - when[0] + step[k], 1e-300))
+        share = (when - when[0] + step[k] / 2) / max(when[-1] - when[0] + step[k], 1e-300)
+        weight = 1 - np.cos(np.pi * np.clip(np.minimum(share, 1 - share) / _TAPER, 0.0, 1.0))
         weight = np.where(still, weight, 0.0) if still.any() else weight
         weight = weight / weight.sum()
         means[k] = weight @ values
@@ -270,7 +271,7 @@ def _resolution(output: Array) -> Array:
 def direction_covariance(record: Calibration, output: Array, force: Array) -> Array:
     """Return the covariance of the upward directions by the record's parameters, rad^2, shape (3 n, 3 n).
 
-    And by what the attitudes scatter beyond their noise, as the record says. The noise itself is not in it.
+    The noise in them is not in it, nor what they scatter beyond it, which the turns show.
 
     Parameters
     ----------
@@ -283,7 +284,6 @@ def direction_covariance(record: Calibration, output: Array, force: Array) -> Ar
     """
     n = len(force)
     joint = np.zeros((n, 3, n, 3))
-    joint[range(n), :, range(n), :] = fit_of(record).excess.value ** 2 * np.eye(3)
     names = [name for name in record.covariance.names if not name.startswith("gyro_")]
     if names:
         matrix = record.covariance.block(names)

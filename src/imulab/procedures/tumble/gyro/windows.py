@@ -35,8 +35,8 @@ _FINEST = 2.5e-3  # s: of shorter steps, the middle of two readings errs by less
 _MOST_PIECES = 4
 _REACH = 10  # samples on each side that a spline is read from: those beyond count by less than 2e-6
 _POLE = np.sqrt(3.0) - 2.0  # of the filter that finds the coefficients of a cubic spline
-EFFECTIVE = 2.0 / 3.0
-"""1 / int h^2 dt of a Hann window, over its length: a mean of white noise q has the variance q / (EFFECTIVE length)."""
+_EFFECTIVE = 2.0 / 3.0
+"""1 / int h^2 dt of a Hann window, over its length: a mean of white noise q has the variance q / (effective length)."""
 _ALL_STILL = 0.999  # of a window's weight
 _KNOCKED = 6.0  # medians over the holds: with three differences in each, none of 100 is beyond by chance
 
@@ -116,7 +116,7 @@ def noise_density(time: Array, output: Array, still: NDArray[np.bool_], ends: Ho
     """
     pairs = _pairs(ends)
     means = hann_means(time, np.column_stack([output, still]), ends.neighbours)
-    square = np.diff(means[:, :-1], axis=0)[pairs] ** 2 / 2 * (EFFECTIVE * ends.neighbours.length[:-1][pairs])[:, None]
+    square = np.diff(means[:, :-1], axis=0)[pairs] ** 2 / 2 * (_EFFECTIVE * ends.neighbours.length[:-1][pairs])[:, None]
     quiet = (np.minimum(means[:-1, -1], means[1:, -1]) > _ALL_STILL)[pairs]
     chosen = quiet if quiet.any() else np.ones_like(quiet)
     return mean_of_holds(square[chosen], ends.hold[:-1][pairs][chosen])
