@@ -14,6 +14,8 @@ from imulab.procedures.registry import loads
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.records.calibration import content_sha256
 
+LOOK = "look at the figures of the report (--report FILE.html) for what the reasons name"
+
 
 @pytest.fixture(scope="module")
 def record():
@@ -26,8 +28,13 @@ def record():
     [
         ((), Verdict("good")),
         ((Note("the head's gravity was used"),), Verdict("good")),
-        (("look here", Note("by the way")), Verdict("look", ("look here",))),
-        (("look here", Bad("wrong unit")), Verdict("bad", ("wrong unit", "look here"))),
+        (("a: turn it", Note("by the way")), Verdict("look", ("a: turn it",), ("turn it",))),
+        (
+            ("a: turn it", Bad("wrong unit", "state it")),
+            Verdict("bad", ("wrong unit", "a: turn it"), ("state it", "turn it")),
+        ),
+        (("a: turn it", "b: turn it"), Verdict("look", ("a: turn it", "b: turn it"), ("turn it",))),
+        (("odd (p .1; turn it)",), Verdict("look", ("odd (p .1; turn it)",), (LOOK,))),
     ],
 )
 def test_the_gravest_finding_decides(findings, expected):
@@ -36,11 +43,13 @@ def test_the_gravest_finding_decides(findings, expected):
 
 
 def test_a_record_keeps_its_verdict(record, tmp_path):
-    bad = replace(record, warnings=(Bad("wrong unit"), Note("by the way")), verdict=verdict_of((Bad("wrong unit"),)))
+    findings = (Bad("wrong unit", "state it with --unit"), Note("by the way"))
+    bad = replace(record, warnings=findings, verdict=verdict_of(findings))
     bad.save(tmp_path / "r.json")
     stored = json.loads((tmp_path / "r.json").read_text())
-    assert stored["verdict"] == {"state": "bad", "reasons": ["wrong unit"]}
-    assert il.load(tmp_path / "r.json").verdict == Verdict("bad", ("wrong unit",))
+    assert stored["verdict"] == {"state": "bad", "reasons": ["wrong unit"], "next": ["state it with --unit"]}
+    kept = il.load(tmp_path / "r.json")
+    assert kept.verdict == verdict_of(kept.warnings) == Verdict("bad", ("wrong unit",), ("state it with --unit",))
 
 
 def test_findings_are_what_they_were_when_a_record_is_read_and_judged_anew(record, tmp_path):
@@ -66,7 +75,9 @@ def test_records_from_before_there_were_verdicts_are_judged_by_their_warnings(re
     content = {key: value for key, value in record.to_dict().items() if key not in ("verdict", "content_sha256")}
     content["warnings"] = ["the head of the file is odd"]
     content["content_sha256"] = content_sha256(content)
-    assert loads(json.dumps(content).encode(), "old.json").verdict == Verdict("look", ("the head of the file is odd",))
+    assert loads(json.dumps(content).encode(), "old.json").verdict == Verdict(
+        "look", ("the head of the file is odd",), (LOOK,)
+    )
 
 
 def test_a_verdict_that_cannot_be_is_refused(record):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from typing import Any, Literal, Self
 
@@ -169,12 +169,14 @@ class Bad(Finding):
 class Verdict:
     """``good``, ``look`` or ``bad``, and the findings that led to it, the gravest first.
 
-    `next` holds what to do now, an action each; it is empty where the state is ``good``.
+    `next` holds what to do now, an action each; it is empty where the state is ``good``. Records of older versions have
+    none, and are written again without it (`has_next`).
     """
 
     state: State
     reasons: tuple[str, ...] = ()
     next: tuple[str, ...] = ()
+    has_next: bool = field(default=True, repr=False, compare=False)
 
 
 UNJUDGED = Verdict("good")
@@ -227,6 +229,8 @@ def as_judged(findings: Iterable[str], verdict: Verdict) -> tuple[str, ...]:
         action = further if finding == first else ""
         if finding == worst:
             return Bad(finding, action)
-        return Finding(finding, action) if finding in verdict.reasons else Note(finding)
+        if finding in verdict.reasons:
+            return Finding(finding, action) if action else str(finding)
+        return Note(finding)
 
     return tuple(map(judged, findings))

@@ -307,11 +307,8 @@ class Calibration:
             "covariance": {"names": self.covariance.names, "matrix": self.covariance.matrix},
             "options": self.options,
             "fit": self.fit,
-            "verdict": {
-                "state": self.verdict.state,
-                "reasons": list(self.verdict.reasons),
-                "next": list(self.verdict.next),
-            },
+            "verdict": {"state": self.verdict.state, "reasons": list(self.verdict.reasons)}
+            | ({"next": list(self.verdict.next)} if self.verdict.has_next else {}),
             "warnings": list(self.warnings),
             **self.sections,
             "data": self.data,

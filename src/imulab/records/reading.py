@@ -111,7 +111,8 @@ def _validated(content: dict[str, Any], name: str, *, plain: bool) -> Calibratio
         _check_numbers(record)
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None
-    return replace(record, warnings=as_judged(record.warnings, record.verdict))
+    verdict = replace(record.verdict, has_next="next" in content.get("verdict", {"next": ()}))
+    return replace(record, warnings=as_judged(record.warnings, verdict), verdict=verdict)
 
 
 def _check_numbers(record: Calibration) -> None:
