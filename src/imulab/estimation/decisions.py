@@ -95,7 +95,7 @@ SCALE_CHANGE = Decision(
     0.0027, "note", {"tumble gyro": 6}, "which axis's scale factor changes with the rate, once any does", limit=3.0
 )
 SAMPLES_LOST = Decision(
-    1e-3, "verdict", {"tumble gyro": 1}, "turns miss as they do where samples are lost (restricted likelihood ratio)"
+    5e-4, "verdict", {"tumble gyro": 1}, "turns miss as they do where samples are lost (restricted likelihood ratio)"
 )
 CLOCKS_DISAGREE = Decision(
     0.00047, "verdict", {"tumble gyro": 1}, "the two triads' clocks differ by more than crystals do", limit=3.5
