@@ -57,6 +57,26 @@ def test_a_zero_far_from_the_middle_of_the_range_is_found():
         assert found.value(name) == pytest.approx(value, rel=1e-9), name
 
 
+@pytest.mark.parametrize("loss", ["auto", "huber"])
+@pytest.mark.parametrize("up", [(0.1, 0.2, 0.98), (0.0, 0.1, -0.9)])
+def test_one_attitude_of_outputs_that_never_change_is_refused_by_name(up, loss):
+    with pytest.raises(ObservabilityError, match="of the 9 parameters of order 1"):
+        il.fit_tumble(np.tile(up, (60, 1)), rate=10.0, unit="g", gravity=G, loss=loss)
+
+
+def test_one_long_and_quiet_hold_does_not_stand_out_of_attitudes_that_scatter():
+    named = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        ups = reference.random_attitudes(rng, 24)
+        sigma = np.full((24, 3), 2e-4)
+        sigma[0] /= 10
+        data = G * ups * (1 + 2e-4 * rng.standard_normal((24, 1))) + sigma * rng.standard_normal((24, 3))
+        record = fit(data, "auto", sigma=sigma).calibration
+        named += any("stands out" in w or "set aside" in w for w in record.warnings)
+    assert named == 0
+
+
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_noisy_fit_equals_the_reference_fit(order):
     rng = np.random.default_rng(20 + order)

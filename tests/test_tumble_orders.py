@@ -127,7 +127,7 @@ def test_the_blend_is_that_of_the_published_formulas(planned):
         total += (1 - mean) * step
         matrix += 1.3 * ((1 - mean) * (spread[e] - spread[e - 1]) + variance * np.outer(step, step))
     attitudes = il.find_attitudes(table(data, "g"))
-    record = il.fit_tumble(attitudes, gravity=G, order="blend").calibration
+    record = il.fit_tumble(attitudes, gravity=G, order="blend", asymmetry=1e-12).calibration
     u = np.sqrt(np.diag(matrix))
     assert record.model["order"] == 3
     assert record.fit["coverage_factor_95"] == pytest.approx(stats.t.isf(0.025, nu))
@@ -137,7 +137,7 @@ def test_the_blend_is_that_of_the_published_formulas(planned):
         assert bias.standard_uncertainty / G == pytest.approx(u[axis], rel=0.02)
         assert scale.value * G - 1 == pytest.approx(total[3 + axis], abs=0.05 * u[3 + axis])
         assert scale.standard_uncertainty * G == pytest.approx(u[3 + axis], rel=0.02)
-    auto = il.fit_tumble(attitudes, gravity=G).calibration
+    auto = il.fit_tumble(attitudes, gravity=G, asymmetry=1e-12).calibration
     away = theta[auto.model["order"] - 1] - total
     expected = np.sqrt(np.diag(matrix) + away**2)
     for axis, a in enumerate("xyz"):
@@ -192,6 +192,40 @@ def test_known_spread_of_nonlinearity_narrows_the_intervals_and_still_covers(pla
     assert np.mean(ratio) < 1.35  # tau is a third of the noise; the blend's is 2.6
 
 
+def asymmetric(rng, directions, q, sigma):
+    """Outputs of a triad whose scale factors are larger by q for positive and smaller for negative input, m/s^2."""
+    s = G * directions
+    s = s + q * rng.choice([-1.0, 1.0], 3) * np.abs(s)
+    return s + G * 0.01 + sigma * G * rng.standard_normal(s.shape)
+
+
+@pytest.mark.parametrize(("q", "options"), [(200e-6, {}), (400e-6, {}), (1000e-6, {}), (30e-6, {"asymmetry": 30e-6})])
+def test_a_scale_factor_that_differs_between_plus_and_minus_is_in_the_uncertainty_of_the_bias(planned, q, options):
+    covered = []
+    for seed in range(12):
+        record = fit(asymmetric(np.random.default_rng(seed), planned, q, 20e-6), 20e-6 * G, **options)
+        factor = record.fit["coverage_factor_95"]
+        covered += [
+            abs(record.value(f"bias_{a}") - 0.01 * G) < factor * record.parameters[f"bias_{a}"].standard_uncertainty
+            for a in "xyz"
+        ]
+    assert np.mean(covered) > 0.9
+
+
+def test_a_known_asymmetry_narrows_the_bias_and_one_that_explains_the_same_as_k2_is_said(planned):
+    data = asymmetric(np.random.default_rng(3), planned, 400e-6, 20e-6)
+    free, known = fit(data, 20e-6 * G), fit(data, 20e-6 * G, asymmetry=20e-6)
+    ratio = [
+        free.parameters[f"bias_{a}"].standard_uncertainty / known.parameters[f"bias_{a}"].standard_uncertainty
+        for a in "xyz"
+    ]
+    assert min(ratio) > 2
+    (said,) = [w for w in free.warnings if "between + and -" in w]
+    assert isinstance(said, Note)
+    assert "--asymmetry" in said
+    assert not [w for w in known.warnings if "between + and -" in w]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -199,6 +233,8 @@ def test_known_spread_of_nonlinearity_narrows_the_intervals_and_still_covers(pla
         ({"order": "blend", "monte_carlo": 1000}, "order blend needs method norm"),
         ({"order": 2, "nonlinearity": (1e-6, 1e-6)}, "nonlinearity needs order auto or blend"),
         ({"nonlinearity": (0.0, 1e-6)}, "expected two standard deviations above 0"),
+        ({"order": 1, "asymmetry": 1e-6}, "asymmetry needs order auto or blend"),
+        ({"asymmetry": 0.0}, "expected a standard deviation above 0"),
     ],
 )
 def test_what_does_not_go_together_is_refused(planned, options, message):

@@ -34,13 +34,15 @@ def table(
     count: int = 24,
     k2: float = 0.0,
     k3: float = 0.0,
+    q: float = 0.0,
     noise: float = 60.0,
     stated: float | None = 1.0,
     knocks: Sequence[tuple[int, float]] = (),
 ) -> tuple[Recording, dict[str, float]]:
     """Return a table of attitudes and the truth.
 
-    Errors of 1 %, 20 mg and 10 mrad; k2 in ug/g^2, k3 in ug/g^3 with random signs; noise in ug; `stated` is the stated
+    Errors of 1 %, 20 mg and 10 mrad; k2 in ug/g^2, k3 in ug/g^3 and q in ppm with random signs: the scale factor is
+    larger by q for positive and smaller by q for negative input; noise in ug; `stated` is the stated
     noise over the true one, or None; a knock lengthens or shortens one attitude's force by so many ug.
     """
     up = directions(rng, count)
@@ -53,6 +55,8 @@ def table(
     s[:, 1] += yx * force[:, 0]
     s[:, 2] += zx * force[:, 0] + zy * force[:, 1]
     second, third = (size * 1e-6 * rng.choice([-1, 1], 3) for size in (k2, k3))
+    if q:
+        s = s + q * 1e-6 * rng.choice([-1, 1], 3) * np.abs(s)
     output = scale * (s + second / G * s**2 + third / G**2 * s**3 + bias)
     output += noise * UG * rng.standard_normal(output.shape)
     columns = {f"accel_{axis}": output[:, i].copy() for i, axis in enumerate("xyz")}

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.procedures.tumble.attitudes import POOL_DEGREES, SMALLEST_BLOCK
+from imulab.procedures.tumble.attitudes import FINEST_STEP, POOL_DEGREES, SMALLEST_BLOCK
 from imulab.recording import Array
 
 BLOCK = 0.1  # s over which the scatter of samples is computed, as in a recording
@@ -189,7 +189,8 @@ class Stillness:
         spread = self._pooled / self._freedom if self._freedom else squares / max(freedom, 1)
         spread = (POOL_DEGREES * spread + squares) / (POOL_DEGREES + freedom)
         if not np.any(spread):
-            spread = np.diag(np.where(np.isfinite(self._resolution), self._resolution, 0.0) ** 2 / 12)
+            finest = FINEST_STEP * np.abs(total.mean).max()
+            spread = np.diag(np.where(np.isfinite(self._resolution), self._resolution, finest) ** 2 / 12)
         return Hold(total.start, total.stop, total.mean.copy(), spread / total.count, total.count, total.resumed)
 
 

@@ -431,6 +431,10 @@ def _motion(held: HeldStill, moments: Array, freedom: Array, share: Array) -> Mo
     )
 
 
+FINEST_STEP = 2.0**-23
+"""Step of an output that never changes, relative to the largest: that of a number of 32 bits."""
+
+
 def covariance_and_motion(
     held: HeldStill, recording: Recording, names: list[str], resolution: Array
 ) -> tuple[Array, Motion | None]:
@@ -439,6 +443,7 @@ def covariance_and_motion(
     noise = np.sqrt(medians(held.scatter, 0))
     if (noise < resolution / 2).any():
         resolution = resolutions(recording, names)
+    resolution = np.where(resolution > 0, resolution, FINEST_STEP * np.abs(held.centre).max(axis=0))
     # Noise below half a step of the output does not average its rounding away.
     rounding = np.where(noise < resolution / 2, resolution**2 / 12, 0.0)
     covariance = _shrink_covariance(moments[:, :3, :3], freedom, share)

@@ -76,6 +76,7 @@ def check_options(
     with_prior: bool = False,
     ageing: Sequence[float] = (),
     nonlinearity: tuple[float, float] | None = None,
+    asymmetry: float | None = None,
     cross: bool = False,
     threshold: Sequence[float] | None = None,
     further: Sequence[str] = (),
@@ -116,6 +117,11 @@ def check_options(
             raise OptionError(f"nonlinearity needs order auto or blend without a prior, found order {order}")
         if not all(0 < value < np.inf for value in nonlinearity):
             raise OptionError(f"nonlinearity {nonlinearity}: expected two standard deviations above 0, of k2 and k3")
+    if asymmetry is not None:
+        if order not in FROM_DATA or with_prior:
+            raise OptionError(f"asymmetry needs order auto or blend without a prior, found order {order}")
+        if not 0 < asymmetry < np.inf:
+            raise OptionError(f"asymmetry {asymmetry:g}: expected a standard deviation above 0")
     if cross and (method != "norm" or order in (0, *FROM_DATA) or with_prior or monte_carlo is not None):
         raise OptionError(
             f"cross needs method norm and an order of 1 to {HIGHEST_ORDER}, and goes with no prior and no monte-carlo"
@@ -123,7 +129,8 @@ def check_options(
     if "mag" in further:
         _check_with_mag(
             method=None if method == "norm" else method, order=order if order in (0, "blend") else None,
-            cross=cross or None, prior=with_prior or None, nonlinearity=nonlinearity, monte_carlo=monte_carlo,
+            cross=cross or None, prior=with_prior or None, nonlinearity=nonlinearity, asymmetry=asymmetry,
+            monte_carlo=monte_carlo,
         )  # fmt: skip
     check_field(field)
     _check_mag_options("mag" in further, field=field, hemisphere=hemisphere, dip=dip)
@@ -225,6 +232,7 @@ def estimate_triad(
     rest: Threshold | None = None,
     *,
     nonlinearity: tuple[float, float] | None = None,
+    asymmetry: float | None = None,
     prior: Calibration | None = None,
     ageing: Sequence[float] = (),
     cross: bool = False,
@@ -256,7 +264,11 @@ def estimate_triad(
     )
     stated = given_order
     if choice is not None and given_order is not None:
-        blended = with_known_spread(used, choice, nonlinearity) if nonlinearity else blend_orders(used, choice)
+        blended = (
+            with_known_spread(used, choice, nonlinearity, asymmetry)
+            if nonlinearity
+            else blend_orders(used, choice, asymmetry)
+        )
         problem, solution, stated = _with_order_uncertainty(
             used, problem, solution, given_order, blended, order == "blend"
         )

@@ -87,6 +87,7 @@ def fit_tumble(
     method: Annotated[str, choice(METHODS)] = "norm",
     loss: Annotated[str, choice(LOSSES)] = "auto",
     nonlinearity: Annotated[tuple[float, float] | str | None, parsed(tumble.nonlinearity, "20ug,20ug")] = None,
+    asymmetry: Annotated[float | str | None, measure("number", "ppm", "20ppm")] = None,
     prior: Record | None = None,
     ageing: Annotated[Sequence[float] | str, parsed(tumble.ageing, "100ug,100ppm[,50urad]")] = (),
     monte_carlo: int | str | None = None,
@@ -132,6 +133,10 @@ def fit_tumble(
     nonlinearity
         Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known. About zero, as numbers in units of 1/g and 1/g^2, or
         as ``"20ug,20ug"``; order auto or blend.
+    asymmetry
+        Standard deviation of half the difference of a scale factor between + and -, if known. Relative, as a number or
+        as ``"20ppm"``; order auto or blend. It looks like k2, and shifts biases; unknown, it is in their uncertainties,
+        beside `nonlinearity` with the standard deviation of k2.
     prior
         Earlier record of this unit, or one over temperature, as prior knowledge. A record or its file, taken as a
         normal distribution of the parameters, which is widened by what the attitudes say that it aged; gives the order
@@ -204,13 +209,15 @@ def fit_tumble(
     order = tumble.order(order, "order") if isinstance(order, str) else order
     nonlinearity = tumble.nonlinearity(nonlinearity, "nonlinearity") if isinstance(nonlinearity, str) else nonlinearity
     ageing = tumble.ageing(ageing, "ageing") if isinstance(ageing, str) else ageing
+    asymmetry = None if asymmetry is None else in_si(asymmetry, "asymmetry", "number", "ppm")
     threshold = tumble.threshold(threshold, "threshold") if isinstance(threshold, str) else threshold
     monte_carlo = None if monte_carlo is None else whole(monte_carlo, "monte_carlo")
     further = further_triads(with_, "with_")
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
     check_options(
         order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing, cross=cross, dip=dip,
-        nonlinearity=nonlinearity, threshold=threshold, further=further, field=magnitude, hemisphere=hemisphere,
+        nonlinearity=nonlinearity, asymmetry=asymmetry, threshold=threshold, further=further, field=magnitude,
+        hemisphere=hemisphere,
     )  # fmt: skip
     place = _stated_place(further, hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
@@ -221,12 +228,14 @@ def fit_tumble(
     order = order if known is None else _prior_order(known, order, attitudes)
     rest = _threshold(threshold, local.value) if method == "linearised" else None
     estimate = estimate_triad(
-        attitudes, local, scaling, order, loss, rest, nonlinearity=nonlinearity, prior=known, ageing=ageing, cross=cross
+        attitudes, local, scaling, order, loss, rest, nonlinearity=nonlinearity, asymmetry=asymmetry, prior=known,
+        ageing=ageing, cross=cross,
     )  # fmt: skip
     trials = None if monte_carlo is None else _propagated(estimate, monte_carlo, progress)
     options = {
         "order": order, "method": method, "loss": loss, "gravity": local.value,
-        "nonlinearity": nonlinearity and list(nonlinearity), "monte_carlo": monte_carlo, "cross": cross or None,
+        "nonlinearity": nonlinearity and list(nonlinearity), "asymmetry": asymmetry,
+        "monte_carlo": monte_carlo, "cross": cross or None,
         "threshold": None if rest is None else rest.in_si(local.value),
     }  # fmt: skip
     record = make_record(estimate, local, scaling, {k: v for k, v in options.items() if v is not None}, trials)

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 _NAMED = (
-    "order", "method", "loss", "threshold", "ageing", "nonlinearity", "cross", "monte-carlo", "with_", "field",
-    "hemisphere", "latitude", "dip",
+    "order", "method", "loss", "threshold", "ageing", "nonlinearity", "asymmetry", "cross", "monte-carlo", "with_",
+    "field", "hemisphere", "latitude", "dip",
 )  # fmt: skip
 
 
@@ -49,6 +49,7 @@ def _fit(
         method=values["method"],
         loss=values["loss"],
         nonlinearity=values["nonlinearity"],
+        asymmetry=values["asymmetry"],
         prior=prior,
         ageing=values["ageing"],
         monte_carlo=values["monte_carlo"],
@@ -99,8 +100,8 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         check_options(
             values["order"], values["method"], values["loss"],
             monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
-            nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
-            further=values["with"], field=values["field"],
+            nonlinearity=values["nonlinearity"], asymmetry=values["asymmetry"], cross=values["cross"],
+            threshold=values["threshold"], further=values["with"], field=values["field"],
             hemisphere=values["hemisphere"], dip=values["dip"],
         )  # fmt: skip
         if "mag" in values["with"]:

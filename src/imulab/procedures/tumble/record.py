@@ -211,6 +211,16 @@ def assumption_notes(stated: StatedUncertainty | None) -> list[str]:
     if stated is None or stated.blended is None:
         return []
     notes: list[str] = []
+    asymmetry = stated.blended.asymmetry
+    if asymmetry is not None and asymmetry.alike:
+        notes.append(
+            Note(
+                f"k2, or scale factors that differ by up to {_TO_MICRO * 2 * asymmetry.size:.2g} ppm between + and -, "
+                f"explain these attitudes alike: biases differ by up to {_TO_MICRO * asymmetry.bias:.2g} µg between "
+                "the two, which the uncertainties hold; 48 attitudes or less noise tell, and --asymmetry 20ppm narrows "
+                "them where scale factors are known to differ by no more"
+            )
+        )
     for order, (bias, scale) in stated.blended.assumed.items():
         unit = f"µg/g{'⁰¹²³'[order]}"
         moved = [
@@ -604,18 +614,19 @@ def _freedom_warnings(problem: TumbleProblem, solution: TumbleSolution, observab
 def _find_outliers(problem: TumbleProblem, solution: TumbleSolution) -> dict[int, float]:
     """Return the attitudes that stand out, and by how many standard deviations.
 
-    Each residual is held against the scatter of the others, with itself left out (externally studentised; Belsley, Kuh
-    and Welsch 1980), or against its own noise where that is more; the limit is one false alarm in a thousand tests.
+    Each residual is held against its noise and excess, scaled by the scatter of the others with itself left out
+    (externally studentised; Belsley, Kuh and Welsch 1980), or against its own noise where that is more. What the
+    attitudes scatter in common is a long and quiet hold's too.
     """
     n, size = problem.reading.shape[1], solution.theta.shape[1]
     freedom = n - size
     if freedom < FEW_DEGREES:
         return {}
     share = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-3)
-    standard = np.abs(solution.residuals[0]) / np.sqrt(solution.own_variance[0] * share)
+    standard = np.abs(solution.residuals[0]) / np.sqrt(solution.variance[0] * share)
     others = np.sqrt(np.maximum(((standard**2 * share).sum() - standard**2) / (freedom - 1), 0.0))
-    least = 1.0 if problem.covariance is not None else 1e-12
-    standard = standard / np.maximum(others, least)
+    own = np.sqrt(solution.own_variance[0] / solution.variance[0])
+    standard = standard / np.maximum(others, own if problem.covariance is not None else 1e-12)
     limit = max(ATTITUDE_STANDS_OUT_BY.limit, coverage_factor(freedom - 1, 1 - ATTITUDE_STANDS_OUT.level / n))
     return {i: float(standard[i]) for i in np.flatnonzero(standard > limit).tolist()}
 
