@@ -176,12 +176,12 @@ def test_hysteresis_is_seldom_found_where_there_is_none(reduced):
 
 
 def test_a_loop_of_ten_ppm_is_found_by_three_cycles(reduced):
-    """0.3 deg/sqrt(h), 8 s, three cycles: 5 standard deviations of the loop, of which 2.6 are needed."""
+    """0.3 deg/sqrt(h), 8 s, three cycles: 5 standard deviations; some go to a scale factor that may drift likewise."""
     trials = 2 if reduced else 4
     how = {"noise": "0.025 deg/s", "rate": "25 Hz", "hold": "8 s", "cycles": 3, "loop": "10 ppm"}
     found = [il.fit_rate(il.simulate_rate(seed=seed, **how)).calibration for seed in range(trials)]
     loops = [axis["loop"] for record in found for axis in record.fit["axes"].values()]
-    assert sum(loop < 0.01 for loop in loops) >= 11 / 4 * trials  # of 12 that are found with 99.4 % each
+    assert sum(loop < 0.01 for loop in loops) >= 9 / 4 * trials  # of 12 that are found with 88 % each
 
 
 def test_a_record_corrects_recordings_and_goes_through_the_core(tmp_path):
@@ -558,6 +558,30 @@ def test_a_zero_that_walks_makes_no_loop(reduced):
         loop = il.fit_rate(RateRecordings(test, tuple(runs), {}), order=1).linearity["z"].loop
         alarms += loop < 0.01
     assert alarms <= trials / 8
+
+
+@pytest.mark.parametrize("width", [1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("play", [False, True])
+def test_a_loop_of_one_cycle_does_not_hide_in_its_own_scatter(width, play):
+    """Of 200 and 1000 ppm none was said: the first dwell's branch is not known, and its loop counted as scatter."""
+    made = recording(noise=1e-4, rng=np.random.default_rng(3))
+    rate = made.column("table_rate")
+    change = np.sign(np.diff(np.round(rate, 9), prepend=rate[0]))
+    steps = np.flatnonzero(change)
+    came = np.zeros(len(rate))
+    came[steps] = change[steps]
+    last = np.maximum.accumulate(np.where(came != 0, np.arange(len(rate)), 0))
+    x = np.abs(rate) / np.abs(rate).max()
+    loop = width / 2 * DEGREE * np.abs(rate).max() * came[last] * (x < 1 - 1e-9 if play else 1 - x**2)
+    looped = changed(made, gyro_z=made.column("gyro_z") + loop)
+    test = RateTest((Run("z.csv", "+z"),), relative_uncertainty=0.0, latitude=0.0)
+    with_loop = il.fit_rate(RateRecordings(test, (looped,), {}), order=1)
+    without = il.fit_rate(RateRecordings(test, (made,), {}), order=1)
+    value, u = with_loop.linearity["z"].fitted_loop
+    assert value == pytest.approx(width, rel=0.2)
+    assert value > 4 * u
+    assert any("hysteresis" in reason for reason in with_loop.calibration.verdict.reasons)
+    assert not any("hysteresis" in reason for reason in without.calibration.verdict.reasons)
 
 
 def warmed(temperatures, slope=50e-6, within=0.0):

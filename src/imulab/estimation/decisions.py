@@ -191,11 +191,11 @@ RATE_POWER = Decision(0.01, "model", {"rate": 12}, "the output has a higher powe
 RATES_SCATTER_AS_NOISE = Decision(
     0.2, "model", {"rate": 12}, "what a polynomial leaves is more than noise, so that it tells the noise (F-test)"
 )
-LINE_BENDS = Decision(0.01, "verdict", {"rate": 3}, "the output bends beyond the order that was stated")
+LINE_BENDS = Decision(0.005, "verdict", {"rate": 3}, "the output bends beyond the order that was stated")
 SLOPES_KINK = Decision(1e-3, "verdict", {"rate": 3}, "slopes of positive and negative rates differ", limit=3.29)
-HYSTERESIS = Decision(0.01, "verdict", {"rate": 3}, "rising and falling rates differ")
+HYSTERESIS = Decision(0.006, "verdict", {"rate": 3}, "rising and falling rates differ")
 HYSTERESIS_SCATTERS = Decision(
-    0.01, "uncertainty", {"rate": 6}, "a loop has another shape, or visits of one rate scatter beyond their noise"
+    0.01, "uncertainty", {"rate": 6}, "a sweep's loop has another shape, or visits of one rate scatter beyond noise"
 )
 DWELLS_SCATTER = Decision(
     0.01, "uncertainty", {"rate": 4}, "dwells scatter beyond their noise, which is added to each and noted"
@@ -207,8 +207,8 @@ TURNS_ACROSS_SCATTER = Decision(
 )
 RATE_PRIOR_CONTRADICTED = Decision(0.01, "verdict", {"rate prior": 1}, "a rate record and the earlier one disagree")
 LENGTH_AT_REST_OFF = Decision(
-    0.0027, "verdict", {"rate": 6}, "|f| at rest is not g by the accelerometers' record, a power cycle allowed for",
-    limit=3.0,
+    4.7e-4, "verdict", {"rate": 6}, "|f| at rest is not g by the accelerometers' record, a power cycle allowed for",
+    limit=3.5,
 )  # fmt: skip
 
 # Centrifuge

@@ -289,6 +289,7 @@ def _join_dwells(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> 
             [0.0 if run_dwells.sweep is None else run_dwells.sweep.largest for run_dwells in dwells], counts
         ),
         branch=np.concatenate([_rising_or_falling(run_dwells) for run_dwells in dwells]),
+        time=np.concatenate([(run_dwells.start + run_dwells.stop) / 2 for run_dwells in dwells]),
     )
 
 

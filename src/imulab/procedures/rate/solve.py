@@ -29,18 +29,17 @@ from numpy.typing import NDArray
 
 from imulab.estimation.decisions import (
     DWELLS_SCATTER,
-    HYSTERESIS_SCATTERS,
     RATE_POWER,
     RATES_SCATTER_AS_NOISE,
     RUNS_SCATTER,
     SLOPES_KINK,
 )
-from imulab.estimation.distributions import normal_cdf, t_cdf
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor, f_test
 from imulab.gravity import EARTH
 from imulab.procedures.rate import AXES
 from imulab.procedures.rate.axes import TableAxes
 from imulab.procedures.rate.dwells import Dwells
+from imulab.procedures.rate.hysteresis import find_directions, fit_hysteresis, fit_loop, fit_weighted, test_visits
 from imulab.procedures.rate.schema import RateTest
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Parameter
@@ -85,6 +84,8 @@ class RateProblem:
         Components of the table axis over that along the body axis, shape (n, 3); None if it lies along the body axis.
     force
         Specific force at rate 0 in each run, m/s^2, shape (m, 3); None for g along the faces.
+    time
+        Middle of each dwell in its recording, s, shape (n,); None where it is not known.
     """
 
     gyros: tuple[int, ...]
@@ -104,6 +105,7 @@ class RateProblem:
     branch: NDArray[np.int64] | None = None
     lean: Array | None = None
     force: Array | None = None
+    time: Array | None = None
 
     @property
     def runs(self) -> int:
@@ -404,8 +406,6 @@ def _is_significant(costs: Mapping[int, float], below: int, order: int, count: i
 
 _ONE_SIDED = 1.645  # standard uncertainties: 95 % of normal values lie below
 _SMALL = 1e-3  # of the largest rate: if all rates show and none is smaller, the threshold is not known
-_BY_PARTS = 15
-"""Degrees of freedom of a delay by the batches of a sweep: half their number, since each has other frequencies."""
 _RATES, _POWERS = 7, 5
 """Fewest different rates that distinguish a kink from powers of the rate, and these powers."""
 
@@ -479,7 +479,7 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
     of_rate = problem.rate_uncertainty[on_axis] ** 2
     zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
     largest = max(float(np.abs(rate).max()), 0.0 if problem.reach is None else float(problem.reach[on_axis].max()))
-    left, _ = _fit_weighted(np.column_stack([rate, zeros]), values, variance)
+    left, _ = fit_weighted(np.column_stack([rate, zeros]), values, variance)
     means = np.array(
         [
             [left[key == k].mean(), variance[key == k].sum() / (key == k).sum() ** 2 + of_rate[key == k].mean()]
@@ -497,14 +497,17 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
         if problem.branch is None
         else problem.branch[on_axis] * problem.sign[on_axis]
     )
-    direction = np.where(branch != 0, branch, _find_directions(rate, runs))
+    direction = np.where(branch != 0, branch, find_directions(rate, runs))
     powers = np.column_stack([*(rate**power for power in range(1, order + 1)), zeros])
-    rest = _fit_weighted(powers, values, variance)[0]
-    beyond = _test_visits(key, direction, zeros, values, variance)
+    rest = fit_weighted(powers, values, variance)[0]
+    beyond = test_visits(key, direction, zeros, values, variance)
     error = np.zeros(len(rate)) if problem.loop_error is None else problem.loop_error[on_axis]
-    loop, fitted_loop, hysteresis = _fit_hysteresis(
+    loop, fitted_loop, hysteresis = fit_hysteresis(
         left / largest, variance / largest**2, key, runs, direction, rate / largest, error, beyond
     )
+    if loop is not None and not branch.any() and problem.time is not None:
+        steps = rate / largest, values / largest, variance / largest**2
+        loop, fitted_loop = fit_loop(*steps, key, runs, problem.time[on_axis], direction) or (None, None)
     return Linearity(
         rate=rate,
         residual=left / largest,
@@ -524,26 +527,6 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
     )
 
 
-def _fit_weighted(columns: Array, values: Array, variance: Array) -> tuple[Array, Array]:
-    """Return the residual of a weighted fit, and its coefficients with their covariance, shape (p, p + 1)."""
-    weight, size = 1 / np.sqrt(variance), np.abs(columns).max(axis=0)
-    scaled = columns / size * weight[:, None]
-    inverse = np.linalg.pinv(scaled)
-    coefficients = inverse @ (values * weight) / size
-    return values - columns @ coefficients, np.column_stack([coefficients, inverse @ inverse.T / np.outer(size, size)])
-
-
-def _find_directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return whether the rate rose (1) or fell (-1) into and out of each dwell, 0 elsewhere."""
-    directions = np.zeros(len(rate), dtype=np.int64)
-    for run in np.unique(runs):
-        which = np.flatnonzero(runs == run)
-        step = np.sign(np.round(np.diff(rate[which]), 6))
-        inner = np.where(step[:-1] == step[1:], step[1:], 0.0)
-        directions[which[1:-1]] = inner.astype(np.int64)
-    return directions
-
-
 def _fit_asymmetry(
     rate: Array, values: Array, variance: Array, zeros: Array, direction: NDArray[np.int64], of_rate: Array
 ) -> tuple[float, float] | None:
@@ -555,7 +538,7 @@ def _fit_asymmetry(
     came = np.where(first, 0.0, np.sign(np.round(np.diff(rate, prepend=0.0), 6)))
     if direction.any():  # the branch of a loop that the first dwell of a run is on is not known
         columns += [came * (1 - (rate / np.abs(rate).max()) ** 2), first.astype(np.float64)]
-    fitted = _fit_weighted(np.column_stack(columns), values, variance + of_rate)[1]
+    fitted = fit_weighted(np.column_stack(columns), values, variance + of_rate)[1]
     u = np.sqrt(max(fitted[0, 1] + fitted[1, 2] - 2 * fitted[0, 2], 0.0))
     return float(fitted[0, 0] - fitted[1, 0]), float(u)
 
@@ -566,74 +549,10 @@ def _fit_kink(rate: Array, values: Array, variance: Array, zeros: Array, count: 
         return None
     powers = range(1, min(_POWERS, count - 3) + 1)
     columns = np.column_stack([np.abs(rate), *(rate**power for power in powers), zeros])
-    left, fitted = _fit_weighted(columns, values, variance)
+    left, fitted = fit_weighted(columns, values, variance)
     freedom = len(values) - np.linalg.matrix_rank(columns)
     beyond = max(float(np.sum(left**2 / variance)) / freedom, 1.0) if freedom > 0 else 1.0
     return 2 * float(fitted[0, 0]) if abs(fitted[0, 0]) > SLOPES_KINK.limit * np.sqrt(fitted[0, 1] * beyond) else None
-
-
-def _test_visits(
-    key: NDArray[Any], direction: NDArray[np.int64], zeros: Array, values: Array, variance: Array
-) -> tuple[float, int] | None:
-    """Return chi-square and degrees of freedom of visits of one rate from one side; None where noise explains them."""
-    cells = np.unique(3 * key + direction, return_inverse=True)[1]
-    columns = np.column_stack([cells[:, None] == np.arange(cells.max() + 1), zeros]).astype(np.float64)
-    freedom = len(values) - int(np.linalg.matrix_rank(columns))
-    chi_square = float(np.sum(_fit_weighted(columns, values, variance)[0] ** 2 / variance))
-    return (
-        (chi_square, freedom)
-        if freedom and chi_square_probability(chi_square, freedom) < HYSTERESIS_SCATTERS.level
-        else None
-    )
-
-
-def _fit_hysteresis(
-    left: Array,
-    variance: Array,
-    key: NDArray[Any],
-    runs: NDArray[Any],
-    direction: NDArray[np.int64],
-    rate: Array,
-    error: Array,
-    beyond: tuple[float, int] | None,
-) -> tuple[float | None, tuple[float, float] | None, tuple[float, float] | None]:
-    """Return `Linearity.loop`, `fitted_loop` and `hysteresis`, all over the largest rate.
-
-    The loop ``h (1 - (w/w_max)^2)`` is fitted to rising less falling at each rate by weighted least squares. `error` is
-    the standard uncertainty of h by the delay of a sweep, infinite where the two cannot be distinguished.
-    """
-    rows = []
-    for k in np.unique(key):
-        pairs = []
-        for run in np.unique(runs):
-            up, down = (np.flatnonzero((key == k) & (runs == run) & (direction == d)) for d in (1, -1))
-            if up.size and down.size and np.isfinite(error[up[0]]):
-                u2 = variance[up].sum() / up.size**2 + variance[down].sum() / down.size**2
-                pairs.append((float(left[up].mean() - left[down].mean()), float(u2), float(error[up[0]]) ** 2))
-        if pairs:
-            means = np.array(pairs).mean(axis=0)
-            rows.append((float(rate[key == k].mean()), means[0], *(means[1:] / len(pairs))))
-    if not rows:
-        return None, None, None
-    table = np.array(rows)
-    worst = int(np.argmax(np.abs(table[:, 1])))
-    loop = 1 - table[:, 0] ** 2
-    size = float(table[worst, 1]), float(np.sqrt(table[worst, 2] + table[worst, 3] * loop[worst] ** 2))
-    spread = float(np.sum(loop**2 / table[:, 2]))
-    if len(rows) < 2 or spread <= 0:
-        return None, None, size
-    slope = float(np.sum(loop * table[:, 1] / table[:, 2])) / spread
-    chi_square = float(np.sum((table[:, 1] - slope * loop) ** 2 / table[:, 2]))
-    t = float(abs(slope) / np.sqrt(1 / spread + table[:, 3].max()))
-    chances = [2 * float(t_cdf(-t, _BY_PARTS) if table[:, 3].any() else normal_cdf(-t))]
-    freedom, wide = len(rows) - 1, [1.0]
-    if chi_square_probability(chi_square, freedom) < HYSTERESIS_SCATTERS.level:  # another shape, or dwells scatter more
-        wide.append(chi_square / freedom)
-        chances.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), freedom)))
-    if beyond:
-        wide.append(beyond[0] / beyond[1])
-        chances.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), beyond[1])))
-    return max(chances), (slope, float(np.sqrt(max(wide) / spread + table[:, 3].max()))), size
 
 
 def _measure_repeatability(
@@ -645,7 +564,7 @@ def _measure_repeatability(
         which = runs == run
         if which.sum() > 2:  # a line through two dwells leaves no scatter
             columns = np.column_stack([rate[which], np.ones(int(which.sum()))])
-            rows.append(_fit_weighted(columns, values[which], variance[which])[1][0, :2])
+            rows.append(fit_weighted(columns, values[which], variance[which])[1][0, :2])
     if len(rows) < 2:
         return None
     table = np.array(rows)

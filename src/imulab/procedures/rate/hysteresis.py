@@ -1,0 +1,219 @@
+"""Hysteresis of a gyroscope: how far rising and falling rates differ, apart from what drifts, walks and scatters.
+
+Dwells of steps (`fit_loop`): the output is ``value of the rate + zero of the run + a t + h d g(x)``, x the rate over
+the largest, t the time within the run, d = 1 where the rate was reached from below, -1 from above, and g the width of
+one of three loops: ``1 - x^2``, that of play, a narrow one. The covariance is the noise, a scatter of each dwell, a
+zero that walks, ``K^2 min(t, t')``, and a scale factor that drifts, ``c t x``. Their variances are not known: h is the
+mean over a grid of them and over the loops, weighted by restricted likelihood. So the loop is never part of the
+scatter it is held against, and what walks or drifts is not taken for a loop.
+
+Means by rate of sweeps (`fit_hysteresis`): rising less falling at each rate.
+
+Sources: Patterson and Thompson, Biometrika 58 (1971) 545, restricted likelihood; IEEE Std 528 (terms).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.estimation.decisions import HYSTERESIS_SCATTERS
+from imulab.estimation.distributions import normal_cdf, t_cdf
+from imulab.estimation.least_squares import chi_square_probability
+from imulab.recording import Array
+
+_BY_PARTS = 15
+"""Degrees of freedom of a delay by the batches of a sweep: half their number, since each has other frequencies."""
+_NONE = 0.8  # probability beforehand that dwells do not scatter, nor zeros walk, nor a scale factor drift, each
+_LEAST, _GRID, _COARSE, _MANY = 0.3, 5, 2, 150
+"""Least variance of scatter, walk and drift over that of noise, and number of variances, fewer from so many dwells."""
+_SHAPES: tuple[Callable[[Array], Array], ...] = (
+    lambda x: 1 - x**2,
+    lambda x: np.where(x < 1 - 1e-9, 1.0, 0.0),
+    lambda x: np.maximum(1 - x, 0.0) ** 3,
+)
+"""Width of a loop over that at rate 0, by the rate over the largest: of an ellipse, of play, and a narrow one."""
+
+
+def fit_weighted(columns: Array, values: Array, variance: Array) -> tuple[Array, Array]:
+    """Return the residual of a weighted fit, and its coefficients with their covariance, shape (p, p + 1)."""
+    weight, size = 1 / np.sqrt(variance), np.abs(columns).max(axis=0)
+    scaled = columns / size * weight[:, None]
+    inverse = np.linalg.pinv(scaled)
+    coefficients = inverse @ (values * weight) / size
+    return values - columns @ coefficients, np.column_stack([coefficients, inverse @ inverse.T / np.outer(size, size)])
+
+
+def find_directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return whether the rate rose (1) or fell (-1) into and out of each dwell, 0 elsewhere."""
+    directions = np.zeros(len(rate), dtype=np.int64)
+    for run in np.unique(runs):
+        which = np.flatnonzero(runs == run)
+        step = np.sign(np.round(np.diff(rate[which]), 6))
+        inner = np.where(step[:-1] == step[1:], step[1:], 0.0)
+        directions[which[1:-1]] = inner.astype(np.int64)
+    return directions
+
+
+def fit_loop(
+    rate: Array,
+    values: Array,
+    variance: Array,
+    key: NDArray[Any],
+    runs: NDArray[Any],
+    time: Array,
+    direction: NDArray[np.int64],
+) -> tuple[float, tuple[float, float]] | None:
+    """Return the probability that noise alone makes such a loop, and h and its standard uncertainty; None without one.
+
+    Parameters
+    ----------
+    rate
+        Rate of each of n dwells over the largest, shape (n,).
+    values, variance
+        Outputs over scale factor and largest rate, and the variances of their noise, shape (n,).
+    key, runs, time, direction
+        Which rate and run; middle of the dwell, s; and `find_directions`, shape (n,).
+    """
+    apart = (direction == 0) & (np.abs(rate) < 1 - 1e-9)  # dwells on a branch that is not known
+    number, which = np.unique(runs, return_inverse=True)
+    within = time - np.array([time[runs == run].min() for run in number])[which]
+    nuisance = np.column_stack(
+        [
+            (key[:, None] == np.unique(key)).astype(np.float64),
+            np.eye(len(number))[which],
+            np.eye(len(number))[which] * within[:, None],
+            np.eye(len(rate))[:, apart],
+        ]
+    )
+    free = _null_space((nuisance / np.maximum(np.abs(nuisance).max(axis=0), 1e-300)).T)
+    shapes = free.T @ np.column_stack([direction * shape(np.abs(rate)) for shape in _SHAPES])
+    if free.shape[1] < 2 or not (np.sum(shapes**2, axis=0) > 1e-9).all():
+        return None
+    seen = free.T @ values
+    walk = np.where(which[:, None] == which, np.minimum(within[:, None], within), 0.0)
+    parts = [np.eye(len(rate)), walk, np.outer(within * rate, within * rate)]
+    noise, *parts = (free.T @ part @ free for part in (np.diag(variance), *parts))
+    mean, u, probability = _average_models(noise, parts, shapes, seen, _GRID if len(rate) < _MANY else _COARSE)
+    return probability, (2 * mean, 2 * u)
+
+
+def _average_models(
+    noise: Array, parts: list[Array], shapes: Array, seen: Array, number: int
+) -> tuple[float, float, float]:
+    """Return mean and standard uncertainty of half the loop, and the probability that noise alone makes it.
+
+    The covariance is that of the noise and each of three parts in one of `number` sizes, or not at all.
+    """
+    usual = float(np.trace(noise))
+    most = max(100.0, 3 * float(seen @ seen) / usual)
+    steps = np.geomspace(_LEAST, most, number)
+    ladder = [(0.0, np.log(_NONE)), *((step, np.log((1 - _NONE) / len(steps))) for step in steps.tolist())]
+    rows = []
+    for combination in product(ladder, repeat=3):
+        covariance, chance = noise, 0.0
+        for (size, log_chance), part in zip(combination, parts, strict=True):
+            covariance = covariance + size * usual / max(float(np.trace(part)), 1e-300) * part
+            chance += log_chance
+        rows += [
+            (value, u, log_likelihood + chance) for value, u, log_likelihood in _fit_each(covariance, shapes, seen)
+        ]
+    table = np.array(rows)
+    weight = np.exp(table[:, 2] - table[:, 2].max())
+    weight /= weight.sum()
+    mean = float(weight @ table[:, 0])
+    u = float(np.sqrt(weight @ (table[:, 1] ** 2 + (table[:, 0] - mean) ** 2)))
+    tails = np.array([normal_cdf(-abs(value) / spread) for value, spread, _ in rows])
+    return mean, u, 2 * float(weight @ tails)
+
+
+def _null_space(rows: Array) -> Array:
+    """Return an orthonormal basis of the vectors that all rows are normal to, shape (n, k)."""
+    _, spread, turn = np.linalg.svd(rows)
+    rank = int(np.sum(spread > 1e-9 * spread[0]))
+    return np.asarray(turn[rank:].T)
+
+
+def _fit_each(covariance: Array, shapes: Array, seen: Array) -> list[tuple[float, float, float]]:
+    """Return the coefficient of each shape alone, its standard uncertainty, and the log restricted likelihood."""
+    lower = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(lower, np.column_stack([shapes, seen]))
+    square = np.sum(white[:, :-1] ** 2, axis=0)
+    value = white[:, -1] @ white[:, :-1] / square
+    left = float(white[:, -1] @ white[:, -1]) - value**2 * square
+    likelihood = -float(np.log(np.diag(lower)).sum()) - np.log(square) / 2 - left / 2
+    return list(zip(value.tolist(), (1 / np.sqrt(square)).tolist(), likelihood.tolist(), strict=True))
+
+
+def test_visits(
+    key: NDArray[Any], direction: NDArray[np.int64], zeros: Array, values: Array, variance: Array
+) -> tuple[float, int] | None:
+    """Return chi-square and degrees of freedom of visits of one rate from one side; None where noise explains them.
+
+    Dwells whose branch is not known are left out: a loop itself makes these scatter.
+    """
+    known = direction != 0
+    if not known.any():
+        return None
+    cells = np.unique(3 * key[known] + direction[known], return_inverse=True)[1]
+    columns = np.column_stack([cells[:, None] == np.arange(cells.max() + 1), zeros[known]]).astype(np.float64)
+    freedom = int(known.sum()) - int(np.linalg.matrix_rank(columns))
+    chi_square = float(np.sum(fit_weighted(columns, values[known], variance[known])[0] ** 2 / variance[known]))
+    return (
+        (chi_square, freedom)
+        if freedom and chi_square_probability(chi_square, freedom) < HYSTERESIS_SCATTERS.level
+        else None
+    )
+
+
+def fit_hysteresis(
+    left: Array,
+    variance: Array,
+    key: NDArray[Any],
+    runs: NDArray[Any],
+    direction: NDArray[np.int64],
+    rate: Array,
+    error: Array,
+    beyond: tuple[float, int] | None,
+) -> tuple[float | None, tuple[float, float] | None, tuple[float, float] | None]:
+    """Return `Linearity.loop`, `fitted_loop` and `hysteresis`, all over the largest rate.
+
+    The loop ``h (1 - (w/w_max)^2)`` is fitted to rising less falling at each rate by weighted least squares. `error` is
+    the standard uncertainty of h by the delay of a sweep, infinite where the two cannot be distinguished.
+    """
+    rows = []
+    for k in np.unique(key):
+        pairs = []
+        for run in np.unique(runs):
+            up, down = (np.flatnonzero((key == k) & (runs == run) & (direction == d)) for d in (1, -1))
+            if up.size and down.size and np.isfinite(error[up[0]]):
+                u2 = variance[up].sum() / up.size**2 + variance[down].sum() / down.size**2
+                pairs.append((float(left[up].mean() - left[down].mean()), float(u2), float(error[up[0]]) ** 2))
+        if pairs:
+            means = np.array(pairs).mean(axis=0)
+            rows.append((float(rate[key == k].mean()), means[0], *(means[1:] / len(pairs))))
+    if not rows:
+        return None, None, None
+    table = np.array(rows)
+    worst = int(np.argmax(np.abs(table[:, 1])))
+    loop = 1 - table[:, 0] ** 2
+    size = float(table[worst, 1]), float(np.sqrt(table[worst, 2] + table[worst, 3] * loop[worst] ** 2))
+    spread = float(np.sum(loop**2 / table[:, 2]))
+    if len(rows) < 2 or spread <= 0:
+        return None, None, size
+    slope = float(np.sum(loop * table[:, 1] / table[:, 2])) / spread
+    chi_square = float(np.sum((table[:, 1] - slope * loop) ** 2 / table[:, 2]))
+    t = float(abs(slope) / np.sqrt(1 / spread + table[:, 3].max()))
+    chances = [2 * float(t_cdf(-t, _BY_PARTS) if table[:, 3].any() else normal_cdf(-t))]
+    freedom, wide = len(rows) - 1, [1.0]
+    if chi_square_probability(chi_square, freedom) < HYSTERESIS_SCATTERS.level:  # another shape, or dwells scatter more
+        wide.append(chi_square / freedom)
+        chances.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), freedom)))
+    if beyond:
+        wide.append(beyond[0] / beyond[1])
+        chances.append(2 * float(t_cdf(-t / np.sqrt(wide[-1]), beyond[1])))
+    return max(chances), (slope, float(np.sqrt(max(wide) / spread + table[:, 3].max()))), size
