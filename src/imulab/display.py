@@ -165,6 +165,12 @@ class Bad(Finding):
     __slots__ = ()
 
 
+def prefixed(prefix: str, finding: str) -> str:
+    """Return a finding as ``prefix: finding``, of the same class and with the same action."""
+    text = f"{prefix}: {finding}"
+    return type(finding)(text, finding.action) if isinstance(finding, Finding) else text
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """``good``, ``look`` or ``bad``, and the findings that led to it, the gravest first.

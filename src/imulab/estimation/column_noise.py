@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from imulab.columns import INERTIAL, kind_of
-from imulab.display import Note
+from imulab.display import Note, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.noise.analysis import CANDIDATES, Analysis, analyses, average
 from imulab.estimation.noise.readings import doubtful_units, own_readings
@@ -186,12 +186,12 @@ def _noises(
 
 def _mended(recording: Recording, names: list[str]) -> tuple[Recording, float, list[str]]:
     """Return the rows that are readings, at one rate, Hz, and notes on the other rows."""
-    notes = [type(note)(f"{recording.name}: {note}") for note in recording.notes]
+    notes = [prefixed(recording.name, note) for note in recording.notes]
     recording, more = bridged(recording, names)
     for sensor in dict.fromkeys(map(kind_of, names)):
         left_out = leave_out(recording, [name for name in names if kind_of(name) == sensor])
         left_out.check(0, len(recording), "the recording")
-        more += [type(note)(f"{recording.name}: {note}") for note in left_out.notes()]
+        more += [prefixed(recording.name, note) for note in left_out.notes()]
         recording = left_out.recording
     _check_squares(recording, names)
     recording, mended = own_readings(recording, names)

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.display import Note
+from imulab.display import Note, prefixed
 from imulab.errors import DataError
 from imulab.estimation.column_noise import most_reach, moved_columns
 from imulab.estimation.noise.readings import LEVELS, doubtful_units, dropouts, own_readings
@@ -185,7 +185,7 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
     recording, notes = bridged(recording, list(names))
     recording, more = own_readings(recording, names)
     recording, trimmed = steady_part(recording)
-    notes = [*(type(note)(f"{recording.name}: {note}") for note in recording.notes), *notes, *more, *trimmed]
+    notes = [*(prefixed(recording.name, note) for note in recording.notes), *notes, *more, *trimmed]
     if len(recording) < FEWEST:
         raise _too_few(recording, len(recording))
     rate, timing = sampling_rate(recording)
@@ -453,7 +453,7 @@ class _Log:
             tuple((0, count, None) for count in lengths),
             filled,
             (
-                *(type(note)(f"{head.name}: {note}") for note in self._notes),
+                *(prefixed(head.name, note) for note in self._notes),
                 *bad,
                 *mislabelled(head, 1 / interval),
                 *self._coarse,

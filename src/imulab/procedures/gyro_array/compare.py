@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from imulab.device import METHODS
+from imulab.display import prefixed
 from imulab.errors import DataError, ImulabError, OptionError, listed
 from imulab.estimation.decisions import METHOD_FOLLOWS_LESS
 from imulab.estimation.noise_coefficients import allan_deviation
@@ -318,7 +319,7 @@ def compare_methods(
     recording = on_one_clock(recording)
     elements = find_elements(recording)
     rate, notes = sampling_rate(recording)
-    warnings = [*(type(note)(f"{recording.name}: {note}") for note in recording.notes), *notes]
+    warnings = [*(prefixed(recording.name, note) for note in recording.notes), *notes]
     logged = elements.readings(recording)
     readings, aligned = _correct_readings(logged, recording, elements, calibration)
     for a, row in enumerate(elements.names):

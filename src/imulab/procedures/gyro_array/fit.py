@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.device.tables import Fusion
-from imulab.display import Note
+from imulab.display import Note, prefixed
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
 from imulab.estimation.column_noise import noise_lines
 from imulab.estimation.noise_coefficients import COEFFICIENTS, DeviationCurve, coefficients_dict
@@ -109,8 +109,8 @@ def calibrate_array(
         raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
     _check_readings(still, elements)
     left_out = _bridge_rows(still, elements)
-    warnings = [type(note)(f"{still.name}: {note}") for note in still.notes]
-    warnings += [type(note)(f"{still.name}: {note}") for note in left_out.notes()]
+    warnings = [prefixed(still.name, note) for note in still.notes]
+    warnings += [prefixed(still.name, note) for note in left_out.notes()]
     still, cut = _still_part(left_out, elements)
     warnings += cut
     _check_readings(still, elements)
@@ -214,8 +214,8 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
     moving = left_out.recording
     readings = _readings_si(moving, its)
     clipped = _clipped_rows(readings)
-    notes = [type(note)(f"{moving.name}: {note}") for note in moving.notes]
-    notes += [type(note)(f"{moving.name}: {note}") for note in left_out.notes()]
+    notes = [prefixed(moving.name, note) for note in moving.notes]
+    notes += [prefixed(moving.name, note) for note in left_out.notes()]
     if clipped.any():
         notes.append(f"{moving.name}: {int(clipped.sum())} samples at the end of a gyro's range were left out")
     truth = its.truth(moving)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.device.unit import DeviceUnit
-from imulab.display import Bad, Note
+from imulab.display import Bad, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, SegmentError, UnitError
 from imulab.estimation.decisions import BIAS_FOLLOWS_GRAVITY, SCALE_LAW_SCATTERS, SCALE_OFF_UNIT, TURNED_IN_HOLD
 from imulab.estimation.least_squares import chi_square_probability
@@ -225,7 +225,7 @@ def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
         output = scale_output(left_out.recording, size)
         members = np.flatnonzero(holds.recording == number)
         rest, hold_averages, moved = _average_still(holds, members, output, recording)
-        notes += [f"gyro: {recording.name}: {note}" for note in left_out.notes(rest)] + moved
+        notes += [prefixed(f"gyro: {recording.name}", note) for note in left_out.notes(rest)] + moved
         for index, cut in zip(members.tolist(), hold_averages, strict=True):
             cuts[index] = cut
     kept = np.array([cut is not None for cut in cuts])
@@ -708,7 +708,7 @@ def scale_from_turns(
         except SegmentError as error:
             notes.append(Note(f"gyro: no scale factors from {error}"))
             continue
-        notes += [f"{holds.recordings[number].name}: {note}" for note in solved.notes]
+        notes += [prefixed(holds.recordings[number].name, note) for note in solved.notes]
         if 2 * len(solved.segments.start) <= solved.theta.size or not solved.converged:
             notes.append(Note(f"gyro: {case.name}: its turns do not tell scale factors and misalignment apart"))
             continue

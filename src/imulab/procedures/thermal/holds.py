@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.display import Note
+from imulab.display import Note, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import DIRECTION_WANDERS
 from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
@@ -237,11 +237,7 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
         attitudes=tuple(attitudes),
         wander=wander,
         notes=(
-            *(
-                (Note if isinstance(note, Note) else str)(f"{at_rest.recording.name}: {note}")
-                for at_rest in attitudes
-                for note in at_rest.notes
-            ),
+            *(prefixed(at_rest.recording.name, note) for at_rest in attitudes for note in at_rest.notes),
             *drift_notes,
         ),
     )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.device.unit import output_factor
-from imulab.display import UNJUDGED, Bad, Note
+from imulab.display import UNJUDGED, Bad, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
 from imulab.estimation.decisions import SCALE_OFF_UNIT, SCALES_OFF_ALIKE
 from imulab.estimation.least_squares import Observability, coverage_factor, observability
@@ -192,7 +192,7 @@ def fit_gyro_triad(
     solved, noise_notes = (solved, []) if noise is None else _with_noise_record(solved, noise, attitudes, recording)
     known = clock_of_scale(comparison, clock, clock_of, counted=is_counted(check_time(recording)))
     notes = [
-        *(f"gyro: {note}" for note in left_out.notes(_at_rest(attitudes, stamps.on_accel, left_out))),
+        *(prefixed("gyro", note) for note in left_out.notes(_at_rest(attitudes, stamps.on_accel, left_out))),
         *stamp_notes,
         *noise_notes,
         *solved.notes,
