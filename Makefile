@@ -8,7 +8,7 @@ ALONE := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.alone)
 # For what runs as several programs: two at a time, if make was not told otherwise.
 BOTH = $(if $(findstring jobserver,$(MAKEFLAGS)),,-j 2)
 
-.PHONY: demo test test-all pytest pytest-all core fuzz dist wheel-names lint format bench compare footprint truth docs clean
+.PHONY: demo test test-all pytest pytest-all core fuzz dist wheel-names lint format bench compare footprint truth truth-all docs clean
 
 demo: $(ALONE)
 	$(BIN)/imulab demo demo
@@ -74,9 +74,10 @@ footprint: $(STAMP)
 compare: $(STAMP) $(VENV)/.bench
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/comparison.py
 
-# Coverage, warnings and errors under the disturbances and defaults that people have; writes docs/truth.md.
-truth: $(STAMP)
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/truth/run.py
+# Coverage, warnings and errors under the disturbances and defaults that people have; writes docs/truth.md, or with
+# TRUTH="turns scatter" these sections of it. truth-all makes ten times the trials.
+truth truth-all: $(STAMP)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/truth/run.py $(if $(filter truth-all,$@),--all) $(TRUTH)
 
 docs: $(STAMP) $(VENV)/.docs
 	$(BIN)/python docs/make_commands.py

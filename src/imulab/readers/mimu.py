@@ -16,6 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.display import Note
 from imulab.errors import ReadError
 from imulab.readers.selection import Selection
 from imulab.recording import Array, Recording, Source
@@ -74,7 +75,7 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
                 units[title] = unit
     notes = []
     if cut is not None:
-        notes.append(f"truncated: the last frame, at byte {cut}, is cut; read up to there")
+        notes.append(Note(f"truncated: the last frame, at byte {cut}, is cut; read up to there"))
     if skipped:
         notes.append(f"{skipped} bytes between frames were skipped as damaged")
     if lost.any():

@@ -119,7 +119,7 @@ def _survey(path: Path, name: str) -> _Contents:
         shown = end.left[:3].hex(" ")
         raise ReadError(f"{name}: damaged at byte {end.position}: expected a ULog message, found {shown}")
     if end.left and contents.limit == size:
-        contents.notes.append(f"truncated: the last message, at byte {end.position}, is cut; read up to there")
+        contents.notes.append(Note(f"truncated: the last message, at byte {end.position}, is cut; read up to there"))
     if contents.dropouts:
         contents.notes.append(f"{len(contents.dropouts)} dropouts of the logger, {sum(contents.dropouts)} ms in all")
     return contents
