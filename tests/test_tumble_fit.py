@@ -64,6 +64,34 @@ def test_one_attitude_of_outputs_that_never_change_is_refused_by_name(up, loss):
         il.fit_tumble(np.tile(up, (60, 1)), rate=10.0, unit="g", gravity=G, loss=loss)
 
 
+@pytest.mark.parametrize("unit", ["m/s^2", "g"])
+@pytest.mark.parametrize("offset", [-2.0, 1.0, 1.5])
+def test_zeros_of_one_to_two_g_are_found_in_any_unit(unit, offset):
+    rng = np.random.default_rng(5)
+    ups, sigma = reference.random_attitudes(rng, 24), 6e-5
+    scale = 1 + 0.01 * rng.standard_normal(3)
+    data = scale * (ups + offset) + sigma * rng.standard_normal((24, 3))
+    size = G if unit == "m/s^2" else 1.0
+    record = fit(size * data, "auto", unit=unit, sigma=size * sigma).calibration
+    for axis, true in zip("xyz", scale, strict=True):
+        bias, factor = record.parameters[f"bias_{axis}"], record.parameters[f"scale_factor_{axis}"]
+        assert abs(bias.value / G - offset) < 3 * bias.standard_uncertainty / G
+        assert factor.value * G / size == pytest.approx(true, abs=1e-3)
+    assert record.verdict.state == "good"
+
+
+@pytest.mark.parametrize(
+    ("factor", "state", "words"),
+    [(1.05, "good", ""), (1.15, "look", "is the unit right"), (0.5, "bad", "range were twice"), (2.0, "bad", "half")],
+)
+def test_scale_factors_of_another_unit_or_range_are_bad(factor, state, words):
+    rng = np.random.default_rng(6)
+    data = factor * G * (reference.random_attitudes(rng, 24) + 1e-4 * rng.standard_normal((24, 3)))
+    verdict = fit(data, "auto", sigma=1e-4 * G).calibration.verdict
+    assert verdict.state == state
+    assert words in " ".join(verdict.reasons)
+
+
 def test_one_long_and_quiet_hold_does_not_stand_out_of_attitudes_that_scatter():
     named = 0
     for seed in range(20):

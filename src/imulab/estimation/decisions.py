@@ -68,7 +68,9 @@ ATTITUDE_STANDS_OUT = Decision(
 ATTITUDE_STANDS_OUT_BY = Decision(
     5.7e-7, "verdict", {"tumble": 24}, "the same, where the level above would ask for less than 5 sigma", limit=5.0
 )
-ATTITUDES_SCATTER = Decision(0.01, "verdict", {"tumble": 1}, "the attitudes scatter more than their own noise explains")
+ATTITUDES_SCATTER = Decision(
+    0.01, "note", {"tumble": 1}, "the attitudes scatter more than their own noise explains, which uncertainties hold"
+)
 ATTITUDES_TOO_QUIET = Decision(1e-3, "verdict", {"tumble": 1}, "the attitudes scatter less: their noise is overstated")
 RESIDUALS_FOLLOW_DIRECTION = Decision(
     0.01, "verdict", {"tumble": 1}, "the residuals are a function of direction: the model lacks terms (F-test)"
@@ -279,6 +281,9 @@ SCALE_OFF_UNIT = 0.1
 
 Uncalibrated sensors stay within it (ADXL345: 230 to 282 counts/g), and no two units are so near.
 """
+
+SCALE_OF_ANOTHER_UNIT = 0.2
+"""Relative: accelerometers that are farther off their stated unit than this have another one: *bad*."""
 
 NINE_AXES = ("tumble", "tumble gyro", "tumble mag")
 """The parts of a tumble test of accelerometers, gyroscopes and magnetometers."""

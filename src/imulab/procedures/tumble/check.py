@@ -21,7 +21,7 @@ from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_place, lo
 from imulab.options import measure
 from imulab.procedures.result import Record, RecordCheck, as_record, columns_as_rows, probability_fact, probability_text
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
-from imulab.procedures.tumble.checks import check_fresh, made_from
+from imulab.procedures.tumble.checks import check_fresh, check_uncorrected, made_from
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.record import Scaling, scaled_parameters
 from imulab.procedures.tumble.schema import attitudes_of, fit_of, model_of
@@ -388,7 +388,7 @@ def check_tumble(
     OptionError
         The limit is not above 0, or gravity cannot be.
     DataError
-        The magnitudes are nowhere near gravity.
+        The magnitudes are nowhere near gravity, or the recording was corrected by this record.
 
     Examples
     --------
@@ -410,6 +410,7 @@ def check_tumble(
         raise OptionError(f"limit {limit:g} m/s^2: expected more than 0")
     if limit is None and not record.covariance.names:
         raise RecordError("the record states no uncertainties to test against; expected a fixed limit (--limit 1mg)")
+    check_uncorrected(record, attitudes.recording)
     local = _gravity(record, at_place(gravity, latitude, height), attitudes)
     attitudes = _convert_attitudes(record, attitudes)
     g, order = local.value, model_of(record).order

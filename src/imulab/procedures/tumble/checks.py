@@ -22,6 +22,9 @@ _DEAD_SPAN = 0.02  # of the largest span of the three axes: an axis that spans l
 _GYRO_SPAN = 0.05  # of the swing within the recording: outputs whose holds differ by less are rates
 _PROPORTIONAL = 0.9999  # correlation of two axes from which one is a copy of the other
 _FARTHEST = 5.0  # times the usual magnitude, or its inverse: such an attitude is no specific force
+_ANOTHER_UNIT = 2.5  # times g, or its inverse, beyond which nothing is fitted; half and twice g are judged after
+_FLAT = 0.05  # of the largest extent of the outputs: flatter ones do not show their centre
+_FAR_ZERO = 0.3  # of g: where the zero is nearer, a fit may start from 0
 _WORST_RMS = 0.1  # g: what a fit may leave; more is no triad of accelerometers at rest
 _LEAST_EIGENVALUE = 1e-12  # of a stated correlation matrix, for rounding
 _SHAKES, _LEAST_SHORTENING = 3.0, 2e-5  # standard uncertainties of |f| in an attitude; of g
@@ -81,9 +84,9 @@ def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
     unit = parse_unit(attitudes.unit)
     if unit.quantity != "acceleration":
         return
-    lengths = to_si(np.linalg.norm(attitudes.mean, axis=1), unit.symbol)
+    lengths = to_si(np.linalg.norm(attitudes.mean - far_zero(attitudes.mean), axis=1), unit.symbol)
     force = median(lengths)
-    if not gravity / 2 <= force <= 2 * gravity:
+    if not gravity / _ANOTHER_UNIT <= force <= _ANOTHER_UNIT * gravity:
         raise DataError(
             f"{attitudes.recording.name}: columns accel_x accel_y accel_z: the specific force at rest is about "
             f"{from_si(force, unit.symbol):.4g} {unit.symbol}, expected {from_si(gravity, unit.symbol):.4g} "
@@ -98,6 +101,22 @@ def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
             f"the specific force is {from_si(magnitude[index] * gravity, unit.symbol):.4g} {unit.symbol}, expected "
             f"about {from_si(gravity, unit.symbol):.4g} {unit.symbol}{_untimed(attitudes)}"
         )
+
+
+def far_zero(mean: Array) -> Array:
+    """Return the centre of the sphere that outputs at rest lie on, shape (3,); 0 where it is near, or not to be told.
+
+    ``|M|^2 = 2 c M + d`` by least squares: firmware that takes gravity off leaves offsets of 1 g and more.
+    """
+    centred = mean - mean.mean(axis=0)
+    spread = np.linalg.svd(centred, compute_uv=False) if len(mean) >= _ENOUGH_TO_TELL else np.zeros(3)
+    if spread[-1] <= _FLAT * spread[0]:
+        return np.zeros(3)
+    size = float(np.abs(mean).max())
+    rows = np.column_stack([2 * mean / size, np.ones(len(mean))])
+    *centre, rest = np.linalg.lstsq(rows, (mean**2).sum(axis=1) / size**2, rcond=None)[0].tolist()
+    zero = np.array(centre)
+    return size * zero if zero @ zero > _FAR_ZERO**2 * (rest + zero @ zero) else np.zeros(3)
 
 
 def _untimed(attitudes: Attitudes) -> str:
@@ -151,6 +170,24 @@ def check_fresh(residuals: Array, gravity: float, name: str) -> None:
             f"{name}: columns accel_x accel_y accel_z: the specific force at rest is about {force:.4g} m/s^2 under the "
             f"record, expected {gravity:.4g} m/s^2: a wrong unit, or a record of another unit?"
         )
+
+
+def check_uncorrected(record: Calibration, recording: Recording) -> None:
+    """Check that a recording was not corrected by the record that it is to be held against.
+
+    Raises
+    ------
+    DataError
+        It was: what is left says nothing of the unit.
+    """
+    digest = record.to_dict()["content_sha256"]
+    for entry in recording.corrected_by:
+        name, _, corrected = entry.rpartition(" sha256:")
+        if corrected == digest:
+            raise DataError(
+                f"{recording.name}: already corrected by {name}: a second time would take its errors off twice; "
+                "expected the recording as it was measured"
+            )
 
 
 def made_from(record: Calibration, recording: Recording) -> bool:

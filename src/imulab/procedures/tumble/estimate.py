@@ -17,7 +17,7 @@ from imulab.estimation.least_squares import Observability, covariance, huber_inf
 from imulab.gravity import Gravity
 from imulab.procedures.tumble import FROM_DATA, FURTHER, HIGHEST_ORDER, LOSSES, METHODS
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.checks import check_residuals
+from imulab.procedures.tumble.checks import check_residuals, far_zero
 from imulab.procedures.tumble.gyro.rotation import check_axes
 from imulab.procedures.tumble.model import GROUPS, MISALIGNMENTS, parameter_count, parameter_names
 from imulab.procedures.tumble.orders import (
@@ -342,10 +342,10 @@ def _scaled_ageing(ageing: Sequence[float], gravity: float) -> tuple[float | Non
 
 
 def nominal_scaling(attitudes: Attitudes, gravity: float) -> Scaling:
-    """Nominal sensor: by its unit, or for counts and volts from the span of each axis."""
+    """Nominal sensor: by its unit, or for counts and volts from the span of each axis; a far zero by its sphere."""
     unit = parse_unit(attitudes.unit)
     if unit.quantity == "acceleration":
-        return Scaling(np.zeros(3), np.full(3, gravity / to_si(1.0, unit.symbol)))
+        return Scaling(far_zero(attitudes.mean), np.full(3, gravity / to_si(1.0, unit.symbol)))
     high, low = attitudes.mean.max(axis=0), attitudes.mean.min(axis=0)
     return Scaling((high + low) / 2, np.maximum((high - low) / 2, (high - low).max() / 20))
 

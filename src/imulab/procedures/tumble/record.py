@@ -14,13 +14,14 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from imulab.display import Note
+from imulab.display import Bad, Note
 from imulab.errors import first_of
 from imulab.estimation.decisions import (
     ATTITUDE_STANDS_OUT,
     ATTITUDE_STANDS_OUT_BY,
     ATTITUDES_SCATTER,
     ATTITUDES_TOO_QUIET,
+    SCALE_OF_ANOTHER_UNIT,
     SCALE_OFF_UNIT,
 )
 from imulab.estimation.least_squares import Observability, chi_square_probability, coverage_factor, leverage
@@ -59,7 +60,7 @@ from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, StatedGravity, entries
 from imulab.report.parameters import Row, reading_unit, rows_of
 from imulab.report.traces import plain_number
-from imulab.units import parse_unit
+from imulab.units import conversion_factor, parse_unit
 
 if TYPE_CHECKING:
     from imulab.procedures.tumble.montecarlo import MonteCarlo
@@ -74,6 +75,9 @@ _NEGLIGIBLE = 0.01  # µg or ppm: an order that is left out and moves less is no
 FEW_DEGREES, _ENOUGH_DEGREES = 5, 9
 _WORST_MISALIGNMENT = 0.1  # rad: a larger misalignment is an axis with another name or sign
 _MOST_NAMED = 8  # attitudes that a warning names
+_UNITS = ("m/s^2", "g", "mg")
+_RANGES = {0.25: "four times", 0.5: "twice", 2.0: "half", 4.0: "a quarter of"}
+"""How outputs shrink or grow where a sensor is set to another range than its driver assumes."""
 
 
 class FittedAttitudes(Struct, frozen=True):
@@ -193,17 +197,38 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
     """Return warnings of errors too large for an accelerometer: unit or columns are probably stated wrongly."""
     theta, messages = solution.theta[0], []
     if parse_unit(attitudes.unit).quantity == "acceleration":
+        off = [(axis, value) for axis, value in zip(AXES, theta[3:6].tolist(), strict=True)]
         messages += [
             f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?"
-            for axis, value in zip(AXES, theta[3:6], strict=True)
-            if abs(value - 1) > SCALE_OFF_UNIT
+            for axis, value in off
+            if SCALE_OFF_UNIT < abs(value - 1) <= SCALE_OF_ANOTHER_UNIT
         ]
+        if other := [axis for axis, value in off if abs(value - 1) > SCALE_OF_ANOTHER_UNIT]:
+            scale = float(np.median(theta[3:6]))
+            messages.append(
+                Bad(
+                    f"the scale factor of {' '.join(other)} is off by more than {100 * SCALE_OF_ANOTHER_UNIT:.0f} %, "
+                    f"the median scale factor is {scale:.3g}: {_likely_unit(scale, attitudes.unit)}",
+                    f"state the unit that the outputs have (count, if none of {' '.join(_UNITS)} fits)",
+                )
+            )
     messages += [
         f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?"
         for pair, value in zip(MISALIGNMENTS, theta[6:9], strict=False)  # order 0 has none
         if abs(value) > _WORST_MISALIGNMENT
     ]
     return messages
+
+
+def _likely_unit(scale: float, unit: str) -> str:
+    """Return what would explain a median scale factor in a stated unit: another unit, or a range set wrong."""
+    for other in _UNITS:
+        if abs(scale / conversion_factor(other, unit) - 1) < SCALE_OFF_UNIT:
+            return f"the outputs look like {other}, not {unit}"
+    for factor, words in _RANGES.items():
+        if abs(scale / factor - 1) < SCALE_OFF_UNIT:
+            return f"as if the sensor's range were {words} the one that its driver assumes"
+    return f"outputs of a sensor are never so far off {unit}"
 
 
 def assumption_notes(stated: StatedUncertainty | None) -> list[str]:
@@ -552,10 +577,11 @@ def _scatter_warnings(problem: TumbleProblem, solution: TumbleSolution, chi_squa
     if not beyond_noise(problem, chi_square, freedom):
         return []
     added = f"; {_TO_MICRO * solution.excess[0]:.3g} µg were added to each attitude's uncertainty"
-    return [
+    text = (
         "the attitudes scatter more than their own noise explains (reduced chi-square "
         f"{chi_square / freedom:.3g}){added if solution.excess[0] > 0 else ''}"
-    ]
+    )
+    return [Note(text) if solution.excess[0] > 0 else text]
 
 
 def _pattern_warnings(
