@@ -209,6 +209,45 @@ def test_drift_with_temperature_is_told_apart_and_taken_out():
     assert said.model["terms"]["gyro_x"] != "N"
 
 
+def columns_of(disturbance, seed=0, count=60_000):
+    """Three gyroscopes of 0.005 deg/s/sqrt(Hz) at 100 Hz."""
+    rng = np.random.default_rng([seed, 19])
+    t = np.arange(count) / 100
+    made = {f"gyro_{axis}": 0.05 * rng.standard_normal(count) + disturbance(t, rng) for axis in "xyz"}
+    units = {"time": "s"} | dict.fromkeys(made, "deg/s")
+    return il.Recording({"time": t, **made}, units, name="log")
+
+
+def vibration(t, rng):
+    """A resonance whose size swings: by sidebands it is no line."""
+    swing = 1 + 0.6 * np.sin(2 * np.pi * t / 50 + rng.uniform(0, 6))
+    return rng.uniform(0.05, 0.3) * swing * np.sin(2 * np.pi * rng.uniform(8, 15) * t)
+
+
+def narrow_band(t, rng):
+    frequency = rng.uniform(8, 15)
+    p = np.exp(-2 * np.pi * 0.02 * frequency / 100)
+    y = lfilter([1], [1, -2 * p * np.cos(2 * np.pi * frequency / 100), p * p], rng.standard_normal(len(t)))
+    return 0.2 * y / y.std()
+
+
+@pytest.mark.parametrize("disturbance", [vibration, narrow_band])
+def test_vibration_is_no_change_of_level(disturbance):
+    record = il.fit_noise(columns_of(disturbance, count=30_000)).calibration
+    assert not any("level changes" in line for line in record.warnings)
+
+
+def test_a_small_step_is_named_and_not_only_a_random_walk():
+    """.006 deg/s, 13 standard uncertainties: a model of white noise and walk took it for walk without a word."""
+    record = il.fit_noise(columns_of(lambda t, _: np.where(t > 250, 0.006, 0.0))).calibration
+    for column in ("gyro_x", "gyro_y", "gyro_z"):
+        (step,) = record.fit["columns"][column]["steps"]
+        assert step["time"]["value"] == pytest.approx(250, abs=10)
+        assert step["size"]["value"] == pytest.approx(np.radians(0.006), rel=0.35)
+    taken = il.fit_noise(columns_of(lambda t, _: np.where(t > 250, 0.006, 0.0)), steps="remove").calibration
+    assert set(taken.model["terms"].values()) == {"N"}
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_temperature_in_whole_degrees_gives_the_slope_and_says_what_it_hides(seed):
     """Regression on the steps themselves gives a thirteenth of the slope."""

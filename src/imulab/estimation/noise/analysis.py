@@ -496,6 +496,11 @@ class Analysis:
         """Which parameters the chosen candidate has, shape (8,)."""
         return np.asarray(self.choice.models[0, self.index])
 
+    def cost(self, stretches: Sequence[Stretch], model: Flags) -> float:
+        """Return the deviance of a model fitted to other stretches with the weights of these, plus 4 a parameter."""
+        _, deviance = self._refit([each for stretch in stretches for each in stretch.spectra], model)
+        return float(deviance + PER_PARAMETER * model.sum())
+
     @property
     def letters(self) -> str:
         """The terms of the chosen candidate."""
@@ -539,6 +544,9 @@ class Analysis:
         for each in stretches:
             stop = start + len(each.spectra)
             level = variances_of_coefficients(variances[start:stop], each)
+            # Vibration beyond the band, and bins off the model, would show as steps at the ends of the stretch.
+            share = counted(replace(each, spectra=self.spectra[start:stop]))
+            level = np.where(share > 0, level / np.maximum(share, 1e-300), np.inf)
             steps.append(find_steps(each.slow, level, each.count, each.interval, limit))
             start = stop
         return steps
@@ -547,15 +555,16 @@ class Analysis:
         """Return the column's dependence on covariates, given as slow coefficients of each stretch, shape (k, J)."""
         return regress(self.stretches, covariates, self._refit)
 
-    def _refit(self, spectra: Sequence[Spectrum]) -> tuple[Sequence[Array], float]:
+    def _refit(self, spectra: Sequence[Spectrum], model: Flags | None = None) -> tuple[Sequence[Array], float]:
         """Return variances and deviance of the chosen model fitted to spectra with the weights of the analysed ones."""
+        model = self.model if model is None else model
         bins = prepare(
             [
                 Spectrum(s.interval, s.count, s.first, s.last, s.power, mine.freedom)
                 for s, mine in zip(spectra, self.spectra, strict=True)
             ]
         )
-        refitted = fit(bins, self.model[None], self.limits, bins.power[None], bins.freedom[None])
+        refitted = fit(bins, model[None], self.limits, bins.power[None], bins.freedom[None])
         return _split(bins.variances(refitted.values)[0], self.spectra), float(refitted.deviance[0])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -278,6 +279,9 @@ def _largest_step(c: Array, variances: Array, count: int) -> tuple[float, float,
     weight = 1 / variances[: len(used)] / s**2
     information = (weight.sum() - _cosines(weight, grid)) / count
     z = np.abs(score) / np.sqrt(np.maximum(information, 1e-300))
+    beside = math.ceil(_BLOCK * grid / count)  # places as near to an end as a spike or knock is long are no level
+    if 2 * beside < len(z):
+        z[:beside] = z[len(z) - beside :] = 0.0
     best = int(np.argmax(z))
     size, u = float(score[best] / information[best]), float(1 / np.sqrt(information[best]))
     return (best + 1) * count / grid, size, u

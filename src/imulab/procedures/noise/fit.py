@@ -596,6 +596,9 @@ def _numbers(values: Array) -> list[float]:
 
 
 _SAME_RATE = 0.01  # relative: logs of other rates have no common spectrum
+_FEW_STEPS, _STEP_PRICE, _WITHOUT_SLOW = 2, 14.0, ("N", "NQ")
+"""Most steps that are taken for what looks like slow noise; what each must gain over it, for its size and the choice of
+its place among a hundred; models that have no slow noise."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -848,11 +851,12 @@ def _fit_column(
     stretches = [each for rest in rests for each in rest.stretches(name)]
     spikes, lines = sum(each.spikes for each in stretches), _longest(stretches).lines
     analysis = analysed(stretches, candidates, band)
-    steps = analysis.steps(stretches, LEVEL_STEP_PERHAPS.limit)
-    if any(steps):  # with the steps in the data, the model takes some of them for random walk
-        without = analysed(without_steps(stretches, steps), candidates, band)
-        steps = without.steps(stretches)
-        analysis = analysed(without_steps(stretches, steps), candidates, band) if flat and any(steps) else analysis
+    steps = _steps_for_slow_noise(stretches, analysis, candidates)
+    perhaps = [] if steps else analysis.steps(stretches, LEVEL_STEP_PERHAPS.limit)
+    if any(perhaps):  # with the steps in the data, the model takes some of them for random walk
+        steps = analysed(without_steps(stretches, perhaps), candidates, band).steps(stretches)
+    if flat and any(steps):
+        analysis = analysed(without_steps(stretches, steps), candidates, band)
     drifts = []
     for covariate, slow in _covariates(temperatures, analysis.stretches).items():
         regression = analysis.regressed(slow)
@@ -875,6 +879,28 @@ def _fit_column(
         tuple(step for each in steps for step in each),
         tuple(drifts),
     )
+
+
+def _steps_for_slow_noise(
+    stretches: Sequence[Stretch], analysis: Analysis, candidates: tuple[str, ...]
+) -> list[tuple[LevelChange, ...]]:
+    """Return the changes of level without which a column has no slow noise, where they explain it better.
+
+    Under a model with random walk a step is lost among its steps, so that it is looked for under white noise alone.
+    """
+    if candidates != CANDIDATES or analysis.letters in _WITHOUT_SLOW:
+        return []
+    highest = analysis.band.highest
+    steps = analysed(stretches, ("N",), highest).steps(stretches, LEVEL_STEP_PERHAPS.limit)
+    count = sum(map(len, steps))
+    if not 0 < count <= _FEW_STEPS:
+        return []
+    cleaned = without_steps(stretches, steps)
+    left = analysed(cleaned, candidates, highest)
+    if left.letters not in _WITHOUT_SLOW:
+        return []
+    gain = left.cost(stretches, analysis.model) - left.cost(cleaned, left.model)
+    return steps if gain > _STEP_PRICE * count else []
 
 
 def _longest(stretches: Sequence[Stretch]) -> Stretch:
