@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 import imulab as il
 from imulab.cli import main
-from imulab.errors import DataError, OptionError, UnitError
+from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.estimation.noise.simulate import simulated
 from imulab.procedures.noise.figures import exhibits
 from imulab.procedures.views import render_record
@@ -191,6 +191,29 @@ def test_two_records_are_compared(record):
     changed = il.compare_records(record, il.fit_noise(noisier).calibration)
     assert not any(change.significant for change in same.changes)
     assert {"gyro_x_white", "accel_z_white"} <= {change.name for change in changed.changes if change.significant}
+
+
+def test_magnetometers_that_are_left_out_are_named():
+    made = il.simulate_noise(white="0.3 deg/sqrt(h)", duration="1 min", columns=["gyro_x"])
+    field = {"mag_x": 50 + 0.1 * np.random.default_rng(1).standard_normal(len(made))}
+    both = made.with_columns(field, {"mag_x": "uT"})
+    record = il.fit_noise(both).calibration
+    assert "mag_x: magnetometers are not fitted unless --columns names them" in record.warnings
+    assert record.verdict.state == "good"
+    assert "mag_x_white" in il.fit_noise(both, columns=["mag_x"]).calibration.parameters
+
+
+def test_like_is_compared_with_like():
+    """Between models of other terms only the white noise means the same, and not beside Gauss-Markov noise."""
+    made = il.simulate_noise(white="0.3 deg/sqrt(h)", walk="30 deg/h/sqrt(h)", duration="5 min", columns=["gyro_x"])
+    walk, flicker, markov = (il.fit_noise(made, terms=terms).calibration for terms in ("NK", "NB", "NG"))
+    compared = il.compare_records(walk, flicker)
+    assert [change.name for change in compared.changes] == ["gyro_x_white"]
+    assert compared.probability > 0.01
+    assert {"gyro_x_walk", "gyro_x_flicker"} <= set(compared.left_out)
+    assert len(il.compare_records(walk, walk).changes) >= 2
+    with pytest.raises(RecordError, match=r"no parameter that means the same in both: .*gyro_x NK and NG"):
+        il.compare_records(walk, markov)
 
 
 def test_drift_with_temperature_is_told_apart_and_taken_out():

@@ -84,6 +84,11 @@ def compared(
         for name in first.parameters
         if name in second.parameters and (same_meaning is None or same_meaning(name, first, second))
     ]
+    if not shared:
+        raise RecordError(
+            "the two records have no parameter that means the same in both: their models differ "
+            f"({'; '.join(_model_differences(first.model, second.model)) or 'in all names'})"
+        )
     judged = [name for name in shared if _uncertainty(name, first, second)]
     if not judged:
         raise RecordError("a record without uncertainties cannot be compared")

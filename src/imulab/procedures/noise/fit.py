@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.arguments import checked
+from imulab.columns import kind_of
 from imulab.display import Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed, several
 from imulab.estimation.column_noise import noise_columns
@@ -198,6 +199,9 @@ def findings(columns: Mapping[str, ColumnModel], rests: Sequence[Rest], horizon:
         for kind, text in _describe_column(column):
             columns_by_text.setdefault((kind, text), []).append(name)
     messages = [note for rest in rests for note in rest.notes]
+    left = [name for name in rests[0].recording.columns if kind_of(name) == "mag" and name not in columns]
+    if left and len(left) == sum(kind_of(name) == "mag" for name in rests[0].recording.columns):
+        messages.append(Note(f"{_named(left)}: magnetometers are not fitted unless --columns names them"))
     for (kind, text), names in columns_by_text.items():
         messages.append(kind(f"{_named(names)}: {text}"))
     longest = max(column.analysis.length for column in columns.values())

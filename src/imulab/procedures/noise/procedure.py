@@ -76,6 +76,11 @@ class NoiseProcedure(Procedure):
 
         check(record)
 
+    def same_meaning(self, name: str, first: Calibration, second: Calibration) -> bool:
+        from imulab.procedures.noise.schema import same_meaning
+
+        return same_meaning(name, first, second)
+
     def exhibits(self, record: Calibration) -> Exhibits:
         from imulab.procedures.noise.figures import exhibits
 

@@ -408,3 +408,18 @@ def split(name: str) -> tuple[str, str]:
         if name.endswith(f"_{term}"):
             return name[: -len(term) - 1], term
     return name, ""
+
+
+# Two records.
+
+
+def same_meaning(name: str, first: Calibration, second: Calibration) -> bool:
+    """Return whether a parameter means the same in two records: where its column has the same terms in both.
+
+    A term takes up what another model gives to another term. White noise alone is the same beside slow noise of any
+    kind, but not beside Gauss-Markov noise or quantisation, which may be as fast.
+    """
+    terms: list[dict[str, str]] = [record.model.get("terms", {}) for record in (first, second)]
+    column = max((each for each in terms[0] if name.startswith(f"{each}_")), key=len, default="")
+    models = [each.get(column, "") for each in terms]
+    return models[0] == models[1] or (name == f"{column}_white" and not set("GQ") & set("".join(models)))
