@@ -135,7 +135,7 @@ _LOOK = "look at the figures of the report (--report FILE.html) for what the rea
 _CLAUSES = re.compile(r"[:;] (?![^(]*\))")  # not those within parentheses
 _IMPERATIVE = re.compile(
     r"(?:add|ask|calibrate|check|choose|compare|correct|cut|drop|export|find|fit|fix|give|hold|keep|leave|let|look|make|"
-    r"measure|mount|move|name|open|place|plan|put|read|record|repeat|run|see|set|simulate|start|state|take|test|turn|"
+    r"measure|mend|mount|move|name|open|place|plan|put|read|record|repeat|run|see|set|simulate|start|state|take|test|turn|"
     r"update|use|wait|warm|write)\b"
 )
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
 
 from msgspec import Struct
 
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import OptionError, quoted
 from imulab.options import Group, text
 from imulab.quantities import in_si, quantity, with_uncertainty
@@ -118,13 +118,21 @@ def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
         allowed = _TOLD_APART * head.value + 2 * gravity.standard_uncertainty
         if abs(gravity.value - head.value) > allowed:
             return [
-                f"gravity {gravity.value:.6g} m/s^2 was used, but the head of {recording.name} says {head.value:.6g} "
-                f"m/s^2: scale factors differ by {_TO_MICRO * (head.value / gravity.value - 1):+.0f} ppm between the "
-                "two"
+                Finding(
+                    f"gravity {gravity.value:.6g} m/s^2 was used, but the head of {recording.name} says "
+                    f"{head.value:.6g} m/s^2: scale factors differ by "
+                    f"{_TO_MICRO * (head.value / gravity.value - 1):+.0f} ppm between the two",
+                    "correct the gravity in the head of the file, or leave --gravity out",
+                )
             ]
     low, high = _ON_EARTH
     if not low <= gravity.value <= high:
-        return [f"gravity {gravity.value:g} m/s^2 is found nowhere on Earth ({low} to {high} m/s^2)"]
+        return [
+            Finding(
+                f"gravity {gravity.value:g} m/s^2 is found nowhere on Earth ({low} to {high} m/s^2)",
+                "state the local gravity (--latitude, --height)",
+            )
+        ]
     if head is not None and gravity.note and abs(gravity.value - head.value) > _TOLD_APART * head.value:
         other = f"the head of {recording.name} says {head.value:.6g} m/s^2 (--gravity keeps that)"
         return [Note(f"{gravity.note}; {other}")]

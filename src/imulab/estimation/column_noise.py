@@ -181,7 +181,7 @@ def _noises(
             notes.append(_step_line(recording, name, step))
         if not isinstance(taus, str) or taus != "octave":
             noises[name] = replace(noises[name], curve=allan_deviation(samples, rate, taus))
-    return noises, notes + [type(line)(f"{recording.name}: {line}") for line in noise_lines(noises)]
+    return noises, notes + [prefixed(recording.name, line) for line in noise_lines(noises)]
 
 
 def _mended(recording: Recording, names: list[str]) -> tuple[Recording, float, list[str]]:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.decisions import CYCLES_SCATTER
 from imulab.estimation.least_squares import chi_square_limit, excess_variance
@@ -289,9 +289,12 @@ def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> L
             lines[run.index] = _run_line(run, manifest, method, directed)
     if undirected:
         warnings.append(
-            f"{manifest.name}: no table_angle at level {', '.join(map(str, sorted(set(undirected))))}: magnitudes of "
-            "the two senses were averaged, so that flexure and tilt do not cancel; the direction of the drift, which "
-            "apply needs, is not known"
+            Finding(
+                f"{manifest.name}: no table_angle at level {', '.join(map(str, sorted(set(undirected))))}: magnitudes "
+                "of the two senses were averaged, so that flexure and tilt do not cancel; the direction of the drift, "
+                "which apply needs, is not known",
+                "record table_angle in every run",
+            )
         )
     members = [[lines[run.index] for run in groups[key]] for key in keys]
     repeatability = find_repeatability(_deviations(members))

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.display import Finding
 from imulab.errors import DataError
 from imulab.estimation.decisions import EARTH_LINE_SEEN, RIG_ERROR
 from imulab.estimation.least_squares import coverage_factor
@@ -800,8 +801,11 @@ def find_rates(cells: Cells, place: str) -> Rates:
     if not encoder and (table_shift is None or not _significant(solution, LINE, fog, table_noise)):
         origin, shifts[0] = "manifest", 0.0
         warnings.append(
-            f"{place}: no significant FOG line at the table rate{_strongest_elsewhere(cells, fog)}; the manifest's "
-            "rate was used as it is"
+            Finding(
+                f"{place}: no significant FOG line at the table rate{_strongest_elsewhere(cells, fog)}; the manifest's "
+                "rate was used as it is",
+                "check table_rate in the manifest, or record table_angle",
+            )
         )
     elif not encoder and refined is not None:
         table_uncertainty = float(np.sqrt(refined.table_gain * table_noise[fog, fog].real))
@@ -814,7 +818,10 @@ def find_rates(cells: Cells, place: str) -> Rates:
     if net_start is None or not solution.kept[ROOM] or not _significant(solution, ROOM, fog, net_noise):
         shifts[1] = 0.0
         warnings.append(
-            f"{place}: no significant Earth-rate line of the FOG at the net rate {in_degrees(cells.net_rate)}"
+            Finding(
+                f"{place}: no significant Earth-rate line of the FOG at the net rate {in_degrees(cells.net_rate)}",
+                "check arm_rate and table_rate of this run in the manifest",
+            )
         )
     else:
         assert refined is not None
@@ -841,8 +848,12 @@ def _check_net(expected: float, measured: float, reach: float, place: str) -> li
         raise _mismatch(expected, measured, place)
     if off > max(_DOUBT, reach):
         return [
-            f"{place}: the net rate measured on Earth rate is {in_degrees(measured)} ± {in_degrees(reach / 3)}, "
-            f"{in_degrees(measured - expected)} from arm_rate less table_rate: the difference is in u of this run's K"
+            Finding(
+                f"{place}: the net rate measured on Earth rate is {in_degrees(measured)} ± {in_degrees(reach / 3)}, "
+                f"{in_degrees(measured - expected)} from arm_rate less table_rate: the difference is in u of this "
+                "run's K",
+                "check arm_rate and table_rate of this run in the manifest",
+            )
         ]
     return []
 
@@ -880,7 +891,7 @@ def _check_units(solution: LineRegression, noise: Complex, place: str) -> list[s
             )
             if name == "dtg_x":
                 raise DataError(message)
-            warnings.append(message)
+            warnings.append(Finding(message, "check axes and signs of the channels, and title the columns accordingly"))
     return warnings
 
 

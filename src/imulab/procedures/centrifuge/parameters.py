@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.display import Finding
 from imulab.errors import OptionError, listed
 from imulab.estimation.decisions import CURVE_TERM
 from imulab.estimation.least_squares import blend, chi_square_limit, chi_square_probability, coverage_factor
@@ -278,10 +279,13 @@ def _correct_delay(
         shown.append(
             _Finding(
                 1j * delay.axis * test.table[:, None] * drift,
-                f"X turns against table_angle as if it were {1e3 * delay.axis:.3g} ± "
-                f"{1e3 * delay.axis_uncertainty:.1g} ms late (differential flexure looks the same): "
-                "added to the uncertainty of the direction, which it "
-                f"changes by up to {np.degrees(abs(delay.axis) * top):.2g} deg at the highest level",
+                Finding(
+                    f"X turns against table_angle as if it were {1e3 * delay.axis:.3g} ± "
+                    f"{1e3 * delay.axis_uncertainty:.1g} ms late (differential flexure looks the same): "
+                    "added to the uncertainty of the direction, which it "
+                    f"changes by up to {np.degrees(abs(delay.axis) * top):.2g} deg at the highest level",
+                    "take table_angle and the gyroscope's channels by one clock",
+                ),
             )
         )
     return late, shown
@@ -309,11 +313,14 @@ def _correct_mismatch(
         shown.append(
             _Finding(
                 -size * (unit * turn * test.fog)[:, None] * _QUARTER[:axes] * (np.arange(axes) == axis),
-                f"Earth rate shows a {name} of {1e3 * value:.3g} ± {1e3 * ratio.uncertainty:.1g} {scale} between "
-                f"{'XY'[axis]} and the FOG, which would change K at the highest level by up to "
-                f"{100 * abs(value) * test.fog_share:.2g} %: "
-                f"{'corrected' if correct else 'method fourier does not correct it'}, and what is uncertain of it "
-                "is in u; both senses of rotation remove it",
+                Finding(
+                    f"Earth rate shows a {name} of {1e3 * value:.3g} ± {1e3 * ratio.uncertainty:.1g} {scale} between "
+                    f"{'XY'[axis]} and the FOG, which would change K at the highest level by up to "
+                    f"{100 * abs(value) * test.fog_share:.2g} %: "
+                    f"{'corrected' if correct else 'method fourier does not correct it'}, and what is uncertain of it "
+                    "is in u; both senses of rotation remove it",
+                    "run both senses of rotation",
+                ),
                 (name,) if axis == 0 else (),
             )
         )
@@ -392,6 +399,16 @@ class Estimates:
     warnings: tuple[str, ...] = field(default=())
 
 
+def _warn_weak_lines(factors: Sequence[_Row], uncertainties: Sequence[float]) -> list[str]:
+    """Return a message for each level whose line is below four standard uncertainties, (rad/s)/(m/s^2)."""
+    action = "record longer runs at this level, or start at a higher one"
+    return [
+        Finding(f"{row.name}: the line is hardly above the noise ({row.value / max(u, 1e-300):.1f} sigma)", action)
+        for row, u in zip(factors, uncertainties, strict=True)
+        if row.value < 4 * u
+    ]
+
+
 def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "auto") -> Estimates:
     """Return the parameters of all axes and both positions of the spin axis.
 
@@ -441,12 +458,7 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
                 direction, probability = _direction(prefix, items, mine, axis, V, size, width)
                 rows.append(direction)
                 turning[prefix] = probability
-            for row, index in zip(K, mine, strict=True):
-                u = float(np.sqrt(items[index].component_variance[axis]))
-                if row.value < 4 * u:
-                    warnings.append(
-                        f"{row.name}: the line is hardly above the noise ({row.value / max(u, 1e-300):.1f} sigma)"
-                    )
+            warnings += _warn_weak_lines(K, [float(np.sqrt(items[index].component_variance[axis])) for index in mine])
     cross = _cross(items, axes, size, width, manifest, rows, warnings)
     J = np.array([row.derivative for row in rows])
     values = np.array([row.value for row in rows])
@@ -577,7 +589,12 @@ def _cross(
         if spin_axis != "up" or down is None:
             continue
         if not (items[up].directed and items[down].directed):
-            warnings.append(f"level {number}: no table_angle, so that spin-axis cross terms cannot be separated")
+            warnings.append(
+                Finding(
+                    f"level {number}: no table_angle, so that spin-axis cross terms cannot be separated",
+                    "record table_angle in every run",
+                )
+            )
             continue
         difference = (items[up].line - items[down].line) / (2 * manifest.gravity)
         by_level[number] = (difference, (items[up].line + items[down].line) / 2)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.display import Finding
 from imulab.estimation.decisions import CURVE_MISSES, DRIFT_DIRECTION_TURNS
 from imulab.procedures.centrifuge.levels import Levels, RunLine, amplitude_lost, axis_lines
 from imulab.procedures.centrifuge.lines import in_degrees
@@ -253,34 +254,52 @@ def _rounded(values: Array, digits: int) -> list[float]:
     return [float(f"{value:.{digits}g}") for value in values.tolist()]
 
 
+def _warn_fourier(manifest: Manifest, runs: Sequence[LoadedRun]) -> list[str]:
+    """Return messages on runs that are too short, or too far off their table rate, for method fourier."""
+    action = "reduce the runs again with --method least-squares"
+    messages: list[str] = []
+    few = [run for run in runs if run.whole_periods is not None and run.whole_periods.periods <= 500]
+    if few:
+        least = min(few, key=lambda run: run.whole_periods.periods if run.whole_periods else 0)
+        periods = least.whole_periods.periods if least.whole_periods else 0
+        messages.append(
+            Finding(
+                f"{len(few)} runs have 500 table periods or fewer (least: {least.run.file}, {periods}): drift "
+                "leaks into whole-period sums; method least-squares has no such limit",
+                action,
+            )
+        )
+    off = {run.index: amplitude_lost(run, manifest, "fourier") for run in runs}
+    worst = max(runs, key=lambda run: off[run.index])
+    if off[worst.index] > _LOST:
+        messages.append(
+            Finding(
+                f"method fourier takes the manifest's table rate: in {worst.run.file} the rate measured is "
+                f"{in_degrees(abs(worst.rates.table_rate))}, not {in_degrees(worst.run.table_rate)}, which costs "
+                f"{100 * off[worst.index]:.2g} % of the amplitude (in the uncertainty); method least-squares "
+                "follows it",
+                action,
+            )
+        )
+    return messages
+
+
 def _warnings(
     manifest: Manifest, runs: Sequence[LoadedRun], levels: Levels, estimates: Estimates, method: str
 ) -> tuple[str, ...]:
     messages = [message for run in runs for message in run.warnings]
     messages += [*levels.warnings, *estimates.warnings]
     if method == "fourier":
-        few = [run for run in runs if run.whole_periods is not None and run.whole_periods.periods <= 500]
-        if few:
-            least = min(few, key=lambda run: run.whole_periods.periods if run.whole_periods else 0)
-            periods = least.whole_periods.periods if least.whole_periods else 0
-            messages.append(
-                f"{len(few)} runs have 500 table periods or fewer (least: {least.run.file}, {periods}): drift leaks "
-                "into whole-period sums; method least-squares has no such limit"
-            )
-        off = {run.index: amplitude_lost(run, manifest, method) for run in runs}
-        worst = max(runs, key=lambda run: off[run.index])
-        if off[worst.index] > _LOST:
-            messages.append(
-                f"method fourier takes the manifest's table rate: in {worst.run.file} the rate measured is "
-                f"{in_degrees(abs(worst.rates.table_rate))}, not {in_degrees(worst.run.table_rate)}, which costs "
-                f"{100 * off[worst.index]:.2g} % of the amplitude (in the uncertainty); method least-squares follows it"
-            )
+        messages += _warn_fourier(manifest, runs)
     for prefix, fitted in estimates.curves.items():
         if fitted.probability is not None and fitted.probability < CURVE_MISSES.level:
             messages.append(
-                f"{prefix.rstrip('_')}: K(a) is not described by the curve {fitted.model} within its uncertainty "
-                f"(chi-square "
-                f"{fitted.chi_square:.1f} with {fitted.freedom} degrees of freedom)"
+                Finding(
+                    f"{prefix.rstrip('_')}: K(a) is not described by the curve {fitted.model} within its uncertainty "
+                    f"(chi-square "
+                    f"{fitted.chi_square:.1f} with {fitted.freedom} degrees of freedom)",
+                    "take the drift factors of the levels instead of the curve, and run more levels",
+                )
             )
     for prefix, probability in estimates.turning.items():
         if probability < DRIFT_DIRECTION_TURNS.level:
@@ -291,19 +310,25 @@ def _warnings(
             ]
             span = float(np.ptp(np.unwrap(np.radians(angles))))
             messages.append(
-                f"{prefix.rstrip('_')}: the direction of the drift turns by {np.degrees(span):.2g} deg between the "
-                f"levels: "
-                "nonlinearity that the magnitude does not show"
+                Finding(
+                    f"{prefix.rstrip('_')}: the direction of the drift turns by {np.degrees(span):.2g} deg between the "
+                    f"levels: "
+                    "nonlinearity that the magnitude does not show",
+                    "check the tilt of the table at these levels, and run them again",
+                )
             )
     senses = {run.run.sense for run in runs}
     if len(senses) == 1 and len(runs) > 1:
         messages.append(
-            "one sense of rotation only: differential flexure, scale mismatch and a delay of the FOG within what the "
-            "error budget leaves open are not separated from K(a), and not in u; run both senses"
-            + (
-                ""
-                if all(run.encoder for run in runs)
-                else "; no table_angle: no direction of the drift, which apply needs"
+            Finding(
+                "one sense of rotation only: differential flexure, scale mismatch and a delay of the FOG within what "
+                "the error budget leaves open are not separated from K(a), and not in u; run both senses"
+                + (
+                    ""
+                    if all(run.encoder for run in runs)
+                    else "; no table_angle: no direction of the drift, which apply needs"
+                ),
+                "run both senses of rotation, with table_angle recorded",
             )
         )
     return tuple(dict.fromkeys(messages))

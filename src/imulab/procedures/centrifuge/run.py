@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.display import Finding, Note
 from imulab.errors import DataError, ImulabError, UnitError
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.procedures.centrifuge.lines import (
@@ -23,6 +24,7 @@ from imulab.procedures.centrifuge.lines import (
     Cells,
     CellSamples,
     Complex,
+    LineRegression,
     PeriodResult,
     PeriodSums,
     Rates,
@@ -172,10 +174,10 @@ def steady_part(cells: Cells, place: str) -> tuple[Cells, list[str]]:
     total = whole.start + whole.duration
     if first:
         warnings.append(
-            f"{place}: a rate ramp in the first {begin - whole.start:.1f} s was cut; used from {begin:.1f} s"
+            Note(f"{place}: a rate ramp in the first {begin - whole.start:.1f} s was cut; used from {begin:.1f} s")
         )
     if last < len(whole.centre):
-        warnings.append(f"{place}: a rate ramp in the last {total - end:.1f} s was cut; used up to {end:.1f} s")
+        warnings.append(Note(f"{place}: a rate ramp in the last {total - end:.1f} s was cut; used up to {end:.1f} s"))
     return cells, warnings
 
 
@@ -296,7 +298,11 @@ def _slow_change(deviation: Complex, size: Array, place: str) -> list[str]:
         )
     if worst > _SLOW_WARNING:
         return [
-            f"{place}: the line at the table rate wanders by {100 * worst:.1f} % over the run; are the rates steady?"
+            Finding(
+                f"{place}: the line at the table rate wanders by {100 * worst:.1f} % over the run; are the rates "
+                "steady?",
+                "hold arm rate and table rate steady, and record this run again",
+            )
         ]
     return []
 
@@ -505,6 +511,29 @@ class LoadedRun:
     common: Complex | None = None
 
 
+def _warn_short_run(solution: LineRegression, blocks: int, place: str) -> list[str]:
+    """Return messages on a run that is too short for its noise, or for all of its lines."""
+    action = "record longer runs"
+    messages: list[str] = []
+    if not blocks:
+        text = f"{place}: too short for noise from blocks of the run; white noise is assumed"
+        messages.append(Finding(text, action))
+    if not solution.kept.all():
+        text = f"{place}: too short to tell all lines apart; some harmonics or the net rate were left out"
+        messages.append(Finding(text, action))
+    return messages
+
+
+def _warn_dead_channels(names: Sequence[str], cells: Cells, place: str) -> list[str]:
+    """Return a message for each channel that never changes."""
+    action = "check the cable of this channel, and record the run again"
+    return [
+        Finding(f"{place}: column {name} never changes; is it connected?", action)
+        for name, values in zip(names, cells.series, strict=True)
+        if np.ptp(values) == 0
+    ]
+
+
 def reduce_run(
     blocks: Iterable[Recording],
     manifest: Manifest,
@@ -546,16 +575,10 @@ def reduce_run(
     scattered = scatter(used, solution)
     if scattered is None:
         noise, freedom, blocks_used = residual_noise(used, solution), float(max(used.samples - 10, 1)), 0
-        warnings.append(f"{place}: too short for noise from blocks of the run; white noise is assumed")
     else:
         noise, freedom, blocks_used = scattered.noise, scattered.freedom, len(scattered.centre)
-    if not solution.kept.all():
-        warnings.append(f"{place}: too short to tell all lines apart; some harmonics or the net rate were left out")
-    warnings += [
-        f"{place}: column {name} never changes; is it connected?"
-        for name, values in zip(channels.names, cells.series, strict=True)
-        if np.ptp(values) == 0
-    ]
+    warnings += _warn_short_run(solution, blocks_used, place)
+    warnings += _warn_dead_channels(channels.names, cells, place)
     encoder = cells.series_angle is not None
     # The regression's phase is that of the cells' rate at the middle of the run; chi starts at 0 without encoder.
     turn = np.exp(1j * solution.table_shift * (solution.middle - cells.start))

@@ -327,7 +327,7 @@ def compare_methods(
             raise DataError(f"{recording.name}: columns {row[0]} to {row[-1]}: expected finite readings, found none")
     checks = Checks(elements.names)
     checks.watch(logged)
-    warnings += [type(line)(f"{recording.name}: {line}") for line in checks.lines(turned=not aligned)]
+    warnings += [prefixed(recording.name, line) for line in checks.lines(turned=not aligned)]
     truth = elements.truth(recording)
     start, stop = (0, len(recording)) if truth is not None else _longest_quiet(recording, readings, rate)
     if stop - start < len(recording):
@@ -342,7 +342,7 @@ def compare_methods(
     figures, data = _evaluate(recording, elements, runs, readings, reference, rate, slice(start, stop))
     warnings += _warn_filtering(figures, runs.response, rate)
     if not isinstance(figures["feedback"], str):
-        warnings += [type(line)(f"{recording.name}: {line}") for line in feedback_notes(elements.count, rate)]
+        warnings += [prefixed(recording.name, line) for line in feedback_notes(elements.count, rate)]
     record = Calibration(
         procedure="gyro_array",
         parameters={},

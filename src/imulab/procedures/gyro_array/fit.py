@@ -116,7 +116,7 @@ def calibrate_array(
     _check_readings(still, elements)
     rate, timing = sampling_rate(still)
     rest, notes = at_rest(_readings_si(still, elements), rate, elements, noise, still.metadata)
-    warnings += [*(f"{still.name}: {line}" for line in notes), *timing]
+    warnings += [*(prefixed(still.name, line) for line in notes), *timing]
     aligned = None
     if moving is not None:
         aligned, more = _align_in_motion(moving, elements, rest)
@@ -124,7 +124,7 @@ def calibrate_array(
     readings = _readings_si(still, elements) - rest.bias
     checks = Checks(elements.names)
     checks.watch(readings)
-    warnings += [type(line)(f"{still.name}: {line}") for line in checks.units()]
+    warnings += [prefixed(still.name, line) for line in checks.units()]
     if aligned is not None:
         readings = np.einsum("iab,mbi->mai", np.linalg.inv(aligned.sensing), readings)
     covariance, used, count = _allan_covariance(readings, rest.rate, averaging_time)
@@ -136,11 +136,11 @@ def calibrate_array(
             )
         )
     noises = {elements.names[a][i]: gyro_noise for a, row in enumerate(rest.noise) for i, gyro_noise in enumerate(row)}
-    warnings += [type(line)(f"{still.name}: {line}") for line in noise_lines(noises)]
+    warnings += [prefixed(still.name, line) for line in noise_lines(noises)]
     if noise is None:
         warnings += [Note(f"{still.name}: {line}") for line in unseen(noises, rest)]
     if fusion is not None and fusion.method == "feedback":
-        warnings += [type(line)(f"{still.name}: {line}") for line in feedback_notes(elements.count, rest.rate)]
+        warnings += [prefixed(still.name, line) for line in feedback_notes(elements.count, rest.rate)]
     record = _make_record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
     if fusion is not None:
         record = replace(record, model={**record.model, "fusion": fusion.to_dict()})
@@ -224,7 +224,7 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
     kept = readings[~clipped] - rest.bias
     checks = Checks(its.names)
     checks.watch(kept)
-    notes += [type(line)(f"{moving.name}: {line}") for line in checks.units()]
+    notes += [prefixed(moving.name, line) for line in checks.units()]
     notes += [Note(f"{moving.name}: {line}; the record puts it right") for line in checks.turned()]
     if len(kept) < _FEWEST_SAMPLES:
         raise DataError(f"{moving.name}: {len(kept)} usable samples in motion; expected {_FEWEST_SAMPLES} or more")
@@ -235,7 +235,7 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
         raise ObservabilityError(f"{moving.name}: {error}") from None
     names = its.names[0] if len(its.axes) == 1 else [f"element {i + 1}" for i in range(its.count)]
     lines = [*latency_notes(alignment, names), *bend_notes(alignment, names)]
-    return alignment, [*notes, *(f"{moving.name}: {line}" for line in lines)]
+    return alignment, [*notes, *(prefixed(moving.name, line) for line in lines)]
 
 
 def _clipped_rows(readings: Array) -> np.ndarray:

@@ -18,6 +18,7 @@ from imulab.arguments import check_fields
 from imulab.device import METHODS, STARTS
 from imulab.device.tables import MOST_COUNT, ArraySettings, Fusion, fusion_of
 from imulab.device.unit import Blob
+from imulab.display import prefixed
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.rows import HISTORY, MAD_TO_SIGMA, zero_rows
 from imulab.procedures.gyro_array.elements import (
@@ -584,7 +585,7 @@ class Fuser:
         if self.lost:
             rows = f"{self.lost} row{'s' * (self.lost > 1)}"
             lines = [*lines, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
-        return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in [*lines, *more])]
+        return [*self.clock.lines(self.name), *(prefixed(self.name, line) for line in [*lines, *more])]
 
     def _drop_zeros(self, readings: Array) -> None:
         """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to NaN."""

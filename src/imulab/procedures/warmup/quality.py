@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.display import Bad, Note
+from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, first_of
 from imulab.estimation.decisions import STILL_DRIFTS
 from imulab.estimation.noise.readings import no_gravity
@@ -424,12 +424,27 @@ def _warn_dead_columns(curves: Curves) -> list[str]:
             elif (longest := _longest(still[:, i])) >= _PAUSE and still[:, i].mean() < _MOSTLY:
                 paused.setdefault(axis, []).append(f"{cycle.name} ({longest} s)")
     for axis, names in stuck.items():
-        messages.append(Bad(f"{axis} never changes in {_named(names)}: is it connected? --axes leaves a column out"))
+        messages.append(
+            Bad(
+                f"{axis} never changes in {_named(names)}: is it connected? --axes leaves a column out",
+                "check the cable and record the cycles again, or leave the column out (--axes)",
+            )
+        )
     for axis, names in paused.items():
-        messages.append(Bad(f"{axis} is stuck for a while in {_named(names)}: its samples repeat exactly"))
+        messages.append(
+            Bad(
+                f"{axis} is stuck for a while in {_named(names)}: its samples repeat exactly",
+                "check the link to the sensor, and record those cycles again",
+            )
+        )
     empty = [f"{cycle.name} ({cycle.zeros})" for cycle in curves.cycles if cycle.zeros]
     if empty:
-        messages.append(f"rows in which every axis is exactly zero were left out: {_named(empty)}")
+        messages.append(
+            Finding(
+                f"rows in which every axis is exactly zero were left out: {_named(empty)}",
+                "check the link to the sensor, and record those cycles again",
+            )
+        )
     return messages
 
 
@@ -454,30 +469,40 @@ def _warn_ends(curves: Curves, settled: bool) -> list[str]:
     beyond = [f"{t:g}" for t, e in zip(curves.temperatures, reached, strict=True) if e < curves.settling_time - 1]
     if beyond:
         messages.append(
-            f"no cycle at {' '.join(beyond)} degC lasts to T_M = {curves.settling_time:g} s: the table goes on from "
-            f"{reached.min():g} s without data, and a cubic may go anywhere there"
+            Finding(
+                f"no cycle at {' '.join(beyond)} degC lasts to T_M = {curves.settling_time:g} s: the table goes on "
+                f"from {reached.min():g} s without data, and a cubic may go anywhere there",
+                "record there beyond T_M, or state a shorter one (--settling-time)",
+            )
         )
     short = [
         f"{c.name} ({end:.6g} s)" for c, end, half in zip(curves.cycles, curves.end, curves.halved, strict=True) if half
     ]
     if short:
         messages.append(
-            f"not settled: ends before T_M + {SETTLED:g} s = {curves.settling_time + SETTLED:g} s, so that the second "
-            f"half of the cycle is its reference: {_named(short)}"
+            Finding(
+                f"not settled: ends before T_M + {SETTLED:g} s = {curves.settling_time + SETTLED:g} s, so that the "
+                f"second half of the cycle is its reference: {_named(short)}",
+                "record longer, or state a shorter T_M (--settling-time)",
+            )
         )
     return messages
 
 
 def _warn_starts(curves: Curves) -> list[str]:
     late = [f"{c.name} ({c.first:.3g} s)" for c in curves.cycles if c.first > _LATE]
-    return [f"the first sample comes late after power-on: {_named(late)}"] if late else []
+    action = "start the log before power comes on, and record those cycles again"
+    return [Finding(f"the first sample comes late after power-on: {_named(late)}", action)] if late else []
 
 
 def _warn_sizes(curves: Curves) -> list[str]:
     """Return messages on changes so large that the column's title probably states a wrong unit."""
     largest = np.nanmax(np.abs(curves.mean), axis=(0, 1))
     return [
-        f"{axis} changes by {small_text(change, unit)} after power-on: does its column have the right unit?"
+        Finding(
+            f"{axis} changes by {small_text(change, unit)} after power-on: does its column have the right unit?",
+            "correct the unit in the title of this column",
+        )
         for axis, change, unit in zip(curves.axes, largest, curves.units, strict=True)
         if change > _IMPROBABLE.get(unit, np.inf)
     ]
@@ -490,7 +515,8 @@ def _warn_gravity(curves: Curves) -> list[str]:
         return []
     unit = curves.cycles[0].file_units[places[0]]
     reason = no_gravity(float(np.median(np.linalg.norm(curves.reference[:, places], axis=1))), unit)
-    return [Bad(f"accel_x .. accel_z: {reason}; is their unit, {unit}, right?")] if reason else []
+    action = "correct the unit in the titles of accel_x accel_y accel_z"
+    return [Bad(f"accel_x .. accel_z: {reason}; is their unit, {unit}, right?", action)] if reason else []
 
 
 def _warn_motion(curves: Curves) -> list[str]:
@@ -499,7 +525,8 @@ def _warn_motion(curves: Curves) -> list[str]:
         for c, (seconds, began) in zip(curves.cycles, curves.moved, strict=True)
         if seconds > 0
     ]
-    return [f"the unit moved; those seconds are left out: {_named(moved)}"] if moved else []
+    action = "fix the unit to something heavy, and record those cycles again"
+    return [Finding(f"the unit moved; those seconds are left out: {_named(moved)}", action)] if moved else []
 
 
 def _warn_drifts(curves: Curves, chosen: Judged) -> list[str]:
@@ -514,10 +541,13 @@ def _warn_drifts(curves: Curves, chosen: Judged) -> list[str]:
             row, column = np.unravel_index(np.argmax(np.abs(curves.drift[:, index]) * share), share.shape)
             axis = index[column]
             messages.append(
-                f"not settled: {kind} still drifts in the settled part of {int(share.any(axis=1).sum())} of "
-                f"{len(curves.cycles)} cycles, most in {curves.cycles[row].name} ({curves.axes[axis]}, "
-                f"{small_text(curves.drift[row, axis], curves.units[axis])} from T_M to its end); Z is relative to "
-                "the mean of that part"
+                Finding(
+                    f"not settled: {kind} still drifts in the settled part of {int(share.any(axis=1).sum())} of "
+                    f"{len(curves.cycles)} cycles, most in {curves.cycles[row].name} ({curves.axes[axis]}, "
+                    f"{small_text(curves.drift[row, axis], curves.units[axis])} from T_M to its end); Z is relative to "
+                    "the mean of that part",
+                    "record longer, and state a later T_M (--settling-time)",
+                )
             )
     return messages
 
@@ -534,11 +564,19 @@ def _warn_temperatures(curves: Curves) -> list[str]:
     messages = []
     if warm:
         messages.append(
-            "not cold: at power-on warmer than the chamber, so that the curve starts half-way (soak longer): "
-            f"{_named(warm)}"
+            Finding(
+                "not cold: at power-on warmer than the chamber, so that the curve starts half-way (soak longer): "
+                f"{_named(warm)}",
+                "soak longer with the unit off, and record those cycles again",
+            )
         )
     if far:
-        messages.append(f"power-on temperature more than {_OFF_SET_POINT:g} K from the set point: {_named(far)}")
+        messages.append(
+            Finding(
+                f"power-on temperature more than {_OFF_SET_POINT:g} K from the set point: {_named(far)}",
+                "wait for the set point before power-on, or state the temperatures (--temperatures)",
+            )
+        )
     return messages
 
 
@@ -547,7 +585,12 @@ def _warn_single(curves: Curves) -> list[str]:
     alone = [f"{t:g}" for t, n in zip(curves.temperatures, count, strict=True) if n == 1]
     if not alone:
         return []
-    return [f"one cycle only at {' '.join(alone)} degC: its repeatability is not known there"]
+    return [
+        Finding(
+            f"one cycle only at {' '.join(alone)} degC: its repeatability is not known there",
+            "record a second cycle there",
+        )
+    ]
 
 
 def _warn_odd_cycles(curves: Curves) -> list[str]:
@@ -601,8 +644,11 @@ def _warn_constants(curves: Curves, chosen: Judged) -> list[str]:
     if tau < SCALE_LIMIT * curves.settling_time / _AT_LIMIT or not counts.any():
         return []
     return [
-        f"the time constant {tau:.4g} s is the longest that is sought, {SCALE_LIMIT:g} T_M: the cycles only show that "
-        "something changes more slowly than they last"
+        Finding(
+            f"the time constant {tau:.4g} s is the longest that is sought, {SCALE_LIMIT:g} T_M: the cycles only show "
+            "that something changes more slowly than they last",
+            "record longer cycles",
+        )
     ]
 
 

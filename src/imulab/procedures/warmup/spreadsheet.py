@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from imulab.device.unit import is_blob
-from imulab.display import Shown
+from imulab.display import Finding, Shown
 from imulab.errors import OptionError, ReadError, RecordError, UnitError, listed
 from imulab.files import write_text
 from imulab.procedures.result import Record, as_record
@@ -320,6 +320,11 @@ def make_table_record(read: tuple[WarmupTable, str | None], file: str) -> Calibr
         options={},
         sensor={"serial": serial} if serial else {},
         sources=(Source(file, sha256(Path(file).read_bytes()).hexdigest()),),
-        warnings=("made from an edited table: no uncertainties, and no test data behind it",),
+        warnings=(
+            Finding(
+                "made from an edited table: no uncertainties, and no test data behind it",
+                "apply it to a fresh power cycle and look at what is left (imulab apply)",
+            ),
+        ),
         sections={"table": table.to_section()},
     )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.device.unit import output_factor
-from imulab.display import UNJUDGED, Bad, Note, prefixed
+from imulab.display import UNJUDGED, Bad, Finding, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
 from imulab.estimation.decisions import SCALE_OFF_UNIT, SCALES_OFF_ALIKE
 from imulab.estimation.least_squares import Observability, coverage_factor, observability
@@ -340,13 +340,17 @@ def _observability_of_turns(solved: TurnSolution, freedom: int, name: str) -> Ob
 def _warn_foreign_record(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
     """Say if the accelerometers' record is hardly of this unit."""
     other = different_units(("the record", record.sensor), ("the recording", attitudes.recording.metadata))
-    messages = [f"gyro: {other}"] if other else []
+    action = "use the accelerometers' record of this unit (--accel)"
+    messages: list[str] = [Finding(f"gyro: {other}", action)] if other else []
     length = np.linalg.norm(force, axis=1)
     scatter, usual = float(length.std()), fit_of(record).rms.value
     if scatter > _FOREIGN * usual + _TOUCHED:
         messages.append(
-            f"gyro: under the record |f| scatters by {from_si(scatter, 'mg'):.3g} mg from attitude to attitude, by "
-            f"{from_si(usual, 'mg'):.3g} mg when it was made: is it of this unit?"
+            Finding(
+                f"gyro: under the record |f| scatters by {from_si(scatter, 'mg'):.3g} mg from attitude to attitude, by "
+                f"{from_si(usual, 'mg'):.3g} mg when it was made: is it of this unit?",
+                action,
+            )
         )
     return messages
 
@@ -614,7 +618,12 @@ def _warnings(fit: GyroFit) -> list[str]:
         )
     rms = float(np.degrees(np.sqrt(np.mean(fit.residuals**2))))
     if rms > _LARGE_MISS:
-        messages.append(f"gyro: the turns miss the change of gravity's direction by {rms:.2g} deg rms")
+        messages.append(
+            Finding(
+                f"gyro: the turns miss the change of gravity's direction by {rms:.2g} deg rms",
+                "check axes, signs and unit of the gyroscopes against the accelerometers",
+            )
+        )
     return messages
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.display import Finding
 from imulab.errors import DataError
 from imulab.estimation.decisions import BIAS_FOLLOWS_GRAVITY
 from imulab.estimation.least_squares import f_test
@@ -121,7 +122,12 @@ def clock_notes(holds: RestHolds, attitudes: Attitudes, time: Array) -> list[str
     into = np.median(time[holds.arrive] - attitudes.start), np.median(attitudes.stop - time[holds.leave])
     for late, other, when in ((*into, "stop turning {:.1f} s after"), (*into[::-1], "start turning {:.1f} s before")):
         if late > _LATE and other < late / 2:
-            return [f"gyro: the gyroscopes {when.format(late)} the accelerometers (median): does one clock drive both?"]
+            return [
+                Finding(
+                    f"gyro: the gyroscopes {when.format(late)} the accelerometers (median): does one clock drive both?",
+                    "record both sensors by one clock",
+                )
+            ]
     return []
 
 

@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.display import Bad, Note
+from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.decisions import (
     CLOCKS_DISAGREE,
@@ -435,8 +435,11 @@ def _solve(
     others = float(np.sqrt((residual**2).sum() / (len(residual) // 3)))
     aside = np.column_stack([segments.start, segments.stop, missed])[out]
     notes = notes + [
-        f"gyro: the turn at {start:.1f} to {stop:.1f} s set aside: it misses by {np.degrees(size):.3g} deg, the "
-        f"others by {np.degrees(others):.3g} deg rms: knocked, or samples lost?"
+        Finding(
+            f"gyro: the turn at {start:.1f} to {stop:.1f} s set aside: it misses by {np.degrees(size):.3g} deg, the "
+            f"others by {np.degrees(others):.3g} deg rms: knocked, or samples lost?",
+            "record this turn again, without knocks and without lost samples",
+        )
         for start, stop, size in aside.tolist()
     ]
     if out.sum() * _TOO_MANY_OUT > len(out):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import SegmentError
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.gyro.rest import beyond_range
@@ -140,13 +140,18 @@ def choose_turns(attitudes: Attitudes, stamps: Stamps, output: Array, name: str)
         axes = " ".join(f"gyro_{'xyz'[axis]}" for axis in range(3) if clipped[:, axis].any())
         which = np.asarray(clipped.any(axis=1))
         notes.append(
-            f"gyro: {count(which)} left out, clipped: {axes} stay at the end of their range (from {times(which)} s)"
+            Finding(
+                f"gyro: {count(which)} left out, clipped: {axes} stay at the end of their range (from {times(which)} "
+                "s)",
+                "turn more slowly, or set the gyroscopes to a larger range, and record again",
+            )
         )
     if broken.any():
         longest = float(step[wide].max())
-        sentence = (
+        sentence = Finding(
             f"gyro: {count(broken)} left out, samples are missing during them: gaps of up to {longest:.3g} s "
-            f"(turns from {times(broken)} s)"
+            f"(turns from {times(broken)} s)",
+            "record again without lost samples, by a faster link or at a lower rate",
         )
         notes.append(Note(sentence) if broken.sum() <= _FEW_BROKEN * turns.sum() else sentence)
     if len(chosen) < _FEWEST_TURNS:
