@@ -82,6 +82,33 @@ def test_an_axis_of_one_value_has_no_time_constants_to_speak_of():
     assert said == [True, False]
 
 
+@pytest.mark.parametrize("exchanged", [None, (1, 2), (0, 3)])
+def test_exchanged_temperatures_are_named(exchanged):
+    """The amplitude of a curve goes as a parabola of the temperature: what fits no neighbours is no such law."""
+    at, labels = [-40, -20, 0, 20, 40], [-40, -20, 0, 20, 40]
+    if exchanged:
+        a, b = exchanged
+        labels[a], labels[b] = labels[b], labels[a]
+    rng = np.random.default_rng(1)
+
+    def curve(true):
+        size = (100 + 2 * true - 0.01 * true**2) * (1 + 0.02 * rng.standard_normal())
+        return lambda t: size * HOUR * np.exp(-t / 60)
+
+    cycles = [
+        cycle_of(curve(true), label, name=f"c{true}_{number}")
+        for true, label in zip(at, labels, strict=True)
+        for number in (1, 2)
+    ]
+    warnings = il.fit_warmup(cycles, temperatures=at, settling_time=END, model="knot-cubic").calibration.warnings
+    lines = [line for line in warnings if "only when they are exchanged" in line]
+    assert bool(lines) == bool(exchanged)
+    if exchanged:
+        low, high = (at[k] for k in exchanged)
+        assert f"the curves at {low} and {high} degC fit" in lines[0]
+        assert f"c{low}_1" in lines[0]
+
+
 @pytest.mark.parametrize(("factor", "words"), [(0.5, "1/2 of g"), (1 / 9.80665, "as g would be"), (1.0, "")])
 def test_accelerometers_that_show_no_gravity_are_bad(factor, words):
     cycles = [cycle_of(flat, t, name=f"c{t}{c}") for t in (-20, 0) for c in (1, 2)]

@@ -61,6 +61,22 @@ def fitted(change, word: str, seed: int) -> Trial:
     return Trial(warned=any(w in finding for w in words for finding in record.warnings))
 
 
+def exchanged(swap: bool, cycles: int, seed: int) -> Trial:
+    """Whether a fit names two set points whose power-on temperatures were exchanged."""
+    rng = np.random.default_rng([seed, 15])
+    tests = Chamber(cycles=cycles).test(seed)
+    stated = [test.metadata["power_on_temperature"] for test in tests]
+    a, b = rng.choice(len(TEMPERATURES), 2, replace=False) if swap else (0, 0)
+    for number in range(cycles):
+        i, j = a * cycles + number, b * cycles + number
+        stated[i], stated[j] = stated[j], stated[i]
+    tests = [
+        replace(test, metadata={**test.metadata, "power_on_temperature": label}, name=f"{number}_{test.name}")
+        for number, (test, label) in enumerate(zip(tests, stated, strict=True))
+    ]
+    return Trial(warned=any("exchanged" in line for line in il.fit_warmup(tests, **_MODEL).calibration.warnings))
+
+
 def applied(change, word: str, seed: int) -> Trial:
     """Whether `apply` refuses a recording that was changed, and says why."""
     from imulab.procedures.apply import apply_blocks
@@ -145,6 +161,14 @@ SCENARIOS = [
     Scenario("Warm-up", "fit: a stuck gyro", partial(fitted, _stuck, "never changes"), 8, None, warned=95),
     Scenario("Warm-up", "fit: a knock of 2 s, 8 deg/s", partial(fitted, _knocked, "moved"), 8, None, warned=95),
     Scenario("Warm-up", "fit: every 50th row zero", partial(fitted, _zeros, "exactly zero"), 8, None, warned=95),
+    *[
+        Scenario(
+            "Warm-up", f"fit: {'two temperatures exchanged' if swap else 'no temperatures exchanged'}, {cycles} cycles",
+            partial(exchanged, swap, cycles), 12, None, warned=95 if swap else None, false_alarms=None if swap else 5,
+        )
+        for cycles in (1, 3)
+        for swap in (False, True)
+    ],
     _refused("apply: ms titled as s", _milliseconds, "milliseconds"),
     _refused("apply: starts 20 s late", partial(_moved, 20.0), "after power-on"),
     _refused("apply: negative times", partial(_moved, -3.0), "before power-on"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -362,6 +363,8 @@ _COLD = 1.0  # K above the chamber at power-on: the unit was still warm
 _OFF_SET_POINT = 0.5  # K from the set point
 _LATE = 0.5  # s after power-on: the fastest part of the curve is missing
 _DRIFT_SHARE = 0.5  # of the residual: a smaller drift of the settled part is not warned of
+_FEWEST_TEMPERATURES, _EXCHANGED = 5, 3.0
+"""Temperatures that show two of them exchanged; by how many times the bends between neighbours must then lessen."""
 _MOST_NAMED = 3  # cycles that a warning names
 _WIDE = 20.0  # K between knots from which one curve for the whole interval is doubted
 _AT_LIMIT = 1.02  # a time constant within 2 % of the limit of the search is at the limit
@@ -387,6 +390,8 @@ def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]
         *_warn_temperatures(curves),
         *_warn_single(curves),
         *_warn_odd_cycles(curves),
+        *_warn_exchanged(curves),
+        *_note_start(curves),
         *_warn_intervals(curves, chosen),
         *_warn_constants(curves, chosen),
     ]
@@ -571,12 +576,7 @@ def _warn_temperatures(curves: Curves) -> list[str]:
             )
         )
     if far:
-        messages.append(
-            Finding(
-                f"power-on temperature more than {_OFF_SET_POINT:g} K from the set point: {_named(far)}",
-                "wait for the set point before power-on, or state the temperatures (--temperatures)",
-            )
-        )
+        messages.append(Note(f"power-on temperature more than {_OFF_SET_POINT:g} K from the set point: {_named(far)}"))
     return messages
 
 
@@ -613,6 +613,69 @@ def _warn_odd_cycles(curves: Curves) -> list[str]:
         f"a power cycle differs from the others at its temperature by {small_text(apart[row, column], unit)} "
         f"({curves.axes[column]}), where cycles usually differ by {small_text(usual[column], unit)}: look at "
         f"{_named(names)}, and leave out what is wrong"
+    ]
+
+
+def _warn_exchanged(curves: Curves) -> list[str]:
+    """Return a message on two temperatures whose curves fit those of their neighbours only when they are exchanged."""
+    t, (means, seconds) = curves.temperatures, curves.group_means()
+    count = len(t)
+    if count < _FEWEST_TEMPERATURES:
+        return []
+    width = np.sqrt(np.diff(curves.edges))[:, None] * (seconds > 0).all(axis=0)[:, None]
+    scale = np.maximum(np.sqrt(np.mean(means**2, axis=(0, 1))), _ROUNDING * np.abs(curves.reference).max(axis=0))
+    scale = np.where(scale > 0, scale, np.inf)
+    flat = (means * width / scale).reshape(count, -1)
+    share = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+    bend = np.zeros((count - 2, count))
+    for k in range(count - 2):
+        bend[k, k : k + 3] = share[k] - 1, 1.0, -share[k]
+    apart = np.square((curves.mean - means[curves.group]) * width / scale).sum(axis=(1, 2))
+    cycles = np.bincount(curves.group, minlength=count)
+    scatter = float(apart.sum()) / max(int((cycles - 1).sum()), 1)
+    floor = float((np.square(bend).sum(axis=0) / cycles).sum()) * scatter
+
+    def roughness(order: Sequence[int]) -> float:
+        return float(np.square(bend @ flat[list(order)]).sum())
+
+    own = roughness(range(count))
+    others = []
+    for a, b in combinations(range(count), 2):
+        order = list(range(count))
+        order[a], order[b] = b, a
+        others.append((roughness(order), a, b))
+    least, a, b = min(others)
+    if own < _EXCHANGED * (least + floor):
+        return []
+    names = [cycle.name for cycle, group in zip(curves.cycles, curves.group.tolist(), strict=True) if group in (a, b)]
+    return [
+        f"the curves at {t[a]:g} and {t[b]:g} degC fit those at the temperatures beside them only when they are "
+        f"exchanged, {np.sqrt(own / max(least, 1e-300)):.2g} times better: look at power_on_temperature of "
+        f"{_named(names)}"
+    ]
+
+
+def _note_start(curves: Curves) -> list[str]:
+    """Return a note on what logs that all begin late, which no curve shows, would make of the table."""
+    means, seconds = curves.group_means()
+    early = np.flatnonzero((seconds > 0).all(axis=0))[:2]
+    if len(early) < 2:
+        return []
+    middle = (curves.edges[1:] + curves.edges[:-1]) / 2
+    steep = np.abs(means[:, early[1]] - means[:, early[0]]).max(axis=0) / (middle[early[1]] - middle[early[0]])
+    noise = 2 * np.sqrt(2 * curves.noise / seconds[:, early].min()) / (middle[early[1]] - middle[early[0]])
+    sizes = [
+        f"{small_text(float(steep[index].max()), curves.units[index[0]])} ({kind})"
+        for kind, index in curves.kinds().items()
+        if (steep[index] > noise[index]).any()
+    ]
+    if not sizes:
+        return []
+    return [
+        Note(
+            f"time 0 of each file is taken for power-on: all logs begun 1 s late would put up to {' and '.join(sizes)} "
+            "of error into the first seconds"
+        )
     ]
 
 
