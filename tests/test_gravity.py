@@ -8,7 +8,7 @@ import pytest
 import imulab as il
 from conftest import table
 from imulab.errors import OptionError
-from imulab.gravity import ANOMALY, gravity_option, normal_gravity, stated_gravity
+from imulab.gravity import ANOMALY, at_latitude, gravity_option, normal_gravity, stated_gravity
 from imulab.procedures.views import compare_records
 from reference import tumble as reference
 
@@ -220,3 +220,13 @@ def test_a_place_may_be_a_text_and_degrees_without_one_are_told_how_to_be_writte
     assert normal_gravity("48.1 deg", "520 m") == normal_gravity(math.radians(48.1), 520.0)
     with pytest.raises(OptionError, match=r'expected -90 to 90 deg; numbers are rad, degrees are written "48.1 deg"'):
         normal_gravity(48.1)
+
+
+def test_the_earth_turns_eastward_a_full_turn_in_a_sidereal_day():
+    """So the rate points to the celestial north pole: up in the north, level at the equator, down in the south."""
+    sidereal_day = 86164.0905  # s
+    pole, equator, south = (at_latitude(f"{degrees} deg") for degrees in (90, 0, -30))
+    assert pole.vertical == pytest.approx(2 * math.pi / sidereal_day, rel=1e-6)
+    assert (equator.vertical, equator.level) == pytest.approx((0.0, 2 * math.pi / sidereal_day), rel=1e-6)
+    assert south.vertical == pytest.approx(-math.pi / sidereal_day, rel=1e-6)
+    assert at_latitude(None) is None
