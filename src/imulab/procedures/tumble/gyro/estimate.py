@@ -6,7 +6,7 @@ A turn misses its direction of gravity by two angles, across the direction after
 - the noise of both directions, from neighbouring windows within the holds, between which the gyroscopes say how the
   unit moved;
 - the zero of the two holds, as far as their noise hides it, times int w dt;
-- what all turns share: the zero of all holds, the accelerometers' parameters, and theirs alone beyond the noise;
+- what all turns share: the zero of all holds, and the accelerometers' parameters;
 - tau^2, what is beyond all this, such that the weighted squares equal their degrees of freedom; not below 0.
 
 To the covariance of the parameters comes what all turns of a recording have alike: half the difference of the two
@@ -30,12 +30,12 @@ from imulab.estimation.decisions import SAMPLES_LOST, SCALE_CHANGE, SCALE_CHANGE
 from imulab.estimation.least_squares import chi_square_limit, f_test
 from imulab.procedures.tumble.gyro.rotation import weighted_turns
 from imulab.procedures.tumble.gyro.solve import TurnSolution
-from imulab.procedures.tumble.gyro.turns import body_rate, misalignment, model, shared_covariance
+from imulab.procedures.tumble.gyro.turns import body_rate, by_directions, directions_missed, misalignment, model
 from imulab.procedures.tumble.gyro.windows import mean_of_holds
 from imulab.recording import Array
 
 _ITERATIONS = 6
-_SETTLED = 1e-9  # rad and relative: a step that is smaller changes no digit
+_SETTLED = 1e-3  # standard uncertainties: what a step leaves is of its square
 _LEAST = 1e-9  # rad: no direction is known better, and no rounding is larger
 _DOUBLINGS = 60
 _FEWEST_LEFT = 6  # degrees of freedom that the test of linearity must leave
@@ -162,32 +162,31 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
     zero
         Standard uncertainty of the output at rest, (3,), or None where the biases are fitted.
     """
-    segments, scale, theta = solved.segments, solved.scale, solved.theta
-    fit_bias = theta.size > 9
-    across = normals(segments.after)
-    shell = TurnEstimate(solved, np.empty(0), np.empty(0), across, np.empty(0), 0.0, np.zeros(theta.size))
-    matrix = np.empty(0)
-    for iteration in range(_ITERATIONS):
-        left, slope = model(segments, scale, theta, fit_bias)
-        residual, jacobian = shell.project(left[:, None])[:, 0], shell.project(slope)
-        if iteration < 2:
-            matrix = _covariance_of_turns(solved, theta, shell, directions, zero)
-            beyond = _variance_beyond(matrix, jacobian, residual)
+    segments, scale, size = solved.segments, solved.scale, solved.theta.size
+    theta = np.concatenate([solved.theta, np.zeros(12 - size)])
+    shell = TurnEstimate(solved, np.empty(0), np.empty(0), normals(segments.after), np.empty(0), 0.0, np.zeros(size))
+    matrix = root = np.empty(0)
+    for _ in range(_ITERATIONS):
+        left, slopes = model(segments, scale, theta, fit_bias=True)
+        residual, jacobian = shell.project(left[:, None])[:, 0], shell.project(slopes)
+        if not root.size:
+            matrix = _covariance_of_turns(solved, theta, shell, directions, zero, jacobian[:, 9:] / scale)
+            beyond = _variance_beyond(matrix, jacobian[:, :size], residual)
             root = np.linalg.cholesky(matrix + beyond * np.eye(len(matrix)))
-        white = np.linalg.solve(root, np.column_stack([jacobian, residual]))
+        white = np.linalg.solve(root, np.column_stack([jacobian[:, :size], residual]))
         inverse = np.linalg.pinv(white[:, :-1])
-        step = inverse @ white[:, -1]
-        theta = theta - step
-        if np.abs(step).max() < _SETTLED:
+        covariance, step = inverse @ inverse.T, inverse @ white[:, -1]
+        theta[:size] -= step
+        left -= slopes[:, :size] @ step
+        if (np.abs(step) < _SETTLED * np.sqrt(np.diag(covariance))).all():
             break
+    theta = theta[:size]
     gain = -inverse @ np.linalg.inv(root)
-    covariance = inverse @ inverse.T
-    left, slope = model(segments, scale, theta, fit_bias)
-    moved = model(replace(segments, output=segments.output + segments.half), scale, theta, fit_bias)[0] - left
-    solution = replace(solved, theta=theta, residual=left, jacobian=slope)
+    other = replace(segments, output=segments.output + segments.half)
+    moved = directions_missed(other, scale, theta) - directions_missed(segments, scale, theta)
     estimate = replace(
-        shell, solution=solution, covariance=covariance, gain=gain, root=root, beyond=beyond,
-        reading=gain @ shell.project(moved[:, None])[:, 0],
+        shell, solution=replace(solved, theta=theta, residual=left, jacobian=slopes[:, :size]), covariance=covariance,
+        gain=gain, root=root, beyond=beyond, reading=gain @ shell.project(moved[:, None])[:, 0],
     )  # fmt: skip
     columns, largest = rate_columns(estimate)
     estimate = replace(estimate, linearity=test_linearity(estimate, columns, largest))
@@ -203,15 +202,16 @@ def normals(directions: Array) -> Array:
 
 
 def _covariance_of_turns(
-    solved: TurnSolution, theta: Array, shell: TurnEstimate, directions: Array, zero: Array | None
+    solved: TurnSolution, theta: Array, shell: TurnEstimate, directions: Array, zero: Array | None, by_zero: Array
 ) -> Array:
-    """Return V without tau^2, (2 m, 2 m)."""
-    segments, scale = solved.segments, solved.scale
-    m = len(segments.start)
-    shared = shared_covariance(segments, scale, theta, directions, zero)
-    blocks = np.einsum("mij,mjnk,nlk->minl", shell.across, shared.reshape(m, 3, m, 3), shell.across, optimize=True)
-    by_rate = model(segments, scale, np.concatenate([theta[:9], np.zeros(3)]), fit_bias=True)[1][:, 9:] / scale
-    own = shell.project(by_rate).reshape(m, 2, 3)
+    """Return V without tau^2, (2 m, 2 m); `by_zero` are the derivatives by the outputs at rest, (2 m, 3)."""
+    segments, scale, m = solved.segments, solved.scale, len(solved.segments.start)
+    flat = shell.project(by_directions(segments, scale, theta, len(directions) // 3))
+    shared = flat @ directions @ flat.T
+    if zero is not None:
+        shared += by_zero * zero**2 @ by_zero.T
+    blocks = shared.reshape(m, 2, m, 2)
+    own = by_zero.reshape(m, 2, 3)
     blocks[range(m), :, range(m), :] += np.einsum("mij,j,mkj->mik", own, solved.rest.moved_variance * np.ones(3), own)
     density, direction = noise_of_turns(solved, theta)
     alone = density * segments.squared + 2 * direction + _LEAST**2
@@ -228,7 +228,7 @@ def noise_of_turns(solved: TurnSolution, theta: Array) -> tuple[float, float]:
     density, within = float(np.mean(solved.density / solved.scale**2)), solved.within
     if not len(within.start):
         return density, 0.0
-    left = model(within, solved.scale, theta, fit_bias=theta.size > 9)[0].reshape(-1, 1, 3)
+    left = directions_missed(within, solved.scale, theta).reshape(-1, 1, 3)
     miss = np.einsum("mij,mkj->mi", normals(within.after), left)
     square = float(mean_of_holds((miss**2).sum(axis=1, keepdims=True) / 2, within.attitude)[0])
     during = float(within.squared.mean())

@@ -414,6 +414,7 @@ def _solve(
 ) -> TurnSolution:
     """Fit the turns; those that stand out from all others are set aside one by one."""
     known = parse_unit(case.unit)
+    fine, segments = segments, segments.whole_steps(pieces)
     theta = np.zeros(12 if case.fit_bias else 9)
     residual = model(segments, scale, theta, case.fit_bias)[0].reshape(-1, 3)
     if known.quantity == "rate" and np.median(np.linalg.norm(residual, axis=1)) > _UNIT_DOUBTED:
@@ -450,7 +451,7 @@ def _solve(
             )
         )
     return TurnSolution(
-        kept, within, rest, density, pieces, scale, theta, residual, jacobian,
+        fine.part(~out), within, rest, density, pieces, scale, theta, residual, jacobian,
         bool(fit.converged[0]), aside, tuple(notes),
     )  # fmt: skip
 

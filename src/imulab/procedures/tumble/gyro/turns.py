@@ -5,7 +5,7 @@ Source of the change of a turn with the rate: Bortz, IEEE Trans. AES-7 (1971) 61
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,17 @@ class Segments:
         """Return some of the turns."""
         values = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
         return Segments(**values)
+
+    def whole_steps(self, pieces: int) -> Segments:
+        """Return them with the pieces of each step taken as one, for a first fit."""
+        shape = (len(self.step), -1, pieces)
+        step = self.step.reshape(shape).sum(axis=2)
+        size = np.maximum(step, 1e-300)[:, :, None]
+        output, half = (
+            (values * self.step[:, :, None]).reshape(*shape, 3).sum(axis=2) / size
+            for values in (self.output, self.half)
+        )
+        return replace(self, output=output, half=half, step=step)
 
 
 @dataclass(frozen=True)
@@ -188,25 +199,6 @@ def start_scale(segments: Segments) -> Array:
     return np.full(3, guess * float(_START_FACTORS[int(np.argmin(costs))]))
 
 
-def shared_covariance(segments: Segments, scale: Array, theta: Array, known: Array, zero: Array | None) -> Array:
-    """Return what directions of gravity and the zero at rest bring to the residuals, rad^2, shape (3 m, 3 m).
-
-    Parameters
-    ----------
-    known
-        Covariance of the upward directions of all holds, shape (3 n, 3 n).
-    zero
-        Standard uncertainty of the output at rest, shape (3,), or None where the biases are fitted.
-    """
-    flat = by_directions(segments, scale, theta, len(known) // 3)
-    shared: Array = flat @ known @ flat.T
-    if zero is not None:
-        moved = model(segments, scale, np.concatenate([theta[:9], np.zeros(3)]), fit_bias=True)[1][:, 9:]
-        moved = moved * (zero / scale)
-        shared += moved @ moved.T
-    return shared
-
-
 def by_directions(segments: Segments, scale: Array, theta: Array, holds: int) -> Array:
     """Return the derivatives of the residuals by the upward directions of all holds, shape (3 m, 3 holds)."""
     m = len(segments.before)
@@ -219,6 +211,12 @@ def by_directions(segments: Segments, scale: Array, theta: Array, holds: int) ->
 def carried(segments: Segments, scale: Array, theta: Array) -> Array:
     """Return the matrices of the turns under given parameters, shape (m, 3, 3)."""
     return composed_turns(body_rate(segments, scale, theta) * segments.step[:, :, None])
+
+
+def directions_missed(segments: Segments, scale: Array, theta: Array) -> Array:
+    """Return the carried less the found direction of each turn, shape (3 m,)."""
+    missed: Array = np.einsum("mij,mj->mi", carried(segments, scale, theta), segments.before) - segments.after
+    return missed.ravel()
 
 
 def body_rate(segments: Segments, scale: Array, theta: Array) -> Array:

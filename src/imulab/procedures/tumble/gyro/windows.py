@@ -173,17 +173,15 @@ def read_between(output: Array, start: NDArray[np.intp], steps: int, pieces: int
 
     The splines run over the number of a sample, not over its time: stamps that come in bursts do not bend them.
     """
-    index = start[:, None] + np.arange(1 - _REACH, steps + _REACH)
-    values = output[np.clip(index, 0, len(output) - 1)]
-    kernels = _kernels(pieces)
-    result = np.zeros((2, len(start), steps, pieces, output.shape[1]))
-    for tap in range(2 * _REACH):
-        part = values[:, tap : tap + steps, None, :]
-        for reading, kernel in zip(result, kernels, strict=True):
-            reading += kernel[tap][None, None, :, None] * part
-    shape = (len(start), steps * pieces, output.shape[1])
-    mean, point = result[0].reshape(shape), result[1].reshape(shape)
-    return Readings((mean + point) / 2, (mean - point) / 2, pieces)
+    mean, point = _kernels(pieces)
+    kernels = np.hstack([(mean + point) / 2, (mean - point) / 2])
+    result = np.empty((2, len(start), steps * pieces, output.shape[1]))
+    for turn, first in enumerate(start.tolist()):
+        index = np.clip(np.arange(first + 1 - _REACH, first + steps + _REACH), 0, len(output) - 1)
+        around = np.lib.stride_tricks.sliding_window_view(output[index].T, 2 * _REACH, axis=1)  # (columns, steps, taps)
+        read = (around @ kernels).reshape(-1, steps, 2, pieces)
+        result[:, turn] = np.moveaxis(read, 2, 0).transpose(0, 2, 3, 1).reshape(2, steps * pieces, -1)
+    return Readings(result[0], result[1], pieces)
 
 
 @cache
