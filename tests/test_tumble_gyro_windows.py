@@ -27,7 +27,7 @@ def test_the_two_readings_between_samples_are_those_of_splines_through_samples_a
 
 
 def test_a_mean_angle_and_a_ramp_of_the_rate_belong_together():
-    """About one axis: the mean angle in the later window less that in the earlier one is the integral of w times rate."""
+    """About one axis: the mean angle of the later window less that of the earlier one is the sum of w times rate."""
     time = np.arange(0, 6, 1e-3)
     angle = 0.3 * np.tanh(2 * (time - 3)) + 0.01 * np.sin(17 * time)  # moves in both windows
     first, last = (Windows(np.array([start]), np.array([1.0])) for start in (1.0, 4.0))
