@@ -227,3 +227,23 @@ def test_the_view_is_drawn_in_every_state():
     text = console.export_text()
     assert "misalignment yx zx zy" in text
     assert "enough: five more would bring" in text
+
+
+def test_what_a_higher_order_explains_is_no_knocked_attitude():
+    recording = il.simulate_tumble(
+        attitudes=14, order=2, gravity=9.81, noise="0.1 mg", hold="3 s", move="1 s", seed=7, gyro=False
+    )
+    _, events = session_of(recording, planned=14)
+    assert not [event.text for event in events if event.kind == "knocked"]
+    (said,) = [event.text for event in events if event.text.startswith("the model is too simple: order ")]
+    assert "none is set aside; fit with --order " in said
+
+
+def test_it_is_not_enough_before_the_degrees_of_freedom_that_a_record_is_not_remarked_on_for():
+    recording = il.simulate_tumble(attitudes=16, order=1, gravity=9.81, gyro=False)
+    session, events = session_of(recording, targets=read_targets("bias 50 mg"))
+    (first,) = [event.time for event in events if event.kind == "enough"][:1]
+    accepted = [event.time for event in events if event.kind == "accepted" and event.time <= first]
+    assert len(accepted) == 9 + 5
+    assert session.guide.fit is not None
+    assert not [w for w in session.guide.fit.calibration.verdict.reasons if "of freedom" in w]

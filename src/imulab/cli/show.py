@@ -168,7 +168,12 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
         if isinstance(item, ReportTable):
             mark = [["*" if i == item.highlight else "", *row] for i, row in enumerate(item.rows)]
             chosen = " (* chosen)" if item.highlight is not None else ""
-            lines += [f"{item.title}{chosen}", *aligned(["", *item.columns], mark), ""]
+            lines += [
+                f"{item.title}{chosen}",
+                *aligned(["", *item.columns], mark),
+                *([item.message] if item.message else []),
+                "",
+            ]
     if provenance:
         lines += [f"created {record.created} by {record.software}"]
         lines += [f"source {printable(source.file)} SHA-256 {source.sha256}" for source in record.sources]

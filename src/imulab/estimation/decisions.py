@@ -69,8 +69,9 @@ ATTITUDE_STANDS_OUT_BY = Decision(
     5.7e-7, "verdict", {"tumble": 24}, "the same, where the level above would ask for less than 5 sigma", limit=5.0
 )
 ATTITUDES_SCATTER = Decision(
-    0.01, "note", {"tumble": 1}, "the attitudes scatter more than their own noise explains, which uncertainties hold"
-)
+    0.004, "verdict", {"tumble": 1},
+    "the attitudes scatter more than their own noise explains: a model whose order was stated may be too simple",
+)  # fmt: skip
 ATTITUDES_TOO_QUIET = Decision(1e-3, "verdict", {"tumble": 1}, "the attitudes scatter less: their noise is overstated")
 RESIDUALS_FOLLOW_DIRECTION = Decision(
     0.01, "verdict", {"tumble": 1}, "the residuals are a function of direction: the model lacks terms (F-test)"

@@ -19,6 +19,7 @@ from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.fit import TumbleFit, fit_tumble
 from imulab.procedures.tumble.model import parameter_count, parameter_names
 from imulab.procedures.tumble.plan import sphere_candidates
+from imulab.procedures.tumble.record import FEW_DEGREES
 from imulab.procedures.tumble.schema import attitudes_of, fit_of, model_of
 from imulab.procedures.tumble.solve import Search, information_rows, quick_set
 from imulab.quantities import quantity
@@ -105,7 +106,7 @@ _USUAL_ORDER = 3
 """Order that is planned for under ``auto``: its attitudes show what an order 2 would leave in the scale factors."""
 _MORE = 1.5
 """Attitudes per parameter where neither a number nor a target is stated."""
-_SPARE = 4
+_SPARE = FEW_DEGREES
 """Attitudes beyond the parameters that a fit needs to find a knocked attitude and to test its order."""
 _NEAR = np.cos(np.radians(12.0))
 _HORIZON = 60
@@ -237,6 +238,12 @@ class Guide:
             f"scatters by itself: more of them help little; {higher} may"
         )
 
+    def too_simple(self) -> str:
+        """Return a message where a higher order explains attitudes that would pass for knocked ones; else empty."""
+        if self.fit is None:
+            return ""
+        return next((w for w in self.fit.calibration.warnings if w.startswith("the model is too simple")), "")
+
     def lengthen(self, attitude: Attitude) -> None:
         """Replace the last attitude by a longer hold of it."""
         self.attitudes[-1] = attitude
@@ -326,7 +333,9 @@ class Guide:
         """Whether the targets are met, or, without any, the number of attitudes is reached."""
         if self.targets:
             enough = len(self.kept) >= self._fewest_reliable
-            return enough and self.fit is not None and max(self.shares()) <= 1.0
+            if not enough or self.fit is None or max(self.shares()) > 1.0:
+                return False
+            return fit_of(self.fit.calibration).degrees_of_freedom >= FEW_DEGREES  # fewer are remarked on
         return self.fit is not None and len(self.kept) >= self.wanted()
 
     def shares(self) -> list[float]:

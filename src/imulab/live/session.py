@@ -54,6 +54,10 @@ class Watch:
         """Return the warning that more attitudes help little, the first time that there is a reason."""
         return self._once("scatter", text) if text else []
 
+    def order(self, text: str) -> list[str]:
+        """Return the warning that the model is too simple, the first time that it is."""
+        return self._once("order", text) if text else []
+
     def hold(self, hold: Hold, unit: str, gravity: float) -> list[str]:
         """Return a warning where the length of f at rest shows a wrong unit."""
         length = float(np.linalg.norm(hold.mean))
@@ -413,6 +417,7 @@ class Session:
                     f"attitude {number} is off by {milli:+.2g} mg: knocked? put it down again, or press u to drop it",
                 )
         self._aside = frozenset(aside)
+        self._warn(self._watch.order(self.guide.too_simple()))
         if not self._aside and self.guide.targets and not self.guide.met:
             self._warn(self._watch.scatter(self.guide.scatter()))
 

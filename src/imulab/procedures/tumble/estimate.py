@@ -28,11 +28,13 @@ from imulab.procedures.tumble.orders import (
     absolute_weights,
     blend_orders,
     choose_order,
+    explaining_order,
     find_disturbed,
     solve_orders,
     with_known_spread,
 )
 from imulab.procedures.tumble.record import Estimate, FittedAttitudes, Scaling, StatedUncertainty
+from imulab.procedures.tumble.schema import model_of
 from imulab.procedures.tumble.solve import (
     Threshold,
     TumbleProblem,
@@ -112,16 +114,7 @@ def check_options(
         )
     if order == "blend" and (method != "norm" or with_prior or monte_carlo is not None):
         raise OptionError("order blend needs method norm, and goes neither with a prior nor with monte-carlo")
-    if nonlinearity is not None:
-        if order not in FROM_DATA or with_prior:
-            raise OptionError(f"nonlinearity needs order auto or blend without a prior, found order {order}")
-        if not all(0 < value < np.inf for value in nonlinearity):
-            raise OptionError(f"nonlinearity {nonlinearity}: expected two standard deviations above 0, of k2 and k3")
-    if asymmetry is not None:
-        if order not in FROM_DATA or with_prior:
-            raise OptionError(f"asymmetry needs order auto or blend without a prior, found order {order}")
-        if not 0 < asymmetry < np.inf:
-            raise OptionError(f"asymmetry {asymmetry:g}: expected a standard deviation above 0")
+    _check_known_spread(order, nonlinearity, asymmetry, with_prior=with_prior)
     if cross and (method != "norm" or order in (0, *FROM_DATA) or with_prior or monte_carlo is not None):
         raise OptionError(
             f"cross needs method norm and an order of 1 to {HIGHEST_ORDER}, and goes with no prior and no monte-carlo"
@@ -136,6 +129,21 @@ def check_options(
     _check_mag_options("mag" in further, field=field, hemisphere=hemisphere, dip=dip)
     if monte_carlo is not None:
         _check_monte_carlo(monte_carlo, method, with_prior=with_prior)
+
+
+def _check_known_spread(
+    order: int | str, nonlinearity: tuple[float, float] | None, asymmetry: float | None, *, with_prior: bool
+) -> None:
+    if nonlinearity is not None:
+        if order not in FROM_DATA or with_prior:
+            raise OptionError(f"nonlinearity needs order auto or blend without a prior, found order {order}")
+        if not all(0 < value < np.inf for value in nonlinearity):
+            raise OptionError(f"nonlinearity {nonlinearity}: expected two standard deviations above 0, of k2 and k3")
+    if asymmetry is not None:
+        if order not in FROM_DATA or with_prior:
+            raise OptionError(f"asymmetry needs order auto or blend without a prior, found order {order}")
+        if not 0 < asymmetry < np.inf:
+            raise OptionError(f"asymmetry {asymmetry:g}: expected a standard deviation above 0")
 
 
 def _check_monte_carlo(trials: int, method: str, *, with_prior: bool) -> None:
@@ -209,7 +217,9 @@ def check_field(field: float | None) -> None:
 
 
 def with_assumed_alignment(record: Calibration) -> Calibration:
-    """Return a record of order 0 with misalignments of 0, without uncertainty, and a note that they are assumed."""
+    """Return a record; one of order 0 has misalignments of 0 without uncertainty, and a note that they are assumed."""
+    if model_of(record).order > 0:
+        return record
     assumed = {f"misalignment_{pair}": Parameter(0.0, None, "rad") for pair in MISALIGNMENTS}
     note = Note(
         "order 0 takes every misalignment as 0: each mrad that there is puts 1 mg per g of one axis into another; "
@@ -244,9 +254,9 @@ def estimate_triad(
         from imulab.procedures.tumble.prior import combine_with_prior, known_of, prior_shares, prior_warnings
 
         known = known_of(prior, scaling, gravity, attitudes.unit)
-    aside, fitted = NONE_ASIDE, dict[int, TumbleSolution]()
+    aside, fitted, explained_by = NONE_ASIDE, dict[int, TumbleSolution](), None
     if loss == "auto" and rest is None and not cross:
-        aside, fitted = find_disturbed(every, lambda subset: _fits(subset, order))
+        aside, fitted, explained_by = _set_aside(every, order)
     used, kept = every, attitudes
     if aside.index:
         used, kept = every.only(aside.others(len(attitudes))), attitudes.only(aside.others(len(attitudes)))
@@ -264,11 +274,7 @@ def estimate_triad(
     )
     stated = given_order
     if choice is not None and given_order is not None:
-        blended = (
-            with_known_spread(used, choice, nonlinearity, asymmetry)
-            if nonlinearity
-            else blend_orders(used, choice, asymmetry)
-        )
+        blended = _blended(used, choice, nonlinearity, asymmetry)
         problem, solution, stated = _with_order_uncertainty(
             used, problem, solution, given_order, blended, order == "blend"
         )
@@ -276,8 +282,9 @@ def estimate_triad(
     check_residuals(kept, solution, gravity.value)
     check_axes(attitudes, forces(complete.problem, complete.solution)[0])
     estimate = Estimate(
-        kept, problem, solution, given_order, stated, complete, conditioning, choice.rows if choice else ()
-    )
+        kept, problem, solution, given_order, stated, complete, conditioning, choice.rows if choice else (),
+        explained_by=explained_by,
+    )  # fmt: skip
     if prior is None or known is None or aged is None:
         return estimate
     return replace(
@@ -302,6 +309,17 @@ def _fits(problem: TumbleProblem, order: int | str) -> dict[int, TumbleSolution]
     return solve_orders(problem) if order in FROM_DATA else {int(order): solve_norm(replace(problem, order=int(order)))}
 
 
+def _set_aside(problem: TumbleProblem, order: int | str) -> tuple[Aside, dict[int, TumbleSolution], int | None]:
+    """Return the knocked attitudes, the fits of the others, and the higher order that explains them all instead."""
+    aside, fitted = find_disturbed(problem, lambda subset: _fits(subset, order))
+    if aside.index and order not in FROM_DATA:
+        whole = replace(problem, order=int(order))
+        solution = solve_norm(whole)
+        if explained_by := explaining_order(whole, solution):
+            return NONE_ASIDE, {int(order): solution}, explained_by
+    return aside, fitted, None
+
+
 def _with_aside(
     attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution, aside: Aside
 ) -> FittedAttitudes:
@@ -311,6 +329,14 @@ def _with_aside(
     every = evaluate(problem, solution)
     every.down_weights[0, list(aside.index)] = 0.0
     return FittedAttitudes(attitudes, problem, every, aside)
+
+
+def _blended(
+    problem: TumbleProblem, choice: OrderChoice, nonlinearity: tuple[float, float] | None, asymmetry: float | None
+) -> Blended:
+    if nonlinearity is None:
+        return blend_orders(problem, choice, asymmetry)
+    return with_known_spread(problem, choice, nonlinearity, asymmetry)
 
 
 def _with_order_uncertainty(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,12 @@ import numpy as np
 from imulab.estimation.rows import median, quantile, rms
 from imulab.procedures.tumble import record as engineering
 from imulab.procedures.tumble.model import AXES
+from imulab.procedures.tumble.orders import BLIND_SPOT
 from imulab.procedures.tumble.schema import (
     DeviationTrace,
     HeldAttitudes,
+    OrderBlend,
+    OrderRow,
     PriorShares,
     Trials,
     TurnAside,
@@ -166,6 +170,8 @@ def _label(axes: tuple[str, str], x: float, y: float, text: str) -> dict[str, An
 # The tables of a tumble record, from the record alone.
 
 
+_MUCH_NARROWER = 1.5  # factor from which it is worth a line
+_CLEARLY_BETTER = 0.9  # of the error of prediction of the order that was chosen
 _AGREE = 10.0
 """Per cent by which the widths of two kinds of intervals may differ before it matters."""
 
@@ -191,6 +197,7 @@ def parameters_table(record: Calibration) -> ReportTable:
     fit, model = fit_of(record), model_of(record)
     factors = {False: fit.coverage_factor_95, True: None if fit.gyro is None else fit.gyro.coverage_factor_95}
     rows = []
+    known = _with_order_known(record)
     for row in engineering.rows(record):
         factor = factors[row.name.startswith("gyro_")]
         value, uncertainty = row.text()
@@ -201,14 +208,12 @@ def parameters_table(record: Calibration) -> ReportTable:
             half = factor * row.standard_uncertainty
             interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
         order_known = "–" if row.given_order is None else format_uncertain(row.value, row.given_order)[1]
-        order_cells = [] if fit.blend is None else [order_known]
+        order_cells = [order_known] if known else []
         rows.append([row.name, value, uncertainty, *order_cells, interval, row.unit])
     basis = _basis(record)
     if fit.blend is not None:
-        basis += (
-            f" The standard uncertainty holds whatever the order is, up to {fit.blend.highest_order}; beside it what "
-            f"it would be if order {model.order} were known to be right."
-        )
+        basis += f" The standard uncertainty holds whatever the order is, up to {fit.blend.highest_order}"
+        basis += f"; beside it what it would be if order {model.order} were known to be right." if known else "."
     turned = ""
     if fit.gyro is not None:
         turned = (
@@ -226,12 +231,42 @@ def parameters_table(record: Calibration) -> ReportTable:
             "parameter",
             "value",
             "standard uncertainty",
-            *([] if fit.blend is None else [f"if order {model.order} is right"]),
+            *([f"if order {model.order} is right"] if known else []),
             "95 % interval",
             "unit",
         ],
         rows=rows,
+        message=_narrower(fit.blend),
     )
+
+
+def _with_order_known(record: Calibration) -> bool:
+    """Whether to show what the uncertainties of accelerometers alone would be with the order known: no larger ones."""
+    fit = fit_of(record)
+    return (
+        fit.blend is not None
+        and fit.gyro is None
+        and fit.mag is None
+        and all(
+            p.standard_uncertainty_given_order <= (p.standard_uncertainty or 0.0)
+            for p in record.parameters.values()
+            if p.standard_uncertainty_given_order is not None
+        )
+    )
+
+
+def _narrower(blended: OrderBlend | None) -> str:
+    """Say which knowledge would narrow the uncertainties, and by how much, where it would."""
+    if blended is None or blended.narrower is None:
+        return ""
+    gains = [
+        f"{name.replace('_', ' ')} {ratio:.2g} times narrower"
+        for name, ratio in blended.narrower.items()
+        if ratio > _MUCH_NARROWER
+    ]
+    if not gains:
+        return ""
+    return f"If k2 and k3 are known to 20 ug: {', '.join(gains)} (--nonlinearity 20ug,20ug)."
 
 
 def propagated_table(record: Calibration, trials: Trials) -> ReportTable:
@@ -315,7 +350,22 @@ def orders_table(record: Calibration) -> ReportTable:
         ],
         rows=rows,
         highlight=highlight,
+        message=_better_order(fit.orders, chosen),
     )
+
+
+def _better_order(orders: Sequence[OrderRow], chosen: int) -> str:
+    """Say which order predicts better, and is not taken because it leaves |f| uncertain somewhere."""
+    errors = {row.order: row.leave_one_out for row in orders if row.observable and row.leave_one_out is not None}
+    for row in sorted(orders, key=lambda each: errors.get(each.order, np.inf)):
+        if row.order <= chosen or errors.get(row.order, np.inf) >= _CLEARLY_BETTER * errors.get(chosen, 0.0):
+            continue
+        if row.largest_uncertainty is not None and row.largest_uncertainty > BLIND_SPOT * orders[0].scatter:
+            return (
+                f"Order {row.order} predicts better here but leaves |f| uncertain by "
+                f"{small_g(row.largest_uncertainty)} somewhere on the sphere: more attitudes would show it."
+            )
+    return ""
 
 
 # The figures and tables of a tumble record, from the record alone.

@@ -25,7 +25,7 @@ from imulab.procedures.tumble.estimate import (
     with_assumed_alignment,
 )
 from imulab.procedures.tumble.model import parameter_count
-from imulab.procedures.tumble.record import Estimate, make_record
+from imulab.procedures.tumble.record import Estimate, Scaling, make_record
 from imulab.procedures.tumble.schema import OrderRow, model_of
 from imulab.procedures.tumble.solve import SOURCE_THRESHOLD, Threshold
 from imulab.quantities import in_si, whole
@@ -222,8 +222,7 @@ def fit_tumble(
     place = _stated_place(further, hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
     local = local_gravity(at_place(gravity, latitude, height, beside="gyro" in further), attitudes.recording)
-    check_attitudes(attitudes, local.value)
-    scaling = nominal_scaling(attitudes, local.value)
+    scaling = _checked_scaling(attitudes, local.value)
     known = None if prior is None else prior_record(as_record(prior, "fit_tumble: prior"), attitudes)
     order = order if known is None else _prior_order(known, order, attitudes)
     rest = _threshold(threshold, local.value) if method == "linearised" else None
@@ -231,22 +230,24 @@ def fit_tumble(
         attitudes, local, scaling, order, loss, rest, nonlinearity=nonlinearity, asymmetry=asymmetry, prior=known,
         ageing=ageing, cross=cross,
     )  # fmt: skip
-    trials = None if monte_carlo is None else _propagated(estimate, monte_carlo, progress)
     options = {
         "order": order, "method": method, "loss": loss, "gravity": local.value,
-        "nonlinearity": nonlinearity and list(nonlinearity), "asymmetry": asymmetry,
-        "monte_carlo": monte_carlo, "cross": cross or None,
-        "threshold": None if rest is None else rest.in_si(local.value),
+        "nonlinearity": nonlinearity and list(nonlinearity), "asymmetry": asymmetry, "monte_carlo": monte_carlo,
+        "cross": cross or None, "threshold": None if rest is None else rest.in_si(local.value),
     }  # fmt: skip
+    trials = None if monte_carlo is None else _propagated(estimate, monte_carlo, progress)
     record = make_record(estimate, local, scaling, {k: v for k, v in options.items() if v is not None}, trials)
-    record = with_assumed_alignment(record) if estimate.problem.order == 0 else record
     return TumbleFit(
-        calibration=_with_further(record, further, attitudes, local, loss, magnitude, place, latitude),
-        observability=estimate.observability,
-        orders=estimate.orders,
-        residuals=local.value * estimate.found.solution.deviations[0],
-        down_weights=estimate.found.solution.down_weights[0],
-    )
+        _with_further(with_assumed_alignment(record), further, attitudes, local, loss, magnitude, place, latitude),
+        estimate.observability, estimate.orders, local.value * estimate.found.solution.deviations[0],
+        estimate.found.solution.down_weights[0],
+    )  # fmt: skip
+
+
+def _checked_scaling(attitudes: Attitudes, gravity: float) -> Scaling:
+    """Return the nominal sensor, once the attitudes can be those of an accelerometer triad."""
+    check_attitudes(attitudes, gravity)
+    return nominal_scaling(attitudes, gravity)
 
 
 def _stated_place(

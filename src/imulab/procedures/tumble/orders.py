@@ -62,6 +62,7 @@ from imulab.estimation.least_squares import (
     leverage,
     observability,
 )
+from imulab.estimation.rows import median
 from imulab.procedures.tumble import HIGHEST_ORDER
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.model import AXES, MISALIGNMENTS, fit_lengths, norm_and_jacobian, parameter_count
@@ -82,7 +83,7 @@ from imulab.records.triads import CROSS_TERMS
 # Which order of the model the attitudes support.
 
 
-_BLIND_SPOT = 4.0
+BLIND_SPOT = 4.0
 """Predicted standard uncertainty of |f| anywhere on the sphere, over the scatter at order 1, where an order guesses."""
 _DIRECTIONS = 400  # over the sphere, 10 deg apart, in which an order's |f| is judged
 _ROUNDING = 1e-30
@@ -158,7 +159,7 @@ def choose_order(problem: TumbleProblem, gravity: float, solutions: Mapping[int,
         if best is None or (
             _is_clearly_smaller(squares, best, 1 - leverage(fit.jacobian, fit.weights)[0])
             and _significant(costs, chosen, order, n)
-            and (row.largest_uncertainty or 0.0) <= _BLIND_SPOT * rows[0].scatter
+            and (row.largest_uncertainty or 0.0) <= BLIND_SPOT * rows[0].scatter
         ):
             chosen, best = order, squares
     return OrderChoice(chosen, tuple(rows), solutions, conditioning[chosen])
@@ -465,6 +466,32 @@ def find_outliers(solutions: Mapping[int, TumbleSolution], *, known: bool, exces
     excess
         Standard deviation that is added to each attitude's own noise.
     """
+    return _best_set(solutions, known, excess)[0]
+
+
+def explaining_order(problem: TumbleProblem, solution: TumbleSolution) -> int | None:
+    """Return the higher order that explains all attitudes, some of which an order alone would take for knocked.
+
+    Parameters
+    ----------
+    problem, solution
+        All attitudes of one unit (a batch of one), and their fit of the problem's order; None where none does.
+    """
+    n, known = problem.reading.shape[1], problem.covariance is not None
+    best, least = None, _best_set({problem.order: solution}, known, 0.0)[1]
+    for order in range(problem.order + 1, HIGHEST_TESTED + 1):
+        size = parameter_count(order)
+        if n - size < (1 if known else FREEDOM[False]):
+            break
+        fit = solve_norm(replace(problem, order=order))
+        criterion = _criterion(float((fit.residuals[0] ** 2 / fit.own_variance[0]).sum()), n, size, 0, known)
+        if fit.converged[0] and criterion < least:
+            best, least = order, criterion
+    return best
+
+
+def _best_set(solutions: Mapping[int, TumbleSolution], known: bool, excess: float) -> tuple[Aside, float]:
+    """Return the set with the least information criterion, and that."""
     best, least = NONE_ASIDE, np.inf
     for order in _tested(solutions):
         white = _whitened(solutions[order], excess)
@@ -473,7 +500,7 @@ def find_outliers(solutions: Mapping[int, TumbleSolution], *, known: bool, exces
         for candidate, criterion in _candidates(white, known):
             if criterion < least:
                 best, least = candidate, criterion
-    return best
+    return best, least
 
 
 def _tested(solutions: Mapping[int, TumbleSolution]) -> list[int]:
@@ -650,6 +677,7 @@ _ASYMMETRIES = (np.geomspace(20e-6, 5e-3, 9), 250e-6)  # the same of q
 _SYMMETRIC, _LINEAR = 0.4, 0.3  # how probable before the data q = 0 is, and k2 = 0, and k3 = 0
 _BIAS_WIDER = 1.1
 """Calibrated: at a noise of 60 µg q of 200 ppm is hardly seen, and moves biases by 150 µg."""
+USUAL_NONLINEARITY = 20e-6  # of k2 and k3, in units of g: knowledge whose gain is stated
 _LIKELY = 0.05
 """Share of the sets of terms from which one counts as an explanation of the attitudes, and below which none does."""
 
@@ -690,6 +718,8 @@ class Blended(Struct, frozen=True):
         one unit of one axis's coefficient.
     asymmetry
         k2 and q as explanations of the same; None where the attitudes do not show k2.
+    narrower
+        How many times biases and scale factors would be narrower with k2 and k3 known to 20 µg; None if told or unseen.
     """
 
     theta: Array
@@ -699,6 +729,7 @@ class Blended(Struct, frozen=True):
     noise: Mapping[int, float]
     assumed: Mapping[int, tuple[float, float]]
     asymmetry: Asymmetry | None = None
+    narrower: Mapping[str, float] | None = None
 
     def about(self, theta: Array) -> Array:
         """Return the covariance of other values, of this order or a lower one, shape (p,): ``V + d d'``."""
@@ -741,15 +772,24 @@ def blend_orders(problem: TumbleProblem, choice: OrderChoice, asymmetry: float |
     of_sizes = beside.shares() if top > 1 and asymmetry is None else None
     averaged = beside.average(of_sizes, asymmetry or 0.0)
     wider = np.where(np.arange(size) < 3, 1.0 if of_sizes is None else _BIAS_WIDER, 1.0)
+    matrix = averaged.covariance * np.outer(wider, wider)
     return Blended(
         averaged.values,
-        averaged.covariance * np.outer(wider, wider),
+        matrix,
         top,
         freedom,
         dict(zip(range(2, top + 1), averaged.noise.tolist(), strict=True)),
         {order: _effect_of_left_out(problem, solution, order) for order in range(top + 1, HIGHEST_BLENDED + 1)},
         None if of_sizes is None else beside.two_explanations(of_sizes),
+        None if of_sizes is None else _narrower(problem, choice, matrix),
     )
+
+
+def _narrower(problem: TumbleProblem, choice: OrderChoice, matrix: Array) -> dict[str, float]:
+    """Return by how much less uncertain the middle bias and scale factor are with k2 and k3 known to 20 µg."""
+    known = with_known_spread(problem, choice, (USUAL_NONLINEARITY, USUAL_NONLINEARITY)).covariance
+    ratio = np.sqrt(np.diag(matrix)[:6] / np.diag(known)[:6])
+    return {"bias": median(ratio[:3]), "scale_factor": median(ratio[3:])}
 
 
 def _asymmetry_columns(problem: TumbleProblem, theta: Array, order: int) -> Array:

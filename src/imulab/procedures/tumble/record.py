@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from imulab.display import Bad, Note
+from imulab.display import Bad, Finding, Note
 from imulab.errors import first_of
 from imulab.estimation.decisions import (
     ATTITUDE_STANDS_OUT,
@@ -104,7 +104,8 @@ class Estimate:
     """Estimate from the attitudes that were not set aside, in units of g.
 
     `with_gravity` says that the covariance holds gravity's own uncertainty already; `prior` is the record's entry on an
-    earlier record, and `notes` are findings about that.
+    earlier record, and `notes` are findings about that. `explained_by` is the higher order that explains
+    attitudes which this one would take for knocked.
     """
 
     attitudes: Attitudes
@@ -118,6 +119,7 @@ class Estimate:
     with_gravity: bool = False
     prior: PriorShares | None = None
     notes: Sequence[str] = ()
+    explained_by: int | None = None
 
 
 def aside_of(record: Calibration, attitudes: Attitudes) -> NDArray[np.bool_]:
@@ -325,8 +327,8 @@ def make_record(
         sensor={key: recording.metadata[key] for key in ("serial", "model", "element") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
         warnings=(
-            *_warnings(attitudes, gravity, problem, solution, estimate.observability, options),
-            *_scatter_warnings(problem, solution, chi_square, freedom),
+            *_warnings(attitudes, gravity, problem, solution, estimate, options),
+            *_scatter_warnings(problem, solution, chi_square, freedom, order_chosen=bool(estimate.orders)),
             *shake_warnings(problem.motion, solution),
             *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(estimate.orders)),
             *vertical_warnings(complete, str(options["method"])),
@@ -422,7 +424,10 @@ def _blend(stated: StatedUncertainty | None) -> OrderBlend | None:
     if stated is None or stated.blended is None:
         return None
     noise = {str(order): share for order, share in stated.blended.noise.items()}
-    return OrderBlend(highest_order=stated.blended.order, noise_share=noise)
+    narrower = stated.blended.narrower
+    return OrderBlend(
+        highest_order=stated.blended.order, noise_share=noise, narrower=None if narrower is None else dict(narrower)
+    )
 
 
 def zero_outputs(record: Calibration) -> dict[str, Parameter]:
@@ -546,16 +551,27 @@ def _warnings(
     gravity: Gravity,
     problem: TumbleProblem,
     solution: TumbleSolution,
-    observability: Observability,
+    estimate: Estimate,
     options: Mapping[str, Any],
 ) -> list[str]:
     return [
         *attitudes.recording.notes,
         *attitudes.notes,
         *gravity_findings(gravity, attitudes.recording),
-        *_attitude_warnings(attitudes, problem, solution, options),
-        *_freedom_warnings(problem, solution, observability),
+        *(_order_warnings(estimate) or _attitude_warnings(attitudes, problem, solution, options)),
+        *_freedom_warnings(problem, solution, estimate.observability),
         *size_warnings(attitudes, solution),
+    ]
+
+
+def _order_warnings(estimate: Estimate) -> list[str]:
+    """Say that the model is too simple, where a higher order explains what would pass for a knock."""
+    order = estimate.explained_by
+    if order is None:
+        return []
+    return [
+        f"the model is too simple: order {order} explains attitudes that would pass for knocked ones at order "
+        f"{estimate.problem.order}, and none is set aside; fit with --order {order} or --order auto"
     ]
 
 
@@ -565,8 +581,14 @@ def beyond_noise(problem: TumbleProblem, chi_square: float, freedom: float) -> b
     return known and chi_square_probability(chi_square, freedom) < ATTITUDES_SCATTER.level
 
 
-def _scatter_warnings(problem: TumbleProblem, solution: TumbleSolution, chi_square: float, freedom: float) -> list[str]:
-    """Say that the attitudes scatter beyond their noise, which the uncertainties hold anyway, or far below it."""
+def _scatter_warnings(
+    problem: TumbleProblem, solution: TumbleSolution, chi_square: float, freedom: float, *, order_chosen: bool
+) -> list[str]:
+    """Say that the attitudes scatter beyond their noise, or far below it.
+
+    The uncertainties hold what scatters: with the order chosen from the data that is a note. With one that was stated
+    it may be what the model lacks, which is no scatter.
+    """
     known = problem.covariance is not None and problem.prior is None and not problem.robust
     if known and freedom > 0 and chi_square_probability(chi_square, freedom) > 1 - ATTITUDES_TOO_QUIET.level:
         return [
@@ -581,7 +603,9 @@ def _scatter_warnings(problem: TumbleProblem, solution: TumbleSolution, chi_squa
         "the attitudes scatter more than their own noise explains (reduced chi-square "
         f"{chi_square / freedom:.3g}){added if solution.excess[0] > 0 else ''}"
     )
-    return [Note(text) if solution.excess[0] > 0 else text]
+    if solution.excess[0] > 0 and order_chosen:
+        return [Note(text)]
+    return [Finding(text, "fit with --order auto" if not order_chosen else "put the unit on something firm")]
 
 
 def _pattern_warnings(

@@ -94,10 +94,14 @@ class PriorShares(Part):
 
 
 class OrderBlend(Part):
-    """``fit.blend``: the highest order that the stated uncertainty allows for, and the noise that each order takes."""
+    """``fit.blend``: the highest order that the stated uncertainty allows for, and the noise that each order takes.
+
+    `narrower`: how many times narrower biases and scale factors would be with k2 and k3 known to 20 µg.
+    """
 
     highest_order: int
     noise_share: dict[str, float]
+    narrower: dict[str, float] | None = None
 
 
 class TurnAside(Part):
