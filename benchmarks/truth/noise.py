@@ -60,6 +60,11 @@ def _disturbed(fault: str, rng: np.random.Generator) -> tuple[np.ndarray, float]
             x += 0.5 * SIGMA * np.sin(2 * np.pi * frequency * t + rng.uniform(0, 6))
     elif fault == "step":
         x += np.where(t > t[-1] * rng.uniform(0.2, 0.8), 60 * DEG / 3600, 0.0)
+    elif fault == "small step":
+        x = white + np.where(t > t[-1] * rng.uniform(0.2, 0.8), 0.007 * DEG, 0.0)
+    elif fault == "vibration":
+        swing = 1 + 0.6 * np.sin(2 * np.pi * t / 50 + rng.uniform(0, 6))
+        x += SIGMA * rng.uniform(1, 6) * swing * np.sin(2 * np.pi * rng.uniform(8, 15) * t)
     elif fault == "radians":
         return LSB * np.round(x / LSB) * DEG, math.nan
     return x, WHITE
@@ -98,6 +103,40 @@ def _drift(seed: int, slope: float) -> Trial:
     return Trial((held,), bool(found["significant"]), (size["value"] - slope) / DEG)
 
 
+def _degrees(seed: int, rounded: bool) -> Trial:
+    """Slope against a temperature that is logged in whole degrees, taken out."""
+    import imulab as il
+
+    rng = np.random.default_rng([seed, 22])
+    time = np.arange(COUNT) / 20
+    temperature = 25 + rng.uniform() + 2 * np.sin(2 * np.pi * time / 1500 + rng.uniform(0, 6))
+    slope = 108 * DEG / 3600
+    samples = WHITE * math.sqrt(20) * rng.standard_normal(COUNT) + slope * temperature
+    shown = temperature + 0.02 * rng.standard_normal(COUNT)
+    columns = {"time": time, "gyro_x": samples, "temperature": np.round(shown) if rounded else shown}
+    log = il.Recording(columns, {"time": "s", "gyro_x": "rad/s", "temperature": "degC"}, name="log")
+    record = il.fit_noise(log, regress="temperature").calibration
+    (found,) = (each for each in record.fit["columns"]["gyro_x"]["drifts"] if each["follows"] == "temperature")
+    off = found["slope"]["value"] - slope
+    said = any("in steps of 1 K" in line for line in record.warnings)
+    return Trial((abs(off) < 1.96 * found["slope"]["standard_uncertainty"],), said, 3600 * off / DEG)
+
+
+GRAVITIES = {"right": 9.80665, "half": 4.903, "twice": 19.61, "g read as m/s^2": 1.0, "counts": 16384 * 9.80665,
+             "ft/s^2": 32.17, "none": 0.0}  # fmt: skip
+
+
+def _gravity(seed: int, kind: str) -> Trial:
+    """Whether a record of three accelerometers at rest, in m/s^2, is bad."""
+    import imulab as il
+
+    rng = np.random.default_rng([seed, 23])
+    samples = 0.01 * rng.standard_normal((6000, 3)) + GRAVITIES[kind] * np.array([0.0, 0.6, 0.8])
+    columns = {"time": np.arange(6000) / RATE} | {f"accel_{a}": samples[:, k] for k, a in enumerate("xyz")}
+    log = il.Recording(columns, {n: "s" if n == "time" else "m/s^2" for n in columns}, name="log")
+    return Trial((), il.fit_noise(log).calibration.verdict.state == "bad")
+
+
 def _row(name: str, fault: str, word: str, coverage: tuple[float, float] | None = (92.0, 100.0)) -> Scenario:
     return Scenario(
         "Noise at rest",
@@ -122,6 +161,21 @@ SCENARIOS = [
     _row("the level changes by 60 deg/h", "step", "the level changes by"),
     _row("behind the sensor's own filter of 5 Hz", "filter", "level", (88.0, 100.0)),
     _row("rad/s read as deg/s, a gyro of 16 bits", "radians", "right?", None),
+    _row("a step of 25 deg/h in white noise, 10 u, that looks like a random walk", "small step", "the level changes by"),
+    Scenario("Noise at rest", "vibration of 8 to 15 Hz that swings, one to six sigma: no change of level",
+             partial(_trial, fault="vibration", word="level changes"), trials=40, coverage=None, false_alarms=5.0),
+    *[
+        Scenario("Noise at rest", f"accelerometers of 9.8 m/s^2, |f|: {kind}", partial(_gravity, kind=kind), trials=5,
+                 coverage=None, warned=None if kind == "right" else 95.0,
+                 false_alarms=5.0 if kind == "right" else None)
+        for kind in GRAVITIES
+    ],
+    *[
+        Scenario("Noise at rest", f"--regress temperature, {'in whole degrees' if rounded else 'fine'}: slope",
+                 partial(_degrees, rounded=rounded), trials=30, coverage=(92.0, 100.0),
+                 warned=95.0 if rounded else None, false_alarms=None if rounded else 5.0, unit="(deg/h)/K")
+        for rounded in (False, True)
+    ],
     Scenario("Noise at rest", "a temperature that the gyro does not follow", partial(_drift, slope=0.0), trials=50,
              coverage=(92.0, 98.0), false_alarms=6.0, unit="(deg/s)/K"),
     Scenario("Noise at rest", "a gyro that follows its temperature by 0.002 (deg/s)/K", partial(_drift, slope=KELVIN),

@@ -34,6 +34,7 @@ _LOUDEST_GYRO, _QUIET = 0.3, 0.035
 _EARTH, _PLAIN_OFFSET = (4.0, 100.0), 10.0
 """deg/h that three such gyroscopes show at rest: the Earth's 15 and their offsets. Zeroed ones, whose mean is within
 ten standard uncertainties of 0, are passed over."""
+_STATE_UNIT = "state the right unit in the column's title or in a layout, and fit again"
 _NO_GRAVITY = 0.2  # relative: |f| at rest farther than this off g is no gravity, whatever the zeros of the sensor
 _NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit or range makes that the likely one
 _OTHERS = {**{unit: to_si(1.0, unit) for unit in ("m/s^2", "g", "mg")}, "ft/s^2": 0.3048}
@@ -48,7 +49,8 @@ def doubtful_units(recording: Recording, names: Sequence[str], rate: float) -> l
         if its and (reason := why(recording, its, rate)):
             named = its[0] if len(its) == 1 else f"{its[0]} .. {its[-1]}"
             unit = recording.units[its[0]]
-            notes.append(Bad(f"{recording.name}: {named}: {reason}; is their unit, {unit}, right?"))
+            text = f"{recording.name}: {named}: {reason}; is their unit, {unit}, right?"
+            notes.append(Bad(text, _STATE_UNIT))
     return notes
 
 

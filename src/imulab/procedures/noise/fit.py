@@ -248,7 +248,7 @@ def _describe_column(column: ColumnModel) -> list[tuple[type[str], str]]:
         messages.append((Note, f"from {low:.3g} to {high:.3g} Hz the spectrum, left out, is {factor:.2g} of the model"))
     for step in column.steps:
         text = f"the level changes by {_sized(step.size, column.unit)} at {step.time:.4g} s"
-        messages.append((str, f"{text}, which slow noise does not make; --steps remove takes it out"))
+        messages.append((str, f"{text}, which slow noise does not make; take it out by --steps remove"))
     messages += [each for drift in column.drifts if (each := _drift_sentence(drift, column)) is not None]
     choice, shortest = analysis.choice, analysis.limits[0]
     near = [analysis.index, *np.flatnonzero(choice.rivals[0]).tolist()]
@@ -291,7 +291,7 @@ def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> tuple[type[st
         return (
             str,
             f"follows the {drift.covariate}, {slope}, which was taken out as far as readings in steps of "
-            f"{drift.rounding:.3g} K show it: slow noise below {hidden} may be what the steps hide; log the "
+            f"{drift.rounding:.3g} K show it: slow noise below {hidden} may be what the steps hide; record the "
             "temperature in finer steps",
         )
     if drift.taken:
