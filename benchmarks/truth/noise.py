@@ -161,7 +161,7 @@ SCENARIOS = [
     _row("the level changes by 60 deg/h", "step", "the level changes by"),
     _row("behind the sensor's own filter of 5 Hz", "filter", "level", (88.0, 100.0)),
     _row("rad/s read as deg/s, a gyro of 16 bits", "radians", "right?", None),
-    _row("a step of 25 deg/h in white noise, 10 u, that looks like a random walk", "small step", "the level changes by"),
+    _row("a step of 25 deg/h, 10 u, that looks like a random walk", "small step", "the level changes by"),
     Scenario("Noise at rest", "vibration of 8 to 15 Hz that swings, one to six sigma: no change of level",
              partial(_trial, fault="vibration", word="level changes"), trials=40, coverage=None, false_alarms=5.0),
     *[
