@@ -121,7 +121,7 @@ def test_limit_and_level_agree(name):
         (("thermal gyro",), 0.0516),
         (("thermal check",), 0.0500),
         (("rate",), 0.0388),
-        (("rate turn",), 0.0),
+        (("rate turn",), 0.0148),
         (("rate prior",), 0.0100),
         (("centrifuge",), 0.0362),
         (("noise",), 0.0299),

@@ -457,3 +457,78 @@ def test_an_earlier_record_of_both_triads_is_joined_to_turns_with_accelerometers
             if i != k:
                 p = both.parameters[f"gyro_misalignment_{a}{b}"]
                 assert abs(p.value - TURN[i, k]) < 4 * p.standard_uncertainty
+
+
+EARTH = np.degrees(7.292115e-5)  # deg/s
+
+
+def made_turns(up=1.0, tilt=0.0, lost=0.0, fence=0.0, seed=0, counts=(1, 1, 1, -1, -1, -1), noise=0.01):
+    """Turns about z at latitude 48 deg, by plain equations, with the specific force that goes with them."""
+    rng = np.random.default_rng(seed)
+    stops = fence / np.sqrt(2) * rng.standard_normal(len(counts) + 1)
+    x = np.arange(400) / 400
+    rates = [np.zeros(300)]
+    for k, count in enumerate(counts):
+        rates += [(360 * count + stops[k + 1] - stops[k]) * (1 - np.cos(2 * np.pi * x)) / 4, np.zeros(300)]
+    w = np.concatenate(rates)
+    heading = np.radians(np.cumsum(w) / 100)
+    axis = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+    gyro = w[:, None] * axis
+    gyro[:, 2] += up * EARTH * np.sin(np.radians(48))
+    gyro[:, 0] += EARTH * np.cos(np.radians(48)) * np.cos(heading)
+    gyro += 0.1 + noise * rng.standard_normal(gyro.shape)
+    kept = rng.random(len(gyro)) >= lost
+    force = np.tile([0.0, 0.0, up * 9.81], (len(gyro), 1))
+    return gyro[kept], force[kept]
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_the_earths_rate_is_taken_off_a_bias_or_is_in_its_uncertainty(up):
+    gyro, force = made_turns(up)
+    off = EARTH * np.sin(np.radians(48))
+    hour = 3600.0
+
+    def bias(columns, **how):
+        units = {name: {"gyro": "deg/s", "accel": "m/s^2"}[name] for name in columns}
+        fit = il.fit_turns(il.Recording.from_arrays(rate=100.0, units=units, **columns), **how)
+        assert fit.calibration.verdict.state == "good"
+        p = fit.calibration.parameters["gyro_bias_z"]
+        return np.degrees(p.value) - 0.1, np.degrees(p.standard_uncertainty), fit.calibration.warnings
+
+    error, u, notes = bias({"gyro": gyro})
+    assert hour * error == pytest.approx(up * hour * off, abs=2)
+    assert hour * u > 8
+    assert any("--latitude" in note for note in notes)
+    error, u, notes = bias({"gyro": gyro}, latitude="48 deg")
+    assert abs(error) < 1.96 * u
+    assert any("which way is up" in note for note in notes)
+    error, u, _ = bias({"gyro": gyro, "accel": force}, latitude="48 deg")
+    assert abs(hour * error) < 2
+    assert hour * u < 2
+
+
+def test_a_tilted_axis_is_in_the_uncertainty_and_said_where_it_is_seen():
+    def turned(lean, **how):
+        return il.fit_turns({"gyro": made_turns(tilt=lean)[0]}, rate=100, unit="deg/s", **how).calibration
+
+    level, leaning = turned(0.0), turned(np.radians(3))
+    u = [record.parameters["gyro_scale_factor_z"].standard_uncertainty / 57.3 for record in (level, leaning)]
+    assert u[0] < 1.1 * 360e-6  # stops alone
+    assert u[1] > 1.5 * u[0]  # misalignments of 10 mrad times the tilt
+    assert not any("off its own" in reason for reason in level.verdict.reasons)
+    assert any("3 deg off its own" in reason for reason in leaning.verdict.reasons)
+    assert leaning.verdict.next == ("turn about x, y and z, with the record of the accelerometers (--accel)",)
+    exact = turned(np.radians(3), tilt="0 deg")
+    assert exact.verdict.state == "good"
+
+
+def test_lost_samples_are_in_the_uncertainty_and_said():
+    counts = (1, -1) * 5
+    for lost in (0.0, 0.005):
+        gyro = made_turns(lost=lost, fence=0.5, counts=counts, seed=2)[0]
+        record = il.fit_turns({"gyro": gyro}, rate=100, unit="deg/s").calibration
+        p = record.parameters["gyro_scale_factor_z"]
+        error, u = p.value / (180 / np.pi) - 1, p.standard_uncertainty / (180 / np.pi)
+        assert abs(error) < 2 * u
+        assert (u > 2e-3) == (lost > 0)
+        assert any("samples were lost" in reason for reason in record.verdict.reasons) == (lost > 0)

@@ -205,6 +205,13 @@ DWELLS_SCATTER = Decision(
 )
 RUNS_SCATTER = Decision(0.01, "uncertainty", {"rate": 1}, "scale factors differ from run to run beyond their noise")
 TURNS_SCATTER = Decision(0.01, "uncertainty", {"rate turn": 3}, "whole turns about an axis scatter beyond their noise")
+TURNS_LOSE_SAMPLES = Decision(
+    0.003, "verdict", {"rate turn": 3}, "turns scatter beyond their stops, more likely as lost samples make them"
+)
+AXIS_TILTED = Decision(
+    9.7e-4, "verdict", {"rate turn": 6}, "turns are about an axis farther off a body axis than misalignments reach",
+    limit=3.3,
+)  # fmt: skip
 TURNS_ACROSS_SCATTER = Decision(
     0.01, "uncertainty", {"rate turn": 9}, "what turns show across their axis scatters beyond the noise"
 )

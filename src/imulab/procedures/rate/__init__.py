@@ -22,6 +22,7 @@ GAINS = ("gyro_bias", "gyro_scale_factor", "gyro_misalignment", "gyro_g_sensitiv
 ORDERS = ("auto", "1", "2", "3", "4", "5")
 RATES = "0,10,50,100,200,300"
 FENCE = "0.5 deg"
+TILT = "0.5 deg"
 
 
 def parse_rates(text: str, option: str) -> tuple[float, ...]:

@@ -17,17 +17,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Annotated, Unpack
 
 import numpy as np
 
 from imulab.display import UNJUDGED, Bad, Note
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
-from imulab.estimation.decisions import SCALE_OFF_UNIT, TURNS_ACROSS_SCATTER, TURNS_SCATTER
+from imulab.estimation.decisions import (
+    AXIS_TILTED,
+    SCALE_OFF_UNIT,
+    TURNS_ACROSS_SCATTER,
+    TURNS_LOSE_SAMPLES,
+    TURNS_SCATTER,
+)
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
+from imulab.gravity import EARTH, checked_latitude
 from imulab.options import measure, text
-from imulab.procedures.rate import AXES, FENCE, name_gyroscopes, parse_fraction
+from imulab.procedures.rate import AXES, FENCE, TILT, name_gyroscopes, parse_fraction
 from imulab.procedures.rate.axes import (
     BY_ACCELEROMETERS,
     correct_means,
@@ -41,78 +47,15 @@ from imulab.procedures.rate.axes import (
     with_prior,
 )
 from imulab.procedures.rate.schema import TurnsEvidence, TurnsModel, TurnsSummary, WholeTurns
+from imulab.procedures.rate.turn_defects import check_motions, even_stamps
+from imulab.procedures.rate.turn_errors import LIKELY, MISALIGNMENT, RestingBias, bias_at_rest, share_lost, tilt_shift
 from imulab.procedures.result import Record, Result, as_record, as_recording
 from imulab.quantities import in_si
 from imulab.recording import Array, Data, Reading, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Quantity, entries
+from imulab.report.parameters import text_in
 from imulab.units import from_si, parse_unit, to_si
-
-# Defects of a recording: time stamps in bursts, gaps within a turn, and saturated outputs.
-
-
-_QUICK, _SHARE_IN_BURSTS = 0.25, 0.25  # of the mean step; share of such short steps from which stamps come in bursts
-_KEEPS = 0.1  # s by which such stamps are off a straight line at most
-_GAP = 3.0  # usual steps: within a longer one motion may be hidden
-_SHAKE = (2 * np.pi * 2.0) ** 2 / 12
-"""Angle error across a gap, over rate and gap cubed: a straight line in place of a rate that a hand varies at 2 Hz."""
-_STILL_SAMPLES = 10  # equal samples in a row from which an output stands still
-_QUIET = 0.5  # share of equal neighbours at rest from which this is usual for the output
-
-
-def even_stamps(time: Array, name: str) -> tuple[Array, list[str]]:
-    """Return time stamps, s, evened where they come in bursts, and the note that says so.
-
-    A quarter of the steps or more are shorter than a quarter of the mean, as no sensor samples, and the stamps keep to
-    a straight line within 0.1 s and ten samples.
-    """
-    step = np.diff(time)
-    mean = float(step.mean())
-    if float((step < _QUICK * mean).mean()) < _SHARE_IN_BURSTS:
-        return time, []
-    count = np.arange(len(time), dtype=np.float64)
-    even = np.polynomial.Polynomial.fit(count, time, 1)(count)
-    if float(np.abs(time - even).max()) > _KEEPS + _STILL_SAMPLES * mean:
-        return time, []
-    note = Note(
-        f"{name}: the time stamps come in bursts (steps of {1e3 * float(step.min()):.3g} to "
-        f"{1e3 * float(step.max()):.3g} ms): taken as even, {1 / float(even[1] - even[0]):.5g} Hz"
-    )
-    return np.asarray(even), [note]
-
-
-def check_motions(time: Array, rate: Array, rests: list[tuple[int, int]], fence: float, name: str) -> None:
-    """Refuse a gap inside a turn that may hide more motion than the fence, and an output that is saturated.
-
-    Raises
-    ------
-    DataError
-        There is one; the message names the time.
-    """
-    usual = float(np.median(np.diff(time)))
-    repeats = np.mean([np.mean(np.diff(rate[a:b], axis=0) == 0, axis=0) for a, b in rests], axis=0)
-    for (_, end), (start, _) in pairwise(rests):
-        part, at = rate[end - 1 : start + 1], time[end - 1 : start + 1]
-        step = np.diff(at)
-        beside = np.maximum(np.linalg.norm(part[1:], axis=1), np.linalg.norm(part[:-1], axis=1))
-        hidden = np.where(step > _GAP * usual, _SHAKE * beside * step**3, 0.0)
-        worst = int(np.argmax(hidden))
-        if hidden[worst] > fence:
-            raise DataError(
-                f"{name}: samples are missing from {at[worst]:.2f} to {at[worst + 1]:.2f} s, while the unit turned at "
-                f"{np.degrees(beside[worst]):.0f} deg/s: the angle of that turn is not known; leave it out (--window)"
-            )
-        for axis in range(3):
-            values = np.abs(part[:, axis])
-            top = values == values.max()
-            edges = np.flatnonzero(np.diff(np.concatenate([[False], top, [False]]).astype(int))).reshape(-1, 2)
-            longest = edges[int(np.argmax(edges[:, 1] - edges[:, 0]))]
-            if longest[1] - longest[0] >= _STILL_SAMPLES and repeats[axis] < _QUIET:
-                raise DataError(
-                    f"{name}: gyro_{AXES[axis]} stands still at {np.degrees(values.max()):.5g} deg/s from "
-                    f"{at[longest[0]]:.2f} to {at[longest[1] - 1]:.2f} s: its output is saturated; turn more slowly"
-                )
-
 
 # Rests, and how far the unit turned between them.
 
@@ -142,6 +85,12 @@ class AxisTurns:
         Turns less one where they scatter beyond the fence, and that scatter is in the uncertainty; else None.
     motion
         Index of each turn among the motions, shape (k,).
+    tilt
+        What `scale` holds too much by tilt and misalignment of the axis, relative, and its standard uncertainty.
+    across
+        Largest angle by which the other gyroscopes see the axis lie off this one's, rad.
+    lost, lost_probability
+        Root mean square share of samples that may be lost, and the probability that any are.
     """
 
     count: Array
@@ -152,6 +101,10 @@ class AxisTurns:
     scale_uncertainty: float
     freedom: int | None
     motion: tuple[int, ...]
+    tilt: tuple[float, float] = (0.0, 0.0)
+    across: float = 0.0
+    lost: float = 0.0
+    lost_probability: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -176,8 +129,8 @@ class Motions:
         First and last sample of each motion.
     period
         Usual time between two samples, s.
-    bias, bias_uncertainty
-        Mean output at rest and its standard uncertainty, rad/s, shape (3,).
+    zeros
+        Mean output at each rest, rad/s, shape (m + 1, 3).
     notes
         Notes on changes to the recording, such as evened time stamps.
     """
@@ -190,8 +143,7 @@ class Motions:
     before: Array | None
     after: Array | None
     steps: tuple[Array, ...]
-    bias: Array
-    bias_uncertainty: Array
+    zeros: Array
     span: tuple[tuple[int, int], ...]
     period: float
     notes: tuple[str, ...] = ()
@@ -243,8 +195,7 @@ def find_motions(recording: Recording, fence: float) -> Motions:
         before=None if means is None else means[:-1],
         after=None if means is None else means[1:],
         steps=tuple(row[2] for row in rows),
-        bias=zero.mean(axis=0),
-        bias_uncertainty=zero.std(axis=0, ddof=1) / np.sqrt(len(zero)),
+        zeros=zero,
         span=tuple(row[4] for row in rows),
         period=float(np.median(np.diff(time))),
         notes=tuple(notes),
@@ -540,30 +491,17 @@ def _extend_record(record: Calibration, matrix: Array, covariance: Array) -> Cal
 
 
 def turns_record(
-    recording: Recording, motions: Motions, axis_turns: Mapping[str, AxisTurns], fence: float, clock: float | None
+    recording: Recording,
+    motions: Motions,
+    axis_turns: Mapping[str, AxisTurns],
+    fence: float,
+    clock: float | None,
+    latitude: float | None = None,
 ) -> Calibration:
     """Return the record of the scale factors and biases."""
     unit = recording.triad_unit("gyro")
-    nominal = float(from_si(1.0, unit))
-    parameters = {
-        f"gyro_bias_{a}": Parameter(
-            float(motions.bias[AXES.index(a)]) / turned_axis.scale,
-            float(motions.bias_uncertainty[AXES.index(a)]) / turned_axis.scale,
-            "rad/s",
-        )
-        for a, turned_axis in axis_turns.items()
-    }
-    for a, turned_axis in axis_turns.items():
-        u = float(np.hypot(turned_axis.scale_uncertainty, turned_axis.scale * (clock or 0.0)))
-        reach = None if turned_axis.freedom is None else coverage_factor(float(turned_axis.freedom)) * u
-        parameters[f"gyro_scale_factor_{a}"] = Parameter(
-            turned_axis.scale * nominal,
-            u * nominal,
-            f"{unit}/(rad/s)",
-            interval_95=None
-            if reach is None
-            else ((turned_axis.scale - reach) * nominal, (turned_axis.scale + reach) * nominal),
-        )
+    bias = _bias_of_rests(motions, axis_turns, latitude)
+    parameters = _bias_parameters(bias, axis_turns) | _scale_parameters(axis_turns, clock, unit)
     spread = np.array([p.standard_uncertainty or 0.0 for p in parameters.values()])
     matrix = np.diag(spread**2)
     names = list(parameters)
@@ -591,8 +529,55 @@ def turns_record(
         data=entries(TurnsEvidence(turns=turns)),
         sensor={key: text for key in ("serial", "model", "element") if (text := recording.metadata.get(key))},
         sources=() if recording.source is None else (recording.source,),
-        warnings=(*motions.notes, *_warn_turns(axis_turns, clock)),
+        warnings=(
+            *motions.notes,
+            *_warn_turns(axis_turns, clock),
+            *_warn_unseen(axis_turns, bias, latitude, motions),
+        ),
     )
+
+
+def _bias_of_rests(motions: Motions, axis_turns: Mapping[str, AxisTurns], latitude: float | None) -> RestingBias:
+    """Return the biases by the rests; a rest has the axis upright about which the unit turned beside it."""
+    upright = np.full(len(motions.zeros), -1)
+    for axis, turned_axis in axis_turns.items():
+        for k in turned_axis.motion:
+            upright[k : k + 2] = AXES.index(axis)
+    force = None
+    if motions.before is not None and motions.after is not None:
+        force = np.vstack([motions.before, motions.after[-1:]])
+    return bias_at_rest(motions.zeros, force, upright, latitude)
+
+
+def _bias_parameters(bias: RestingBias, axis_turns: Mapping[str, AxisTurns]) -> dict[str, Parameter]:
+    """Return ``gyro_bias_i``; intervals are Student's t of the rests, as far as their scatter is the uncertainty."""
+    parameters = {}
+    for a, turned_axis in axis_turns.items():
+        i = AXES.index(a)
+        value, noise = float(bias.value[i]) / turned_axis.scale, float(bias.noise[i]) / turned_axis.scale
+        u = float(np.hypot(noise, bias.earth[i]))
+        half = coverage_factor((bias.rests - 1) * (u / noise) ** 4) * u if noise else None
+        interval = None if half is None else (value - half, value + half)
+        parameters[f"gyro_bias_{a}"] = Parameter(value, u, "rad/s", interval_95=interval)
+    return parameters
+
+
+def _scale_parameters(axis_turns: Mapping[str, AxisTurns], clock: float | None, unit: str) -> dict[str, Parameter]:
+    """Return ``gyro_scale_factor_i``, with the uncertainty by stops, tilt, lost samples and clock."""
+    nominal = float(from_si(1.0, unit))
+    parameters = {}
+    for a, turned_axis in axis_turns.items():
+        scale = turned_axis.scale / (1 + turned_axis.tilt[0])
+        relative = np.linalg.norm([turned_axis.tilt[1], turned_axis.lost, clock or 0.0])
+        u = float(np.hypot(turned_axis.scale_uncertainty, scale * relative))
+        interval = None
+        if turned_axis.freedom is not None:
+            reach = coverage_factor(float(turned_axis.freedom)) * u
+            interval = ((scale - reach) * nominal, (scale + reach) * nominal)
+        parameters[f"gyro_scale_factor_{a}"] = Parameter(
+            scale * nominal, u * nominal, f"{unit}/(rad/s)", interval_95=interval
+        )
+    return parameters
 
 
 def _warn_turns(axis_turns: Mapping[str, AxisTurns], clock: float | None) -> list[str]:
@@ -619,6 +604,43 @@ def _warn_turns(axis_turns: Mapping[str, AxisTurns], clock: float | None) -> lis
             Note(
                 "the scale factors are those per clock: a sample rate that is off is in them; state what it is known "
                 "to (--clock)"
+            )
+        )
+    return messages
+
+
+def _warn_unseen(
+    axis_turns: Mapping[str, AxisTurns], bias: RestingBias, latitude: float | None, motions: Motions
+) -> list[str]:
+    """Return what is said of lost samples, a tilted axis and the Earth's rate."""
+    messages: list[str] = []
+    for a, turned_axis in axis_turns.items():
+        if turned_axis.lost_probability > LIKELY:
+            messages.append(
+                f"gyro_{a}: the turns scatter as if {100 * turned_axis.lost:.2g} % of the samples were lost; its scale "
+                "factor may be low by as much, which its uncertainty holds; record with a counter or stamps of the "
+                "sensor's clock"
+            )
+        if turned_axis.tilt[1] and turned_axis.across > AXIS_TILTED.limit * MISALIGNMENT:
+            messages.append(
+                f"gyro_{a}: by the other gyroscopes the turns were about an axis "
+                f"{np.degrees(turned_axis.across):.2g} deg off its own, by tilt or misalignment; the scale factor's "
+                "uncertainty holds what that may add; turn about x, y and z, with the record of the accelerometers "
+                "(--accel)"
+            )
+    which = [AXES.index(a) for a in axis_turns]
+    if latitude is None and (bias.earth[which] > bias.noise[which] / 3).any():
+        messages.append(
+            Note(
+                f"the Earth's rate, up to {text_in(EARTH, 'deg/h', 2)} deg/h, is in the uncertainties of the biases; "
+                "the latitude tells its vertical part (--latitude)"
+            )
+        )
+    elif latitude is not None and motions.before is None:
+        messages.append(
+            Note(
+                "which way is up is not known without accelerometers: the Earth's rate is in the uncertainties of the "
+                "biases"
             )
         )
     return messages
@@ -668,6 +690,8 @@ def fit_turns(
     fence: Annotated[float | str, measure("angle", "deg")] = FENCE,
     turns: Annotated[str | Sequence[int] | None, text("N,N,...")] = None,
     clock: Annotated[float | str | None, text("FRACTION")] = None,
+    latitude: Annotated[float | str | None, measure("angle", "deg")] = None,
+    tilt: Annotated[float | str, measure("angle", "deg")] = TILT,
     accel: Record | None = None,
     prior: Record | None = None,
     **reading: Unpack[Reading],
@@ -688,6 +712,10 @@ def fit_turns(
     clock
         Uncertainty of the sample rate, such as 50ppm. Relative standard uncertainty; without it the scale factors are
         those per clock.
+    latitude
+        Of the place, for the Earth's rate. In rad; without it that rate is in the uncertainties of the biases.
+    tilt
+        How far the axis of the turns may lie off the body axis. Standard uncertainty, rad; not used with accel.
     accel
         Tumble record, whose accelerometers tell the turns' axes. Of `fit_tumble` of the same unit or its file, for
         turns about x, y and z on a level table: the result is a record of both triads, with misalignments.
@@ -727,6 +755,10 @@ def fit_turns(
     if not 0 < width < 1:
         raise OptionError(f"fence {fence}: expected the uncertainty of the difference of two stops, such as 0.5 deg")
     of_clock = None if clock is None else parse_fraction(clock, "clock")
+    place = None if latitude is None else checked_latitude(in_si(latitude, "latitude", "angle", "deg"))
+    lean = in_si(tilt, "tilt", "angle", "deg")
+    if not 0 <= lean < 0.5:
+        raise OptionError(f"tilt {tilt}: expected an angle of 0 or more, such as 0.5 deg")
     stated = None if turns is None else _parse_counts(turns)
     held = None if accel is None else as_record(accel, "fit_turns: accel")
     recording = as_recording(data, reading, fit_turns, name_gyroscopes)
@@ -747,8 +779,8 @@ def fit_turns(
             )
             count = _count_turns(angle, motions, members, recording.name) if stated_counts is None else stated_counts
             _check_counts(angle / _TURN, count, motions, members, recording.name)
-            axis_turns[AXES[axis]] = _fit_scale(motions, members, axis, angle, count, width)
-    record = turns_record(recording, motions, axis_turns, width, of_clock)
+            axis_turns[AXES[axis]] = _fit_scale(motions, members, axis, angle, count, width, lean)
+    record = turns_record(recording, motions, axis_turns, width, of_clock, place)
     if held is not None:
         record = add_misalignments(record, recording, motions, axis_turns, held)
     if prior is not None:
@@ -880,24 +912,33 @@ def _check_counts(ratio: Array, count: Array, motions: Motions, members: list[in
         )
 
 
-def _fit_scale(motions: Motions, members: list[int], axis: int, angle: Array, count: Array, fence: float) -> AxisTurns:
+def _fit_scale(
+    motions: Motions, members: list[int], axis: int, angle: Array, count: Array, fence: float, tilt: float
+) -> AxisTurns:
     """Return the scale factor about one axis: ``S = (t' C^-1 angle) / (t' C^-1 t)``, ``t = 2 pi count``.
 
     C holds fence^2 and the zero's variance on the diagonal, and -fence^2 / 2 between successive turns, which share a
     stop. Where the turns scatter beyond that (chi-square), the variance is enlarged.
     """
-    covariance = np.diag(fence**2 + motions.zero[members, axis] ** 2)
+    stops = fence**2 * np.eye(len(members))
     for k in range(len(members) - 1):
         if members[k + 1] == members[k] + 1:
-            covariance[k, k + 1] = covariance[k + 1, k] = -(fence**2) / 2
+            stops[k, k + 1] = stops[k + 1, k] = -(fence**2) / 2
+    of_zero = motions.zero[members, axis] ** 2
+    covariance = stops + np.diag(of_zero)
     turned = _TURN * count
     weight = np.linalg.solve(covariance, turned)
     variance = 1 / float(turned @ weight)
     scale = variance * float(weight @ angle)
     left = angle - scale * turned
     chi_square, freedom = float(left @ np.linalg.solve(covariance, left)), len(members) - 1
-    beyond = freedom > 0 and chi_square_probability(chi_square, freedom) < TURNS_SCATTER.level
+    by_stops = chi_square_probability(chi_square, freedom) if freedom > 0 else 1.0
+    beyond = by_stops < TURNS_SCATTER.level
     wide = chi_square / freedom if beyond else 1.0
+    others = [other for other in range(3) if other != axis]
+    across = count @ motions.angle[members][:, others] / (count @ turned)
+    square = np.array([np.sum(motions.steps[k][:, axis] ** 2) for k in members])
+    lost, probability = share_lost(angle, turned, stops, of_zero, square)
     return AxisTurns(
         count=count,
         angle=angle,
@@ -907,4 +948,8 @@ def _fit_scale(motions: Motions, members: list[int], axis: int, angle: Array, co
         scale_uncertainty=float(np.sqrt(variance * wide)),
         freedom=freedom if beyond else None,
         motion=tuple(members),
+        tilt=tilt_shift(across, tilt),
+        across=float(np.abs(across).max()),
+        lost=lost,
+        lost_probability=probability if by_stops < TURNS_LOSE_SAMPLES.level else 0.0,
     )
