@@ -367,11 +367,15 @@ def _scaled_ageing(ageing: Sequence[float], gravity: float) -> tuple[float | Non
     return (*known, *[None] * (len(GROUPS) - len(known)))
 
 
-def nominal_scaling(attitudes: Attitudes, gravity: float) -> Scaling:
-    """Nominal sensor: by its unit, or for counts and volts from the span of each axis; a far zero by its sphere."""
+def nominal_scaling(attitudes: Attitudes, gravity: float, method: str = "norm") -> Scaling:
+    """Nominal sensor: by its unit, for counts and volts from the span of each axis; a far zero by the outputs' sphere.
+
+    Method linearised starts where its source does.
+    """
     unit = parse_unit(attitudes.unit)
     if unit.quantity == "acceleration":
-        return Scaling(far_zero(attitudes.mean), np.full(3, gravity / to_si(1.0, unit.symbol)))
+        zero = far_zero(attitudes.mean) if method == "norm" else np.zeros(3)
+        return Scaling(zero, np.full(3, gravity / to_si(1.0, unit.symbol)))
     high, low = attitudes.mean.max(axis=0), attitudes.mean.min(axis=0)
     return Scaling((high + low) / 2, np.maximum((high - low) / 2, (high - low).max() / 20))
 

@@ -222,7 +222,7 @@ def fit_tumble(
     place = _stated_place(further, hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
     local = local_gravity(at_place(gravity, latitude, height, beside="gyro" in further), attitudes.recording)
-    scaling = _checked_scaling(attitudes, local.value)
+    scaling = _checked_scaling(attitudes, local.value, method)
     known = None if prior is None else prior_record(as_record(prior, "fit_tumble: prior"), attitudes)
     order = order if known is None else _prior_order(known, order, attitudes)
     rest = _threshold(threshold, local.value) if method == "linearised" else None
@@ -244,10 +244,10 @@ def fit_tumble(
     )  # fmt: skip
 
 
-def _checked_scaling(attitudes: Attitudes, gravity: float) -> Scaling:
+def _checked_scaling(attitudes: Attitudes, gravity: float, method: str) -> Scaling:
     """Return the nominal sensor, once the attitudes can be those of an accelerometer triad."""
     check_attitudes(attitudes, gravity)
-    return nominal_scaling(attitudes, gravity)
+    return nominal_scaling(attitudes, gravity, method)
 
 
 def _stated_place(
