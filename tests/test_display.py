@@ -1,14 +1,16 @@
 """The verdict on a result, where it is seen: in records, on the terminal, at the head of a report."""
 
+import ast
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.display import Bad, Note, Verdict, verdict_of
+from imulab.display import Bad, Note, Verdict, action_of, verdict_of
 from imulab.errors import RecordError
 from imulab.procedures.registry import loads
 from imulab.procedures.tumble.simulate import simulate_tumble
@@ -205,3 +207,57 @@ def test_a_gravity_that_is_hardly_known_is_refused(run, option, words):
     status, _, said = run("tumble", "fit", "a.csv", option)
     assert status == 2
     assert words in said
+
+
+MESSAGES = {"messages", "warnings", "notes", "lines", "named"}
+NO_FINDINGS = re.compile(r"plan|simulate|figures|manifest|schema|views|apply|device")
+
+
+def _texts(node):
+    """Yield the texts in a list of messages that state no action beside themselves, with x for what is filled in."""
+    match node:
+        case ast.List():
+            for item in node.elts:
+                yield from _texts(item)
+        case ast.ListComp() | ast.GeneratorExp():
+            yield from _texts(node.elt)
+        case ast.Starred():
+            yield from _texts(node.value)
+        case ast.IfExp():
+            yield from [*_texts(node.body), *_texts(node.orelse)]
+        case ast.BinOp():
+            yield from [*_texts(node.left), *_texts(node.right)]
+        case ast.Call(func=ast.Name(id="Finding" | "Bad"), args=[text]):
+            yield from _texts(text)
+        case ast.JoinedStr():
+            yield "".join(str(part.value) if isinstance(part, ast.Constant) else "x" for part in node.values)
+        case ast.Constant(value=str()):
+            yield node.value
+
+
+def _lists_of_messages(function):
+    """Yield the expressions by which a function adds to its messages."""
+    for node in ast.walk(function):
+        match node:
+            case ast.Call(func=ast.Attribute(value=ast.Name(id=name), attr="append"), args=[value]) if name in MESSAGES:
+                yield value
+            case ast.AugAssign(target=ast.Name(id=name), value=value) if name in MESSAGES:
+                yield value
+            case ast.Return(value=value) if function.name.startswith(("warn", "_warn")) and value is not None:
+                yield value
+
+
+def test_every_finding_asks_for_something():
+    source = Path(il.__file__).parent
+    files = [*(source / "procedures").rglob("*.py"), *(source / "estimation").rglob("*.py"), source / "gravity.py"]
+    silent = {
+        f"{file.name}: {text}"
+        for file in files
+        if not NO_FINDINGS.search(file.name)
+        for function in ast.walk(ast.parse(file.read_text()))
+        if isinstance(function, ast.FunctionDef) and function.name not in ("measured", "turned", "_of_magnetometers")
+        for expression in _lists_of_messages(function)
+        for text in _texts(expression)
+        if len(text.split()) > 3 and not action_of(text)
+    }
+    assert not silent

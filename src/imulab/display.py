@@ -215,8 +215,6 @@ def action_of(finding: str) -> str:
     if action:
         return action
     clause = _CLAUSES.split(finding)[-1].strip()
-    if clause.endswith("?"):
-        return f"answer this: {clause}"
     return clause if _IMPERATIVE.match(clause) and clause != finding else ""
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from imulab.columns import INERTIAL, kind_of
-from imulab.display import Note, prefixed
+from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.noise.analysis import CANDIDATES, Analysis, analyses, average
 from imulab.estimation.noise.readings import doubtful_units, own_readings
@@ -171,7 +171,7 @@ def _noises(
     recording: Recording, rate: float, names: list[str], wanted: Sequence[str], taus: str | Array
 ) -> tuple[dict[str, ColumnNoise], list[str]]:
     """Return the noise of the columns `wanted`, with notes; a column of a sensor that moved has no coefficients."""
-    notes = []
+    notes: list[str] = []
     moved = moved_columns(recording, names, rate)
     values = (recording.si(name) for name in wanted)  # one at a time: a long log is large
     noises = dict(zip(wanted, columns_noise(values, rate, [moved.get(name, "") for name in wanted]), strict=True))
@@ -283,11 +283,12 @@ def noise_lines(noises: Mapping[str, ColumnNoise]) -> list[str]:
         reason = its.angle_random_walk.reason or its.bias_instability.reason
         if reason:
             by_reason.setdefault(reason, []).append(name)
-    messages = []
+    messages: list[str] = []
     for reason, names in by_reason.items():
         alone = not noises[names[0]].coefficients.angle_random_walk.reason
         which = "bias instability and random walk of the zero" if alone else "noise coefficients"
-        messages.append((Note if alone else str)(f"{_columns(names)}: {which} not determined: {reason}"))
+        text = f"{_columns(names)}: {which} not determined: {reason}"
+        messages.append((Note if alone else Finding)(text, "check the sensor, and the resolution of its log"))
     filtered = {n: f.coefficients for n, f in noises.items() if f.coefficients.filtered}
     if filtered:
         highest = min(f.highest for f in filtered.values())

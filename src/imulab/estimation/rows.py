@@ -18,7 +18,7 @@ from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
 from imulab.columns import kind_of
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import DataError
 from imulab.recording import Array, Recording, stored_as
 
@@ -230,16 +230,17 @@ class LeftOut(Struct, frozen=True):
 
     def notes(self, rest: NDArray[np.bool_] | None = None) -> list[str]:
         """Return a sentence for each reason why rows were left out; far samples count only at `rest`, shape (n,)."""
-        notes = []
+        notes: list[str] = []
         for kind, rows in self.kinds.items():
             left_out = rows & rest if rest is not None and kind == FAR else rows
             count = int(np.count_nonzero(left_out))
             if count:
-                kind_of = Note if count < _SHARE_NOTED * len(left_out) else str
+                kind_of = Note if count < _SHARE_NOTED * len(left_out) else Finding
                 notes.append(
                     kind_of(
                         f"{count} row{'s' * (count > 1)} of {_shown(self.names)} left out: {kind}, first at "
-                        f"{self.recording.place(int(np.argmax(left_out)))}"
+                        f"{self.recording.place(int(np.argmax(left_out)))}",
+                        "check the link to the sensor, and record again",
                     )
                 )
         return notes

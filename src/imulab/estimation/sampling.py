@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.rows import median, quantile
 from imulab.recording import Array, Recording, check_finite, check_time, stored_as
@@ -67,8 +67,11 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
         return rate, mislabelled(recording, rate)
     worst = int(wide[np.argmax(step[wide])])
     return 1 / usual, [
-        f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest {step[worst]:.3g} s "
-        f"after {recording.place(worst)}; the samples on both sides are taken as neighbours",
+        Finding(
+            f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest {step[worst]:.3g} s "
+            f"after {recording.place(worst)}; the samples on both sides are taken as neighbours",
+            "record again without lost samples",
+        ),
         *mislabelled(recording, 1 / usual),
     ]
 
@@ -115,9 +118,10 @@ def steady_part(recording: Recording) -> tuple[Recording, list[str]]:
     if (start, stop) == (0, len(time)):
         return recording, []
     columns = {name: values[start:stop] for name, values in recording.columns.items()}
-    line = (
+    line = Finding(
         f"{_change(recording, time, start, stop)}; used are {recording.place(start)} to {recording.place(stop - 1)}, "
-        f"{time[stop - 1] - time[start]:.4g} s"
+        f"{time[stop - 1] - time[start]:.4g} s",
+        "state the part to use (--window)",
     )
     return replace(recording, columns=columns, first_row=recording.first_row + start), [line]
 
@@ -157,8 +161,8 @@ def bridged_line(name: str, count: int, rows: int, first: str) -> str:
     """Return the finding of how many of a file's rows hold no numbers, and where the first is: a note of a few."""
     many = f"{count} row{'s' if count > 1 else ''} without numbers"
     where = first if count == 1 else f"the first {first}"
-    kind = Note if count == 1 or count < FEW * rows else str
-    return kind(f"{name}: {many} ({where}) bridged from their neighbours")
+    kind = Note if count == 1 or count < FEW * rows else Finding
+    return kind(f"{name}: {many} ({where}) bridged from their neighbours", "record again without lost samples")
 
 
 def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
@@ -187,6 +191,9 @@ def mislabelled(recording: Recording, rate: float) -> list[str]:
     ]
     guess = f": {' or '.join(likely)}" if likely else ""
     return [
-        f"{recording.name}: column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): is the unit of "
-        f"time right{guess}? If not, every figure that depends on time is wrong"
+        Finding(
+            f"{recording.name}: column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): is the unit of "
+            f"time right{guess}? If not, every figure that depends on time is wrong",
+            "correct the unit of the column time",
+        )
     ]

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from imulab.columns import triad
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError
 from imulab.readers import logs
 from imulab.readers.selection import Selection
@@ -127,7 +127,13 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
         per_second=1_000_000,
         origin=0,
         metadata=lambda _: metadata,
-        notes=(*contents.notes, "ArduPilot logs outputs that it has already corrected by its INS_ parameters"),
+        notes=(
+            *contents.notes,
+            Finding(
+                "ArduPilot logs outputs that it has already corrected by its INS_ parameters",
+                "set the INS_ offsets to 0 and scales to 1, and record again",
+            ),
+        ),
     )
 
 
@@ -163,7 +169,12 @@ def _survey(path: Path, name: str) -> _Contents:
         raise ReadError(f"{name}: damaged at byte {end.position}: expected a message (a3 95 ..), found {shown}")
     if end.left:
         what = "filling behind" if filled else "the last message, cut,"
-        contents.notes.append(f"truncated: {what} at byte {end.position}; read up to there")
+        contents.notes.append(
+            Finding(
+                f"truncated: {what} at byte {end.position}; read up to there",
+                "check that the part read is the whole test, or take the log off again",
+            )
+        )
     return contents
 
 
@@ -246,13 +257,20 @@ def _choose(
         gyros = samples.get("GYR", 0)
         if samples["IMU"] > logs.PLAINLY_MORE * gyros:
             contents.notes.append(
-                f"ACC, which has {samples['ACC']} samples, is not read but {samples['IMU']} of IMU: of GYR there are "
-                f"{gyros}; a topic chooses"
+                Finding(
+                    f"ACC, which has {samples['ACC']} samples, is not read but {samples['IMU']} of IMU: of GYR there "
+                    f"are {gyros}; a topic chooses",
+                    "choose the messages (--topic)",
+                )
             )
         else:
             topic = "ACC"
             contents.notes.append(
-                f"ACC, which has {samples['ACC']} samples, is read rather than {samples['IMU']} of IMU; a topic chooses"
+                Finding(
+                    f"ACC, which has {samples['ACC']} samples, is read rather than {samples['IMU']} of IMU; a topic "
+                    "chooses",
+                    "choose the messages (--topic)",
+                )
             )
     if (topic, instance) not in there:
         known = ", ".join(f"{title} {number}" for title, number in sorted(there))

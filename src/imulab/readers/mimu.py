@@ -16,7 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import ReadError
 from imulab.readers.selection import Selection
 from imulab.recording import Array, Recording, Source
@@ -77,10 +77,20 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
     if cut is not None:
         notes.append(Note(f"truncated: the last frame, at byte {cut}, is cut; read up to there"))
     if skipped:
-        notes.append(f"{skipped} bytes between frames were skipped as damaged")
+        notes.append(
+            Finding(
+                f"{skipped} bytes between frames were skipped as damaged",
+                "check the link of the logger, and record again",
+            )
+        )
     if lost.any():
         index = int(np.flatnonzero(lost)[0])
-        notes.append(f"{int(lost.sum())} frames are missing from the log, the first after row {index + 1}")
+        notes.append(
+            Finding(
+                f"{int(lost.sum())} frames are missing from the log, the first after row {index + 1}",
+                "check the link of the logger, and record again",
+            )
+        )
     return Recording(
         columns=columns,
         units=units,

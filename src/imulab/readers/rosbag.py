@@ -29,7 +29,7 @@ from typing import Any, BinaryIO, Protocol, cast
 import numpy as np
 
 from imulab.columns import triad
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError, listed
 from imulab.readers import logs
 from imulab.readers.formats import Budget, unpack
@@ -483,7 +483,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
             )
         ]
         notes += [
-            f"{chosen[0]} does not report the {what}"
+            Finding(f"{chosen[0]} does not report the {what}", "choose a topic that has both (--topic)")
             for what, is_there in zip(("accelerometer", "gyroscope"), there, strict=True)
             if not is_there
         ]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import kind_of
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, ReadError
 from imulab.estimation.sampling import WIDEST_GAP
 from imulab.recording import Array, Recording, check_time
@@ -266,16 +266,19 @@ def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
     """Return a note by how much the first stream to end ends before the others; a warning if that is a large part."""
     timed = [(b.last, b.first, b) for b in buffers if b.last is not None and b.first is not None and b.stream.bounds]
     end, _, first = min(timed, key=lambda ending: ending[0])
-    messages = []
+    messages: list[str] = []
     for last, start, buffer in timed:
         left = last - end
         if left > WIDEST_GAP * np.nan_to_num(max(first.step, buffer.step)):
             lost = f"{left / per_second:.4g} s"
             share = left / (last - start)
             messages.append(
-                f"{'truncated stream: ' if share > _MUCH else ''}the {first.stream.what} ends {lost} before the "
-                f"{buffer.stream.what}: rows end there, and {lost} ({100 * share:.2g} %) of the "
-                f"{buffer.stream.what} are left out"
+                Finding(
+                    f"{'truncated stream: ' if share > _MUCH else ''}the {first.stream.what} ends {lost} before the "
+                    f"{buffer.stream.what}: rows end there, and {lost} ({100 * share:.2g} %) of the "
+                    f"{buffer.stream.what} are left out",
+                    "check that the log is whole, or record again",
+                )
             )
     return messages
 

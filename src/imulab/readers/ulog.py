@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from imulab.columns import triad
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError
 from imulab.readers import logs
 from imulab.readers.selection import Selection
@@ -121,7 +121,12 @@ def _survey(path: Path, name: str) -> _Contents:
     if end.left and contents.limit == size:
         contents.notes.append(Note(f"truncated: the last message, at byte {end.position}, is cut; read up to there"))
     if contents.dropouts:
-        contents.notes.append(f"{len(contents.dropouts)} dropouts of the logger, {sum(contents.dropouts)} ms in all")
+        contents.notes.append(
+            Finding(
+                f"{len(contents.dropouts)} dropouts of the logger, {sum(contents.dropouts)} ms in all",
+                "record again with a faster card or fewer topics",
+            )
+        )
     return contents
 
 
@@ -211,7 +216,12 @@ def _choose(
             streams.append(LoggedStream("magnetometer", _MAG, placed=True))
         else:
             streams += [LoggedStream("accelerometer", _ACCEL), LoggedStream("gyroscope", _GYRO)]
-            contents.notes.append("sensor_combined holds outputs that PX4 has already corrected")
+            contents.notes.append(
+                Finding(
+                    "sensor_combined holds outputs that PX4 has already corrected",
+                    "log sensor_accel and sensor_gyro, and record again",
+                )
+            )
     return streams, sources
 
 

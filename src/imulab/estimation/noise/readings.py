@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import kind_of, triad
-from imulab.display import Bad, Note
+from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.rows import deviation_of_steps, distinct, median
@@ -166,15 +166,22 @@ def own_readings(recording: Recording, names: Sequence[str]) -> tuple[Recording,
     for count in sorted(set(held.values()) - {1}):
         its = [name for name in names if held[name] == count]
         notes.append(
-            f"{recording.name}: {_columns(its)}: every reading stands in {count} rows, of a sensor slower than its "
-            f"log: fitted alone (--columns), each counts once"
+            Finding(
+                f"{recording.name}: {_columns(its)}: every reading stands in {count} rows, of a sensor slower than its "
+                f"log: fitted alone (--columns), each counts once",
+                "fit these columns alone (--columns)",
+            )
         )
     single = [name for name in names if held[name] == 1]
     kinds = [kind_of(name) or name for name in single]
     if share := _repeated([recording.column(name)[:_SEEN] for name in single], kinds):
         notes.append(
-            f"{recording.name}: {100 * share:.0f} % of the rows repeat the readings before, more than chance makes: of "
-            "a sensor slower than its log the white noise is that of the log, repeats and all, larger than the sensor's"
+            Finding(
+                f"{recording.name}: {100 * share:.0f} % of the rows repeat the readings before, more than chance "
+                "makes: of a sensor slower than its log the white noise is that of the log, repeats and all, larger "
+                "than the sensor's",
+                "log each reading once, at the rate of the sensor",
+            )
         )
     return recording, notes
 
@@ -221,10 +228,11 @@ def _bridge_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Record
         columns[name] = stored_as(mended, recording.column(name))
     bad = np.logical_or.reduce(list(lost_rows.values()))
     count = int(np.count_nonzero(bad))
-    kind = Note if count < FEW * len(recording) else str
+    kind = Note if count < FEW * len(recording) else Finding
     note = kind(
         f"{recording.name}: {_columns(list(lost_rows))}: exact zeros in {count} rows, the first "
-        f"{recording.place(int(np.argmax(bad)))}, in place of lost readings: bridged by straight lines"
+        f"{recording.place(int(np.argmax(bad)))}, in place of lost readings: bridged by straight lines",
+        "check the link to the sensor, and record it again",
     )
     return recording.with_columns(columns, {}), [note]
 

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.display import Note, prefixed
+from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError
 from imulab.estimation.column_noise import most_reach, moved_columns
 from imulab.estimation.noise.readings import LEVELS, doubtful_units, dropouts, own_readings
@@ -205,14 +205,17 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
 
 def notes_of_steps(recording: Recording, names: Sequence[str]) -> list[str]:
     """Return notes on outputs whose steps are larger than their noise, from the first samples of a recording."""
-    notes = []
+    notes: list[str] = []
     for name in names:
         samples = recording.column(name)[:_SEEN]
         step, noise = resolution(samples), deviation_of_steps(samples) / math.sqrt(2)
         if step > noise > 0:
             notes.append(
-                f"{recording.name}: column {name}: steps of {step:.3g} {recording.units[name]}, {step / noise:.2g} "
-                "times the noise of a sample: the white noise holds what rounding adds, up to all of it"
+                Finding(
+                    f"{recording.name}: column {name}: steps of {step:.3g} {recording.units[name]}, {step / noise:.2g} "
+                    "times the noise of a sample: the white noise holds what rounding adds, up to all of it",
+                    "log finer steps: a smaller range, or more digits",
+                )
             )
     return notes
 
@@ -229,7 +232,12 @@ def notes_of_gaps(
     if len(lengths) > 1 or left_out:
         words = f"{len(lengths)} stretches of {duration:.4g} s in all" if len(lengths) > 1 else "one stretch"
         lost = f"; {left_out} samples in shorter ones are left out" if left_out else ""
-        notes.append(f"{name}: gaps in time leave {words}, which are taken as records of the same noise{lost}")
+        notes.append(
+            Finding(
+                f"{name}: gaps in time leave {words}, which are taken as records of the same noise{lost}",
+                "record again without lost samples",
+            )
+        )
     if duration < SHORT:
         notes.append(
             Note(f"{name}: {duration:.3g} s; below {SHORT:g} s only white noise and limits of slow noise can be told")

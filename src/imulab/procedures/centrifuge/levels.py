@@ -278,7 +278,7 @@ def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> L
             groups.setdefault((run.run.spin_axis, numbers[run.index]), []).append(run)
     keys = sorted(groups, key=lambda key: (key[0] != "up", key[1]))
     lines: dict[int, RunLine] = {}
-    warnings = []
+    warnings: list[str] = []
     undirected = []
     for key in keys:
         directed = all(run.encoder for run in groups[key])

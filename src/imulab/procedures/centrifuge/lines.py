@@ -874,7 +874,7 @@ def _check_units(solution: LineRegression, noise: Complex, place: str) -> list[s
             f"{place}: column fog shows Earth rate as {from_si(earth, 'deg/h'):.4g} deg/h, expected up to 15.04 deg/h: "
             "is its unit or scale factor wrong?"
         )
-    warnings = []
+    warnings: list[str] = []
     sigma = np.sqrt(solution.gain(ROOM) * np.diagonal(noise).real)
     # A vector fixed in the room passes Y a quarter turn before X.
     for name, value, expected, u in zip(("dtg_x", "dtg_y"), line[:-1], (fog, -1j * fog), sigma[:-1], strict=False):

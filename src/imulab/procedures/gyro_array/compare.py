@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from imulab.device import METHODS
-from imulab.display import prefixed
+from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError, ImulabError, OptionError, listed
 from imulab.estimation.decisions import METHOD_FOLLOWS_LESS
 from imulab.estimation.noise_coefficients import allan_deviation
@@ -333,8 +333,10 @@ def compare_methods(
     if stop - start < len(recording):
         time = recording.si("time")
         warnings.append(
-            f"{recording.name}: no truth_rate: the figures are of the longest stretch at rest, "
-            f"{time[start]:.6g} to {time[stop - 1]:.6g} s, with 0 as the truth"
+            Note(
+                f"{recording.name}: no truth_rate: the figures are of the longest stretch at rest, "
+                f"{time[start]:.6g} to {time[stop - 1]:.6g} s, with 0 as the truth"
+            )
         )
     reference = np.zeros((stop - start, len(elements.axes))) if truth is None else truth[start:stop]
     options = partial(FuseOptions, memory=memory, start=count_from, rate=rate)
@@ -569,7 +571,7 @@ def _warn_filtering(
     figures: dict[str, tuple[MethodRow, ...] | str], response: dict[str, list[Response]], rate: float
 ) -> list[str]:
     """Return warnings where lower noise comes from not following motion: its fast part (low-pass filter), or all."""
-    messages = []
+    messages: list[str] = []
     for method, rows in figures.items():
         if isinstance(rows, str):
             continue
@@ -580,18 +582,27 @@ def _warn_filtering(
             verbs = "does not move and counts" if len(slow.blind) == 1 else "do not move and count"
             why = f": {' '.join(slow.blind)} {verbs} in it"
             messages.append(
-                f"{method}: it follows only {slow.gain:.2f} ± {max(slow.gain_uncertainty, _FINEST):.2f} of a motion"
-                f"{why if slow.blind else ''}"
+                Finding(
+                    f"{method}: it follows only {slow.gain:.2f} ± {max(slow.gain_uncertainty, _FINEST):.2f} of a motion"
+                    f"{why if slow.blind else ''}",
+                    "compare with the other methods before you use this one",
+                )
             )
         elif narrow < _FILTERED * rate / 2:
             messages.append(
-                f"{method}: its bandwidth is {narrow:.3g} Hz of {rate / 2:.3g} Hz: where its rate noise is lower that "
-                "is low-pass filtering, which does not lower the angle error"
+                Finding(
+                    f"{method}: its bandwidth is {narrow:.3g} Hz of {rate / 2:.3g} Hz: where its rate noise is lower "
+                    "that is low-pass filtering, which does not lower the angle error",
+                    "compare the angle errors, not the rate noise",
+                )
             )
         elif beyond < _BEYOND_LIMIT:
             messages.append(
-                f"{method}: its noise from sample to sample is {beyond:.2f} of the least that weights can reach: that "
-                "is low-pass filtering, which does not lower the angle error"
+                Finding(
+                    f"{method}: its noise from sample to sample is {beyond:.2f} of the least that weights can reach: "
+                    "that is low-pass filtering, which does not lower the angle error",
+                    "compare the angle errors, not the rate noise",
+                )
             )
     return messages
 

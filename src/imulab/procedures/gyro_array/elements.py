@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from imulab.display import Bad, Note
+from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.sampling import GAP, usual_step
@@ -331,12 +331,10 @@ class SampleClock:
 
     def lines(self, name: str) -> list[str]:
         """Return messages on gaps."""
-        messages = [f"{name}: {gap}" for gap in self.gaps]
-        if self.count > len(self.gaps):
-            messages.append(
-                f"{name}: {self.count - len(self.gaps)} more gaps; {self.total:.6g} s in all {self.count} together"
-            )
-        return messages
+        gaps = list(self.gaps)
+        if self.count > len(gaps):
+            gaps.append(f"{self.count - len(gaps)} more gaps; {self.total:.6g} s in all {self.count} together")
+        return [Finding(f"{name}: {gap}", "record again without lost samples") for gap in gaps]
 
 
 def find_clocks(recording: Recording) -> dict[int, str]:
@@ -501,7 +499,7 @@ class Health:
 
     def lines(self) -> list[str]:
         """Return a line for each gyro that was excluded, stuck, jumped or not finite, and one where none was left."""
-        lines = []
+        lines: list[str] = []
         gyros = sorted({(a, i) for a, i, _ in self.events})
         for a, i in gyros:
             parts = [
@@ -509,13 +507,14 @@ class Health:
                 for _, kind in _KINDS
                 if (event := self.events.get((a, i, kind))) is not None
             ]
-            lines.append(f"{self.names[a][i]}: {'; '.join(parts)} (of {_samples(self.total)})")
+            text = f"{self.names[a][i]}: {'; '.join(parts)} (of {_samples(self.total)})"
+            lines.append(Finding(text, "check supply, link and range of this gyro"))
+        action = "check supply and link of the gyros that were excluded"
         if self.few > 0:
-            lines.append(
-                f"fewer than three gyros left in {_samples(self.few)}: nothing to compare with, equal weights there"
-            )
+            text = f"fewer than three gyros left in {_samples(self.few)}: nothing to compare with, equal weights there"
+            lines.append(Finding(text, action))
         if self.lost:
-            lines.append(f"no gyro left in {_samples(self.lost)}: the output is nan there")
+            lines.append(Finding(f"no gyro left in {_samples(self.lost)}: the output is nan there", action))
         return lines
 
 
@@ -625,7 +624,13 @@ class Checks:
         """Return messages on all checks; on `turned` elements only if asked, and not on dead gyros already `known`."""
         lines = self.dead(known) + self.doubled() + self.units()
         if turned:
-            lines += [f"{line}: mounted the other way round? {_UNTURNED}" for line in self.turned()]
+            lines += [
+                Finding(
+                    f"{line}: mounted the other way round? {_UNTURNED}",
+                    "check the mounting of this gyro, and correct the sign of its column",
+                )
+                for line in self.turned()
+            ]
         return lines
 
     def dead(self, known: Collection[str] = ()) -> list[str]:
@@ -638,10 +643,18 @@ class Checks:
             named = [name for name, gone in zip(row, dead, strict=True) if gone]
             if len(named) == len(row):
                 messages.append(
-                    Bad(f"{_listed(named)}: no reading ever changes: all gyros are dead, and so is the result")
+                    Bad(
+                        f"{_listed(named)}: no reading ever changes: all gyros are dead, and so is the result",
+                        "check supply and link of the array, and record it again",
+                    )
                 )
             elif set(named) - set(known):
-                messages.append(f"{' '.join(n for n in named if n not in known)}: no reading ever changes: a dead gyro")
+                messages.append(
+                    Finding(
+                        f"{' '.join(n for n in named if n not in known)}: no reading ever changes: a dead gyro",
+                        "check or replace this gyro, and record it again",
+                    )
+                )
         return messages
 
     def doubled(self) -> list[str]:
@@ -651,7 +664,10 @@ class Checks:
         flat = [name for row in self.names for name in row]
         live = ~self.still
         return [
-            Bad(f"{flat[i]} and {flat[j]} read the same throughout: one gyro, logged twice? It counts as two")
+            Bad(
+                f"{flat[i]} and {flat[j]} read the same throughout: one gyro, logged twice? It counts as two",
+                "give each column its gyro in the log, and record it again",
+            )
             for i, j in self.twins or []
             if live[i]
         ]
@@ -680,11 +696,12 @@ class Checks:
             likely = [text for factor, text in _FACTORS.items() if 1 / _NEAR < ratio / factor < _NEAR]
             smaller, larger = (" ".join(row[i] for i in sorted(part.tolist())) for part in (order[:cut], order[cut:]))
             what = "readings" if moves else "noise"
-            kind = Bad if moves or min(cut, len(order) - cut) > 1 else str
+            kind = Bad if moves or min(cut, len(order) - cut) > 1 else Finding
             messages.append(
                 kind(
                     f"the {what} of {larger} is {ratio:.3g} times as large as that of {smaller}: another unit"
-                    f"{f' ({likely[0]})' if likely else ''} or another kind of gyro? Unlike units must not be fused"
+                    f"{f' ({likely[0]})' if likely else ''} or another kind of gyro? Unlike units must not be fused",
+                    "correct the unit of these columns",
                 )
             )
         return messages
@@ -708,7 +725,7 @@ class Checks:
             if any(pair is not None and pair != plain[a] for a, pair in enumerate(mapping)):
                 by_map.setdefault(mapping, []).append(i)
         others = "first gyro of the axis" if usual == plain else "other gyros of the axis"
-        lines = []
+        lines: list[str] = []
         for mapping, elements in by_map.items():
             if axes == 1:
                 verb = "turns" if len(elements) == 1 else "turn"
@@ -928,9 +945,10 @@ def _refuse_motion(
 
 
 def _motion_message(name: str, moves: float, ratio: float) -> str:
-    return (
+    return Finding(
         f"{name}: the array moves: its elements go together by {math.degrees(moves):.3g} deg/s, {ratio:.0f} times what "
-        "they differ; expected a recording at rest"
+        "they differ; expected a recording at rest",
+        "record the array at rest",
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.device.tables import Fusion
-from imulab.display import Note, prefixed
+from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
 from imulab.estimation.column_noise import noise_lines
 from imulab.estimation.noise_coefficients import COEFFICIENTS, DeviationCurve, coefficients_dict
@@ -196,8 +196,11 @@ def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[
         )
     first, last = time[rest.start], time[rest.stop - 1]
     return part, [
-        f"{still.name}: not at rest throughout ({rest.moved}): used is the longest stretch at rest, {first:.6g} to "
-        f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval FROM:TO chooses another"
+        Finding(
+            f"{still.name}: not at rest throughout ({rest.moved}): used is the longest stretch at rest, {first:.6g} to "
+            f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval FROM:TO chooses another",
+            "record again at rest, or state the part at rest (--interval)",
+        )
     ]
 
 
@@ -217,7 +220,12 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
     notes = [prefixed(moving.name, note) for note in moving.notes]
     notes += [prefixed(moving.name, note) for note in left_out.notes()]
     if clipped.any():
-        notes.append(f"{moving.name}: {int(clipped.sum())} samples at the end of a gyro's range were left out")
+        notes.append(
+            Finding(
+                f"{moving.name}: {int(clipped.sum())} samples at the end of a gyro's range were left out",
+                "turn more slowly, or set a larger range, and record it again",
+            )
+        )
     truth = its.truth(moving)
     if truth is not None:
         truth = np.column_stack([to_si(truth[:, a], unit) for a, unit in enumerate(its.units)])[~clipped]
@@ -309,6 +317,19 @@ def _element_entries(
     return listed, parameters
 
 
+def _warn_shared_noise(correlation: float) -> list[str]:
+    """Return a message on noise that the elements have in common, by their mean correlation."""
+    if correlation <= _SHARED:
+        return []
+    return [
+        Finding(
+            f"the elements' noise is shared (mean correlation {correlation:.2f}): was the array at rest? Fusion "
+            "cannot remove it",
+            "record the array at rest, on a firm base",
+        )
+    ]
+
+
 def _make_record(
     still: Recording,
     moving: Recording | None,
@@ -323,13 +344,7 @@ def _make_record(
     listed, parameters = _element_entries(elements, rest, aligned)
     sigma = np.sqrt(np.einsum("aii->ai", covariance))
     correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
-    shared = _mean_correlation(correlation)
-    if shared > _SHARED:
-        warnings = [
-            *warnings,
-            f"the elements' noise is shared (mean correlation {shared:.2f}): was the array at rest? Fusion "
-            f"cannot remove it",
-        ]
+    warnings = [*warnings, *_warn_shared_noise(_mean_correlation(correlation))]
     sources = tuple(r.source for r in (still, moving) if r is not None and r.source is not None)
     return Calibration(
         procedure="gyro_array",

@@ -18,7 +18,7 @@ from imulab.arguments import check_fields
 from imulab.device import METHODS, STARTS
 from imulab.device.tables import MOST_COUNT, ArraySettings, Fusion, fusion_of
 from imulab.device.unit import Blob
-from imulab.display import prefixed
+from imulab.display import Finding, prefixed
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.rows import HISTORY, MAD_TO_SIGMA, zero_rows
 from imulab.procedures.gyro_array.elements import (
@@ -584,7 +584,8 @@ class Fuser:
         lines = self.checks.lines(turned=not self._aligns(), known=known) if self.checks is not None else []
         if self.lost:
             rows = f"{self.lost} row{'s' * (self.lost > 1)}"
-            lines = [*lines, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
+            text = f"{rows} left out: every gyro is exactly zero; the output is nan there"
+            lines = [*lines, Finding(text, "check the link to the array, and record again")]
         return [*self.clock.lines(self.name), *(prefixed(self.name, line) for line in [*lines, *more])]
 
     def _drop_zeros(self, readings: Array) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from imulab.columns import kind_of, triad
-from imulab.display import Shown
+from imulab.display import Finding, Note, Shown
 from imulab.errors import DataError, UnitError
 from imulab.estimation.sampling import WIDEST_GAP, usual_step
 from imulab.procedures.gyro_array.elements import MOST_ELEMENTS
@@ -76,18 +76,21 @@ def merge_recordings(
             )
     times = [_time(recording) for recording in recordings]
     values = [_convert_units(first, names[0], r, gyro_names) for r, gyro_names in zip(recordings, names, strict=True)]
-    notes = []
+    notes: list[str] = []
     for i in range(1, len(recordings)):
         name, offset = recordings[i].name, _clock_offset(times[0], values[0], times[i], values[i])
         if align:
             if offset is None:
                 raise DataError(f"{name}: --align: found no motion that fits {first.name} at one offset of time only")
             times[i] = times[i] - offset
-            notes.append(f"{name}: moved by {-offset:+.6g} s, where its motion fits that of {first.name}")
+            notes.append(Note(f"{name}: moved by {-offset:+.6g} s, where its motion fits that of {first.name}"))
         elif offset is not None and abs(offset) > max(usual_step(np.diff(times[k]))[0] for k in (0, i)):
             later = f"{abs(offset):.4g} s {'later' if offset > 0 else 'earlier'}"
             notes.append(
-                f"{name}: its motion comes {later} than that of {first.name}: the clocks differ; --align moves it"
+                Finding(
+                    f"{name}: its motion comes {later} than that of {first.name}: the clocks differ; --align moves it",
+                    "merge with --align",
+                )
             )
     start, stop = max(t[0] for t in times), min(t[-1] for t in times)
     rows = np.flatnonzero((times[0] >= start) & (times[0] <= stop))
@@ -215,8 +218,10 @@ def _note_joining(recording: Recording, time: Array, clock: Array, wanted: Array
         return []
     rates = [1 / usual_step(np.diff(t))[0] for t in (time, clock)]
     return [
-        f"{recording.name}: {rates[0]:.6g} Hz interpolated to the times of the first file, {rates[1]:.6g} Hz, "
-        f"which lie up to {most:.2g} s from its own samples"
+        Note(
+            f"{recording.name}: {rates[0]:.6g} Hz interpolated to the times of the first file, {rates[1]:.6g} Hz, "
+            f"which lie up to {most:.2g} s from its own samples"
+        )
     ]
 
 

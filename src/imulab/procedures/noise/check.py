@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, TypeAlias, Unpack
 
 import numpy as np
 
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.decisions import NOISE_CHECK
 from imulab.estimation.noise.agreement import Agreement, agreement
@@ -394,7 +394,12 @@ def _shared_columns(
         if other := different_units((recording.name, recording.metadata), ("the record", record.sensor)):
             notes.append(other)
         if recording.source is not None and recording.source.sha256 in [each.sha256 for each in record.sources]:
-            notes.append(f"{recording.name}: the record was made from this log, which says nothing of a change")
+            notes.append(
+                Finding(
+                    f"{recording.name}: the record was made from this log, which says nothing of a change",
+                    "check with a fresh log",
+                )
+            )
     if missing := [name for name in fit.columns if name not in names]:
         notes.append(Note(f"not in the log, and not checked: {' '.join(missing)}"))
     return names, notes

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from imulab.arguments import checked
 from imulab.columns import kind_of
-from imulab.display import Note
+from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed, several
 from imulab.estimation.column_noise import noise_columns
 from imulab.estimation.decisions import LEVEL_STEP_PERHAPS
@@ -191,19 +191,18 @@ _SLOW_FACTOR, _LEANS = 10.0, 0.005
 
 def findings(columns: Mapping[str, ColumnModel], rests: Sequence[Rest], horizon: float) -> tuple[str, ...]:
     """Return the findings on all columns; columns with the same finding share a sentence."""
-    columns_by_text: dict[tuple[type[str], str], list[str]] = {}
+    columns_by_finding: dict[str, list[str]] = {}
     for name, column in columns.items():
         if rejected(p := column.analysis.test.probability, len(columns)):
             text = f"no model of these terms fits (p = {p:.1g}); the numbers tell the size of the noise alone"
-            columns_by_text[(str, text)] = [name]
-        for kind, text in _describe_column(column):
-            columns_by_text.setdefault((kind, text), []).append(name)
+            columns_by_finding[Finding(text, "take the white noise alone, or fit a quieter part (--window)")] = [name]
+        for finding in _describe_column(column):
+            columns_by_finding.setdefault(finding, []).append(name)
     messages = [note for rest in rests for note in rest.notes]
     left = [name for name in rests[0].recording.columns if kind_of(name) == "mag" and name not in columns]
     if left and len(left) == sum(kind_of(name) == "mag" for name in rests[0].recording.columns):
         messages.append(Note(f"{_named(left)}: magnetometers are not fitted unless --columns names them"))
-    for (kind, text), names in columns_by_text.items():
-        messages.append(kind(f"{_named(names)}: {text}"))
+    messages += [prefixed(_named(names), finding) for finding, names in columns_by_finding.items()]
     longest = max(column.analysis.length for column in columns.values())
     if horizon > longest / _SLOW_FACTOR:
         messages.append(
@@ -219,43 +218,47 @@ def _named(names: Sequence[str]) -> str:
     return " ".join(names) if len(names) == 1 else f"columns {' '.join(names)}"
 
 
-def _describe_column(column: ColumnModel) -> list[tuple[type[str], str]]:
+def _describe_column(column: ColumnModel) -> list[str]:
+    """Return the findings on one column."""
     analysis = column.analysis
-    messages: list[tuple[type[str], str]] = []
+    messages: list[str] = []
     if not analysis.band.flat:
-        messages.append((str, "the spectrum is level nowhere, so that white noise is not told apart from other noise"))
+        text = "the spectrum is level nowhere, so that white noise is not told apart from other noise"
+        messages.append(Finding(text, "log at a higher rate, or with a wider filter"))
     elif analysis.band.filtered(analysis.interval):
         highest, low = analysis.band.highest, 2 * analysis.band.roll_off
         lean = (
             f", which may leave the white noise up to {plain_number(100 * low, 1)} % too small" if low > _LEANS else ""
         )
         text = f"fitted up to {highest:.3g} Hz; from about {2 * highest:.3g} Hz on the spectrum is not level"
-        messages.append((Note, text + lean))
+        messages.append(Note(text + lean))
     if at_band_edge(analysis.values, analysis.limits[0]).any():
-        messages.append((Note, _describe_edge(column)))
+        messages.append(Note(_describe_edge(column)))
     samples = sum(each.count for each in analysis.stretches)
     if column.spikes:
-        kind: type[str] = str if column.spikes > _MANY_SPIKES * samples else Note
-        messages.append((kind, f"{column.spikes} spikes replaced, of {samples} samples"))
+        kind = Finding if column.spikes > _MANY_SPIKES * samples else Note
+        text = f"{column.spikes} spikes replaced, of {samples} samples"
+        messages.append(kind(text, "check the link to the sensor, and record again"))
     if column.knocks:
         start, lost = column.knocks[0][0], sum(length for _, length in column.knocks)
         many = f"{len(column.knocks)} knocks or other parts" if len(column.knocks) > 1 else "a knock or other part"
         text = f"{many} unlike the noise around, {lost:.2g} s from {start:.5g} s on, bridged by straight lines"
-        messages.append((str if lost > _MANY_SPIKES * samples * analysis.interval else Note, text))
+        kind = Finding if lost > _MANY_SPIKES * samples * analysis.interval else Note
+        messages.append(kind(text, "let the unit rest undisturbed, and record again"))
     if column.lines:
-        messages.append((Note, _describe_lines(column)))
+        messages.append(Note(_describe_lines(column)))
     for low, high, factor in analysis.allowance.off[:_MOST_NAMED]:
-        messages.append((Note, f"from {low:.3g} to {high:.3g} Hz the spectrum, left out, is {factor:.2g} of the model"))
+        messages.append(Note(f"from {low:.3g} to {high:.3g} Hz the spectrum, left out, is {factor:.2g} of the model"))
     for step in column.steps:
         text = f"the level changes by {_sized(step.size, column.unit)} at {step.time:.4g} s"
-        messages.append((str, f"{text}, which slow noise does not make; take it out by --steps remove"))
+        messages.append(Finding(f"{text}, which slow noise does not make; take it out by --steps remove"))
     messages += [each for drift in column.drifts if (each := _drift_sentence(drift, column)) is not None]
     choice, shortest = analysis.choice, analysis.limits[0]
     near = [analysis.index, *np.flatnonzero(choice.rivals[0]).tolist()]
     models = (letters_inside(choice.models[0, k], choice.values[0, k], shortest) for k in near)
     chosen, *rivals = dict.fromkeys(models)
     if rivals:
-        messages.append((Note, f"{chosen} and {', '.join(rivals)} describe the record about equally well"))
+        messages.append(Note(f"{chosen} and {', '.join(rivals)} describe the record about equally well"))
     return messages
 
 
@@ -279,7 +282,7 @@ def _describe_lines(column: ColumnModel) -> str:
     return f"{many} line{'s' if many > 1 else ''} of the spectrum left out, the largest {named}"
 
 
-def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> tuple[type[str], str] | None:
+def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> str | None:
     if not drift.regression.follows:
         return None
     unit, factor = small_unit(column.unit).scale
@@ -288,18 +291,17 @@ def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> tuple[type[st
     slope = f"{drift.slope * scale:.2g} ± {drift.standard_uncertainty * scale:.1g} ({unit})/{per}"
     if drift.taken and drift.rounding:
         hidden = _sized(abs(drift.slope) * drift.rounding / 2, column.unit)
-        return (
-            str,
+        return Finding(
             f"follows the {drift.covariate}, {slope}, which was taken out as far as readings in steps of "
             f"{drift.rounding:.3g} K show it: slow noise below {hidden} may be what the steps hide; record the "
             "temperature in finer steps",
         )
     if drift.taken:
-        return Note, f"follows the {drift.covariate}, {slope}, which was taken out"
-    return (
-        str,
+        return Note(f"follows the {drift.covariate}, {slope}, which was taken out")
+    return Finding(
         f"follows the {drift.covariate}, {slope}; model {drift.letters[0]}, without that drift {drift.letters[1]} "
         f"(--regress {drift.covariate})",
+        f"fit with --regress {drift.covariate}",
     )
 
 

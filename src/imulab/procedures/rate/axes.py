@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.display import UNJUDGED, Note
+from imulab.display import UNJUDGED, Finding, Note
 from imulab.errors import DataError, RecordError
 from imulab.estimation.decisions import LENGTH_AT_REST_OFF, RATE_PRIOR_CONTRADICTED
 from imulab.estimation.least_squares import coverage_factor
@@ -252,14 +252,17 @@ def _upward_axis(direction: Array) -> str:
 
 def warn_faces(test: RateTest, recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> list[str]:
     """Return a warning for each run in which uncalibrated accelerometers see another face up than the manifest says."""
-    messages = []
+    messages: list[str] = []
     for k, (recording, run_dwells) in enumerate(zip(recordings, dwells, strict=True)):
         if all(name in recording for name in _TRIAD):
             mean = _dwell_means(recording, run_dwells, test.place(k)).mean(axis=0)
             if _upward_axis(mean) != test.runs[k].mounting:
                 place = test.place(k)
                 messages.append(
-                    f"{place}: the accelerometers see {_upward_axis(mean)} up: is mounting wrong, or their sign?"
+                    Finding(
+                        f"{place}: the accelerometers see {_upward_axis(mean)} up: is mounting wrong, or their sign?",
+                        "correct mounting in the manifest, or the axes of the accelerometers",
+                    )
                 )
     return messages
 
@@ -267,7 +270,11 @@ def warn_faces(test: RateTest, recordings: Sequence[Recording], dwells: Sequence
 def warn_other_unit(record: Calibration, sensor: Mapping[str, str], option: str) -> list[str]:
     """Return a warning where the record of an option is of another unit than the recordings, by serial or element."""
     other = different_units(("the record", record.sensor), ("the recordings", sensor), keys=("serial", "element"))
-    return [f"{option}: {other}: is it of this unit?"] if other else []
+    return (
+        [Finding(f"{option}: {other}: is it of this unit?", f"state the record of this unit ({option})")]
+        if other
+        else []
+    )
 
 
 def warn_force_length(accel: Calibration, force: Array, uncertainty: Array, places: Sequence[str]) -> list[str]:
@@ -278,9 +285,12 @@ def warn_force_length(accel: Calibration, force: Array, uncertainty: Array, plac
     if beyond[k] <= 0:
         return []
     return [
-        f"accel: under the record |f| is {from_si(float(off[k]), 'mg'):+.3g} mg off gravity in {places[k]}, more than "
-        f"its uncertainty ({from_si(float(uncertainty[k]), 'mg'):.2g} mg) and a power cycle explain: is it of this "
-        "unit, at this temperature?"
+        Finding(
+            f"accel: under the record |f| is {from_si(float(off[k]), 'mg'):+.3g} mg off gravity in {places[k]}, more "
+            f"than its uncertainty ({from_si(float(uncertainty[k]), 'mg'):.2g} mg) and a power cycle explain: is it of "
+            "this unit, at this temperature?",
+            "use an accelerometer record of this unit and temperature (--accel)",
+        )
     ]
 
 
@@ -514,16 +524,18 @@ def _state_agreement(probability: float | None, changes: Any) -> str:
     chance = "" if probability is None else f" (probability {probability:.2g})"
     differing = [change for change in changes if change.significant]
     if not differing and probability is not None and probability < RATE_PRIOR_CONTRADICTED.level:
-        return (
+        return Finding(
             f"the prior does not agree{chance}: all parameters together, no one parameter by itself; both are one fit "
-            "all the same (see show A B)"
+            "all the same (see show A B)",
+            "compare the two (imulab show A B), and leave --prior out if the unit has changed",
         )
     if not differing:
         return Note(f"the prior agrees{chance}; both are one fit, but for the biases, which are new")
     worst = max(differing, key=lambda change: abs(change.deviations or 0.0))
     read = reading_unit(worst.unit, worst.name)
-    return (
+    return Finding(
         f"the prior does not agree{chance}: {worst.name} differs by {read.factor * worst.difference:+.3g} "
         f"{read.of_difference}, {abs(worst.deviations or 0.0):.1f} times its uncertainty; both are one fit all "
-        "the same (see show A B)"
+        "the same (see show A B)",
+        "compare the two (imulab show A B), and leave --prior out if the unit has changed",
     )

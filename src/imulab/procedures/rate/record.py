@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from imulab.display import Bad, Note
+from imulab.display import Bad, Finding, Note
 from imulab.estimation.decisions import DWELLS_SCATTER, HYSTERESIS, LINE_BENDS, SCALE_OFF_UNIT
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
 from imulab.gravity import EARTH
@@ -83,23 +83,27 @@ def summarize_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[SweptRun]
 
 def note_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
     """Return a note for each sweep that does not show hysteresis, or is of a single frequency."""
-    messages = []
+    messages: list[str] = []
     for index, run in enumerate(dwells):
         if run.sweep is None or run.sweep.loop_error is not None:
             continue
         place = test.place(index)
         if run.sweep.frequency is None:
             messages.append(
-                f"{place}: the rate sweeps at one speed, so that the delay contains the hysteresis; a sweep of "
-                "frequencies, or steps, shows it"
+                Note(
+                    f"{place}: the rate sweeps at one speed, so that the delay contains the hysteresis; a sweep of "
+                    "frequencies, or steps, shows it"
+                )
             )
         else:
             messages.append(
-                f"{place}: the rate is one sine of {run.sweep.frequency:.4g} Hz: the scale factor is the amplitude at "
-                "that frequency, the delay holds hysteresis, and no bandwidth can be told from it; a sweep of "
-                "frequencies, or steps, shows that at rest, and the hysteresis"
+                Note(
+                    f"{place}: the rate is one sine of {run.sweep.frequency:.4g} Hz: the scale factor is the amplitude "
+                    "at that frequency, the delay holds hysteresis, and no bandwidth can be told from it; a sweep of "
+                    "frequencies, or steps, shows that at rest, and the hysteresis"
+                )
             )
-    return [Note(line) for line in messages]
+    return messages
 
 
 # The record.
@@ -274,7 +278,11 @@ def _dwell_residuals(linearity: Mapping[str, Linearity]) -> DwellResiduals:
 def _warn_other_unit(test: RateTest, recordings: Sequence[Recording]) -> list[str]:
     """Return a warning where a recording and the manifest name different units."""
     pairs = (different_units((r.name, r.metadata), ("the manifest", test.sensor)) for r in recordings)
-    return [f"{other}: which is the unit?" for other in pairs if other][:1]
+    return [
+        Finding(f"{other}: which is the unit?", "correct the serial number in the manifest or in the file")
+        for other in pairs
+        if other
+    ][:1]
 
 
 def _warn_output_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
@@ -286,7 +294,12 @@ def _warn_output_unit(parameters: Mapping[str, Parameter], unit: str) -> list[st
     if max(map(abs, off.values())) <= SCALE_OFF_UNIT:
         return []
     offs = " ".join(f"{axis} {100 * value:+.3g} %" for axis, value in off.items())
-    return [Bad(f"the scale factors are off by {offs}: is the unit ({unit}) right, or that of the table's rates?")]
+    return [
+        Bad(
+            f"the scale factors are off by {offs}: is the unit ({unit}) right, or that of the table's rates?",
+            "check the unit of the outputs and that of the table's rates, and correct the wrong one",
+        )
+    ]
 
 
 def _warn_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool, by_angle: bool) -> list[str]:
@@ -323,8 +336,11 @@ def _warn_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], as
     for axis, line in linearity.items():
         if asked != "auto" and line.probability < LINE_BENDS.level and line.by_polynomial > line.by_noise:
             messages.append(
-                f"gyro_{axis}: the output bends by {1e6 * line.by_polynomial:.3g} ppm of the largest rate beyond order "
-                f"{asked}, and beyond the noise of its dwells: is a higher order supported (--order auto)?"
+                Finding(
+                    f"gyro_{axis}: the output bends by {1e6 * line.by_polynomial:.3g} ppm of the largest rate beyond "
+                    f"order {asked}, and beyond the noise of its dwells: is a higher order supported (--order auto)?",
+                    "fit with --order auto",
+                )
             )
         elif asked == "auto" and line.probability < LINE_BENDS.level and orders[axis] == 1:
             messages.append(
@@ -336,14 +352,20 @@ def _warn_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], as
             )
         if line.kink is not None:
             messages.append(
-                f"gyro_{axis}: the slopes of positive and negative rates differ by {1e6 * line.kink:+.3g} ppm, with a "
-                f"kink at 0 that no power of the rate compensates: at most {1e6 * line.by_polynomial:.3g} ppm of the "
-                "largest rate are left"
+                Finding(
+                    f"gyro_{axis}: the slopes of positive and negative rates differ by {1e6 * line.kink:+.3g} ppm, "
+                    f"with a kink at 0 that no power of the rate compensates: at most {1e6 * line.by_polynomial:.3g} "
+                    "ppm of the largest rate are left",
+                    "use the calibration for one sign of the rate, or check the table at low rates",
+                )
             )
         if line.loop is not None and line.loop < HYSTERESIS.level and line.hysteresis is not None:
             messages.append(
-                f"gyro_{axis}: rising and falling rates differ by {1e6 * line.hysteresis[0]:+.3g} ppm of the largest "
-                "rate (hysteresis), which no calibration removes"
+                Finding(
+                    f"gyro_{axis}: rising and falling rates differ by {1e6 * line.hysteresis[0]:+.3g} ppm of the "
+                    "largest rate (hysteresis), which no calibration removes",
+                    "check the table and the temperature, and run the rates up and down again",
+                )
             )
     return messages
 

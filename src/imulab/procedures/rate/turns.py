@@ -586,7 +586,10 @@ def _warn_turns(axis_turns: Mapping[str, AxisTurns], clock: float | None) -> lis
     for a, turned_axis in axis_turns.items():
         if abs(turned_axis.scale - 1) > SCALE_OFF_UNIT:
             messages.append(
-                Bad(f"gyro_{a}: the scale factor is off by {100 * (turned_axis.scale - 1):+.3g} %: is the unit right?")
+                Bad(
+                    f"gyro_{a}: the scale factor is off by {100 * (turned_axis.scale - 1):+.3g} %: is the unit right?",
+                    "check the unit of the outputs, and the turns stated",
+                )
             )
         if turned_axis.freedom is not None:
             messages.append(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.estimation.decisions import THERMAL_CHECK
 from imulab.gravity import EarthRate, Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
@@ -118,7 +118,7 @@ def check_gyros(
     try:
         held, aside = leave_out_turns(replace(_rates_by_record(record, holds, force), earth=known), laws)
     except DataError as error:  # faulty gyroscopes do not keep accelerometers from being tested
-        return None, [f"gyroscopes not tested: {error}"]
+        return None, [Finding(f"gyroscopes not tested: {error}", "check the columns gyro_x gyro_y gyro_z")]
     names, _ = names_and_units(laws, sensitivity=model.gyro.g_sensitivity)
     size = 3 * laws.terms[0]
     factor = np.eye(len(names)) / model.gravity.value
@@ -562,9 +562,10 @@ def _select_in_range(record: Calibration, holds: Holds) -> tuple[Holds, list[str
     group = chosen["group"]
     chosen["wander"] = holds.wander[np.ix_(kept, kept)]
     chosen["group"] = np.where(group >= 0, np.searchsorted(np.unique(group[group >= 0]), group), -1)
-    note = (
+    note = Finding(
         f"{(~kept).sum()} of {len(kept)} holds are at {where}, outside the {low:.1f} to {high:.1f} degC of the record, "
-        "which says nothing there: not tested"
+        "which says nothing there: not tested",
+        "record holds within the range of the record",
     )
     return replace(holds, **chosen), [note]
 
@@ -573,7 +574,10 @@ def _warn_known(record: Calibration, recordings: Sequence[Recording]) -> list[st
     """Return a warning for each recording from which the record was made."""
     sources = {source.sha256 for source in record.sources}
     return [
-        f"{each.name}: the record was made from this recording, which says nothing of whether it still holds"
+        Finding(
+            f"{each.name}: the record was made from this recording, which says nothing of whether it still holds",
+            "check with a fresh recording",
+        )
         for each in recordings
         if each.source is not None and each.source.sha256 in sources
     ]

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import ObservabilityError
 from imulab.estimation.decisions import (
     LAG_OR_LOOP,
@@ -606,15 +606,21 @@ def warn_lag_and_loops(drift: LagAndLoops, solution: ThermalSolution, name: str)
         lag = float(drift.values[0])
         who = "biases lag the temperature" if lag > 0 else "the temperature lags the biases"
         messages.append(
-            f"{name}: {who} by {abs(lag):.3g} s (u {u[0]:.2g} s); corrected outputs use none, and are off by up to "
-            f"{1e3 * np.abs(slope[:, :3]).max() * abs(lag) / 60:.2g} mg where it changes by 1 K/min"
+            Finding(
+                f"{name}: {who} by {abs(lag):.3g} s (u {u[0]:.2g} s); corrected outputs use none, and are off by up to "
+                f"{1e3 * np.abs(slope[:, :3]).max() * abs(lag) / 60:.2g} mg where it changes by 1 K/min",
+                "record ramps at the speed at which the temperature changes in use",
+            )
         )
     if 1 in drift.free:
         each = ", ".join(f"{axis} {1e3 * h:+.2f}" for axis, h in zip(AXES, drift.values[1:], strict=True))
         messages.append(
-            f"{name}: biases differ between warming and cooling: in the middle of the range they are {each} mg "
-            f"(u {1e3 * u[1:].max():.2g} mg) from their laws in warming, and as much the other way in cooling, which "
-            "corrected outputs keep"
+            Finding(
+                f"{name}: biases differ between warming and cooling: in the middle of the range they are {each} mg "
+                f"(u {1e3 * u[1:].max():.2g} mg) from their laws in warming, and as much the other way in cooling, "
+                "which corrected outputs keep",
+                "let each temperature soak longer, warming and cooling",
+            )
         )
     return messages
 
@@ -682,10 +688,13 @@ def bias_shift_from_unobserved(
         if error > _WORTH * stated:
             kind = GROUPS[group][0].replace("_", " ")
             messages.append(
-                f"{name}: the holds do not tell whether {kind} follows the temperature, which is taken as constant: "
-                f"one that moves by {usual}, as is usual, shifts the biases by {1e3 * error:.2g} mg, where their "
-                f"uncertainty is {1e3 * stated:.2g} mg: another axis up while the temperature changes, or attitudes "
-                "at another temperature, would tell"
+                Finding(
+                    f"{name}: the holds do not tell whether {kind} follows the temperature, which is taken as "
+                    f"constant: one that moves by {usual}, as is usual, shifts the biases by {1e3 * error:.2g} mg, "
+                    f"where their uncertainty is {1e3 * stated:.2g} mg: another axis up while the temperature changes, "
+                    "or attitudes at another temperature, would tell",
+                    "record another axis up while the temperature changes",
+                )
             )
     if drift.reason and (error := error_by(rows.drift[:, :1] * _LAG)) > stated:
         messages.append(
@@ -802,21 +811,30 @@ def warn_disagreement(holds: Holds, problem: ThermalProblem, solution: ThermalSo
     apart = _name_outlier(holds, problem, solution.laws) if differ or scattered else ""
     if differ and (apart or not solution.scatter.bound):  # a bound contains bends of the law
         messages.append(
-            f"{name}: from one recording to the next {' and '.join(differ)} differ, which no power cycle does: are all "
-            f"of one unit, its axes named alike, its temperatures by one thermometer?{apart}"
+            Finding(
+                f"{name}: from one recording to the next {' and '.join(differ)} differ, which no power cycle does: are "
+                f"all of one unit, its axes named alike, its temperatures by one thermometer?{apart}",
+                "leave out recordings of another unit, axis order or thermometer",
+            )
         )
     if scattered:
         messages.append(
-            f"{name}: within recordings |f| scatters by {1e6 * solution.excess:.0f} ug, of which noise explains "
-            f"{1e6 * noise:.0f} ug: is a recording of another unit, with axes swapped, or with a jump of its outputs?"
-            f"{'' if differ else apart}"
+            Finding(
+                f"{name}: within recordings |f| scatters by {1e6 * solution.excess:.0f} ug, of which noise explains "
+                f"{1e6 * noise:.0f} ug: is a recording of another unit, with axes swapped, or with a jump of its "
+                f"outputs?{'' if differ else apart}",
+                "leave out the recording that is of another unit, or record it again",
+            )
         )
     if not apart:
         messages += _warn_offset(holds, problem, solution)
     if solution.laws.high > _HOTTEST:
         messages.append(
-            f"{name}: temperatures up to {solution.laws.high:.0f} degC, above what sensors are rated to: are these "
-            "degrees Fahrenheit? expected degC or kelvins"
+            Finding(
+                f"{name}: temperatures up to {solution.laws.high:.0f} degC, above what sensors are rated to: are these "
+                "degrees Fahrenheit? expected degC or kelvins",
+                "state the temperatures in degC or kelvins",
+            )
         )
     return messages
 
@@ -874,8 +892,11 @@ def _warn_offset(holds: Holds, problem: ThermalProblem, solution: ThermalSolutio
                 by = f"{1e6 * size:.0f} ppm in scale factors" if kind else f"{1e3 * size:.2g} mg in biases"
                 asked.append((chance, f"{holds.recordings[number].name}: lies off the other recordings by {by}"))
     return [
-        f"{words}, far more than they differ among themselves: is it of the same unit, at the temperature that it "
-        "says, or have the laws a bend there? come back to that temperature"
+        Finding(
+            f"{words}, far more than they differ among themselves: is it of the same unit, at the temperature that it "
+            "says, or have the laws a bend there? come back to that temperature",
+            "record again at that temperature",
+        )
         for _, words in sorted(asked)[:1]
     ]
 

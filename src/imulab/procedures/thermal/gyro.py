@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.device.unit import DeviceUnit
-from imulab.display import Bad, Note, prefixed
+from imulab.display import Bad, Finding, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, SegmentError, UnitError
 from imulab.estimation.decisions import BIAS_FOLLOWS_GRAVITY, SCALE_LAW_SCATTERS, SCALE_OFF_UNIT, TURNED_IN_HOLD
 from imulab.estimation.least_squares import chi_square_probability
@@ -269,11 +269,16 @@ def _average_still(
     steps = [np.diff(np.unique(column)) for column in output[rest].T]
     sigma = np.maximum(MAD_TO_SIGMA * np.median(spread, axis=0), [step.min() for step in steps])
     cuts: list[Cut | None] = []
-    notes = []
+    notes: list[str] = []
     for index, piece, m in zip(members.tolist(), pieces, median, strict=True):
         still = (np.abs(output[piece] - m) <= STILL_SIGMAS * sigma).all(axis=1)
         if still.sum() < max(QUIET_SHARE * len(still), _FEWEST):
-            notes.append(f"gyro: {holds.label(index)} left out: the gyroscopes turn, which accelerometers do not see")
+            notes.append(
+                Finding(
+                    f"gyro: {holds.label(index)} left out: the gyroscopes turn, which accelerometers do not see",
+                    "record this hold again, with the unit at rest",
+                )
+            )
             cuts.append(None)
             continue
         kept = np.flatnonzero(still) + piece.start
@@ -575,7 +580,11 @@ def leave_out_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray
 def note_turns(holds: Holds, aside: NDArray[np.int64]) -> list[str]:
     """Return a warning for each hold that `leave_out_turns` left out."""
     return [
-        f"gyro: {holds.label(index)} left out: its outputs differ from the others of its recording: the unit turned"
+        Finding(
+            f"gyro: {holds.label(index)} left out: its outputs differ from the others of its recording: the unit "
+            "turned",
+            "record this hold again, with the unit at rest",
+        )
         for index in aside.tolist()
     ]
 
@@ -799,7 +808,10 @@ def _fit_scale_laws(turned: list[Turned], known: Array, over: Laws, notes: list[
     if np.abs(middle).max() > SCALE_OFF_UNIT:
         off = " ".join(f"{100 * value:+.3g}" for value in middle)
         notes.append(
-            Bad(f"gyro: the scale factors are off by {off} % (x y z): is the unit, or the sample rate, wrong?")
+            Bad(
+                f"gyro: the scale factors are off by {off} % (x y z): is the unit, or the sample rate, wrong?",
+                "check the unit of the gyroscopes and the sample rate of the recordings",
+            )
         )
     turns = sum(each.turns for each in turned)
     miss = float(np.sqrt(sum(each.cost for each in turned) / turns))
@@ -807,7 +819,8 @@ def _fit_scale_laws(turned: list[Turned], known: Array, over: Laws, notes: list[
         notes.append(
             Bad(
                 f"gyro: the turns miss the change of gravity's direction by {np.degrees(miss):.2g} deg rms, with axes "
-                f"askew by up to {1e3 * np.abs(coefficients[size:]).max():.0f} mrad: swapped or reversed axes?"
+                f"askew by up to {1e3 * np.abs(coefficients[size:]).max():.0f} mrad: swapped or reversed axes?",
+                "check axes and signs of the gyroscopes against the accelerometers",
             )
         )
     return ScaleLaws(laws, coefficients, matrix, len(turned), turns, miss, square, freedom, tuple(notes))

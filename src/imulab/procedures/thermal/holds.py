@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.display import Note, prefixed
+from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import DIRECTION_WANDERS
 from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
@@ -279,9 +279,10 @@ def _join_rest(attitudes: Attitudes, outputs: Array) -> Attitudes:
     if len(edges) > 1:
         first, lost = time[edges[0, 1]], 100 * (1 - np.diff(edges).sum() / len(time))
         sentence = (
-            f"knocked while it rested, {len(edges) - 1} times, first at {first:.0f} s: {lost:.2g} % of its samples"
+            f"knocked while it rested, {len(edges) - 1} times, first at {first:.0f} s: {lost:.2g} % of its samples "
+            "left out"
         )
-        notes = (*notes, f"{sentence} left out")
+        notes = (*notes, Finding(sentence, "let the unit rest undisturbed, and record again"))
     return replace(attitudes, pieces=np.column_stack([edges, np.zeros(len(edges), dtype=np.int64)]), notes=notes)
 
 
@@ -571,9 +572,12 @@ def _note_constant(recordings: Sequence[Recording]) -> list[Recording]:
     ]
     if max(counts) < _READINGS:
         return list(recordings)
-    note = "column temperature: the same value in every row, while it changes in other recordings: a thermometer stuck?"
+    note = Finding(
+        "column temperature: the same value in every row, while it changes in other recordings: a thermometer stuck?",
+        "check the thermometer, and record this file again",
+    )
     return [
-        replace(recording, notes=(*recording.notes, f"{recording.name}: {note}")) if count == 1 else recording
+        replace(recording, notes=(*recording.notes, prefixed(recording.name, note))) if count == 1 else recording
         for recording, count in zip(recordings, counts, strict=True)
     ]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.display import UNJUDGED, Note
+from imulab.display import UNJUDGED, Finding, Note
 from imulab.estimation.decisions import HOLD_DISAGREEMENT, TEMPERATURE_MISSED
 from imulab.estimation.least_squares import coverage_factor
 from imulab.gravity import Gravity, gravity_findings
@@ -334,8 +334,12 @@ def _warn_fit(
         "explains: the unit's law has a bend between the temperatures; record one more there"
         for each in far
     ]
-    messages += warn_lag_and_loops(drift, solution, name)
-    rows = solution.rows
+    return messages + warn_lag_and_loops(drift, solution, name) + _warn_odd_holds(holds, solution)
+
+
+def _warn_odd_holds(holds: Holds, solution: ThermalSolution) -> list[str]:
+    """Return messages on the holds that stand out from the others of their recording."""
+    rows, messages = solution.rows, []
     # Residuals less the part that a recording has in common, since that is due to its power cycle.
     whole, noise = (row_covariance(rows, solution.excess**2, tau) for tau in (solution.scatter.tau, np.zeros(2)))
     left = noise @ np.linalg.solve(whole, rows.residual)
@@ -343,7 +347,12 @@ def _warn_fit(
     out = np.flatnonzero((standard > HOLD_DISAGREEMENT.limit) & (rows.owner >= 0))
     for index in out[np.argsort(-standard[out], kind="stable")][:_MOST_NAMED].tolist():
         what = "its magnitude" if rows.magnitude[index] else "its direction, although nothing was to move: a knock?"
-        messages.append(f"{holds.label(int(rows.owner[index]))} stands out by {standard[index]:.0f} u in {what}")
+        messages.append(
+            Finding(
+                f"{holds.label(int(rows.owner[index]))} stands out by {standard[index]:.0f} u in {what}",
+                "leave this hold out (--window), or record it again",
+            )
+        )
     return messages
 
 
@@ -560,16 +569,22 @@ def _warn_gyro_drift(gyros: ThermalGyroscopes, name: str) -> list[str]:
     u = np.sqrt(np.diag(drift.covariance))
     if 0 in drift.free:
         messages.append(
-            f"gyro: {name}: biases differ from their laws by those of {drift.values[0]:.3g} s before (u {u[0]:.2g} s); "
-            "corrected outputs keep that"
+            Finding(
+                f"gyro: {name}: biases differ from their laws by those of {drift.values[0]:.3g} s before (u {u[0]:.2g} "
+                "s); corrected outputs keep that",
+                "record ramps at the speed at which the temperature changes in use",
+            )
         )
     if 1 in drift.free:
         loops = from_si(drift.values[1:], "deg/h")
         each = ", ".join(f"{axis} {loop:+.3g}" for axis, loop in zip(AXES, loops, strict=True))
         messages.append(
-            f"gyro: {name}: biases differ between warming and cooling: in the middle of the range they are {each} "
-            f"deg/h (u {text_in(float(u[1:].max()), 'deg/h', 2)}) from their laws in warming, and as much the other "
-            "way in cooling, which corrected outputs keep"
+            Finding(
+                f"gyro: {name}: biases differ between warming and cooling: in the middle of the range they are {each} "
+                f"deg/h (u {text_in(float(u[1:].max()), 'deg/h', 2)}) from their laws in warming, and as much the "
+                "other way in cooling, which corrected outputs keep",
+                "let each temperature soak longer, warming and cooling",
+            )
         )
     return messages
 

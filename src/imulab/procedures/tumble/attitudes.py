@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import imulab.procedures.tumble._segment as _segment
 from imulab.columns import triad
+from imulab.display import Finding
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
 from imulab.procedures.result import as_recording
@@ -215,8 +216,11 @@ def attitude_table(
         again = int(np.setdiff1d(np.arange(len(mean)), kept)[0])
         first = int(np.argmax((mean == mean[again]).all(axis=1)))
         notes.append(
-            f"{len(mean) - len(kept)} of {len(mean)} rows are duplicates of earlier ones, such as "
-            f"{recording.place(again)} of {recording.place(first)}: they were left out, being no measurements"
+            Finding(
+                f"{len(mean) - len(kept)} of {len(mean)} rows are duplicates of earlier ones, such as "
+                f"{recording.place(again)} of {recording.place(first)}: they were left out, being no measurements",
+                "record these attitudes anew, or take the copies out of the table",
+            )
         )
     return Attitudes(
         mean=mean[kept],
@@ -629,8 +633,11 @@ def _at_rest(stretches: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
 
 def _corrected_notes(recording: Recording) -> tuple[str, ...]:
     return tuple(
-        f"the recording was corrected by {entry.rpartition(' sha256:')[0]}: what is found is what that left; expected "
-        "the recording as it was measured"
+        Finding(
+            f"the recording was corrected by {entry.rpartition(' sha256:')[0]}: what is found is what that left; "
+            "expected the recording as it was measured",
+            "fit the recording as it was measured",
+        )
         for entry in recording.corrected_by
     )
 
@@ -639,11 +646,21 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
     """What is odd about the clock of the recording."""
     rate = blocks.length / blocks.duration
     lost = 1 - float(np.isfinite(variance).mean())
-    notes = []
+    notes: list[str] = []
     if rate < _SLOW:
-        notes.append(f"about {rate:.3g} samples per second: is the unit of time right?")
+        notes.append(
+            Finding(
+                f"about {rate:.3g} samples per second: is the unit of time right?",
+                "correct the unit of the column time",
+            )
+        )
     if lost > _MUCH_LOST:
-        notes.append(f"gaps in time: {100 * lost:.0f} % of the windows reach across one and were not used")
+        notes.append(
+            Finding(
+                f"gaps in time: {100 * lost:.0f} % of the windows reach across one and were not used",
+                "record again without lost samples, by a faster link or at a lower rate",
+            )
+        )
     return tuple(notes)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.device.unit import output_factor
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.decisions import ATTITUDES_DISTURBED, TUMBLE_CHECK
 from imulab.estimation.distributions import f_tail
@@ -426,7 +426,7 @@ def check_tumble(
     check_fresh(residuals, g, attitudes.recording.name)
     notes = [*([local.note] if local.note else []), *of_noise]
     if made_from(record, attitudes.recording):
-        notes.append("the record was made from this recording, which therefore says nothing of whether it still holds")
+        notes.append(Finding(_MADE_FROM_IT, "check with a fresh recording"))
     if not record.covariance.names:
         return Check(residuals, None, None, None, local, limit, tuple(notes), attitudes)
     from imulab.procedures.tumble.prior import contradiction, known_of
@@ -436,10 +436,7 @@ def check_tumble(
     own_variance = np.maximum(noise_variance[0] + _excess(record, g), 1e-24)  # data without noise leave rounding
     more = prior_scatter(rows, relative_residuals, own_variance)
     if more > 0:
-        notes.append(
-            f"the attitudes scatter by {1e6 * np.sqrt(more):.3g} µg beyond their noise, which no change of the record "
-            "explains and the test allows for: holds that were disturbed, or a model of too low an order"
-        )
+        notes.append(_describe_scatter(more))
     known = known_of(record, scaling, local, attitudes.unit)
     common = 0.0 if known.shared else (local.standard_uncertainty / g) ** 2
     noise = np.diag(own_variance + more) + common
@@ -449,6 +446,18 @@ def check_tumble(
         probability = float(f_tail(value / len(relative_residuals), len(relative_residuals), freedom))
     total = g * np.sqrt(np.diag(rows @ known.covariance @ rows.T + noise))
     return Check(residuals, total, value, probability, local, limit, tuple(notes), attitudes, mag)
+
+
+_MADE_FROM_IT = "the record was made from this recording, which therefore says nothing of whether it still holds"
+
+
+def _describe_scatter(variance: float) -> str:
+    """Return the finding of attitudes that scatter beyond their noise by a variance, g^2."""
+    return Finding(
+        f"the attitudes scatter by {1e6 * np.sqrt(variance):.3g} µg beyond their noise, which no change of the "
+        "record explains and the test allows for: holds that were disturbed, or a model of too low an order",
+        "record the attitudes again, each held still until it has settled",
+    )
 
 
 def _mag(record: Calibration, attitudes: Attitudes, notes: list[str]) -> MagCheck | None:

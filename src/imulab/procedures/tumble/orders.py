@@ -40,6 +40,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from imulab.display import Finding
 from imulab.estimation.decisions import (
     ATTITUDE_SET_ASIDE,
     ATTITUDES_FIT_STATED_NOISE,
@@ -337,20 +338,30 @@ def direction_findings(problem: TumbleProblem, solution: TumbleSolution, *, orde
         f"{name} {_MICRO * value:+.0f} ± {_MICRO * u:.0f}"
         for name, value, u in zip(terms, pattern.value, pattern.uncertainty, strict=False)
     )
-    looks, remedy = {
+    looks, remedy, action = {
         "cross": (
             f"they look like products of two axes ({sizes} {unit})",
             f"--cross --order {problem.order or 1} fits these",
+            f"fit with --cross --order {problem.order or 1}",
         ),
         "order": (
             f"they look like the next order ({sizes} {unit})",
             f"--order {problem.order + 1} fits it, or --order auto",
+            f"fit with --order {problem.order + 1}, or --order auto",
         ),
-        "other": ("they look like products of the third and fourth degree", "no option fits these; repeat the test"),
+        "other": (
+            "they look like products of the third and fourth degree",
+            "no option fits these; repeat the test",
+            "repeat the test",
+        ),
     }[likeliest]
     return [
-        f"the residuals are a function of the direction of gravity, {_MICRO * pattern.size:.3g} µg rms (probability by "
-        f"chance {_chance(pattern.probability)}): {looks}, which the uncertainties do not hold; {remedy}"
+        Finding(
+            f"the residuals are a function of the direction of gravity, {_MICRO * pattern.size:.3g} µg rms "
+            f"(probability by chance {_chance(pattern.probability)}): {looks}, which the uncertainties do not hold; "
+            f"{remedy}",
+            action,
+        )
     ]
 
 

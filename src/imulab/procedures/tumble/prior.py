@@ -14,7 +14,7 @@ from itertools import product
 
 import numpy as np
 
-from imulab.display import Bad
+from imulab.display import Bad, Finding
 from imulab.errors import RecordError
 from imulab.estimation.decisions import ATTITUDES_DISTURBED, PRIOR_CONTRADICTED, PRIOR_EXPLAINS_NOTHING
 from imulab.estimation.least_squares import chi_square_probability, plausible_excess
@@ -307,9 +307,9 @@ def prior_shares(
 
 def prior_warnings(record: Calibration, aged: AgedPrior, recording: Recording, count: int) -> list[str]:
     """Return what a user must know of a prior, a sentence each."""
-    messages = []
+    messages: list[str] = []
     if other := different_units(("the prior", record.sensor), ("the recording", recording.metadata)):
-        messages.append(other)
+        messages.append(Finding(other, "use a prior of this unit (--prior)"))
     if aged.probability < PRIOR_CONTRADICTED.level:
         sizes = [f"{1e6 * tau:.3g} {unit}" for tau, unit in zip(aged.ageing, ("µg", "ppm", "µrad"), strict=False)]
         few = (
@@ -317,9 +317,13 @@ def prior_warnings(record: Calibration, aged: AgedPrior, recording: Recording, c
             f"{_ASKED} or more are asked for"
         )
         messages.append(
-            f"prior and attitudes contradict each other (p = {aged.probability:.2g}): the unit has changed since the "
-            "prior was made, or attitudes were disturbed; the prior was widened as far as they ask (bias, scale factor"
-            f"{', misalignment' if len(sizes) > 2 else ''}: {', '.join(sizes)}){few if count < _ASKED else ''}"
+            Finding(
+                f"prior and attitudes contradict each other (p = {aged.probability:.2g}): the unit has changed since "
+                "the prior was made, or attitudes were disturbed; the prior was widened as far as they ask (bias, "
+                f"scale factor{', misalignment' if len(sizes) > 2 else ''}: "
+                f"{', '.join(sizes)}){few if count < _ASKED else ''}",
+                "fit without the prior (leave --prior out), or record the attitudes again",
+            )
         )
     residuals, variance = aged.solution.residuals[0], aged.solution.variance[0]
     rms, times = float(np.sqrt(np.mean(residuals**2))), float(np.sqrt(np.mean(residuals**2 / variance)))

@@ -144,10 +144,13 @@ def aside_warnings(complete: FittedAttitudes, options: Mapping[str, Any]) -> lis
             )
         ]
     aside = complete.aside
-    named = [
-        f"{complete.attitudes.label(index)} set aside: {1e3 * complete.solution.residuals[0, index]:+.3f} mg "
-        f"({abs(deviations):.0f} standard uncertainties) from what the others give, as if it had been knocked or had "
-        "not settled; --loss square keeps it"
+    named: list[str] = [
+        Finding(
+            f"{complete.attitudes.label(index)} set aside: {1e3 * complete.solution.residuals[0, index]:+.3f} mg "
+            f"({abs(deviations):.0f} standard uncertainties) from what the others give, as if it had been knocked or "
+            "had not settled; --loss square keeps it",
+            "measure this attitude again",
+        )
         for index, deviations in zip(aside.index, aside.deviations, strict=True)
     ]
     n = len(complete.attitudes)
@@ -170,10 +173,11 @@ def freedom_finding(attitudes: int, size: int, order: int) -> str | None:
     freedom = attitudes - size
     if freedom >= FEW_DEGREES:
         return None
-    return (
+    return Finding(
         f"only {freedom} degree{'' if freedom == 1 else 's'} of freedom: {attitudes} attitudes hardly check whether "
         f"order {order} is enough, and the uncertainties hold only if it is; {size + _ENOUGH_DEGREES} or more would "
-        "tell"
+        "tell",
+        "record more attitudes (imulab tumble plan --add FILE)",
     )
 
 
@@ -182,15 +186,18 @@ def vertical_warnings(complete: FittedAttitudes, method: str) -> list[str]:
     if method != "linearised":
         return []
     vertical = near_vertical(forces(complete.problem, complete.solution)[0], CLOSEST)
-    warnings = []
+    warnings: list[str] = []
     for axis, column in zip(AXES, vertical.T, strict=True):
         which = np.flatnonzero(column).tolist()
         if len(which) > 1:
             named = first_of([complete.attitudes.label(index) for index in which], _MOST_NAMED)
             warnings.append(
-                f"axis {axis} is vertical within {np.degrees(CLOSEST):.0f} deg in {len(which)} attitudes ("
-                f"{named}): the source of method linearised has no axis vertical in two; "
-                "tumble plan --method linearised chooses attitudes without such"
+                Finding(
+                    f"axis {axis} is vertical within {np.degrees(CLOSEST):.0f} deg in {len(which)} attitudes ("
+                    f"{named}): the source of method linearised has no axis vertical in two; "
+                    "tumble plan --method linearised chooses attitudes without such",
+                    "choose attitudes by imulab tumble plan --method linearised",
+                )
             )
     return warnings
 
@@ -201,7 +208,10 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
     if parse_unit(attitudes.unit).quantity == "acceleration":
         off = [(axis, value) for axis, value in zip(AXES, theta[3:6].tolist(), strict=True)]
         messages += [
-            f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?"
+            Finding(
+                f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?",
+                "correct the unit in the titles of accel_x accel_y accel_z",
+            )
             for axis, value in off
             if SCALE_OFF_UNIT < abs(value - 1) <= SCALE_OF_ANOTHER_UNIT
         ]
@@ -215,7 +225,10 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
                 )
             )
     messages += [
-        f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?"
+        Finding(
+            f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?",
+            "check which column is which axis, and title them accordingly",
+        )
         for pair, value in zip(MISALIGNMENTS, theta[6:9], strict=False)  # order 0 has none
         if abs(value) > _WORST_MISALIGNMENT
     ]
@@ -592,16 +605,20 @@ def _scatter_warnings(
     known = problem.covariance is not None and problem.prior is None and not problem.robust
     if known and freedom > 0 and chi_square_probability(chi_square, freedom) > 1 - ATTITUDES_TOO_QUIET.level:
         return [
-            "the attitudes scatter less than their own noise lets expect (reduced chi-square "
-            f"{chi_square / freedom:.3g}): that noise is overstated, and every uncertainty is about "
-            f"{np.sqrt(freedom / max(chi_square, 1e-12)):.2g} times too large"
+            Finding(
+                "the attitudes scatter less than their own noise lets expect (reduced chi-square "
+                f"{chi_square / freedom:.3g}): that noise is overstated, and every uncertainty is about "
+                f"{np.sqrt(freedom / max(chi_square, 1e-12)):.2g} times too large",
+                "leave the stated noise out (columns std_*)",
+            )
         ]
     if not beyond_noise(problem, chi_square, freedom):
         return []
     added = f"; {_TO_MICRO * solution.excess[0]:.3g} µg were added to each attitude's uncertainty"
-    text = (
+    text = Finding(
         "the attitudes scatter more than their own noise explains (reduced chi-square "
-        f"{chi_square / freedom:.3g}){added if solution.excess[0] > 0 else ''}"
+        f"{chi_square / freedom:.3g}){added if solution.excess[0] > 0 else ''}",
+        "record the attitudes again, each held still until it has settled",
     )
     if solution.excess[0] > 0 and order_chosen:
         return [Note(text)]
@@ -630,30 +647,47 @@ def _attitude_warnings(
     if problem.robust:
         down = solution.down_weights[0]
         which = np.flatnonzero(down < _DOWN_WEIGHTED).tolist()
-        single = [
-            f"down-weighted to {down[i]:.2f}: {attitudes.label(i)}, residual {deviation[i]:+.3f} mg" for i in which
+        single: list[str] = [
+            Finding(
+                f"down-weighted to {down[i]:.2f}: {attitudes.label(i)}, residual {deviation[i]:+.3f} mg",
+                "measure this attitude again",
+            )
+            for i in which
         ]
     else:
         single = [
-            f"{attitudes.label(i)} stands out by {standard:.0f} standard deviations "
-            f"(residual {deviation[i]:+.3f} mg); {_REMEDIES[options['method'], options['loss']]}"
+            Finding(
+                f"{attitudes.label(i)} stands out by {standard:.0f} standard deviations "
+                f"(residual {deviation[i]:+.3f} mg); {_REMEDIES[options['method'], options['loss']]}",
+                "measure this attitude again",
+            )
             for i, standard in _find_outliers(problem, solution).items()
         ]
-    more = [f"and {len(single) - _MOST_NAMED} more attitudes like these"] if len(single) > _MOST_NAMED else []
-    return single[:_MOST_NAMED] + more
+    if len(single) <= _MOST_NAMED:
+        return single
+    more = f"and {len(single) - _MOST_NAMED} more attitudes like these"
+    return [*single[:_MOST_NAMED], Finding(more, "measure these attitudes again")]
 
 
 def _freedom_warnings(problem: TumbleProblem, solution: TumbleSolution, observability: Observability) -> list[str]:
     n, size = problem.reading.shape[1], solution.theta.shape[1]
-    messages = []
+    messages: list[str] = []
     if observability.condition > _HIGH_CONDITION:
         confused = observability.confused(parameter_names(problem.order, problem.cross))
         messages.append(
-            f"condition number {observability.condition:.0f}: these attitudes hardly separate {' '.join(confused[:6])}"
+            Finding(
+                f"condition number {observability.condition:.0f}: these attitudes hardly separate "
+                f"{' '.join(confused[:6])}",
+                "record more attitudes (imulab tumble plan --add FILE)",
+            )
         )
     if n == size and problem.covariance is None:
         messages.append(
-            f"{n} attitudes for {size} parameters leave nothing to estimate the noise from: no uncertainty is stated"
+            Finding(
+                f"{n} attitudes for {size} parameters leave nothing to estimate the noise from: no uncertainty is "
+                "stated",
+                "record more attitudes (imulab tumble plan --add FILE)",
+            )
         )
     few = freedom_finding(n, size, problem.order)
     if few is not None and problem.prior is None:

@@ -464,7 +464,7 @@ def _named(names: list[str]) -> str:
 
 
 def _warn_ends(curves: Curves, settled: bool) -> list[str]:
-    messages = []
+    messages: list[str] = []
     if not settled:
         messages.append(
             f"not settled: the curves still change when the recordings end; T_M = {curves.settling_time:g} s leaves "
@@ -539,7 +539,7 @@ def _warn_drifts(curves: Curves, chosen: Judged) -> list[str]:
     clear = np.abs(curves.drift) > STILL_DRIFTS.limit * curves.drift_uncertainty
     largest = np.sqrt((curves.mean**2).mean(axis=(0, 1)))
     big = np.abs(curves.drift) > np.maximum(_DRIFT_SHARE * chosen.training, 0.05 * largest)
-    messages = []
+    messages: list[str] = []
     for kind, index in curves.kinds().items():
         share = (clear & big)[:, index]
         if share.any():
@@ -566,7 +566,7 @@ def _warn_temperatures(curves: Curves) -> list[str]:
             warm.append(f"{cycle.name} ({reading - chamber:+.2g} K)")
         elif abs(cycle.temperature - nominal) > _OFF_SET_POINT:
             far.append(f"{cycle.name} ({cycle.temperature - nominal:+.2g} K)")
-    messages = []
+    messages: list[str] = []
     if warm:
         messages.append(
             Finding(

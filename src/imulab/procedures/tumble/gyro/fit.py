@@ -222,7 +222,7 @@ def _on_accel_clock(case: TurnProblem, time: Array, sensitivity: str) -> Array:
 
 def _warn_sampling(estimate: TurnEstimate, stamps: Stamps) -> list[str]:
     """Say if the samples are too few for these turns, or some of them lost."""
-    messages = []
+    messages: list[str] = []
     u = np.sqrt(np.diag(estimate.total()))[:3]
     off = np.abs(estimate.reading[:3])
     if (off > u / 2).any():

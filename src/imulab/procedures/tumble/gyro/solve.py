@@ -118,10 +118,13 @@ class Clock:
             return []
         if self.of == "gyro" and drift.clear(self.assumed):
             return [
-                f"gyro: the accelerometers' clock runs {1e6 * drift.rate:+.0f} ppm (u "
-                f"{1e6 * drift.rate_uncertainty:.0f} ppm) against the gyroscopes': if the gyroscopes' is wrong, so are "
-                "all their scale factors, by as much; their uncertainty covers it. If the accelerometers' clock is the "
-                "true one, use --clock-of accel"
+                Finding(
+                    f"gyro: the accelerometers' clock runs {1e6 * drift.rate:+.0f} ppm (u "
+                    f"{1e6 * drift.rate_uncertainty:.0f} ppm) against the gyroscopes': if the gyroscopes' is wrong, so "
+                    "are all their scale factors, by as much; their uncertainty covers it. If the accelerometers' "
+                    "clock is the true one, use --clock-of accel",
+                    "compare both clocks with a third, and state the true one (--clock-of)",
+                )
             ]
         late = -drift.delay
         if not apart and abs(late) > max(_LATENCY, SAMPLES_COME_LATE.limit * drift.delay_uncertainty):

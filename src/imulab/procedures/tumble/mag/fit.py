@@ -9,7 +9,7 @@ from typing import Annotated, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.display import UNJUDGED, Bad, Note
+from imulab.display import UNJUDGED, Bad, Finding, Note
 from imulab.errors import DataError, OptionError, listed, quoted
 from imulab.estimation.decisions import (
     DIP_MOVES_ACCELEROMETERS,
@@ -252,13 +252,14 @@ def _warn_scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> li
     worst = max(magnitude / _LARGE_RMS, dip / _LARGE_DIP)
     if worst <= 1:
         return []
-    kind = Bad if worst > _HOPELESS else str
+    kind = Bad if worst > _HOPELESS else Finding
     count, axis, value = count_extremes(means.mean[used])
     clipped = f", is mag_{_AXES[axis]} saturated at {value:.4g} {means.unit} ({count} attitudes)" if count > 2 else ""
     return [
         kind(
-            f"mag: |m| scatters by {100 * magnitude:.2g} % of the field, the dip by {np.degrees(dip):.2g} deg: were "
-            f"both triads in the same attitudes, by one clock, and was no iron near that moved{clipped}?"
+            f"mag: |m| scatters by {100 * magnitude:.2g} % of the field, the dip by {np.degrees(dip):.2g} deg: "
+            f"were both triads in the same attitudes, by one clock, and was no iron near that moved{clipped}?",
+            "record both triads in the same attitudes, by one clock, away from iron that moves",
         )
     ]
 
@@ -280,7 +281,12 @@ def _warn_step(joint: Joint, labels: Sequence[str]) -> list[str]:
                 "as well as time: attitudes in mixed order would tell"
             )
         ]
-    return [f"{what}: was iron, such as a phone, near in a part of the attitudes, or did the place change?"]
+    return [
+        Finding(
+            f"{what}: was iron, such as a phone, near in a part of the attitudes, or did the place change?",
+            "record all attitudes again at one place, away from phones and iron",
+        )
+    ]
 
 
 def _warn_stated_dip(dip: Parameter, stated: Sequence[float] | None) -> list[str]:
@@ -291,20 +297,38 @@ def _warn_stated_dip(dip: Parameter, stated: Sequence[float] | None) -> list[str
     if abs(off) <= DIP_OFF_STATED.limit * sigma:
         return []
     return [
-        f"mag: the dip of {np.degrees(dip.value):.2f} deg is {np.degrees(abs(off)):.2g} deg "
-        f"{'more' if off > 0 else 'less'} than the {np.degrees(stated[0]):.2f} deg stated, {abs(off) / sigma:.1f} "
-        "standard uncertainties: is iron near, or is the stated dip of another place?"
+        Finding(
+            f"mag: the dip of {np.degrees(dip.value):.2f} deg is {np.degrees(abs(off)):.2g} deg "
+            f"{'more' if off > 0 else 'less'} than the {np.degrees(stated[0]):.2f} deg stated, {abs(off) / sigma:.1f} "
+            "standard uncertainties: is iron near, or is the stated dip of another place?",
+            "state the dip of this place (--dip), or measure farther from iron",
+        )
     ]
 
 
 def _note_set_aside(label: str, off: Disturbed) -> str:
     """Return the words that name an attitude which was set aside, and by how much it is off: a note by its chance."""
-    kind = str if off.probability < FIELD_DISTURBED.level else Note
+    kind = Finding if off.probability < FIELD_DISTURBED.level else Note
     return kind(
         f"mag: {label} set aside: |m| {100 * abs(off.magnitude):.2g} % "
         f"{'high' if off.magnitude > 0 else 'low'}, dip {np.degrees(abs(off.dip)):.2g} deg "
-        f"{'high' if off.dip > 0 else 'low'} against the others (p {off.probability:.1g}): iron or a vehicle near?"
+        f"{'high' if off.dip > 0 else 'low'} against the others (p {off.probability:.1g}): iron or a vehicle near?",
+        "measure this attitude again, away from iron and vehicles",
     )
+
+
+def _warn_moved(moved: Mapping[str, float]) -> list[str]:
+    """Return a message on the accelerometers' parameter that the dip moves most, by its standard uncertainties."""
+    name, value = max(moved.items(), key=lambda item: abs(item[1]), default=("", 0.0))
+    if abs(value) <= DIP_MOVES_ACCELEROMETERS.limit:
+        return []
+    return [
+        Finding(
+            f"mag: the dip moves the accelerometers' {name} by {abs(value):.1f} standard uncertainties: field and "
+            "gravity contradict each other; was iron near, or did the unit move?",
+            "record again away from iron, each attitude held still",
+        )
+    ]
 
 
 def _warn_fit(
@@ -321,12 +345,14 @@ def _warn_fit(
     messages = [_note_set_aside(attitudes.label(disturbed.index), disturbed) for disturbed in aside]
     n = len(joint.pair.mag)
     if n < _ATTITUDES_ASKED:
-        messages.append(
-            f"mag: {n} attitudes leave little to tell the noise from; {_ATTITUDES_ASKED} or more are asked for"
-        )
+        text = f"mag: {n} attitudes leave little to tell the noise from; {_ATTITUDES_ASKED} or more are asked for"
+        messages.append(Finding(text, f"record {_ATTITUDES_ASKED} attitudes or more (imulab tumble plan --with mag)"))
     if not joint.converged:
         messages.append(
-            "mag: the fit of both triads did not come to rest: more attitudes, at several headings, would help"
+            Finding(
+                "mag: the fit of both triads did not come to rest: more attitudes, at several headings, would help",
+                "record more attitudes, at several headings",
+            )
         )
     if observability.condition > _ONE_WAY:
         left = np.delete(ready.kept, [disturbed.index for disturbed in aside])
@@ -338,20 +364,17 @@ def _warn_fit(
                 "would help most"
             )
         )
-    far = {name: value for name, value in moved.items() if abs(value) > DIP_MOVES_ACCELEROMETERS.limit}
-    if far:
-        name, value = max(far.items(), key=lambda item: abs(item[1]))
-        messages.append(
-            f"mag: the dip moves the accelerometers' {name} by {abs(value):.1f} standard uncertainties: field and "
-            "gravity contradict each other; was iron near, or did the unit move?"
-        )
+    messages += _warn_moved(moved)
     left = np.delete(ready.kept, [disturbed.index for disturbed in aside])
     labels = [attitudes.label(int(np.searchsorted(ready.kept, i))) for i in left]
     messages += [*_warn_scatter(joint, ready.means, left), *_warn_step(joint, labels)]
     if joint.pair.held is not None and joint.sigma[2] > _POINTING:
         messages.append(
-            f"mag: the attitudes of --same-direction scatter by {np.degrees(joint.sigma[2]):.2g} deg about their "
-            "directions: does one axis of the body point the same way in them?"
+            Finding(
+                f"mag: the attitudes of --same-direction scatter by {np.degrees(joint.sigma[2]):.2g} deg about their "
+                "directions: does one axis of the body point the same way in them?",
+                "check which attitudes --same-direction names",
+            )
         )
     if "hemisphere" not in options:
         dip = float(np.degrees(joint.theta[joint.pair.layout.dip_at]))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.display import Finding
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, quoted
 from imulab.estimation.decisions import ACCELEROMETERS_CONTRADICT_RECORD
 from imulab.estimation.distributions import f_tail
@@ -393,8 +394,11 @@ def _read_prior(
         if p < ACCELEROMETERS_CONTRADICT_RECORD.level:
             gyroscopes = "; its gyroscopes were left out" if "gyro_output_unit" in known.model else ""
             return None, [
-                f"mag: the accelerometers of {attitudes.recording.name} contradict their record (p = {p:.2g}): it was "
-                f"not used; they were calibrated anew from these attitudes{gyroscopes}"
+                Finding(
+                    f"mag: the accelerometers of {attitudes.recording.name} contradict their record (p = {p:.2g}): it "
+                    f"was not used; they were calibrated anew from these attitudes{gyroscopes}",
+                    "calibrate the accelerometers again (imulab tumble fit)",
+                )
             ]
     return (held.mean, np.linalg.inv(np.linalg.cholesky(held.covariance))), []
 
