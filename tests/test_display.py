@@ -10,7 +10,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.display import Bad, Note, Verdict, action_of, verdict_of
+from imulab.display import Bad, Finding, Note, Verdict, action_of, verdict_of
 from imulab.errors import RecordError
 from imulab.procedures.registry import loads
 from imulab.procedures.tumble.simulate import simulate_tumble
@@ -207,6 +207,18 @@ def test_a_gravity_that_is_hardly_known_is_refused(run, option, words):
     status, _, said = run("tumble", "fit", "a.csv", option)
     assert status == 2
     assert words in said
+
+
+def test_what_to_do_next_stands_after_the_state_everywhere(record, imulab, tmp_path):
+    findings = (Bad("the unit is wrong", "state it: <g>"), Finding("a hold was knocked", "measure it again"))
+    judged = replace(record, warnings=findings, verdict=verdict_of(findings))
+    judged.save(tmp_path / "r.json")
+    assert imulab("show", "r.json").stdout.splitlines()[1:3] == ["next: state it: <g>", "next: measure it again"]
+    assert "\nnext: state it: <g>\n" in repr(judged)
+    assert "<b>next:</b> measure it again" in judged._repr_html_()
+    il.write_report(judged, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert page.index("<li>a hold was knocked</li>") < page.index("<b>next:</b> state it: &lt;g&gt;")
 
 
 MESSAGES = {"messages", "warnings", "notes", "lines", "named"}

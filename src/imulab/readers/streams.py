@@ -255,8 +255,10 @@ def _block(
 
 def _left_out(clock: _Buffer, others: list[_Buffer]) -> list[str]:
     return [
-        f"{other.left_out} row{'s' * (other.left_out > 1)} of the {clock.stream.what} left out where the "
-        f"{other.stream.what} has not begun or has ended"
+        Note(
+            f"{other.left_out} row{'s' * (other.left_out > 1)} of the {clock.stream.what} left out where the "
+            f"{other.stream.what} has not begun or has ended"
+        )
         for other in others
         if other.left_out
     ]

@@ -332,12 +332,8 @@ def compare_methods(
     start, stop = (0, len(recording)) if truth is not None else _longest_quiet(recording, readings, rate)
     if stop - start < len(recording):
         time = recording.si("time")
-        warnings.append(
-            Note(
-                f"{recording.name}: no truth_rate: the figures are of the longest stretch at rest, "
-                f"{time[start]:.6g} to {time[stop - 1]:.6g} s, with 0 as the truth"
-            )
-        )
+        text = f"{recording.name}: no truth_rate: the figures are of the longest stretch at rest, "
+        warnings.append(Note(f"{text}{time[start]:.6g} to {time[stop - 1]:.6g} s, with 0 as the truth"))
     reference = np.zeros((stop - start, len(elements.axes))) if truth is None else truth[start:stop]
     options = partial(FuseOptions, memory=memory, start=count_from, rate=rate)
     runs = _run_methods(recording, elements, logged, readings, options, calibration, slice(start, stop))
