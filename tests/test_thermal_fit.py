@@ -1,8 +1,11 @@
 """The calibration over temperature: exact data, statistics, rest ramps, and what a person can get wrong."""
 
+import importlib.util
 import json
 import re
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +20,7 @@ from imulab.procedures.thermal.degrees import (
     predict_left_out,
     split_temperatures,
 )
+from imulab.procedures.thermal.holds import find_holds
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.record import predict_parameters
 from imulab.procedures.thermal.simulate import thermal_truth
@@ -515,3 +519,44 @@ def test_what_counts_as_observable_is_known_as_stated_and_what_does_not_is_not(r
     assert np.sqrt(np.mean(ratios[True])) == pytest.approx(1, abs=margin)
     assert np.mean(beyond[True]) < 0.01
     assert np.mean(beyond[False]) > 0.1
+
+
+def load_oven():
+    path = Path(__file__).parent.parent / "benchmarks" / "truth" / "_thermal_oven.py"
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+oven = load_oven()
+
+
+def soaks(unit, *, both=False):
+    if both:
+        back = [unit.soak(point, -1.0, stated=True) for point in oven.POINTS[::-1]]
+        return [unit.soak(point, stated=True) for point in oven.POINTS] + back
+    return [unit.soak(point) for point in oven.POINTS]
+
+
+def test_what_soaks_from_one_side_cannot_show_is_in_the_uncertainty_and_noted():
+    one_sided = il.fit_thermal(soaks(oven.Oven(np.random.default_rng(1))), gravity=oven.G).calibration
+    assert one_sided.verdict.state == "good"
+    assert any("recordings from one side do not show" in warning for warning in one_sided.warnings)
+    both = il.fit_thermal(soaks(oven.Oven(np.random.default_rng(1)), both=True), gravity=oven.G).calibration
+    assert not any("recordings from one side do not show" in warning for warning in both.warnings)
+
+
+def test_a_third_of_gravity_less_is_bad_and_says_why():
+    taken = [
+        recording.with_columns({f"accel_{a}": 0.7 * recording.column(f"accel_{a}") for a in "xyz"}, {})
+        for recording in soaks(oven.Oven(np.random.default_rng(1)))
+    ]
+    record = il.fit_thermal(taken, gravity=oven.G).calibration
+    assert record.verdict.state == "bad"
+    assert any("which is no gravity" in reason for reason in record.verdict.reasons)
+
+
+def test_a_ramp_at_two_hertz_is_not_asked_for_its_unit_of_time():
+    ramp = oven.Oven(np.random.default_rng(1)).ramp(0, duration=600.0)
+    assert not any("unit of time" in note for note in find_holds([ramp]).notes)

@@ -11,7 +11,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.apply import apply_blocks
-from imulab.procedures.thermal.gyro import RatesAtRest, fit_gyroscopes
+from imulab.procedures.thermal.gyro import RatesAtRest, between_turns, fit_gyroscopes
 from imulab.procedures.thermal.record import predict_gyro_bias
 from reference import thermal_gyro as reference
 from reference.thermal import directions, natural_spline
@@ -648,3 +648,16 @@ def test_auto_of_laws_with_and_without_a_kink(reduced):
         (cubic, spline, auto), held = tried("cubic", 7, 9, trials, turn_on)
         assert auto < 1.2 * cubic < spline
         assert held > least
+
+
+def test_slow_ends_of_a_hold_are_cut_and_a_turn_inside_it_is_not():
+    still = np.ones(400, dtype=bool)
+    assert between_turns(still).all()
+    still[:40], still[370:] = False, False
+    kept = np.flatnonzero(between_turns(still))
+    assert (kept[0], kept[-1]) == (80, 339)
+    still = np.ones(400, dtype=bool)
+    still[200] = False  # a spike
+    assert between_turns(still).sum() == 399
+    still[120:280] = False
+    assert not between_turns(still).any()

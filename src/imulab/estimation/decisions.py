@@ -157,22 +157,25 @@ THERMAL_POWER = Decision(
     0.01, "model", {"thermal": 9}, "the highest power of the temperature in a law is needed (Wald)"
 )
 THERMAL_DEGREES_TOO_LOW = Decision(
-    0.01, "verdict", {"thermal": 1}, "the degrees that were stated leave out powers that are there (Wald)"
+    0.005, "verdict", {"thermal": 1}, "the degrees that were stated leave out powers that are there (Wald)"
 )
 THERMAL_LAW_BENDS = Decision(0.01, "model", {"thermal": 1}, "the biases lie on no cubic: a spline is allowed (Wald)")
 SCALES_SCATTER_BETWEEN_CYCLES = Decision(
-    0.05, "uncertainty", {"thermal": 1}, "scale factors scatter from power cycle to power cycle"
+    0.3, "uncertainty", {"thermal": 1}, "scale factors scatter from power cycle to power cycle, as far as it seems"
 )
 LAG_OR_LOOP = Decision(
-    0.01, "verdict", {"thermal": 2, "thermal gyro": 2}, "biases lag the temperature; they differ in warming and cooling"
+    0.003,
+    "verdict",
+    {"thermal": 2, "thermal gyro": 2},
+    "biases lag the temperature; they differ in warming and cooling",
 )
 RECORDING_DISAGREEMENT = Decision(
-    0.005, "verdict", {"thermal": 2}, "a recording's biases, or scale factors, lie off those of all others"
+    0.002, "verdict", {"thermal": 2}, "a recording's biases, or scale factors, lie off those of all others"
 )
 HOLD_DISAGREEMENT = Decision(5.7e-7, "verdict", {"thermal": 200}, "a hold stands out from the laws", limit=5.0)
 TEMPERATURE_MISSED = Decision(
-    0.0027, "verdict", {"thermal": 8, "thermal gyro": 8}, "a temperature that was left out is missed: the law bends",
-    limit=3.0,
+    0.00047, "verdict", {"thermal": 8, "thermal gyro": 8}, "a temperature that was left out is missed: the law bends",
+    limit=3.5,
 )  # fmt: skip
 DIRECTION_WANDERS = Decision(
     0.013,
@@ -185,7 +188,7 @@ TURNED_IN_HOLD = Decision(
     1.2e-15, "verdict", {"thermal gyro": 200}, "the unit turned in a hold, which is left out", limit=8.0
 )
 SCALE_LAW_SCATTERS = Decision(
-    0.01, "verdict", {"thermal gyro": 1}, "the scale factors of the recordings lie on no law that they determine"
+    0.005, "verdict", {"thermal gyro": 1}, "the scale factors of the recordings lie on no law that they determine"
 )
 THERMAL_CHECK = Decision(0.05, "check", {"thermal check": 1}, "the record over temperature no longer holds")
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Unpack
 
 import numpy as np
 
+from imulab.display import UNJUDGED
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import Observability
 from imulab.gravity import EarthRate, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
@@ -23,6 +24,7 @@ from imulab.procedures.thermal.degrees import (
     DegreesStep,
     LeftOutCluster,
     choose_laws,
+    cover_hidden,
     drift_rates,
     fit_lag_and_loops,
 )
@@ -154,7 +156,7 @@ def fit_thermal(
     local = local_gravity(at_place(gravity, latitude, height, beside=earth is not None), recordings[0])
     holds = find_holds(recordings)
     nominal = conversion_factor(holds.unit, "m/s^2") if parse_unit(holds.unit).quantity == "acceleration" else None
-    check_holds(holds, local.value, nominal)
+    doubts = check_holds(holds, local.value, nominal)
     scale, zero = _nominal_scale(holds, local.value, nominal)
     leaning = _read_tilt(tilt)
     scatter = _read_scatter(turn_on_scatter, "turn_on_scatter", "acceleration", "mg", local.value)
@@ -170,6 +172,8 @@ def fit_thermal(
     if drift.free:
         problem = replace(problem, free=drift.free)
         choice = choose_laws(problem, laws, wanted, scatter, name, spline=spline)
+    covered, hidden = cover_hidden(problem, choice.solution, drift, name)
+    choice = replace(choice, solution=covered)
     options = {
         "degrees": wanted if isinstance(wanted, str) else ["spline", *wanted[1:]] if spline else list(wanted),
         "gravity": local.value,
@@ -183,6 +187,7 @@ def fit_thermal(
     }
     options = {key: value for key, value in options.items() if value is not None}
     record = make_record(holds, problem, choice, drift, local, scale, options, name)
+    record = replace(record, warnings=(*doubts, *record.warnings, *hidden), verdict=UNJUDGED)
     if further:
         record = _with_gyroscopes(record, holds, problem, choice.solution, scale, wanted, spline, rates, name, earth)
     return ThermalFit(record, choice.view, tuple(choice.steps), tuple(choice.left_out))

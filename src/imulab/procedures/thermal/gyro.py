@@ -111,6 +111,9 @@ def model_earth_rate(force: Array, attitude: NDArray[np.int64], earth: EarthRate
 
 _COLUMNS = triad("gyro")
 _FEWEST = 12  # fewest still samples of a hold
+_QUIET_PART, _ENDS = 0.35, 0.02
+"""Share of still samples of a hold, between slow ends, that tells the zero; and share of moving ones that makes such
+an end."""
 _LARGEST = np.radians(60.0)
 """Largest plausible bias, rad/s."""
 
@@ -271,8 +274,8 @@ def _average_still(
     cuts: list[Cut | None] = []
     notes: list[str] = []
     for index, piece, m in zip(members.tolist(), pieces, median, strict=True):
-        still = (np.abs(output[piece] - m) <= STILL_SIGMAS * sigma).all(axis=1)
-        if still.sum() < max(QUIET_SHARE * len(still), _FEWEST):
+        still = between_turns((np.abs(output[piece] - m) <= STILL_SIGMAS * sigma).all(axis=1))
+        if still.sum() < max(_QUIET_PART * len(still), _FEWEST):
             notes.append(
                 Finding(
                     f"gyro: {holds.label(index)} left out: the gyroscopes turn, which accelerometers do not see",
@@ -284,6 +287,23 @@ def _average_still(
         kept = np.flatnonzero(still) + piece.start
         cuts.append(average_cut(output[kept], temperature[kept], time[kept], 0, len(kept), index))
     return rest, cuts, notes
+
+
+def between_turns(still: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which samples of a hold lie between its slow beginning and end, shape (n,); none where it turns inside.
+
+    A smooth turn ends after the accelerometers are at rest. Beside samples that turn, so many again are left out. A few
+    samples in the middle that stand out are left out alone.
+    """
+    count, moved = len(still), np.flatnonzero(~still)
+    begun, ended = moved[moved < count // 4], moved[moved >= count - count // 4]
+    inside = len(moved) - len(begun) - len(ended)
+    if inside > (1 - QUIET_SHARE) * count:
+        return np.zeros(count, dtype=np.bool_)
+    first = 2 * (int(begun[-1]) + 1) if len(begun) > _ENDS * count else 0
+    last = count - 2 * (count - int(ended[0])) if len(ended) > _ENDS * count else count
+    place = np.arange(count)
+    return still & (place >= min(first, count * 3 // 10)) & (place < max(last, count * 7 // 10))
 
 
 # Biases over temperature from all holds at rest.

@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.display import Finding, Note, prefixed
+from imulab.display import Bad, Finding, Note, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import DIRECTION_WANDERS
+from imulab.estimation.noise.readings import no_gravity
 from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
 from imulab.procedures.thermal import LEAST_SPAN, SETTLE
-from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes, find_attitudes
+from imulab.procedures.tumble.attitudes import POOL_DEGREES, TIME_DOUBTED, Attitudes, find_attitudes
 from imulab.recording import Array, Recording, check_finite
 from imulab.records.comparison import different_units
 from imulab.units import parse_unit
@@ -275,7 +276,8 @@ def _join_rest(attitudes: Attitudes, outputs: Array) -> Attitudes:
     edges = find_stretches_at_rest(outputs, time)
     if edges is None:
         return attitudes
-    notes = attitudes.notes
+    # A ramp through the temperatures needs no more than a sample now and then.
+    notes = tuple(note for note in attitudes.notes if TIME_DOUBTED not in note)
     if len(edges) > 1:
         first, lost = time[edges[0, 1]], 100 * (1 - np.diff(edges).sum() / len(time))
         sentence = (
@@ -604,8 +606,10 @@ def _skip_settling(recording: Recording, settle: float | None) -> Recording:
     )
 
 
-def check_holds(holds: Holds, gravity: float, nominal: float | None) -> None:
-    """Refuse holds that cannot be those of accelerometers under `gravity`, m/s^2, with `nominal` m/s^2 per output.
+def check_holds(holds: Holds, gravity: float, nominal: float | None) -> list[str]:
+    """Return why |f| at rest is no gravity, and refuse holds that cannot be those of accelerometers.
+
+    `gravity` is in m/s^2, `nominal` in m/s^2 per output.
 
     Raises
     ------
@@ -616,11 +620,21 @@ def check_holds(holds: Holds, gravity: float, nominal: float | None) -> None:
         length = np.linalg.norm(holds.mean, axis=1) * nominal
         far = np.flatnonzero((length < gravity / 2) | (length > 2 * gravity))
         if far.size:
+            reason = no_gravity(float(length[far[0]]), holds.unit)
             raise DataError(
                 f"{holds.label(int(far[0]))}: columns accel_x accel_y accel_z: the specific force at rest is "
-                f"{length[far[0]]:.4g} m/s^2, expected {gravity:.4g} m/s^2: is the unit wrong?"
+                f"{length[far[0]]:.4g} m/s^2, expected {gravity:.4g} m/s^2: is the unit wrong? {reason}"
             )
+    doubts: list[str] = []
+    if nominal is not None and (reason := no_gravity(float(np.median(length)), holds.unit)):
+        doubts.append(
+            Bad(
+                f"{holds.recordings[0].name}: columns accel_x accel_y accel_z: {reason}",
+                "state the unit that the columns have, as by --unit accel=UNIT, and fit again",
+            )
+        )
     span = np.ptp(holds.mean, axis=0)
     if span.min() <= 0:
         name = triad("accel")[int(np.argmin(span))]
         raise DataError(f"{holds.recordings[0].name}: column {name}: the same output in every hold: a dead axis")
+    return doubts

@@ -476,6 +476,7 @@ def resolutions(recording: Recording, names: list[str], part: int | None = None)
 _BLOCK_SECONDS = 0.1  # s over which the scatter of samples is computed
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap; no window reaches across it."""
+TIME_DOUBTED = "is the unit of time right?"
 _SLOW = 5.0  # Hz: of slower samples too few fall into a hold
 _MUCH_LOST = 0.05  # share of the time that gaps may take without a warning
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)
@@ -650,7 +651,7 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
     if rate < _SLOW:
         notes.append(
             Finding(
-                f"about {rate:.3g} samples per second: is the unit of time right?",
+                f"about {rate:.3g} samples per second: {TIME_DOUBTED}",
                 "correct the unit of the column time",
             )
         )
