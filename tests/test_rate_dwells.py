@@ -484,3 +484,24 @@ def test_every_dwell_is_found_and_none_at_a_wrong_rate(name, reduced):
             assert rate == pytest.approx(way[k], abs=1e-9)
             seen.add(k)
         assert len(seen) == len(way), f"seed {seed}"
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0, 5.0])
+def test_noise_of_the_recorded_rate_is_in_the_uncertainty_or_said(noise):
+    """2 deg/s of 100 took 0.1 % off the scale factor of a sine, 5 deg/s 3 %, with a good verdict."""
+    rng = np.random.default_rng(4)
+    time = np.arange(4000) / 100
+    rate = 100 * np.sin(2 * np.pi * 0.3 * time)
+    gyro = np.zeros((4000, 3))
+    gyro[:, 2] = rate
+    gyro += 0.1 * rng.standard_normal(gyro.shape)
+    table = rate + noise * rng.standard_normal(4000)
+    units = {"gyro": "deg/s", "table_rate": "deg/s"}
+    made = il.Recording.from_arrays(time=time, gyro=gyro, table_rate=table, units=units)
+    record = il.fit_rate(made, latitude=0.0).calibration
+    p = record.parameters["gyro_scale_factor_z"]
+    error, u = p.value / (180 / np.pi) - 1, p.standard_uncertainty / (180 / np.pi)
+    warned = any("recorded rate has noise" in reason for reason in record.verdict.reasons)
+    assert warned == (noise > 0)
+    assert warned or abs(error) < 2 * u
+    assert noise or u < 4e-5

@@ -248,6 +248,9 @@ _BESIDE_NOISE = 8  # samples on both sides over which noise is averaged
 _SMOOTH = 0.02  # of the largest step of the rate: it changes all the time if more steps than half exceed this
 _LONGEST = 1 << 17  # samples that are analysed; more are thinned
 _SHOWN = 3.0  # standard uncertainties that ``2 c - tau^2`` must exceed for a bandwidth to be stated
+_CLEAN, _EXTRAPOLATED, _MUCH = 1e-6, 2.0, 5e-4
+"""Share of the rate's power below which its noise does not matter; uncertainty over what noise takes away, and how much
+of that is said."""
 _OWN, _CLEAR = 1e-3, 100
 """A derivative counts if rate and lower derivatives leave this share of its power, so many times that of its noise."""
 _TOLD = 0.05
@@ -280,6 +283,10 @@ class Sweep:
         Largest rate of the table, rad/s; the means by rate lie within it.
     rising
         Number of means at rising rates; they come first.
+    attenuation
+        What noise of the recorded rate takes off the scale factor, a fraction, and that noise, rad/s; 0 without.
+    attenuation_shown
+        Whether that is so much that the uncertainty may not hold it.
     """
 
     delay: tuple[float, float]
@@ -291,6 +298,8 @@ class Sweep:
     zero_error: Array
     largest: float
     rising: int
+    attenuation: tuple[float, float] = (0.0, 0.0)
+    attenuation_shown: bool = False
 
 
 @dataclass(frozen=True)
@@ -343,6 +352,9 @@ def rate_of_angle(angle: Array, time: Array) -> Array:
 def reduce_sweep(time: Array, rate: Array, outputs: list[Array], main: int) -> tuple[Sweep, Binned]:
     """Return delay and bandwidth of gyroscope number `main`, and the means of all outputs by rate.
 
+    Noise of the recorded rate takes from the slope. By how much shows where as much noise is added once more
+    (simulation and extrapolation: Cook and Stefanski, J. Am. Stat. Assoc. 89 (1994) 1314); it is in the uncertainty.
+
     Parameters
     ----------
     time, rate
@@ -350,6 +362,27 @@ def reduce_sweep(time: Array, rate: Array, outputs: list[Array], main: int) -> t
     outputs
         Output of each gyroscope, shape (n,).
     """
+    sweep, binned = _reduce_as_recorded(time, rate, outputs, main)
+    step = float(np.median(np.diff(time[:10_001])))
+    noise = float(np.sqrt(_noise_of_rate(time, rate, step)))
+    if noise**2 < _CLEAN * float(np.var(rate)):
+        return sweep, binned
+    added = noise * np.random.default_rng(0).standard_normal(len(rate))
+    varied = rate - rate.mean()
+    noisier = rate + added - (added @ varied) / (varied @ varied) * varied  # so that chance does not tilt the line
+    slopes = [_slope(pair[1], main) for pair in ((sweep, binned), _reduce_as_recorded(time, noisier, outputs, main))]
+    lost = abs(slopes[1] / slopes[0] - 1)
+    sweep = replace(sweep, scale_error=float(np.hypot(sweep.scale_error, _EXTRAPOLATED * lost)))
+    return replace(sweep, attenuation=(lost, noise), attenuation_shown=lost > _MUCH), binned
+
+
+def _slope(binned: Binned, main: int) -> float:
+    """Return the slope of a gyroscope's means over the rate, weighted by time."""
+    return float(np.polyfit(binned.rate, binned.mean[:, main], 1, w=np.sqrt(binned.duration))[0])
+
+
+def _reduce_as_recorded(time: Array, rate: Array, outputs: list[Array], main: int) -> tuple[Sweep, Binned]:
+    """Return what `reduce_sweep` does, with the rate taken as it was recorded."""
     step = float(np.median(np.diff(time[:10_001])))
     top, frequency = _find_band(rate, step)
     many = _PER_PERIOD if frequency is None else 2 * _PER_PERIOD
@@ -456,9 +489,14 @@ def _derivative_noise(time: Array, rate: Array, step: float, spacing: float) -> 
 
     Differences across a gap are left out. White noise of variance s^2 has eighth differences of variance 12870 s^2.
     """
-    whole = time[8:_LONGEST] - time[: _LONGEST - 8][: len(time) - 8] < WHOLE * step
-    of_rate = float(np.mean(np.diff(rate[:_LONGEST], n=8)[whole] ** 2)) / 12870
+    of_rate = _noise_of_rate(time, rate, step)
     return [of_rate * float(kernel @ kernel) / spacing ** (2 * k) for k, kernel in enumerate(KERNELS, 1)]
+
+
+def _noise_of_rate(time: Array, rate: Array, step: float) -> float:
+    """Return the variance of white noise of the recorded rate, by its eighth differences."""
+    whole = time[8:_LONGEST] - time[: _LONGEST - 8][: len(time) - 8] < WHOLE * step
+    return float(np.mean(np.diff(rate[:_LONGEST], n=8)[whole] ** 2)) / 12870 if whole.any() else 0.0
 
 
 def _count_derivatives(moments: Moments, noise: list[float]) -> int:
