@@ -52,14 +52,17 @@ def rotation(vector: Array) -> Array:
     x, y, z = (vector / np.maximum(angle, 1e-300)[:, None]).T
     nil = np.zeros_like(x)
     cross = np.array([[nil, -z, y], [z, nil, -x], [-y, x, nil]]).transpose(2, 0, 1)
-    return np.eye(3) + np.sin(angle)[:, None, None] * cross + (1 - np.cos(angle))[:, None, None] * cross @ cross
+    return np.asarray(
+        np.eye(3) + np.sin(angle)[:, None, None] * cross + (1 - np.cos(angle))[:, None, None] * cross @ cross,
+        dtype=np.float64,
+    )
 
 
 def rotation_vector(matrix: Array) -> Array:
     """Return the rotation vector of one rotation matrix that is not a half turn."""
     axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
     sine, cosine = np.linalg.norm(axis) / 2, (np.trace(matrix) - 1) / 2
-    return axis / max(2 * sine, 1e-12) * np.arctan2(sine, cosine)
+    return np.asarray(axis / max(2 * sine, 1e-12) * np.arctan2(sine, cosine), dtype=np.float64)
 
 
 def low_pass(values: Array, corner: float, rate: float) -> Array:
@@ -90,7 +93,7 @@ def attitudes(rng: np.random.Generator, count: int, *, poses: bool) -> Array:
         for first, axis in ((count - half, np.array([1.0, 0.0, 0.0])), (count - half // 2, np.array([0.0, 1.0, 0.0]))):
             rolls = 2 * np.pi * np.arange(half // 2) / (half // 2)
             turns[first - 0 : first + half // 2] = rotation(rolls[:, None] * axis) @ turns[first]
-    return turns
+    return np.asarray(turns, dtype=np.float64)
 
 
 def record(

@@ -662,9 +662,9 @@ def _covariance_of_gradient(
     white = np.zeros((n, k))
     white[:, 1:3] = extra[:2]
     weigh = _root_of_information(information)
-    whiten = np.zeros((n, k, n, k))
-    whiten[np.arange(n), :, np.arange(n), :] = weigh
-    whiten = whiten.reshape(n * k, n * k)
+    blocks = np.zeros((n, k, n, k))
+    blocks[np.arange(n), :, np.arange(n), :] = weigh
+    whiten: Array = blocks.reshape(n * k, n * k)
     jacobian = whiten @ evaluated.by_parameters.reshape(n * k, -1)
     rotated = np.linalg.qr(jacobian, mode="complete")[0]
     free = rotated[:, jacobian.shape[1] :]
