@@ -290,11 +290,12 @@ def _dwell_residuals(linearity: Mapping[str, Linearity]) -> DwellResiduals:
 def _warn_other_unit(test: RateTest, recordings: Sequence[Recording]) -> list[str]:
     """Return a warning where a recording and the manifest name different units."""
     pairs = (different_units((r.name, r.metadata), ("the manifest", test.sensor)) for r in recordings)
-    return [
+    messages: list[str] = [
         Finding(f"{other}: which is the unit?", "correct the serial number in the manifest or in the file")
         for other in pairs
         if other
-    ][:1]
+    ]
+    return messages[:1]
 
 
 def _warn_output_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
