@@ -73,7 +73,7 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
                 title = f"{sensor}_{letter}_{element + 1}"
                 columns[title] = step * frames["data"][:, element, first + axis].astype(np.float64)
                 units[title] = unit
-    notes = []
+    notes: list[str] = []
     if cut is not None:
         notes.append(Note(f"truncated: the last frame, at byte {cut}, is cut; read up to there"))
     if skipped:

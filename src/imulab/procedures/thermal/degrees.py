@@ -599,7 +599,8 @@ def warn_lag_and_loops(drift: LagAndLoops, solution: ThermalSolution, name: str)
     if drift.values is None:
         return [Note(f"{name}: {drift.reason}")] if drift.reason else []
     assert drift.covariance is not None
-    messages, u = [], np.sqrt(np.diag(drift.covariance))
+    u = np.sqrt(np.diag(drift.covariance))
+    messages: list[str] = []
     if 0 in drift.free:
         laws = solution.laws
         slope = laws.slope(np.linspace(laws.low, laws.high, 81)) @ solution.coefficients[: laws.size]
@@ -680,7 +681,8 @@ def bias_shift_from_unobserved(
         return float(np.sqrt(np.mean(np.einsum("tpa,ab,tpb->tp", moved, left, moved))))
 
     temperature = problem.temperature if problem.known is None else np.append(problem.temperature, problem.known[0])
-    place, messages = laws.place(temperature)[rows.owner], []  # a prior's owner is -1
+    place = laws.place(temperature)[rows.owner]  # a prior's owner is -1
+    messages: list[str] = []
     for group in groups:
         slope, usual = _USUAL_SLOPES[group]
         constants = [part.start for part in laws.parts[3 * group : 3 * group + 3]]
@@ -902,7 +904,8 @@ def warn_disagreement(holds: Holds, problem: ThermalProblem, solution: ThermalSo
         )
         if size > 1
     ]
-    rows, messages = solution.rows, []
+    rows = solution.rows
+    messages: list[str] = []
     noise = float(np.median(np.sqrt(np.diag(rows.noise)[rows.magnitude])))
     scattered = solution.excess > max(_SCATTERS, _NOISE * noise)
     apart = _name_outlier(holds, problem, solution.laws) if differ or scattered else ""

@@ -339,7 +339,8 @@ def _warn_fit(
 
 def _warn_odd_holds(holds: Holds, solution: ThermalSolution) -> list[str]:
     """Return messages on the holds that stand out from the others of their recording."""
-    rows, messages = solution.rows, []
+    rows = solution.rows
+    messages: list[str] = []
     # Residuals less the part that a recording has in common, since that is due to its power cycle.
     whole, noise = (row_covariance(rows, solution.excess**2, tau) for tau in (solution.scatter.tau, np.zeros(2)))
     left = noise @ np.linalg.solve(whole, rows.residual)
@@ -563,7 +564,8 @@ def _warn_gyroscopes(
 
 def _warn_gyro_drift(gyros: ThermalGyroscopes, name: str) -> list[str]:
     """Return warnings of a significant lag or loop, with the error that corrected outputs keep."""
-    drift, messages = gyros.drift, []
+    drift = gyros.drift
+    messages: list[str] = []
     if drift.values is None or drift.covariance is None:
         return []
     u = np.sqrt(np.diag(drift.covariance))

@@ -204,7 +204,8 @@ def vertical_warnings(complete: FittedAttitudes, method: str) -> list[str]:
 
 def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
     """Return warnings of errors too large for an accelerometer: unit or columns are probably stated wrongly."""
-    theta, messages = solution.theta[0], []
+    theta = solution.theta[0]
+    messages: list[str] = []
     if parse_unit(attitudes.unit).quantity == "acceleration":
         off = [(axis, value) for axis, value in zip(AXES, theta[3:6].tolist(), strict=True)]
         messages += [
