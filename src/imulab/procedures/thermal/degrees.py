@@ -735,7 +735,8 @@ def cover_hidden(
     def spread(matrix: Array) -> Array:
         """Return the mean variances of biases, scale factors and misalignments over the range, shape (3,)."""
         each = np.einsum("tpc,cd,tpd->p", design, matrix[:size, :size], design) / _PLACES
-        return each.reshape(3, 3).mean(axis=1)
+        means: Array = each.reshape(3, 3).mean(axis=1)
+        return means
 
     stated, total = spread(solution.covariance), np.zeros_like(solution.covariance)
     effects = []

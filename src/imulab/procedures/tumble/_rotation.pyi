@@ -9,4 +9,5 @@ def turns(
     stop: NDArray[Any],
     matrix: NDArray[Any],
     sums: NDArray[Any],
+    squares: NDArray[Any],
 ) -> None: ...

@@ -622,7 +622,8 @@ def _warn_exchanged(curves: Curves) -> list[str]:
     count = len(t)
     if count < _FEWEST_TEMPERATURES:
         return []
-    width = np.sqrt(np.diff(curves.edges))[:, None] * (seconds > 0).all(axis=0)[:, None]
+    counted = np.asarray((seconds > 0).all(axis=0))
+    width = np.sqrt(np.diff(curves.edges))[:, None] * counted[:, None]
     scale = np.maximum(np.sqrt(np.mean(means**2, axis=(0, 1))), _ROUNDING * np.abs(curves.reference).max(axis=0))
     scale = np.where(scale > 0, scale, np.inf)
     flat = (means * width / scale).reshape(count, -1)

@@ -163,16 +163,17 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
         Standard uncertainty of the output at rest, (3,), or None where the biases are fitted.
     """
     segments, scale, size = solved.segments, solved.scale, solved.theta.size
-    theta = np.concatenate([solved.theta, np.zeros(12 - size)])
+    theta: Array = np.concatenate([solved.theta, np.zeros(12 - size)])
     shell = TurnEstimate(solved, np.empty(0), np.empty(0), normals(segments.after), np.empty(0), 0.0, np.zeros(size))
-    matrix = root = np.empty(0)
+    matrix: Array = np.empty(0)
+    root: Array = np.empty(0)
     for _ in range(_ITERATIONS):
         left, slopes = model(segments, scale, theta, fit_bias=True)
         residual, jacobian = shell.project(left[:, None])[:, 0], shell.project(slopes)
         if not root.size:
             matrix = _covariance_of_turns(solved, theta, shell, directions, zero, jacobian[:, 9:] / scale)
             beyond = _variance_beyond(matrix, jacobian[:, :size], residual)
-            root = np.linalg.cholesky(matrix + beyond * np.eye(len(matrix)))
+            root = np.asarray(np.linalg.cholesky(matrix + beyond * np.eye(len(matrix))), dtype=np.float64)
         white = np.linalg.solve(root, np.column_stack([jacobian[:, :size], residual]))
         inverse = np.linalg.pinv(white[:, :-1])
         covariance, step = inverse @ inverse.T, inverse @ white[:, -1]

@@ -145,7 +145,8 @@ def neighbouring_pairs(ends: HoldEnds) -> tuple[Windows, Windows, NDArray[np.int
 
 
 def _pairs(ends: HoldEnds) -> NDArray[np.bool_]:
-    return np.diff(ends.hold) == 0
+    pairs: NDArray[np.bool_] = np.diff(ends.hold) == 0
+    return pairs
 
 
 # The rate between samples.
