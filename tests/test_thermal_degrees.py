@@ -14,11 +14,11 @@ import imulab as il
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.thermal.degrees import (
     LagAndLoops,
-    bias_shift_from_unobserved,
     fit_lag_and_loops,
     warn_lag_and_loops,
 )
 from imulab.procedures.thermal.figures import exhibits
+from imulab.procedures.thermal.hidden import bias_shift_from_unobserved
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.record import predict_parameters
 from imulab.procedures.thermal.solve import ThermalProblem, solve

@@ -24,7 +24,6 @@ from imulab.procedures.thermal.degrees import (
     DegreesStep,
     LeftOutCluster,
     choose_laws,
-    cover_hidden,
     drift_rates,
     fit_lag_and_loops,
 )
@@ -35,6 +34,7 @@ from imulab.procedures.thermal.gyro import (
     rates_at_rest,
     scale_from_turns,
 )
+from imulab.procedures.thermal.hidden import cover_hidden
 from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepare_recordings, read_sides
 from imulab.procedures.thermal.model import GROUPS, Laws, forces
 from imulab.procedures.thermal.record import make_record, with_gyroscopes
@@ -160,9 +160,7 @@ def fit_thermal(
     scale, zero = _nominal_scale(holds, local.value, nominal)
     leaning = _read_tilt(tilt)
     scatter = _read_scatter(turn_on_scatter, "turn_on_scatter", "acceleration", "mg", local.value)
-    if gyro_turn_on_scatter is not None and not further:
-        raise OptionError("gyro_turn_on_scatter: no gyroscopes are fitted; expected --with gyro beside it")
-    rates = _read_scatter(gyro_turn_on_scatter, "gyro_turn_on_scatter", "rate", "deg/s")
+    rates = _read_gyro_scatter(gyro_turn_on_scatter, further)
     known = None if prior is None else _read_prior(as_record(prior, "fit_thermal: prior"), holds, local.value, scale)
     problem = _make_problem(holds, scale, zero, leaning, known)
     laws = Laws(float(holds.temperature.min()), float(holds.temperature.max()), (0, 0, 0))
@@ -173,7 +171,6 @@ def fit_thermal(
         problem = replace(problem, free=drift.free)
         choice = choose_laws(problem, laws, wanted, scatter, name, spline=spline)
     covered, hidden = cover_hidden(problem, choice.solution, drift, name)
-    choice = replace(choice, solution=covered)
     options = {
         "degrees": wanted if isinstance(wanted, str) else ["spline", *wanted[1:]] if spline else list(wanted),
         "gravity": local.value,
@@ -185,8 +182,8 @@ def fit_thermal(
         "temperature_column": temperature_column,
         "settle": settling,
     }
-    options = {key: value for key, value in options.items() if value is not None}
-    record = make_record(holds, problem, choice, drift, local, scale, options, name)
+    choice = replace(choice, solution=covered)
+    record = make_record(holds, problem, choice, drift, local, scale, _drop_unstated(options), name)
     record = replace(record, warnings=(*doubts, *record.warnings, *hidden), verdict=UNJUDGED)
     if further:
         record = _with_gyroscopes(record, holds, problem, choice.solution, scale, wanted, spline, rates, name, earth)
@@ -240,6 +237,18 @@ def _read_scatter(stated: float | str | None, name: str, quantity: str, unit: st
     if not 0 <= value < np.inf:
         raise OptionError(f"{name} {value:g}: expected a size of 0 or above")
     return value / size
+
+
+def _read_gyro_scatter(stated: float | str | None, further: Sequence[str]) -> float | None:
+    """Return the stated scatter of the gyroscopes' biases between power cycles, rad/s."""
+    if stated is not None and not further:
+        raise OptionError("gyro_turn_on_scatter: no gyroscopes are fitted; expected --with gyro beside it")
+    return _read_scatter(stated, "gyro_turn_on_scatter", "rate", "deg/s")
+
+
+def _drop_unstated(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options that have a value."""
+    return {key: value for key, value in options.items() if value is not None}
 
 
 def _nominal_scale(holds: Holds, gravity: float, nominal: float | None) -> tuple[Array, Array]:

@@ -15,7 +15,6 @@ from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.thermal.degrees import (
     ChosenLaws,
     LagAndLoops,
-    bias_shift_from_unobserved,
     describe_degrees,
     list_effects,
     number_temperatures,
@@ -30,6 +29,7 @@ from imulab.procedures.thermal.gyro import (
     note_turns,
     rescale_gyroscopes,
 )
+from imulab.procedures.thermal.hidden import bias_shift_from_unobserved
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import AXES, GROUPS, MISALIGNMENTS, SENSITIVITIES, SHARES, Laws, law_names
 from imulab.procedures.thermal.schema import (

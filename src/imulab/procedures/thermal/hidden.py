@@ -1,0 +1,186 @@
+"""What recordings over temperature cannot show: how far it may shift the biases, and its usual size in uncertainties.
+
+Slopes of scale factors and misalignments, a lag behind the thermometer, an element that stays behind it at the ends of
+the range, a loop approached from one side: each is a column of the least-squares problem (`thermal.solve`). What of it
+is left beside the laws moves their coefficients by ``(J' V^-1 J)^-1 J' V^-1 c``.
+
+Missing terms (`bias_shift_from_unobserved`): a term that the holds do not show shifts all coefficients by ``-J^+ A a``,
+J the whitened Jacobian, A the whitened derivatives by the term times its usual size, and a of variance 1. The part B of
+A beside J reduces the variance of a to ``(1 + B'B)^-1``. A warning is given where the shift of the biases is large
+beside their uncertainty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from imulab.display import Finding, Note
+from imulab.procedures.thermal import STRETCHES, TURNS
+from imulab.procedures.thermal.degrees import LagAndLoops
+from imulab.procedures.thermal.model import GROUPS
+from imulab.procedures.thermal.solve import (
+    ThermalProblem,
+    ThermalSolution,
+    whitener,
+)
+from imulab.recording import Array
+
+# Shift of the biases by slopes of scale factors, or by a lag, that the holds do not show.
+
+
+_USUAL_SLOPES = {1: (STRETCHES, f"{1e6 * STRETCHES:.0f} ppm/K"), 2: (TURNS, f"{1e6 * TURNS:.0f} urad/K")}
+_LAG = 5.0
+"""Lag of a sensor behind a thermometer on its own board that is assumed, s."""
+_PLACES = 33  # temperatures over which the shift of the biases is averaged
+_WORTH = 0.5
+"""Share of the biases' uncertainty from which a shift is warned of: it adds an eighth to it."""
+
+
+def bias_shift_from_unobserved(
+    problem: ThermalProblem, solution: ThermalSolution, drift: LagAndLoops, name: str
+) -> list[str]:
+    """Return warnings of what unobserved slopes and lag shift the biases by, beside their uncertainty."""
+    laws, rows = solution.laws, solution.rows
+    groups = [group for group in _USUAL_SLOPES if not laws.degrees[group]]
+    if not groups and not drift.reason:
+        return []
+    white = whitener(rows, solution.excess**2, solution.scatter.tau)
+    jacobian = white(rows.jacobian)
+    inverse = np.linalg.pinv(jacobian, rcond=1e-13)
+    design = laws.design(np.linspace(laws.low, laws.high, _PLACES))[:, :3]
+    covariance = solution.covariance[: laws.size, : laws.size]
+    stated = float(np.sqrt(np.mean(np.einsum("tpc,cd,tpd->tp", design, covariance, design))))
+
+    def error_by(term: Array) -> float:
+        """Return the root mean square shift of the biases over the range by terms of shape (N, k)."""
+        shift = inverse @ white(term)
+        beside = white(term) - jacobian @ shift
+        moved = design @ shift[: laws.size]
+        left = np.linalg.inv(np.eye(term.shape[1]) + beside.T @ beside)
+        return float(np.sqrt(np.mean(np.einsum("tpa,ab,tpb->tp", moved, left, moved))))
+
+    temperature = problem.temperature if problem.known is None else np.append(problem.temperature, problem.known[0])
+    place = laws.place(temperature)[rows.owner]  # a prior's owner is -1
+    messages: list[str] = []
+    for group in groups:
+        slope, usual = _USUAL_SLOPES[group]
+        constants = [part.start for part in laws.parts[3 * group : 3 * group + 3]]
+        error = error_by(rows.jacobian[:, constants] * place[:, None] * slope * laws.half)
+        if error > _WORTH * stated:
+            kind = GROUPS[group][0].replace("_", " ")
+            messages.append(
+                Finding(
+                    f"{name}: the holds do not tell whether {kind} follows the temperature, which is taken as "
+                    f"constant: one that moves by {usual}, as is usual, shifts the biases by {1e3 * error:.2g} mg, "
+                    f"where their uncertainty is {1e3 * stated:.2g} mg: another axis up while the temperature changes, "
+                    "or attitudes at another temperature, would tell",
+                    "record another axis up while the temperature changes",
+                )
+            )
+    if drift.reason and (error := error_by(rows.drift[:, :1] * _LAG)) > stated:
+        messages.append(
+            f"{name}: the temperature changes fast, and the recordings do not tell a lag behind the thermometer: one "
+            f"of {_LAG:g} s shifts the biases by {1e3 * error:.2g} mg, where their uncertainty is "
+            f"{1e3 * stated:.2g} mg: let it change more slowly, or record the way back too"
+        )
+    return messages
+
+
+# What the recordings cannot show, at a usual size in the uncertainties.
+
+
+_BEHIND, _LOOP, _FOLLOWS = 0.8, 0.15e-3, 20.0
+"""Usual standard deviations: of what an element stays behind its thermometer at both ends of the range, K; of loops
+between warming and cooling in its middle, g; and of a lag, s."""
+_SHOWN, _WIDER = 0.1, 1.3
+"""Part of the biases' variance from which a hidden effect is noted, and how much wider all of them may make
+uncertainties: an effect whose usual size is larger is stated beside them."""
+
+
+def cover_hidden(
+    problem: ThermalProblem, solution: ThermalSolution, drift: LagAndLoops, name: str
+) -> tuple[ThermalSolution, list[str]]:
+    """Return the solution with what its recordings cannot show in the covariance, and notes on what would show it.
+
+    Each effect has a usual size, as a prior of mean 0. What remains of it beside the laws moves the coefficients by
+    ``(J' V^-1 J)^-1 J' V^-1 c``; where the recordings show an effect, little of it remains.
+    """
+    rows, laws, size = solution.rows, solution.laws, solution.laws.size
+    white = whitener(rows, solution.excess**2, solution.scatter.tau)
+    jacobian = white(rows.jacobian)
+    inverse = np.linalg.pinv(jacobian, rcond=1e-13)
+    design = laws.design(np.linspace(laws.low, laws.high, _PLACES))
+
+    def spread(matrix: Array) -> Array:
+        """Return the mean variances of biases, scale factors and misalignments over the range, shape (3,)."""
+        each = np.einsum("tpc,cd,tpd->p", design, matrix[:size, :size], design) / _PLACES
+        means: Array = each.reshape(3, 3).mean(axis=1)
+        return means
+
+    stated, total = spread(solution.covariance), np.zeros_like(solution.covariance)
+    effects = []
+    for columns, what in _hidden_effects(problem, solution, drift):
+        shift, whitened = inverse @ white(columns), white(columns)
+        beside = whitened - jacobian @ shift
+        left = np.linalg.inv(np.eye(columns.shape[1]) + beside.T @ beside)
+        moved = shift[: len(total)]
+        gained = moved @ left @ moved.T
+        total += gained
+        effects.append((what, float(spread(gained)[0])))
+    room = np.sqrt((_WIDER**2 - 1) * stated / np.maximum(spread(total), 1e-300))
+    share = np.ones(len(total))
+    for number, part in enumerate(laws.parts):
+        share[part] = min(room[number // 3], 1.0)
+    held = share[0] ** 2
+    notes: list[str] = [
+        Note(
+            f"{name}: {what}; it moves the biases by {1e3 * np.sqrt(variance):.2g} mg, of which their uncertainty "
+            f"holds {1e3 * np.sqrt(held * variance):.2g} mg"
+        )
+        for what, variance in effects
+        if variance > _SHOWN * stated[0]
+    ]
+    return replace(solution, covariance=solution.covariance + share[:, None] * total * share), notes
+
+
+def _hidden_effects(problem: ThermalProblem, solution: ThermalSolution, drift: LagAndLoops) -> list[tuple[Array, str]]:
+    """Return columns of effects, each of its usual size, shape (N, k), and what to say of each."""
+    rows, laws, owner = solution.rows, solution.laws, solution.rows.owner
+    mine = owner >= 0
+    temperature, rate = problem.temperature[owner], problem.rate[owner]
+    place = laws.place(temperature)[:, None]
+    felt = [columns.reshape(len(owner), -1, 3).sum(axis=1) * mine[:, None] for columns in rows.offsets]
+    slope = laws.slope(temperature) @ solution.coefficients[: laws.size]
+    heat = (felt[0] * slope[:, :3] + felt[1] * slope[:, 3:6]).sum(axis=1)
+    steady = (rate == 0) & mine
+    effects = []
+    if steady.any() and (laws.degrees[0] or laws.knots):
+        effects.append(
+            (
+                _BEHIND * place * (heat * steady)[:, None],
+                f"soaks do not show how far the elements stay behind the thermometer: {_BEHIND:g} K at both ends of "
+                "the range is usual; a slow ramp through the range and back would show it",
+            )
+        )
+    side = np.zeros(len(owner)) if problem.side is None else problem.side[owner]
+    if drift.values is None and not (side[mine] != 0).any():
+        way = np.where(rate == 0, 1.0, np.sign(rate))[:, None]
+        effects.append(
+            (
+                _LOOP * way * (1 - place**2) * felt[0],
+                "biases may differ between warming and cooling, which recordings from one side do not show: "
+                f"{1e3 * _LOOP:g} mg are usual; reach the temperatures from both sides, 'reached_by: cooling' in the "
+                "head of such a soak",
+            )
+        )
+    if drift.values is None and drift.reason:
+        effects.append(
+            (
+                _FOLLOWS * rows.drift[:, :1],
+                f"a lag of the biases behind the thermometer, {_FOLLOWS:g} s is usual, looks like their laws where the "
+                "temperature goes one way only; record the way back too",
+            )
+        )
+    return effects
