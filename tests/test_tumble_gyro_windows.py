@@ -89,3 +89,19 @@ def test_samples_lost_without_a_trace_are_said_and_are_in_the_uncertainty():
         name = f"gyro_scale_factor_{axis}"
         assert errors[name] < -1e-3
         assert abs(errors[name]) < 2 * u[name]
+
+
+@pytest.mark.parametrize("size", [0.05, 0.3])
+def test_zeros_that_are_others_in_each_hold_are_no_loss(size):
+    """As of hysteresis, deg/s about each axis: turns scatter by it, with their duration and not with their rate."""
+    made, truth = turned_by_hand(2, QUIET)
+    attitudes = il.find_attitudes(made)
+    middle = (attitudes.stop[:-1] + attitudes.start[1:]) / 2
+    zeros = np.radians(size) * np.random.default_rng(3).standard_normal((len(attitudes), 3))
+    added = zeros[np.searchsorted(middle, made.time)]
+    moved = made.with_columns({f"gyro_{a}": made.columns[f"gyro_{a}"] + added[:, i] for i, a in enumerate("xyz")}, {})
+    record = il.fit_tumble(moved, order=1, gravity=9.80665, with_="gyro").calibration
+    assert not [reason for reason in record.verdict.reasons if "lost" in reason]
+    for axis in "xyz":
+        p = record.parameters[f"gyro_scale_factor_{axis}"]
+        assert abs(p.value - truth[f"gyro_scale_factor_{axis}"]) < 3 * p.standard_uncertainty

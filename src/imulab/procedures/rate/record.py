@@ -106,12 +106,16 @@ def note_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
     return messages
 
 
+_MUCH = 0.01  # of the scale factor: more was not within what is stated, in simulated sweeps
+
+
 def warn_noisy_rates(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
     """Return a warning for each sweep whose recorded rate is so noisy that the scale factor falls with it."""
     return [
         f"{test.place(index)}: the recorded rate has noise of {text_in(run.sweep.attenuation[1], 'deg/s', 2)} deg/s a "
-        f"sample, which takes some {100 * run.sweep.attenuation[0]:.2g} % off the scale factor; its uncertainty holds "
-        "that; record table_angle, or a rate with less noise"
+        f"sample, which takes some {100 * run.sweep.attenuation[0]:.2g} % off the scale factor, "
+        f"{'more than' if run.sweep.attenuation[0] > _MUCH else 'which'} its uncertainty holds; "
+        "record table_angle, or a rate with less noise"
         for index, run in enumerate(dwells)
         if run.sweep is not None and run.sweep.attenuation_shown
     ]

@@ -340,7 +340,7 @@ def add_misalignments(
     places = [f"the turn at {motions.start[k]:.1f} to {motions.stop[k]:.1f} s" for _, k in turned]
     remarks = warn_force_length(accel, seen_force, of_length, places)
     scale = np.array([axis_turns[axis].scale for axis in AXES])
-    u_scale = np.array([axis_turns[axis].scale_uncertainty for axis in AXES])
+    u_scale = np.array([np.hypot(t.scale_uncertainty, t.scale * t.lost) for t in (axis_turns[axis] for axis in AXES)])
     across = np.array([motions.angle[k] for _, k in turned]) / _TURN
     noise = np.array([motions.zero[k] for _, k in turned]) / _TURN
     noise = np.hypot(noise, count[:, None] * spread * scale)
@@ -764,6 +764,7 @@ def fit_turns(
         raise OptionError(f"tilt {tilt}: expected an angle of 0 or more, such as 0.5 deg")
     stated = None if turns is None else _parse_counts(turns)
     held = None if accel is None else as_record(accel, "fit_turns: accel")
+    tilted = lean if held is None else 0.0  # accelerometers show the axis
     recording = as_recording(data, reading, fit_turns, name_gyroscopes)
     if held is not None:
         check_accel(held, recording)
@@ -782,7 +783,7 @@ def fit_turns(
             )
             count = _count_turns(angle, motions, members, recording.name) if stated_counts is None else stated_counts
             _check_counts(angle / _TURN, count, motions, members, recording.name)
-            axis_turns[AXES[axis]] = _fit_scale(motions, members, axis, angle, count, width, lean)
+            axis_turns[AXES[axis]] = _fit_scale(motions, members, axis, angle, count, width, tilted)
     record = turns_record(recording, motions, axis_turns, width, of_clock, place)
     if held is not None:
         record = add_misalignments(record, recording, motions, axis_turns, held)

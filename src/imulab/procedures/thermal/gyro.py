@@ -744,8 +744,8 @@ def scale_from_turns(
         temperature = _mean_temperatures(holds, number, attitudes)
         across, moved = _covariance_of_directions(problem, solution, attitudes, reading, temperature)
         estimate = estimate_turns(solved, across, solved.rest.zero_uncertainty)
-        if estimate.samples_lost:
-            notes.append(f"{holds.recordings[number].name}: {estimate.loss_note()}")
+        step = float(np.median(np.diff(stamps.time)))
+        notes += [prefixed(holds.recordings[number].name, note) for note in estimate.notes(step)]
         turned.append(_evaluate_turns(estimate, moved, float(temperature.mean())))
     if not turned:
         return None
@@ -755,6 +755,8 @@ def scale_from_turns(
         if gyros.sensitivity
         else np.zeros((9, 9)),
     )
+    # Sampling and losses act alike in all recordings: they are no noise that many of them take the mean of.
+    known = block_diagonal(known, np.eye(2))
     return _fit_scale_laws(turned, known, solution.laws, notes)
 
 
@@ -769,9 +771,9 @@ def _evaluate_turns(estimate: TurnEstimate, moved: Array, temperature: float) ->
     values[:3] += solved.scale
     slope = by_directions(solved.segments, solved.scale, solved.theta, len(moved) // 3) @ moved
     slope = np.hstack([slope, _derivatives_by_sensitivity(estimate)])
-    by_shared = size[:, None] * (estimate.gain @ estimate.project(slope))
+    by_shared = size[:, None] * np.hstack([estimate.gain @ estimate.project(slope), estimate.common()])
     turns, cost = len(solved.segments.start), float(solved.residual @ solved.residual)
-    return Turned(values, estimate.total() * np.outer(size, size), by_shared, temperature, turns, cost)
+    return Turned(values, estimate.covariance * np.outer(size, size), by_shared, temperature, turns, cost)
 
 
 def _derivatives_by_sensitivity(estimate: TurnEstimate) -> Array:

@@ -271,7 +271,8 @@ def assumption_notes(stated: StatedUncertainty | None) -> list[str]:
         ]
         notes.append(
             Note(
-                f"these attitudes do not show k{order}: the uncertainties assume k{order} = 0; 1 {unit} of it moves up "
+                f"these attitudes do not show k{order}: the uncertainties assume k{order} = 0"
+                f"{' and scale factors that do not differ between + and -' * (order == 2)}; 1 {unit} of it moves up "
                 f"to {' and '.join(moved)} (tumble plan --order 3 chooses attitudes that show it)"
             )
         )

@@ -51,7 +51,6 @@ class Judged:
     ----------
     model, count
         Name and number of time scales (0 for ``none`` and the cubics in time).
-        Name and number of time scales (0 for ``none`` and the cubics in time).
     solution
         Fit to all cycles; None for ``none``.
     training
@@ -240,7 +239,6 @@ def choose(curves: Curves, rows: list[Judged]) -> Judged:
 
     The score is the sum of both mean squares relative to those without compensation; of models within 2 % of the best
     the one with the fewest time scales is taken.
-    with fewer time scales is taken.
     """
     none = next(row for row in rows if row.model == "none")
     fitted = [row for row in rows if row.model != "none"]
@@ -633,6 +631,8 @@ def _warn_exchanged(curves: Curves) -> list[str]:
         bend[k, k : k + 3] = share[k] - 1, 1.0, -share[k]
     apart = np.square((curves.mean - means[curves.group]) * width / scale).sum(axis=(1, 2))
     cycles = np.bincount(curves.group, minlength=count)
+    if (cycles < 2).all():
+        return []  # nothing tells what cycles scatter by
     scatter = float(apart.sum()) / max(int((cycles - 1).sum()), 1)
     floor = float((np.square(bend).sum(axis=0) / cycles).sum()) * scatter
 
@@ -651,7 +651,7 @@ def _warn_exchanged(curves: Curves) -> list[str]:
     names = [cycle.name for cycle, group in zip(curves.cycles, curves.group.tolist(), strict=True) if group in (a, b)]
     return [
         f"the curves at {t[a]:g} and {t[b]:g} degC fit those at the temperatures beside them only when they are "
-        f"exchanged, {np.sqrt(own / max(least, 1e-300)):.2g} times better: look at power_on_temperature of "
+        f"exchanged, {np.sqrt(own / (least + floor)):.2g} times better (rms): look at power_on_temperature of "
         f"{_named(names)}"
     ]
 

@@ -13,8 +13,8 @@ To the covariance of the parameters comes what all turns of a recording have ali
 readings between samples, and the share p of samples that may be lost. A loss at random takes p off every scale factor,
 and it scatters: a sample that is lost takes the angle of its step from the turn, so that V grows by p D,
 D = sum (w dt)^2 (rho x u)(rho x u)', rho the rate. That is no noise of one size for all turns, so that restricted
-likelihood tells p from tau^2. The length of the runs of lost samples is not known: p is said and carried in the
-uncertainty, never corrected by.
+likelihood tells p from tau^2, and from a rate that is another in each turn. The length of the runs of lost samples is
+not known: p is said and carried in the uncertainty, never corrected by.
 
 Source: Aitken, Proc. Roy. Soc. Edinburgh 55 (1935) 42 (generalised least squares); Harville, J. Am. Stat. Assoc. 72
 (1977) 320 (restricted likelihood); Birge, Phys. Rev. 40 (1932) 207 (squares that equal their degrees of freedom).
@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imulab.display import Note
 from imulab.estimation.decisions import SAMPLES_LOST, SCALE_CHANGE, SCALE_CHANGES_WITH_RATE
 from imulab.estimation.least_squares import chi_square_limit, f_test
 from imulab.procedures.tumble.gyro.rotation import weighted_turns
@@ -41,6 +42,8 @@ _DOUBLINGS = 60
 _FEWEST_LEFT = 6  # degrees of freedom that the test of linearity must leave
 _LOST = np.geomspace(1e-5, 0.2, 21)  # shares of samples, beside none at all
 _BEYOND = np.concatenate([[0.0], np.geomspace(0.05, 20.0, 8)])  # tau^2, in medians of the diagonal of V
+_AROUND = np.geomspace(0.2, 5.0, 5)  # the same in that which was found
+_WANDERS = np.geomspace(0.1, 4.0, 6)  # variance of a rate that each turn has to itself, in that of the zeros of holds
 
 
 @dataclass(frozen=True)
@@ -130,12 +133,32 @@ class TurnEstimate:
     lost_most_likely: float = 0.0
     samples_lost: bool = False
 
-    def total(self) -> Array:
-        """Return the covariance with all that a recording has alike in all its turns, (p, p)."""
+    def common(self) -> Array:
+        """Return what sampling and losses, which all turns have alike, move the parameters by, (p, 2)."""
         loss = np.zeros(len(self.covariance))
         loss[:3] = self.lost
-        total: Array = self.covariance + np.outer(self.reading, self.reading) + np.outer(loss, loss)
+        return np.column_stack([self.reading, loss])
+
+    def total(self) -> Array:
+        """Return the covariance with all that a recording has alike in all its turns, (p, p)."""
+        total: Array = self.covariance + self.common() @ self.common().T
         return total
+
+    def notes(self, step: float) -> list[str]:
+        """Return what is to be said of these turns, sampled every `step` s."""
+        messages: list[str] = []
+        off = np.abs(self.reading[:3])
+        if (off > np.sqrt(np.diag(self.total()))[:3] / 2).any():
+            messages.append(
+                Note(
+                    f"gyro: {1 / step:.3g} Hz is slow for these turns: scale factors are uncertain by "
+                    f"{1e6 * off.max():.0f} ppm for it, which their uncertainty covers: record at {2 / step:.3g} Hz, "
+                    "or turn half as fast"
+                )
+            )
+        if self.samples_lost:
+            messages.append(f"gyro: {self.loss_note()}")
+        return messages + ([] if self.linearity is None else self.linearity.notes())
 
     def loss_note(self) -> str:
         """Say how many samples seem to be lost, and what to do."""
@@ -167,11 +190,13 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
     shell = TurnEstimate(solved, np.empty(0), np.empty(0), normals(segments.after), np.empty(0), 0.0, np.zeros(size))
     matrix: Array = np.empty(0)
     root: Array = np.empty(0)
+    by_zero: Array = np.empty(0)
     for _ in range(_ITERATIONS):
         left, slopes = model(segments, scale, theta, fit_bias=True)
         residual, jacobian = shell.project(left[:, None])[:, 0], shell.project(slopes)
         if not root.size:
-            matrix = _covariance_of_turns(solved, theta, shell, directions, zero, jacobian[:, 9:] / scale)
+            by_zero = jacobian[:, 9:] / scale
+            matrix = _covariance_of_turns(solved, theta, shell, directions, zero, by_zero)
             beyond = _variance_beyond(matrix, jacobian[:, :size], residual)
             root = np.asarray(np.linalg.cholesky(matrix + beyond * np.eye(len(matrix))), dtype=np.float64)
         white = np.linalg.solve(root, np.column_stack([jacobian[:, :size], residual]))
@@ -191,7 +216,12 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
     )  # fmt: skip
     columns, largest = rate_columns(estimate)
     estimate = replace(estimate, linearity=test_linearity(estimate, columns, largest))
-    return _with_losses(estimate, matrix, columns)
+    estimate, covariance = _with_losses(estimate, matrix, columns, by_zero)
+    if estimate.samples_lost:
+        # Losses take the more from a turn the faster it is, as an output that is not linear does.
+        lossy = replace(estimate, root=np.linalg.cholesky(covariance))
+        estimate = replace(estimate, linearity=test_linearity(lossy, columns, largest))
+    return estimate
 
 
 def normals(directions: Array) -> Array:
@@ -256,37 +286,52 @@ def _variance_beyond(matrix: Array, jacobian: Array, residual: Array) -> float:
     return (low + high) / 2
 
 
-def _with_losses(estimate: TurnEstimate, matrix: Array, columns: Array) -> TurnEstimate:
-    """Return the estimate with the share of samples that may be lost: the mean over p and tau^2 of their likelihood.
+def _with_losses(estimate: TurnEstimate, matrix: Array, columns: Array, by_zero: Array) -> tuple[TurnEstimate, Array]:
+    """Return the estimate with the share of samples that may be lost, and the likeliest covariance with losses.
+
+    The share is the root mean square over p and tau^2, weighted by their likelihood.
 
     Before the data none is lost with probability 1/2; else every share from .001 to 20 % is as probable on a scale of
     logarithms. Where the output seems not to be linear, the `columns` of `rate_columns` are fitted beside: what they
-    explain is no loss.
+    explain is no loss, nor what a zero of each turn's own explains, as far as the zeros of the holds scatter; `by_zero`
+    are the derivatives by outputs at rest, (2 m, 3).
     """
     linearity, jacobian = estimate.linearity, estimate.project(estimate.solution.jacobian)
     if linearity is not None and linearity.probability < SCALE_CHANGES_WITH_RATE.level:
         jacobian = np.column_stack([jacobian, columns])
     residual = estimate.project(estimate.solution.residual[:, None])[:, 0]
+    size, n = float(np.median(np.diag(matrix))), len(matrix)
+    beyond = np.concatenate([size * _BEYOND, estimate.beyond * _AROUND])[:, None, None] * np.eye(n)
+
+    def likelihoods(further: Array) -> Array:
+        return _restricted_log_likelihood(matrix + further + beyond, jacobian, residual)
+
+    wander = _own_rates(by_zero * estimate.solution.rest.scatter)
+    none = np.array([likelihoods(share * wander) for share in (0.0, *_WANDERS.tolist())])
     by_loss = loss_covariance(estimate)
-    size = float(np.median(np.diag(matrix)))
-    logs = np.empty((1 + len(_LOST), len(_BEYOND)))
-    for i, share in enumerate((0.0, *_LOST.tolist())):
-        stack = matrix + share * by_loss + (size * _BEYOND)[:, None, None] * np.eye(len(matrix))
-        logs[i] = _restricted_log_likelihood(stack, jacobian, residual)
-    likelihood = np.exp(logs - logs.max())
-    weight = likelihood.sum(axis=1)
-    prior = np.concatenate([[0.5], np.full(len(_LOST), 0.5 / len(_LOST))])
-    posterior = weight * prior / (weight @ prior)
-    profile = logs.max(axis=1)
-    best = int(profile[1:].argmax())
-    gained = 2 * float(profile[1:].max() - profile[0])
-    return replace(
+    logs = np.array([likelihoods(share * by_loss) for share in _LOST.tolist()])
+    top = max(none.max(), logs.max())
+    lost, kept = np.exp(logs - top).mean(axis=1), float(np.exp(none - top).mean(axis=1).max())
+    posterior = lost / len(_LOST) / (lost.mean() + kept)
+    best, scatter = (int(k) for k in np.unravel_index(int(logs.argmax()), logs.shape))
+    gained = 2 * float(logs.max() - none.max())
+    estimate = replace(
         estimate,
-        lost=float(np.sqrt(posterior[1:] @ _LOST**2)),
+        lost=float(np.sqrt(posterior @ _LOST**2)),
         lost_most_likely=float(_LOST[best]),
         # No share lies below 0: by chance half of all gains are 0.
         samples_lost=gained > chi_square_limit(1, 2 * SAMPLES_LOST.level),
     )
+    return estimate, matrix + _LOST[best] * by_loss + beyond[scatter]
+
+
+def _own_rates(by_rate: Array) -> Array:
+    """Return the covariance of residuals by a rate of each turn's own, of variance 1 about each axis, (2 m, 2 m)."""
+    m = len(by_rate) // 2
+    own = by_rate.reshape(m, 2, 3)
+    blocks = np.zeros((m, 2, m, 2))
+    blocks[range(m), :, range(m), :] = own @ np.swapaxes(own, 1, 2)
+    return blocks.reshape(2 * m, 2 * m)
 
 
 def loss_covariance(estimate: TurnEstimate) -> Array:

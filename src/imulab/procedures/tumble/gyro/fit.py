@@ -206,9 +206,7 @@ def fit_gyro_triad(
     conditioning = _observability_of_turns(solved, freedom, recording.name)
     directions = direction_covariance(record, means, case.force)
     estimate = estimate_turns(solved, directions, None if fit_bias else solved.rest.zero_uncertainty)
-    # Losses take the more from a turn the faster it is, as an output that is not linear does.
-    notes += [] if estimate.linearity is None or estimate.samples_lost else estimate.linearity.notes()
-    notes += _warn_sampling(estimate, stamps)
+    notes += estimate.notes(float(np.median(np.diff(stamps.time))))
     fit = _triad_of_estimate(estimate, unit, fit_bias, conditioning, known, tuple(notes))
     return _on_earth(fit, case, earth)
 
@@ -218,24 +216,6 @@ def _on_accel_clock(case: TurnProblem, time: Array, sensitivity: str) -> Array:
     rough = solve_turns(case, Stamps(time, time), sensitivity, rough=True)
     comparison = compare_clocks(case.own, case.own_force, time, rough.rate(case.output), rough.segments, search=True)
     return time if comparison is None else comparison.on_other(time)
-
-
-def _warn_sampling(estimate: TurnEstimate, stamps: Stamps) -> list[str]:
-    """Say if the samples are too few for these turns, or some of them lost."""
-    messages: list[str] = []
-    u = np.sqrt(np.diag(estimate.total()))[:3]
-    off = np.abs(estimate.reading[:3])
-    if (off > u / 2).any():
-        rate = 1 / float(np.median(np.diff(stamps.time)))
-        messages.append(
-            Note(
-                f"gyro: {rate:.3g} Hz is slow for these turns: scale factors are uncertain by {1e6 * off.max():.0f} "
-                f"ppm for it, which their uncertainty covers: record at {2 * rate:.3g} Hz, or turn half as fast"
-            )
-        )
-    if estimate.samples_lost:
-        messages.append(f"gyro: {estimate.loss_note()}")
-    return messages
 
 
 def _on_earth(fit: GyroFit, case: TurnProblem, earth: EarthRate | None) -> GyroFit:

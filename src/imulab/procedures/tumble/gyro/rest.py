@@ -1,7 +1,7 @@
 """The gyroscopes while the accelerometers are at rest, and how well the directions of gravity are known.
 
 Attitudes are found from the accelerometers, which hardly feel a slow beginning of a turn, a twist about the vertical or
-a touch. The gyroscopes do: their own stillness decides which samples tell the zero, and where a turn begins and ends.
+a touch. The gyroscopes do: their own stillness decides which samples tell the zero.
 
 A direction is moved by the noise of its attitude across the vertical, and all of them together by the errors of the
 accelerometers' parameters. The two are independent to first order: those parameters are found from |f|, along it.
@@ -79,6 +79,8 @@ class GyroRest:
     """By how much the zero of each hold is probably another, (holds, 3): its deviation, less what noise explains."""
     moved_variance: Array | float = 0.0
     """Variance of that, (3,)."""
+    scatter: Array | float = 0.0
+    """Standard deviation of the zeros of the holds, (3,)."""
 
 
 def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> RestHolds:
@@ -199,7 +201,12 @@ def at_rest(
     alone = density / (_FLAT * float(np.median(length[quiet])))
     excess = np.maximum((MAD_TO_SIGMA * limit / _HUBER) ** 2 - alone, 0.0)
     share = excess / np.maximum(excess + alone / 2, 1e-300)
-    return replace(rest, moved=share * np.clip(deviation, -limit, limit), moved_variance=share * alone)
+    return replace(
+        rest,
+        moved=share * np.clip(deviation, -limit, limit),
+        moved_variance=share * alone,
+        scatter=MAD_TO_SIGMA * limit / _HUBER,
+    )
 
 
 def _still_means(holds: RestHolds, time: Array, output: Array, scale: Array | None) -> tuple[Array, Array, Array]:

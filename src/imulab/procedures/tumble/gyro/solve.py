@@ -192,7 +192,7 @@ def compare_clocks(
 
     Parameters
     ----------
-    own, force
+    accel_time, force
         Time of the accelerometers' samples, s, (k,), and their specific force, m/s^2, (k, 3).
     time, rate
         Time of the gyroscopes' samples, s, (n,), and the body rate, rad/s, (n, 3).

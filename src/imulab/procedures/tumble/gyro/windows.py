@@ -37,6 +37,7 @@ _REACH = 10  # samples on each side that a spline is read from: those beyond cou
 _POLE = np.sqrt(3.0) - 2.0  # of the filter that finds the coefficients of a cubic spline
 _EFFECTIVE = 2.0 / 3.0
 """1 / int h^2 dt of a Hann window, over its length: a mean of white noise q has the variance q / (effective length)."""
+_NO_WEIGHT = 1e-9
 _ALL_STILL = 0.999  # of a window's weight
 _KNOCKED = 6.0  # medians over the holds: with three differences in each, none of 100 is beyond by chance
 
@@ -103,7 +104,8 @@ def hann_means(time: Array, values: Array, windows: Windows) -> Array:
     filled = size > 0
     if filled.any():
         sums = np.add.reduceat(rows, edges[filled], axis=0)
-        result[filled] = sums[:, :-1] / sums[:, -1:]
+        filled[filled] = weighty = sums[:, -1] > _NO_WEIGHT  # a sample on the edge of a window weighs nothing
+        result[filled] = sums[weighty, :-1] / sums[weighty, -1:]
     return result
 
 

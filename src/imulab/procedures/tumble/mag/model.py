@@ -321,7 +321,7 @@ def _means_of_stretches(
         notes = [*notes, _describe_lag(lag, time, rests)]
     for place, (number, whole) in enumerate(rests.items()):
         index, grown = whole, 1.0
-        if lag:
+        if lag and len(whole) >= 3 * _BATCHES:
             index, samples[whole], grown = _take_lag_off(samples[whole], time[whole], whole, lag)
         mean[number] = samples[index].mean(axis=0)
         scatter[place, 1] = samples[index].var(axis=0, ddof=1).mean()
