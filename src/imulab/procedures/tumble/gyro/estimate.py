@@ -219,7 +219,7 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
     estimate, covariance = _with_losses(estimate, matrix, columns, by_zero)
     if estimate.samples_lost:
         # Losses take the more from a turn the faster it is, as an output that is not linear does.
-        lossy = replace(estimate, root=np.linalg.cholesky(covariance))
+        lossy = replace(estimate, root=np.asarray(np.linalg.cholesky(covariance), dtype=np.float64))
         estimate = replace(estimate, linearity=test_linearity(lossy, columns, largest))
     return estimate
 
