@@ -455,9 +455,10 @@ def test_a_record_to_look_at_first_is_said_with_its_reason(imulab, tmp_path):
     assert found.index("SN002") < found.index("SN000")
     found = json.loads(imulab("fleet", "status", "out", "--json").stdout)
     assert found["verdicts"] == {"good": 2, "look": 1, "bad": 0}
-    ((serial, verdict, reasons),) = (each.values() for each in found["doubtful"])
-    assert (serial, verdict) == ("SN002", "look")
-    assert reasons[0].startswith("row 6")
+    (doubtful,) = found["doubtful"]
+    assert (doubtful["serial"], doubtful["verdict"]) == ("SN002", "look")
+    assert doubtful["reasons"][0].startswith("row 6")
+    assert doubtful["next"]
     write_manifest(manifest, [{"serial": f"N{i}", "procedure": "tumble", "file": f"u{i}.csv"} for i in range(2)])
     alike = run(manifest, tmp_path / "alike").judged
     assert alike.startswith("2 look: N0, N1 no local gravity was given")

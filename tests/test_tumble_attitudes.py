@@ -4,6 +4,7 @@ import dataclasses
 import re
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfilt
@@ -759,7 +760,7 @@ def test_moments_are_the_variance_of_the_mean_of_squares():
     moments = np.array([np.cov(each.T) / 12 for each in rows])
     norm, jacobian, _, _ = norm_and_jacobian(theta, up[None], 1)
     motion = il.find_attitudes(held_hold(0, count=12)).motion
-    motion = dataclasses.replace(motion[np.arange(5)], moments=moments, freedom=np.full(5, 1e12))
+    motion = msgspec.structs.replace(motion[np.arange(5)], moments=moments, freedom=np.full(5, 1e12))
     _, variance = length_noise(theta, jacobian, np.zeros((1, 5, 3, 3)), motion)
     inverse = [[reference.inverse(each, named(theta[0]), 1) for each in up[i] + blocks[i]] for i in range(5)]
     # To first order in |f| - 1: the linear part holds 1 / |f|, half the square does not.

@@ -173,7 +173,9 @@ def test_gravity_that_is_not_of_this_earth_is_warned_of(gravity, warned):
 def test_wild_parameters_are_warned_of():
     u = G * reference.random_attitudes(np.random.default_rng(9), 30)
     record = il.fit_tumble(il.find_attitudes(table(u * [1.0, 0.6, 1.0])), order=1, gravity=G).calibration
-    assert any(w.startswith("scale factor of y is off by -40 %") for w in record.warnings)
+    (reason,) = record.verdict.reasons
+    assert reason.startswith("the scale factor of y is off by more than 20 %, it is 0.6 (median): outputs of a sensor")
+    assert record.verdict.state == "bad"
 
 
 def test_an_attitude_without_gravity_is_named():

@@ -25,7 +25,7 @@ def test_warnings_name_what_is_wrong_with_the_test():
         return replace(recording.with_columns(extra, {}), metadata=recording.metadata | metadata)
 
     good = [noisy(cycle_of(flat, t, name=f"good{t}{c}")) for t in (-20, 0, 20) for c in (1, 2)]
-    assert il.fit_warmup(good, temperatures=[-20, 0, 20], settling_time=END).calibration.warnings == ()
+    assert il.fit_warmup(good, temperatures=[-20, 0, 20], settling_time=END).calibration.verdict.state == "good"
     moving = noisy(cycle_of(flat, -20, name="moving"))
     for axis in ("gyro_x", "accel_x"):
         moving.columns[axis][4000:4200] += 0.05 * np.sin(np.arange(200))

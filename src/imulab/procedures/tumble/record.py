@@ -216,12 +216,12 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
             for axis, value in off
             if SCALE_OFF_UNIT < abs(value - 1) <= SCALE_OF_ANOTHER_UNIT
         ]
-        if other := [axis for axis, value in off if abs(value - 1) > SCALE_OF_ANOTHER_UNIT]:
-            scale = float(np.median(theta[3:6]))
+        if other := {axis: value for axis, value in off if abs(value - 1) > SCALE_OF_ANOTHER_UNIT}:
+            scale = float(np.median(list(other.values())))
             messages.append(
                 Bad(
                     f"the scale factor of {' '.join(other)} is off by more than {100 * SCALE_OF_ANOTHER_UNIT:.0f} %, "
-                    f"the median scale factor is {scale:.3g}: {_likely_unit(scale, attitudes.unit)}",
+                    f"it is {scale:.3g} (median): {_likely_unit(scale, attitudes.unit)}",
                     f"state the unit that the outputs have (count, if none of {' '.join(_UNITS)} fits)",
                 )
             )
@@ -239,7 +239,7 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
 def _likely_unit(scale: float, unit: str) -> str:
     """Return what would explain a median scale factor in a stated unit: another unit, or a range set wrong."""
     for other in _UNITS:
-        if abs(scale / conversion_factor(other, unit) - 1) < SCALE_OFF_UNIT:
+        if other != unit and abs(scale / conversion_factor(other, unit) - 1) < SCALE_OFF_UNIT:
             return f"the outputs look like {other}, not {unit}"
     for factor, words in _RANGES.items():
         if abs(scale / factor - 1) < SCALE_OFF_UNIT:

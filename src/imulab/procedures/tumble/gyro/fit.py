@@ -177,7 +177,8 @@ def fit_gyro_triad(
     force, knocked = specific_force(record, means), aside_of(record, attitudes)
     case = TurnProblem(recording.name, attitudes, force, accel_time, accel_force, output, unit, fit_bias, knocked)
     apart = attitudes.recording is not recording
-    stamps = Stamps(time, _on_accel_clock(case, time, sensitivity) if apart else time)
+    alike = not apart or np.array_equal(time, accel_time)
+    stamps = Stamps(time, time if alike else _on_accel_clock(case, time, sensitivity))
     case, solved = _solve_with_earth(case, stamps, sensitivity, earth)
     stamps, solved, stamp_notes = _with_even_stamps(case, stamps, sensitivity, solved)
     comparison = compare_clocks(
