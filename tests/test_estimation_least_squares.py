@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import integrate, optimize, stats
+from scipy import integrate, linalg, optimize, stats
 
 from imulab.estimation.least_squares import (
     bayesian_information,
@@ -22,6 +22,7 @@ from imulab.estimation.least_squares import (
     noise_share,
     observability,
     plausible_excess,
+    restricted_log_likelihood,
     robust_scale,
 )
 
@@ -480,3 +481,17 @@ def test_intervals_hold_the_truth_whichever_of_two_nested_models_is_right(size: 
         chosen = values[int(squares[0] - squares[1] > 3.84)]
         inside += abs(chosen[0]) < factor * np.sqrt(found.about(chosen)[0, 0])
     assert 0.925 <= inside / trials <= 0.99
+
+
+def test_the_restricted_likelihood_is_that_of_what_the_design_cannot_change():
+    """Of K' y, K the directions across the design: normal with covariance K' V K (scipy); up to one constant."""
+    rng = np.random.default_rng(5)
+    design, values = rng.standard_normal((9, 3)), rng.standard_normal(9)
+    roots = rng.standard_normal((4, 9, 9))
+    matrices = roots @ np.swapaxes(roots, 1, 2) + np.eye(9)
+    across = linalg.null_space(design.T)
+    expected = [
+        stats.multivariate_normal(cov=across.T @ matrix @ across).logpdf(across.T @ values) for matrix in matrices
+    ]
+    logs = restricted_log_likelihood(matrices, design, values)
+    np.testing.assert_allclose(np.diff(logs), np.diff(expected), rtol=1e-9)

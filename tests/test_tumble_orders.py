@@ -248,6 +248,7 @@ def test_the_command_takes_order_blend_and_a_spread(imulab, tmp_path):
     narrow = imulab("tumble", "fit", "r.csv", "--gravity", "9.80665", "--nonlinearity", "5ug,5ug", "-o", "a.json")
     assert narrow.returncode == 0, narrow.stderr
     assert json.loads((tmp_path / "a.json").read_text())["options"]["nonlinearity"] == pytest.approx([5e-6, 5e-6])
+    assert "by as little as k2 is stated to be, 5 ppm; --asymmetry states another size" in narrow.stderr
     whole = imulab("tumble", "fit", "r.csv", "--gravity", "9.80665", "--order", "blend", "-o", "b.json")
     assert whole.returncode == 0, whole.stderr
     assert json.loads((tmp_path / "b.json").read_text())["model"]["order"] == 3

@@ -305,6 +305,33 @@ def f_test(cost: float, size: int, larger_cost: float, larger_size: int, count: 
     return float(f_tail(max(gain / noise, 0.0), larger_size - size, count - larger_size))
 
 
+def restricted_log_likelihood(covariance: Array, design: Array, values: Array) -> Array:
+    """Return the restricted log likelihood of values under each of several covariances, up to a constant, shape (k,).
+
+    ``-1/2 (ln|V| + ln|A' V^-1 A| + r' V^-1 r)``, r what the best fit of the design leaves: the likelihood of what no
+    parameters of the design can change.
+
+    Source: Patterson and Thompson, Biometrika 58 (1971) 545; Harville, J. Am. Stat. Assoc. 72 (1977) 320.
+
+    Parameters
+    ----------
+    covariance
+        V, shape (k, n, n).
+    design
+        A, shape (n, p).
+    values
+        Shape (n,).
+    """
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(root, np.column_stack([design, values])[None])
+    columns, left = white[:, :, :-1], white[:, :, -1:]
+    normal, pulled = np.swapaxes(columns, 1, 2) @ columns, np.swapaxes(columns, 1, 2) @ left
+    square = (left**2).sum(axis=(1, 2)) - (pulled * np.linalg.solve(normal, pulled)).sum(axis=(1, 2))
+    spread = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    logs: Array = -spread - np.linalg.slogdet(normal)[1] / 2 - square / 2
+    return logs
+
+
 def bayesian_information(cost: float, size: int, count: int) -> float:
     """Return Schwarz's criterion (1978) of a model whose noise level is unknown: ``n ln(cost / n) + p ln n``."""
     return float(count * np.log(max(cost, np.finfo(float).tiny) / count) + size * np.log(count))

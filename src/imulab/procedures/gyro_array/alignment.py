@@ -222,8 +222,8 @@ def _allow_for_bends(sensing: Array, uncertainty: Array, slope: Array, *, shared
     """
     count = len(slope)
     others = np.square(slope).sum(axis=0) / count**2 if shared else np.zeros(slope.shape[1])
-    own = np.square(slope) * ((1 - 2 / count) if shared else 1.0) + others
-    bent: Array = np.sqrt(uncertainty**2 + np.square(sensing) * own[:, :, None])
+    bend = np.square(slope) * ((1 - 2 / count) if shared else 1.0) + others
+    bent: Array = np.sqrt(uncertainty**2 + np.square(sensing) * bend[:, :, None])
     return bent
 
 

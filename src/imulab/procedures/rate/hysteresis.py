@@ -94,23 +94,23 @@ def fit_loop(
     shapes = free.T @ np.column_stack([direction * shape(np.abs(rate)) for shape in _SHAPES])
     if free.shape[1] < 2 or not (np.sum(shapes**2, axis=0) > 1e-9).all():
         return None
-    seen = free.T @ values
+    free_values = free.T @ values
     walk = np.where(which[:, None] == which, np.minimum(within[:, None], within), 0.0)
     parts = [np.eye(len(rate)), walk, np.outer(within * rate, within * rate)]
     noise, *parts = (free.T @ part @ free for part in (np.diag(variance), *parts))
-    mean, u, probability = _average_models(noise, parts, shapes, seen, _GRID if len(rate) < _MANY else _COARSE)
+    mean, u, probability = _average_models(noise, parts, shapes, free_values, _GRID if len(rate) < _MANY else _COARSE)
     return probability, (2 * mean, 2 * u)
 
 
 def _average_models(
-    noise: Array, parts: list[Array], shapes: Array, seen: Array, number: int
+    noise: Array, parts: list[Array], shapes: Array, values: Array, number: int
 ) -> tuple[float, float, float]:
     """Return mean and standard uncertainty of half the loop, and the probability that noise alone makes it.
 
     The covariance is that of the noise and each of three parts in one of `number` sizes, or not at all.
     """
     usual = float(np.trace(noise))
-    most = max(100.0, 3 * float(seen @ seen) / usual)
+    most = max(100.0, 3 * float(values @ values) / usual)
     steps = np.geomspace(_LEAST, most, number)
     ladder = [(0.0, np.log(_NONE)), *((step, np.log((1 - _NONE) / len(steps))) for step in steps.tolist())]
     rows = []
@@ -120,7 +120,7 @@ def _average_models(
             covariance = covariance + size * usual / max(float(np.trace(part)), 1e-300) * part
             chance += log_chance
         rows += [
-            (value, u, log_likelihood + chance) for value, u, log_likelihood in _fit_each(covariance, shapes, seen)
+            (value, u, log_likelihood + chance) for value, u, log_likelihood in _fit_each(covariance, shapes, values)
         ]
     table = np.array(rows)
     weight = np.exp(table[:, 2] - table[:, 2].max())
@@ -138,10 +138,10 @@ def _null_space(rows: Array) -> Array:
     return np.asarray(turn[rank:].T)
 
 
-def _fit_each(covariance: Array, shapes: Array, seen: Array) -> list[tuple[float, float, float]]:
+def _fit_each(covariance: Array, shapes: Array, values: Array) -> list[tuple[float, float, float]]:
     """Return the coefficient of each shape alone, its standard uncertainty, and the log restricted likelihood."""
     lower = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(lower, np.column_stack([shapes, seen]))
+    white = np.linalg.solve(lower, np.column_stack([shapes, values]))
     square = np.sum(white[:, :-1] ** 2, axis=0)
     value = white[:, -1] @ white[:, :-1] / square
     left = float(white[:, -1] @ white[:, -1]) - value**2 * square

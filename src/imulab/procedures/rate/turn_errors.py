@@ -9,7 +9,7 @@ Lost samples (`share_lost`): a share p of samples, lost at random, takes p off a
 
 Earth (`bias_at_rest`): the mean at rest holds the Earth's rate, of which gravity and latitude tell the vertical part.
 
-Sources: Patterson and Thompson, Biometrika 58 (1971) 545, restricted likelihood; GUM (JCGM 100:2008).
+Sources: `restricted_log_likelihood`; GUM (JCGM 100:2008).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imulab.estimation.least_squares import restricted_log_likelihood
 from imulab.gravity import EARTH
 from imulab.recording import Array
 
@@ -68,21 +69,14 @@ def share_lost(angle: Array, turned: Array, stops: Array, zero: Array, square: A
     """
     if len(angle) < 3:
         return 0.0, 0.0
-    rows = []
-    for share in _SHARES.tolist():
-        for wide in _STOPS.tolist():
-            lower = np.linalg.cholesky(wide * stops + np.diag(zero + share * square))
-            white = np.linalg.solve(lower, np.column_stack([turned, angle]))
-            normal = float(white[:, 0] @ white[:, 0])
-            left = white[:, 1] - white[:, 0] * float(white[:, 0] @ white[:, 1]) / normal
-            likelihood = -float(np.log(np.diag(lower)).sum()) - np.log(normal) / 2 - float(left @ left) / 2
-            likelihood += np.log(1 - _LOSE if share == 0 else _LOSE / (len(_SHARES) - 1))
-            likelihood += np.log(1 - _STOP if wide == 1 else _STOP / (len(_STOPS) - 1))
-            rows.append((share, likelihood))
-    table = np.array(rows)
-    weight = np.exp(table[:, 1] - table[:, 1].max())
+    share, wide = np.repeat(_SHARES, len(_STOPS)), np.tile(_STOPS, len(_SHARES))
+    alone = (zero + share[:, None] * square)[:, :, None] * np.eye(len(angle))
+    logs = restricted_log_likelihood(wide[:, None, None] * stops + alone, turned[:, None], angle)
+    logs += np.log(np.where(share == 0, 1 - _LOSE, _LOSE / (len(_SHARES) - 1)))
+    logs += np.log(np.where(wide == 1, 1 - _STOP, _STOP / (len(_STOPS) - 1)))
+    weight = np.exp(logs - logs.max())
     weight /= weight.sum()
-    return float(np.sqrt(weight @ table[:, 0] ** 2)), float(weight[table[:, 0] > 0].sum())
+    return float(np.sqrt(weight @ share**2)), float(weight[share > 0].sum())
 
 
 @dataclass(frozen=True)

@@ -81,9 +81,12 @@ def bias_shift_from_unobserved(
             )
     if drift.reason and (error := error_by(rows.drift[:, :1] * _LAG)) > stated:
         messages.append(
-            f"{name}: the temperature changes fast, and the recordings do not tell a lag behind the thermometer: one "
-            f"of {_LAG:g} s shifts the biases by {1e3 * error:.2g} mg, where their uncertainty is "
-            f"{1e3 * stated:.2g} mg: let it change more slowly, or record the way back too"
+            Finding(
+                f"{name}: the temperature changes fast, and the recordings do not tell a lag behind the thermometer: "
+                f"one of {_LAG:g} s shifts the biases by {1e3 * error:.2g} mg, where their uncertainty is "
+                f"{1e3 * stated:.2g} mg: let it change more slowly, or record the way back too",
+                "let the temperature change more slowly, or record the way back too",
+            )
         )
     return messages
 

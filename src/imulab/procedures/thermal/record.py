@@ -330,8 +330,11 @@ def _warn_fit(
         messages.append(Note(f"degrees chosen: {describe_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
     far = [each for each in fitted.left_out if each.chi_square > TEMPERATURE_MISSED.limit**2]
     messages += [
-        f"{each.temperature:.0f} degC, left out, is missed by {1e6 * each.rms:.0f} ug rms, more than its uncertainty "
-        "explains: the unit's law has a bend between the temperatures; record one more there"
+        Finding(
+            f"{each.temperature:.0f} degC, left out, is missed by {1e6 * each.rms:.0f} ug rms, more than its "
+            "uncertainty explains: the unit's law has a bend between the temperatures; record one more there",
+            f"record at one more temperature beside {each.temperature:.0f} degC",
+        )
         for each in far
     ]
     return messages + warn_lag_and_loops(drift, solution, name) + _warn_odd_holds(holds, solution)
@@ -540,8 +543,11 @@ def _warn_gyroscopes(
             "uncertainty covers this: record more temperatures or come back to some, or state --gyro-turn-on-scatter"
         )
     messages += [
-        f"gyro: {each.temperature:.0f} degC, left out, is missed by {np.degrees(each.rms):.2g} deg/s rms, more than "
-        "its uncertainty explains: the law has a bend between the temperatures; record one more there"
+        Finding(
+            f"gyro: {each.temperature:.0f} degC, left out, is missed by {np.degrees(each.rms):.2g} deg/s rms, more "
+            "than its uncertainty explains: the law has a bend between the temperatures; record one more there",
+            f"record at one more temperature beside {each.temperature:.0f} degC",
+        )
         for each in gyros.left_out
         if each.chi_square > TEMPERATURE_MISSED.limit**2
     ]

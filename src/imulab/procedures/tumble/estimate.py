@@ -17,21 +17,19 @@ from imulab.estimation.least_squares import Observability, covariance, huber_inf
 from imulab.gravity import Gravity
 from imulab.procedures.tumble import FROM_DATA, FURTHER, HIGHEST_ORDER, LOSSES, METHODS
 from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.blend import Blended, blend_orders, with_known_spread
 from imulab.procedures.tumble.checks import check_residuals, far_zero
 from imulab.procedures.tumble.gyro.rotation import check_axes
 from imulab.procedures.tumble.model import GROUPS, MISALIGNMENTS, parameter_count, parameter_names
 from imulab.procedures.tumble.orders import (
     NONE_ASIDE,
     Aside,
-    Blended,
     OrderChoice,
     absolute_weights,
-    blend_orders,
     choose_order,
     explaining_order,
     find_disturbed,
     solve_orders,
-    with_known_spread,
 )
 from imulab.procedures.tumble.record import Estimate, FittedAttitudes, Scaling, StatedUncertainty
 from imulab.procedures.tumble.schema import model_of

@@ -27,6 +27,7 @@ from imulab.estimation.decisions import (
 from imulab.estimation.least_squares import Observability, chi_square_probability, coverage_factor, leverage
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.blend import Blended
 from imulab.procedures.tumble.checks import shake_warnings
 from imulab.procedures.tumble.model import (
     AXES,
@@ -38,7 +39,7 @@ from imulab.procedures.tumble.model import (
     parameter_units,
     powers_of_gravity,
 )
-from imulab.procedures.tumble.orders import FREEDOM, HIGHEST_TESTED, Aside, Blended, direction_findings, time_findings
+from imulab.procedures.tumble.orders import FREEDOM, HIGHEST_TESTED, Aside, direction_findings, time_findings
 from imulab.procedures.tumble.schema import (
     DeviationTrace,
     HeldAttitudes,
@@ -260,6 +261,13 @@ def assumption_notes(stated: StatedUncertainty | None) -> list[str]:
                 f"explain these attitudes alike: biases differ by up to {_TO_MICRO * asymmetry.bias:.2g} µg between "
                 "the two, which the uncertainties hold; 48 attitudes or less noise tell, and --asymmetry 20ppm narrows "
                 "them where scale factors are known to differ by no more"
+            )
+        )
+    if (alike := stated.blended.asymmetry_as_k2) is not None:
+        notes.append(
+            Note(
+                f"scale factors are taken to differ between + and - by as little as k2 is stated to be, "
+                f"{_TO_MICRO * alike:.2g} ppm; --asymmetry states another size"
             )
         )
     for order, (bias, scale) in stated.blended.assumed.items():
@@ -711,8 +719,8 @@ def _find_outliers(problem: TumbleProblem, solution: TumbleSolution) -> dict[int
     share = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-3)
     standard = np.abs(solution.residuals[0]) / np.sqrt(solution.variance[0] * share)
     others = np.sqrt(np.maximum(((standard**2 * share).sum() - standard**2) / (freedom - 1), 0.0))
-    own = np.sqrt(solution.own_variance[0] / solution.variance[0])
-    standard = standard / np.maximum(others, own if problem.covariance is not None else 1e-12)
+    stated = np.sqrt(solution.own_variance[0] / solution.variance[0])
+    standard = standard / np.maximum(others, stated if problem.covariance is not None else 1e-12)
     limit = max(ATTITUDE_STANDS_OUT_BY.limit, coverage_factor(freedom - 1, 1 - ATTITUDE_STANDS_OUT.level / n))
     return {i: float(standard[i]) for i in np.flatnonzero(standard > limit).tolist()}
 

@@ -639,19 +639,19 @@ def _warn_exchanged(curves: Curves) -> list[str]:
     def roughness(order: Sequence[int]) -> float:
         return float(np.square(bend @ flat[list(order)]).sum())
 
-    own = roughness(range(count))
+    as_stated = roughness(range(count))
     others = []
     for a, b in combinations(range(count), 2):
         order = list(range(count))
         order[a], order[b] = b, a
         others.append((roughness(order), a, b))
     least, a, b = min(others)
-    if own < _EXCHANGED * (least + floor):
+    if as_stated < _EXCHANGED * (least + floor):
         return []
     names = [cycle.name for cycle, group in zip(curves.cycles, curves.group.tolist(), strict=True) if group in (a, b)]
     return [
         f"the curves at {t[a]:g} and {t[b]:g} degC fit those at the temperatures beside them only when they are "
-        f"exchanged, {np.sqrt(own / (least + floor)):.2g} times better (rms): look at power_on_temperature of "
+        f"exchanged, {np.sqrt(as_stated / (least + floor)):.2g} times better (rms): look at power_on_temperature of "
         f"{_named(names)}"
     ]
 

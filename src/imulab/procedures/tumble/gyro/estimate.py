@@ -16,8 +16,8 @@ D = sum (w dt)^2 (rho x u)(rho x u)', rho the rate. That is no noise of one size
 likelihood tells p from tau^2, and from a rate that is another in each turn. The length of the runs of lost samples is
 not known: p is said and carried in the uncertainty, never corrected by.
 
-Source: Aitken, Proc. Roy. Soc. Edinburgh 55 (1935) 42 (generalised least squares); Harville, J. Am. Stat. Assoc. 72
-(1977) 320 (restricted likelihood); Birge, Phys. Rev. 40 (1932) 207 (squares that equal their degrees of freedom).
+Source: Aitken, Proc. Roy. Soc. Edinburgh 55 (1935) 42 (generalised least squares); Birge, Phys. Rev. 40 (1932) 207
+(squares that equal their degrees of freedom); `restricted_log_likelihood`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 
 from imulab.display import Note
 from imulab.estimation.decisions import SAMPLES_LOST, SCALE_CHANGE, SCALE_CHANGES_WITH_RATE
-from imulab.estimation.least_squares import chi_square_limit, f_test
+from imulab.estimation.least_squares import chi_square_limit, f_test, restricted_log_likelihood
 from imulab.procedures.tumble.gyro.rotation import weighted_turns
 from imulab.procedures.tumble.gyro.solve import TurnSolution
 from imulab.procedures.tumble.gyro.turns import body_rate, by_directions, directions_missed, misalignment, model
@@ -242,8 +242,9 @@ def _covariance_of_turns(
     if zero is not None:
         shared += by_zero * zero**2 @ by_zero.T
     blocks = shared.reshape(m, 2, m, 2)
-    own = by_zero.reshape(m, 2, 3)
-    blocks[range(m), :, range(m), :] += np.einsum("mij,j,mkj->mik", own, solved.rest.moved_variance * np.ones(3), own)
+    each = by_zero.reshape(m, 2, 3)
+    moved = solved.rest.moved_variance * np.ones(3)
+    blocks[range(m), :, range(m), :] += np.einsum("mij,j,mkj->mik", each, moved, each)
     density, direction = noise_of_turns(solved, theta)
     alone = density * segments.squared + 2 * direction + _LEAST**2
     blocks[range(m), :, range(m), :] += alone[:, None, None] * np.eye(2)
@@ -304,7 +305,7 @@ def _with_losses(estimate: TurnEstimate, matrix: Array, columns: Array, by_zero:
     beyond = np.concatenate([size * _BEYOND, estimate.beyond * _AROUND])[:, None, None] * np.eye(n)
 
     def likelihoods(further: Array) -> Array:
-        return _restricted_log_likelihood(matrix + further + beyond, jacobian, residual)
+        return restricted_log_likelihood(matrix + further + beyond, jacobian, residual)
 
     wander = _own_rates(by_zero * estimate.solution.rest.scatter)
     none = np.array([likelihoods(share * wander) for share in (0.0, *_WANDERS.tolist())])
@@ -328,9 +329,9 @@ def _with_losses(estimate: TurnEstimate, matrix: Array, columns: Array, by_zero:
 def _own_rates(by_rate: Array) -> Array:
     """Return the covariance of residuals by a rate of each turn's own, of variance 1 about each axis, (2 m, 2 m)."""
     m = len(by_rate) // 2
-    own = by_rate.reshape(m, 2, 3)
+    each = by_rate.reshape(m, 2, 3)
     blocks = np.zeros((m, 2, m, 2))
-    blocks[range(m), :, range(m), :] = own @ np.swapaxes(own, 1, 2)
+    blocks[range(m), :, range(m), :] = each @ np.swapaxes(each, 1, 2)
     return blocks.reshape(2 * m, 2 * m)
 
 
@@ -351,19 +352,6 @@ def loss_covariance(estimate: TurnEstimate) -> Array:
     whole = np.zeros((m, 2, m, 2))
     whole[range(m), :, range(m), :] = each
     return whole.reshape(2 * m, 2 * m)
-
-
-def _restricted_log_likelihood(stack: Array, jacobian: Array, residual: Array) -> Array:
-    """Return the restricted log likelihood under each of several covariances, (k, n, n), up to a constant, (k,)."""
-    root = np.linalg.cholesky(stack)
-    white = np.linalg.solve(root, np.column_stack([jacobian, residual])[None])
-    design, left = white[:, :, :-1], white[:, :, -1:]
-    normal = np.swapaxes(design, 1, 2) @ design
-    pulled = np.swapaxes(design, 1, 2) @ left
-    square = (left**2).sum(axis=(1, 2)) - (pulled * np.linalg.solve(normal, pulled)).sum(axis=(1, 2))
-    spread = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    logs: Array = -spread - np.linalg.slogdet(normal)[1] / 2 - square / 2
-    return logs
 
 
 # Whether the scale factors of the gyroscopes change with the rate, from what the turns miss.
@@ -403,8 +391,11 @@ def test_linearity(estimate: TurnEstimate, columns: Array, largest: Array) -> No
     freedom = count - size - 6
     if freedom < _FEWEST_LEFT:
         return None
-    own = estimate.project(np.column_stack([estimate.solution.jacobian, estimate.solution.residual]))
-    whole = np.linalg.solve(estimate.root, np.column_stack([own[:, :-1], columns, own[:, -1]]))
+    jacobian, residual = (
+        estimate.project(estimate.solution.jacobian),
+        estimate.project(estimate.solution.residual[:, None]),
+    )
+    whole = np.linalg.solve(estimate.root, np.column_stack([jacobian, columns, residual]))
     design, left = whole[:, :-1], whole[:, -1]
     length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     design = design / length
