@@ -9,6 +9,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
+from imulab.procedures.rate.turn_errors import tilt_shift
 from imulab.procedures.rate.turns import _uncertainty_of_slopes
 from reference import rate as reference
 from test_rate_axes import ARM, SCALE, TURN, G, accel, of_another_unit
@@ -518,8 +519,23 @@ def test_a_tilted_axis_is_in_the_uncertainty_and_said_where_it_is_seen():
     assert not any("off its own" in reason for reason in level.verdict.reasons)
     assert any("3 deg off its own" in reason for reason in leaning.verdict.reasons)
     assert leaning.verdict.next == ("turn about x, y and z, with the record of the accelerometers (--accel)",)
-    exact = turned(np.radians(3), tilt="0 deg")
-    assert exact.verdict.state == "good"
+    for stated in ("0 deg", "3 deg"):
+        assert turned(np.radians(3), tilt=stated).verdict.state == "good"
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.5, 2.0])
+def test_a_tilt_four_times_the_stated_one_is_still_covered(lean):
+    """Turns about a fixed axis are one rotation by ``|B a|``, of which the gyroscope's own component is taken."""
+    rng = np.random.default_rng(4)
+    axis = np.array([np.sin(np.radians(lean)), 0.0, np.cos(np.radians(lean))])
+    covered = []
+    for _ in range(300):
+        seen = (np.eye(3) + 0.01 * rng.standard_normal((3, 3)) * (1 - np.eye(3))) @ axis
+        size = np.linalg.norm(seen)
+        stated = 1 + (size - 1) * seen[2] / size
+        shift, u = tilt_shift(seen[:2], np.radians(0.5))
+        covered.append(abs(stated - 1 - shift) <= 1.96 * u)
+    assert np.mean(covered) > 0.9
 
 
 def test_lost_samples_are_in_the_uncertainty_and_said():

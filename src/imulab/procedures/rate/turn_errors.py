@@ -3,6 +3,8 @@
 Tilt (`tilt_shift`): the unit turns about an axis that lies ``t`` off a gyroscope's own, in the directions of the two
 others. These see ``q_j = T_ji + t_j``, so that composed turns state ``1 + sum (q_j^2 - t_j^2) / 2 + T_ij t_j`` times
 the scale factor. How q divides between misalignment and tilt is not seen: it is averaged over Student's t of either.
+Units lie several times farther off than is stated more often than their sensors do, so that the tilt has one degree of
+freedom (Cauchy), and T eight. T_ij is not seen at all.
 
 Lost samples (`share_lost`): a share p of samples, lost at random, takes p off an angle and scatters it by
 ``p sum (w dt)^2``. Stops scatter neighbouring turns with opposite signs. Restricted likelihood weighs the two.
@@ -24,7 +26,7 @@ from imulab.recording import Array
 
 MISALIGNMENT = 0.01
 """Usual misalignment of a gyroscope, rad: data sheets of MEMS units state 1 % across the axes."""
-_TAILS = 4  # degrees of freedom of tilt and misalignment: either may be several times the usual
+_FREEDOM, _FREEDOM_OF_TILT = 8.0, 1.0
 _SHARES = np.concatenate([[0.0], np.geomspace(1e-5, 0.1, 40)])
 _STOPS = np.concatenate([[1.0], np.geomspace(1.5, 100.0, 12)])
 """Shares of samples that may be lost, and factors of the variance of stops, that are tried."""
@@ -44,14 +46,15 @@ def tilt_shift(across: Array, tilt: float) -> tuple[float, float]:
     """
     shift = variance = 0.0
     for q in across.tolist():
-        t = np.linspace(-1, 1, 801) * (abs(q) + 4 * max(tilt, 1e-12)) if tilt else np.zeros(1)
-        size = (1 + ((t / tilt) ** 2 if tilt else 0.0) / _TAILS) * (1 + ((q - t) / MISALIGNMENT) ** 2 / _TAILS)
-        weight = size ** (-(_TAILS + 1) / 2)
-        weight = weight / weight.sum()
+        t = np.linspace(-1, 1, 1601) * (abs(q) + 10 * tilt) if tilt else np.zeros(1)
+        weight = (1 + ((q - t) / MISALIGNMENT) ** 2 / _FREEDOM) ** (-(_FREEDOM + 1) / 2)
+        weight *= (1 + ((t / tilt) ** 2 if tilt else 0.0) / _FREEDOM_OF_TILT) ** (-(_FREEDOM_OF_TILT + 1) / 2)
+        weight /= weight.sum()
         half = (q**2 - t**2) / 2
         mean = float(weight @ half)
         shift += mean
-        variance += float(weight @ (half - mean) ** 2) + MISALIGNMENT**2 * float(weight @ t**2)
+        unseen = MISALIGNMENT**2 * _FREEDOM / (_FREEDOM - 2)  # variance of T_ij
+        variance += float(weight @ (half - mean) ** 2) + unseen * float(weight @ t**2)
     return shift, float(np.sqrt(variance))
 
 

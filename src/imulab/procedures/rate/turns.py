@@ -78,6 +78,8 @@ class AxisTurns:
         What `scale` holds too much by tilt and misalignment of the axis, relative, and its standard uncertainty.
     across
         Largest angle by which the other gyroscopes see the axis lie off this one's, rad.
+    usual
+        What such an angle usually is, by tilt or misalignment, rad.
     lost, lost_probability
         Root mean square share of samples that may be lost, and the probability that any are.
     """
@@ -92,6 +94,7 @@ class AxisTurns:
     motion: tuple[int, ...]
     tilt: tuple[float, float] = (0.0, 0.0)
     across: float = 0.0
+    usual: float = MISALIGNMENT
     lost: float = 0.0
     lost_probability: float = 0.0
 
@@ -448,7 +451,7 @@ def _warn_unseen(
                 "factor may be low by as much, which its uncertainty holds; record with a counter or stamps of the "
                 "sensor's clock"
             )
-        if turned_axis.tilt[1] and turned_axis.across > AXIS_TILTED.limit * MISALIGNMENT:
+        if turned_axis.tilt[1] and turned_axis.across > AXIS_TILTED.limit * turned_axis.usual:
             messages.append(
                 f"gyro_{a}: by the other gyroscopes the turns were about an axis "
                 f"{np.degrees(turned_axis.across):.2g} deg off its own, by tilt or misalignment; the scale factor's "
@@ -778,6 +781,7 @@ def _fit_scale(
         motion=tuple(members),
         tilt=tilt_shift(across, tilt),
         across=float(np.abs(across).max()),
+        usual=max(MISALIGNMENT, tilt),
         lost=lost,
         lost_probability=probability if by_stops < TURNS_LOSE_SAMPLES.level else 0.0,
     )
