@@ -21,6 +21,7 @@ FUNCTIONS = {
     "report": il.write_report,
     "convert": il.write,
     "export": il.export,
+    "layout guess": il.guess_layout,
     "allan": il.allan_deviation,
     "tumble plan": il.plan_tumble,
     "tumble simulate": il.simulate_tumble,

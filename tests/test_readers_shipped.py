@@ -286,6 +286,11 @@ def test_titles_that_nothing_fits_call_for_a_layout(imulab, tmp_path):
     (tmp_path / "f.csv").write_text("Time (s),Ax,Ay,Az\n0,1,2,3\n")
     done = imulab("show", "f.csv")
     assert done.returncode == 2
+    assert done.stderr.endswith(
+        "; imulab layout guess f.csv --unit accel=m/s^2 -o L.toml writes a layout for it (--layout L.toml)\n"
+    )
+    (tmp_path / "f.csv").write_text("Time (s),Fore,Aft,Up\n0,1,2,3\n")
+    done = imulab("show", "f.csv")
     assert "; a layout says where columns of other titles are: --layout (imulab show --formats" in done.stderr
 
 

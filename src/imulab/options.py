@@ -357,7 +357,7 @@ def read_options(options: Sequence[Option], texts: Mapping[str, str | None], lab
     for option in options:
         typed = texts.get(option.name)
         words = option.default if typed is None else typed
-        called = label.format(option.name.replace("_", "-") if label.startswith("--") else option.name)
+        called = option.flags[-1] if label == FLAG else label.format(option.name)
         values[option.name] = None if words is None else option.value(words, called)
     return values
 

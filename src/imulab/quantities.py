@@ -227,3 +227,23 @@ def number(text: str, option: str) -> float:
     if not math.isfinite(value):
         raise OptionError(f"{option} {text!r}: expected a number")
     return value
+
+
+def parse_units(text: str, called: str) -> dict[str, str]:
+    """Return the units in ``accel=g,gyro=deg/s``.
+
+    Raises
+    ------
+    OptionError
+        It is no such list, or a unit is not known.
+    """
+    units: dict[str, str] = {}
+    for part in text.split(","):
+        name, sign, unit = part.partition("=")
+        if not sign or not name.strip() or not unit.strip() or name.strip() in units:
+            raise OptionError(f"{called} {text!r}: expected NAME=UNIT, each name once, such as accel=g,gyro=deg/s")
+        try:
+            units[name.strip()] = parse_unit(unit).symbol
+        except UnitError as error:
+            raise OptionError(f"{called} {part.strip()}: {error}") from None
+    return units

@@ -10,6 +10,7 @@ Source: SI brochure, 9th edition; standard gravity: 3rd CGPM (1901), 9.80665 m/s
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, overload
@@ -49,6 +50,7 @@ _UNITS = {
         Unit("g", "acceleration", STANDARD_GRAVITY),
         Unit("mg", "acceleration", 1e-3 * STANDARD_GRAVITY),
         Unit("ug", "acceleration", 1e-6 * STANDARD_GRAVITY),
+        Unit("m/s", "velocity"),
         Unit("rad", "angle"),
         Unit("mrad", "angle", 1e-3),
         Unit("urad", "angle", 1e-6),
@@ -138,11 +140,28 @@ def parse_unit(text: str, quantities: Iterable[str] = ()) -> Unit:
     """
     symbol = text.strip()
     unit = _UNITS.get(_SPELLINGS.get(symbol, symbol))
+    if unit is None and "@" in symbol:
+        unit = _increment(symbol)
     if unit is None:
         wanted = set(quantities)
         known = [other.symbol for other in _UNITS.values() if not wanted or other.quantity in wanted]
         raise UnitError(f"unknown unit {text!r}; known units: {listed(known, symbol)}")
     return unit
+
+
+_GAINED = {"angle": "rate", "velocity": "acceleration"}
+"""Quantities that are gained in a sample, and what they are in a second."""
+
+
+def _increment(symbol: str) -> Unit | None:
+    """Return the unit of increments with their rate, ``deg@125Hz``: times 125 they are the mean rate over a sample."""
+    gained, _, often = symbol.partition("@")
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?(?:e\+?\d+)?)\s*(k?)Hz\s*", often)
+    base = _UNITS.get(_SPELLINGS.get(gained.strip(), gained.strip()))
+    if match is None or base is None or base.quantity not in _GAINED or not 0 < float(match[1]) < math.inf:
+        return None
+    rate = float(match[1]) * (1e3 if match[2] else 1.0)
+    return Unit(f"{base.symbol}@{rate:g}Hz", _GAINED[base.quantity], base.factor * rate)
 
 
 def parse_scale_factor(text: str) -> tuple[Unit, Unit]:

@@ -31,7 +31,7 @@ ROOT_OPTIONS = (
 _WHERE = {
     **dict.fromkeys(("apply", "show", "report", "demo"), "records"),
     **{"convert": "records", "export": "records", "allan": "noise", "live": "live", "open": "live"},
-    **{name: name for name in ("tumble", "array", "centrifuge", "warmup", "noise", "thermal", "rate", "fleet")},
+    **{x: x for x in ("tumble", "array", "centrifuge", "warmup", "noise", "thermal", "rate", "fleet", "layout")},
 }
 """Module of each first word of a command."""
 

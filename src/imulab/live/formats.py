@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from imulab.live.decoders import (
     looks_like_msp,
 )
 from imulab.live.stamps import ArrivalClock, Counts, DeviceClock
+from imulab.readers.guess import GuessError, LayoutGuess, guess_table, layout_of_table, table_of_records
 from imulab.readers.text import is_number
 from imulab.recording import Array, Layout, Recording
 from imulab.units import STANDARD_GRAVITY
@@ -41,16 +41,14 @@ _NEAR = 0.25  # relative: a mean this near to g in some unit is a specific force
 _STEADY = 0.2  # largest relative scatter of the length of three columns of specific force in a hand
 
 
-@dataclass(frozen=True)
-class Guess:
-    """A layout as the text of a file, and the reasons for it."""
-
-    toml: str
-    why: str
+_SUPPOSED = {"gyro": "deg/s", "accel": "count", "mag": "count"}
+"""Units that are offered where neither titles nor readings say them."""
 
 
-def guess_layout(lines: list[str], seconds: float) -> Guess | None:
+def guess_stream(lines: list[str], seconds: float) -> LayoutGuess | None:
     """Return a layout that may fit, or None where the lines hold no rows of numbers.
+
+    Titles are read as those of files are; without titles the readings alone are looked at.
 
     Parameters
     ----------
@@ -61,6 +59,9 @@ def guess_layout(lines: list[str], seconds: float) -> Guess | None:
     """
     if sum(line.startswith("{") for line in lines) > len(lines) / 2:
         return _guess_json(lines, seconds)
+    titled = _by_titles(lambda: guess_table(lines, "stream"), seconds)
+    if titled is not None:
+        return titled
     delimiter = max(",;\t", key=lambda sign: sum(line.count(sign) for line in lines))
     split: Callable[[str], list[str]] = lambda line: [field.strip() for field in line.split(delimiter)]  # noqa: E731
     shown = {",": '","', ";": '";"', "\t": '"\\t"'}[delimiter]
@@ -69,20 +70,31 @@ def guess_layout(lines: list[str], seconds: float) -> Guess | None:
     rows = [split(line) for line in lines]
     prefix = _prefix(rows)
     rows = [row[1:] for row in rows if row[0] == prefix] if prefix else rows
-    titles = next((row for row in rows if not any(map(is_number, row))), None)
     numbers = [row for row in rows if all(map(is_number, row))]
     width = max(map(len, numbers), default=0)
     table = np.array([list(map(float, row)) for row in numbers if len(row) == width])
     if len(table) < _FEWEST or width < 3:
         return None
     head = [f"delimiter = {shown}", *([f"prefix = {json.dumps(prefix)}"] if prefix else [])]
-    named: list[str | int] = list(range(width))
-    if titles is not None and len(titles) == width:
-        named = list(titles)
-    return _guess(head, named, table, seconds)
+    return _guess(head, list(range(width)), table, seconds)
 
 
-def _guess_json(lines: list[str], seconds: float) -> Guess | None:
+def _by_titles(table: Callable[[], Any], seconds: float) -> LayoutGuess | None:
+    """Return the layout that titles give; a unit that they do not say is supposed, and that is said."""
+    units: dict[str, str] = {}
+    for sensor in ("", *_SUPPOSED):
+        if sensor:
+            units[sensor] = _SUPPOSED[sensor]
+        try:
+            guess = layout_of_table(table(), "stream", units=units, seconds=seconds, timed=False)
+        except GuessError:
+            continue
+        more = tuple(f"the unit of {name}, {unit}, is only supposed" for name, unit in units.items())
+        return LayoutGuess(guess.toml, (*guess.supposed, *more))
+    return None
+
+
+def _guess_json(lines: list[str], seconds: float) -> LayoutGuess | None:
     rows = []
     for line in lines:
         try:
@@ -95,7 +107,8 @@ def _guess_json(lines: list[str], seconds: float) -> Guess | None:
     rows = [row for row in rows if list(row) == keys]
     if len(rows) < _FEWEST or len(keys) < 3:
         return None
-    return _guess([], list(keys), np.array([list(row.values()) for row in rows]), seconds)
+    titled = _by_titles(lambda: table_of_records(rows), seconds)
+    return titled or _guess([], list(keys), np.array([list(row.values()) for row in rows]), seconds)
 
 
 def _flatten(document: dict[str, object], before: str = "") -> dict[str, float]:
@@ -110,7 +123,7 @@ def _flatten(document: dict[str, object], before: str = "") -> dict[str, float]:
     return numbers
 
 
-def _guess(head: list[str], names: list[str | int], table: Array, seconds: float) -> Guess | None:
+def _guess(head: list[str], names: list[str | int], table: Array, seconds: float) -> LayoutGuess | None:
     """Return the layout: a rising first column is the time, three columns of steady length the accelerometers."""
     columns, why = ["[columns]"], []
     steps = np.diff(table[:, 0])
@@ -134,7 +147,7 @@ def _guess(head: list[str], names: list[str | int], table: Array, seconds: float
     if start + 6 <= table.shape[1]:
         columns += _triad("gyro", names, start + 3, "deg/s" if unit != "count" else "count")
         why.append("that the gyroscopes follow, and their unit, is only supposed")
-    return Guess("\n".join([*head, *columns, ""]), "; ".join(why))
+    return LayoutGuess("\n".join([*head, *columns, ""]), tuple(why))
 
 
 def _triad(stem: str, names: list[str | int], start: int, unit: str) -> list[str]:
@@ -167,7 +180,7 @@ STRAIGHTENED = "arrival time, straightened by a robust line"
 class UnknownFormatError(ReadError):
     """A stream of no known format; `lines` are its first lines, `guess` a layout to start from, if there is one."""
 
-    def __init__(self, message: str, lines: tuple[str, ...] = (), guess: Guess | None = None) -> None:
+    def __init__(self, message: str, lines: tuple[str, ...] = (), guess: LayoutGuess | None = None) -> None:
         super().__init__(message)
         self.lines = lines
         self.guess = guess
@@ -353,7 +366,7 @@ class LineStream:
             return UnknownFormatError(
                 f"{self._source}: no line of text has an end among the first {len(head)} bytes; expected lines"
             )
-        guess = guess_layout(lines, self._held[-1][1] - self._held[0][1])
+        guess = guess_stream(lines, self._held[-1][1] - self._held[0][1])
         shown = tuple(printable(line)[:120] for line in lines[1:6] or lines)
         offered = "--layout FILE.toml says what its columns are" + (", and a guess is offered" if guess else "")
         return UnknownFormatError(

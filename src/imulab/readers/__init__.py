@@ -249,21 +249,26 @@ def _is_known(column: str) -> bool:
 
 def _note_layout(file: str | Path) -> list[str]:
     """Return a note on the layout that fits a file without a known column."""
+    from imulab.readers.guess import advice_on_guess
     from imulab.readers.shipped import advice
 
-    hint = advice(_head(file))
+    head = _head(file)
+    hint = advice(head) or (advice_on_guess(head, _name(file)) if head else "")
     return [Note(hint)] if hint else []
 
 
 def _advise(error: ImulabError, file: str | Path, layout: Layout | None) -> ImulabError:
     """Return a refusal of a text file with advice: the layout that reads it, or what a layout is."""
+    from imulab.readers.guess import advice_on_guess
     from imulab.readers.shipped import advice, is_titled
 
     head = _head(file)
     more = advice(head, None if layout is None else layout.name)
-    of_titles = isinstance(error, UnitError) or ": row " in str(error)
-    if not more and head and layout is None and of_titles and "--layout" not in str(error) and not is_titled(head):
-        more = "a layout says where columns of other titles are: --layout (imulab show --formats lists them)"
+    of_titles = isinstance(error, UnitError) or ": row " in str(error) or "found numbers" in str(error)
+    if not more and head and layout is None and of_titles and not is_titled(head):
+        more = advice_on_guess(head, _name(file))
+        if not more and "--layout" not in str(error):
+            more = "a layout says where columns of other titles are: --layout (imulab show --formats lists them)"
     return type(error)(f"{error}; {more}") if more else error
 
 

@@ -105,10 +105,11 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
         known = shipped_names()
         raise ReadError(f"{name}: no such layout file; those that come with imulab: {listed(known, name)}")
     table = load_toml(shipped or path, name, "layout")
-    return _layout(table, name)
+    return layout_of(table, name)
 
 
-def _layout(table: dict[str, Any], path: str) -> Layout:
+def layout_of(table: dict[str, Any], path: str) -> Layout:
+    """Return the layout that a table of TOML describes; errors as for `load_layout`, `path` begins their messages."""
     check_keys(table, _KEYS, path)
     delimiter = table.get("delimiter", "whitespace")
     if not isinstance(delimiter, str) or delimiter not in _DELIMITERS:

@@ -1,0 +1,713 @@
+"""A layout for a foreign file, guessed from its titles: one guess for files, live streams and refusals.
+
+Sensors and units come from the titles and from a units row below them. What the titles leave open may be told by the
+readings (|f| near 9.8 or 1, the step of a clock); it is used, and a comment in the layout says so. A unit that neither
+tells is refused, never supposed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from shlex import quote
+from typing import Annotated
+
+import numpy as np
+from msgspec import Struct, field
+
+from imulab.columns import KINDS, triad
+from imulab.errors import ReadError, file_name, first_of, quoted, readable
+from imulab.options import measure, parsed, text
+from imulab.quantities import parse_units
+from imulab.readers.formats import TEXT, recognised
+from imulab.readers.shipped import advice
+from imulab.readers.text import is_native
+from imulab.readers.titles import Title, known_unit, read_title
+from imulab.recording import Array, Layout
+from imulab.units import STANDARD_GRAVITY, parse_unit
+
+HEAD = 1 << 20
+"""Bytes of a file that show its columns."""
+_MOST_LINES = 300  # above the rows
+_FEWEST = 3  # rows that show a column's size
+_DELIMITERS = {",": '","', ";": '";"', "\t": '"\\t"', " ": '"whitespace"'}
+_LIKELY_RATES = 4.0, 4000.0  # Hz: a clock whose steps give a rate between these in one unit alone has that unit
+_GRAVITIES = {"m/s^2": STANDARD_GRAVITY, "g": 1.0, "mg": 1000.0}
+_NEAR = 0.25  # relative: a mean this near to g in some unit is a specific force
+_SINCE_1970 = 1.2e9, 2.6e9  # s: from 2008 to 2052
+_FIELDS = {"uT": (15.0, 150.0), "gauss": (0.15, 1.5), "nT": (15e3, 150e3)}
+"""The Earth's field with a share of hard iron, in units whose ranges do not meet."""
+_FASTEST = 35.0  # rad/s: no angular rate of a test is beyond 2000 deg/s
+_ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_NAMED = 50  # score of a table whose sensor the file's name speaks of
+_TURNING = 20  # tenths of a second that may show a turn
+_AGREE = 0.9  # least correlation of the turns that rates and accelerometers show
+_EXAMPLES = {"accel": "m/s^2", "gyro": "deg/s", "mag": "uT"}
+
+
+class LayoutGuess(Struct, frozen=True):
+    """A guessed layout.
+
+    Attributes
+    ----------
+    toml
+        The text of the layout file; comments say what was taken from where.
+    supposed
+        What the readings told where titles were silent, a sentence each.
+    """
+
+    toml: str
+    supposed: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return self.toml
+
+    @property
+    def why(self) -> str:
+        """The same in one line."""
+        return "; ".join(self.supposed) or "all of it stands in the titles"
+
+    @property
+    def layout(self) -> Layout:
+        """The layout, as `imulab.read` takes it."""
+        from imulab.readers.layout import layout_of
+
+        return layout_of(tomllib.loads(self.toml), "the guessed layout")
+
+    def save(self, path: str | Path) -> None:
+        """Write the layout file.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written there.
+        """
+        from imulab.files import write_text
+
+        write_text(path, self.toml)
+
+
+class GuessError(ReadError):
+    """No layout can be guessed; `needs` is the option that would help, such as ``--unit gyro=deg/s``, or nothing."""
+
+    def __init__(self, message: str, needs: str = "") -> None:
+        super().__init__(message)
+        self.needs = needs
+
+
+def guess_layout(
+    file: str | PathLike[str],
+    *,
+    units: Annotated[Mapping[str, str] | None, parsed(parse_units, "NAME=UNIT", flags=("--unit",))] = None,
+    sample_rate: Annotated[float | None, measure("frequency", "Hz", "HZ")] = None,
+    prefix: Annotated[str | None, text("NAME")] = None,
+) -> LayoutGuess:
+    r"""Return a layout for a text file of another program, guessed from its titles.
+
+    Parameters
+    ----------
+    file
+        Path of the file.
+    units
+        Units that no title says, by sensor or column, ``{"gyro": "deg/s"}``.
+    sample_rate
+        Rows in a second, Hz, where no column is a time.
+    prefix
+        First field of the lines that count, in a file of several kinds of lines.
+
+    Returns
+    -------
+    LayoutGuess
+        ``toml``, the text of the layout, with comments on what the titles left open; `read` takes its ``layout``.
+
+    Raises
+    ------
+    ReadError
+        The file cannot be read, or a title or unit cannot be told; the message names it.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> from pathlib import Path
+    >>> rows = "".join(f"{0.01 * k:.2f},0.01,0.02,9.81\n" for k in range(9))
+    >>> _ = Path("phone.csv").write_text("Time (s),Acc X (m/s^2),Acc Y (m/s^2),Acc Z (m/s^2)\n" + rows)
+    >>> il.read("phone.csv", il.guess_layout("phone.csv").layout).units["accel_x"]
+    'm/s^2'
+    """
+    name = os.fsencode(file_name(file)).decode("utf-8", "backslashreplace")
+    with readable(name), Path(file).open("rb") as stream:
+        head = stream.read(HEAD)
+    return guess_of_head(head, name, units=units, sample_rate=sample_rate, prefix=prefix or "")
+
+
+def guess_of_head(
+    head: bytes,
+    name: str,
+    *,
+    units: Mapping[str, str] | None = None,
+    sample_rate: float | None = None,
+    prefix: str = "",
+) -> LayoutGuess:
+    """Return the layout of a text file from its first bytes; errors as for `guess_layout`."""
+    kind = recognised(head[:1024])
+    if kind.layout == "none":
+        raise GuessError(f"{name}: a {kind.name} file says itself what its columns are; it needs no layout")
+    if kind is not TEXT or b"\0" in head[:4096]:
+        found = "binary data" if kind is TEXT else kind.name
+        raise GuessError(f"{name}: a layout is guessed from the titles of text, found {found}")
+    encoding = "utf-8"
+    try:
+        text = head[: head.rfind(b"\n") + 1 if len(head) == HEAD else None].decode("utf-8-sig")
+    except UnicodeDecodeError:
+        encoding, text = "latin-1", head.decode("latin-1")
+    lines = text.splitlines()
+    if _is_native(next((line for line in lines if line.strip() and not line.startswith("#")), "")):
+        raise GuessError(f"{name}: titles with units, as imulab writes them; it needs no layout")
+    try:
+        table = guess_table(lines, name, prefix=prefix, encoding=encoding)
+        return layout_of_table(table, name, units=units, sample_rate=sample_rate)
+    except GuessError as error:
+        known = advice(head)
+        raise GuessError(f"{error}; {known}" if known else str(error), error.needs) from None
+
+
+def _is_native(titles: str) -> bool:
+    """Return whether titles are imulab's own, and one is of a sensor."""
+    names = {title.partition("[")[0].strip() for title in titles.split(",")}
+    return is_native(titles) and not names.isdisjoint(column for sensor in _EXAMPLES for column in triad(sensor))
+
+
+def advice_on_guess(head: bytes, name: str) -> str:
+    """Return the command that writes a layout for a text file, from its first bytes; empty where none would."""
+    needs = ""
+    try:
+        guess_of_head(head, name)
+    except GuessError as error:
+        if not error.needs:
+            return ""
+        needs = f" {error.needs}"
+    return f"imulab layout guess {quote(name)}{needs} -o L.toml writes a layout for it (--layout L.toml)"
+
+
+class _Table(Struct):
+    """Rows of fields below a line of titles."""
+
+    titles: list[str]
+    rows: list[list[str]]
+    delimiter: str = ","
+    decimal: str = "."
+    units: list[str] = field(default_factory=list)
+    prefix: str = ""
+    encoding: str = "utf-8"
+    above: int = 0
+    others: tuple[str, ...] = ()
+
+    def numbers(self, column: int) -> Array:
+        """Return the readings of a column, NaN where a field is no number."""
+        return np.array([_number(row[column], self.decimal) if column < len(row) else np.nan for row in self.rows])
+
+
+def guess_table(lines: Sequence[str], name: str, *, prefix: str = "", encoding: str = "utf-8") -> _Table:
+    """Return the table in the first lines of a text file; of several alike, that of the sensor in the file's name.
+
+    Raises
+    ------
+    GuessError
+        No line names the axes of a sensor.
+    """
+    best: tuple[int, _Table] | None = None
+    for delimiter in _DELIMITERS:
+        if delimiter == " " and best is not None:
+            break
+        for above, line in enumerate(lines[:_MOST_LINES]):
+            titles = _fields(line.lstrip("# ") if line.startswith("#") else line, delimiter)
+            if len(titles) < 3 or sum(map(is_number, titles)) > len(titles) / 2:
+                continue
+            if prefix and titles[0] != prefix and f"${titles[1]}" != prefix:
+                continue
+            score = _score(_tagged(titles), _sensors_of_name(name))
+            if score and (best is None or score > best[0]):
+                table = _rows_below(titles, lines[above + 1 :], delimiter, above)
+                if table is not None:
+                    best = score, table
+    if best is None:
+        shown = next((line.strip() for line in lines if line.strip() and not line.startswith("#")), "")
+        raise GuessError(f"{name}: no line of titles names the axes of a sensor; the first is {quoted(shown)}")
+    best[1].encoding = encoding
+    return best[1]
+
+
+def _sensors_of_name(name: str) -> set[str]:
+    """Return the sensors that a file's name speaks of: ``Gyroscope.csv``, ``log-mag.txt``."""
+    words = re.findall(r"[a-z]+", Path(name).stem.lower().replace("total", ""))
+    return {sensor for sensor in _EXAMPLES for word in words if word.startswith(sensor[:3])}
+
+
+def _tagged(titles: list[str]) -> list[str]:
+    """Return titles in which bare axes behind a tag, ``$COL,MAG,time,x,y,z``, have its name."""
+    tag = titles[1] if titles[0].startswith("$") else titles[0]
+    if not any(tag.lower().startswith(sensor[:3]) for sensor in _EXAMPLES):
+        return titles
+    return [f"{tag} {title}" if title.lower() in ("x", "y", "z") else title for title in titles]
+
+
+def _score(titles: Sequence[str], likely: set[str]) -> int:
+    """Return how many whole triads titles name; bare x, y and z count least, a `likely` sensor more."""
+    read = [read_title(title) for title in titles]
+    named = {(t.sensor, t.stem, t.axis) for t in read if t.sensor in _EXAMPLES and t.axis is not None}
+    whole = [key for key in {(s, stem) for s, stem, _ in named} if all((*key, axis) in named for axis in range(3))]
+    bare = {t.axis for t in read if not t.sensor and not t.stem and t.axis is not None}
+    timed = bool(whole) and any(title.sensor == "time" for title in read)
+    return 10 * len(whole) + (len(bare) == 3) + timed + _NAMED * len(likely.intersection(sensor for sensor, _ in whole))
+
+
+def _rows_below(titles: list[str], below: Sequence[str], delimiter: str, above: int) -> _Table | None:
+    """Return the table under titles: its units row, its rows, and the prefix that they have."""
+    tag = titles[0] if not is_number(titles[0]) else ""
+    tags = {tag: titles[1:], f"${titles[1]}": titles[2:]} if titles[0].startswith("$") else {tag: titles[1:]}
+    units: list[str] = []
+    rows: dict[str, list[list[str]]] = {}
+    for line in below:
+        fields = _fields(line, delimiter)
+        if not any(fields) or line.startswith("#"):
+            continue
+        if not rows and not units and (fields[0] in ("$UNIT", "UNIT") or _is_units_row(fields)):
+            of_these = fields[1:2] == titles[1:2]
+            units = fields if not fields[0].endswith("UNIT") else fields[2:] if of_these else []
+            continue
+        key = fields[0] if fields[0] in tags and sum(map(_is_value, fields[1:])) >= 3 else ""
+        if key or len(titles) <= len(fields) <= len(titles) + 1:
+            rows.setdefault(key, []).append(fields[1:] if key else fields)
+    prefix = next((key for key in tags if key and key in rows), "")
+    mine = [row for row in rows.get(prefix, []) if sum(map(_is_value, row)) >= min(3, len(row))]
+    if not mine:
+        return None
+    titles = _tagged(titles)[-len(tags[prefix]) :] if prefix else titles
+    joined = " ".join(field for row in mine[:50] for field in row)
+    decimal = "," if delimiter != "," and re.search(r"\d,\d", joined) and not re.search(r"\d\.\d", joined) else "."
+    starts = [_fields(line, delimiter)[0] for line in below if not line.startswith(("#", "$UNIT"))]
+    others = tuple(dict.fromkeys(s for s in starts if prefix and s and s != prefix and not is_number(s)))
+    return _Table(titles, mine, delimiter, decimal, units, prefix, above=above, others=others)
+
+
+def _is_units_row(fields: Sequence[str]) -> bool:
+    """Return whether fields are units: none is a number, and most that are not empty are known."""
+    words = [word for word in fields if word]
+    return bool(words) and not any(map(is_number, words)) and sum(bool(known_unit(w)) for w in words) > len(words) / 2
+
+
+def is_units_row(line: str, delimiter: str) -> list[str]:
+    """Return the units in a line of a file, as `parse_unit` knows them; none where it is no row of units."""
+    fields = _fields(line, delimiter)
+    return [known_unit(word) for word in fields] if _is_units_row(fields) else []
+
+
+def layout_of_table(
+    table: _Table,
+    name: str,
+    *,
+    units: Mapping[str, str] | None = None,
+    sample_rate: float | None = None,
+    seconds: float | None = None,
+    timed: bool = True,
+) -> LayoutGuess:
+    """Return the layout of a table.
+
+    Parameters
+    ----------
+    units
+        Units of sensors or columns that are known: ``{"gyro": "deg/s"}``.
+    sample_rate
+        Hz, where no column holds the time.
+    seconds
+        Time in which the rows came, where that is known.
+    timed
+        Whether a time is needed.
+
+    Raises
+    ------
+    GuessError
+        A title or a unit cannot be told; the message names it.
+    """
+    known = dict(units or {})
+    titles = [read_title(title, table.units[i] if i < len(table.units) else "") for i, title in enumerate(table.titles)]
+    sensors, left = _sensors(titles, table, name, known)
+    try:
+        clock = _clock(titles, table, known, sample_rate, seconds, name)
+    except GuessError:
+        if timed:
+            raise
+        clock = None
+    # Column, place in the file, unit, and why, where no title says it.
+    chosen: list[tuple[str, int, str, str]] = []
+    step, rate = (None, sample_rate) if clock is None else (_step(table.numbers(clock[0]), clock[1]), clock[3])
+    if clock is not None:
+        chosen.append(("time", *clock[:3]))
+    if sample_rate is not None:
+        step = 1 / sample_rate
+    told = {sensor: titles[places[0]].unit for sensor, places in sensors.items()}
+    for sensor, places in sensors.items():
+        unit, reason = _unit(sensor, places, titles, table, told, known)
+        if not unit and sensor == "gyro" and step is not None and "accel" in sensors:
+            unit, reason = _rate_unit(table, sensors["accel"], places, step)
+        if not unit:
+            raise _unknown_unit(sensor, places, titles, name)
+        told[sensor] = unit
+        if titles[places[0]].increment and "@" not in unit:
+            unit, reason = _increments(unit, rate, titles[places[0]].text, name)
+        for column, place in zip(triad(sensor), places, strict=True):
+            chosen.append((column, place, known.get(column, unit), reason))
+    warm = _temperature(titles, table, known)
+    if warm is not None:
+        chosen.append(("temperature", *warm))
+    about = {column.partition("_")[0]: reason for column, _, _, reason in chosen if reason}
+    return LayoutGuess(
+        _text(table, chosen, left, sample_rate), tuple(f"{sensor}: {reason}" for sensor, reason in about.items())
+    )
+
+
+def _text(
+    table: _Table, chosen: Sequence[tuple[str, int, str, str]], left: Sequence[str], sample_rate: float | None
+) -> str:
+    """Return the text of a layout file; columns are named by title where that names one alone."""
+    numbered = bool(table.prefix) or any(table.titles.count(table.titles[place]) > 1 for _, place, _, _ in chosen)
+    lines = ["# Guessed by imulab layout guess from titles. A comment at a column says what its title does not."]
+    lines += [f"# Not taken: {first_of(left, 8)}"] if left else []
+    lines += [f"# Lines of other kinds: {' '.join(table.others[:8])} (--prefix NAME)"] if table.others else []
+    lines += [f"delimiter = {_DELIMITERS[table.delimiter]}"] if table.delimiter else []
+    lines += ['decimal = ","'] if table.decimal == "," else []
+    lines += [f"encoding = {_toml(table.encoding)}"] if table.encoding != "utf-8" else []
+    lines += [f"prefix = {_toml(table.prefix)}"] if table.prefix else []
+    if numbered and not table.prefix:
+        lines += ["header = true", *([f"skip_lines = {table.above}"] if table.above else [])]
+    if sample_rate is not None:
+        lines.append(f'sample_rate = {{ value = {sample_rate:g}, unit = "Hz" }}')
+    lines.append("[columns]")
+    for column, place, unit, reason in chosen:
+        title = table.titles[place].strip()
+        comments = [*([_toml(title)] if numbered else []), *([reason] if reason else [])]
+        comment = f"  # {'; '.join(comments)}" if comments else ""
+        lines.append(f"{column} = {{ from = {_toml(place if numbered else title)}, unit = {_toml(unit)} }}{comment}")
+    return "\n".join([*lines, ""])
+
+
+def _toml(value: str | int) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+# Which columns are which sensor.
+
+
+def _sensors(
+    titles: Sequence[Title], table: _Table, name: str, known: Mapping[str, str]
+) -> tuple[dict[str, list[int]], list[str]]:
+    """Return the columns of each sensor, and the titles that are not taken."""
+    groups: dict[tuple[str, tuple[str, ...]], dict[int, int]] = {}
+    for place, title in enumerate(titles):
+        sensor = title.sensor or (_bare(title, table, name, known) if not title.stem else "")
+        if title.axis is not None and sensor in _EXAMPLES and np.isfinite(table.numbers(place)).any():
+            groups.setdefault((sensor, title.stem), {}).setdefault(title.axis, place)
+    whole = {key: [axes[k] for k in range(3)] for key, axes in groups.items() if len(axes) == 3}
+    sensors: dict[str, list[int]] = {}
+    for sensor in _EXAMPLES:
+        found = [key for key in whole if key[0] == sensor]
+        # Calibrated readings go before raw ones; acceleration that may be without gravity goes last.
+        found.sort(key=lambda key: ("linear" in key[1], "raw" in key[1] or titles[whole[key][0]].unit == "count"))
+        if found and not _is_linear(found[0], table, whole):
+            sensors[sensor] = whole[found[0]]
+    used = {place for places in sensors.values() for place in places}
+    if not sensors:
+        unknown = next((t.text for t in titles if t.sensor not in ("time", "counter")), table.titles[0])
+        bare = all(any(not t.stem and t.axis == axis for t in titles) for axis in range(3))
+        hint = "; --unit accel=m/s^2 says what x, y and z are" if bare else ""
+        raise GuessError(
+            f"{name}: no titles of three axes that are known; not known: {quoted(unknown)}{hint}",
+            "--unit accel=m/s^2" if bare else "",
+        )
+    left = [t.text.strip() for i, t in enumerate(titles) if i not in used and t.sensor in _EXAMPLES and t.text.strip()]
+    return sensors, left
+
+
+def _bare(title: Title, table: _Table, name: str, known: Mapping[str, str]) -> str:
+    """Return the sensor of a bare x, y or z: by its unit, by the units that were named, or by the file's name."""
+    if title.unit == "1":
+        return "mag"
+    named = [sensor for sensor in _EXAMPLES if sensor in known]
+    if len(named) == 1:
+        return named[0]
+    likely = _sensors_of_name(name)
+    return likely.pop() if len(likely) == 1 else ""
+
+
+def _is_linear(
+    key: tuple[str, tuple[str, ...]], table: _Table, whole: Mapping[tuple[str, tuple[str, ...]], list[int]]
+) -> bool:
+    """Return whether an acceleration that its title calls linear has no gravity in it."""
+    if "linear" not in key[1]:
+        return False
+    return not any(abs(_length(table, whole[key]) / g - 1) < _NEAR for g in _GRAVITIES.values())
+
+
+# Units, from titles or else from the readings.
+
+
+def _length(table: _Table, places: Sequence[int]) -> float:
+    """Return the median length of three columns."""
+    length = np.linalg.norm([table.numbers(place) for place in places], axis=0)
+    length = length[np.isfinite(length)]
+    return float(np.median(length)) if len(length) >= _FEWEST else np.nan
+
+
+def _is_whole(table: _Table, places: Sequence[int]) -> bool:
+    """Return whether all readings are whole numbers, and not just zeros and ones."""
+    values = np.concatenate([table.numbers(place) for place in places])
+    values = values[np.isfinite(values)]
+    return len(values) >= 3 * _FEWEST and bool((values == np.rint(values)).all()) and float(np.abs(values).max()) > 30
+
+
+def _unit(
+    sensor: str,
+    places: Sequence[int],
+    titles: Sequence[Title],
+    table: _Table,
+    told: Mapping[str, str],
+    known: Mapping[str, str],
+) -> tuple[str, str]:
+    """Return the unit of a sensor, and why where no title says it; nothing where it cannot be told."""
+    if sensor in known:
+        return known[sensor], ""
+    columns = triad(sensor)
+    if all(column in known for column in columns):
+        return known[columns[0]], ""
+    stated = {titles[place].unit for place in places}
+    first = titles[places[0]]
+    if len(stated) == 1 and first.unit and _fits(sensor, first):
+        return first.unit, ""
+    if len(stated) == 1 and not first.unit:
+        return _supposed(sensor, places, titles, table, told)
+    return "", ""
+
+
+def _unknown_unit(sensor: str, places: Sequence[int], titles: Sequence[Title], name: str) -> GuessError:
+    stated = {titles[place].unit for place in places}
+    found = "" if stated == {""} else f", found {' '.join(sorted(unit or 'none' for unit in stated))}"
+    example = f"--unit {sensor}={_EXAMPLES[sensor]}"
+    return GuessError(
+        f"{name}: column {quoted(titles[places[0]].text.strip())}: neither the title nor the readings say its "
+        f"unit{found}; {example} states it",
+        example,
+    )
+
+
+def _fits(sensor: str, title: Title) -> bool:
+    """Return whether a stated unit is one of the sensor's quantity, or of its increments."""
+    quantity = parse_unit(title.unit).quantity
+    if quantity == "output" or (sensor == "mag" and quantity in ("magnetic field", "number")):
+        return True
+    return quantity == (
+        {"accel": "velocity", "gyro": "angle"}.get(sensor) if title.increment else KINDS[sensor].quantity
+    )
+
+
+def _supposed(
+    sensor: str, places: Sequence[int], titles: Sequence[Title], table: _Table, told: Mapping[str, str]
+) -> tuple[str, str]:
+    """Return the unit that readings show, and why; nothing where they do not."""
+    words, length = titles[places[0]].stem, _length(table, places)
+    if titles[places[0]].increment:
+        return "", ""
+    if _is_whole(table, places) or "count" in {unit for other, unit in told.items() if other != sensor}:
+        return "count", "no unit in the titles; whole numbers are taken as counts"
+    if sensor == "accel":
+        if "gf" in words:
+            return "g", "g by the name g-force"
+        for unit, gravity in _GRAVITIES.items():
+            if abs(length / gravity - 1) < _NEAR:
+                return unit, f"no unit in the titles; |f| is {length:.3g}, so {unit}"
+        if words[:1] in (("a",), ("alpha",)) and _symbol_rate(titles):
+            return "m/s^2", "no unit in the titles; supposed as SI, as symbols a and w are"
+    if sensor == "gyro" and words[:1] in (("w",), ("omega",), ("angular",)):
+        largest = float(np.nanmax(np.abs([table.numbers(place) for place in places])))
+        by_name = any("gf" in t.stem for t in titles)
+        if largest < _FASTEST and (told.get("accel") == "m/s^2" or by_name):
+            return "rad/s", "no unit in the titles; supposed as SI, as the symbol w is"
+    if sensor == "mag":
+        for unit, (low, high) in _FIELDS.items():
+            if low < length < high:
+                return unit, f"no unit in the titles; a length of {length:.3g} is the Earth's field in {unit}"
+    return "", ""
+
+
+def _step(times: Array, unit: str) -> float | None:
+    """Return the median step of a clock, s."""
+    steps = np.diff(times)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
+    return usual * parse_unit(unit).factor if unit != "iso" and np.isfinite(usual) else None
+
+
+def _rate_unit(table: _Table, accel: Sequence[int], gyro: Sequence[int], step: float) -> tuple[str, str]:
+    """Return the unit of rates in which they explain how gravity turns in the body, df/dt = -w x f.
+
+    The factor of the rates is that of least squares over all rows, f and w smoothed over a tenth of a second.
+    """
+    f = np.column_stack([table.numbers(place) for place in accel])
+    w = np.column_stack([table.numbers(place) for place in gyro])
+    whole = np.isfinite(f).all(axis=1) & np.isfinite(w).all(axis=1)
+    lag = max(1, round(0.1 / step))
+    if len(f) < _TURNING * lag or not whole.all():
+        return "", ""
+    smooth = np.ones(lag) / lag
+    f, w = (np.column_stack([np.convolve(c, smooth, "valid") for c in columns.T]) for columns in (f, w))
+    w = w - np.median(w, axis=0)
+    change = (f[2 * lag :] - f[: -2 * lag]) / (2 * lag * step)
+    turned = -np.cross(w, f)[lag:-lag]
+    both, alone, seen = (float((a * b).sum()) for a, b in ((change, turned), (turned, turned), (change, change)))
+    if not alone or not seen or both / np.sqrt(alone * seen) < _AGREE:
+        return "", ""
+    factor = both / alone
+    for unit in ("rad/s", "deg/s", "mdeg/s", "mrad/s"):
+        if abs(factor / parse_unit(unit).factor - 1) < _NEAR:
+            return unit, f"no unit in the titles; turns of gravity in the accelerometers agree with {unit}"
+    return "", ""
+
+
+def _symbol_rate(titles: Iterable[Title]) -> bool:
+    return any(title.sensor == "gyro" and title.stem[:1] in (("w",), ("omega",)) and not title.unit for title in titles)
+
+
+def _increments(unit: str, rate: float | None, title: str, name: str) -> tuple[str, str]:
+    """Return the unit of increments with their rate."""
+    if rate is None:
+        raise GuessError(
+            f"{name}: column {quoted(title.strip())}: increments per sample, and no clock shows how many samples there "
+            "are in a second; --sample-rate HZ states it",
+            "--sample-rate HZ",
+        )
+    return f"{unit}@{rate:g}Hz", f"increments per sample, by the clock {rate:g} of them a second"
+
+
+def _temperature(titles: Sequence[Title], table: _Table, known: Mapping[str, str]) -> tuple[int, str, str] | None:
+    """Return the column of the temperature, its unit, and why; None where there is none that is surely one."""
+    places = [i for i, t in enumerate(titles) if t.sensor == "temperature" and np.isfinite(table.numbers(i)).any()]
+    if len(places) != 1:
+        return None
+    (place,) = places
+    title, values = titles[place], table.numbers(place)
+    unit = known.get("temperature", title.unit)
+    if unit in ("degC", "K"):
+        return place, unit, ""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    if unit in ("", "deg") and low > -60 and high < 150 and not _is_whole(table, [place] * 3):
+        return place, "degC", f"supposed: {low:g} to {high:g}"
+    return None
+
+
+# The clock.
+
+
+def _clock(
+    titles: Sequence[Title],
+    table: _Table,
+    known: Mapping[str, str],
+    sample_rate: float | None,
+    seconds: float | None,
+    name: str,
+) -> tuple[int, str, str, float | None] | None:
+    """Return the column of the time, its unit, why, and the rate in Hz; None where a sample rate is stated."""
+    if sample_rate is not None:
+        return None
+    ranked: list[tuple[tuple[bool, bool, int], int, str, str, float | None]] = []
+    unknown = ""
+    for place, title in enumerate(titles):
+        if title.sensor != "time":
+            continue
+        values = table.numbers(place)
+        if _ISO.match(table.rows[0][place].strip('" ')) and table.delimiter != " ":
+            ranked.append(((True, False, place), place, "iso", "", None))
+            continue
+        steps = np.diff(values)
+        back = int((steps < 0).sum())  # a counter may begin again
+        if not np.isfinite(values).all() or (len(steps) and (back > 1 + len(steps) / 1000 or steps.max() <= 0)):
+            continue
+        step = float(np.median(steps[steps > 0])) if len(steps) else np.nan
+        unit, reason = (known["time"], "") if "time" in known else _time_unit(title, values, step, seconds)
+        if not unit:
+            unknown = unknown or title.text.strip()
+            continue
+        factor = parse_unit(unit).factor
+        rate = float(f"{1 / (factor * step):.4g}") if np.isfinite(step) else None
+        elapsed = bool({"elapsed", "start"}.intersection(title.stem))
+        ranked.append(((False, not elapsed, place), place, unit, reason, rate))
+    if ranked:
+        return min(ranked)[1:]
+    if unknown:
+        raise GuessError(
+            f"{name}: column {quoted(unknown)}: neither the title nor its steps say the unit of time; --unit time=ms "
+            "states it",
+            "--unit time=ms",
+        )
+    others = [t.text.strip() for t in titles if t.sensor == "time"]
+    found = f", found {quoted(others[0])}, which does not rise" if others else ""
+    raise GuessError(
+        f"{name}: no title of a time that rises{found}; --sample-rate HZ states how many rows there are in a second",
+        "--sample-rate HZ",
+    )
+
+
+def _time_unit(title: Title, values: Array, step: float, seconds: float | None) -> tuple[str, str]:
+    """Return the unit of a clock, and why where its title does not say it."""
+    if title.unit in ("s", "ms", "us", "ns"):
+        return title.unit, ""
+    if "tow" in title.stem or "seconds" in title.stem:
+        return "s", ""
+    rates = {unit: 1 / (parse_unit(unit).factor * step) for unit in ("s", "ms", "us", "ns")} if step > 0 else {}
+    likely = [unit for unit, rate in rates.items() if _LIKELY_RATES[0] <= rate < _LIKELY_RATES[1] and step != 1.0]
+    if "fine" in title.stem:  # microseconds from a Movella DOT, tenths of a millisecond from MT Manager
+        return ("us", f"by its steps us, at {rates['us']:.4g} Hz") if likely == ["us"] else ("", "")
+    for word, unit in (("millis", "ms"), ("micros", "us"), ("nanos", "ns")):
+        if word in title.stem:
+            return unit, ""
+    for unit, per_second in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
+        if _SINCE_1970[0] < values[0] / per_second < _SINCE_1970[1] and 0.5 < rates.get(unit, 1.0) < 1e5:
+            return unit, f"counts {unit} since 1970"
+    if seconds:
+        ticks = float(values[-1] - values[0]) / max(seconds, 1e-3)
+        unit = "s" if ticks < 30 else "ms" if ticks < 3e4 else "us"
+        return unit, f"{unit} by its steps"
+    if likely:
+        return likely[0], f"no unit in the title; by its steps {likely[0]}, at {rates[likely[0]]:.4g} Hz"
+    return "", ""
+
+
+# Fields of lines.
+
+
+def table_of_records(records: Sequence[Mapping[str, float]]) -> _Table:
+    """Return the table of records with the same keys, such as lines of JSON."""
+    return _Table(list(records[0]), [[repr(value) for value in record.values()] for record in records], delimiter="")
+
+
+def _fields(line: str, delimiter: str) -> list[str]:
+    fields = line.split() if delimiter == " " else line.split(delimiter)
+    return [field.strip().strip('"').strip() for field in fields]
+
+
+def _number(text: str, decimal: str) -> float:
+    try:
+        return float(text.replace(",", ".") if decimal == "," else text)
+    except ValueError:
+        return np.nan
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text is one number, with a point or a comma."""
+    return not np.isnan(_number(text, ",")) or text.strip().lower() == "nan"
+
+
+def _is_value(text: str) -> bool:
+    return is_number(text) or text == ""

@@ -1,0 +1,249 @@
+"""Layouts guessed from titles: of heads of the shipped layouts, which are taken away, and of titles that people have."""
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.errors import ReadError
+from imulab.readers import guess, shipped
+from imulab.readers.guess import LayoutGuess
+from imulab.readers.layout import load_layout
+from imulab.readers.titles import read_title
+from test_readers_shipped import FILES
+
+G = 9.80665
+REFUSED = {"kitti-oxts", "motioncal", "movella-dot", "movella-dot-mag", "sensorlogger-accel", "sensorlogger-gyro"}
+"""Layouts whose heads hold no titles, or no unit of a sensor in titles or in readings that are random."""
+
+
+def written(path, titles, columns, delimiter=",", more=""):
+    rows = "".join(delimiter.join(f"{x:.6g}" for x in row) + "\n" for row in zip(*columns, strict=True))
+    path.write_text(f"{titles}\n{more}{rows}", encoding="utf-8")
+    return path
+
+
+def tilting(rows=2000, rate=100.0):
+    """Time, specific force in m/s^2 and rates in rad/s of a body that turns about two axes, integrated here."""
+    t = np.arange(rows) / rate
+    w = np.column_stack([0.8 * np.sin(0.7 * t), 0.6 * np.cos(0.5 * t), 0.05 * np.ones(rows)])
+    up = np.array([0.0, 0.0, 1.0])
+    f = []
+    for row in w:
+        f.append(up * G)
+        angle = np.linalg.norm(row) / rate
+        axis = row / np.linalg.norm(row)
+        up = up * np.cos(angle) - np.cross(axis, up) * np.sin(angle) + axis * (axis @ up) * (1 - np.cos(angle))
+    return t, np.array(f), w
+
+
+def test_heads_of_the_shipped_layouts_without_them(tmp_path, monkeypatch):
+    """At least 20 of 27 are right, and where one is not, it is refused."""
+    monkeypatch.setattr(guess, "advice", lambda head: "")
+    right = set()
+    for name, make in FILES.items():
+        path = tmp_path / f"{name}.csv"
+        path.write_bytes(make().encode())
+        if name in REFUSED:
+            with pytest.raises(ReadError):
+                il.guess_layout(path)
+            continue
+        found = il.read(path, il.guess_layout(path).layout)
+        expected = il.read(path, name)
+        for column in expected.columns:
+            assert found.units[column] == expected.units[column], (name, column)
+            np.testing.assert_array_equal(found.columns[column], expected.columns[column])
+        right.add(name)
+    assert len(right) >= 20
+    assert {entry.name for entry in shipped.shipped()} >= right | REFUSED
+
+
+@pytest.mark.parametrize(
+    ("title", "sensor", "axis", "unit"),
+    [
+        ("Accelerometer X (g)", "accel", 0, "g"),
+        ("a_x", "accel", 0, ""),
+        ("az", "accel", 2, ""),
+        ("Acc_Y", "accel", 1, ""),
+        ("ACCX", "accel", 0, ""),
+        ("accX_g", "accel", 0, "g"),
+        ("acc_x_mps2", "accel", 0, "m/s^2"),
+        ("AccX(m/s/s)", "accel", 0, "m/s^2"),
+        ("accelerometer_m_s2[2]", "accel", 2, "m/s^2"),
+        ("linear_acceleration.y", "accel", 1, ""),
+        ("xacc", "accel", 0, ""),
+        ("gx", "gyro", 0, ""),
+        ("GyroX(deg/s)", "gyro", 0, "deg/s"),
+        ("gyroADC[0]", "gyro", 0, "count"),
+        ("gyro_rad[1]", "gyro", 1, "rad/s"),
+        ("AsX(°/s)", "gyro", 0, "deg/s"),
+        ("angular_velocity.x", "gyro", 0, ""),
+        ("omega_x", "gyro", 0, ""),
+        ("w_RS_S_z [rad s^-1]", "gyro", 2, "rad/s"),
+        ("UncalMagXMicroT", "mag", 0, "uT"),
+        ("hx", "mag", 0, ""),
+        ("MAGNETIC FIELD Z (μT)", "mag", 2, "uT"),
+        ("DeltaAngle X (rad)", "gyro", 0, "rad"),
+        ("dv_z [m/s]", "accel", 2, "m/s"),
+        ("elapsedRealtimeNanos", "time", None, "ns"),
+        ("Time since start in ms ", "time", None, "ms"),
+        ("timestamp [ns]", "time", None, "ns"),
+        ("T(°)", "temperature", None, "deg"),
+        ("Temperature (°C)", "temperature", None, "degC"),
+        ("PacketCounter", "counter", None, ""),
+        ("AngleX(deg)", "", 0, "deg"),
+        ("FreeAcc_X", "", 0, ""),
+        ("BiasXMps2", "", 0, "m/s^2"),
+        ("gx (g)", "accel", 0, "g"),
+        ("axisP[0]", "", 0, ""),
+        ("Absolute field (µT)", "", None, "uT"),
+    ],
+)
+def test_a_title_says_sensor_axis_and_unit(title, sensor, axis, unit):
+    found = read_title(title)
+    assert (found.sensor, found.axis, found.unit) == (sensor, axis, unit)
+    assert found.increment == title.lower().startswith(("delta", "dv"))
+
+
+def test_units_that_titles_lack_are_told_by_the_readings_and_it_is_said(tmp_path):
+    t, f, w = tilting()
+    for factor, accel in ((1.0, "m/s^2"), (1 / G, "g"), (1000 / G, "mg")):
+        for turn, gyro in ((1.0, "rad/s"), (180 / np.pi, "deg/s")):
+            path = written(tmp_path / "f.csv", "t,ax,ay,az,gx,gy,gz", [1000 * t, *(f * factor).T, *(w * turn).T])
+            found = il.guess_layout(path)
+            read = il.read(path, found.layout)
+            assert (read.units["accel_x"], read.units["gyro_x"]) == (accel, gyro)
+            assert read.time[1] == pytest.approx(0.01)
+            assert len(found.supposed) == 3
+            assert found.toml.count("no unit in the title") == 7
+
+
+def test_a_rate_at_rest_has_no_unit_and_is_refused(imulab, tmp_path):
+    rng = np.random.default_rng(4)
+    t = np.arange(3000) / 100
+    columns = [t, *(np.array([0, 0, G]) + rng.normal(0, 0.02, (3000, 3))).T, *rng.normal(0, 0.1, (3, 3000))]
+    written(tmp_path / "f.csv", "Time,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z", columns)
+    done = imulab("layout", "guess", "f.csv", "-o", "l.toml")
+    assert done.returncode == 2
+    assert not (tmp_path / "l.toml").exists()
+    assert done.stderr == (
+        "imulab: f.csv: column 'Gyr_X': neither the title nor the readings say its unit; --unit gyro=deg/s states it\n"
+    )
+    # What is refused without a layout ends with the command that helps, and that command works.
+    refused = imulab("show", "f.csv")
+    assert refused.returncode == 2
+    assert refused.stderr.endswith(
+        "; imulab layout guess f.csv --unit gyro=deg/s -o L.toml writes a layout for it (--layout L.toml)\n"
+    )
+    assert imulab("layout", "guess", "f.csv", "--unit", "gyro=deg/s", "-o", "L.toml").returncode == 0
+    assert il.read(tmp_path / "f.csv", tmp_path / "L.toml").units["gyro_x"] == "deg/s"
+
+
+def test_a_units_row_below_the_titles_and_a_line_that_names_the_separator(tmp_path):
+    path = tmp_path / "f.csv"
+    titles = "\t".join(["S1_Time_CAL", *(f"S1_{s}_{a}_CAL" for s in ("Accel_LN", "Gyro") for a in "XYZ")])
+    units = "\t".join(["ms", *["m/(s^2)"] * 3, *["deg/s"] * 3])
+    rows = "".join(f"{1e12 + 20 * k:.3f}\t0.1\t0.2\t9.8\t1\t2\t3\t\n" for k in range(20))
+    path.write_text(f"sep=\t\n{titles}\t\n{units}\t\n{rows}")
+    found = il.guess_layout(path)
+    assert found.supposed == ()
+    assert {c.unit for name, c in found.layout.columns.items() if name.startswith("accel")} == {"m/s^2"}
+    assert found.layout.columns["gyro_z"].unit == "deg/s"
+    assert found.layout.columns["time"].unit == "ms"
+
+
+def test_calibrated_readings_go_before_raw_ones_and_what_is_left_is_named(tmp_path):
+    titles = "Time (s),Acc RAW X,Acc RAW Y,Acc RAW Z,Acc CAL X (g),Acc CAL Y (g),Acc CAL Z (g)"
+    rows = np.tile([0, 100, 200, 4096, 0.02, 0.05, 1.0], (20, 1))
+    rows[:, 0] = np.arange(20) * 0.01
+    found = il.guess_layout(written(tmp_path / "f.csv", titles, rows.T))
+    assert found.layout.columns["accel_x"].origin == "Acc CAL X (g)"
+    assert "# Not taken: Acc RAW X, Acc RAW Y, Acc RAW Z\n" in found.toml
+
+
+def test_acceleration_without_gravity_is_not_taken(tmp_path):
+    rng = np.random.default_rng(5)
+    columns = [np.arange(50) * 0.01, *rng.normal(0, 0.02, (3, 50))]
+    titles = "Time (s),Linear Acceleration x (m/s^2),Linear Acceleration y (m/s^2),Linear Acceleration z (m/s^2)"
+    with pytest.raises(ReadError, match="no titles of three axes that are known; not known: 'Linear Acceleration x"):
+        il.guess_layout(written(tmp_path / "f.csv", titles, columns))
+
+
+def test_semicolons_with_decimal_commas_and_tabs(tmp_path):
+    path = tmp_path / "f.csv"
+    titles = ["Time (s)", *(f"Acceleration {axis} (m/s^2)" for axis in "xyz")]
+    rows = [[f"{0.01 * k:.2f}", "0.10", "-0.25", "9.81"] for k in range(20)]
+    for delimiter, comma in ((";", True), ("\t", True), ("\t", False), (";", False)):
+        text = "\n".join(delimiter.join(row).replace(*((".", ",") if comma else ("", ""))) for row in rows)
+        path.write_text(delimiter.join(titles) + "\n" + text + "\n")
+        read = il.read(path, il.guess_layout(path).layout)
+        assert read.columns["accel_z"][3] == 9.81
+        assert read.units["time"] == "s"
+
+
+def test_no_title_of_a_time_asks_for_the_rate(imulab, tmp_path):
+    written(tmp_path / "f.csv", "ax,ay,az", np.tile([0.01, 0.02, 9.81], (20, 1)).T)
+    done = imulab("layout", "guess", "f.csv")
+    assert done.returncode == 2
+    assert done.stderr.endswith("--sample-rate HZ states how many rows there are in a second\n")
+    toml = imulab("layout", "guess", "f.csv", "--sample-rate", "50Hz").stdout
+    (tmp_path / "l.toml").write_text(toml)
+    assert il.read(tmp_path / "f.csv", load_layout(tmp_path / "l.toml")).time[-1] == 19 / 50
+
+
+def test_increments_get_the_rate_of_the_clock(tmp_path):
+    t = np.arange(50) / 125
+    columns = [t, *np.tile([0.001, 0.002, -0.001], (50, 1)).T, *np.tile([0.0, 0.0, G / 125], (50, 1)).T]
+    titles = "time (s),dAng X (rad),dAng Y (rad),dAng Z (rad),dVel X (m/s),dVel Y (m/s),dVel Z (m/s)"
+    path = written(tmp_path / "f.csv", titles, columns)
+    found = il.guess_layout(path)
+    read = il.read(path, found.layout)
+    assert read.units["gyro_x"] == "rad@125Hz"
+    np.testing.assert_allclose(read.si("gyro_y"), 0.25, rtol=1e-12)
+    np.testing.assert_allclose(read.si("accel_z"), G, rtol=1e-5)
+    assert len(found.supposed) == 2
+
+
+def test_files_that_need_no_layout_or_hold_no_text_are_refused(imulab, tmp_path):
+    il.write(il.simulate_tumble(attitudes=8, hold="2 s"), tmp_path / "own.csv")
+    (tmp_path / "b.bin").write_bytes(b"\0\1\2" * 900)
+    (tmp_path / "words.csv").write_text("name,place\nA,B\n")
+    for name, words in (
+        ("own.csv", "titles with units, as imulab writes them; it needs no layout"),
+        ("b.bin", "found binary data"),
+        ("words.csv", "no line of titles names the axes of a sensor; the first is 'name,place'"),
+        ("none.csv", "no such file"),
+    ):
+        done = imulab("layout", "guess", name)
+        assert done.returncode == 2
+        assert words in done.stderr
+        assert done.stderr.count("\n") == 1
+    done = imulab("layout", "guess", "words.csv", "-o", "l.csv")
+    assert "expected a name that ends in .toml" in done.stderr
+
+
+def test_the_guess_is_saved_and_shows_itself(imulab, tmp_path):
+    path = tmp_path / "f.csv"
+    path.write_bytes(FILES["x-imu3"]().encode())
+    found = il.guess_layout(path)
+    assert isinstance(found, LayoutGuess)
+    assert repr(found) == found.toml == imulab("layout", "guess", "f.csv").stdout
+    found.save(tmp_path / "l.toml")
+    assert imulab("layout", "guess", "f.csv", "-o", "m.toml").stdout == "layout: m.toml\n"
+    assert (tmp_path / "l.toml").read_bytes() == (tmp_path / "m.toml").read_bytes()
+    assert imulab("show", "f.csv", "--layout", "m.toml").returncode == 0
+
+
+def test_a_clock_without_a_unit_asks_for_it_and_takes_it(imulab, tmp_path):
+    columns = [np.arange(20) * 1.0, *np.tile([0.01, 0.02, 9.81], (20, 1)).T]
+    written(tmp_path / "f.csv", "Time,ax,ay,az", columns)
+    done = imulab("layout", "guess", "f.csv")
+    assert done.returncode == 2
+    assert done.stderr.endswith("neither the title nor its steps say the unit of time; --unit time=ms states it\n")
+    done = imulab("layout", "guess", "f.csv", "--unit", "time=ms,accel=m/s^2")
+    assert 'time = { from = "Time", unit = "ms" }\n' in done.stdout
+    assert "guess" not in done.stderr
+    for wrong, words in (("gyro", "expected NAME=UNIT"), ("accel=gg", "unknown unit 'gg'")):
+        done = imulab("layout", "guess", "f.csv", "--unit", wrong)
+        assert done.returncode == 2
+        assert done.stderr.startswith("imulab: --unit ")
+        assert words in done.stderr
