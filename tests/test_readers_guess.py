@@ -1,4 +1,4 @@
-"""Layouts guessed from titles: of heads of the shipped layouts, which are taken away, and of titles that people have."""
+"""Layouts guessed from titles: from heads of the shipped layouts, which are taken away, and from titles in use."""
 
 import numpy as np
 import pytest

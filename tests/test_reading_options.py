@@ -31,6 +31,7 @@ def test_every_command_that_reads_a_recording_has_the_same_options():
         if path not in BY_MANIFEST | LIVE:
             wanted = PART if path in NOT_BY_ELEMENT else {*PART, "element"}
             assert names & {*PART, "element"} == wanted, path
+            assert "units" in names, path
 
 
 @pytest.fixture
@@ -148,3 +149,102 @@ def test_a_tumble_of_one_imu_of_a_real_array(run, real_data, tmp_path):
         "time",
         *(f"{s}_{a}" for s in ("gyro", "accel") for a in "xyz"),
     ]
+
+
+def test_units_are_stated_on_the_command_line_and_in_python(run, tmp_path):
+    wrong = il.simulate_tumble(attitudes=12, order=1, hold="3 s", gravity=9.81)
+    axes = [f"accel_{axis}" for axis in "xyz"]
+    wrong = wrong.with_columns({axis: wrong.columns[axis] / 9.80665 for axis in axes}, {})
+    still = wrong.with_columns({}, dict.fromkeys(axes, "g"))
+    assert wrong.units["accel_x"] == "m/s^2"
+    il.write(wrong, tmp_path / "wrong.csv")
+    il.write(wrong, tmp_path / "wrong.parquet")
+    il.write(still, tmp_path / "right.csv")
+    right = il.fit_tumble(tmp_path / "right.csv", order=1, gravity=9.81)
+    for name in ("wrong.csv", "wrong.parquet"):
+        status, out, error = run("show", name, "--unit", "accel=g")
+        assert status == 0
+        assert "note: accel is read in g as stated, not in m/s^2" in out
+        fit = il.fit_tumble(tmp_path / name, order=1, gravity=9.81, units={"accel": "g"})
+        assert fit.calibration.parameters["bias_x"] == right.calibration.parameters["bias_x"]
+        assert (
+            run("tumble", "fit", name, "--gravity", "9.81", "--order", "1", "--unit", "accel=g", "-o", "r.json")[0] == 0
+        )
+        assert il.load(tmp_path / "r.json").parameters["bias_x"].value == right.calibration.parameters["bias_x"].value
+    blocks = list(read_blocks(tmp_path / "wrong.csv", units={"accel_y": "mg"}))
+    assert [blocks[0].units[f"accel_{axis}"] for axis in "xyz"] == ["m/s^2", "mg", "m/s^2"]
+    for words, message in (
+        ("gyr=deg/s", "unit of gyr: no such column; columns: time accel_x"),
+        ("accel=deg/s", "column accel_x: expected a unit of acceleration or output, found 'deg/s' (rate)"),
+        ("accel", "--unit 'accel': expected NAME=UNIT, each name once, such as accel=g,gyro=deg/s"),
+        ("accel=gee", "--unit accel=gee: unknown unit 'gee'"),
+    ):
+        status, _, error = run("show", "wrong.csv", "--unit", words)
+        assert (status, error.count("\n")) == (2, 1)
+        assert message in error
+    assert il.read(tmp_path / "wrong.csv", units={"time": "ms"}).time[1] == pytest.approx(still.time[1] / 1000)
+
+
+def test_titles_without_a_unit_take_the_stated_one(run, tmp_path):
+    rows = "".join(f"{0.01 * k:.2f},0.1,0.2,1.0\n" for k in range(50))
+    (tmp_path / "f.csv").write_text(f"time,accel_x,accel_y,accel_z\n{rows}")
+    status, _, error = run("show", "f.csv")
+    assert status == 2
+    assert "--unit time=s" in error
+    status, out, error = run("show", "f.csv", "--unit", "time=s,accel=g")
+    assert (status, error) == (0, "")
+    assert "note:" not in out
+    assert il.read(tmp_path / "f.csv", units={"time": "s", "accel": "g"}).units["accel_z"] == "g"
+
+
+def test_a_log_that_writes_other_units_than_its_format_has(run, tmp_path):
+    data, _, _ = low_rate_log(100, 400)
+    (tmp_path / "log.ulg").write_bytes(data)
+    plain, stated = (il.read(tmp_path / "log.ulg", units=units) for units in (None, {"accel": "g", "gyro": "deg/s"}))
+    assert (plain.units["accel_x"], stated.units["accel_x"], stated.units["gyro_z"]) == ("m/s^2", "g", "deg/s")
+    np.testing.assert_array_equal(plain.columns["accel_x"], stated.columns["accel_x"])
+    assert run("convert", "log.ulg", "--unit", "accel=g,gyro=deg/s", "-o", "out.csv")[0] == 0
+    assert il.read(tmp_path / "out.csv").units["gyro_x"] == "deg/s"
+
+
+def test_increments_are_a_kind_of_their_own_with_their_rate(run, tmp_path):
+    """The rate of increments is their mean over a sample, here compared with the division written out."""
+    rng = np.random.default_rng(6)
+    gained = rng.normal(0, 1e-3, (200, 3))
+    rows = "".join(f"{k / 125},{x!r},{y!r},{z!r}\n" for k, (x, y, z) in enumerate(gained.tolist()))
+    (tmp_path / "f.csv").write_text(f"time [s],gyro_x [deg],gyro_y [deg],gyro_z [deg]\n{rows}")
+    status, _, error = run("show", "f.csv")
+    assert status == 2
+    assert "column gyro_x: expected a unit of rate or output, found 'deg' (angle); of increments per sample" in error
+    assert error.endswith("state their rate too, such as deg@100Hz\n")
+    assert "did you mean" not in error
+    found = il.read(tmp_path / "f.csv", units={"gyro": "deg@125 Hz"})
+    assert found.units["gyro_x"] == "deg@125Hz"
+    np.testing.assert_allclose(found.si("gyro_x"), np.radians(gained[:, 0]) / (1 / 125), rtol=1e-13)
+    il.write(found, tmp_path / "own.csv")
+    again = il.read(tmp_path / "own.csv")
+    assert again.units == found.units
+    np.testing.assert_array_equal(again.columns["gyro_y"], gained[:, 1])
+    for wrong in ("deg@", "deg@0Hz", "g@100Hz", "deg@100"):
+        with pytest.raises(il.ImulabError, match="unknown unit"):
+            il.read(tmp_path / "f.csv", units={"gyro": wrong})
+
+
+def test_units_of_two_files_go_to_the_one_that_has_the_sensor(run, tmp_path):
+    both = il.simulate_tumble(attitudes=16, order=1, gravity=9.81)
+    il.fit_tumble(both, order=1, gravity=9.81).save(tmp_path / "r.json")
+    for sensor in ("accel", "gyro"):
+        names = ["time", *(f"{sensor}_{axis}" for axis in "xyz")]
+        columns = {name: both.columns[name] for name in names}
+        if sensor == "gyro":
+            columns |= {name: both.si(name) for name in names[1:]}
+        il.write(il.Recording(columns, {n: both.units[n] for n in names}), tmp_path / f"{sensor}.csv")
+    words = ["tumble", "gyro", "gyro.csv", "--accel", "r.json", "--accel-file", "accel.csv"]
+    status, _, error = run(*words, "--unit", "gyro=rad/s,accel=m/s^2", "-o", "g.json")
+    assert status == 0, error
+    scale = il.load(tmp_path / "g.json").parameters["gyro_scale_factor_x"]
+    assert scale.value == pytest.approx(np.radians(float(both.metadata["truth_gyro_scale_factor_x"])), abs=5e-3)
+    stated = {"gyro": "rad/s", "accel": "m/s^2"}
+    record, gyro, accel = (tmp_path / name for name in ("r.json", "gyro.csv", "accel.csv"))
+    same = il.fit_gyro(record, gyro, accel_data=accel, units=stated).calibration
+    assert same.parameters["gyro_scale_factor_x"] == scale

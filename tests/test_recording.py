@@ -72,7 +72,7 @@ def test_a_column_of_the_vocabulary_needs_a_unit(name):
         parse_column_title(name, "unit 7.csv")
     assert f"unit 7.csv: column {name} has no unit; expected a title such as '{name} [" in str(caught.value)
     # The title that the message suggests is one.
-    suggested = str(caught.value).split("such as '")[1].rstrip("'")
+    suggested = str(caught.value).split("such as '")[1].partition("'")[0]
     assert parse_column_title(suggested, "f")[0] == name
 
 

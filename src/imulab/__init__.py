@@ -89,7 +89,6 @@ if TYPE_CHECKING:
     from imulab.procedures.warmup.spreadsheet import warmup_table as warmup_table
     from imulab.readers import read as read
     from imulab.readers import read_blocks as read_blocks
-    from imulab.readers.guess import LayoutGuess as LayoutGuess
     from imulab.readers.guess import guess_layout as guess_layout
     from imulab.readers.streams import join_recordings as join_recordings
     from imulab.recording import Recording as Recording
@@ -137,7 +136,6 @@ _HOME = {
     "fit_tumble": "procedures.tumble.fit",
     "fit_warmup": "procedures.warmup.fit",
     "fleet_status": "fleet.run",
-    "LayoutGuess": "readers.guess",
     "guess_layout": "readers.guess",
     "join_recordings": "readers.streams",
     "load": "procedures.registry",

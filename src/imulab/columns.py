@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 from msgspec import Struct
 
@@ -58,8 +59,20 @@ def element_number(column: str, stem: str = "") -> int | None:
     return int(match[1]) if match and column.startswith(f"{stem}_" if stem else "") else None
 
 
-def parse_column_title(title: str, file: str) -> tuple[str, str]:
+def stated_unit(column: str, units: Mapping[str, str]) -> str:
+    """Return the unit that a caller states for a column, by its name or its sensor's; empty where none is stated."""
+    return units.get(column) or units.get(kind_of(column) or "") or ""
+
+
+def units_without(sensor: str, units: Mapping[str, str] | None) -> dict[str, str] | None:
+    """Return stated units without those of a sensor, which is in another file; None where nothing is left."""
+    return {name: unit for name, unit in (units or {}).items() if kind_of(name) != sensor} or None
+
+
+def parse_column_title(title: str, file: str, units: Mapping[str, str] | None = None) -> tuple[str, str]:
     """Return name and unit of ``name [unit]``; a name outside the vocabulary may have no unit.
+
+    `units` are stated by the caller, and stand for what titles do not say.
 
     Raises
     ------
@@ -70,15 +83,28 @@ def parse_column_title(title: str, file: str) -> tuple[str, str]:
     name = name.strip()
     check_name(name, title, file)
     if not bracket:
+        if stated := stated_unit(name, units or {}):
+            return name, stated
         if expected_quantities(name) is None:
             return name, "1"
-        raise UnitError(f"{file}: column {name} has no unit; expected a title such as '{name} [{example_unit(name)}]'")
+        example = example_unit(name)
+        raise UnitError(
+            f"{file}: column {name} has no unit; expected a title such as '{name} [{example}]', or "
+            f"--unit {kind_of(name) or name}={example}"
+        )
     if not rest.rstrip().endswith("]"):
         raise UnitError(f"{file}: column title {title.strip()!r}: expected 'name [unit]'")
     symbol = rest.rstrip()[:-1].strip()
     try:
-        return name, parse_unit(symbol, expected_quantities(name) or ()).symbol
+        unit = parse_unit(symbol, expected_quantities(name) or ())
+        stated = stated_unit(name, units or {})
+        if stated and unit.quantity not in (expected_quantities(name) or (unit.quantity,)):
+            return name, stated
+        check_unit(name, unit.symbol, file)
+        return name, unit.symbol
     except UnitError as error:
+        if str(error).startswith(file):
+            raise
         if expected_quantities(name) is None and symbol:
             return name, symbol  # not ours to convert: it passes through
         raise UnitError(f"{file}: column {name}: {error}") from None
@@ -132,6 +158,8 @@ def check_unit(name: str, unit: str, file: str) -> None:
         return
     quantity = parse_unit(unit, expected).quantity if unit else "nothing"
     if quantity not in expected:
+        gained = (quantity, expected[0]) in (("angle", "rate"), ("velocity", "acceleration"))
+        hint = f"; of increments per sample state their rate too, such as {unit}@100Hz" if gained else ""
         raise UnitError(
-            f"{file}: column {name}: expected a unit of {' or '.join(expected)}, found {unit!r} ({quantity})"
+            f"{file}: column {name}: expected a unit of {' or '.join(expected)}, found {unit!r} ({quantity}){hint}"
         )

@@ -26,7 +26,7 @@ from imulab.display import has_hidden, printable
 from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.options import PROGRAM, READING, file, parsed, text
-from imulab.quantities import span, whole_number
+from imulab.quantities import parse_units, span, whole_number
 from imulab.units import parse_unit, to_si
 from imulab.views import AnyPlot, AnyPlots, views
 
@@ -676,7 +676,7 @@ class Layout:
 
 
 class Part(TypedDict, total=False):
-    """How data are to be understood: arrays and data frames by `time` to `units`, files by `layout` to `instance`.
+    """How data are to be understood: arrays and data frames by `time` to `units`, files by `units` to `instance`.
 
     Attributes
     ----------
@@ -685,7 +685,7 @@ class Part(TypedDict, total=False):
     unit
         Unit of the sensors whose quantity it measures.
     units
-        Units by sensor or column.
+        Units by sensor or column, such as accel=g,gyro=deg/s; of a file, in place of those that it says.
     layout
         Columns of a foreign file; see imulab show --formats.
     topic
@@ -698,7 +698,7 @@ class Part(TypedDict, total=False):
 
     time: Annotated[ArrayLike | None, PROGRAM]
     unit: Annotated[str | None, PROGRAM]
-    units: Annotated[Mapping[str, str] | None, PROGRAM]
+    units: Annotated[Mapping[str, str] | None, parsed(parse_units, "NAME=UNIT", flags=("--unit",)), READING]
     layout: Annotated[str | os.PathLike[str] | Layout | None, file("NAME|L.toml"), READING]
     topic: Annotated[str | None, text("TOPIC"), READING]
     instance: Annotated[int | None, parsed(whole_number, "N"), READING]

@@ -21,6 +21,7 @@ from imulab.cli.options import (
     reading,
     whole_number,
 )
+from imulab.columns import units_without
 from imulab.options import FLAG, OUTPUT, READING
 
 if TYPE_CHECKING:
@@ -106,10 +107,13 @@ def gyro(
     inputs = [name for name in (file, accel, accel_file, how["layout"], accel_layout, noise) if name]
     check_outputs([output, report], inputs)
     record = load(accel)
-    recording = read_recording(file, **how)
-    accel_recording = recording
-    if accel_file is not None:
-        accel_recording = read_recording(accel_file, layout=accel_layout or how["layout"], element=how["element"])
+    units = how["units"]
+    if accel_file is None:
+        recording = accel_recording = read_recording(file, **how)
+    else:
+        recording = read_recording(file, **{**how, "units": units_without("accel", units)})
+        of_accel = {"element": how["element"], "units": units_without("gyro", units)}
+        accel_recording = read_recording(accel_file, layout=accel_layout or how["layout"], **of_accel)
     both = call(il.fit_gyro, record, recording, accel_data=accel_recording, **options)
     finish(
         both.calibration,

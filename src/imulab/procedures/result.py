@@ -140,8 +140,9 @@ Record: TypeAlias = Annotated[Calibration | Result | str | os.PathLike[str], fil
 
 
 _HINTS = types_of(Reading)
-_OF_ARRAYS = ("rate", "time", "unit", "units")
+_OF_ARRAYS = ("rate", "time", "unit")
 _OF_FILES = ("layout", "topic", "instance")
+_UNITS = ("units",)
 _PART = ("window", "element")
 _TITLED = "a file says itself, by its titles or a layout"
 _EXPECTED = "a file name, a Recording, a data frame of pandas or polars, or arrays"
@@ -182,10 +183,10 @@ def as_recording(
     part: dict[str, Any] = {key: stated.get(key) for key in _PART}
     if isinstance(data, str | os.PathLike):
         _refuse(stated, _OF_ARRAYS, called, _TITLED)
-        return read(os.fspath(data), **_pick(stated, _OF_FILES), **part)
+        return read(os.fspath(data), **_pick(stated, (*_OF_FILES, *_UNITS)), **part)
     _refuse(stated, _OF_FILES, called, "only files have that")
     if isinstance(data, Recording):
-        _refuse(stated, _OF_ARRAYS, called, "a recording has its own")
+        _refuse(stated, (*_OF_ARRAYS, *_UNITS), called, "a recording has its own")
         return _select_part(data, **part)
     arrays = _pick(stated, ("rate", "unit", "units"))
     if is_frame(data):
@@ -218,7 +219,7 @@ def as_blocks(
     if path.is_file():
         with path.open("rb") as stream:
             source = Source(str(data), hashlib.file_digest(stream, "sha256").hexdigest())
-    return read_blocks(path, **_pick(stated, _OF_FILES), **part), source
+    return read_blocks(path, **_pick(stated, (*_OF_FILES, *_UNITS)), **part), source
 
 
 def as_record(record: Record, called: str) -> Calibration:

@@ -6,7 +6,7 @@ import hashlib
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -42,6 +42,7 @@ def read(
     instance: int | None = None,
     window: Window | None = None,
     element: int | None = None,
+    units: Mapping[str, str] | None = None,
     name: str | None = None,
 ) -> Recording:
     """Read a recording as a whole.
@@ -60,6 +61,8 @@ def read(
         First and last time to read, s; None for no bound.
     element
         Which IMU of a file of several, from 1; its columns are called as those of a file of one.
+    units
+        Units of sensors or columns, ``{"accel": "g"}``, in place of those that the file says.
     name
         What messages and the source call the file; its path if not given.
 
@@ -73,7 +76,7 @@ def read(
     ReadError, UnitError
         The file cannot be read; the message names file, row and column.
     OptionError
-        The file has no such topic, instance, element or window.
+        The file has no such topic, instance, element, window, or column to state the unit of.
 
     Examples
     --------
@@ -83,7 +86,7 @@ def read(
     >>> recording.units["gyro_x"], recording.metadata["gravity"], recording.source.file
     ('deg/s', '9.81 m/s^2', 'tumble.csv')
     """
-    selection = Selection(topic, instance, window, element)
+    selection = Selection(topic, instance, window, element, units)
     name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
     blocks = _log_reading(selection.of(_blocks(file, name, known, selection, hashed), name))
@@ -121,6 +124,7 @@ def read_blocks(
     instance: int | None = None,
     window: Window | None = None,
     element: int | None = None,
+    units: Mapping[str, str] | None = None,
     name: str | None = None,
 ) -> Iterator[Recording]:
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
@@ -134,7 +138,7 @@ def read_blocks(
     >>> sum(len(block) for block in il.read_blocks("recording.csv")) == len(il.read("recording.csv"))
     True
     """
-    selection = Selection(topic, instance, window, element)
+    selection = Selection(topic, instance, window, element, units)
     name = name or _name(file)
     yield from _log_reading(selection.of(_blocks(file, name, _layout(layout), selection, None), name))
 
@@ -223,14 +227,16 @@ def _blocks(
         return
     selection.refuse(name, "a text file")
     try:
-        yield from _text_blocks(file, name, layout, hashed)
+        yield from _text_blocks(file, name, layout, selection, hashed)
     except (ReadError, UnitError) as error:
         raise _advise(error, file, layout) from None
 
 
-def _text_blocks(file: str | Path, name: str, layout: Layout | None, hashed: _Hash | None) -> Iterator[Recording]:
+def _text_blocks(
+    file: str | Path, name: str, layout: Layout | None, selection: Selection, hashed: _Hash | None
+) -> Iterator[Recording]:
     with _open(file, name) as stream:
-        text = TextFile(stream, name, layout, hashed=hashed is not None, whole=hashed is not None)
+        text = TextFile(stream, name, layout, selection.units, hashed=hashed is not None, whole=hashed is not None)
         if hashed is not None:
             hashed.text = text
         notes: list[str] | None = None
@@ -290,7 +296,8 @@ def _family(module: str, *, by_layout: bool) -> Callable[..., Iterator[Recording
         reader = import_module(f"imulab.readers.{module}")
         if by_layout:
             selection.refuse(name, "such a file")
-            yield from reader.blocks(path, name, layout)
+            stated = [selection.units] if module == "parquet" else []
+            yield from reader.blocks(path, name, layout, *stated)
         else:
             yield from reader.blocks(path, name, selection)
 

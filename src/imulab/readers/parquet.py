@@ -6,7 +6,7 @@ calls, and is imported in 0.55 s against 0.7 s; both take 170 MB.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,9 @@ _NOT_OURS = ("ARROW:", "org.apache.")
 _OTHERS_JSON = ("pandas", "huggingface", "geo")  # metadata of other writers, whose text begins with a brace
 
 
-def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
+def blocks(
+    path: Path, name: str, layout: Layout | None, stated: Mapping[str, str] | None = None
+) -> Iterator[Recording]:
     """Yield the rows of a Parquet file.
 
     Raises
@@ -38,7 +40,7 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
     try:
         with parquet.ParquetFile(path, memory_map=False, pre_buffer=False, buffer_size=1 << 20) as file:
             there = file.schema_arrow.names
-            columns, units = _columns(there, name, layout)
+            columns, units = _columns(there, name, layout, stated)
             stored = file.schema_arrow.metadata or {}
             readings = Readings(layout, name) if layout else None
             metadata = {**_metadata(stored), **((layout and layout.metadata) or {})}
@@ -61,13 +63,15 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
         raise ReadError(f"{name}: no rows of data")
 
 
-def _columns(there: list[str], name: str, layout: Layout | None) -> tuple[dict[str, str], dict[str, str]]:
+def _columns(
+    there: list[str], name: str, layout: Layout | None, stated: Mapping[str, str] | None
+) -> tuple[dict[str, str], dict[str, str]]:
     """Return for each column its title in the file, and its unit."""
     columns: dict[str, str] = {}
     units: dict[str, str] = {}
     if layout is None:
         for title in there:
-            key, unit = parse_column_title(title, name)
+            key, unit = parse_column_title(title, name, stated)
             if key in columns:
                 raise ReadError(f"{name}: column {key} appears twice")
             columns[key], units[key] = title, unit

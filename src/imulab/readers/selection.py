@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imulab.arguments import check_fields
-from imulab.columns import element_number
-from imulab.errors import OptionError
+from imulab.columns import check_unit, element_number, kind_of, stated_unit
+from imulab.display import Note
+from imulab.errors import OptionError, listed
 from imulab.quantities import span
 from imulab.recording import Ends, Recording, Window
+from imulab.units import parse_unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +31,15 @@ class Selection:
         First and last time to read, s, each None for no bound; a text such as ``10:60`` is read.
     element
         Number of the IMU whose columns to read, from 1, in a file of several.
+    units
+        Units of sensors or columns, in place of those that the file says.
     """
 
     topic: str | None = None
     instance: int | None = None
     window: Window | None = None
     element: int | None = None
+    units: Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -68,8 +73,12 @@ class Selection:
         return (others or None), (int(number) if number else None)
 
     def of(self, blocks: Iterator[Recording], name: str) -> Iterator[Recording]:
-        """Yield the rows of the element within the window; errors as for `keep_element` and `windowed`."""
-        return windowed(keep_element(blocks, self.element, name), self.ends, name)
+        """Yield the rows of the element within the window, in the stated units.
+
+        Errors are those of `with_units`, `keep_element` and `windowed`.
+        """
+        stated = with_units(blocks, self.units, name)
+        return windowed(keep_element(stated, self.element, name), self.ends, name)
 
     def refuse(self, name: str, kind: str, *, topic: bool = True, instance: bool = True) -> None:
         """Refuse choices that a kind of file cannot offer."""
@@ -77,6 +86,31 @@ class Selection:
             raise OptionError(f"{name}: {kind} has no topics to choose from; leave out the topic {self.topic!r}")
         if instance and self.instance is not None:
             raise OptionError(f"{name}: {kind} has no instances to choose from; leave out the instance {self.instance}")
+
+
+def with_units(blocks: Iterator[Recording], units: Mapping[str, str] | None, name: str) -> Iterator[Recording]:
+    """Yield blocks whose columns have the units that a caller states; where the file says others, a note says so.
+
+    Raises
+    ------
+    OptionError
+        A name is no column's and no sensor's.
+    UnitError
+        A unit is unknown, or of another quantity than the column.
+    """
+    for block in blocks:
+        if not units:
+            yield block
+            continue
+        stated = {column: parse_unit(unit).symbol for column in block.columns if (unit := stated_unit(column, units))}
+        for key in units:
+            if not any(key in (column, kind_of(column)) for column in block.columns):
+                raise OptionError(f"{name}: unit of {key}: no such column; columns: {listed(block.columns, key)}")
+        for column, unit in stated.items():
+            check_unit(column, unit, name)
+        before = {kind_of(c) or c: (block.units[c], unit) for c, unit in stated.items() if block.units[c] != unit}
+        notes = [Note(f"{key} is read in {new} as stated, not in {old}") for key, (old, new) in before.items()]
+        yield replace(block, units={**block.units, **stated}, notes=(*block.notes, *notes))
 
 
 def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Iterator[Recording]:

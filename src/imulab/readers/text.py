@@ -12,7 +12,7 @@ import re
 import stat
 from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -295,9 +295,16 @@ class TextFile:
     """One pass over a text file; the head is read when it is opened, rows come from `blocks`."""
 
     def __init__(
-        self, stream: BinaryIO, name: str, layout: Layout | None, *, hashed: bool = True, whole: bool = False
+        self,
+        stream: BinaryIO,
+        name: str,
+        layout: Layout | None,
+        units: Mapping[str, str] | None = None,
+        *,
+        hashed: bool = True,
+        whole: bool = False,
     ) -> None:
-        self._name = name
+        self._name, self._stated = name, units
         self._lines = Lines(stream, name, hashed=hashed, whole=whole)
         if layout is not None and layout.if_needed and is_native(self._lines.first().decode("utf-8", "replace")):
             layout = None
@@ -415,7 +422,7 @@ class TextFile:
             )
         titles, units = [], {}
         for title in line.split(","):
-            name, unit = parse_column_title(title, self._name)
+            name, unit = parse_column_title(title, self._name, self._stated)
             if not name:
                 at_end = " (a comma at the end of the line?)" if line.rstrip().endswith(",") else ""
                 raise ReadError(f"{self._name}: line {self._lines.before}: a column without a name{at_end}")

@@ -34,7 +34,7 @@ _LOUDEST_GYRO, _QUIET = 0.3, 0.035
 _EARTH, _PLAIN_OFFSET = (4.0, 100.0), 10.0
 """deg/h that three such gyroscopes show at rest: the Earth's 15 and their offsets. Zeroed ones, whose mean is within
 ten standard uncertainties of 0, are passed over."""
-_STATE_UNIT = "state the right unit in the column's title or in a layout, and fit again"
+_STATE_UNIT = "state the right unit by --unit, in the column's title or in a layout, and fit again"
 _NO_GRAVITY = 0.2  # relative: |f| at rest farther than this off g is no gravity, whatever the zeros of the sensor
 _NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit or range makes that the likely one
 _OTHERS = {**{unit: to_si(1.0, unit) for unit in ("m/s^2", "g", "mg")}, "ft/s^2": 0.3048}

@@ -652,7 +652,7 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
         notes.append(
             Finding(
                 f"about {rate:.3g} samples per second: {TIME_DOUBTED}",
-                "correct the unit of the column time",
+                "correct the unit of the column time, or state it: --unit time=UNIT",
             )
         )
     if lost > _MUCH_LOST:

@@ -90,7 +90,7 @@ def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
         raise DataError(
             f"{attitudes.recording.name}: columns accel_x accel_y accel_z: the specific force at rest is about "
             f"{from_si(force, unit.symbol):.4g} {unit.symbol}, expected {from_si(gravity, unit.symbol):.4g} "
-            f"{unit.symbol}: is the unit wrong?"
+            f"{unit.symbol}: is the unit wrong? --unit accel=UNIT states another"
         )
     magnitude = lengths / gravity
     far = (magnitude < 1 / _FARTHEST) | (magnitude > _FARTHEST)

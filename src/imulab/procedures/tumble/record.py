@@ -212,7 +212,7 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
         messages += [
             Finding(
                 f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?",
-                "correct the unit in the titles of accel_x accel_y accel_z",
+                "correct the unit in the titles of accel_x accel_y accel_z, or state it: --unit accel=UNIT",
             )
             for axis, value in off
             if SCALE_OFF_UNIT < abs(value - 1) <= SCALE_OF_ANOTHER_UNIT

@@ -518,7 +518,7 @@ def _warn_gravity(curves: Curves) -> list[str]:
         return []
     unit = curves.cycles[0].file_units[places[0]]
     reason = no_gravity(float(np.median(np.linalg.norm(curves.reference[:, places], axis=1))), unit)
-    action = "correct the unit in the titles of accel_x accel_y accel_z"
+    action = "correct the unit in the titles of accel_x accel_y accel_z, or state it: --unit accel=UNIT"
     return [Bad(f"accel_x .. accel_z: {reason}; is their unit, {unit}, right?", action)] if reason else []
 
 

@@ -7,7 +7,7 @@ import { address, ask, bytes, send } from "./bench/net.js";
 import { plots } from "./bench/plot.js";
 
 export const title = "Workbench";
-const READING = ["layout", "topic", "instance", "window", "element"];
+const READING = ["layout", "units", "topic", "instance", "window", "element"];
 const KINDS = { recording: "recording", record: "record", report: "report", manifest: "manifest or layout", folder: "folder", other: "file" };
 
 let page = null;

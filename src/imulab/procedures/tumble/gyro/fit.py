@@ -20,7 +20,7 @@ from typing import Annotated, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.columns import triad
+from imulab.columns import triad, units_without
 from imulab.device.unit import output_factor
 from imulab.display import UNJUDGED, Bad, Finding, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
@@ -687,11 +687,13 @@ def fit_gyro(
     True
     """
     known = as_record(accel, "fit_gyro: accel")
-    recording = as_recording(data, reading, fit_gyro, lambda samples: {"gyro": samples})
+    units, named = reading.get("units"), isinstance(accel_data, str | PathLike)
+    of_gyro = reading if not named else {**reading, "units": units_without("accel", units)}
+    recording = as_recording(data, of_gyro, fit_gyro, lambda samples: {"gyro": samples})
     accel_recording = recording
     if accel_data is not None:
-        named = isinstance(accel_data, str | PathLike)
         accel_reading: dict[str, Any] = {key: reading.get(key) for key in ("layout", "element") if named}
+        accel_reading |= {"units": units_without("gyro", units)} if named else {}
         accel_recording = as_recording(accel_data, accel_reading, fit_gyro, name="accel_data")
     gyro_fit = fit_gyro_triad(
         known, find_attitudes(accel_recording), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
