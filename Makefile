@@ -8,22 +8,27 @@ ALONE := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.alone)
 # For what runs as several programs: two at a time, if make was not told otherwise.
 BOTH = $(if $(findstring jobserver,$(MAKEFLAGS)),,-j 2)
 
-.PHONY: demo test test-all pytest pytest-all core fuzz dist wheel-names lint format bench compare footprint truth truth-all docs clean
+.PHONY: demo test test-all pytest pytest-reduced pytest-all core fuzz dist wheel-names lint format bench compare footprint truth truth-all docs clean
 
 demo: $(ALONE)
 	$(BIN)/imulab demo demo
 
-# Everything, with fewer trials and seeds (--reduced); the core by itself beside it.
+# What a person waits for: all but the long statistics (marked slow), with fewer trials and seeds (--reduced); the core
+# by itself beside it.
 test: $(STAMP)
 	$(MAKE) -j 2 core pytest
 
 # The tests start many processes: each would compile what it imports again where the environment forbids to keep it.
-pytest pytest-all: export PYTHONDONTWRITEBYTECODE =
+pytest pytest-reduced pytest-all: export PYTHONDONTWRITEBYTECODE =
 # The matrices of the tests are small: threads of the linear algebra would only wait for each other beside three workers.
-pytest pytest-all: export OPENBLAS_NUM_THREADS = 1
+pytest pytest-reduced pytest-all: export OPENBLAS_NUM_THREADS = 1
 
 # Three workers for two cores: a good part of the tests waits for a browser, a port or a killed process.
 pytest: $(STAMP)
+	$(BIN)/python -m pytest -n 3 --dist worksteal --reduced -m "not slow"
+
+# The long statistics too, in their reduced form.
+pytest-reduced: $(STAMP)
 	$(BIN)/python -m pytest -n 3 --dist worksteal --reduced
 
 # Every seed and thousands of trials.

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import hypothesis
 import numpy as np
 import pytest
 
@@ -33,6 +34,13 @@ for flags in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL"):
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--reduced", action="store_true", help="fewer trials in the statistical tests, fewer seeds in all")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Draw fewer examples in the reduced run, where a test does not say how many; they are others in each run."""
+    hypothesis.settings.register_profile("reduced", max_examples=25)
+    if config.getoption("--reduced"):
+        hypothesis.settings.load_profile("reduced")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

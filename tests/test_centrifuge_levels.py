@@ -287,6 +287,7 @@ G_HONEST = 9.80665
 FORCE = np.array([1.0, 2.0, 5.0, 10.0, 15.0, 20.0]) * G_HONEST
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bend", [0.0, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("model", ["c1", "c2"])
 def test_intervals_of_a_chosen_curve_hold_the_truth_whichever_model_is_right(

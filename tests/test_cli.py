@@ -183,6 +183,7 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly(tmp_path):
     assert process.returncode == 141
 
 
+@pytest.mark.slow
 def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
     done = imulab("demo", "here")
     assert done.returncode == 0, done.stderr

@@ -24,9 +24,7 @@ USUAL_LEVELS = (0.05, 0.01, 0.005, 0.003, 0.001)
 
 @cache
 def modules():
-    for path in SOURCE.rglob("*.py"):
-        if path != Path(decisions.__file__):
-            yield path, ast.parse(path.read_text())
+    return [(path, ast.parse(path.read_text())) for path in SOURCE.rglob("*.py") if path != Path(decisions.__file__)]
 
 
 def test_each_decision_is_made_somewhere():

@@ -351,6 +351,7 @@ def test_nothing_is_added_where_nothing_is_left_to_tell():
     assert effective[0] == np.inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1.0, 1.5, 2.0, 4.0])
 @pytest.mark.parametrize(("count", "size"), [(24, 9), (24, 15), (48, 12)])
 def test_intervals_with_the_plausible_excess_cover(ratio, count, size):
@@ -455,6 +456,7 @@ def test_shares_are_moments_of_the_stated_density(added: int, gain: float, freed
     assert spread[0] == pytest.approx(second / mass - (first / mass) ** 2, rel=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("estimated", [False, True])
 def test_intervals_hold_the_truth_whichever_of_two_nested_models_is_right(size: float, estimated: bool) -> None:

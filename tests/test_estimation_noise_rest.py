@@ -155,6 +155,7 @@ def test_the_rows_are_not_kept(monkeypatch):
     assert len(seen) == 2 * 40
 
 
+@pytest.mark.slow
 def test_functions_and_check_read_a_large_file_in_blocks(tmp_path, monkeypatch, capsys):
     file, later = tmp_path / "log.csv", tmp_path / "later.csv"
     il.write_csv(Recording(log(), UNITS), file)
@@ -193,6 +194,7 @@ def mended(kind):
     return columns
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plain", "no numbers", "zeros", "held"])
 def test_the_curve_of_a_large_file_is_that_of_a_small_one_to_the_last_bit(tmp_path, monkeypatch, capsys, kind):
     file, report = tmp_path / "log.csv", tmp_path / "page.html"

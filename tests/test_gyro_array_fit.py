@@ -273,6 +273,7 @@ def test_a_record_of_another_array_is_refused():
         fuse(simulate_array(duration=2.0), FuseOptions(calibration=tumble.calibration))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [1, 3])
 @pytest.mark.parametrize("bend", [0.0, 1e-3, -6e-3])
 def test_an_element_that_is_not_linear_is_named_and_its_scale_factor_covered(axes, bend):

@@ -36,7 +36,7 @@ def source_modules() -> dict[str, ast.Module]:
 
 
 def _imported(node: ast.AST) -> set[str]:
-    """What a module imports anywhere: in functions, for type checkers and by a name in a string; C modules left out."""
+    """What one node imports, a name in a string too; C modules left out."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("imulab."):
         return {node.value.partition(":")[0]} & source_modules().keys()
     if isinstance(node, ast.Import):
@@ -46,13 +46,20 @@ def _imported(node: ast.AST) -> set[str]:
         paths = {f"{node.module}.{each.name}" for each in node.names}
         modules = paths & source_modules().keys()
         return modules | ({node.module or ""} & source_modules().keys() if len(modules) < len(paths) else set())
-    return set().union(*map(_imported, ast.iter_child_nodes(node)))
+    return set()
 
 
 @cache
 def arrows() -> dict[str, set[str]]:
-    """The face of the package hands names on, and is in nobody's way."""
-    return {name: _imported(tree) - {name} for name, tree in source_modules().items() if name != "imulab"}
+    """What each module imports anywhere, in functions and for type checkers too.
+
+    The face of the package hands names on, and is in nobody's way.
+    """
+    return {
+        name: set().union(*map(_imported, ast.walk(tree))) - {name}
+        for name, tree in source_modules().items()
+        if name != "imulab"
+    }
 
 
 def _room(name: str) -> str:

@@ -106,6 +106,7 @@ def test_the_guide_saves_a_quarter_of_the_attitudes(reduced):
     hold_to_the_promise(3 if reduced else 20)
 
 
+@pytest.mark.slow
 def test_a_session_takes_no_more_attitudes_than_predicted_where_the_noise_is_known(noise_as_stated, reduced):
     """A plan's prediction takes the noise as known; a session that estimates it needs some 2 in 20 more."""
     guided = np.array([attitudes_needed(seed, guided=True) for seed in range(1, 4 if reduced else 6)])

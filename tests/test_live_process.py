@@ -160,6 +160,7 @@ def test_unplugged_in_the_middle(tmp_path):
     assert len(il.find_attitudes(il.read(tmp_path / "rec.csv"))) >= 3
 
 
+@pytest.mark.slow
 def test_the_gyroscopes_follow_the_accelerometers(tmp_path):
     recording = tumble(20, gyro=True)
     with device(lines_of(recording), 100 * SPEED) as unit:
@@ -173,6 +174,7 @@ def test_the_gyroscopes_follow_the_accelerometers(tmp_path):
     assert "gyro_scale_factor_x" in content(tmp_path / "live.json")["parameters"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [False, True])
 def test_the_magnetometers_follow_too_or_are_left_out_with_the_reason(tmp_path, dead):
     recording = tumble(20, gyro=True, field="48 uT")

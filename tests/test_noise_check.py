@@ -72,6 +72,7 @@ def drawn(rng, count, logs, size):
     return [replace(spectrum, power=variance * rng.chisquare(used) / used) for _ in range(logs)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "logs"), [(10_000_000, 1), (1_000_000, 10)])
 @pytest.mark.parametrize(("change", "passes"), [(0.006, True), (0.009, True), (-0.009, True), (0.012, False)])
 def test_long_and_many_logs_keep_to_the_tolerance(count, logs, change, passes):

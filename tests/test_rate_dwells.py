@@ -148,6 +148,7 @@ def wandering(count, step, white, flicker, rng):
     return np.fft.irfft(spectrum, 2 * count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flicker", [0.0, 0.01])
 @pytest.mark.parametrize("kind", ["sine", "chirp"])
 def test_the_bias_of_a_sweep_errs_by_what_is_stated_whatever_wanders(kind, flicker, reduced):
@@ -275,6 +276,7 @@ def test_what_one_rate_cannot_tell_does_not_spoil_the_scale_factor(parts, single
     assert (fit.dwells[0].sweep.frequency is not None) == single
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colour", [0.0, 0.9])
 @pytest.mark.parametrize(("frequency", "periods"), [(0.1, 4.3), (1.0, 10)])
 def test_sines_of_few_periods_state_the_error_of_their_scale_factor(frequency, periods, colour, reduced):

@@ -115,6 +115,7 @@ def tried(do, *arguments, **options):
         return None, str(error)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("procedure", ["tumble", "gyro_array", "warmup", "centrifuge"])
 def test_a_mutated_record_works_or_is_refused_in_words(procedure, real, tmp_path, reduced):
@@ -151,6 +152,7 @@ def closed(body):
     return body + struct.pack("<I", zlib.crc32(body))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("procedure", ["tumble", "gyro_array", "warmup", "centrifuge"])
 def test_a_mutated_blob_works_or_is_refused_in_words(procedure, real, tmp_path, reduced):

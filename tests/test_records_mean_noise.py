@@ -40,6 +40,7 @@ def ratios(kind, count, duration, trials, seed=1):
     return np.array([each.mean_uncertainty(duration) for each in found]) / true_uncertainty(kind, duration)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", TRUTHS)
 def test_a_log_ten_times_as_long_tells_the_uncertainty_of_a_mean(kind):
     """Of a true normal error 2u cover so much, u being what each log says."""

@@ -175,6 +175,7 @@ def recording(lag, seed=1, rate=50.0):
     return Recording(columns=columns, units=units, metadata={"gravity": f"{G} m/s^2"}, name="cycle.csv"), triad
 
 
+@pytest.mark.slow
 def test_a_recording_shows_its_lag_and_is_corrected_without_it(tmp_path):
     given, triad = recording(20.0)
     record = il.fit_thermal(given, degrees="3,2,1", turn_on_scatter="0 mg").calibration
@@ -246,6 +247,7 @@ def test_what_one_ramp_does_not_tell_costs_as_much_as_is_said(reduced):
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.sqrt(np.mean(np.square(said))), rel=0.25)
 
 
+@pytest.mark.slow
 def test_ramps_name_what_they_do_not_tell_and_their_verdict_is_not_good():
     recordings = {each.name: each for each in il.simulate_thermal(ramps=4, turn_on=0.0)}
     named = {}

@@ -118,6 +118,7 @@ def test_auto_takes_the_spline_at_a_kink_and_polynomials_of_a_cubic_law(kinked):
     assert "knots" not in smooth.model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("law", "seed", "knots"), [("cubic", 4, False), ("rough", 1, True)])
 def test_ramps_that_tell_the_law_take_the_spline_only_of_one_that_bends(law, seed, knots):
     """Knots stand 5 K apart, so leaving one out costs a spline little: of a cubic law it is insignificant."""

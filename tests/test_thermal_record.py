@@ -55,6 +55,7 @@ def test_one_unit_is_not_asked_about(seed):
     assert not asked(soaks(seed))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [0, 1, 2, 4])
 @pytest.mark.parametrize("seed", some_of(2, range(3)))
 def test_one_tumble_of_another_unit_without_a_serial_number_is_found_and_named(seed, at):
@@ -242,6 +243,7 @@ def test_the_deviation_of_the_corrected_force_is_that_of_drawn_laws(tmp_path):
     assert "Standard deviation of the corrected force over temperature" in report_of(record, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_misalignment_that_attitudes_at_one_temperature_do_not_show_is_named():
     made = {ramps: il.simulate_thermal(ramps=ramps, turn_on="0", seed=2) for ramps in (3, 4)}
     given = {ramps: [each for each in m if "ramp" in each.name or "25" in each.name] for ramps, m in made.items()}

@@ -75,6 +75,7 @@ def alarms(change, count, trials, stated=True, record_stated=True):
     return float(np.mean(found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "stated", "record_stated"), [(4, True, True), (12, True, True), (12, False, False), (24, True, True)]
 )
@@ -84,6 +85,7 @@ def test_a_record_that_holds_fails_once_in_twenty(count, stated, record_stated):
     assert low <= share <= high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "least"), [(4, 0.70), (12, 0.97)])
 def test_a_tenth_of_a_milligram_is_found(count, least):
     """All three biases moved by 100 µg, the noise 60 µg in an attitude; the figures are the method's."""
@@ -152,6 +154,7 @@ def test_a_check_needs_the_unit_of_the_record(truth):
         check_tumble(record, counts, limit=1.0)
 
 
+@pytest.mark.slow
 def test_no_change_is_claimed_where_nothing_changed(noise_as_stated, truth, reduced):
     """One false claim in twenty comparisons, and the joint probability uniform."""
     trials = 70 if reduced else 200

@@ -503,6 +503,7 @@ def propagated(data, order, trials, **options):
     return il.fit_tumble(attitudes, order=order, gravity=G, monte_carlo=trials, **options).calibration
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2, 4])
 def test_trials_scatter_as_the_bound_says_where_noise_is_known(order, noise_as_stated):
     sigma = 1e-4

@@ -76,6 +76,7 @@ def test_sap5_predicts_what_it_has_not_seen_no_worse_than_order_one(real_data, r
     assert np.median(auto) <= 1.096  # mg, before the choice had a margin and a bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "names"),
     [
@@ -375,6 +376,7 @@ def warned(rng, count, *, sigma, order=1, cross=(0.0, 0.0, 0.0), power=(0, 0.0),
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "stated"), [(24, True), (24, False), (48, True)])
 def test_where_nothing_is_wrong_they_are_silent(count, stated, reduced):
     trials = 100 if reduced else 300

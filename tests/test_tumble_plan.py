@@ -37,6 +37,7 @@ def worst(plan, stem):
     return max(value for name, value in plan.uncertainties(1.0).items() if name.startswith(stem))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "order", "table"),
     [
@@ -78,6 +79,7 @@ def test_a_plan_is_better_in_its_criterion_than_random_attitudes_and_than_the_ot
     assert worst(plans["D"], "scale") < 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_the_prediction_is_the_cramer_rao_bound_of_a_nominal_sensor(order):
     plan = plan_attitudes(order=order, attitudes=3 * (order + 2) + 4)

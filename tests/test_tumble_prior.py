@@ -180,6 +180,7 @@ def test_what_aged_is_weighed_by_how_probable_it_makes_the_attitudes(few):
         assert updated.value(name) == pytest.approx(values[name] + mean[i] * scale[i], abs=0.02 * sigma), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", ["nothing", "bias", "scale_factor"])
 def test_intervals_cover_what_aged(moved, reduced):
     """12 attitudes by hand, noise 60 µg, a record of 20 µg; without ageing a changed group is hardly covered."""

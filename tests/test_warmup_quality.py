@@ -216,6 +216,7 @@ def test_a_cycle_that_moves_throughout_is_known_by_the_others():
         il.fit_warmup(cycles, temperatures=[0, 20], settling_time=END)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["interval-cubic", "knot-cubic", "knot-log-cubic", "exponential"])
 def test_noise_alone_leaves_nothing_at_the_tests(model):
     """A fit follows some of the noise of its own cycles: what is taken off is that much smaller."""

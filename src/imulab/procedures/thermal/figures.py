@@ -469,7 +469,7 @@ def _degrees_table(thermal: ThermalRecord) -> ReportTable:
 
     def chance(row: DegreesTried) -> str:
         p = row.probability
-        return "–" if p is None else "< 0.001" if p < 0.001 else f"{p:.3f}"
+        return "–" if p is None else f"{p:.3f}" if round(p, 3) else "< 0.001"
 
     columns: dict[str, Callable[[DegreesTried], str]] = {
         "degrees": name,
