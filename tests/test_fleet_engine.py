@@ -84,6 +84,7 @@ def test_a_killed_run_is_finished_by_the_next(fleet, reference, tmp_path):
     wait_for(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 10)
 
 
+@pytest.mark.slow
 def test_a_killed_worker_costs_nothing_but_time(fleet, reference, tmp_path):
     folder = tmp_path / "out"
     process = command("fleet", "run", fleet, "-o", folder, "--workers", 2)
@@ -220,6 +221,7 @@ def on(cluster, fleet, folder):
     return command("fleet", "run", fleet, "-o", folder, "--engine", "dask", "--scheduler", cluster.address)
 
 
+@pytest.mark.slow
 def test_a_cluster_makes_the_same_records_whatever_dies(cluster, fleet, reference, tmp_path):
     """One run: its driver is killed. The next: a worker is killed. The rest comes from the worker that is left."""
     folder = tmp_path / "out"
@@ -258,6 +260,7 @@ def test_workers_that_do_not_see_the_folder_send_their_records_back(fleet, refer
     assert not records(tmp_path / "other")
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_is_said_in_one_line(cluster, tmp_path):
     fleet, folder = make_fleet(tmp_path / "in", 30, monte_carlo=10000), tmp_path / "out"
     cluster.add_worker()
@@ -270,6 +273,7 @@ def test_a_lost_scheduler_is_said_in_one_line(cluster, tmp_path):
     assert f"imulab: --scheduler {cluster.address}: the connection is lost" in error
 
 
+@pytest.mark.slow
 def test_a_scheduler_without_workers_is_said(cluster, fleet, tmp_path):
     begin = time.monotonic()
     process = on(cluster, fleet, tmp_path / "out")
@@ -296,6 +300,7 @@ def test_an_unreachable_scheduler_is_reported_with_its_address(fleet, tmp_path, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_cluster_of_its_own(fleet, reference, tmp_path):
     pytest.importorskip("distributed")
     process = command("fleet", "run", fleet, "-o", tmp_path / "out", "--engine", "dask", "--workers", 2)

@@ -6,6 +6,7 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.estimation.noise.simulate import simulated
+from imulab.procedures import registry
 from imulab.procedures.noise.wants import STEPS, noise_for
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
@@ -93,8 +94,22 @@ def test_the_variance_of_a_ros_sample_and_matlab_sizes(record):
     assert matlab["insfilterMARG.GyroscopeBiasNoise"] == pytest.approx(walk**2 / RATE)
 
 
+@pytest.fixture(scope="module")
+def fitted_once():
+    """What the command fits with: it fits the log for the first program alone, and all others have the same record."""
+    run_task, made = registry.run_task, []
+
+    def run(*arguments):
+        if not made:
+            made.append(run_task(*arguments))
+        return made[0]
+
+    return run
+
+
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_the_command_prints_key_and_value_a_line(home, record, capsys, program):
+def test_the_command_prints_key_and_value_a_line(home, record, capsys, monkeypatch, fitted_once, program):
+    monkeypatch.setattr(registry, "run_task", fitted_once)
     assert main(["noise", "fit", str(home / "rest.csv"), "--for", program]) == 0
     lines = capsys.readouterr().out.splitlines()
     printed = {key: float(value) for key, value in (line.split(": ") for line in lines)}
