@@ -84,6 +84,8 @@ _SWEEP_BATCHES, _SWEEP_BLOCK = 32, 1 << 15
 _POWERS = np.vander(np.arange(-4.0, 5.0), increasing=True).T
 KERNELS = np.linalg.solve(_POWERS, np.diag([1.0, 1.0, 2.0, 6.0, 24.0, 0.0, 0.0, 0.0, 0.0]))[:, 1:5].T
 """Four derivatives of polynomials of degree 8, over the spacing to the power of their order, shape (4, 9)."""
+INTERPOLATION = np.array([-1.0, 8.0, -28.0, 56.0, 0.0, 56.0, -28.0, 8.0, -1.0]) / 70
+"""Value in the middle of polynomials of degree 7, by their eight neighbours, shape (9,)."""
 
 
 @dataclass(frozen=True)
@@ -159,10 +161,15 @@ class Moments:
         return float(self.whole[column, column] - self.whole[column, others] @ self._solve(others, column))
 
     def covariance(self, columns: Sequence[int], fitted: Sequence[int], output: int, coefficients: Array) -> Array:
-        """Return the covariance of coefficients of columns, by the residual of `coefficients` of columns `fitted`.
+        """Return the covariance of coefficients of columns, by the residual of `coefficients` of columns `fitted`."""
+        scores = self.scores(columns, fitted, output, coefficients)
+        return np.asarray(scores.T @ scores)
 
-        By the scores of the batches, so that the residual may be correlated within them; each score is enlarged by
-        what the fit took from its batch. Source: Bell and McCaffrey, Survey Methodology 28 (2002) 169.
+    def scores(self, columns: Sequence[int], fitted: Sequence[int], output: int, coefficients: Array) -> Array:
+        """Return what each batch adds to the errors of coefficients, shape (batches, columns).
+
+        The residual may be correlated within a batch; each score is enlarged by what the fit took from its batch.
+        Source: Bell and McCaffrey, Survey Methodology 28 (2002) 169.
         """
         both = self.batches[:, columns]
         size, normal = self._normal(columns)
@@ -171,8 +178,14 @@ class Moments:
         half = turn * np.sqrt(np.maximum(spread, 0.0)) @ turn.T
         share, turn = np.linalg.eigh(half @ (both[:, :, columns] / np.outer(size, size)) @ half)
         kept = np.einsum("bji,bj->bi", turn, scores @ half) / np.sqrt(np.maximum(1 - share, 1 / _SWEEP_BATCHES))
-        scores = np.einsum("bij,bj->bi", turn, kept) @ half / size
-        return np.asarray(scores.T @ scores)
+        return np.asarray(np.einsum("bij,bj->bi", turn, kept) @ half / size)
+
+    def freedom(self, columns: Sequence[int]) -> float:
+        """Return the degrees of freedom of the variance of the first coefficient (Satterthwaite)."""
+        size, normal = self._normal(columns)
+        line = normal[0] / size
+        shares = np.einsum("i,bij,j->b", line, self.batches[np.ix_(range(len(self.batches)), columns, columns)], line)
+        return float(shares.sum() ** 2 / (shares @ shares))
 
     def _normal(self, columns: Sequence[int]) -> tuple[Array, Array]:
         """Return the root sum of squares of each column, and the inverse of the normal matrix over these sizes."""
@@ -227,10 +240,15 @@ def rising(rate: Array) -> NDArray[np.bool_]:
     return rises
 
 
-def weigh_derivatives(samples: Samples, weights: Array) -> Array:
-    """Return the rate and its four derivatives, each times its weight (5,), at each of n samples, shape (n,)."""
+def weigh_derivatives(samples: Samples, weights: Array, own: Array | None = None) -> Array:
+    """Return the rate and its four derivatives, each times its weight (5,), at each of n samples, shape (n,).
+
+    The rate at the sample itself is that which was recorded, or which the neighbours tell by weights `own`, shape (9,).
+    """
     taps = (weights[1:] * samples.spacing ** -np.arange(1.0, 5.0)) @ KERNELS
     taps[4] += weights[0]
+    if own is not None:
+        taps += taps[4] * (own - np.eye(9)[4])
     rate = np.empty(len(samples.time))
     for _, part in blocks(len(rate)):
         rate[part] = taps @ samples.neighbours(part)
@@ -248,9 +266,11 @@ _BESIDE_NOISE = 8  # samples on both sides over which noise is averaged
 _SMOOTH = 0.02  # of the largest step of the rate: it changes all the time if more steps than half exceed this
 _LONGEST = 1 << 17  # samples that are analysed; more are thinned
 _SHOWN = 3.0  # standard uncertainties that ``2 c - tau^2`` must exceed for a bandwidth to be stated
-_CLEAN, _EXTRAPOLATED, _MUCH = 1e-6, 2.0, 5e-4
-"""Share of the rate's power below which its noise does not matter; uncertainty over what noise takes away, and how much
-of that is said."""
+_CLEAN, _OVER_NOISE = 1e-6, 10.0
+"""Share of the rate's power below which its noise does not matter; power over that of the noise from which a frequency
+belongs to the motion."""
+_QUIETEST, _APART = 0.1, 1.5
+"""Share of frequencies that show the noise of the rate alone; factor beyond which differences show motion instead."""
 _OWN, _CLEAR = 1e-3, 100
 """A derivative counts if rate and lower derivatives leave this share of its power, so many times that of its noise."""
 _TOLD = 0.05
@@ -283,10 +303,8 @@ class Sweep:
         Largest rate of the table, rad/s; the means by rate lie within it.
     rising
         Number of means at rising rates; they come first.
-    attenuation
-        What noise of the recorded rate takes off the scale factor, a fraction, and that noise, rad/s; 0 without.
-    attenuation_shown
-        Whether that is so much that the uncertainty may not hold it.
+    freedom
+        Degrees of freedom of the scale factor's uncertainty.
     """
 
     delay: tuple[float, float]
@@ -298,8 +316,7 @@ class Sweep:
     zero_error: Array
     largest: float
     rising: int
-    attenuation: tuple[float, float] = (0.0, 0.0)
-    attenuation_shown: bool = False
+    freedom: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -352,9 +369,6 @@ def rate_of_angle(angle: Array, time: Array) -> Array:
 def reduce_sweep(time: Array, rate: Array, outputs: list[Array], main: int) -> tuple[Sweep, Binned]:
     """Return delay and bandwidth of gyroscope number `main`, and the means of all outputs by rate.
 
-    Noise of the recorded rate takes from the slope. By how much shows where as much noise is added once more
-    (simulation and extrapolation: Cook and Stefanski, J. Am. Stat. Assoc. 89 (1994) 1314); it is in the uncertainty.
-
     Parameters
     ----------
     time, rate
@@ -362,34 +376,14 @@ def reduce_sweep(time: Array, rate: Array, outputs: list[Array], main: int) -> t
     outputs
         Output of each gyroscope, shape (n,).
     """
-    sweep, binned = _reduce_as_recorded(time, rate, outputs, main)
     step = float(np.median(np.diff(time[:10_001])))
-    noise = float(np.sqrt(_noise_of_rate(time, rate, step)))
-    if noise**2 < _CLEAN * float(np.var(rate)):
-        return sweep, binned
-    added = noise * np.random.default_rng(0).standard_normal(len(rate))
-    varied = rate - rate.mean()
-    noisier = rate + added - (added @ varied) / (varied @ varied) * varied  # so that chance does not tilt the line
-    slopes = [_slope(pair[1], main) for pair in ((sweep, binned), _reduce_as_recorded(time, noisier, outputs, main))]
-    lost = abs(slopes[1] / slopes[0] - 1)
-    sweep = replace(sweep, scale_error=float(np.hypot(sweep.scale_error, _EXTRAPOLATED * lost)))
-    return replace(sweep, attenuation=(lost, noise), attenuation_shown=lost > _MUCH), binned
-
-
-def _slope(binned: Binned, main: int) -> float:
-    """Return the slope of a gyroscope's means over the rate, weighted by time."""
-    return float(np.polyfit(binned.rate, binned.mean[:, main], 1, w=np.sqrt(binned.duration))[0])
-
-
-def _reduce_as_recorded(time: Array, rate: Array, outputs: list[Array], main: int) -> tuple[Sweep, Binned]:
-    """Return what `reduce_sweep` does, with the rate taken as it was recorded."""
-    step = float(np.median(np.diff(time[:10_001])))
-    top, frequency = _find_band(rate, step)
+    noise_of_rate = _noise_of_rate(time, rate)
+    top, frequency = _find_band(rate, step, noise_of_rate)
     many = _PER_PERIOD if frequency is None else 2 * _PER_PERIOD
     side = max(1, round(1 / (many * top * step)))
     samples = take_with_neighbours(time, rate, outputs, side, step)
     sums = sweep_moments(samples)
-    noise = _derivative_noise(time, rate, step, side * step)
+    noise = _derivative_noise(noise_of_rate, side * step)
     count = _count_derivatives(sums, noise)
     if frequency is None and count < 2:  # a part of one period, whose spectrum has no peak
         frequency = float(np.sqrt(sums.variance(DERIVATIVES[0]) / sums.variance(RATE)) / (2 * np.pi))
@@ -404,7 +398,8 @@ def _reduce_as_recorded(time: Array, rate: Array, outputs: list[Array], main: in
     rises = rising(felt)
     curve = _fit_curve(samples.time, felt, rises, samples.outputs)
     sweep = replace(sweep, scale_error=float(np.hypot(sweep.scale_error, curve.drift_error(main))))
-    binned = _average_by_rate(samples.time, felt, rises, curve, step)
+    by = weigh_derivatives(samples, weights, INTERPOLATION) if noise_of_rate > _CLEAN * float(np.var(rate)) else None
+    binned = _average_by_rate(samples.time, felt, rises, curve, step, by)
     if sweep.frequency is not None:
         factor = max(1, min(side, len(felt) // _LONGEST))
         binned = replace(binned, variance=binned.variance * _colour_factors(samples.time, felt, curve, binned, factor))
@@ -468,14 +463,24 @@ def _branch_columns(rate: Array, rises: NDArray[np.bool_]) -> list[Array]:
     return [rate, square, square * rate, turn, turn * square]
 
 
-def _find_band(rate: Array, step: float) -> tuple[float, float | None]:
-    """Return the frequency below which the rate's power lies, Hz, and that of the rate if it is a single sine."""
+def _power_of_rate(rate: Array) -> tuple[Array, float, int]:
+    """Return the power of a rate over frequency, that of white noise of variance 1, and samples averaged beforehand."""
     factor = max(1, len(rate) // _LONGEST)
     values = rate[: len(rate) // factor * factor].reshape(-1, factor).mean(axis=1) if factor > 1 else rate
-    values = values - values.mean()
-    power = np.abs(np.fft.rfft(values * np.hanning(len(values)))) ** 2
-    frequency = np.fft.rfftfreq(len(values), step * factor)
+    window = np.hanning(len(values))
+    power = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2
     power[0] = 0.0
+    return power, float(window @ window) / factor, factor
+
+
+def _find_band(rate: Array, step: float, noise: float) -> tuple[float, float | None]:
+    """Return the frequency below which the rate's power lies, Hz, and that of the rate if it is a single sine.
+
+    `noise` is the variance of the recorded rate's noise, above which the power of the motion stands.
+    """
+    power, white, factor = _power_of_rate(rate)
+    power[power < _OVER_NOISE * noise * white] = 0.0
+    frequency = np.fft.rfftfreq(len(rate) // factor, step * factor)
     share = np.cumsum(power) / power.sum()
     top = float(frequency[min(int(np.searchsorted(share, _POWER)) + 1, len(frequency) - 1)])
     peak = int(np.argmax(power))
@@ -484,19 +489,24 @@ def _find_band(rate: Array, step: float) -> tuple[float, float | None]:
     return top, float(power[beside] @ frequency[beside] / power[beside].sum()) if single_line else None
 
 
-def _derivative_noise(time: Array, rate: Array, step: float, spacing: float) -> list[float]:
-    """Return the variances of four derivatives by the noise of the recorded rate, from its eighth differences.
-
-    Differences across a gap are left out. White noise of variance s^2 has eighth differences of variance 12870 s^2.
-    """
-    of_rate = _noise_of_rate(time, rate, step)
+def _derivative_noise(of_rate: float, spacing: float) -> list[float]:
+    """Return the variances of four derivatives by the variance of the recorded rate's noise."""
     return [of_rate * float(kernel @ kernel) / spacing ** (2 * k) for k, kernel in enumerate(KERNELS, 1)]
 
 
-def _noise_of_rate(time: Array, rate: Array, step: float) -> float:
-    """Return the variance of white noise of the recorded rate, by its eighth differences."""
+def _noise_of_rate(time: Array, rate: Array) -> float:
+    """Return the variance of white noise of the recorded rate, by its eighth differences.
+
+    White noise of variance s^2 has eighth differences of variance 12870 s^2; those across a gap are left out. A motion
+    near half the sampling rate has such differences too: the quietest tenth of the spectrum is a limit, where white
+    noise has at most 0.105 of its mean power.
+    """
+    step = float(np.median(np.diff(time[:10_001])))
     whole = time[8:_LONGEST] - time[: _LONGEST - 8][: len(time) - 8] < WHOLE * step
-    return float(np.mean(np.diff(rate[:_LONGEST], n=8)[whole] ** 2)) / 12870 if whole.any() else 0.0
+    of_differences = float(np.mean(np.diff(rate[:_LONGEST], n=8)[whole] ** 2)) / 12870 if whole.any() else 0.0
+    power, white, _ = _power_of_rate(rate[:_LONGEST])
+    quietest = float(np.quantile(power[1:], _QUIETEST)) / -np.log1p(-_QUIETEST) / white
+    return float(min(of_differences, _APART * quietest))
 
 
 def _count_derivatives(moments: Moments, noise: list[float]) -> int:
@@ -536,20 +546,22 @@ def _fit_lag(
     still = [RATE, *loop, ONE, TIME, SQUARE, *([] if frequency is not None else [CUBE])]
     columns = [RATE, *derivatives, *still[1:]]
     coefficients = moments.fit(columns, main)
-    spread = moments.covariance(columns, columns, main, coefficients)
+    scores = moments.scores(columns, columns, main, coefficients)
+    spread = scores.T @ scores
     scale, weights = float(coefficients[0]), np.zeros(5)
-    known = moments.covariance(still, columns, main, coefficients)
-    more = float(np.sqrt(max(float(spread[0, 0] - known[0, 0]), 0.0))) / abs(scale)
+    without = moments.scores(still, columns, main, coefficients)
+    more = float(np.linalg.norm(scores[:, 0] - without[:, 0])) / abs(scale)
     of_loop = None
     if loop:
         at = columns.index(TURN)
-        of_loop = 2 * float(np.sqrt(max(float(spread[at, at] - known[1, 1]), 0.0))) / abs(scale) / largest
+        of_loop = 2 * float(np.linalg.norm(scores[:, at] - without[:, 1])) / abs(scale) / largest
     if frequency is not None:
         omega = 2 * np.pi * frequency
         phase = float(np.arctan2(-coefficients[1] * omega * np.sign(scale), abs(scale)))
         u = float(np.sqrt(spread[1, 1])) / abs(scale)
         weights[:2] = np.cos(phase), -np.sin(phase) / omega
-        return Sweep((phase / omega, u), None, None, frequency, more, None, np.zeros(0), largest, 0), weights
+        freedom = 4.0 * _BESIDE_NOISE  # two of each frequency by which the noise is known
+        return Sweep((phase / omega, u), None, None, frequency, more, None, np.zeros(0), largest, 0, freedom), weights
     tau, c = -coefficients[1] / scale, coefficients[2] / scale
     lines = np.zeros((2, len(coefficients)))
     lines[0, :2] = -tau / scale, -1 / scale
@@ -564,7 +576,8 @@ def _fit_lag(
         beyond = float(1 / (2 * np.pi * np.sqrt(max(square, 0.0) + 2 * u_square + 1e-300)))
     weights[: len(derivatives) + 1] = [1.0, *(coefficients[1 : len(derivatives) + 1] / scale)]
     delay = float(tau), float(np.sqrt(both[0, 0]))
-    return Sweep(delay, bandwidth, beyond, None, more, of_loop, np.zeros(0), largest, 0), weights
+    freedom = moments.freedom(columns)
+    return Sweep(delay, bandwidth, beyond, None, more, of_loop, np.zeros(0), largest, 0, freedom), weights
 
 
 def _colour_factors(time: Array, felt: Array, curve: _Curve, binned: Binned, factor: int) -> Array:
@@ -602,10 +615,18 @@ def _average_samples(values: Array, factor: int) -> Array:
     return values if factor == 1 else values[: len(values) // factor * factor].reshape(-1, factor).mean(axis=1)
 
 
-def _average_by_rate(time: Array, felt: Array, rises: NDArray[np.bool_], curve: _Curve, step: float) -> Binned:
-    """Return the mean outputs by rate, without drift; each is moved along the fitted curve to the middle of its bin."""
-    low, high = float(felt.min()), float(felt.max())
-    number = _number_bins(felt, rises, low, high)
+def _average_by_rate(
+    time: Array, felt: Array, rises: NDArray[np.bool_], curve: _Curve, step: float, by: Array | None
+) -> Binned:
+    """Return the mean outputs by rate, without drift; each is moved along the fitted curve to the middle of its bin.
+
+    Where the recorded rate is noisy, a bin of it holds what noise brought there, and outputs follow less than the rate.
+    Bins of a rate `by` that has noise of its own do not: in them the mean rate belongs to the mean output (Wald, Ann.
+    Math. Stat. 11 (1940) 284).
+    """
+    instrument = felt if by is None else by
+    low, high = float(instrument.min()), float(instrument.max())
+    number = _number_bins(instrument, rises, low, high)
     middle = low + (np.arange(_BINS) + 0.5) / _BINS * (high - low)
     middle = np.concatenate([middle, middle[::-1]])
     count = np.bincount(number, minlength=2 * _BINS)
@@ -617,18 +638,20 @@ def _average_by_rate(time: Array, felt: Array, rises: NDArray[np.bool_], curve: 
 
     starts = np.concatenate([[0], np.flatnonzero(number[1:] != number[:-1]) + 1])
     place = number[starts]
+    rates = middle[which] if by is None else mean(felt)
+    drift = (mean(time) - time.mean()) / np.ptp(time)
     powers = np.array(_branch_columns(middle[which] / max(abs(low), abs(high)), which < _BINS))
     parts = np.linspace(0, len(felt), PARTS, endpoint=False).astype(np.int64)
     means, variances, wander = [], [], []
     for k, fit in enumerate(curve.fits):
         rest = curve.residual(k)
-        means.append(mean(rest) + fit[0] + fit[2:] @ powers)
+        means.append(mean(rest) + fit[0] + fit[2:] @ powers if by is None else mean(curve.outputs[k]) - fit[1] * drift)
         passes = np.add.reduceat(rest, starts) ** 2
         variances.append(np.bincount(place, passes, minlength=2 * _BINS)[which] / size**2)
         wander.append(variance_of_mean(np.add.reduceat(rest, parts) / np.diff(parts, append=len(felt))))
     return Binned(
         int(np.count_nonzero(which < _BINS)),
-        middle[which],
+        rates,
         np.asarray(size * step, dtype=np.float64),
         mean(time),
         np.column_stack(means),

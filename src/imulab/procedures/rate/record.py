@@ -106,21 +106,6 @@ def note_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
     return messages
 
 
-_MUCH = 0.01  # of the scale factor: more was not within what is stated, in simulated sweeps
-
-
-def warn_noisy_rates(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
-    """Return a warning for each sweep whose recorded rate is so noisy that the scale factor falls with it."""
-    return [
-        f"{test.place(index)}: the recorded rate has noise of {text_in(run.sweep.attenuation[1], 'deg/s', 2)} deg/s a "
-        f"sample, which takes some {100 * run.sweep.attenuation[0]:.2g} % off the scale factor, "
-        f"{'more than' if run.sweep.attenuation[0] > _MUCH else 'which'} its uncertainty holds; "
-        "record table_angle, or a rate with less noise"
-        for index, run in enumerate(dwells)
-        if run.sweep is not None and run.sweep.attenuation_shown
-    ]
-
-
 # The record.
 
 
@@ -141,9 +126,7 @@ def make_record(
 ) -> Calibration:
     """Return the record of a solution."""
     names, values, matrix, units, freedoms = model_parameters(test, problem, solution, unit, axes)
-    if solution.cycle_freedom is not None:
-        cycles = solution.cycle_freedom
-        freedoms |= _scale_factor_freedoms(test, cycles, names, values.tolist(), np.diag(matrix).tolist())
+    freedoms |= _scale_factor_freedoms(test, dwells, solution, names, values.tolist(), np.diag(matrix).tolist())
     parameters = {}
     for name, value, u, parameter_unit in zip(
         names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True
@@ -185,7 +168,6 @@ def make_record(
             *_note_scatter(problem, solution),
             *(warn_faces(test, recordings, dwells) if axes is None else note_lean(axes, test)),
             *note_sweeps(test, dwells),
-            *warn_noisy_rates(test, dwells),
         ),
     )
 
@@ -211,14 +193,29 @@ def _largest_rate(problem: RateProblem) -> float:
 
 
 def _scale_factor_freedoms(
-    test: RateTest, freedom: int, names: Sequence[str], values: Sequence[float], variances: Sequence[float]
+    test: RateTest,
+    dwells: Sequence[Dwells],
+    solution: RateSolution,
+    names: Sequence[str],
+    values: Sequence[float],
+    variances: Sequence[float],
 ) -> dict[str, float]:
-    """Return the degrees of freedom of scale factors (Satterthwaite): the table's share has infinitely many."""
+    """Return the degrees of freedom of scale factors that rest on scatter of runs or of parts of sweeps.
+
+    By Satterthwaite: the table's share has infinitely many.
+    """
     freedoms = {}
     for name, value, variance in zip(names, values, variances, strict=True):
         if name.startswith("gyro_scale_factor"):
+            sweeps = [
+                run.sweep.freedom
+                for run, place in zip(dwells, test.runs, strict=True)
+                if run.sweep is not None and AXES[place.axis] == name[-1]
+            ]
+            freedom = sum(sweeps) if solution.cycle_freedom is None else solution.cycle_freedom
             scattered_share = 1 - (value * (test.relative_uncertainty or 0.0)) ** 2 / variance
-            freedoms[name] = freedom / max(scattered_share, 1e-3) ** 2
+            if freedom:
+                freedoms[name] = freedom / max(scattered_share, 1e-3) ** 2
     return freedoms
 
 
