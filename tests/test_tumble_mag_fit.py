@@ -455,10 +455,28 @@ def test_hard_iron_that_moves_half_way_is_said():
     assert il.fit_mag(table(outputs, mag), gravity=G, order=2, loss="square").calibration.verdict.state != "good"
 
 
-def test_a_mirrored_triad_leaves_a_note_on_the_hemisphere():
+@pytest.mark.parametrize(
+    ("columns", "of_accelerometers", "looked_at"),
+    [
+        (np.eye(3), 1.0, False),
+        (np.eye(3), -1.0, False),  # looks like a healthy unit in the other hemisphere
+        (np.diag([-1.0, 1.0, 1.0]), 1.0, True),
+        (np.eye(3)[[1, 0, 2]], 1.0, True),
+        (np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), 1.0, False),  # a turn, as in an MPU-9250
+    ],
+)
+def test_exchanged_and_reversed_axes_are_looked_at_where_no_hemisphere_is_stated(columns, of_accelerometers, looked_at):
     _, _, (outputs, mag) = simulated(43, mounting=np.eye(3))
-    record = il.fit_mag(table(outputs, mag * [-1.0, 1.0, 1.0]), gravity=G, order=2).calibration
-    assert any("if this is the northern, a magnetometer axis is reversed" in w for w in record.warnings)
+    data = table(of_accelerometers * outputs, mag @ columns.T)
+    record = il.fit_mag(data, gravity=G, order=2).calibration
+    (said,) = [w for w in record.warnings if "hemisphere" in w]
+    assert "a magnetometer axis is reversed, two are exchanged, or the accelerometers read minus" in said
+    assert any("hemisphere" in reason for reason in record.verdict.reasons) == looked_at
+    assert ("state the hemisphere (--hemisphere)" in record.verdict.next) == looked_at
+
+
+def test_a_stated_hemisphere_leaves_no_remark_on_it():
+    _, _, (outputs, mag) = simulated(43, mounting=np.eye(3))
     told = il.fit_mag(table(outputs, mag), gravity=G, order=2, hemisphere="north").calibration
     assert not any("hemisphere" in w for w in told.warnings)
 

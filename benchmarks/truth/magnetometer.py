@@ -53,6 +53,16 @@ def trial(seed: int, *, disturbance: Disturbance, accelerometers: bool = False) 
     return Trial(covers(calibration, truth), warned, float(100 * np.sqrt(np.mean(np.square(off)))))
 
 
+def exchanged(seed: int, *, sensor: str) -> Trial:
+    """Fit one recording without a hemisphere whose columns x and y of a sensor changed places; whether that is said."""
+    bench = record(np.random.default_rng(seed), Disturbance())
+    columns = {name: bench.recording.column(name) for name in bench.recording.units}
+    columns[f"{sensor}_x"], columns[f"{sensor}_y"] = columns[f"{sensor}_y"], columns[f"{sensor}_x"]
+    made = il.Recording(columns, bench.recording.units)
+    reasons = il.fit_mag(made, gravity=G, order=1, field="48 uT").calibration.verdict.reasons
+    return Trial(warned=any("two are exchanged" in reason for reason in reasons))
+
+
 def row(
     name: str,
     disturbance: Disturbance,
@@ -90,4 +100,8 @@ SCENARIOS = [
         coverage=None,
     ),
     row("a phone of 1 µT from the middle on", Disturbance(phone=1.0), coverage=None, warned=95.0),
+    *(
+        Scenario(GROUP, f"x and y of the {name} exchanged", partial(exchanged, sensor=sensor), 10, None, 95.0)
+        for name, sensor in (("accelerometers", "accel"), ("magnetometers", "mag"))
+    ),
 ]  # fmt: skip

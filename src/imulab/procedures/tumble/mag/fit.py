@@ -171,17 +171,21 @@ def _make_parameters(
     return parameters
 
 
+def _name_columns(axes: Array) -> str:
+    """Return the output that became each axis, such as ``+y -x +z``, from a signed permutation."""
+    return " ".join(
+        f"{'+' if row[output] > 0 else '-'}{'xyz'[output]}"
+        for row, output in zip(axes, np.abs(axes).argmax(axis=1).tolist(), strict=True)
+    )
+
+
 def _model_section(ready: Ready, joint: Joint) -> MagModel:
     """Return ``model``: order, unit and field of the magnetometers, and which output became which axis."""
-    axes = " ".join(
-        f"{'+' if row[output] > 0 else '-'}{'xyz'[output]}"
-        for row, output in zip(ready.mag.axes, np.abs(ready.mag.axes).argmax(axis=1).tolist(), strict=True)
-    )
     field = ready.mag.field
     return MagModel(
         mag_order=joint.pair.mag_order,
         mag_output_unit=ready.means.unit,
-        mag_axes=axes,
+        mag_axes=_name_columns(ready.mag.axes),
         field=Quantity(value=1.0, unit="1") if field is None else Quantity(value=field, unit="T"),
     )
 
@@ -377,18 +381,30 @@ def _warn_fit(
             )
         )
     if "hemisphere" not in options:
-        dip = float(np.degrees(joint.theta[joint.pair.layout.dip_at]))
-        where, other = ("northern", "southern") if dip > 0 else ("southern", "northern")
-        messages.append(
-            Note(
-                f"mag: the dip of {dip:+.1f} deg is one of the {where} hemisphere; if this is the {other}, a "
-                "magnetometer axis is reversed, two are exchanged, or the accelerometers read minus the specific force "
-                "(--hemisphere checks it)"
-            )
-        )
+        messages.append(_warn_sign_of_dip(float(joint.theta[joint.pair.layout.dip_at]), ready.mag.axes))
     if ready.mag.field is None and parse_unit(ready.means.unit).quantity == "magnetic field":
         messages.append(_warn_field_size(ready.mag.size * parse_unit(ready.means.unit).factor, ready.means.unit))
     return messages
+
+
+def _warn_sign_of_dip(dip: float, axes: Array) -> str:
+    """Return what the sign of a dip, rad, rests on: all of field, gravity and turns look alike with the other sign.
+
+    With the other sign the columns that became axes are reversed, which the fit cannot tell from a turn of the
+    magnetometers in the body. It is to be looked at where that reverses fewer columns: two exchanged axes, or one
+    reversed axis, explain the data more simply.
+    """
+    where, other = ("northern", "southern") if dip > 0 else ("southern", "northern")
+    said = (
+        f"mag: the dip of {np.degrees(dip):+.1f} deg is one of the {where} hemisphere; if this is the {other}, a "
+        "magnetometer axis is reversed, two are exchanged, or the accelerometers read minus the specific force"
+    )
+    if np.count_nonzero(axes < 0) < 2:
+        return Note(f"{said} (--hemisphere checks it)")
+    return Finding(
+        f"{said}: x y z are taken from the columns {_name_columns(axes)}, and would be {_name_columns(-axes)}",
+        "state the hemisphere (--hemisphere)",
+    )
 
 
 def _warn_field_size(field: float, unit: str) -> str:
