@@ -14,6 +14,9 @@ from test_readers_shipped import FILES
 G = 9.80665
 REFUSED = {"kitti-oxts", "motioncal", "movella-dot", "movella-dot-mag", "sensorlogger-accel", "sensorlogger-gyro"}
 """Layouts whose heads hold no titles, or no unit of a sensor in titles or in readings that are random."""
+LATER = {"fusion", "fusion-mag", "gcsv", "gcsv-gyro", "kalibr", "mt-manager", "mt-manager-mag", "picoquake", "shimmer"}
+LATER |= {"ulog2csv", "ulog2csv-accel", "ulog2csv-gyro"}
+"""Layouts that came after the 27 by which the guess is measured."""
 
 
 def written(path, titles, columns, delimiter=",", more=""):
@@ -41,6 +44,8 @@ def test_heads_of_the_shipped_layouts_without_them(tmp_path, monkeypatch):
     monkeypatch.setattr(guess, "advice", lambda head: "")
     right = set()
     for name, make in FILES.items():
+        if name in LATER:
+            continue
         path = tmp_path / f"{name}.csv"
         path.write_bytes(make().encode())
         if name in REFUSED:
@@ -54,7 +59,8 @@ def test_heads_of_the_shipped_layouts_without_them(tmp_path, monkeypatch):
             np.testing.assert_array_equal(found.columns[column], expected.columns[column])
         right.add(name)
     assert len(right) >= 20
-    assert {entry.name for entry in shipped.shipped()} >= right | REFUSED
+    assert len(right | REFUSED) == 27
+    assert {entry.name for entry in shipped.shipped()} == right | REFUSED | LATER
 
 
 @pytest.mark.parametrize(

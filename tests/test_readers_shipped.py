@@ -133,7 +133,74 @@ def motioncal():
     return "Adafruit AHRS - IMU Calibration!\n" + "".join(f"{line}\r\n{more}" for line in raw)
 
 
+def mt_manager(*, mag=False):
+    head = (
+        "// General information:\r\n//  MT Manager version: 4.6.0\r\n// Device information:\r\n//  DeviceId: 0378\r\n"
+    )
+    titles = ["PacketCounter", "SampleTimeFine", *xyz("Acc_{1}"), *xyz("Gyr_{1}"), *(xyz("Mag_{1}") if mag else ())]
+    rows = [range(ROWS), stamps(1e4, 1234500), *ACCEL.T, *GYRO.T, *(MAG.T if mag else ())]
+    return head + "\t".join(titles) + "\r\n" + lines(*rows, delimiter="\t")
+
+
+def gcsv(*, accel=True):
+    head = "GYROFLOW IMU LOG\nversion,1.3\nid,custom_logger_name\norientation,YxZ\nnote,development_test\n"
+    head += "frame_readout_time,15.23\ntscale,0.001\ngscale,0.00122173047\n"
+    head += "ascale,0.00048828125\nt,gx,gy,gz,ax,ay,az\n" if accel else "t,gx,gy,gz\n"
+    counts = np.rint(GYRO / 0.00122173047).astype(int), np.rint(ACCEL / G / 0.00048828125).astype(int)
+    return head + lines(stamps(1e3, 7), *counts[0].T, *(counts[1].T if accel else ()))
+
+
+def shimmer():
+    titles = ["S_A1_Timestamp_Unix_CAL", *xyz("S_A1_Accel_LN_{1}_CAL"), *xyz("S_A1_Gyro_{1}_CAL")]
+    units = ["ms", *["m/(s^2)"] * 3, *["deg/s"] * 3]
+    rows = lines(stamps(1e3, 1733938900000), *ACCEL.T, *np.degrees(GYRO).T, delimiter="\t").replace("\n", "\t\n")
+    return "sep=\t\n" + "".join("\t".join(row) + "\t\n" for row in (titles, units)) + rows
+
+
+def ulog2csv(sensor):
+    readings = {"accel": ACCEL, "gyro": GYRO}[sensor]
+    head = "timestamp,timestamp_sample,device_id,x,y,z,temperature,error_count,samples\n"
+    same = [[one] * ROWS for one in (1310988, 0, 1)]
+    return head + lines(stamps(1e6, 400), stamps(1e6, 100), same[0], *readings.T, CELSIUS, *same[1:])
+
+
+def picoquake():
+    head = "# PLab PicoQuake Data\n# Time: 2024-04-21 15:54:46.333682, Device: D4E9 (E6632891E36F2029)\n"
+    head += f"# Num. samples: {ROWS}, Duration: 0.05 s\n"
+    head += "# Config: sample_rate = 100.0 Hz, filter = 42 Hz, acc_range = 4 g, gyro_range = 250.0 dps\n"
+    head += "# Integrity: True, Skipped samples: 0\ncount,a_x,a_y,a_z,g_x,g_y,g_z\n"
+    return head + lines(range(ROWS), *(ACCEL / G).T, *np.degrees(GYRO).T)
+
+
+def fusion(*, mag=False):
+    titles = ["Time (s)", *xyz("Gyroscope {1} (deg/s)"), *xyz("Accelerometer {1} (g)")]
+    titles += xyz("Magnetometer {1} (uT)") if mag else []
+    return ",".join(titles) + "\n" + lines(TIME, *np.degrees(GYRO).T, *(ACCEL / G).T, *((MAG * 1e6).T if mag else ()))
+
+
 FILES = {
+    "fusion": fusion,
+    "fusion-mag": lambda: fusion(mag=True),
+    "gcsv": gcsv,
+    "gcsv-gyro": lambda: gcsv(accel=False),
+    "kalibr": lambda: (
+        ",".join(["timestamp", *xyz("omega_{0}"), *xyz("alpha_{0}")])
+        + "\n"
+        + lines(stamps(1e9, 1385030208736607488), *GYRO.T, *ACCEL.T)
+    ),
+    "mt-manager": mt_manager,
+    "mt-manager-mag": lambda: mt_manager(mag=True),
+    "picoquake": picoquake,
+    "shimmer": shimmer,
+    "ulog2csv": lambda: (
+        ",".join(["timestamp", *(f"gyro_rad[{k}]" for k in range(3)), "gyro_integral_dt"])
+        + ","
+        + ",".join(["accelerometer_timestamp_relative", *(f"accelerometer_m_s2[{k}]" for k in range(3))])
+        + "\n"
+        + lines(stamps(1e6, 100), *GYRO.T, [4000] * ROWS, [0] * ROWS, *ACCEL.T)
+    ),
+    "ulog2csv-accel": lambda: ulog2csv("accel"),
+    "ulog2csv-gyro": lambda: ulog2csv("gyro"),
     "androsensor": androsensor,
     "androsensor-mag": lambda: androsensor(mag=True),
     "betaflight": lambda: blackbox(ACCEL / G, np.degrees(GYRO), (" (g)", " (deg/s)")),
@@ -189,12 +256,16 @@ ALIKE = {
     "flysight": ["flysight", "flysight-mag"],
     "flysight-mag": ["flysight", "flysight-mag"],
     "kitti-oxts": [],
+    **{f"ulog2csv-{sensor}": ["ulog2csv-accel", "ulog2csv-gyro"] for sensor in ("accel", "gyro")},
 }
 """Which layouts fit a file of each, where that is not just its own."""
+APPS = ("androsensor", "microstrain", "movella-dot", "physics-toolbox", "mt-manager", "fusion")
 SENSORS = {
     **{f"{app}-{sensor}": [sensor] for app in ("sensorlogger", "gnsslogger") for sensor in OF_ALL},
     **{f"{app}-mag": ["mag"] for app in ("phyphox", "x-imu3", "flysight")},
-    **{f"{app}-mag": list(OF_ALL) for app in ("androsensor", "microstrain", "movella-dot", "physics-toolbox")},
+    **{f"{app}-mag": list(OF_ALL) for app in APPS},
+    **{f"ulog2csv-{sensor}": [sensor] for sensor in ("accel", "gyro")},
+    "gcsv-gyro": ["gyro"],
     "motioncal": list(OF_ALL),
     "phyphox": ["accel"],
     "phyphox-gyro": ["gyro"],
@@ -223,6 +294,9 @@ def test_a_file_is_read_by_the_name_of_its_layout(tmp_path, name):
     of = {"accel": ACCEL, "gyro": GYRO, "mag": MAG}
     if name == "motioncal":
         of = {"accel": RAW[:, :3] * G / 8192, "gyro": np.radians(RAW[:, 3:6] / 16), "mag": RAW[:, 6:] * 1e-7}
+    if name.startswith("gcsv"):
+        steps = {"accel": 0.00048828125 * G, "gyro": 0.00122173047}
+        of = {sensor: np.rint(of[sensor] / step) * step for sensor, step in steps.items()}
     assert [sensor for sensor in of if f"{sensor}_x" in found] == SENSORS.get(name, ["accel", "gyro"])
     for sensor in SENSORS.get(name, ["accel", "gyro"]):
         read = np.column_stack([found.si(f"{sensor}_{axis}") for axis in "xyz"])
@@ -336,16 +410,16 @@ def test_a_fleet_takes_a_layout_by_name(imulab, tmp_path):
 
 @pytest.mark.parametrize(("delimiter", "decimal"), [(";", ","), ("\t", ",")])
 def test_other_separators_are_named_with_what_to_change(imulab, tmp_path, delimiter, decimal):
-    text = FILES["phyphox"]().replace(",", delimiter).replace(".", decimal)
+    text = FILES["x-imu3"]().replace(",", delimiter).replace(".", decimal)
     (tmp_path / "f.csv").write_text(text)
     written = delimiter.replace("\t", "\\t")
-    said = f'phyphox) and set delimiter = "{written}" and decimal = "{decimal}"\n'
-    for layout in ([], ["--layout", "phyphox"]):
+    said = f'x-imu3) and set delimiter = "{written}" and decimal = "{decimal}"\n'
+    for layout in ([], ["--layout", "x-imu3"]):
         done = imulab("tumble", "fit", "f.csv", "--gravity", "9.81", "-o", "r.json", *layout)
         assert done.returncode == 2
         assert done.stderr.endswith(said)
         assert done.stderr.count("\n") == 1
-    mended = shipped_file("phyphox").read_text().replace('delimiter = ","', f'delimiter = "{written}"\ndecimal = ","')
+    mended = shipped_file("x-imu3").read_text().replace('delimiter = ","', f'delimiter = "{written}"\ndecimal = ","')
     (tmp_path / "l.toml").write_text(mended)
     assert len(il.read(tmp_path / "f.csv", tmp_path / "l.toml")) == ROWS
 
@@ -370,3 +444,73 @@ def test_a_line_of_titles_without_end_is_not_printed_as_a_whole(tmp_path):
     with pytest.raises(ReadError) as caught:
         il.read(tmp_path / "f.csv", "euroc")
     assert len(str(caught.value)) < 600
+
+
+def test_a_file_is_not_taken_for_that_of_a_program_whose_mark_it_lacks(imulab, tmp_path):
+    """Titles of MT Manager are those of Movella DOT, in rad/s and tenths of a millisecond instead of deg/s and us."""
+    (tmp_path / "mt.txt").write_text(mt_manager())
+    assert fitting((tmp_path / "mt.txt").read_bytes()) == ["mt-manager"]
+    bare = mt_manager().splitlines(keepends=True)[4:]
+    (tmp_path / "bare.txt").write_text("".join(bare))
+    (tmp_path / "bare.csv").write_text("".join(bare).replace("\t", ","))
+    for name in ("bare.txt", "bare.csv"):
+        assert fitting((tmp_path / name).read_bytes()) == []
+        done = imulab("show", name)
+        assert "movella" not in done.stderr + done.stdout
+        assert "imulab layout guess" in done.stderr + done.stdout
+    done = imulab("show", "mt.txt", "--layout", "movella-dot")
+    assert done.returncode == 2
+    assert done.stderr.endswith("looks like a file of mt-manager: try --layout mt-manager\n")
+    # A comma in place of the tab is no reason to read it as the other program's.
+    (tmp_path / "comma.csv").write_text(mt_manager().replace("\t", ","))
+    assert il.read(tmp_path / "comma.csv", "mt-manager").units["gyro_x"] == "rad/s"
+    noted = imulab("convert", "comma.csv", "--layout", "movella-dot", "-o", "out.csv")
+    assert "none of DeviceTag:, Xsens DOT, Movella DOT stands above the titles" in noted.stderr
+
+
+@pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")])
+def test_phyphox_in_all_its_separators(tmp_path, delimiter, decimal):
+    path = tmp_path / "f.csv"
+    rows = FILES["phyphox"]().splitlines()
+    swapped = [delimiter.join(field.replace(".", decimal) for field in row.split(",")) for row in rows[1:]]
+    path.write_text("\n".join([rows[0].replace(",", delimiter), *swapped]) + "\n")
+    assert fitting(path.read_bytes()) == ["phyphox"]
+    np.testing.assert_array_equal(il.read(path, "phyphox").triad("accel"), ACCEL)
+
+
+def test_numbers_above_the_rows_that_are_not_there_are_named(tmp_path):
+    path = tmp_path / "f.gcsv"
+    path.write_text(gcsv().replace("gscale,0.00122173047\n", ""))
+    with pytest.raises(ReadError, match="takes the scale of gyro_x from the number behind 'gscale' above the rows"):
+        il.read(path, "gcsv")
+    path.write_text(picoquake().replace("sample_rate", "data_rate"))
+    assert il.read(path, "picoquake").time[-1] == pytest.approx((ROWS - 1) / 100)
+    path.write_text(picoquake().replace("sample_rate = 100.0", "rate"))
+    with pytest.raises(ReadError, match=r"takes the sample rate from the number behind 'sample_rate.data_rate'"):
+        il.read(path, "picoquake")
+
+
+def test_a_row_of_units_is_read_and_must_agree(tmp_path):
+    path = tmp_path / "f.csv"
+    path.write_text(shimmer().replace("deg/s", "rad/s"))
+    with pytest.raises(ReadError, match=r"line 3: the row of units says rad/s for 'S_A1_Gyro_X_CAL', shimmer says"):
+        il.read(path, "shimmer")
+    path.write_text(shimmer().replace("S_A1_Gyro_X", "S_B2_Gyro_X_CAL\tS_A1_Gyro_X"))
+    with pytest.raises(ReadError, match=r"from one column named '\*_Gyro_X_CAL', found S_A1_.*, S_B2_Gyro_X_CAL"):
+        il.read(path, "shimmer")
+
+
+def test_a_layout_without_a_delimiter_takes_that_of_the_file(tmp_path):
+    path, layout = tmp_path / "f.csv", tmp_path / "l.toml"
+    by_number = "[columns]\n" + "".join(f'accel_{a} = {{ from = {k}, unit = "g" }}\n' for k, a in enumerate("xyz", 1))
+    for delimiter in (",", ";", "\t", " ", ", "):
+        path.write_text(lines(TIME, *ACCEL.T, delimiter=delimiter))
+        layout.write_text("sample_rate = 100\n" + by_number)
+        np.testing.assert_array_equal(il.read(path, layout).triad("accel"), ACCEL)
+    named = by_number
+    for k, axis in enumerate("xyz", 1):
+        named = named.replace(f"from = {k}", f'from = "A {axis}"')
+    for delimiter in (",", ";", "\t"):
+        path.write_text(delimiter.join(["t", "A x", "A y", "A z"]) + "\n" + lines(TIME, *ACCEL.T, delimiter=delimiter))
+        layout.write_text("sample_rate = 100\n" + named)
+        np.testing.assert_array_equal(il.read(path, layout).triad("accel"), ACCEL)

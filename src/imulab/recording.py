@@ -605,6 +605,7 @@ class LayoutColumn:
     """Where a column comes from (0-based number, or name in the header), and how it becomes a reading.
 
     A reading in `unit` is (what was read x `scale` - `zero`) / `scale_factor`. Dates become seconds since the first.
+    `scale_from` is the word above the rows whose number is a factor of `scale`.
     """
 
     origin: int | str
@@ -613,6 +614,7 @@ class LayoutColumn:
     zero: float = 0.0
     scale_factor: float = 1.0
     date: bool = False
+    scale_from: str = ""
 
     def convert(self, values: Array) -> None:
         """Turn what was read into readings, in place; a number that no reading can be becomes infinite."""
@@ -629,11 +631,12 @@ class LayoutColumn:
 class Layout:
     """Where the columns of a foreign file are.
 
-    ``delimiter`` is one character, a blank meaning any run of blanks; ``decimal`` a point or a comma; ``sample_rate``
-    in Hz or None; ``encoding`` that of the header's names; ``prefix`` the first field of the lines that count (what
-    that field begins with, where the prefix ends with a colon), or nothing; ``text`` says that the file is delimited
-    text whatever it looks like (it names a delimiter); ``if_needed`` that it is left out where a file says itself what
-    its columns are.
+    ``delimiter`` is one character, a blank meaning any run of blanks, or nothing where the file shows it; ``decimal`` a
+    point or a comma; ``sample_rate`` in Hz or None; ``encoding`` that of the header's names; ``prefix`` the first field
+    of the lines that count (what that field begins with, where the prefix ends with a colon), or nothing; ``text`` says
+    that the file is delimited text whatever it looks like (it names a delimiter); ``if_needed`` that it is left out
+    where a file says itself what its columns are; ``rate_from`` the word above the rows before the sample rate;
+    ``marks`` texts of which one stands above the titles of such a file.
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -649,6 +652,18 @@ class Layout:
     prefix: str = ""
     skip_incomplete: bool = False
     if_needed: bool = False
+    rate_from: str = ""
+    marks: tuple[str, ...] = ()
+
+    @property
+    def starred(self) -> bool:
+        """Whether a name has a ``*``, which stands for any text."""
+        return any(isinstance(column.origin, str) and "*" in column.origin for column in self.columns.values())
+
+    @property
+    def named_numbers(self) -> bool:
+        """Whether a scale or the sample rate stands above the rows."""
+        return bool(self.rate_from) or any(column.scale_from for column in self.columns.values())
 
     @property
     def units(self) -> dict[str, str]:

@@ -20,6 +20,7 @@ import numpy as np
 from imulab.columns import parse_column_title, triad
 from imulab.errors import OptionError, ReadError, UnitError, quoted
 from imulab.live.stamps import Counts
+from imulab.readers.opened import fits
 from imulab.recording import Array, Layout
 
 # Lines of text.
@@ -185,6 +186,8 @@ class LayoutDecoder(LineDecoder):
         super().__init__(counts)
         if any(column.date for column in layout.columns.values()):
             raise OptionError(f"{layout.name}: a live stream takes no dates; expected a time in s, ms or us")
+        if layout.named_numbers:
+            raise OptionError(f"{layout.name}: a live stream has no head; expected scale and sample_rate as numbers")
         self.name = f"layout {layout.name}"
         self.units = {name: column.unit for name, column in layout.columns.items()}
         self._layout = layout
@@ -204,15 +207,17 @@ class LayoutDecoder(LineDecoder):
         if text.startswith("{"):
             document = json.loads(text)
             return [float(_look_up(document, key)) for key in self._keys]
-        delimiter = None if self._layout.delimiter == " " else self._layout.delimiter
+        sign = self._layout.delimiter or next((sign for sign in ",;\t" if sign in text), " ")
+        delimiter = None if sign == " " else sign
         behind = self._layout.behind_prefix([field.strip() for field in text.split(delimiter)])
         if behind is None:
             return None
         fields = behind
         if self._titled:
             titles = [field.strip('"') for field in fields]
-            if all(key in titles for key in self._keys):
-                self._places = [titles.index(key) for key in self._keys]
+            places = [[n for n, title in enumerate(titles) if fits(key, title)] for key in self._keys]
+            if all(places):
+                self._places = [numbers[0] for numbers in places]
                 return None
         if self._places is None:
             return None

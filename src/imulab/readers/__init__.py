@@ -242,7 +242,7 @@ def _text_blocks(
         notes: list[str] | None = None
         for block in text.blocks():
             if notes is None:
-                notes = [] if layout or any(map(_is_known, block.columns)) else _note_layout(file)
+                notes = text.doubts if layout or any(map(_is_known, block.columns)) else _note_layout(file)
             yield replace(block, notes=(*block.notes, *notes)) if notes else block
         if hashed is not None:
             text.drain()

@@ -12,6 +12,8 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
+from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 from shlex import quote
@@ -27,7 +29,7 @@ from imulab.quantities import parse_units
 from imulab.readers.formats import TEXT, recognised
 from imulab.readers.shipped import advice
 from imulab.readers.text import is_native
-from imulab.readers.titles import Title, known_unit, read_title
+from imulab.readers.titles import Title, is_number, is_units_row, read_title
 from imulab.recording import Array, Layout
 from imulab.units import STANDARD_GRAVITY, parse_unit
 
@@ -276,7 +278,7 @@ def _rows_below(titles: list[str], below: Sequence[str], delimiter: str, above: 
         fields = _fields(line, delimiter)
         if not any(fields) or line.startswith("#"):
             continue
-        if not rows and not units and (fields[0] in ("$UNIT", "UNIT") or _is_units_row(fields)):
+        if not rows and not units and (fields[0] in ("$UNIT", "UNIT") or is_units_row(fields)):
             of_these = fields[1:2] == titles[1:2]
             units = fields if not fields[0].endswith("UNIT") else fields[2:] if of_these else []
             continue
@@ -293,18 +295,6 @@ def _rows_below(titles: list[str], below: Sequence[str], delimiter: str, above: 
     starts = [_fields(line, delimiter)[0] for line in below if not line.startswith(("#", "$UNIT"))]
     others = tuple(dict.fromkeys(s for s in starts if prefix and s and s != prefix and not is_number(s)))
     return _Table(titles, mine, delimiter, decimal, units, prefix, above=above, others=others)
-
-
-def _is_units_row(fields: Sequence[str]) -> bool:
-    """Return whether fields are units: none is a number, and most that are not empty are known."""
-    words = [word for word in fields if word]
-    return bool(words) and not any(map(is_number, words)) and sum(bool(known_unit(w)) for w in words) > len(words) / 2
-
-
-def is_units_row(line: str, delimiter: str) -> list[str]:
-    """Return the units in a line of a file, as `parse_unit` knows them; none where it is no row of units."""
-    fields = _fields(line, delimiter)
-    return [known_unit(word) for word in fields] if _is_units_row(fields) else []
 
 
 def layout_of_table(
@@ -627,7 +617,7 @@ def _clock(
         if title.sensor != "time":
             continue
         values = table.numbers(place)
-        if _ISO.match(table.rows[0][place].strip('" ')) and table.delimiter != " ":
+        if table.delimiter != " " and _are_dates([row[place] for row in table.rows if place < len(row)]):
             ranked.append(((True, False, place), place, "iso", "", None))
             continue
         steps = np.diff(values)
@@ -657,6 +647,17 @@ def _clock(
         f"{name}: no title of a time that rises{found}; --sample-rate HZ states how many rows there are in a second",
         "--sample-rate HZ",
     )
+
+
+def _are_dates(texts: Sequence[str]) -> bool:
+    """Return whether texts are dates of ISO 8601 that rise."""
+    if not all(_ISO.match(text) for text in texts):
+        return False
+    try:
+        dates = [datetime.fromisoformat(f"{text[:10]}T{text[11:]}") for text in texts]
+        return all(before <= after for before, after in pairwise(dates))
+    except (ValueError, TypeError):  # no dates, or only some with a zone
+        return False
 
 
 def _time_unit(title: Title, values: Array, step: float, seconds: float | None) -> tuple[str, str]:
@@ -702,11 +703,6 @@ def _number(text: str, decimal: str) -> float:
         return float(text.replace(",", ".") if decimal == "," else text)
     except ValueError:
         return np.nan
-
-
-def is_number(text: str) -> bool:
-    """Return whether a text is one number, with a point or a comma."""
-    return not np.isnan(_number(text, ",")) or text.strip().lower() == "nan"
 
 
 def _is_value(text: str) -> bool:

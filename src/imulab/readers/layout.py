@@ -7,6 +7,7 @@ every key.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from imulab.units import Unit, conversion_factor, parse_unit, to_si
 
 
 EXAMPLE = """\
-delimiter = "whitespace"                        # or "," ";" "\\t"
+delimiter = "whitespace"                        # or "," ";" "\\t"; without it, what the file has
 decimal = "."                                   # or "," where numbers are written 9,81
 header = false                                  # true: the first line names the columns
 skip_lines = 0                                  # lines above the header or the data
@@ -51,6 +52,7 @@ _KEYS = (
     "columns",
     "delimiter",
     "header",
+    "marks",
     "metadata",
     "sample_rate",
     "skip_lines",
@@ -64,6 +66,7 @@ _KEYS = (
 _COLUMN_KEYS = ("from", "unit", "scale", "zero", "scale_factor")
 _ASCII = bytes(range(32, 92)) + bytes(range(93, 127)) + b"\\u0041\t\n"
 """Characters that an encoding of titles must keep; unicode_escape would change the escape."""
+_WORD = re.compile(r"[A-Za-z]")  # begins a word whose number stands above the rows
 _LARGEST = 1e30  # a scale or offset beyond it, or below its inverse, is a mistake
 _RATES = (1e-6, 1e9)  # Hz, of any sensor
 _BY_COLUMN = {
@@ -111,8 +114,8 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
 def layout_of(table: dict[str, Any], path: str) -> Layout:
     """Return the layout that a table of TOML describes; errors as for `load_layout`, `path` begins their messages."""
     check_keys(table, _KEYS, path)
-    delimiter = table.get("delimiter", "whitespace")
-    if not isinstance(delimiter, str) or delimiter not in _DELIMITERS:
+    delimiter = table.get("delimiter", "")
+    if not isinstance(delimiter, str) or (delimiter not in _DELIMITERS and "delimiter" in table):
         raise ReadError(f"{path}: delimiter {quoted(delimiter)}; expected 'whitespace' ',' ';' or a tab")
     decimal = table.get("decimal", ".")
     if decimal not in (".", ",") or decimal == delimiter:
@@ -126,7 +129,9 @@ def layout_of(table: dict[str, Any], path: str) -> Layout:
     for key in ("header", "skip_incomplete"):
         if not isinstance(table.get(key, False), bool):
             raise ReadError(f"{path}: {key} = {quoted(table[key])}; expected true or false")
-    sample_rate = _sample_rate(table.get("sample_rate"), path)
+    rate = table.get("sample_rate")
+    rate_from = rate if isinstance(rate, str) and _WORD.match(rate) else ""
+    sample_rate = 1.0 if rate_from else _sample_rate(rate, path)  # until the file says it
     columns = _with_tables(columns, table, path)
     parsed = {name: _column(name, entry, path, counted=sample_rate is not None) for name, entry in columns.items()}
     metadata = table.get("metadata", {})
@@ -139,7 +144,7 @@ def layout_of(table: dict[str, Any], path: str) -> Layout:
         )
     return Layout(
         columns=parsed,
-        delimiter=_DELIMITERS[delimiter],
+        delimiter=_DELIMITERS.get(delimiter, ""),
         header=table.get("header", False) or any(isinstance(c.origin, str) for c in parsed.values()),
         skip_lines=skip_lines,
         sample_rate=sample_rate,
@@ -147,8 +152,10 @@ def layout_of(table: dict[str, Any], path: str) -> Layout:
         name=path,
         text="delimiter" in table,
         decimal=decimal,
-        prefix=_prefix(table["prefix"], _DELIMITERS[delimiter], path) if "prefix" in table else "",
+        prefix=_prefix(table["prefix"], _DELIMITERS.get(delimiter, ""), path) if "prefix" in table else "",
         skip_incomplete=table.get("skip_incomplete", False),
+        rate_from=rate_from,
+        marks=_marks(table.get("marks", []), path),
         encoding=_encoding(table.get("encoding", "utf-8"), path),
     )
 
@@ -178,7 +185,9 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
     origin = entry["from"]
     if not (isinstance(origin, str) or (type(origin) is int and origin >= 0)):
         raise ReadError(f"{place}: from = {quoted(origin)}; expected a column number from 0, or a name")
-    scale = number_of(entry.get("scale", 1.0), f"{place}: scale")
+    scale = entry.get("scale", 1.0)
+    scale_from = scale if isinstance(scale, str) and _WORD.match(scale) else ""
+    scale = 1.0 if scale_from else number_of(scale, f"{place}: scale")
     if scale == 0:
         raise ReadError(f"{place}: scale = {quoted(entry['scale'])}; expected a number other than 0")
     _check_size(scale, f"{place}: scale")
@@ -199,7 +208,7 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
     if "scale_factor" not in entry:
         if not (counted and name == "time" and unit.symbol == "count"):
             check_unit(name, unit.symbol, path)
-        return LayoutColumn(origin, unit.symbol, scale, zero)
+        return LayoutColumn(origin, unit.symbol, scale, zero, scale_from=scale_from)
     known = scale_factor_of(
         entry["scale_factor"], f"{place}: scale_factor", f"scale_factor = {_BY_COLUMN['scale_factor']}"
     )
@@ -212,7 +221,7 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
         ) from None
     _check_size(factor, f"{place}: scale_factor")
     check_unit(name, known.measured.symbol, path)
-    return LayoutColumn(origin, known.measured.symbol, scale, zero, factor)
+    return LayoutColumn(origin, known.measured.symbol, scale, zero, factor, scale_from=scale_from)
 
 
 def _zero(entry: Any, unit: Unit, place: str) -> float:
@@ -236,11 +245,17 @@ def _check_size(value: float, place: str) -> None:
 
 
 def _prefix(prefix: Any, delimiter: str, path: str) -> str:
-    if not isinstance(prefix, str) or prefix.strip() != prefix or not prefix or {delimiter, "\n"} & set(prefix):
+    if not isinstance(prefix, str) or prefix.strip() != prefix or not prefix or {delimiter or " ", "\n"} & set(prefix):
         raise ReadError(
             f'{path}: prefix = {quoted(prefix)}; expected the first field of the lines that count, such as "IMU"'
         )
     return prefix
+
+
+def _marks(entry: Any, path: str) -> tuple[str, ...]:
+    if not isinstance(entry, list) or not all(isinstance(mark, str) and mark for mark in entry):
+        raise ReadError(f'{path}: marks = {quoted(entry)}; expected texts above the titles, such as ["DeviceTag:"]')
+    return tuple(entry)
 
 
 def _encoding(name: Any, path: str) -> str:

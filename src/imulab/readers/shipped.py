@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 from imulab.readers.layout import load_layout, shipped_file, shipped_names
-from imulab.readers.text import titles_of
+from imulab.readers.opened import holds
 from imulab.recording import Layout
 
 _MOST_LINES = 200  # of a head that show a known logger
@@ -45,11 +45,12 @@ def shipped() -> tuple[Shipped, ...]:
 def fitting(head: bytes) -> list[str]:
     """Return the names of the layouts that fit the first lines of a text file.
 
-    A layout fits where one line holds all titles that it wants, or begins with its prefix. One that wants only some of
-    the titles of another that fits is not named. Layouts that count columns without a prefix cannot be recognised.
+    A layout fits where one line holds all titles that it wants, or begins with its prefix, and a line has one of its
+    marks. One that wants only some of the titles of another that fits is not named. Layouts that count columns without
+    a prefix cannot be recognised.
     """
     lines = head.decode("utf-8-sig", "replace").splitlines()[:_MOST_LINES]
-    fits = [entry for entry in shipped() if any(_fits(entry, line) for line in lines)]
+    fits = [entry for entry in shipped() if any(_fits(entry, line) for line in lines) and _is_marked(entry, lines)]
     return [a.name for a in fits if not any(a.titles and a.titles < b.titles for b in fits)]
 
 
@@ -57,7 +58,13 @@ def _fits(entry: Shipped, line: str) -> bool:
     layout = entry.layout
     if layout.prefix:
         return line.startswith(layout.prefix + ("" if layout.prefix.endswith(":") else layout.delimiter))
-    return bool(entry.titles) and entry.titles.issubset(titles_of(line, layout.delimiter))
+    return bool(entry.titles) and any(holds(layout, line, sign) for sign in layout.delimiter or ",;\t")
+
+
+def _is_marked(entry: Shipped, lines: list[str]) -> bool:
+    """Return whether lines hold what only files of this program have beside their titles."""
+    marks = entry.layout.marks
+    return not marks or any(mark in line for line in lines for mark in marks)
 
 
 def advice(head: bytes, layout: str | None = None) -> str:
@@ -74,9 +81,11 @@ def _separated(head: bytes) -> str:
     """Return the layout that fits except for the delimiter, with the change that it needs; empty if there is none."""
     lines = head.decode("utf-8-sig", "replace").splitlines()[:_MOST_LINES]
     for entry in shipped():
+        if not entry.layout.delimiter or not _is_marked(entry, lines):
+            continue
         for delimiter in {",", ";", "\t"} - {entry.layout.delimiter}:
             for number, line in enumerate(lines):
-                if not entry.titles or not entry.titles.issubset(titles_of(line, delimiter)):
+                if not entry.titles or not holds(entry.layout, line, delimiter):
                     continue
                 rows = "".join(lines[number + 1 :])
                 decimal = ' and decimal = ","' if delimiter != "," and "," in rows and "." not in rows else ""

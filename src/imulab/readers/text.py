@@ -26,6 +26,8 @@ from imulab.columns import parse_column_title
 from imulab.display import Note
 from imulab.errors import ReadError, several
 from imulab.readers.layout import BackwardsError, Readings
+from imulab.readers.opened import HEAD, opened, unit_row
+from imulab.readers.titles import fields_of, titles_of
 from imulab.recording import CORRECTED_BY, Layout, Recording
 from imulab.writers import powers_of_five
 
@@ -198,6 +200,12 @@ class Lines:
                 return line_of_data
             self._read_more()
 
+    def head(self, size: int) -> bytes:
+        """Return the first bytes without consuming them, fewer from a pipe or a short file."""
+        while self.waiting < size and not self._ended and not self.live:
+            self._read_more()
+        return self._rest[self._at : self._at + size]
+
     def line(self, encoding: str = "utf-8", errors: str = "strict", hint: str = "") -> str | None:
         """Return one line of the head, None at the end of the file; comments may have any encoding.
 
@@ -292,7 +300,10 @@ class _Job(Struct, frozen=True):
 
 
 class TextFile:
-    """One pass over a text file; the head is read when it is opened, rows come from `blocks`."""
+    """One pass over a text file; the head is read when it is opened, rows come from `blocks`.
+
+    `doubts` are notes on whether the file is one that the layout is for.
+    """
 
     def __init__(
         self,
@@ -308,6 +319,15 @@ class TextFile:
         self._lines = Lines(stream, name, hashed=hashed, whole=whole)
         if layout is not None and layout.if_needed and is_native(self._lines.first().decode("utf-8", "replace")):
             layout = None
+        self.doubts: list[str] = []
+        if layout is not None:
+            layout = opened(layout, self._lines.head(HEAD), name)
+            head = self._lines.head(HEAD)
+            if layout.marks and not any(mark.encode() in head for mark in layout.marks):
+                self.doubts.append(
+                    f"none of {', '.join(layout.marks)} stands above the titles, as in files of {layout.name}: are its "
+                    "units those of this file?"
+                )
         self._layout = layout
         self._readings = Readings(layout, name) if layout else None
         self._room: np.ndarray | None = None
@@ -441,6 +461,7 @@ class TextFile:
                 self._note(line)
         if layout.header:
             present = self._layout_titles(layout)
+            self._check_units_row(layout, present)
         else:
             present = [str(number) for number in range(self._first_fields(layout))]
         if self._lines.is_blank():
@@ -466,13 +487,28 @@ class TextFile:
             slots = slots[: int(np.flatnonzero(slots >= 0)[-1]) + 1]
         return list(layout.columns), layout.units, slots
 
+    def _check_units_row(self, layout: Layout, titles: list[str]) -> None:
+        """Read a row of units below the titles; one that says other units than the layout is refused."""
+        row = unit_row(self._lines.next_line().decode(layout.encoding, "replace").rstrip("\r"), layout.delimiter)
+        if not row:
+            return
+        self._lines.line(layout.encoding, "replace")
+        for name, column in layout.columns.items():
+            place = titles.index(column.origin) if isinstance(column.origin, str) else column.origin
+            unit = row[place] if place < len(row) else ""
+            if unit and column.scale == column.scale_factor == 1.0 and not column.date and unit != column.unit:
+                raise ReadError(
+                    f"{self._name}: line {self._lines.before}: the row of units says {unit} for {titles[place]!r}, "
+                    f"{layout.name} says {column.unit} for {name}: correct the layout"
+                )
+
     def _pass_last_delimiter(self) -> None:
         """Allow an empty field more than there are titles, in every row, if the first row ends with a delimiter."""
         line = self._lines.next_line().decode("utf-8", "replace").rstrip("\r")
         titles = self._most_fields or len(self._slots)
         if self._delimiter == " " or self._prefix or not line.endswith(self._delimiter):
             return
-        if len(_fields(line, self._delimiter)) == titles + 1:
+        if len(fields_of(line, self._delimiter)) == titles + 1:
             self._most_fields = titles + 1
             if not self._skips:
                 self._slots = np.append(self._slots, np.int32(-1))
@@ -491,7 +527,7 @@ class TextFile:
             raise ReadError(
                 f"{self._name}: no line whose first field is {layout.prefix!r}, the prefix in {layout.name}"
             )
-        return len(layout.behind_prefix(_fields(line.decode("utf-8", "replace"), layout.delimiter)) or [])
+        return len(layout.behind_prefix(fields_of(line.decode("utf-8", "replace"), layout.delimiter)) or [])
 
     def _has_prefix(self, line: bytes) -> bool:
         return (
@@ -593,7 +629,7 @@ class TextFile:
             raise ReadError(f"{place}: expected {expected} fields, found an empty line")
         if problem == _WRONG_COUNT:
             raise ReadError(f"{place}: expected {expected} fields, found {field}")
-        entry = _fields(line, self._delimiter)[field].strip(" \t\r")
+        entry = fields_of(line, self._delimiter)[field].strip(" \t\r")
         column = self._titles[int(self._slots[field]) & ~_DATE]
         shown = entry if len(entry) <= 40 else entry[:37] + "..."
         if problem == _NOT_A_DATE:
@@ -604,16 +640,6 @@ class TextFile:
         if comma and self._layout:
             comma += '; decimal = "," in the layout reads it'
         raise ReadError(f"{place}, column {column}: expected a number, found {shown!r}{comma}")
-
-
-def _fields(line: str, delimiter: str) -> list[str]:
-    """Return the fields of a line as the C module splits it: blanks are spaces and tabs only."""
-    return re.split(r"[ \t]+", line.strip(" \t\r")) if delimiter == " " else line.split(delimiter)
-
-
-def titles_of(line: str, delimiter: str) -> list[str]:
-    """Return the titles in a line, which may begin with # and have them in quotes."""
-    return [title.strip().strip('"') for title in _fields(line.lstrip("# "), delimiter)]
 
 
 def is_native(line: str) -> bool:

@@ -7,6 +7,7 @@ the last ones or what stands in brackets may be the unit, and the others say whi
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from msgspec import Struct
 
@@ -213,6 +214,33 @@ def known_unit(text: str) -> str:
     return ""
 
 
+def is_units_row(fields: Sequence[str]) -> bool:
+    """Return whether fields are units: none is a number, and most that are not empty are known."""
+    words = [word.strip().strip('"').strip() for word in fields if word.strip()]
+    if len(words) < 3 or any(map(is_number, words)):
+        return False
+    return sum(bool(known_unit(word)) for word in words) > len(words) / 2
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text is one number, with a point or a comma."""
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def fields_of(line: str, delimiter: str) -> list[str]:
+    """Return the fields of a line as the C module splits it: blanks are spaces and tabs only."""
+    return re.split(r"[ \t]+", line.strip(" \t\r")) if delimiter == " " else line.split(delimiter)
+
+
+def titles_of(line: str, delimiter: str) -> list[str]:
+    """Return the titles in a line, which may begin with # and have them in quotes."""
+    return [title.strip().strip('"') for title in fields_of(line.lstrip("# "), delimiter)]
+
+
 def read_title(title: str, unit: str = "") -> Title:
     """Return what a title says; `unit` is that of a units row, which goes before the title's own."""
     rest, own = _split_unit(title.strip().lstrip("#").strip())
@@ -221,6 +249,8 @@ def read_title(title: str, unit: str = "") -> Title:
     if not (own or unit):
         words, own = _unit_of_words(words)
     symbol = known_unit(unit) or own
+    if symbol == "g" and rest != title.strip() and title.rstrip().endswith(("(G)", "[G]")) and "mag" in title.lower():
+        symbol = "gauss"
     gained = "d" in words and {"ang", "angle", "theta", "v", "vel", "velocity"}.intersection(words)
     increment = bool(gained or _INCREMENT.intersection(words)) and not {"time", "t"}.intersection(words)
     return Title(title, _sensor(words, axis, symbol, increment), axis, symbol, tuple(words), increment)
