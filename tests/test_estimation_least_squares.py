@@ -459,7 +459,9 @@ def test_shares_are_moments_of_the_stated_density(added: int, gain: float, freed
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("estimated", [False, True])
-def test_intervals_hold_the_truth_whichever_of_two_nested_models_is_right(size: float, estimated: bool) -> None:
+def test_intervals_hold_the_truth_whichever_of_two_nested_models_is_right(
+    size: float, estimated: bool, reduced: bool
+) -> None:
     """A straight line that may bend: 95 % intervals of its value at zero, bend of `size` standard deviations."""
     x = np.linspace(-1, 1, 12)
     design = np.stack([np.ones(12), x, x**2], axis=1)
@@ -469,7 +471,7 @@ def test_intervals_hold_the_truth_whichever_of_two_nested_models_is_right(size: 
     covariances = np.zeros((2, 3, 3))
     covariances[0, :2, :2], covariances[1] = small, large
     inside = 0
-    trials = 2000
+    trials = 800 if reduced else 2000
     for _ in range(trials):
         y = bend * x**2 + rng.standard_normal(12)
         values = np.zeros((2, 3))

@@ -79,18 +79,20 @@ def alarms(change, count, trials, stated=True, record_stated=True):
 @pytest.mark.parametrize(
     ("count", "stated", "record_stated"), [(4, True, True), (12, True, True), (12, False, False), (24, True, True)]
 )
-def test_a_record_that_holds_fails_once_in_twenty(count, stated, record_stated):
-    share = alarms({}, count, 200, stated, record_stated)
-    low, high = stats.binom.ppf([0.001, 0.999], 200, 0.05) / 200
+def test_a_record_that_holds_fails_once_in_twenty(count, stated, record_stated, reduced):
+    trials = 60 if reduced else 200
+    share = alarms({}, count, trials, stated, record_stated)
+    low, high = stats.binom.ppf([0.001, 0.999], trials, 0.05) / trials
     assert low <= share <= high
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "least"), [(4, 0.70), (12, 0.97)])
-def test_a_tenth_of_a_milligram_is_found(count, least):
+def test_a_tenth_of_a_milligram_is_found(count, least, reduced):
     """All three biases moved by 100 µg, the noise 60 µg in an attitude; the figures are the method's."""
-    share = alarms({f"bias_{axis}": 1e-4 * G for axis in "xyz"}, count, 100)
-    assert share >= stats.binom.ppf(0.001, 100, least) / 100
+    trials = 40 if reduced else 100
+    share = alarms({f"bias_{axis}": 1e-4 * G for axis in "xyz"}, count, trials)
+    assert share >= stats.binom.ppf(0.001, trials, least) / trials
 
 
 def test_a_check_without_noise_takes_that_of_the_record_and_says_so(truth):
