@@ -53,6 +53,22 @@ def test_warnings_name_what_is_wrong_with_the_test():
     assert any("gyro still drifts in the settled part of 4 of 4" in message for message in found)
 
 
+@pytest.mark.parametrize("late", [0.0, 10.0])
+def test_logs_that_all_begin_late_are_said_where_there_is_a_thermometer(late):
+    def begun(on, name):
+        made = cycle_of(lambda t: flat(t + late), on, name=name)
+        inside = on + 10 * (1 - np.exp(-(made.column("time") + late) / 80))
+        units = {"temperature": "degC"}
+        return replace(
+            made.with_columns({"temperature": inside}, units), metadata=made.metadata | {"set_point": str(on)}
+        )
+
+    cycles = [begun(on, f"c{on}{k}") for on in (-20, 0, 20) for k in (1, 2)]
+    verdict = il.fit_warmup(cycles, temperatures=[-20, 0, 20], settling_time=END).calibration.verdict
+    assert any("logged from some time after power-on" in reason for reason in verdict.reasons) == (late > 0)
+    assert any("start the log before power comes on" in line for line in verdict.next) == (late > 0)
+
+
 def sloping_cycles(slope):
     """Two cycles at each of three temperatures: an exponential, and a straight line of so much of it each second."""
 

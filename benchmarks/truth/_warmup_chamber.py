@@ -24,6 +24,8 @@ class Chamber:
     rate: float = 5.0
     seconds: float = 600.0
     cycles: int = 3
+    late: float = 0.0  # s after power-on at which every log begins
+    thermometer: bool = False
 
     def zero(self, x: np.ndarray, axis: int) -> np.ndarray:
         """Zero at the sensor's temperature, deg/h."""
@@ -31,12 +33,16 @@ class Chamber:
         smooth = (16.0 + 2 * axis) * y - 0.2 * y**2 - 6e-4 * y**3
         return smooth - self.bend * 15.0 * np.log(np.cosh((x - 22.0) / 15.0))
 
-    def curve(self, time: np.ndarray, power_on: float, stages: np.ndarray | float = 1.0) -> np.ndarray:
-        """Zero less its final value, deg/h, shape (n, 3)."""
+    def inside(self, time: np.ndarray, power_on: float, stages: np.ndarray | float = 1.0) -> np.ndarray:
+        """Temperature of the sensor, degC, shape (n,)."""
         heat = np.array([1.3, 3.1, 5.3]) * stages
         tau = np.array([18.0, 66.0, 170.0]) * (1 - 8e-4 * (power_on - 20.0))
-        x = power_on + (heat * (1 - np.exp(-time[:, None] / tau))).sum(axis=1)
-        final = np.array(power_on + heat.sum())
+        return power_on + (heat * (1 - np.exp(-time[:, None] / tau))).sum(axis=1)
+
+    def curve(self, time: np.ndarray, power_on: float, stages: np.ndarray | float = 1.0) -> np.ndarray:
+        """Zero less its final value, deg/h, shape (n, 3)."""
+        x = self.inside(time, power_on, stages)
+        final = np.array(power_on + (np.array([1.3, 3.1, 5.3]) * stages).sum())
         return np.stack([self.zero(x, i) - self.zero(final, i) for i in range(3)], axis=1)
 
     def cycle(self, set_point: float, rng: np.random.Generator, seconds: float | None = None) -> il.Recording:
@@ -45,11 +51,16 @@ class Chamber:
         n = round((seconds or self.seconds) * self.rate)
         time = np.arange(n) / self.rate
         stages = 1 + self.repeat * rng.standard_normal(3)
-        z = self.curve(time, power_on, stages) + 30 * rng.standard_normal(3)
+        z = self.curve(time + self.late, power_on, stages) + 30 * rng.standard_normal(3)
         z = z + self.walk * 60 * np.sqrt(self.rate) * rng.standard_normal(z.shape)
+        columns = {"time": time} | {name: z[:, i] for i, name in enumerate(AXES)}
+        units = {"time": "s"} | dict.fromkeys(AXES, "deg/h")
+        if self.thermometer:
+            columns["temperature"] = self.inside(time + self.late, power_on, stages) + 0.02 * rng.standard_normal(n)
+            units["temperature"] = "degC"
         return il.Recording(
-            columns={"time": time} | {name: z[:, i] for i, name in enumerate(AXES)},
-            units={"time": "s"} | dict.fromkeys(AXES, "deg/h"),
+            columns=columns,
+            units=units,
             metadata={"power_on_temperature": f"{power_on:.3f}", "serial": "U1"},
             name=f"cycle_{set_point:+g}.csv",
         )

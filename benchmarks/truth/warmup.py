@@ -77,6 +77,13 @@ def exchanged(swap: bool, cycles: int, seed: int) -> Trial:
     return Trial(warned=any("exchanged" in line for line in il.fit_warmup(tests, **_MODEL).calibration.warnings))
 
 
+def begun(late: float, seed: int) -> Trial:
+    """Whether a fit says that all logs began late, where they hold a temperature."""
+    chamber = Chamber(cycles=2, late=late, thermometer=True)
+    warnings = il.fit_warmup(chamber.test(seed), temperatures=TEMPERATURES, **_MODEL).calibration.warnings
+    return Trial(warned=any("logged from some time after power-on" in line for line in warnings))
+
+
 def applied(change, word: str, seed: int) -> Trial:
     """Whether `apply` refuses a recording that was changed, and says why."""
     from imulab.procedures.apply import apply_blocks
@@ -169,6 +176,8 @@ SCENARIOS = [
         for cycles in (1, 3)
         for swap in (False, True)
     ],
+    Scenario("Warm-up", "fit: logs begun in time, thermometer", partial(begun, 0.0), 8, None, false_alarms=5),
+    Scenario("Warm-up", "fit: all logs begun 10 s late, thermometer", partial(begun, 10.0), 8, None, warned=95),
     _refused("apply: ms titled as s", _milliseconds, "milliseconds"),
     _refused("apply: starts 20 s late", partial(_moved, 20.0), "after power-on"),
     _refused("apply: negative times", partial(_moved, -3.0), "before power-on"),

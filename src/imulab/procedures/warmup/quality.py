@@ -568,9 +568,9 @@ def _warn_temperatures(curves: Curves) -> list[str]:
     if warm:
         messages.append(
             Finding(
-                "not cold: at power-on warmer than the chamber, so that the curve starts half-way (soak longer): "
-                f"{_named(warm)}",
-                "soak longer with the unit off, and record those cycles again",
+                "not cold: at power-on warmer than the chamber, so that the curve starts half-way (soaked too briefly, "
+                f"or logged from some time after power-on): {_named(warm)}",
+                "soak longer with the unit off, start the log before power comes on, and record those cycles again",
             )
         )
     if far:
