@@ -285,10 +285,44 @@ def test_a_temperature_in_whole_degrees_gives_the_slope_and_says_what_it_hides(s
     (drift,) = (each for each in record.fit["columns"]["gyro_x"]["drifts"] if each["follows"] == "temperature")
     assert abs(drift["slope"]["value"] - slope) < 3 * drift["slope"]["standard_uncertainty"]
     assert drift["slope"]["value"] == pytest.approx(slope, rel=0.15)
-    assert any("in steps of 1 K show it: slow noise below " in reason for reason in record.verdict.reasons)
+    # The line through the changes of level is off by up to half a step: no random walk, and no doubt of a fit.
+    assert any("in steps of 1 K show it: slow noise below " in warning for warning in record.warnings)
+    assert record.verdict.state == "good"
+    assert record.model["terms"] == {"gyro_x": "N"}
+    assert (
+        record.parameters["gyro_x_walk"].interval_95[1] > 3e-6
+    )  # rad/s/sqrt(s): frequencies that would show it are out
     two = log.with_columns({"temperature": np.where(t < 900, 25.0, 26.0)}, {})
     with pytest.raises(DataError, match="by more than one step of its readings"):
         il.fit_noise(two, regress="temperature")
+
+
+def test_a_walk_beyond_what_whole_degrees_hide_is_found():
+    rng = np.random.default_rng(5)
+    t = np.arange(40_000) / 20
+    temperature = 25.3 + 2 * np.sin(2 * np.pi * t / 1500)
+    walk = 2e-5 * np.cumsum(rng.standard_normal(len(t))) / np.sqrt(20)
+    rate = 0.0004 * rng.standard_normal(len(t)) + 108 * DEGREE / 3600 * temperature + walk
+    columns = {"time": t, "gyro_x": rate, "temperature": np.round(temperature + 0.02 * rng.standard_normal(len(t)))}
+    log = il.Recording(columns, {"time": "s", "gyro_x": "rad/s", "temperature": "degC"}, name="log")
+    walked = il.fit_noise(log, regress="temperature").calibration.parameters["gyro_x_walk"]
+    assert walked.value == pytest.approx(2e-5, rel=0.4)
+    assert walked.interval_95[0] > 5e-6
+
+
+def test_noise_of_the_thermometer_leaves_no_walk_of_what_is_taken_out():
+    """Under the walk of the raw column the slope leans to high frequencies, where the thermometer's noise is."""
+    rng = np.random.default_rng(1)
+    t = np.arange(40_000) / 20
+    temperature = 25 + 2 * np.sin(2 * np.pi * t / 1500)
+    slope = 108 * DEGREE / 3600
+    rate = 0.0004 * rng.standard_normal(len(t)) + slope * temperature
+    columns = {"time": t, "gyro_x": rate, "temperature": temperature + 0.02 * rng.standard_normal(len(t))}
+    log = il.Recording(columns, {"time": "s", "gyro_x": "rad/s", "temperature": "degC"}, name="log")
+    record = il.fit_noise(log, regress="temperature").calibration
+    (drift,) = (each for each in record.fit["columns"]["gyro_x"]["drifts"] if each["follows"] == "temperature")
+    assert drift["slope"]["value"] == pytest.approx(slope, rel=0.005)
+    assert record.model["terms"] == {"gyro_x": "N"}
 
 
 def test_a_ramp_is_a_parameter():

@@ -118,7 +118,8 @@ def _degrees(seed: int, rounded: bool) -> Trial:
     record = il.fit_noise(log, regress="temperature").calibration
     (found,) = (each for each in record.fit["columns"]["gyro_x"]["drifts"] if each["follows"] == "temperature")
     off = found["slope"]["value"] - slope
-    said = any("in steps of 1 K" in line for line in record.warnings)
+    # A walk that is claimed, or a doubt of the fit, is no note; that steps hide something is one.
+    said = record.verdict.state != "good" or record.model["terms"]["gyro_x"] != "N"
     return Trial((abs(off) < 1.96 * found["slope"]["standard_uncertainty"],), said, 3600 * off / DEG)
 
 
@@ -171,9 +172,9 @@ SCENARIOS = [
         for kind in GRAVITIES
     ],
     *[
-        Scenario("Noise at rest", f"--regress temperature, {'in whole degrees' if rounded else 'fine'}: slope",
+        Scenario("Noise at rest", f"--regress temperature, {'in whole degrees' if rounded else 'fine'}: slope; no walk",
                  partial(_degrees, rounded=rounded), trials=30, coverage=(92.0, 100.0),
-                 warned=95.0 if rounded else None, false_alarms=None if rounded else 5.0, unit="(deg/h)/K")
+                 false_alarms=5.0, unit="(deg/h)/K")
         for rounded in (False, True)
     ],
     Scenario("Noise at rest", "a temperature that the gyro does not follow", partial(_drift, slope=0.0), trials=50,

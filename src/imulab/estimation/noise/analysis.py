@@ -39,8 +39,11 @@ from imulab.recording import Array
 
 Refit = Callable[[Sequence[Spectrum]], tuple[Sequence[Array], float]]
 """Fits a model to spectra; returns its variance in each bin of each spectrum, (b,), and its deviance."""
-# How often regression and noise model are fitted in turn
-_REGRESSION_ROUNDS = 3
+# How often regression and noise model are fitted in turn, at least and at most, and the change of the slopes, in their
+# uncertainties, that ends it
+_REGRESSION_ROUNDS, _MOST_ROUNDS, _SETTLED = 3, 12, 0.01
+_HIDES = 0.1
+"""Variance of a coefficient by what a covariate's rounding hides, over its noise, from which it is left out."""
 # Price of a covariate in deviance, as of a term of the model; further fall of the deviance that is asked for
 _PENALTY, _GAIN = 4.0, 6.0
 
@@ -81,11 +84,18 @@ def ramp_coefficients(stretch: Stretch) -> Array:
 
 
 def regress(
-    stretches: Sequence[Stretch], covariates: Sequence[Array], refit: Refit, rounds: int = _REGRESSION_ROUNDS
+    stretches: Sequence[Stretch],
+    covariates: Sequence[Array],
+    refit: Refit,
+    rounds: int = _REGRESSION_ROUNDS,
+    hidden: Sequence[Array] = (),
 ) -> Regression:
-    """Return the dependence of stretches on covariates, fitted in turn with the noise model, three times.
+    """Return the dependence of stretches on covariates, fitted in turn with the noise model until both rest.
 
-    ``b = (X' Lambda^-1 X)^-1 X' Lambda^-1 c``, with the cosine coefficients c of all stretches one below the other.
+    ``b = (X' V^-1 X)^-1 X' V^-1 c``, with the cosine coefficients c of all stretches one below the other. V is the
+    variance of the noise, Lambda, and where readings of the covariate are rounded ``b^2 H' H``, H what that hides.
+    Coefficients in which it hides more than a tenth of the noise are left out of what remains: slow noise there cannot
+    be told from it.
 
     Parameters
     ----------
@@ -95,35 +105,67 @@ def regress(
         For each stretch the slow coefficients of each covariate, shape (k, J); all k are fitted together.
     refit
         Fits the noise model to spectra.
+    rounds
+        How often at least.
+    hidden
+        For each stretch rows of unit variance of what the rounding of the only covariate hides, shape (h, J) with the
+        lowest J; empty where nothing is hidden.
     """
     spectra = [each for stretch in stretches for each in stretch.spectra]
     variances, before = refit(spectra)
-    residual: tuple[Stretch, ...] = tuple(stretches)
-    after = before
-    for _ in range(rounds):
-        slope, covariance = _slopes(stretches, covariates, variances)
-        residual = tuple(
-            without(stretch, slope @ np.atleast_2d(x)) for stretch, x in zip(stretches, covariates, strict=True)
-        )
-        variances, after = refit([each for stretch in residual for each in stretch.spectra])
-    slope, covariance = _slopes(stretches, covariates, variances)
-    return Regression(slope, np.sqrt(np.diag(covariance)), before - after, residual)
+    hidden = hidden or [np.empty((0, 0))] * len(stretches)
+    slope = np.zeros(len(np.atleast_2d(covariates[0])))
+    cleaned: list[Stretch] = []
+    for number in range(_MOST_ROUNDS):
+        last = slope
+        slope, covariance = _slopes(stretches, covariates, variances, [last[0] * each for each in hidden])
+        cleaned = [without(stretch, slope @ np.atleast_2d(x)) for stretch, x in zip(stretches, covariates, strict=True)]
+        variances, after = refit([each for stretch in cleaned for each in stretch.spectra])
+        if number + 1 >= rounds and (np.abs(slope - last) < _SETTLED * np.sqrt(np.diag(covariance))).all():
+            break
+    scaled = [slope[0] * each for each in hidden]
+    slope, covariance = _slopes(stretches, covariates, variances, scaled)
+    if any(each.size for each in hidden):
+        cleaned = [_without_hidden(each, rows) for each, rows in zip(cleaned, scaled, strict=True)]
+    return Regression(slope, np.sqrt(np.diag(covariance)), before - after, tuple(cleaned))
 
 
 def _slopes(
-    stretches: Sequence[Stretch], covariates: Sequence[Array], variances: Sequence[Array]
+    stretches: Sequence[Stretch], covariates: Sequence[Array], variances: Sequence[Array], hidden: Sequence[Array]
 ) -> tuple[Array, Array]:
     size, start = len(np.atleast_2d(covariates[0])), 0
     normal, right = np.zeros((size, size)), np.zeros(size)
-    for stretch, covariate in zip(stretches, covariates, strict=True):
+    for stretch, covariate, rows in zip(stretches, covariates, hidden, strict=True):
         stop = start + len(stretch.spectra)
         weight = counted(stretch) / variances_of_coefficients(variances[start:stop], stretch)
         x = np.atleast_2d(covariate)
         normal += x * weight @ x.T
         right += x * weight @ stretch.slow
+        if rows.any():
+            lowest = np.s_[: rows.shape[1]]
+            weighted = rows * weight[lowest]
+            by_x = weighted @ x[:, lowest].T
+            taken = np.linalg.solve(np.eye(len(rows)) + weighted @ rows.T, by_x)
+            normal -= taken.T @ by_x
+            right -= taken.T @ (weighted @ stretch.slow[lowest])
         start = stop
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     return np.asarray(covariance @ right), covariance
+
+
+def _without_hidden(stretch: Stretch, rows: Array) -> Stretch:
+    """Return a stretch without the coefficients that rows of what is hidden, shape (h, J), move beyond its noise."""
+    if not rows.any():
+        return stretch
+    spectrum = stretch.spectra[0]
+    counts = (spectrum.freedom > 0) & (spectrum.last <= len(stretch.slow))
+    noise = float(np.median(spectrum.power[counts])) if counts.any() else 0.0
+    moved = np.zeros(len(stretch.slow))
+    moved[: rows.shape[1]] = (rows**2).sum(axis=0)
+    hidden = np.flatnonzero(moved > _HIDES * noise)
+    used = stretch.used.copy()
+    used[: hidden.max(initial=-1) + 1] = False
+    return without(replace(stretch, used=used), np.zeros(1))
 
 
 def counted(stretch: Stretch) -> Array:
@@ -144,9 +186,10 @@ def without(stretch: Stretch, taken: Array) -> Stretch:
     spectrum = stretch.spectra[0]
     low = spectrum.last <= len(slow)
     edges = (spectrum.first[low], spectrum.last[low])
-    power = spectrum.power.copy()
-    power[low] = binned(slow**2, stretch.used, edges, spectrum.interval, spectrum.count).power
-    return replace(stretch, slow=slow, spectra=(replace(spectrum, power=power), *stretch.spectra[1:]))
+    power, freedom = spectrum.power.copy(), spectrum.freedom.copy()
+    again = binned(slow**2, stretch.used, edges, spectrum.interval, spectrum.count)
+    power[low], freedom[low] = again.power, np.minimum(freedom[low], again.freedom)
+    return replace(stretch, slow=slow, spectra=(replace(spectrum, power=power, freedom=freedom), *stretch.spectra[1:]))
 
 
 # Test of fit: Allan variances of a record against those of the model (generalised method of wavelet moments).
@@ -551,16 +594,16 @@ class Analysis:
             start = stop
         return steps
 
-    def regressed(self, covariates: Sequence[Array]) -> Regression:
-        """Return the column's dependence on covariates, given as slow coefficients of each stretch, shape (k, J)."""
-        return regress(self.stretches, covariates, self._refit)
+    def regressed(self, covariates: Sequence[Array], hidden: Sequence[Array] = ()) -> Regression:
+        """Return the column's dependence on covariates, given as slow coefficients of each stretch: see `regress`."""
+        return regress(self.stretches, covariates, self._refit, hidden=hidden)
 
     def _refit(self, spectra: Sequence[Spectrum], model: Flags | None = None) -> tuple[Sequence[Array], float]:
         """Return variances and deviance of the chosen model fitted to spectra with the weights of the analysed ones."""
         model = self.model if model is None else model
         bins = prepare(
             [
-                Spectrum(s.interval, s.count, s.first, s.last, s.power, mine.freedom)
+                Spectrum(s.interval, s.count, s.first, s.last, s.power, np.minimum(mine.freedom, s.freedom))
                 for s, mine in zip(spectra, self.spectra, strict=True)
             ]
         )

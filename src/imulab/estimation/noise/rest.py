@@ -48,6 +48,10 @@ _MOST_LEVELS = 50
 """Steps of a quantity's readings over its range from which their rounding does not matter."""
 _COARSE_KELVIN = 0.2
 """Step of a temperature's readings from which a log is read as a whole, so that their rounding can be undone."""
+_SHORT = 0.1
+"""Share of the longest dwell at a level up to which another is no dwell, but noise beside an edge."""
+_MOST_DWELLS, _LOWEST = 64, 8192
+"""Dwells, the longest, and coefficients, the lowest, in which what rounding hides is followed."""
 _SEEN = 100_000  # samples of which distinct values are counted
 
 
@@ -116,6 +120,10 @@ class Rest:
         slow = [slow_coefficients(each, self.interval) for each in lines if each is not None]
         return slow if len(slow) == len(samples) else None
 
+    def hidden(self, name: str) -> list[Array]:
+        """Return what the rounding of a covariate hides of it, stretch by stretch: see `hidden_by_rounding`."""
+        return [hidden_by_rounding(each, self.interval) for each in self.samples(name)]
+
     def rounding(self, name: str) -> float:
         """Return the step of a slow quantity's readings, SI, where it is coarse for the range they take; else 0."""
         return max(map(coarse_step, self.samples(name)), default=0.0) if name in self.recording else 0.0
@@ -146,28 +154,91 @@ def coarse_step(values: Array) -> float:
     return 0.0 if 2 * len(changes) > len(values) or float(np.ptp(values)) > _MOST_LEVELS * step else step
 
 
+@dataclass(frozen=True)
+class _Dwells:
+    """Where a slow quantity stays at one level of its readings, by the places of their changes, in samples.
+
+    Between two changes by the same edge it has turned inside of its level, by anything from none to all of it, taken as
+    uniform: a parabola of half a step, +- a step over root 12. Between changes by both edges the line through them is
+    off by a parabola of a quarter of a step at most. Outside the first and the last change it may go anywhere.
+    """
+
+    place: Array
+    middle: Array
+    turns: Array
+    step: float
+
+    @property
+    def long(self) -> NDArray[np.bool_]:
+        """Whether each of them is a dwell: where the quantity is near an edge, its own noise changes the level."""
+        length = np.diff(self.place)
+        return np.asarray(length > _SHORT * length.max(initial=0.0))
+
+
+def _dwells(values: Array, step: float) -> _Dwells:
+    changes = np.flatnonzero(np.diff(values))
+    middle: Array = (values[changes] + values[changes + 1]) / 2
+    inside = np.sign(values[changes[:-1] + 1] - middle[:-1])
+    place: Array = changes + np.float64(0.5)
+    return _Dwells(place, middle, np.where(np.diff(middle) == 0, inside, 0.0), step)
+
+
+def _bump(place: Array, count: int) -> tuple[slice, Array]:
+    """Return the samples between two places, and a parabola that is 0 at both and 1 in the middle."""
+    rows = slice(max(int(np.ceil(place[0])), 0), min(int(np.floor(place[1])) + 1, count))
+    share = (np.arange(rows.start, rows.stop) - place[0]) / (place[1] - place[0])
+    return rows, 4 * share * (1 - share)
+
+
 def unrounded(values: Array) -> Array | None:
     """Return a slow quantity without the rounding of its readings, shape (n,); None where they show too little of it.
 
     Where most readings repeat the one before and few levels are taken, each change of level is at the middle of both,
-    and the quantity is the line from one change to the next, held within its last level outside of them.
+    and the quantity is the line from one change to the next, with a parabola of half a step where it turns in between,
+    held within its last level outside of them.
     """
     step = coarse_step(values)
     if not step:
         return values
-    changes = np.flatnonzero(np.diff(values))
-    middle = (values[changes] + values[changes + 1]) / 2
+    dwells = _dwells(values, step)
+    place, middle = dwells.place, dwells.middle
     if float(np.ptp(middle)) == 0:
         return None
-    place = changes + 0.5
     inner = np.interp(np.arange(len(values)), place, middle)
-    for end, toward in ((slice(None, changes[0] + 1), 1), (slice(changes[-1] + 1, None), -1)):
+    for start in np.flatnonzero(dwells.long & (dwells.turns != 0)).tolist():
+        rows, bump = _bump(place[start : start + 2], len(values))
+        inner[rows] += dwells.turns[start] * step / 2 * bump
+    first, last = int(place[0] + 0.5), int(place[-1] + 0.5)
+    for end, toward in ((slice(None, first), 1), (slice(last, None), -1)):
         ends = middle[::toward]
         far = int(np.argmax(ends != ends[0]))
         slope = (ends[far] - ends[0]) / (place[::toward][far] - place[::toward][0])
         line = ends[0] + slope * (np.arange(len(values))[end] - place[::toward][0])
         inner[end] = np.clip(line, values[end] - step / 2, values[end] + step / 2)
     return np.asarray(inner)
+
+
+def hidden_by_rounding(values: Array, interval: float) -> Array:
+    """Return the slow coefficients of what `unrounded` may be off by, a row of unit variance for each dwell, (k, J).
+
+    They fall with the square of the frequency, so that only the lowest are returned; k is 0 for fine readings.
+    """
+    step, count = coarse_step(values), len(values)
+    if not step:
+        return np.empty((0, 0))
+    dwells = _dwells(values, step)
+    place = dwells.place
+    size = np.where(dwells.turns != 0, step / np.sqrt(12), step / 4 / np.sqrt(3))
+    longest = np.argsort(-np.diff(place) * dwells.long, kind="stable")[: min(_MOST_DWELLS, int(dwells.long.sum()))]
+    rows = []
+    for start in longest.tolist():
+        where, bump = _bump(place[start : start + 2], count)
+        rows.append(np.zeros(count))
+        rows[-1][where] = size[start] * bump
+    for edge, end in ((place[0], 0.0), (place[-1], count - 1.0)):
+        outside = (np.arange(count) - edge) / (end - edge) if end != edge else np.zeros(count)
+        rows.append(np.clip(outside, 0.0, None) * step / np.sqrt(12))
+    return np.array([slow_coefficients(row, interval)[:_LOWEST] for row in rows])
 
 
 def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
@@ -330,6 +401,10 @@ class LongRest(Rest):
     def slow(self, name: str) -> list[Array] | None:
         """Return the slow coefficients of the temperature, stretch by stretch; None where it does not change."""
         return self.temperature if name == "temperature" else None
+
+    def hidden(self, name: str) -> list[Array]:
+        """Return what the rounding of a covariate hides of it, stretch by stretch: see `hidden_by_rounding`."""
+        return [hidden_by_rounding(each, self.interval) for each in self.samples(name)]
 
     def rounding(self, name: str) -> float:
         """Return 0: a log with coarse readings is read as a whole."""

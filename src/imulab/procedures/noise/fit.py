@@ -291,10 +291,10 @@ def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> str | None:
     slope = f"{drift.slope * scale:.2g} ± {drift.standard_uncertainty * scale:.1g} ({unit})/{per}"
     if drift.taken and drift.rounding:
         hidden = _sized(abs(drift.slope) * drift.rounding / 2, column.unit)
-        return Finding(
+        return Note(
             f"follows the {drift.covariate}, {slope}, which was taken out as far as readings in steps of "
-            f"{drift.rounding:.3g} K show it: slow noise below {hidden} may be what the steps hide; record the "
-            "temperature in finer steps",
+            f"{drift.rounding:.3g} K show it: slow noise below {hidden} may be what the steps hide, and the "
+            "frequencies that these move are left out; record the temperature in finer steps"
         )
     if drift.taken:
         return Note(f"follows the {drift.covariate}, {slope}, which was taken out")
@@ -865,7 +865,8 @@ def _fit_column(
         analysis = analysed(without_steps(stretches, steps), candidates, band)
     drifts = []
     for covariate, slow in _covariates(temperatures, analysis.stretches).items():
-        regression = analysis.regressed(slow)
+        hidden = [each for rest in rests for each in rest.hidden(covariate)] if covariate == "temperature" else []
+        regression = analysis.regressed(slow, hidden)
         taken, left = covariate == regress, analysis.letters
         if regression.follows or taken:
             left = analysed(regression.residual, candidates, band).letters
