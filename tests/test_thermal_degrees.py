@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.display import Finding, Note
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.thermal.degrees import (
     LagAndLoops,
@@ -18,7 +19,7 @@ from imulab.procedures.thermal.degrees import (
     warn_lag_and_loops,
 )
 from imulab.procedures.thermal.figures import exhibits
-from imulab.procedures.thermal.hidden import bias_shift_from_unobserved
+from imulab.procedures.thermal.hidden import bias_shift_from_unobserved, cover_hidden
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.record import predict_parameters
 from imulab.procedures.thermal.solve import ThermalProblem, solve
@@ -240,7 +241,7 @@ def test_what_one_ramp_does_not_tell_costs_as_much_as_is_said(reduced):
         triad = reference.Triad(rng, degrees=(3, 1, 0))
         given = one_ramp(rng, triad)
         found = solve(given, laws, tau=0.0)
-        (text, *_) = bias_shift_from_unobserved(given, found, LagAndLoops(), "ramp")
+        (text, *_) = bias_shift_from_unobserved(given, found, "ramp")
         said.append(float(re.search(r"scale factor follows .* shifts the biases by (\S+) mg", text)[1]))
         biases = laws.design(AT)[:, :3] @ found.coefficients
         errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))
@@ -276,14 +277,34 @@ def test_a_lag_that_fast_ramps_do_not_tell_is_said_with_what_it_costs(reduced):
         assert "only warm" in drift.reason
         texts = [
             text
-            for text in bias_shift_from_unobserved(problem_, found, drift, "ramp")
-            if "behind the thermometer" in text
+            for text in cover_hidden(problem_, found, drift, "ramp")[1]
+            if "a lag of the biases behind the thermometer, 20 s" in text and isinstance(text, Finding)
         ]
-        said += [float(re.search(r"shifts the biases by (\S+) mg", text)[1]) for text in texts]
+        said += [float(re.search(r"moves the biases by (\S+) mg", text)[1]) * 5.0 / 20.0 for text in texts]
         biases = laws.design(AT)[:, :3] @ found.coefficients
         errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))
     assert len(said) > trials / 2
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.sqrt(np.mean(np.square(said))), rel=0.4)
+
+
+def test_what_elements_behind_the_thermometer_do_to_scale_factors_is_noted_with_its_size():
+    """A law of a temperature stretched by 0.8 K at both ends is one of the same degree, which no soak tells from it."""
+    soaks = list(il.simulate_thermal(attitudes=12))
+    record = il.fit_thermal(soaks, degrees="3,2,1").calibration
+    (text,) = (each for each in record.warnings if "stay behind the thermometer" in each)
+    assert isinstance(text, Note)
+    assert record.verdict.state == "good"
+    noted, held = map(
+        float, re.search(r"scale factors by (\S+) ppm, of which their uncertainty holds (\S+) p", text).groups()
+    )
+    low, high = record.model["range"]
+    temperature = np.linspace(low, high, 201)
+    place = (2 * temperature - low - high) / (high - low)
+    values, _ = predict_parameters(record, temperature)
+    scale = values[3:6] / values[3:6].mean(axis=1, keepdims=True)
+    moved = 0.8 * place * np.gradient(scale, temperature, axis=1)
+    assert noted == pytest.approx(1e6 * np.sqrt(np.mean(moved**2)), rel=0.1)
+    assert 0 < held < noted
 
 
 def test_ramps_without_a_tumble_are_refused_with_what_is_missing():

@@ -325,7 +325,7 @@ def _warn_fit(
             "few recordings do not tell whether by their temperature or from power cycle to power cycle: record five "
             "temperatures or more, or state --degrees"
         )
-    messages += bias_shift_from_unobserved(problem, solution, drift, name)
+    messages += bias_shift_from_unobserved(problem, solution, name)
     if options["degrees"] == "auto":
         messages.append(Note(f"degrees chosen: {describe_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
     far = [each for each in fitted.left_out if each.chi_square > TEMPERATURE_MISSED.limit**2]
