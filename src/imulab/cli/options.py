@@ -223,7 +223,9 @@ class GivenFiles:
 
     def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
         """Read a recording as a whole, and warn where it was cut."""
-        return read_recording(name, layout=layout, **part)
+        from imulab.estimation.sampling import mend_stamps
+
+        return mend_stamps(read_recording(name, layout=layout, **part))
 
     def record(self, name: str) -> Calibration:
         """Read a calibration record."""

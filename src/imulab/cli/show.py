@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from math import inf, nan
 from typing import TYPE_CHECKING, Any
@@ -152,7 +152,8 @@ def finish_check(
 # Records and recordings in a few lines of plain text.
 
 
-_GAP = 1.5  # of the usual step: a longer one is counted as a gap, as where recordings are read
+_LEAST_JITTER = 1e-6  # s: a smaller one is that of rounding
+_SHOWN = 0.1  # s: times are shown to this
 
 
 def describe_record(record: Calibration, *, provenance: bool = True) -> str:
@@ -255,49 +256,104 @@ class _Column(Struct):
             "missing": self.missing,
         }
 
-    def texts(self) -> list[str]:
+    def texts(self, step: float | None = None) -> list[str]:
+        """Return the numbers in six digits, or in those that show this step, with the number of missing values."""
         numbers = (self.low, self.total / self.finite, self.high) if self.finite else ()
-        return [*([f"{x:.6g}" for x in numbers] or ["–"] * 3), str(self.missing)]
+        many = step is not None and any(abs(x) >= 1e6 * step for x in numbers)
+        digits = ".1f" if many and step is not None and step < 1 else ".0f" if many else ".6g"
+        return [*([f"{x:{digits}}" for x in numbers] or ["–"] * 3), str(self.missing)]
 
 
 class _Clock(Struct):
-    """Duration, rate and gaps, updated by each block; the usual step is that of the first block."""
+    """Times of the blocks, and which rows equal the row before: what `read_clock` wants."""
+
+    time: list[Array] = []
+    same: list[Array] = []
+    last: dict[str, float] = {}
+
+    def add(self, block: Recording) -> None:
+        from imulab.estimation.clock import same_rows
+
+        if block.time is None or not len(block):
+            return
+        self.time.append(block.time)
+        self.same.append(same_rows(block.columns, self.last or None))
+        self.last = {name: float(values[-1]) for name, values in block.columns.items()}
+
+    def summary(self, metadata: Mapping[str, str]) -> _Summary:
+        """Return what the clock shows."""
+        import numpy as np
+
+        from imulab.estimation.clock import epoch_of, read_clock, utc
+        from imulab.estimation.sampling import steady_rows
+
+        if not self.time:
+            return _Summary()
+        time = np.concatenate(self.time)
+        clock = read_clock(time, np.concatenate(self.same))
+        finite = time[np.isfinite(time)]
+        if not finite.size:
+            return _Summary()
+        first, last = float(finite[0]), float(finite[-1])
+        epoch = epoch_of(metadata, first)
+        summary = _Summary(first, last, None if epoch is None else utc(epoch + first), doubt=clock.doubt)
+        summary.backwards, summary.repeated, summary.tick = clock.backwards, clock.repeated, clock.tick
+        if clock.doubt:
+            return summary
+        rising = time if clock.kept is None else time[clock.kept]
+        rising = rising if clock.even is None else clock.even
+        start, stop = steady_rows(rising, lossy=clock.kept is not None)
+        if (start, stop) != (0, len(rising)):
+            clock = read_clock(rising[start:stop], lossy=clock.kept is not None)
+            summary.steady = (float(rising[start]), float(rising[stop - 1]))
+        summary.rate, summary.jitter, summary.tick = clock.rate, clock.jitter, max(summary.tick, clock.tick)
+        summary.gaps, summary.missing = len(clock.gaps), int(clock.missing.sum())
+        summary.widest = clock.widest if summary.gaps else 0.0
+        return summary
+
+
+class _Summary(Struct):
+    """What the time stamps of a recording show; times in s."""
 
     first: float | None = None
     last: float = 0.0
-    usual: float = nan
+    utc: str | None = None
+    rate: float = nan
+    jitter: float = nan
     gaps: int = 0
+    missing: int = 0
     widest: float = 0.0
+    repeated: int = 0
+    tick: float = 0.0
     backwards: int = 0
-    broken: bool = False
-
-    def add(self, time: Array) -> None:
-        import numpy as np
-
-        self.broken = self.broken or not np.isfinite(time).all()
-        step = np.diff(time) if self.first is None else np.diff(time, prepend=self.last)
-        if np.isnan(self.usual) and step.size:
-            self.usual = float(np.median(step))
-        if step.size:
-            self.gaps += int(np.count_nonzero(step > _GAP * self.usual))
-            self.widest = max(self.widest, float(step.max()))
-            self.backwards += int(np.count_nonzero(step < 0))
-        self.first = float(time[0]) if self.first is None else self.first
-        self.last = float(time[-1])
+    steady: tuple[float, float] | None = None
+    doubt: str = ""
 
     def text(self) -> list[str]:
-        import numpy as np
-
-        if self.broken or self.first is None:
+        if self.first is None:
             return []
-        if np.isnan(self.usual):
-            return ["duration 0 s, rate unknown: a single sample"]
-        rising = self.usual > 0
-        rate = f"{1 / self.usual:.6g} Hz" if rising else "unknown, time does not rise"
-        widest = f" (the widest {self.widest:.6g} s)" if self.gaps and rising else ""
-        lines = [f"duration {self.last - self.first:.6g} s, rate {rate}, gaps {self.gaps if rising else 0}{widest}"]
-        times = "once" if self.backwards == 1 else f"{self.backwards} times"
-        return [*lines, f"time runs backwards {times}: procedures refuse it"] if self.backwards else lines
+        rate = f"{self.rate:.6g} Hz" if self.rate > 0 else f"unknown: {self.doubt}"
+        widest = f" (the widest {self.widest:.6g} s), missing {self.missing}" if self.gaps else ""
+        jitter = f", jitter {1e3 * self.jitter:.3g} ms" if self.jitter >= _LEAST_JITTER else ""
+        repeated = f", repeated {self.repeated}" if self.repeated else ""
+        gaps = f", gaps {self.gaps}{widest}" if self.rate > 0 else ""
+        lines = [f"duration {self.last - self.first:.6g} s, rate {rate}{gaps}{repeated}{jitter}"]
+        lines.append(f"start {self.first:.1f} s, end {self.last:.1f} s")
+        if self.utc:
+            lines.append(f"time {self.first:.1f} to {self.last:.1f} s ({self.utc} UTC)")
+        if self.steady:
+            lines.append(f"the rate changes: it is that of {self.steady[0]:.1f} to {self.steady[1]:.1f} s")
+        if self.repeated:
+            rows = "1 row" if self.repeated == 1 else f"{self.repeated} rows"
+            lines.append(f"repeated: {rows} with stamp and values of the row before, which procedures drop")
+        if self.tick and self.rate > 0:
+            lines.append(f"readings share time stamps, which are {self.tick:.3g} s apart: taken in order and as even")
+        if self.backwards:
+            times = "once" if self.backwards == 1 else f"{self.backwards} times"
+            lines.append(f"time runs backwards {times}: procedures refuse it")
+        elif not self.rate > 0 and self.doubt != "a single sample":
+            lines.append("procedures refuse this time: where samples are even, state sample_rate in a layout instead")
+        return lines
 
 
 class _Contents(Struct):
@@ -317,8 +373,7 @@ def _contents(blocks: Iterable[Recording]) -> _Contents:
     for block in blocks:
         samples += len(block)
         notes |= dict.fromkeys(block.notes)
-        if block.time is not None and len(block):
-            clock.add(block.time)
+        clock.add(block)
         for name, values in block.columns.items():
             columns.setdefault(name, _Column()).add(values)
     if block is None:
@@ -328,11 +383,18 @@ def _contents(blocks: Iterable[Recording]) -> _Contents:
 
 def describe_recording(blocks: Iterable[Recording]) -> str:
     """Return a recording in lines: samples, rate, gaps, duration, and each column's range."""
+    from imulab.units import to_si
+
     contents = _contents(blocks)
     last = contents.last
     lines = [f"{printable(last.name)}: {contents.samples} samples"]
-    lines += contents.clock.text() if "time" in last else ["no time column: a table of attitudes, a row each"]
-    rows = [[name, last.units[name], *column.texts()] for name, column in contents.columns.items()]
+    lines += (
+        contents.clock.summary(last.metadata).text()
+        if "time" in last
+        else ["no time column: a table of attitudes, a row each"]
+    )
+    steps = {"time": _SHOWN / to_si(1.0, last.units["time"])} if "time" in last else {}
+    rows = [[name, last.units[name], *column.texts(steps.get(name))] for name, column in contents.columns.items()]
     lines += ["", *aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]
     if last.metadata:
         lines += ["", *(f"{key}: {value}" for key, value in last.metadata.items())]
@@ -345,18 +407,20 @@ def recording_json(blocks: Iterable[Recording]) -> str:
     from imulab.records.calibration import json_text
 
     contents = _contents(blocks)
-    last, clock = contents.last, contents.clock
-    duration = rate = None
-    if clock.first is not None and not clock.broken:
-        duration = clock.last - clock.first
-        rate = 1 / clock.usual if clock.usual > 0 else None
+    last, clock = contents.last, contents.clock.summary(contents.last.metadata)
+    known = clock.first is not None
     return json_text(
         {
             "file": last.name,
             "samples": contents.samples,
-            "duration": {"value": duration, "unit": "s"},
-            "sample_rate": {"value": rate, "unit": "Hz"},
+            "start": {"value": clock.first, "unit": "s", "utc": clock.utc},
+            "end": {"value": clock.last if known else None, "unit": "s"},
+            "duration": {"value": clock.last - clock.first if clock.first is not None else None, "unit": "s"},
+            "sample_rate": {"value": clock.rate if clock.rate > 0 else None, "unit": "Hz"},
+            "jitter": {"value": clock.jitter if clock.rate > 0 else None, "unit": "s"},
             "gaps": clock.gaps,
+            "missing": clock.missing,
+            "repeated": clock.repeated,
             "columns": {
                 name: {"unit": last.units[name], **column.values()} for name, column in contents.columns.items()
             },

@@ -30,7 +30,7 @@ from imulab.estimation.noise_coefficients import (
     unseen,
 )
 from imulab.estimation.rows import Step, deviation_of_steps, find_step, leave_out
-from imulab.estimation.sampling import bridged, sampling_rate, steady_part
+from imulab.estimation.sampling import bridged, mend_stamps, sampling_rate, steady_part
 from imulab.recording import Array, Recording
 from imulab.units import from_si, parse_unit, si_unit
 
@@ -186,6 +186,7 @@ def _noises(
 
 def _mended(recording: Recording, names: list[str]) -> tuple[Recording, float, list[str]]:
     """Return the rows that are readings, at one rate, Hz, and notes on the other rows."""
+    recording = mend_stamps(recording)
     notes = [prefixed(recording.name, note) for note in recording.notes]
     recording, more = bridged(recording, names)
     for sensor in dict.fromkeys(map(kind_of, names)):

@@ -8,6 +8,7 @@ import numpy as np
 
 from imulab.display import Finding, Note
 from imulab.errors import DataError
+from imulab.estimation.clock import GAP, Clock, read_clock, same_rows
 from imulab.estimation.rows import median, quantile
 from imulab.recording import Array, Recording, check_finite, check_time, stored_as
 from imulab.units import to_si
@@ -15,9 +16,9 @@ from imulab.units import to_si
 WIDEST_GAP = 10.0
 """Most sampling intervals across which readings are interpolated."""
 _FEWEST = 3  # samples of a recording that has a rate
-GAP = 1.5  # usual steps: a longer step is a gap
 _COARSE = 0.2  # share of steps beyond the limit from which time stamps are coarse and the steps are no gaps
-_BLOCKS, _SMALLEST_BLOCK = 100, 100  # blocks whose median steps show a change of rate; fewest steps of a block
+_BLOCKS, _SMALLEST_BLOCK = 100, 100  # blocks whose usual steps show a change of rate; fewest steps of a block
+_MORE_IN_BURSTS = 10  # times as many steps of a block where stamps come in bursts
 SAME_RATE = 0.05  # relative: parts of a recording whose steps are this close have one rate
 _SLOWEST, _FASTEST = 5.0, 20_000.0  # Hz: rates at which inertial sensors are logged
 _USUAL = (10.0, 10_000.0)  # Hz: likely rates, for the guess at the right unit of time
@@ -25,12 +26,92 @@ BRIDGED, FEW = 0.01, 0.001
 """Largest share of rows without numbers; share of the rows below which what is bridged or left out is only noted."""
 
 
+class StampNote(Note):
+    """What was done to rows because of their time stamps."""
+
+    __slots__ = ()
+
+
+class StampFinding(Finding):
+    """The same, of so many rows that someone should look."""
+
+    __slots__ = ()
+
+
+def mend_stamps(recording: Recording) -> Recording:
+    """Return a recording whose time rises, with notes on what was done for that (`read_clock`).
+
+    Rows that came again are dropped. Readings that share stamps are spread evenly, in their order. A recording whose
+    time rises, or runs backwards, is returned as it is.
+
+    Raises
+    ------
+    DataError
+        Time stands still, or the rate cannot be told from coarse stamps; the message names the row, and `sample_rate`.
+    """
+    time = recording.time
+    if time is None or len(time) < 2 or not (time[1:] == time[:-1]).any():
+        return recording
+    clock = read_clock(time, same_rows(recording.columns))
+    if clock.doubt:
+        if clock.backwards or not np.isfinite(time).all():
+            return recording  # refused by `check_time`, or bridged
+        raise DataError(_standstill(recording, clock))
+    columns = dict(recording.columns)
+    if clock.kept is not None:
+        columns = {name: stored_as(values[clock.kept], values) for name, values in columns.items()}
+    if clock.even is not None:
+        columns["time"] = stored_as(clock.even / to_si(1.0, recording.units["time"]), columns["time"])
+    lines = recording.lines_before if clock.kept is None else None
+    return replace(
+        recording, columns=columns, lines_before=lines, notes=(*recording.notes, *_stamp_notes(clock, len(time)))
+    )
+
+
+def _standstill(recording: Recording, clock: Clock) -> str:
+    row = clock.doubtful_row
+    raw, unit = recording.column("time"), recording.units["time"]
+    place = f"{recording.name}: {recording.place(row)}, column time"
+    advice = "where the samples are even, state sample_rate in a layout instead of this column (in Python rate=)"
+    if clock.doubt == "time stands still":
+        found = f"{raw[row]:.15g} {unit}"
+        return f"{place}: time stands still: expected more than {raw[row - 1]:.15g} {unit}, found {found}; {advice}"
+    return f"{place}: {clock.doubt}: the sampling rate cannot be told; {advice}"
+
+
+def _stamp_notes(clock: Clock, rows: int) -> list[str]:
+    notes: list[str] = []
+    if clock.repeated:
+        many = f"{clock.repeated} row{'s' if clock.repeated > 1 else ''} that came twice, with stamp and all values,"
+        text = f"{many} {'are' if clock.repeated > 1 else 'is'} dropped"
+        few = clock.repeated == 1 or clock.repeated < FEW * rows
+        notes.append(StampNote(text) if few else StampFinding(text, "record each message once"))
+    if clock.even is not None:
+        notes.append(
+            StampNote(
+                f"readings share time stamps, which are {clock.tick:.3g} s apart: taken in order and as even, "
+                f"{clock.rate:.6g} Hz by their number over time"
+            )
+        )
+    return notes
+
+
+def is_lossy(recording: Recording) -> bool:
+    """Return whether rows of a recording were dropped because they came twice: where one did, another is missing."""
+    return any("came twice" in note for note in stamp_notes(recording))
+
+
+def stamp_notes(recording: Recording) -> list[str]:
+    """Return the notes of a recording on what was done to its time stamps."""
+    return [note for note in recording.notes if isinstance(note, StampNote | StampFinding)]
+
+
 def usual_step(step: Array) -> tuple[float, float]:
     """Return the usual step of time, s, and the longest step that is no gap, from steps of time, shape (n,), n >= 1.
 
     Beyond 1.5 times the median a step is a gap, unless a fifth of all steps are: then time is written that coarsely
     (stamps in whole milliseconds at 700 Hz alternate between 1 and 2 ms), and the limit is 1.5 times the step that a
-    fifth exceed. The usual step is the mean of those that are no gaps.
+    fifth exceed. The usual step is that of `read_clock`.
     """
     if step.max() <= GAP * step.min():  # no gap, whatever the median is
         usual = float(step.mean())
@@ -38,11 +119,11 @@ def usual_step(step: Array) -> tuple[float, float]:
     longest = GAP * median(step)
     if np.mean(step > longest) > _COARSE:
         longest = GAP * quantile(step, 1 - _COARSE)
-    return float(step[step <= longest].mean()), longest
+    return read_clock(np.concatenate([[0.0], np.cumsum(step)])).step, longest
 
 
 def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
-    """Return the sampling rate of a recording, Hz, and warnings about its time.
+    """Return the mean sampling rate of a recording over what is no gap, Hz, and warnings about its time.
 
     The warnings name gaps, a change of rate, and a rate at which no sensor is logged (then the unit of time is wrong).
 
@@ -56,41 +137,44 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     time = check_time(recording)
     if len(time) < _FEWEST:
         raise DataError(f"{recording.name}: {len(time)} samples are too few; expected at least {_FEWEST}")
-    step = np.diff(time)
-    usual, longest = usual_step(step)
-    start, stop = steady_rows(time)
+    lossy = is_lossy(recording)
+    start, stop = steady_rows(time, lossy=lossy)
+    clock = read_clock(time[start:stop], lossy=lossy)
+    odd = mislabelled(recording, clock.rate)
     if (start, stop) != (0, len(time)):
-        return 1 / usual, [_change(recording, time, start, stop), *mislabelled(recording, 1 / usual)]
-    wide = np.flatnonzero(step > longest)
-    if not wide.size:
-        rate = (len(time) - 1) / float(time[-1] - time[0])
-        return rate, mislabelled(recording, rate)
-    worst = int(wide[np.argmax(step[wide])])
-    return 1 / usual, [
+        return clock.rate, [_change(recording, time, start, stop), *odd]
+    count = len(clock.gaps)
+    if not count:
+        return clock.rate, odd
+    step = time[clock.gaps + 1] - time[clock.gaps]
+    worst = int(np.argmax(step))
+    return clock.rate, [
         Finding(
-            f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest {step[worst]:.3g} s "
-            f"after {recording.place(worst)}; the samples on both sides are taken as neighbours",
+            f"{recording.name}: {count} gap{'s' if count > 1 else ''} in time, the longest {step[worst]:.3g} s "
+            f"after {recording.place(int(clock.gaps[worst]))}; the samples on both sides are taken as neighbours",
             "record again without lost samples",
         ),
-        *mislabelled(recording, 1 / usual),
+        *odd,
     ]
 
 
-def steady_rows(time: Array) -> tuple[int, int]:
+def steady_rows(time: Array, *, lossy: bool = False) -> tuple[int, int]:
     """Return the first row, and the last plus 1, of the longest stretch with one sampling rate; times in s, shape (n,).
 
     Blocks of at least a hundred samples have different rates where their usual steps differ by more than 5 %; a single
-    block that differs is passed over.
+    block that differs is passed over. `lossy` is as for `read_clock`.
     """
     step = np.diff(time)
     if step.size and step.max() < (1 + SAME_RATE / 2) * step.min():  # as most are
         return 0, len(time)
     size = max(_SMALLEST_BLOCK, -(-len(step) // _BLOCKS))
+    if step.size and median(step) < float(step.mean()) / 2:  # in bursts: a block holds many of them
+        size *= _MORE_IN_BURSTS
     count = len(step) // size
     if count < 2:
         return 0, len(time)
-    blocks = np.array_split(step[: count * size], count)
-    size_of_step = np.log([usual_step(block)[0] for block in blocks])
+    blocks = [time[k * size : (k + 1) * size + 1] for k in range(count)]
+    size_of_step = np.log([read_clock(block, lossy=lossy).step for block in blocks])
     best = (0, 0)
     for level in size_of_step:
         same = np.abs(size_of_step - level) < SAME_RATE
@@ -114,7 +198,7 @@ def steady_part(recording: Recording) -> tuple[Recording, list[str]]:
     if "time" not in recording:
         return recording, []
     time = check_time(recording)
-    start, stop = steady_rows(time)
+    start, stop = steady_rows(time, lossy=is_lossy(recording))
     if (start, stop) == (0, len(time)):
         return recording, []
     columns = {name: values[start:stop] for name, values in recording.columns.items()}
@@ -169,7 +253,7 @@ def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
     """Return the message of where the rate changes, and between which rates."""
 
     def rate(rows: slice) -> float:
-        return 1 / usual_step(np.diff(time[rows]))[0]
+        return read_clock(time[rows], lossy=is_lossy(recording)).rate
 
     steady = rate(slice(start, stop))
     other = rate(slice(stop, None)) if len(time) - stop > start else rate(slice(None, start))

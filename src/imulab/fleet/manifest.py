@@ -223,6 +223,7 @@ class UnitFiles:
 
     def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
         """Return a recording as a whole, with the manifest's name for messages and the record."""
+        from imulab.estimation.sampling import mend_stamps
         from imulab.readers import read
 
         known = self._layout(layout)
@@ -230,7 +231,7 @@ class UnitFiles:
         if recording.source is not None:
             self.inputs[name] = recording.source.sha256
         self.remember_head(recording)
-        return recording
+        return mend_stamps(recording)
 
     def record(self, name: str) -> Calibration:
         """Return a calibration record."""

@@ -19,7 +19,7 @@ from imulab.options import measure
 from imulab.procedures.correction_order import check_after, check_order, name_correction, parse_thermals
 from imulab.procedures.procedure import Procedure, Section
 from imulab.procedures.registry import joined_of, load_any, procedure_of, section
-from imulab.procedures.result import Record, as_record, as_recording
+from imulab.procedures.result import Record, as_read, as_record
 from imulab.quantities import in_si
 from imulab.recording import Data, Reading, Recording, with_power_on_temperature
 from imulab.records.calibration import Calibration
@@ -231,7 +231,7 @@ def apply(
         record = load_any(fspath(record))
     if not isinstance(record, Blob | Loaded):
         record = as_record(record, "apply")
-    recording = as_recording(data, reading, apply)
+    recording = as_read(data, reading, apply)
     if isinstance(record, Loaded):
         ready = record
     else:

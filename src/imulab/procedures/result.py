@@ -18,6 +18,7 @@ from imulab._version import VERSION
 from imulab.arguments import check, checked, described, types_of
 from imulab.display import Bad, Note, Shown, aligned, verdict_of
 from imulab.errors import DataError, OptionError, listed
+from imulab.estimation.sampling import mend_stamps
 from imulab.files import write_page
 from imulab.frames import columns_of_arrays, is_frame, unmasked
 from imulab.options import file
@@ -155,7 +156,18 @@ def as_recording(
     columns: Callable[[NDArray[Any]], Mapping[str, ArrayLike]] | None = None,
     name: str = "data",
 ) -> Recording:
-    """Return data as a recording.
+    """Return data as a recording whose time rises (`mend_stamps`); else as for `as_read`."""
+    return mend_stamps(as_read(data, reading, function, columns, name))
+
+
+def as_read(
+    data: Data,
+    reading: Mapping[str, Any] | Reading | Sampling,
+    function: Callable[..., Any],
+    columns: Callable[[NDArray[Any]], Mapping[str, ArrayLike]] | None = None,
+    name: str = "data",
+) -> Recording:
+    """Return data as a recording, row by row.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from imulab.errors import OptionError, RecordError, listed
 from imulab.files import write_page
 from imulab.procedures.registry import joined_of, procedure_of
 from imulab.procedures.registry import load as load
-from imulab.procedures.result import Drawn, Record, as_record, as_recording
+from imulab.procedures.result import Drawn, Record, as_read, as_record
 from imulab.recording import Reading, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import RecordComparison, compared
@@ -271,7 +271,7 @@ def apply_to(
     """Return data corrected by a record."""
     from imulab.procedures.apply import apply
 
-    return apply(record, as_recording(data, reading, Calibration.apply), again=again, heading=heading)
+    return apply(record, as_read(data, reading, Calibration.apply), again=again, heading=heading)
 
 
 def export_to(record: Calibration, target: str, folder: str | Path, **options: Any) -> list[Path]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError
+from imulab.estimation.clock import read_clock
 from imulab.estimation.column_noise import most_reach, moved_columns
 from imulab.estimation.noise.readings import LEVELS, doubtful_units, dropouts, own_readings
 from imulab.estimation.noise.spectrum import Accumulator, Stretch, slow_coefficients, transformed
@@ -27,6 +28,8 @@ from imulab.estimation.sampling import (
     WIDEST_GAP,
     bridged,
     bridged_line,
+    is_lossy,
+    mend_stamps,
     mislabelled,
     sampling_rate,
     steady_part,
@@ -52,6 +55,7 @@ _SHORT = 0.1
 """Share of the longest dwell at a level up to which another is no dwell, but noise beside an edge."""
 _MOST_DWELLS, _LOWEST = 64, 8192
 """Dwells, the longest, and coefficients, the lowest, in which what rounding hides is followed."""
+_MOST_BRIDGED = 0.02  # share of samples missing in short gaps beyond which neighbours are taken as such
 _SEEN = 100_000  # samples of which distinct values are counted
 
 
@@ -253,7 +257,7 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
         There is no time or it does not rise, more than 1 % of the rows hold no numbers, a column moves, or no stretch
         holds 500 samples.
     """
-    recording, notes = bridged(recording, list(names))
+    recording, notes = bridged(mend_stamps(recording), list(names))
     recording, more = own_readings(recording, names)
     recording, trimmed = steady_part(recording)
     notes = [*(prefixed(recording.name, note) for note in recording.notes), *notes, *more, *trimmed]
@@ -264,7 +268,7 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
         raise DataError(f"{recording.name}: column {name}: {why} Expected a unit at rest; choose its rest by --window")
     time = check_time(recording)
     usual = 1 / rate
-    parts, filled, left_out = _parts(time)
+    parts, filled, left_out = _parts(time, lossy=is_lossy(recording))
     if not parts:
         raise _too_few(recording, left_out)
     # Lines about gaps come from notes_of_gaps: they say what follows for the noise, not for an Allan curve.
@@ -325,12 +329,12 @@ def _length(part: tuple[int, int, Array | None]) -> int:
     return stop - start if place is None else int(place[-1]) + 1
 
 
-def _parts(time: Array) -> tuple[list[tuple[int, int, Array | None]], int, int]:
+def _parts(time: Array, *, lossy: bool) -> tuple[list[tuple[int, int, Array | None]], int, int]:
     """Return stretches between gaps, the number of samples bridged within them, and of samples outside them."""
-    step = np.diff(time)
-    usual, longest = usual_step(step)
-    wide = np.flatnonzero(step > longest)
-    steps = np.round(step[wide] / usual)
+    clock = read_clock(time, lossy=lossy)
+    wide, steps = clock.gaps, clock.missing + 1
+    if int(clock.missing[steps <= WIDEST_GAP].sum()) > _MOST_BRIDGED * len(time):  # lines would change the noise
+        wide, steps = wide[steps > WIDEST_GAP], steps[steps > WIDEST_GAP]
     edges = [0, *(wide[steps > WIDEST_GAP] + 1).tolist(), len(time)]
     parts: list[tuple[int, int, Array | None]] = []
     filled = 0

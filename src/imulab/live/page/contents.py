@@ -18,6 +18,7 @@ import numpy as np
 
 from imulab.columns import triad
 from imulab.errors import ImulabError
+from imulab.estimation.clock import read_clock
 from imulab.live.page.curves import Head, Writer
 from imulab.options import options_of, part_of, read_options
 from imulab.recording import Array, Reading, Recording
@@ -59,8 +60,15 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
             last_sent = monotonic()
             yield {"head": asdict(writer.head), "metadata": dict(block.metadata), "notes": list(notes)}
     about = {"metadata": dict(block.metadata) if block else {}, "notes": list(notes)}
+    writer.head.usual = usual_step(folder, writer.head)
     yield {"head": asdict(writer.head), **about, "done": True}
     yield attitudes(folder, writer.head, Path(file).name)
+
+
+def usual_step(folder: Path, head: Head) -> float:
+    """Return the usual step of the times that a `Writer` has written, s: the inverse of the mean rate."""
+    step = read_clock(_all(folder / "time.values", head.rows)).step if head.timed and head.rows > 1 else np.nan
+    return step if np.isfinite(step) else head.usual
 
 
 def attitudes(folder: Path, head: Head, name: str) -> dict[str, Any]:

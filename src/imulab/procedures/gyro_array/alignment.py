@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import ObservabilityError
+from imulab.estimation.clock import GAP
 from imulab.estimation.column_noise import ColumnNoise, columns_noise
 from imulab.estimation.decisions import ELEMENT_BENDS, READINGS_LATE
 from imulab.estimation.least_squares import coverage_factor
 from imulab.estimation.noise_coefficients import DeviationCurve
-from imulab.estimation.sampling import GAP
 from imulab.procedures.gyro_array.elements import Elements
 from imulab.recording import Array
 from imulab.records.calibration import Calibration

@@ -16,8 +16,9 @@ import numpy as np
 
 from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, RecordError, UnitError
+from imulab.estimation.clock import GAP
 from imulab.estimation.noise_coefficients import resolution
-from imulab.estimation.sampling import GAP, usual_step
+from imulab.estimation.sampling import mend_stamps, usual_step
 from imulab.procedures.gyro_array.schema import array_of
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration
@@ -385,7 +386,7 @@ def on_one_clock(recording: Recording) -> Recording:
     DataError
         The clocks have no time in common.
     """
-    for block in to_one_clock([recording]):
+    for block in to_one_clock([mend_stamps(recording)]):
         return block
     raise DataError(f"{recording.name}: the clocks of the elements have no time in common with column time")
 

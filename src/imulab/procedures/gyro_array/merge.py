@@ -11,7 +11,8 @@ import numpy as np
 from imulab.columns import kind_of, triad
 from imulab.display import Finding, Note, Shown
 from imulab.errors import DataError, UnitError
-from imulab.estimation.sampling import WIDEST_GAP, usual_step
+from imulab.estimation.clock import read_clock
+from imulab.estimation.sampling import WIDEST_GAP
 from imulab.procedures.gyro_array.elements import MOST_ELEMENTS
 from imulab.recording import Array, Recording, check_time
 from imulab.units import conversion_factor, parse_unit
@@ -84,7 +85,7 @@ def merge_recordings(
                 raise DataError(f"{name}: --align: found no motion that fits {first.name} at one offset of time only")
             times[i] = times[i] - offset
             notes.append(Note(f"{name}: moved by {-offset:+.6g} s, where its motion fits that of {first.name}"))
-        elif offset is not None and abs(offset) > max(usual_step(np.diff(times[k]))[0] for k in (0, i)):
+        elif offset is not None and abs(offset) > max(read_clock(times[k]).step for k in (0, i)):
             later = f"{abs(offset):.4g} s {'later' if offset > 0 else 'earlier'}"
             notes.append(
                 Finding(
@@ -207,7 +208,7 @@ def _distance_to_samples(wanted: Array, time: Array) -> tuple[Array, np.ndarray]
     """Return the distance of times, shape (m,), to the nearest sample, s, and whether they lie in a wide gap."""
     right = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
     away = np.minimum(np.abs(time[right] - wanted), np.abs(wanted - time[right - 1]))
-    return away, time[right] - time[right - 1] > WIDEST_GAP * usual_step(np.diff(time))[0]
+    return away, time[right] - time[right - 1] > WIDEST_GAP * read_clock(time).step
 
 
 def _note_joining(recording: Recording, time: Array, clock: Array, wanted: Array) -> list[str]:
@@ -216,7 +217,7 @@ def _note_joining(recording: Recording, time: Array, clock: Array, wanted: Array
     most = float(away[~across].max(initial=0.0))
     if most == 0:
         return []
-    rates = [1 / usual_step(np.diff(t))[0] for t in (time, clock)]
+    rates = [read_clock(t).rate for t in (time, clock)]
     return [
         Note(
             f"{recording.name}: {rates[0]:.6g} Hz interpolated to the times of the first file, {rates[1]:.6g} Hz, "
@@ -231,7 +232,7 @@ def _clock_offset(time: Array, values: Array, other: Array, others: Array) -> fl
     The size of the rate does not depend on how a gyroscope is mounted; it is correlated over all shifts that leave half
     of the shorter recording.
     """
-    step = max(usual_step(np.diff(time))[0], usual_step(np.diff(other))[0])
+    step = max(read_clock(time).step, read_clock(other).step)
     step = max(step, max(time[-1] - time[0], other[-1] - other[0]) / _MOST_POINTS)
     a, b = _size_of_rate(time, values, step), _size_of_rate(other, others, step)
     shorter = min(len(a), len(b))

@@ -14,8 +14,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from imulab.display import Note
+from imulab.display import Note, prefixed
 from imulab.errors import DataError, SegmentError
+from imulab.estimation.sampling import stamp_notes
 from imulab.procedures.rate import AXES
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import parse_unit, to_si
@@ -87,6 +88,7 @@ def find_motions(recording: Recording, fence: float) -> Motions:
     names = [f"gyro_{axis}" for axis in AXES]
     check_finite(recording, [name for name in names if name in recording])
     time, notes = even_stamps(check_time(recording), recording.name)
+    notes += [prefixed(recording.name, note) for note in stamp_notes(recording)]
     unit = recording.triad_unit("gyro")
     if parse_unit(unit).quantity != "rate":
         raise DataError(f"{recording.name}: gyroscopes in {unit}; turns are counted in a unit of rate, such as deg/s")

@@ -26,6 +26,7 @@ from imulab.columns import triad
 from imulab.display import Finding
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
+from imulab.estimation.sampling import stamp_notes
 from imulab.procedures.result import as_recording
 from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time
 from imulab.units import conversion_factor
@@ -573,7 +574,7 @@ def find_attitudes(
     if "time" not in recording:
         check_clipped_rows(recording, names)
         attitudes = attitude_table(recording, sensor, names, unit, temperature)
-        return replace(attitudes, notes=(*_corrected_notes(recording), *attitudes.notes))
+        return replace(attitudes, notes=(*_recording_notes(recording), *attitudes.notes))
     time = check_time(recording)
     left_out = leave_out(recording, names)
     original, recording = recording, left_out.recording
@@ -606,7 +607,7 @@ def find_attitudes(
         swing=np.ptp(blocks.mean, axis=0),
         motion=motion,
         notes=(
-            *_corrected_notes(recording),
+            *_recording_notes(recording),
             *left_out.notes(_at_rest(stretches, len(time))),
             *_notes(blocks, variance),
         ),
@@ -632,8 +633,8 @@ def _at_rest(stretches: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
     return rest
 
 
-def _corrected_notes(recording: Recording) -> tuple[str, ...]:
-    return tuple(
+def _recording_notes(recording: Recording) -> tuple[str, ...]:
+    corrected = (
         Finding(
             f"the recording was corrected by {entry.rpartition(' sha256:')[0]}: what is found is what that left; "
             "expected the recording as it was measured",
@@ -641,6 +642,7 @@ def _corrected_notes(recording: Recording) -> tuple[str, ...]:
         )
         for entry in recording.corrected_by
     )
+    return (*corrected, *stamp_notes(recording))
 
 
 def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:

@@ -1,0 +1,181 @@
+"""The rule of the clock: mean rate, jitter, gaps, coarse and repeated stamps, by times made with a known truth."""
+
+import json
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.errors import DataError
+from imulab.estimation.clock import read_clock, same_rows
+from imulab.estimation.column_noise import analyse
+from imulab.estimation.sampling import mend_stamps, sampling_rate
+from imulab.recording import Recording
+
+N = 30_000
+NUMBER = np.arange(N)
+
+
+def noise(count, seed=1):
+    return np.random.default_rng(seed).standard_normal(count)
+
+
+def log(time, values=None, unit="s", name="r.csv"):
+    values = noise(len(time)) if values is None else values
+    columns = {"time": np.asarray(time, dtype=float)} | {f"gyro_{axis}": values + k for k, axis in enumerate("xyz")}
+    return Recording(columns, {"time": unit} | {f"gyro_{axis}": "deg/s" for axis in "xyz"}, name=name, lines_before=1)
+
+
+def lose(keep, rate):
+    return NUMBER[keep] / rate
+
+
+@pytest.mark.parametrize("jitter", [0.02, 0.1, 0.2])
+def test_late_stamps_are_no_gaps_and_the_rate_is_samples_over_time(jitter):
+    time = np.sort(NUMBER / 100.06 + noise(N) * jitter / 100.06)
+    clock = read_clock(time)
+    assert clock.rate == pytest.approx((N - 1) / (time[-1] - time[0]), rel=1e-12)
+    assert len(clock.gaps) == 0
+    assert clock.jitter == pytest.approx(np.sqrt(2) * jitter / 100.06, rel=0.02)
+    rate, notes = sampling_rate(log(time))
+    assert (rate, notes) == (clock.rate, [])
+
+
+def test_a_stall_whose_readings_follow_at_once_is_no_gap():
+    late = np.zeros(N)
+    for start in range(500, N - 100, 1000):
+        late[start : start + 20] = (20 - np.arange(20)) / 200 * 0.999
+    clock = read_clock(NUMBER / 200 + late)
+    assert (len(clock.gaps), clock.rate) == (0, pytest.approx(200, rel=1e-9))
+
+
+@pytest.mark.parametrize("jitter", [0, 0.1, 0.2])
+def test_lost_samples_are_gaps_and_leave_the_rate_as_it_is(jitter):
+    keep = np.random.default_rng(2).random(N) > 0.01
+    time = lose(keep, 100) + noise(keep.sum()) * jitter / 100
+    clock = read_clock(np.sort(time))
+    assert clock.rate == pytest.approx(100, rel=1e-3 if jitter else 1e-9)
+    lost = int(np.count_nonzero(~keep[np.argmax(keep) : N - np.argmax(keep[::-1])]))
+    assert clock.missing.sum() == pytest.approx(lost, rel=0.03 if jitter else 0)
+
+
+@pytest.mark.parametrize(
+    ("time", "rate"),
+    [
+        (np.floor(NUMBER / 1.6) / 1e3, 1600),
+        (np.floor(NUMBER / 0.85) / 1e3, 850),
+        (np.round(NUMBER / 0.7) / 1e3, 700),
+        (np.round(NUMBER / 200 + 12, 2), 200),
+        (np.round(NUMBER / 190 + 12, 2), 190),
+        (np.floor(NUMBER / 102.4 + 0.3), 102.4),
+        (np.floor(NUMBER / 50), 50),
+        (np.repeat(NUMBER[: N // 2] / 100, 2), 200),
+        (np.floor(NUMBER / 100 / 0.015625) * 0.015625, 100),
+        (np.floor(NUMBER[:1000] / 100 + 0.3), 100),
+    ],
+    ids=["ms 1600", "ms 850", "ms 700", "2 digits 200", "2 digits 190", "s 102.4", "s 50", "pairs", "15.6 ms", "10 s"],
+)
+def test_coarse_stamps_give_the_rate_by_number_over_time(time, rate):
+    recording = log(time)
+    mended = mend_stamps(recording)
+    assert sampling_rate(mended)[0] == pytest.approx(rate, rel=2e-4)
+    assert sampling_rate(mended)[1] == []
+    assert len(mended) == len(time)
+    assert np.array_equal(mended.column("gyro_x"), recording.column("gyro_x"))
+    tick = np.diff(np.unique(time)).max()
+    assert np.abs(mended.time - time).max() < 1.1 * tick
+    assert (np.diff(mended.time) > 0).all()
+
+
+def test_samples_lost_under_coarse_stamps_stay_a_gap():
+    time = np.floor(np.delete(NUMBER, slice(7000, 7300)) / 1.6) / 1e3
+    clock = read_clock(time)
+    assert (clock.rate, clock.missing.tolist()) == (pytest.approx(1600, rel=1e-4), [300])
+    assert np.diff(clock.even).max() == pytest.approx(301 / 1600, rel=0.02)
+
+
+@pytest.mark.parametrize("values", [np.round(0.3 * noise(N)), np.zeros(N)], ids=["quiet counts", "constant"])
+def test_equal_counts_at_coarse_stamps_are_readings(values):
+    mended = mend_stamps(log(np.floor(NUMBER / 100), values))
+    assert len(mended) == N
+    assert sampling_rate(mended)[0] == pytest.approx(100, rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["some", "each", "in place of the next"])
+def test_a_message_that_came_twice_is_dropped_and_counted(kind):
+    """The rate, the rows and the white noise are those of the messages."""
+    rng = np.random.default_rng(4)
+    values = noise(N, 6)
+    if kind == "some":
+        rows = np.sort(np.concatenate([NUMBER, rng.choice(NUMBER, 900, replace=False)]))
+    elif kind == "each":
+        rows = np.repeat(NUMBER, 2)
+    else:
+        rows = np.where(NUMBER % 3 == 2, NUMBER - 1, NUMBER)
+    repeated = log(NUMBER[rows] / 100, values[rows])
+    mended = mend_stamps(repeated)
+    assert np.array_equal(mended.column("gyro_x"), values[np.unique(rows)])
+    count = len(rows) - len(np.unique(rows))
+    assert mended.notes[0] == f"{count} rows that came twice, with stamp and all values, are dropped"
+    found = analyse(repeated)
+    assert found["sample_rate"]["value"] == pytest.approx(100, rel=1e-9)
+    white = found["columns"]["gyro_x"]["angle_random_walk"]
+    assert abs(white["value"] - np.radians(1) / 10) < 3 * white["standard_uncertainty"]
+    assert found["warnings"][0].startswith(f"r.csv: {count} rows that came twice")
+
+
+@pytest.mark.parametrize(
+    ("time", "said"),
+    [
+        (np.where(NUMBER < 500, NUMBER, np.maximum(NUMBER - 100, 500)) / 100, r"502 .* still for 101 rows"),
+        (np.where(NUMBER == 500, 499, NUMBER) / 100, "501 .* still: expected more than 4.99 s, found 4.99"),
+        (np.full(N, 7.0), "time stands still"),
+        (np.floor(NUMBER[:150] / 100), "time stands still"),
+        (np.floor(NUMBER[np.random.default_rng(1).random(N) > 0.3] / 100), "the sampling rate cannot be told"),
+    ],
+    ids=["frozen", "once", "always", "short", "losses"],
+)  # fmt: skip
+def test_what_cannot_be_told_names_the_row_and_sample_rate(time, said):
+    with pytest.raises(DataError, match=f"r.csv: row .*{said}.*sample_rate"):
+        mend_stamps(log(time))
+
+
+def test_time_that_runs_backwards_is_refused_as_such():
+    time = NUMBER / 100
+    time[9000] = time[8990]
+    time[50] = time[49]
+    with pytest.raises(DataError, match=r"row 9001 .*runs backwards"):
+        sampling_rate(mend_stamps(log(np.where(NUMBER == 50, 0.5, time))))
+
+
+def test_same_rows_look_back_over_blocks():
+    columns = {"time": np.arange(4.0), "a": np.array([1, 1, np.nan, np.nan]), "b": np.array([2.0, 2, 2, 2])}
+    assert same_rows(columns).tolist() == [False, True, False, True]
+    assert same_rows(columns, {"a": 1.0, "b": 2.0}).tolist() == [True, True, False, True]
+    assert same_rows({"time": np.arange(2.0)}).tolist() == [False, False]
+
+
+def test_show_and_noise_have_one_rule(imulab, tmp_path):
+    time = np.sort(1655928838.6 + NUMBER / 100.06 + 0.002 * noise(N, 3))
+    recording = log(1e6 * time, unit="us")
+    il.write_csv(recording, tmp_path / "r.csv")
+    shown = imulab("show", "r.csv").stdout
+    assert "rate 100.062 Hz, gaps 0, jitter 2.8 ms" in shown
+    assert "start 1655928838.6 s, end 1655929138.4 s" in shown
+    assert "time 1655928838.6 to 1655929138.4 s (2022-06-22 20:13:58 UTC)" in shown
+    assert "  1655928838604082  " in shown
+    told = json.loads(imulab("show", "r.csv", "--json").stdout)
+    assert told["sample_rate"]["value"] == pytest.approx(analyse(il.read(tmp_path / "r.csv"))["sample_rate"]["value"])
+    assert told["start"] == {"value": pytest.approx(time[0]), "unit": "s", "utc": "2022-06-22 20:13:58"}
+    assert told["end"]["value"] == pytest.approx(time[-1])
+    assert (told["gaps"], told["missing"], told["repeated"]) == (0, 0, 0)
+
+
+def test_show_counts_what_is_repeated_and_missing(imulab, tmp_path):
+    rows = np.where(NUMBER % 3 == 2, NUMBER - 1, NUMBER)[:300]
+    il.write_csv(log(rows / 100, noise(300)[rows]), tmp_path / "twice.csv")
+    shown = imulab("show", "twice.csv").stdout
+    assert "rate 100 Hz, gaps 99 (the widest 0.02 s), missing 99, repeated 100" in shown
+    il.write_csv(log(np.floor(NUMBER[:150] / 100)), tmp_path / "short.csv")
+    assert "rate unknown: time stands still" in imulab("show", "short.csv").stdout
+    assert "sample_rate" in imulab("show", "short.csv").stdout
