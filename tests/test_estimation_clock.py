@@ -179,3 +179,55 @@ def test_show_counts_what_is_repeated_and_missing(imulab, tmp_path):
     il.write_csv(log(np.floor(NUMBER[:150] / 100)), tmp_path / "short.csv")
     assert "rate unknown: time stands still" in imulab("show", "short.csv").stdout
     assert "sample_rate" in imulab("show", "short.csv").stdout
+
+
+@pytest.mark.parametrize("window", ["+1:+2.5", "+1:", ":+2.5"])
+@pytest.mark.parametrize("first", [0.0, 100.0, 1655928838.5], ids=["zero", "boot", "epoch"])
+def test_a_window_with_signs_counts_from_the_start(imulab, tmp_path, window, first):
+    recording = log(first + NUMBER[:400] / 100)
+    il.write_csv(recording, tmp_path / "r.csv")
+    since = (NUMBER[:400] / 100).tolist()
+    low, high = 1.0 if window[0] == "+" else 0.0, 2.5 if "2.5" in window else 9.0
+    inside = [t for t in since if low <= t <= high]
+    part = il.read(tmp_path / "r.csv", window=window)
+    assert part.time - first == pytest.approx(inside, abs=1e-6)
+    assert f"r.csv: {len(inside)} samples" in imulab("show", "r.csv", "--window", window).stdout
+    assert len(il.read(tmp_path / "r.csv", window=window)) == len(inside)
+
+
+def test_a_window_of_a_frame_counts_from_its_start():
+    recording = il.simulate_tumble(gravity=9.81)
+    how = {"gravity": 9.81, "order": 1}
+    late = recording.with_columns({"time": recording.column("time") + 1655928838.5}, {})
+    first = il.fit_tumble(recording, window=(0, 100), **how).calibration
+    for data in (late, late.to_frame()):
+        again = il.fit_tumble(data, window="+0:+100", **how).calibration
+        assert again.value("bias_x") == pytest.approx(first.value("bias_x"), rel=1e-6)
+
+
+def test_a_window_that_misses_times_since_1970_says_how_to_type_one(imulab, tmp_path):
+    il.write_csv(log(1655928838.5 + NUMBER[:400] / 100), tmp_path / "r.csv")
+    done = imulab("show", "r.csv", "--window", "0:60")
+    assert done.returncode == 2
+    assert done.stderr == (
+        "imulab: r.csv: nothing in the window 0 to 60 s; the file runs from 1655928838.5 to 1655928842.5 s; a window such "
+        "as +0:+60 counts from the start\n"
+    )
+
+
+def test_times_since_1970_are_drawn_from_the_start():
+    figure = log(1655928838.5 + NUMBER[:400] / 100).plot("gyro").figure
+    assert figure.layout["xaxis"]["title"] == {"text": "time from 2022-06-22 20:13:58 UTC on, s"}
+    assert figure.traces[0]["x"][:2] == pytest.approx([0.0, 0.01], abs=1e-6)
+    figure = log(500 + NUMBER[:400] / 100).plot("gyro").figure
+    assert figure.layout["xaxis"]["title"] == {"text": "time, s"}
+    assert figure.traces[0]["x"][0] == 500
+    report = il.fit_tumble(
+        il.simulate_tumble(gravity=9.81).with_columns(
+            {"time": il.simulate_tumble(gravity=9.81).column("time") + 1655928838.5}, {}
+        ),
+        gravity=9.81,
+    )
+    (rest,) = [figure for figure in report.plot() if figure.figure.title == "Where the unit was at rest"]
+    assert rest.figure.layout["xaxis"]["title"]["text"].startswith("time from 2022-06-22")
+    assert 0 <= min(shape["x0"] for shape in rest.figure.layout["shapes"]) < 20

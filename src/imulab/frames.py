@@ -165,11 +165,44 @@ def columns_of_frame(
     if len(titles) < len(frame.columns):
         twice = next(title for title in titles if list(frame.columns).count(title) > 1)
         raise DataError(f"{name}: column {twice} appears twice")
-    entries = [(*_title(title, name), _column(frame[at], title, name)) for at, title in titles.items()]
     index = getattr(frame, "index", None)
+    titles = _with_times(frame, titles, index, name)
+    entries = [(*_title(title, name), _column(frame[at], title, name)) for at, title in titles.items()]
     if index is not None and not any(key == "time" for key, _, _ in entries):
         entries[:0] = _index_times(index, name, stated=rate is not None)
     return _put_together(entries, known_units, rate)
+
+
+def _with_times(frame: Frame, titles: Mapping[Any, str], index: Any, name: str) -> dict[Any, str]:
+    """Return titles in which the one column of dates or durations is called ``time``, unless the index holds times.
+
+    Raises
+    ------
+    DataError
+        Several columns hold dates, and none is called ``time``.
+    """
+    dated = [at for at in titles if _is_dated(frame[at])]
+    named = [at for at, title in titles.items() if title.partition("[")[0].strip() == "time"]
+    if index is not None and _dtype(index).startswith(_TIMES):
+        return dict(titles)
+    if not named and len(dated) > 1:
+        known = " ".join(titles[at] for at in dated)
+        raise DataError(f"{name}: several columns hold dates ({known}); expected the one of the samples called 'time'")
+    return {**titles, **{at: "time" for at in (named or dated) if at in dated}}
+
+
+def _is_dated(column: Any) -> bool:
+    """Return whether a column holds dates or durations: of NumPy, pandas, polars, or Python's own objects."""
+    if _dtype(column).startswith((*_TIMES, "datetime", "duration")):
+        return True
+    if _dtype(column) != "object":
+        return False
+    return isinstance(next((value for value in column if value is not None), None), datetime)
+
+
+def _is_date(value: Any) -> bool:
+    """Return whether an object is a date, and not pandas' missing one, which is no number of a year."""
+    return isinstance(value, datetime) and value.year == value.year
 
 
 def is_frame(value: object) -> bool:
@@ -273,8 +306,11 @@ def _convert_objects(values: NDArray[Any]) -> NDArray[Any]:
     kinds = {type(value) for value in values.flat}
     if any(issubclass(kind, str | bytes) for kind in kinds):
         return values
-    if kinds and all(issubclass(kind, datetime) for kind in kinds):
-        return np.array([value - values[0] for value in values], dtype="timedelta64[us]")
+    first = next((value for value in values.flat if _is_date(value)), None)
+    if first is not None and all(issubclass(kind, (datetime, float, type(None))) for kind in kinds):
+        return np.array(
+            [value - first if _is_date(value) else np.timedelta64("NaT") for value in values], dtype="timedelta64[us]"
+        )
     return values.astype(np.float64)
 
 

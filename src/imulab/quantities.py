@@ -169,8 +169,16 @@ def whole_number(text: str, option: str) -> int:
         raise OptionError(f"{option} {text!r}: expected a whole number") from None
 
 
+class FromStart(float):
+    """A time that counts from the first of a recording, s."""
+
+    __slots__ = ()
+
+
 def span(text: str, option: str) -> tuple[float | None, float | None]:
     """Return a part of a recording's time such as ``10:60``, ``10:`` or ``:60``, s; None for an end that is not given.
+
+    An end with a sign, ``+10:+60``, is a `FromStart`.
 
     Raises
     ------
@@ -179,9 +187,18 @@ def span(text: str, option: str) -> tuple[float | None, float | None]:
     """
     ends = _BETWEEN.split(text.strip())
     if len(ends) != 2 or not any(end.strip() for end in ends):
-        raise OptionError(f"{option} {text!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60")
-    first, last = (quantity(end, option, "time", "s") if end.strip() else None for end in ends)
+        raise OptionError(
+            f"{option} {text!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60, or +10:+60 from the start"
+        )
+    first, last = (_end(end.strip(), option) for end in ends)
     return first, last
+
+
+def _end(text: str, option: str) -> float | None:
+    if not text:
+        return None
+    seconds = quantity(text, option, "time", "s")
+    return FromStart(seconds) if text.startswith("+") else seconds
 
 
 def interval(text: str, option: str) -> tuple[float, float]:

@@ -604,8 +604,10 @@ Window: TypeAlias = Annotated[str | Ends, "(FROM, TO) in s, such as (10, 60) or 
 class LayoutColumn:
     """Where a column comes from (0-based number, or name in the header), and how it becomes a reading.
 
-    A reading in `unit` is (what was read x `scale` - `zero`) / `scale_factor`. Dates become seconds since the first.
-    `scale_from` is the word above the rows whose number is a factor of `scale`.
+    A reading in `unit` is (what was read x `scale` - `zero`) / `scale_factor`. Dates become seconds since the first;
+    `day_first` says whether 11/12 is in December, None that only dates which fit one way are read. A counter of so many
+    `bits` is carried on where it begins again. `scale_from` is the word above the rows whose number is a factor of
+    `scale`.
     """
 
     origin: int | str
@@ -615,6 +617,8 @@ class LayoutColumn:
     scale_factor: float = 1.0
     date: bool = False
     scale_from: str = ""
+    day_first: bool | None = None
+    bits: int = 0
 
     def convert(self, values: Array) -> None:
         """Turn what was read into readings, in place; a number that no reading can be becomes infinite."""
@@ -636,7 +640,8 @@ class Layout:
     of the lines that count (what that field begins with, where the prefix ends with a colon), or nothing; ``text`` says
     that the file is delimited text whatever it looks like (it names a delimiter); ``if_needed`` that it is left out
     where a file says itself what its columns are; ``rate_from`` the word above the rows before the sample rate;
-    ``marks`` texts of which one stands above the titles of such a file.
+    ``marks`` texts of which one stands above the titles of such a file; ``packet`` says which row's stamp a packet of
+    rows shares, the ``first`` or the ``last``, or nothing.
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -654,6 +659,7 @@ class Layout:
     if_needed: bool = False
     rate_from: str = ""
     marks: tuple[str, ...] = ()
+    packet: str = ""
 
     @property
     def starred(self) -> bool:
@@ -738,7 +744,8 @@ class Reading(Sampling, total=False):
     Attributes
     ----------
     window
-        Part to read; either side may be left out. First and last time, s, as ``(10, 60)`` or ``"10:60"``.
+        Part to read; either side may be left out. First and last time, s, as ``(10, 60)`` or ``"10:60"``;
+        ``"+10:+60"`` counts from the first sample.
     """
 
     window: Annotated[Window | None, parsed(span, "FROM:TO", unit="s"), READING]

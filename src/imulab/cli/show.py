@@ -268,7 +268,7 @@ class _Clock(Struct):
     """Times of the blocks, and which rows equal the row before: what `read_clock` wants."""
 
     time: list[Array] = []
-    same: list[Array] = []
+    same: list[Any] = []
     last: dict[str, float] = {}
 
     def add(self, block: Recording) -> None:

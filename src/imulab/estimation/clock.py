@@ -342,4 +342,5 @@ def _spread(time: Array, marks: Rows, stamps: Array, usual: float, gaps: Rows) -
         return even
     before, behind = usual * marks[0], usual * (len(time) - marks[-1])
     knots = np.concatenate([[0], marks, [len(time)]])
-    return np.interp(number, knots, np.concatenate([[stamps[0] - before], stamps, [stamps[-1] + behind]]))
+    through = np.concatenate([[stamps[0] - before], stamps, [stamps[-1] + behind]])
+    return np.asarray(np.interp(number, knots, through))

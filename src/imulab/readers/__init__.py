@@ -20,7 +20,7 @@ from imulab.columns import kind_of
 from imulab.display import Note
 from imulab.errors import ImulabError, ReadError, UnitError, file_name
 from imulab.readers.formats import FORMATS, TEXT, recognised
-from imulab.readers.layout import IfNeeded, load_layout
+from imulab.readers.layout import IfNeeded, load_layout, spread_packets
 from imulab.readers.selection import Selection
 from imulab.readers.text import TextFile
 from imulab.recording import Array, Layout, Recording, Source, Window
@@ -221,15 +221,20 @@ def _blocks(
         raise ReadError(f"{name}: a {kind.name} file says itself what its columns are; leave out {layout.name}")
     if kind is not TEXT:
         try:
-            yield from _FAMILIES[kind.module](Path(file), name, layout, selection)
+            yield from _spread(_FAMILIES[kind.module](Path(file), name, layout, selection), layout)
         except OSError as error:
             raise ReadError(f"{name}: cannot be read: {error.strerror or error}") from None
         return
     selection.refuse(name, "a text file")
     try:
-        yield from _text_blocks(file, name, layout, selection, hashed)
+        yield from _spread(_text_blocks(file, name, layout, selection, hashed), layout)
     except (ReadError, UnitError) as error:
         raise _advise(error, file, layout) from None
+
+
+def _spread(blocks: Iterator[Recording], layout: Layout | None) -> Iterator[Recording]:
+    """Yield blocks as they are, or with the rows of packets spread where the layout has such."""
+    return spread_packets(blocks, layout) if layout is not None and layout.packet else blocks
 
 
 def _text_blocks(

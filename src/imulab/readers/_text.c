@@ -13,8 +13,9 @@
 #include <math.h>
 #include <string.h>
 
-enum { OK = 0, NOT_A_NUMBER = 1, WRONG_COUNT = 2, LONGEST_TOKEN = 400 }; /* 3: NOT_A_DATE */
-enum { DATE = 1 << 30 }; /* flag of a slot: the field is a date, the column takes nanoseconds since 1970 as int64 */
+enum { OK = 0, NOT_A_NUMBER = 1, WRONG_COUNT = 2, LONGEST_TOKEN = 400 }; /* 3, 4: of dates */
+/* Flag of a slot: the field is a date, the column takes nanoseconds since 1970 as int64; the order is in two bits. */
+enum { DATE = 1 << 30, ORDER = 28, FLAGS = DATE | 3 << ORDER };
 
 #include "_dates.h"
 #include "_fields.h"
@@ -268,8 +269,9 @@ static int line_fields(Task *t, const char *p, const char *end, Py_ssize_t row, 
             if (stop == NULL) stop = end;
         }
         if (field < t->fields && t->slots[field] >= 0) {
-            double *value = &t->out[(t->slots[field] & ~DATE) * t->capacity + row];
-            const int problem = t->slots[field] & DATE ? date(p, stop, value) : number(p, stop, value, &t->thread);
+            double *value = &t->out[(t->slots[field] & ~FLAGS) * t->capacity + row];
+            const int order = t->slots[field] >> ORDER & 3;
+            const int problem = t->slots[field] & DATE ? date(p, stop, order, value) : number(p, stop, value, &t->thread);
             if (problem != OK) {
                 *found = field;
                 return problem;
@@ -287,8 +289,9 @@ PyDoc_STRVAR(parse_doc,
              "parse(block, delimiter, slots, out, capacity, start=0, stop=-1, row=0) -> (rows, problem, field)\n\n"
              "Read whole lines of `block` from byte `start` to `stop`; field i goes to column slots[i] (int32, -1: skip) of\n"
              "`out`, a writable float64 buffer of columns with `capacity` rows each, from row `row` on. Delimiter ' ' means\n"
-             "any run of blanks. A slot with bit 30 set takes dates, as nanoseconds since 1970 (int64). On a problem (1: field\n"
-             "`field` is no number, 2: the line has `field` fields, 3: field `field` is no date) `rows` is the index of that\n"
+             "any run of blanks. A slot with bit 30 set takes dates, as nanoseconds since 1970 (int64); bit 28: the day comes\n"
+             "first, bit 29: the month. On a problem (1: field `field` is no number, 2: the line has `field` fields, 3: field\n"
+             "`field` is no date, 4: day and month may be either way round) `rows` is the index of that\n"
              "line from `start`. The interpreter is released: threads may fill different rows.");
 
 static PyObject *parse(PyObject *module, PyObject *args) {
@@ -307,7 +310,7 @@ static PyObject *parse(PyObject *module, PyObject *args) {
                              start <= last && last <= v[BLOCK].len && row >= 0;
     for (Py_ssize_t i = 0; fits && i < t.fields; i++) {
         const Py_ssize_t columns = v[OUT].len / DOUBLE_BYTES / (capacity > 0 ? capacity : 1);
-        fits = t.slots[i] < 0 || (t.slots[i] & ~DATE) < columns;
+        fits = t.slots[i] < 0 || (t.slots[i] & ~FLAGS) < columns;
         t.dated |= t.slots[i] >= 0 && (t.slots[i] & DATE);
     }
     if (fits) {

@@ -18,7 +18,7 @@ import imulab.readers._text as _text
 from imulab.display import Note
 from imulab.errors import ReadError, meant
 from imulab.readers.arrays import origins, recordings
-from imulab.readers.text import _DATE
+from imulab.readers.text import date_flags
 from imulab.recording import Array, Layout, Recording
 from imulab.records.calibration import FORMAT
 
@@ -176,7 +176,7 @@ def _column(column: str, values: list[Any], rows: np.ndarray, layout: Layout, na
         out = np.empty((1, len(values) + 1))
         if wrong is None:
             lines = "\n".join(values).encode("utf-8", "replace")
-            read, problem, _ = _text.parse(lines, "\x1f", np.array([_DATE], np.int32), out, len(values))
+            read, problem, _ = _text.parse(lines, "\x1f", np.array([date_flags(entry)], np.int32), out, len(values))
             if not problem and read == len(values):
                 return out[0, :read]
             wrong = read

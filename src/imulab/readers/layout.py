@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from imulab.columns import check_unit, expected_quantities
 from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.files import check_keys, load_toml, number_of, scale_factor_of, unit_of, value_and_unit
-from imulab.recording import Array, Layout, LayoutColumn
+from imulab.recording import Array, Layout, LayoutColumn, Recording
 from imulab.units import Unit, conversion_factor, parse_unit, to_si
 
 # Layout files; `EXAMPLE` has every key.
@@ -32,8 +33,11 @@ skip_incomplete = false                         # true: rows without a reading i
 # prefix = "IMU"                                # only lines whose first field is IMU, without that field; or "Raw:"
 # encoding = "gbk"                              # of the names in the header, where they are not UTF-8
 # sample_rate = { value = 100, unit = "Hz" }    # instead of time, where no column holds it
+# packet = "last"                               # rows of one time are a packet: it is that of the last, or "first"
 [columns]
 time = { from = 0, unit = "s" }                 # 0-based number, or a name in the header; unit "iso": dates
+# time = { from = 0, unit = "iso", day_first = true }   # 11/12/2024 17:41:40.000 is of December; false: of November
+# time = { from = 0, unit = "us", bits = 32 }   # a counter of 32 bits, which begins again after 2^32 - 1
 accel_x = { from = 1, unit = "count" }
 accel_y = { from = 2, unit = "count" }
 accel_z = { from = 3, unit = "count" }
@@ -55,6 +59,7 @@ _KEYS = (
     "marks",
     "metadata",
     "sample_rate",
+    "packet",
     "skip_lines",
     "decimal",
     "encoding",
@@ -63,7 +68,9 @@ _KEYS = (
     "scale_factor",
     "zero",
 )
-_COLUMN_KEYS = ("from", "unit", "scale", "zero", "scale_factor")
+_COLUMN_KEYS = ("from", "unit", "scale", "zero", "scale_factor", "day_first", "bits")
+_BITS = (8, 64)  # of counters of time
+_PACKETS = ("first", "last")
 _ASCII = bytes(range(32, 92)) + bytes(range(93, 127)) + b"\\u0041\t\n"
 """Characters that an encoding of titles must keep; unicode_escape would change the escape."""
 _WORD = re.compile(r"[A-Za-z]")  # begins a word whose number stands above the rows
@@ -156,6 +163,7 @@ def layout_of(table: dict[str, Any], path: str) -> Layout:
         skip_incomplete=table.get("skip_incomplete", False),
         rate_from=rate_from,
         marks=_marks(table.get("marks", []), path),
+        packet=_packet(table.get("packet"), parsed, path),
         encoding=_encoding(table.get("encoding", "utf-8"), path),
     )
 
@@ -196,10 +204,18 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
             check_unit(name, "s", path)
         except UnitError as error:
             raise UnitError(str(error).replace("'s' (time)", "'iso' (dates)")) from None
-        converts = sorted(set(entry) & {"scale", "zero", "scale_factor"})
+        converts = sorted(set(entry) & {"scale", "zero", "scale_factor", "bits"})
         if converts:
             raise ReadError(f"{place}: {converts[0]}: expected none for dates, whose seconds are counted")
-        return LayoutColumn(origin, "s", date=True)
+        day_first = entry.get("day_first")
+        if not isinstance(day_first, bool | None):
+            raise ReadError(f"{place}: day_first = {quoted(day_first)}; expected true (11/12 is in December) or false")
+        return LayoutColumn(origin, "s", date=True, day_first=day_first)
+    if "day_first" in entry:
+        raise ReadError(f'{place}: day_first: expected for dates only, whose unit is "iso"')
+    bits = _bits(entry.get("bits"), place)
+    if bits and expected_quantities(name) != ("time",):
+        raise ReadError(f"{place}: bits: expected for a time only, which counts on")
     try:
         unit = parse_unit(str(entry["unit"]), expected_quantities(name) or ())
     except UnitError as error:
@@ -208,7 +224,7 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
     if "scale_factor" not in entry:
         if not (counted and name == "time" and unit.symbol == "count"):
             check_unit(name, unit.symbol, path)
-        return LayoutColumn(origin, unit.symbol, scale, zero, scale_from=scale_from)
+        return LayoutColumn(origin, unit.symbol, scale, zero, scale_from=scale_from, bits=bits)
     known = scale_factor_of(
         entry["scale_factor"], f"{place}: scale_factor", f"scale_factor = {_BY_COLUMN['scale_factor']}"
     )
@@ -221,7 +237,7 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
         ) from None
     _check_size(factor, f"{place}: scale_factor")
     check_unit(name, known.measured.symbol, path)
-    return LayoutColumn(origin, known.measured.symbol, scale, zero, factor, scale_from=scale_from)
+    return LayoutColumn(origin, known.measured.symbol, scale, zero, factor, scale_from=scale_from, bits=bits)
 
 
 def _zero(entry: Any, unit: Unit, place: str) -> float:
@@ -276,6 +292,26 @@ def _encoding(name: Any, path: str) -> str:
     return str(name)
 
 
+def _packet(entry: Any, columns: Mapping[str, LayoutColumn], path: str) -> str:
+    """Return of which sample of a packet the time is; empty where rows have times of their own."""
+    if entry is None:
+        return ""
+    if entry not in _PACKETS:
+        raise ReadError(f'{path}: packet = {quoted(entry)}; expected "first" or "last", the row whose time it is')
+    if "time" not in columns:
+        raise ReadError(f"{path}: packet: expected a column time, which the rows of a packet share")
+    return str(entry)
+
+
+def _bits(entry: Any, place: str) -> int:
+    """Return the bits of a counter, 0 where it does not begin again."""
+    if entry is None:
+        return 0
+    if type(entry) is not int or not _BITS[0] <= entry <= _BITS[1]:
+        raise ReadError(f"{place}: bits = {quoted(entry)}; expected {_BITS[0]} to {_BITS[1]}, the width of the counter")
+    return entry
+
+
 def _sample_rate(entry: Any, path: str) -> float | None:
     if entry is None:
         return None
@@ -298,6 +334,21 @@ _LOST_AT_WRAP = 16
 """Steps that a counter may miss where it wraps around."""
 
 
+_MISSING = 1.5  # usual times from row to row: beyond them packets are missing
+_SEEN = 1000  # packets that show the usual time from row to row
+_DAY = 86_400_000_000_000  # ns
+
+
+def _place(row: int, lines_before: int | None) -> str:
+    return f"row {row}" if lines_before is None else f"row {row} (line {row + lines_before})"
+
+
+def _date_text(stamp: int) -> str:
+    """Return a date in ns since 1970, or a time of day, as text."""
+    text = str(np.datetime_as_string(np.datetime64(stamp, "ns")))
+    return text.partition("T")[2] if 0 <= stamp < _DAY else f"{text} UTC"
+
+
 class BackwardsError(ReadError):
     """A date is before the one above it; the first `index` rows of the block are good."""
 
@@ -315,6 +366,7 @@ class Readings:
         self._step = np.inf
         self._carried = 0.0
         self._dates: dict[str, tuple[int, int]] = {}
+        self._begun: dict[str, tuple[float, float]] = {}
 
     def of(self, columns: Mapping[str, Array], first_row: int, lines_before: int | None = None) -> dict[str, Array]:
         """Return the readings of a block that begins at row `first_row`; the arrays are changed in place.
@@ -327,8 +379,11 @@ class Readings:
         dates = [name for name in columns if self._layout.columns[name].date and len(columns[name])]
         for name in dates:
             self._check_dates(name, columns[name], first_row, lines_before)
+        for name, values in columns.items():
+            if self._layout.columns[name].bits:
+                self._carry(name, values, first_row, lines_before)
         rate = self._layout.sample_rate
-        if rate is not None and "time" in columns:
+        if rate is not None and "time" in columns and not self._layout.columns["time"].bits:
             columns["time"][:] = self._unwrap(columns["time"])
         for name, values in columns.items():
             if name in dates:
@@ -350,21 +405,43 @@ class Readings:
         values[:] = (stamps - first) / 1e9
 
     def _check_dates(self, name: str, values: Array, first_row: int, lines_before: int | None) -> None:
+        """Refuse dates that run backwards; times of day alone are carried on past midnight, in place."""
         stamps = values.view(np.int64)
         _, last = self._dates.get(name, (0, int(stamps[0])))
+        if int(stamps.min()) >= 0 and int(stamps.max()) < _DAY:
+            rise = np.diff(stamps, prepend=last % _DAY)
+            stamps += (last // _DAY + np.cumsum(rise < -_DAY // 2)) * _DAY
         back = np.diff(stamps, prepend=last) < 0
         if back.any():
             index = int(np.argmax(back))
-            row = first_row + index
-            place = f"row {row}" if lines_before is None else f"row {row} (line {row + lines_before})"
-            above = stamps[index - 1] if index else last
-            dates = (np.datetime_as_string(np.datetime64(int(stamp), "ns")) for stamp in (above, stamps[index]))
+            above = int(stamps[index - 1]) if index else last
+            dates = (_date_text(stamp) for stamp in (above, int(stamps[index])))
+            place = _place(first_row + index, lines_before)
             raise BackwardsError(
-                "{}: {}, column {}: time runs backwards: expected {} UTC or later, found {}".format(
+                "{}: {}, column {}: time runs backwards: expected {} or later, found {}".format(
                     self._name, place, name, *dates
                 ),
                 index,
             )
+
+    def _carry(self, name: str, values: Array, first_row: int, lines_before: int | None) -> None:
+        """Carry a counter on where it begins again: it fell by more than half of what its bits hold."""
+        size = 2.0 ** self._layout.columns[name].bits
+        known = np.isfinite(values)
+        numbers = values[known]
+        if not numbers.size:
+            return
+        wrong = (numbers < 0) | (numbers >= size)
+        if wrong.any():
+            row = int(np.flatnonzero(known)[np.argmax(wrong)])
+            raise ReadError(
+                f"{self._name}: {_place(first_row + row, lines_before)}, column {name}: expected a counter below "
+                f"2^{self._layout.columns[name].bits} (bits in {self._layout.name}), found {values[row]:.15g}"
+            )
+        last, carried = self._begun.get(name, (float(numbers[0]), 0.0))
+        carry = carried + size * np.cumsum(np.diff(numbers, prepend=last) < -size / 2)
+        self._begun[name] = float(numbers[-1]), float(carry[-1])
+        values[known] = numbers + carry
 
     def _unwrap(self, numbers: Array) -> Array:
         """Return a counter without wrap-around, where it wraps within a few of its steps of 2^8, 2^16 or 2^32.
@@ -382,3 +459,72 @@ class Readings:
         carried = self._carried + np.cumsum(np.where(wraps, size, 0.0))
         self._last, self._step, self._carried = float(numbers[-1]), float(step[-1]), float(carried[-1])
         return numbers + carried
+
+
+# Packets: rows that share the stamp of their first or last one.
+
+
+def spread_packets(blocks: Iterable[Recording], layout: Layout) -> Iterator[Recording]:
+    """Yield the rows of a file whose rows come in packets of one time stamp, with a time for each row.
+
+    Rows of a packet are spread evenly over the time to the next stamp, or since the one before, as the stamp is that of
+    the first or the last; where packets are missing, over the usual time of so many rows.
+    """
+    held: Recording | None = None
+    packets = _Packets(layout.packet)
+    for block in blocks:
+        joined = block if held is None else _joined(held, block)
+        stamps = joined.columns["time"]
+        changes = np.flatnonzero(np.diff(stamps) != 0) + 1
+        complete = int(changes[-1]) if changes.size > (not packets.begun) else 0  # the first two show the rate
+        held = _rows_of(joined, complete, len(joined))
+        if complete:
+            yield packets.spread(_rows_of(joined, 0, complete), float(stamps[complete]))
+    if held is not None:
+        yield packets.spread(held, None)
+
+
+class _Packets:
+    """The stamp before, and times from row to row, over the blocks of a file."""
+
+    def __init__(self, whose: str) -> None:
+        self._whose = whose
+        self._last: float | None = None
+        self._known = np.empty(0)
+
+    @property
+    def begun(self) -> bool:
+        """Whether rows have been spread."""
+        return bool(self._known.size)
+
+    def spread(self, rows: Recording, following: float | None) -> Recording:
+        """Return rows, whole packets, with a time each; `following` is the stamp of the packet after them."""
+        stamps = rows.columns["time"]
+        begin = np.concatenate([[0], np.flatnonzero(np.diff(stamps) != 0) + 1])
+        count = np.diff(np.append(begin, len(stamps)))
+        of_packet = stamps[begin]
+        if self._whose == "first":
+            span = np.diff(of_packet, append=np.nan if following is None else following)
+        else:
+            span = np.diff(of_packet, prepend=np.nan if self._last is None else self._last)
+        self._last = float(of_packet[-1])
+        each = span / count
+        self._known = np.concatenate([self._known, each[np.isfinite(each)]])[-_SEEN:]
+        if not self._known.size:
+            return rows  # a single packet: its rows stay at one time, which is refused
+        usual = float(np.median(self._known))
+        each = np.where(each <= _MISSING * usual, each, usual)
+        place = np.arange(len(stamps)) - np.repeat(begin, count)
+        if self._whose == "last":
+            place -= np.repeat(count - 1, count)
+        return replace(rows, columns={**rows.columns, "time": stamps + place * np.repeat(each, count)})
+
+
+def _rows_of(recording: Recording, start: int, stop: int) -> Recording:
+    columns = {name: values[start:stop] for name, values in recording.columns.items()}
+    return replace(recording, columns=columns, first_row=recording.first_row + start)
+
+
+def _joined(first: Recording, second: Recording) -> Recording:
+    columns = {name: np.concatenate([values, second.columns[name]]) for name, values in first.columns.items()}
+    return replace(second, columns=columns, first_row=first.first_row, notes=(*first.notes, *second.notes))

@@ -11,7 +11,7 @@ from imulab.arguments import check_fields
 from imulab.columns import check_unit, element_number, kind_of, stated_unit
 from imulab.display import Note
 from imulab.errors import OptionError, listed
-from imulab.quantities import span
+from imulab.quantities import FromStart, span
 from imulab.recording import Ends, Recording, Window
 from imulab.units import parse_unit
 
@@ -48,7 +48,8 @@ class Selection:
         if self.element is not None and self.element < 1:
             raise OptionError(f"element {self.element}: expected a number from 1")
         first, last = self.ends or (None, None)
-        if first is not None and last is not None and not first < last:
+        alike = isinstance(first, FromStart) == isinstance(last, FromStart)
+        if first is not None and last is not None and alike and not first < last:
             raise OptionError(f"window {first:g}:{last:g}: expected a start before its end")
 
     @property
@@ -124,13 +125,16 @@ def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Ite
     if window is None:
         yield from blocks
         return
-    first, last = (-np.inf if window[0] is None else window[0]), (np.inf if window[1] is None else window[1])
-    low, high, any_row = np.inf, -np.inf, False
+    first, last = -np.inf, np.inf
+    low, high, any_row, any_time = np.inf, -np.inf, False, False
     for block in blocks:
         time = block.time
         if time is None:
             raise OptionError(f"{name}: no time column, so there is no window of it to read")
         finite = time[np.isfinite(time)]
+        if finite.size and not any_time:
+            any_time = True
+            first, last = _from(window[0], float(finite[0]), -np.inf), _from(window[1], float(finite[0]), np.inf)
         if finite.size:
             low, high = min(low, float(finite.min())), max(high, float(finite.max()))
         inside = (time >= first) & (time <= last)
@@ -146,8 +150,25 @@ def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Ite
             break
     if not any_row:
         raise OptionError(
-            f"{name}: nothing in the window {first:g} to {last:g} s; the file runs from {low:g} to {high:g} s"
+            f"{name}: nothing in the window {_time(first)} to {_time(last)} s; the file runs from {_time(low)} to "
+            f"{_time(high)} s{_from_start(low)}"
         )
+
+
+def _from(end: float | None, start: float, without: float) -> float:
+    """Return an end of a window as a time of the recording, whose first is `start`; `without` where there is none."""
+    if end is None:
+        return without
+    return start + end if isinstance(end, FromStart) else end
+
+
+def _time(seconds: float) -> str:
+    """Return a time in six digits, or in those that show a tenth of a second."""
+    return f"{seconds:.1f}" if 1e5 <= abs(seconds) < np.inf else f"{seconds:g}"
+
+
+def _from_start(low: float) -> str:
+    return "; a window such as +0:+60 counts from the start" if abs(low) >= 1e5 else ""
 
 
 def keep_element(blocks: Iterator[Recording], element: int | None, name: str) -> Iterator[Recording]:

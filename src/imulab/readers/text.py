@@ -28,7 +28,7 @@ from imulab.errors import ReadError, several
 from imulab.readers.layout import BackwardsError, Readings
 from imulab.readers.opened import HEAD, opened, unit_row
 from imulab.readers.titles import fields_of, titles_of
-from imulab.recording import CORRECTED_BY, Layout, Recording
+from imulab.recording import CORRECTED_BY, Layout, LayoutColumn, Recording
 from imulab.writers import powers_of_five
 
 # Lines of a file: one by one for the head, in whole blocks below.
@@ -272,8 +272,12 @@ def _is_pipe(stream: BinaryIO) -> bool:
 
 _text.prepare(powers_of_five())
 _TITLE = re.compile(r"[^,\[\]]+\[[^,\[\]]+\]")
-_DATE = 1 << 30  # flag of a column of dates, beyond any column's number
-_NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE = 1, 2, 3  # problems that the parser in C reports
+_DATE, _DAY_FIRST, _MONTH_FIRST = 1 << 30, 1 << 28, 1 << 29  # flags of a column of dates, beyond any column's number
+_COLUMN = _DAY_FIRST - 1  # the number without flags
+_NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE, _EITHER_ORDER = 1, 2, 3, 4  # problems that the parser in C reports
+_ARROW = re.compile(rb"^[ \t]*(\d?\d:\d\d:\d\d(?:[.:]\d+)?) -> ?", re.M)
+"""What a serial monitor puts before each line."""
+_DATE_ELSEWHERE = re.compile(r'"?\d\d?[./-]\d\d?[./-]\d{4}\b')
 _MOST_ABOVE = 100  # lines above the titles
 _UNENDED = Note("the last line has no line end: if the file was cut there, its last number is short")
 
@@ -342,6 +346,7 @@ class TextFile:
         self._chooses = bool(self._prefix) or self._skips
         self._most_fields = 0
         self._passed = self._incomplete = 0
+        self._arrow = _arrow(layout, self._lines.first()) if layout else None
         self._titles, self._units, self._slots = self._layout_head(layout) if layout else self._native_head()
         if layout is None or layout.header:
             self._pass_last_delimiter()
@@ -480,9 +485,9 @@ class TextFile:
                 known = f"{len(present)} columns" if isinstance(origin, int) else several(present)
                 raise ReadError(f"{self._name}: {layout.name} takes {name} from {what}, found {known}")
             if slots[index] >= 0:
-                other = list(layout.columns)[slots[index] & ~_DATE]
+                other = list(layout.columns)[slots[index] & _COLUMN]
                 raise ReadError(f"{self._name}: {layout.name} takes both {other} and {name} from column {origin}")
-            slots[index] = slot | _DATE if column.date else slot
+            slots[index] = slot | date_flags(column) if column.date else slot
         if self._skips:
             slots = slots[: int(np.flatnonzero(slots >= 0)[-1]) + 1]
         return list(layout.columns), layout.units, slots
@@ -515,12 +520,12 @@ class TextFile:
 
     def _first_fields(self, layout: Layout) -> int:
         """Return the number of fields in a row: as in the first, or as asked for where rows may lack some."""
-        line = self._lines.next_line()
+        line = self._unstamped(self._lines.next_line())
         while self._lines.waiting and (line.startswith(b"#") or not self._has_prefix(line)):
             comment = self._lines.line(layout.encoding, "replace") or ""
             if comment.startswith("#"):
                 self._note(comment)
-            line = self._lines.next_line()
+            line = self._unstamped(self._lines.next_line())
         if self._skips:
             return 1 + max(column.origin for column in layout.columns.values() if isinstance(column.origin, int))
         if self._prefix and not self._lines.waiting:
@@ -528,6 +533,10 @@ class TextFile:
                 f"{self._name}: no line whose first field is {layout.prefix!r}, the prefix in {layout.name}"
             )
         return len(layout.behind_prefix(fields_of(line.decode("utf-8", "replace"), layout.delimiter)) or [])
+
+    def _unstamped(self, lines: bytes) -> bytes:
+        """Return lines with a serial monitor's time of day as their first field, or without it where none is taken."""
+        return lines if self._arrow is None else self._arrow[0].sub(self._arrow[1], lines)
 
     def _has_prefix(self, line: bytes) -> bool:
         return (
@@ -545,7 +554,7 @@ class TextFile:
             line = self._lines.line(layout.encoding, hint=hint)
             if line is None:
                 break
-            titles = titles_of(line, layout.delimiter)
+            titles = titles_of(self._unstamped(line.encode()).decode(), layout.delimiter)
             if wanted.issubset(titles):
                 return layout.behind_prefix(titles) or titles[1:]
             if line.startswith("#") and wanted.isdisjoint(titles):
@@ -568,7 +577,7 @@ class TextFile:
 
     def _begin(self, lines: bytes, threads: ParserThreads) -> _Job:
         """Start parsing a block of whole lines."""
-        rows = lines
+        rows = self._unstamped(lines)
         if self._layout and self._layout.decimal == ",":
             rows = rows.replace(b",", b".")
         if self._chooses:
@@ -630,16 +639,47 @@ class TextFile:
         if problem == _WRONG_COUNT:
             raise ReadError(f"{place}: expected {expected} fields, found {field}")
         entry = fields_of(line, self._delimiter)[field].strip(" \t\r")
-        column = self._titles[int(self._slots[field]) & ~_DATE]
+        column = self._titles[int(self._slots[field]) & _COLUMN]
         shown = entry if len(entry) <= 40 else entry[:37] + "..."
+        if problem == _EITHER_ORDER:
+            raise ReadError(
+                f"{place}, column {column}: {shown!r} may be day or month first; expected day_first = true or false "
+                "for this column in the layout"
+            )
         if problem == _NOT_A_DATE:
+            hint = "; day_first in the layout says which of day and month comes first"
             raise ReadError(
                 f"{place}, column {column}: expected a date and time such as 2026-11-22T15:04:05.250Z, found {shown!r}"
+                + (hint if _DATE_ELSEWHERE.match(entry) else "")
             )
         comma = " (a decimal comma? expected a point)" if re.fullmatch(r"[-+]?\d+,\d+", entry) else ""
         if comma and self._layout:
             comma += '; decimal = "," in the layout reads it'
         raise ReadError(f"{place}, column {column}: expected a number, found {shown!r}{comma}")
+
+
+def _arrow(layout: Layout, line: bytes) -> tuple[re.Pattern[bytes], bytes] | None:
+    """Return what to replace in lines of a serial monitor, ``13:58:48.156 -> 0.1,0.2``, by what; None for others.
+
+    The time of day becomes the first field where the layout takes a date; else it goes. With blanks between fields
+    and no prefix, time and arrow are two fields already.
+    """
+    blank = layout.delimiter == " "
+    if not _ARROW.match(line) or (blank and not layout.prefix):
+        return None
+    between = layout.delimiter.encode()
+    prefix = re.escape(layout.prefix.encode())
+    joined = rb"[ \t]*" if blank else re.escape(between) + b"?"
+    pattern = re.compile(_ARROW.pattern + (b"(" + prefix + b")" if prefix else b"()") + joined, re.M)
+    dated = any(column.date for column in layout.columns.values())
+    if prefix:
+        return pattern, rb"\2" + between + (rb"\1" + between if dated else b"")
+    return pattern, rb"\1" + between if dated else b""
+
+
+def date_flags(column: LayoutColumn) -> int:
+    """Return the flags by which the parser knows a column of dates, and which of day and month comes first."""
+    return _DATE | {None: 0, True: _DAY_FIRST, False: _MONTH_FIRST}[column.day_first]
 
 
 def is_native(line: str) -> bool:

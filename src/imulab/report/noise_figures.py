@@ -23,6 +23,7 @@ from imulab.report.traces import (
     MARGIN,
     QUIET,
     SYMBOLS,
+    TIME,
     Exhibits,
     Figure,
     ReportTable,
@@ -79,7 +80,7 @@ def thinned(place: Array, values: Array, points: int = _POINTS) -> tuple[Array, 
 
 def _channel_figure(recording: Recording, names: list[str], stem: str, unit: str, place: Array) -> Figure:
     """Return the columns of one sensor over time or rows."""
-    over = "time, s" if "time" in recording else "row"
+    over = TIME if "time" in recording else "row"
     thin = len(recording) > 2 * _POINTS
     traces = [_trace(*thinned(place, recording.columns[name]), name, number) for number, name in enumerate(names)]
     return Figure(

@@ -14,6 +14,7 @@ import numpy as np
 from msgspec import Struct, field
 from numpy.typing import ArrayLike, NDArray
 
+from imulab.estimation.clock import is_epoch, utc
 from imulab.estimation.rows import MAD_TO_SIGMA
 from imulab.recording import Array
 
@@ -28,8 +29,15 @@ ALARM = 0.5
 """An observation with less than this share of its weight is drawn as standing out."""
 
 
+TIME = "time, s"
+"""Title of an axis of a recording's times."""
+
+
 class Figure(Struct, frozen=True):
-    """A Plotly figure (traces and layout as plain JSON values), a title, how to read it, and what it shows."""
+    """A Plotly figure (traces and layout as plain JSON values), a title, how to read it, and what it shows.
+
+    Times since 1970 are drawn from their first on, which the axis names: 1.656e9 s has no digits left for seconds.
+    """
 
     title: str
     caption: str
@@ -37,6 +45,23 @@ class Figure(Struct, frozen=True):
     layout: dict[str, Any] = field(default_factory=dict)
     height: int = 380
     message: str = ""
+
+    def __post_init__(self) -> None:
+        axis = self.layout.get("xaxis", {})
+        if axis.get("title") != {"text": TIME}:
+            return
+        start = min((x for trace in self.traces for x in trace.get("x", ()) if x is not None), default=0.0)
+        if not is_epoch(start):
+            return
+        self.layout["xaxis"] = {**axis, "title": {"text": f"time from {utc(start)} UTC on, s"}}
+        if "range" in axis:
+            self.layout["xaxis"]["range"] = [x - start for x in axis["range"]]
+        for trace in self.traces:
+            if "x" in trace:
+                trace["x"] = [None if x is None else x - start for x in trace["x"]]
+        for shape in self.layout.get("shapes", ()):
+            if shape.get("xref") == "x":
+                shape |= {"x0": shape["x0"] - start, "x1": shape["x1"] - start}
 
 
 class ReportTable(Struct, frozen=True):

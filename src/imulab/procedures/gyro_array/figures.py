@@ -28,6 +28,7 @@ from imulab.report.traces import (
     LEGEND,
     MARGIN,
     SYMBOLS,
+    TIME,
     Exhibits,
     Figure,
     ReportTable,
@@ -236,7 +237,7 @@ def _angles(record: ComparisonRecord, a: int) -> Figure:
         caption="Integral of the rate error. A straight line is a bias; lines on top of each other differ in nothing "
         "that counts for an attitude.",
         traces=traces,
-        x=figure_axis("time, s"),
+        x=figure_axis(TIME),
         y=figure_axis(f"angle error, {angle}"),
     )
 
@@ -275,7 +276,7 @@ def _health(record: ComparisonRecord, a: int) -> Figure:
         caption="Dark: counts for much. White: not in use. Marks: stuck, non-finite, or a bias that jumped and is "
         "being estimated again.",
         traces=traces,
-        x=figure_axis("time, s"),
+        x=figure_axis(TIME),
         y={"automargin": True, "autorange": "reversed"},
         height=max(260, 30 * len(names) + 120),
     )

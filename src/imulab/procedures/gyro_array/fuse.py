@@ -51,6 +51,7 @@ from imulab.report.traces import (
     GOOD,
     INK,
     QUIET,
+    TIME,
     Exhibits,
     Figure,
     ReportTable,
@@ -166,7 +167,7 @@ def _rate(fused: Fused) -> Figure:
         if len(traces) > len(names)
         else "No gyro was flagged.",
         traces=traces,
-        x=figure_axis("time, s"),
+        x=figure_axis(TIME),
         y=figure_axis(f"rate, {' '.join(units)}"),
     )
 
@@ -203,7 +204,7 @@ def _states(fused: Fused) -> list[Figure]:
                     title=f"State of each gyro{axis_suffix(letter)}",
                     caption=f"A mark where a gyro was in that state in one of {len(edges)} equal pieces of time.",
                     traces=traces,
-                    x=figure_axis("time, s", range=[float(fused.time[0]), float(fused.time[-1])]),
+                    x=figure_axis(TIME, range=[float(fused.time[0]), float(fused.time[-1])]),
                     y={"automargin": True, "categoryorder": "array", "categoryarray": [*names],
                        "range": [len(names) - 0.5, -0.5]},
                     height=max(260, 30 * len(names) + 120),

@@ -37,6 +37,7 @@ from imulab.report.traces import (
     INK,
     LEGEND,
     QUIET,
+    TIME,
     Exhibits,
     Figure,
     ReportTable,
@@ -533,7 +534,7 @@ def _trace(trace: DeviationTrace, data: HeldAttitudes) -> Figure:
             ),
         ],
         layout={
-            "xaxis": figure_axis("time, s"),
+            "xaxis": figure_axis(TIME),
             "yaxis": log_axis("standard deviation, mg"),
             "legend": LEGEND,
             "shapes": [
