@@ -182,13 +182,13 @@ def _with_times(frame: Frame, titles: Mapping[Any, str], index: Any, name: str) 
         Several columns hold dates, and none is called ``time``.
     """
     dated = [at for at in titles if _is_dated(frame[at])]
-    named = [at for at, title in titles.items() if title.partition("[")[0].strip() == "time"]
+    named = [at for at, title in titles.items() if title.partition("[")[0].strip() == "time"]  # [s]: numbers
     if index is not None and _dtype(index).startswith(_TIMES):
         return dict(titles)
     if not named and len(dated) > 1:
         known = " ".join(titles[at] for at in dated)
         raise DataError(f"{name}: several columns hold dates ({known}); expected the one of the samples called 'time'")
-    return {**titles, **{at: "time" for at in (named or dated) if at in dated}}
+    return dict(titles) if named else {**titles, **dict.fromkeys(dated, "time")}
 
 
 def _is_dated(column: Any) -> bool:

@@ -97,6 +97,13 @@ static int begins_with_time(const char *p, const char *end) {
     return end - p > digits && p[0] >= '0' && p[0] <= '9' && p[digits] == ':';
 }
 
+/* Whether a stamp that `date` wrote is a time of day, or of 1970-01-01. */
+static int is_time_of_day(const double *value) {
+    int64_t stamp;
+    memcpy(&stamp, value, sizeof stamp);
+    return stamp >= 0 && stamp < INT64_C(86400000000000);
+}
+
 /* Date and time, or time of day alone, [p, end) -> nanoseconds since 1970, or since midnight, written as int64 to
  * `value`: ISO 8601, or a date with slashes of this order; UTC where no zone is given. The arrow of a serial monitor
  * behind it is passed over. */

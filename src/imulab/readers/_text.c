@@ -219,6 +219,7 @@ typedef struct {
     Py_ssize_t fields, capacity;
     char delimiter;
     int dated; /* whether a field is a date */
+    Py_ssize_t first; /* row of the first line */
     PyThreadState *thread;
 } Task;
 
@@ -272,9 +273,11 @@ static int line_fields(Task *t, const char *p, const char *end, Py_ssize_t row, 
             double *value = &t->out[(t->slots[field] & ~FLAGS) * t->capacity + row];
             const int order = t->slots[field] >> ORDER & 3;
             const int problem = t->slots[field] & DATE ? date(p, stop, order, value) : number(p, stop, value, &t->thread);
-            if (problem != OK) {
+            /* A time of day below a date is damaged. */
+            const int other = problem == OK && t->slots[field] & DATE && row > t->first && !is_time_of_day(value - 1);
+            if (problem != OK || (other && is_time_of_day(value))) {
                 *found = field;
-                return problem;
+                return problem != OK ? problem : NOT_A_DATE;
             }
         }
         field++;
@@ -304,7 +307,7 @@ static PyObject *parse(PyObject *module, PyObject *args) {
         return NULL;
     }
     if (last < 0) last = v[BLOCK].len;
-    Task t = {NULL, v[SLOTS].buf, v[OUT].buf, v[SLOTS].len / (Py_ssize_t)sizeof(int32_t), capacity, (char)delimiter, 0, NULL};
+    Task t = {NULL, v[SLOTS].buf, v[OUT].buf, v[SLOTS].len / (Py_ssize_t)sizeof(int32_t), capacity, (char)delimiter, 0, row, NULL};
     Py_ssize_t rows = 0, found = 0;
     int problem = OK, fits = prepared && capacity >= 0 && delimiter > 0 && delimiter < 128 && start >= 0 &&
                              start <= last && last <= v[BLOCK].len && row >= 0;
