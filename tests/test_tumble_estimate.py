@@ -205,6 +205,7 @@ def test_reversed_gyroscopes_and_left_handed_units_are_found(reverse):
         il.fit_tumble(il.find_attitudes(recording), order=1, gravity=G)
 
 
+@pytest.mark.slow
 def test_ten_thousand_attitudes_choose_their_order_in_linear_memory():
     rng = np.random.default_rng(11)
     truth = reference.random_truth(rng, 1)
