@@ -504,6 +504,7 @@ def test_the_arduino_example_corrects_as_the_desk_does(tools, tmp_path):
         assert np.abs(found[:, part] - np.column_stack(expected)).max() < SINGLE * scale
 
 
+@pytest.mark.slow
 def test_the_arduino_example_of_nine_axes_and_of_an_array(tools, tmp_path):
     rng = np.random.default_rng(5)
     truth = magnetometer.random_unit(rng, np.radians(67.0), magnetometer.random_rotation(rng))

@@ -106,6 +106,7 @@ sys.addaudithook(hook)
 """
 
 
+@pytest.mark.slow
 def test_a_unit_that_kills_its_process_fails_alone(tmp_path):
     manifest = make_fleet(tmp_path / "in", 12)
     (tmp_path / "in" / "u5.csv").rename(tmp_path / "in" / "poison.csv")
@@ -122,6 +123,7 @@ def test_a_unit_that_kills_its_process_fails_alone(tmp_path):
     assert set(records(tmp_path / "out")) == {f"SN{i:03d}" for i in range(12) if i != 5}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begun", [False, True])
 def test_an_interrupt_of_the_terminal_ends_all_processes_without_a_word(fleet, reference, tmp_path, begun):
     folder = tmp_path / "out"
@@ -154,6 +156,7 @@ def test_no_process_of_a_run_hears_an_interrupt(fleet, tmp_path):
     assert held_back == [1, 1]
 
 
+@pytest.mark.slow
 def test_two_runs_at_once_the_second_is_refused(fleet, tmp_path):
     folder = tmp_path / "out"
     first = command("fleet", "run", fleet, "-o", folder, "--workers", 2)

@@ -126,6 +126,7 @@ def test_from_the_plug_to_the_record_with_a_knocked_attitude_dropped(live, new_p
     assert content(tmp_path / "sn42.json") == content(tmp_path / "fit.json")
 
 
+@pytest.mark.slow
 def test_a_simulated_unit_is_turned_with_the_mouse_and_its_gyroscopes_are_calibrated(live, new_page, tmp_path):
     running = live(f"{UNIT},speed=10,gyro=1", "--attitudes", "14", *FIT, "--save", "rec.csv", "-o", "both.json")
     page = new_page(running.address)

@@ -301,6 +301,7 @@ def test_two_records_are_compared(folder, new_page):
     assert not (folder / "imulab-files").exists()  # nothing was made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [390, 768, 1280])
 def test_every_control_has_a_name_and_fits_the_screen(workbench, new_page, width):
     page = new_page(workbench.address)

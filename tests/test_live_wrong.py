@@ -124,6 +124,7 @@ def same_as_sent(folder: Path, recording: il.Recording, unit: Device | None = No
     np.testing.assert_array_equal(saved.columns["accel_z"], recording.columns["accel_z"][places].round(5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["udp", "tcp", "-"])
 def test_every_sample_of_a_network_source_is_saved(kind, tmp_path):
     recording = tumble()

@@ -290,6 +290,7 @@ def test_degrees_taken_for_radians_are_said_by_the_turns(turned):
     assert any("the scale factors are off by" in each and "is the unit" in each for each in record.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{"gyro_x": "gyro_y", "gyro_y": "gyro_x"}, {"gyro_z": "-"}])
 def test_swapped_and_reversed_axes_are_refused(turned, change):
     made = [{**c, **{a: -c[a] if b == "-" else c[b] for a, b in change.items()}} for c in turned[2][::2]]
