@@ -130,17 +130,17 @@ def check_name(name: str, title: str, file: str) -> None:
 
 def expected_quantities(name: str) -> tuple[str, ...] | None:
     """Return the quantities that a column of the vocabulary may measure; None for other columns."""
-    kind = kind_of(_measured(name))
+    kind = kind_of(measured(name))
     quantity = None if kind is None else KINDS[kind].quantity
     return None if quantity is None else ("time",) if quantity == "time" else (quantity, "output")
 
 
 def example_unit(name: str) -> str:
     """Return a unit that a column of the vocabulary can have, for a message."""
-    return KINDS[kind_of(_measured(name)) or "time"].example
+    return KINDS[kind_of(measured(name)) or "time"].example
 
 
-def _measured(name: str) -> str:
+def measured(name: str) -> str:
     """Return the column that a truth or a standard deviation belongs to."""
     return name.removeprefix("truth_").removeprefix("std_")
 

@@ -378,4 +378,5 @@ def names_of_columns(typed: str, called: str) -> list[str]:
 
 def part_of(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of `imulab.read` that choose a part of a file."""
-    return {name: values[name] for name in ("topic", "instance", "window", "element", "units") if name in values}
+    names = ("topic", "instance", "window", "element", "units", "damaged")
+    return {name: values[name] for name in names if name in values}

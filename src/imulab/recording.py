@@ -25,7 +25,7 @@ from imulab.columns import check_unit, element_number, expected_quantities, tria
 from imulab.display import has_hidden, printable
 from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
-from imulab.options import PROGRAM, READING, file, parsed, text
+from imulab.options import PROGRAM, READING, choice, file, parsed, text
 from imulab.quantities import parse_units, span, whole_number
 from imulab.units import parse_unit, to_si
 from imulab.views import AnyPlot, AnyPlots, views
@@ -641,7 +641,8 @@ class Layout:
     that the file is delimited text whatever it looks like (it names a delimiter); ``if_needed`` that it is left out
     where a file says itself what its columns are; ``rate_from`` the word above the rows before the sample rate;
     ``marks`` texts of which one stands above the titles of such a file; ``packet`` says which row's stamp a packet of
-    rows shares, the ``first`` or the ``last``, or nothing.
+    rows shares, the ``first`` or the ``last``, or nothing; ``labelled`` whether
+    numbers stand behind their names.
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -660,6 +661,7 @@ class Layout:
     rate_from: str = ""
     marks: tuple[str, ...] = ()
     packet: str = ""
+    labelled: bool = False
 
     @property
     def starred(self) -> bool:
@@ -696,6 +698,10 @@ class Layout:
         return f"{count} {what}{far} skipped that {lack} a reading of {columns} (skip_incomplete in {self.name})"
 
 
+DAMAGED = ("refuse", "skip")
+"""What to do with lines of text that cannot be read."""
+
+
 class Part(TypedDict, total=False):
     """How data are to be understood: arrays and data frames by `time` to `units`, files by `units` to `instance`.
 
@@ -715,6 +721,8 @@ class Part(TypedDict, total=False):
         Sensor of a flight log, from 0; the first if not given.
     element
         One IMU of a file of several, from 1.
+    damaged
+        Lines of text that cannot be read: refuse them, or skip and count them.
     """
 
     time: Annotated[ArrayLike | None, PROGRAM]
@@ -724,6 +732,7 @@ class Part(TypedDict, total=False):
     topic: Annotated[str | None, text("TOPIC"), READING]
     instance: Annotated[int | None, parsed(whole_number, "N"), READING]
     element: Annotated[int | None, parsed(whole_number, "N"), READING]
+    damaged: Annotated[str | None, choice(DAMAGED), READING]
 
 
 class Sampling(Part, total=False):

@@ -142,7 +142,7 @@ Record: TypeAlias = Annotated[Calibration | Result | str | os.PathLike[str], fil
 
 _HINTS = types_of(Reading)
 _OF_ARRAYS = ("rate", "time", "unit")
-_OF_FILES = ("layout", "topic", "instance")
+_OF_FILES = ("layout", "topic", "instance", "damaged")
 _UNITS = ("units",)
 _PART = ("window", "element")
 _TITLED = "a file says itself, by its titles or a layout"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -21,6 +22,7 @@ from imulab.display import Note
 from imulab.errors import ImulabError, ReadError, UnitError, file_name
 from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import IfNeeded, load_layout, spread_packets
+from imulab.readers.packed import is_packed, unpacked
 from imulab.readers.selection import Selection
 from imulab.readers.text import TextFile
 from imulab.recording import Array, Layout, Recording, Source, Window
@@ -30,6 +32,7 @@ __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 _LOG = logging.getLogger(__name__)
 """Logger of each file's format, rows, times, and reading time."""
 _HEAD = 1 << 16  # bytes that show the format
+_SOUND_ROWS = 10  # above a line that cannot be read: it is damaged, and not the layout wrong
 _PART = 1 << 22
 """Rows up to which blocks are joined as they are read."""
 
@@ -43,6 +46,7 @@ def read(
     window: Window | None = None,
     element: int | None = None,
     units: Mapping[str, str] | None = None,
+    damaged: str | None = None,
     name: str | None = None,
 ) -> Recording:
     """Read a recording as a whole.
@@ -63,6 +67,8 @@ def read(
         Which IMU of a file of several, from 1; its columns are called as those of a file of one.
     units
         Units of sensors or columns, ``{"accel": "g"}``, in place of those that the file says.
+    damaged
+        ``"skip"`` passes over lines of text that cannot be read, and counts them; they are refused if not given.
     name
         What messages and the source call the file; its path if not given.
 
@@ -86,7 +92,7 @@ def read(
     >>> recording.units["gyro_x"], recording.metadata["gravity"], recording.source.file
     ('deg/s', '9.81 m/s^2', 'tumble.csv')
     """
-    selection = Selection(topic, instance, window, element, units)
+    selection = Selection(topic, instance, window, element, units, damaged)
     name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
     blocks = _log_reading(selection.of(_blocks(file, name, known, selection, hashed), name))
@@ -125,6 +131,7 @@ def read_blocks(
     window: Window | None = None,
     element: int | None = None,
     units: Mapping[str, str] | None = None,
+    damaged: str | None = None,
     name: str | None = None,
 ) -> Iterator[Recording]:
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
@@ -138,7 +145,7 @@ def read_blocks(
     >>> sum(len(block) for block in il.read_blocks("recording.csv")) == len(il.read("recording.csv"))
     True
     """
-    selection = Selection(topic, instance, window, element, units)
+    selection = Selection(topic, instance, window, element, units, damaged)
     name = name or _name(file)
     yield from _log_reading(selection.of(_blocks(file, name, _layout(layout), selection, None), name))
 
@@ -200,7 +207,18 @@ class _Hash:
 def _blocks(
     file: str | Path, name: str, layout: Layout | None, selection: Selection, hashed: _Hash | None
 ) -> Iterator[Recording]:
-    """Yield the blocks of a file in the format that its first bytes show."""
+    """Yield the blocks of a file in the format that its first bytes show, unpacked where it is packed as a whole."""
+    if is_packed(_head(file, 4)):
+        with unpacked(Path(file), name) as content:
+            yield from _content_blocks(content, name, layout, selection, None)
+        return
+    yield from _content_blocks(file, name, layout, selection, hashed)
+
+
+def _content_blocks(
+    file: str | Path, name: str, layout: Layout | None, selection: Selection, hashed: _Hash | None
+) -> Iterator[Recording]:
+    """Yield the blocks of a file that is not packed."""
     if str(file) != "-" and Path(file).is_dir():
         kind = next(kind for kind in FORMATS if kind.module == "rosbag")
     else:
@@ -229,7 +247,7 @@ def _blocks(
     try:
         yield from _spread(_text_blocks(file, name, layout, selection, hashed), layout)
     except (ReadError, UnitError) as error:
-        raise _advise(error, file, layout) from None
+        raise _advise(error, file, name, layout) from None
 
 
 def _spread(blocks: Iterator[Recording], layout: Layout | None) -> Iterator[Recording]:
@@ -241,13 +259,21 @@ def _text_blocks(
     file: str | Path, name: str, layout: Layout | None, selection: Selection, hashed: _Hash | None
 ) -> Iterator[Recording]:
     with _open(file, name) as stream:
-        text = TextFile(stream, name, layout, selection.units, hashed=hashed is not None, whole=hashed is not None)
+        text = TextFile(
+            stream,
+            name,
+            layout,
+            selection.units,
+            skip_damaged=selection.damaged == "skip",
+            hashed=hashed is not None,
+            whole=hashed is not None,
+        )
         if hashed is not None:
             hashed.text = text
         notes: list[str] | None = None
         for block in text.blocks():
             if notes is None:
-                notes = text.doubts if layout or any(map(_is_known, block.columns)) else _note_layout(file)
+                notes = text.doubts if layout or any(map(_is_known, block.columns)) else _note_layout(file, name)
             yield replace(block, notes=(*block.notes, *notes)) if notes else block
         if hashed is not None:
             text.drain()
@@ -258,17 +284,17 @@ def _is_known(column: str) -> bool:
     return column.startswith("truth_") or kind_of(column) not in (None, "time")
 
 
-def _note_layout(file: str | Path) -> list[str]:
+def _note_layout(file: str | Path, name: str) -> list[str]:
     """Return a note on the layout that fits a file without a known column."""
     from imulab.readers.guess import advice_on_guess
     from imulab.readers.shipped import advice
 
     head = _head(file)
-    hint = advice(head) or (advice_on_guess(head, _name(file)) if head else "")
+    hint = advice(head) or (advice_on_guess(head, name) if head else "")
     return [Note(hint)] if hint else []
 
 
-def _advise(error: ImulabError, file: str | Path, layout: Layout | None) -> ImulabError:
+def _advise(error: ImulabError, file: str | Path, name: str, layout: Layout | None) -> ImulabError:
     """Return a refusal of a text file with advice: the layout that reads it, or what a layout is."""
     from imulab.readers.guess import advice_on_guess
     from imulab.readers.shipped import advice, is_titled
@@ -277,19 +303,22 @@ def _advise(error: ImulabError, file: str | Path, layout: Layout | None) -> Imul
     more = advice(head, None if layout is None else layout.name)
     of_titles = isinstance(error, UnitError) or ": row " in str(error) or "found numbers" in str(error)
     if not more and head and layout is None and of_titles and not is_titled(head):
-        more = advice_on_guess(head, _name(file))
+        more = advice_on_guess(head, name)
         if not more and "--layout" not in str(error):
             more = "a layout says where columns of other titles are: --layout (imulab show --formats lists them)"
+    row = re.search(r": row (\d+) \(line \d+\)", str(error))
+    if not more and row and int(row[1]) > _SOUND_ROWS and "expected" in str(error):
+        more = "--damaged skip passes over such lines and counts them"
     return type(error)(f"{error}; {more}") if more else error
 
 
-def _head(file: str | Path) -> bytes:
+def _head(file: str | Path, size: int = _HEAD) -> bytes:
     """Return the first bytes of a file, or nothing where it can be read only once."""
     if is_pipe(file):
         return b""
     try:
         with Path(file).open("rb") as stream:
-            return stream.read(_HEAD)
+            return stream.read(size)
     except OSError:
         return b""
 

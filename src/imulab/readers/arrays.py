@@ -14,6 +14,8 @@ from imulab.recording import Array, Layout, Recording
 
 ROWS = 1 << 16  # of a block of a table held in memory
 _INDEXED = re.compile(r"(.*?)\[(\d{1,9})\]")
+FLAT = re.compile(r"(.*?)\[(\d{1,9})::(\d{1,9})\]")
+"""Every third number of an array from the first on: ``acc[0::3]``."""
 
 
 def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | None]]:

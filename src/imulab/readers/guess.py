@@ -12,12 +12,13 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from datetime import datetime
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 from shlex import quote
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Struct, field
@@ -27,6 +28,9 @@ from imulab.errors import ReadError, file_name, first_of, quoted, readable
 from imulab.options import measure, parsed, text
 from imulab.quantities import parse_units
 from imulab.readers.formats import TEXT, recognised
+from imulab.readers.jsonfile import LARGEST, parsed_document
+from imulab.readers.labelled import LabelledLines, pairs
+from imulab.readers.packed import is_packed, unpacked
 from imulab.readers.shipped import advice
 from imulab.readers.text import is_native
 from imulab.readers.titles import Title, is_number, is_units_row, read_title
@@ -35,6 +39,7 @@ from imulab.units import STANDARD_GRAVITY, parse_unit
 
 HEAD = 1 << 20
 """Bytes of a file that show its columns."""
+_MOST_LABELLED = 20_000  # lines or records that are looked at
 _MOST_LINES = 300  # above the rows
 _FEWEST = 3  # rows that show a column's size
 _DELIMITERS = {",": '","', ";": '";"', "\t": '"\\t"', " ": '"whitespace"'}
@@ -144,6 +149,11 @@ def guess_layout(
     name = os.fsencode(file_name(file)).decode("utf-8", "backslashreplace")
     with readable(name), Path(file).open("rb") as stream:
         head = stream.read(HEAD)
+        packed = unpacked(Path(file), name) if is_packed(head) else nullcontext(Path(file))
+    with packed as content, content.open("rb") as stream:
+        head = stream.read(HEAD)
+        if recognised(head[:1024]).module == "jsonfile":
+            head += stream.read(LARGEST)
     return guess_of_head(head, name, units=units, sample_rate=sample_rate, prefix=prefix or "")
 
 
@@ -159,6 +169,8 @@ def guess_of_head(
     kind = recognised(head[:1024])
     if kind.layout == "none":
         raise GuessError(f"{name}: a {kind.name} file says itself what its columns are; it needs no layout")
+    if kind.module == "jsonfile":
+        return layout_of_table(_table_of_json(head, name), name, units=units, sample_rate=sample_rate)
     if kind is not TEXT or b"\0" in head[:4096]:
         found = "binary data" if kind is TEXT else kind.name
         raise GuessError(f"{name}: a layout is guessed from the titles of text, found {found}")
@@ -171,7 +183,7 @@ def guess_of_head(
     if _is_native(next((line for line in lines if line.strip() and not line.startswith("#")), "")):
         raise GuessError(f"{name}: titles with units, as imulab writes them; it needs no layout")
     try:
-        table = guess_table(lines, name, prefix=prefix, encoding=encoding)
+        table = _labelled_table(lines) or guess_table(lines, name, prefix=prefix, encoding=encoding)
         return layout_of_table(table, name, units=units, sample_rate=sample_rate)
     except GuessError as error:
         known = advice(head)
@@ -207,6 +219,7 @@ class _Table(Struct):
     prefix: str = ""
     encoding: str = "utf-8"
     above: int = 0
+    labelled: bool = False
     others: tuple[str, ...] = ()
 
     def numbers(self, column: int) -> Array:
@@ -248,6 +261,62 @@ def _sensors_of_name(name: str) -> set[str]:
     """Return the sensors that a file's name speaks of: ``Gyroscope.csv``, ``log-mag.txt``."""
     words = re.findall(r"[a-z]+", Path(name).stem.lower().replace("total", ""))
     return {sensor for sensor in _EXAMPLES for word in words if word.startswith(sensor[:3])}
+
+
+def _labelled_table(lines: Sequence[str]) -> _Table | None:
+    """Return the table of numbers with a label each, ``Acceleration X: -2.76, Y: ..``; None for other text."""
+    counts: dict[str, int] = {}
+    units: dict[str, str] = {}
+    found = [list(pairs(line)) for line in lines[:_MOST_LABELLED]]
+    for label, _, unit in (pair for line in found for pair in line):
+        counts[label] = counts.get(label, 0) + 1
+        units[label] = units.get(label) or unit
+    often = [label for label, count in counts.items() if count > _FEWEST and count > max(counts.values()) / 2]
+    if _score(often, set()) < 10:  # no triad
+        return None
+    stems = {label: read_title(label).stem for label in often}
+    for label in often:  # the unit of the last axis is that of all three
+        units[label] = units[label] or next((units[o] for o in often if stems[o] == stems[label] and units[o]), "")
+    rows = LabelledLines(often, "", "", skips=True).read("\n".join(lines[:_MOST_LABELLED]).encode()).decode().split()
+    table = _Table(often, [row.split(",") for row in rows], "", units=[units[label] for label in often], labelled=True)
+    return table if rows else None
+
+
+def _table_of_json(data: bytes, name: str) -> _Table:
+    """Return the table of a JSON file: records, or arrays by key, in which triples may lie flat."""
+    document = parsed_document(data, name)
+    if isinstance(document, dict):
+        arrays = {key: value for key, value in document.items() if isinstance(value, list) and value}
+        rows = min((len(value) for value in arrays.values() if not isinstance(value[0], dict | list)), default=0)
+        columns: dict[str, list[Any]] = {}
+        for key, value in arrays.items():
+            if len(value) == 3 * rows and rows and not isinstance(value[0], dict | list):
+                columns |= {f"{key}[{k}::3]": value[k::3] for k in range(3)}
+            elif not rows or len(value) == rows:
+                flat = [_numbers_of(item, key) for item in value]
+                columns |= {each: [item.get(each) for item in flat] for each in (flat[0] if flat else ())}
+        records = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=False)]
+    else:
+        records = [_numbers_of(item, "") for item in document[:_MOST_LABELLED]] if isinstance(document, list) else []
+    records = [record for record in records if record.keys() == records[0].keys()]
+    if not records or not records[0]:
+        raise GuessError(f"{name}: no records of numbers, and no arrays of them by key")
+    return table_of_records(records)
+
+
+def _numbers_of(value: Any, name: str) -> dict[str, float]:
+    """Return the numbers in a JSON value by the names that a layout has for them; nan for null."""
+    if isinstance(value, dict):
+        parts = [_numbers_of(item, f"{name}.{key}" if name else key) for key, item in value.items()]
+    elif isinstance(value, list):
+        parts = [_numbers_of(item, f"{name}[{place}]") for place, item in enumerate(value[:9])]
+    else:
+        return {name: float("nan") if value is None else float(value)} if _is_json_number(value) else {}
+    return {key: number for part in parts for key, number in part.items()}
+
+
+def _is_json_number(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
 def _tagged(titles: list[str]) -> list[str]:
@@ -370,6 +439,7 @@ def _text(
     lines += [f"# Not taken: {first_of(left, 8)}"] if left else []
     lines += [f"# Lines of other kinds: {' '.join(table.others[:8])} (--prefix NAME)"] if table.others else []
     lines += [f"delimiter = {_DELIMITERS[table.delimiter]}"] if table.delimiter else []
+    lines += ["labelled = true"] if table.labelled else []
     lines += ['decimal = ","'] if table.decimal == "," else []
     lines += [f"encoding = {_toml(table.encoding)}"] if table.encoding != "utf-8" else []
     lines += [f"prefix = {_toml(table.prefix)}"] if table.prefix else []
@@ -688,9 +758,13 @@ def _time_unit(title: Title, values: Array, step: float, seconds: float | None) 
 # Fields of lines.
 
 
-def table_of_records(records: Sequence[Mapping[str, float]]) -> _Table:
+def table_of_records(records: Sequence[Mapping[str, float | None]]) -> _Table:
     """Return the table of records with the same keys, such as lines of JSON."""
-    return _Table(list(records[0]), [[repr(value) for value in record.values()] for record in records], delimiter="")
+    return _Table(
+        list(records[0]),
+        [["nan" if v is None else repr(v) for v in record.values()] for record in records],
+        delimiter="",
+    )
 
 
 def _fields(line: str, delimiter: str) -> list[str]:

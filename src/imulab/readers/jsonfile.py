@@ -17,7 +17,7 @@ import numpy as np
 import imulab.readers._text as _text
 from imulab.display import Note
 from imulab.errors import ReadError, meant
-from imulab.readers.arrays import origins, recordings
+from imulab.readers.arrays import FLAT, origins, recordings
 from imulab.readers.text import date_flags
 from imulab.recording import Array, Layout, Recording
 from imulab.records.calibration import FORMAT
@@ -46,7 +46,7 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
             "as a whole: write CSV, or several files"
         )
     try:
-        document = _document(path.read_bytes(), name)
+        document = parsed_document(path.read_bytes(), name)
         if isinstance(document, dict) and document.get("format") == FORMAT:
             raise ReadError(f"{name}: expected a recording, found JSON (a calibration record?)")
         if layout is None:
@@ -59,11 +59,16 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
     values = {}
     for column, (key, number) in origins(layout, name, "JSON").items():
         where = f"{name}: {layout.name} takes {column} from {key!r}"
-        values[column] = _values(document, key, number, where, layout.skip_incomplete)
+        flat = FLAT.fullmatch(key)
+        if flat is None:
+            values[column] = _values(document, key, number, where, layout.skip_incomplete)
+        else:
+            numbers = _values(document, flat[1], None, where, layout.skip_incomplete)
+            values[column] = _every(numbers, int(flat[2]), int(flat[3]), where)
     yield from _blocks(values, layout, name)
 
 
-def _document(data: bytes, name: str) -> Any:
+def parsed_document(data: bytes, name: str) -> Any:
     """Return what a file holds; of a record a line, the list of them."""
     try:
         text = data.decode("utf-8-sig")
@@ -124,6 +129,15 @@ def _values(document: Any, key: str, number: int | None, where: str, skips: bool
     raise ReadError(f"{where}: row {index + 1}: no such key, found {_listed(there)}{meant(there, rest)}{advice}")
 
 
+def _every(numbers: list[Any], first: int, step: int, where: str) -> list[Any]:
+    """Return every so manieth number of a flat array, ``x, y, z, x, y, z ..``."""
+    if not first < step:
+        raise ReadError(f"{where}: expected a first place below the step, such as [0::3] for x of x, y, z, x ..")
+    if len(numbers) % step:
+        raise ReadError(f"{where}: an array of {len(numbers)} numbers, which are no whole groups of {step}")
+    return numbers[first::step]
+
+
 def _inside(value: Any, rest: str, number: int | None, row: int, where: str) -> Any:
     """Return the value that a name leads to in a row; None for null, `KeyError` without such a key."""
     while rest and value is not None:
@@ -139,7 +153,10 @@ def _inside(value: Any, rest: str, number: int | None, row: int, where: str) -> 
     if number is None or value is None:
         return value
     if not isinstance(value, list) or len(value) <= number:
-        raise ReadError(f"{where}: row {row}: expected an array with a place [{number}], found {_described(value)}")
+        flat = f'; where x, y, z lie flat in one array, from = "..[{number}::3]"' if _is_number(value) else ""
+        raise ReadError(
+            f"{where}: row {row}: expected an array with a place [{number}], found {_described(value)}{flat}"
+        )
     return value[number]
 
 

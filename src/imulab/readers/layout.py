@@ -31,6 +31,8 @@ header = false                                  # true: the first line names the
 skip_lines = 0                                  # lines above the header or the data
 skip_incomplete = false                         # true: rows without a reading in every column are skipped and counted
 # prefix = "IMU"                                # only lines whose first field is IMU, without that field; or "Raw:"
+# labelled = true                               # in place of delimiter: numbers behind their names, ax: 0.1
+# marks = ["DeviceTag:"]                        # one stands above the titles, or the layout is not for the file
 # encoding = "gbk"                              # of the names in the header, where they are not UTF-8
 # sample_rate = { value = 100, unit = "Hz" }    # instead of time, where no column holds it
 # packet = "last"                               # rows of one time are a packet: it is that of the last, or "first"
@@ -56,6 +58,7 @@ _KEYS = (
     "columns",
     "delimiter",
     "header",
+    "labelled",
     "marks",
     "metadata",
     "sample_rate",
@@ -133,7 +136,7 @@ def layout_of(table: dict[str, Any], path: str) -> Layout:
     skip_lines = table.get("skip_lines", 0)
     if type(skip_lines) is not int or skip_lines < 0:
         raise ReadError(f"{path}: skip_lines = {quoted(skip_lines)}; expected a number of lines")
-    for key in ("header", "skip_incomplete"):
+    for key in ("header", "skip_incomplete", "labelled"):
         if not isinstance(table.get(key, False), bool):
             raise ReadError(f"{path}: {key} = {quoted(table[key])}; expected true or false")
     rate = table.get("sample_rate")
@@ -152,16 +155,18 @@ def layout_of(table: dict[str, Any], path: str) -> Layout:
     return Layout(
         columns=parsed,
         delimiter=_DELIMITERS.get(delimiter, ""),
-        header=table.get("header", False) or any(isinstance(c.origin, str) for c in parsed.values()),
+        header=table.get("header", False)
+        or (any(isinstance(c.origin, str) for c in parsed.values()) and not table.get("labelled", False)),
         skip_lines=skip_lines,
         sample_rate=sample_rate,
         metadata={key: str(value) for key, value in metadata.items()},
         name=path,
-        text="delimiter" in table,
+        text="delimiter" in table or table.get("labelled", False),
         decimal=decimal,
         prefix=_prefix(table["prefix"], _DELIMITERS.get(delimiter, ""), path) if "prefix" in table else "",
         skip_incomplete=table.get("skip_incomplete", False),
         rate_from=rate_from,
+        labelled=_labelled(table, parsed, path),
         marks=_marks(table.get("marks", []), path),
         packet=_packet(table.get("packet"), parsed, path),
         encoding=_encoding(table.get("encoding", "utf-8"), path),
@@ -266,6 +271,19 @@ def _prefix(prefix: Any, delimiter: str, path: str) -> str:
             f'{path}: prefix = {quoted(prefix)}; expected the first field of the lines that count, such as "IMU"'
         )
     return prefix
+
+
+def _labelled(table: dict[str, Any], columns: Mapping[str, LayoutColumn], path: str) -> bool:
+    """Return whether numbers stand behind their names in each line, ``ax: 0.1``."""
+    if not table.get("labelled", False):
+        return False
+    for key in ("delimiter", "header", "prefix", "decimal", "skip_lines", "encoding"):
+        if key in table:
+            raise ReadError(f"{path}: {key} together with labelled = true: expected one of them")
+    for name, column in columns.items():
+        if not isinstance(column.origin, str) or column.date:
+            raise ReadError(f'{path}: column {name}: expected the label of a number, such as from = "Acceleration X"')
+    return True
 
 
 def _marks(entry: Any, path: str) -> tuple[str, ...]:

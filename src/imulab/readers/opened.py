@@ -29,6 +29,8 @@ def opened(layout: Layout, head: bytes, name: str) -> Layout:
     ReadError
         Several titles fit a name with ``*``, or a number is not there.
     """
+    if layout.labelled:
+        return replace(layout, delimiter=",")
     if layout.delimiter and not layout.starred and not layout.named_numbers:
         return layout
     lines = [line.rstrip("\r") for line in head.decode(layout.encoding, "replace").lstrip("\ufeff").split("\n")]

@@ -10,7 +10,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from imulab.columns import parse_column_title
+from imulab.columns import kind_of, measured, parse_column_title
+from imulab.display import Note
 from imulab.errors import ReadError
 from imulab.readers.arrays import ROWS, origins, to_floats
 from imulab.readers.formats import library
@@ -41,6 +42,12 @@ def blocks(
         with parquet.ParquetFile(path, memory_map=False, pre_buffer=False, buffer_size=1 << 20) as file:
             there = file.schema_arrow.names
             columns, units = _columns(there, name, layout, stated)
+            notes: tuple[Note, ...] = ()
+            if layout is None:
+                texts = [key for key, title in columns.items() if _is_text(arrow, file.schema_arrow, title, key)]
+                columns = {key: title for key, title in columns.items() if key not in texts}
+                notes = tuple(Note(f"column {key} holds text, which is left out") for key in texts)
+                units = {key: units[key] for key in columns}
             stored = file.schema_arrow.metadata or {}
             readings = Readings(layout, name) if layout else None
             metadata = {**_metadata(stored), **((layout and layout.metadata) or {})}
@@ -53,14 +60,18 @@ def blocks(
                 values = {key: _floats(arrow, batch.column(title), title, name) for key, title in columns.items()}
                 if readings is not None:
                     values = readings.of(values, row)
-                yield Recording(
-                    columns=values, units=units, metadata=metadata, name=name, first_row=row, corrected_by=corrected
-                )
+                yield Recording(values, units, metadata, name, first_row=row, corrected_by=corrected, notes=notes)
                 row += batch.num_rows
     except (arrow.ArrowException, OSError, ValueError, MemoryError) as error:
         raise ReadError(f"{name}: not a whole Parquet file: {' '.join(str(error).split())[:160]}") from None
     if row == 1:
         raise ReadError(f"{name}: no rows of data")
+
+
+def _is_text(arrow: Any, schema: Any, title: str, column: str) -> bool:
+    """Return whether a column that imulab does not know holds text."""
+    kind = schema.field(title).type
+    return kind_of(measured(column)) is None and (arrow.types.is_string(kind) or arrow.types.is_large_string(kind))
 
 
 def _columns(

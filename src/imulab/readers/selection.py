@@ -12,7 +12,7 @@ from imulab.columns import check_unit, element_number, kind_of, stated_unit
 from imulab.display import Note
 from imulab.errors import OptionError, listed
 from imulab.quantities import FromStart, span
-from imulab.recording import Ends, Recording, Window
+from imulab.recording import DAMAGED, Ends, Recording, Window
 from imulab.units import parse_unit
 
 
@@ -33,6 +33,8 @@ class Selection:
         Number of the IMU whose columns to read, from 1, in a file of several.
     units
         Units of sensors or columns, in place of those that the file says.
+    damaged
+        What to do with lines of text that cannot be read: one of `DAMAGED`.
     """
 
     topic: str | None = None
@@ -40,9 +42,12 @@ class Selection:
     window: Window | None = None
     element: int | None = None
     units: Mapping[str, str] | None = None
+    damaged: str | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.damaged is not None and self.damaged not in DAMAGED:
+            raise OptionError(f"damaged {self.damaged!r}: expected one of {listed(DAMAGED, self.damaged)}")
         if self.instance is not None and self.instance < 0:
             raise OptionError(f"instance {self.instance}: expected a number from 0")
         if self.element is not None and self.element < 1:

@@ -22,9 +22,10 @@ import numpy as np
 from msgspec import Struct
 
 import imulab.readers._text as _text
-from imulab.columns import parse_column_title
+from imulab.columns import kind_of, measured, parse_column_title
 from imulab.display import Note
 from imulab.errors import ReadError, several
+from imulab.readers.labelled import LabelledLines
 from imulab.readers.layout import BackwardsError, Readings
 from imulab.readers.opened import HEAD, opened, unit_row
 from imulab.readers.titles import fields_of, titles_of
@@ -106,6 +107,8 @@ class Lines:
         Whether the last line has no line end.
     overlong
         Whether the rows ended with a line that is too long to be one.
+    zeros
+        Bytes of zero at the end of the file, as a card has them whose file was made larger than what was written.
     """
 
     def __init__(self, stream: BinaryIO, name: str, *, hashed: bool, whole: bool) -> None:
@@ -116,6 +119,7 @@ class Lines:
         self._rest = b""
         self._at = 0
         self._ended = self.unended = self.overlong = False
+        self.zeros = 0
         self.taken = self.before = 0
         self.size = os.fstat(stream.fileno()).st_size if whole and not self.live and _is_file(stream) else 0
         self._read_more()
@@ -176,6 +180,8 @@ class Lines:
                 self.overlong, self._rest = True, b""
                 return None
             self._rest += data
+        if self.zeros and not self._rest.endswith(b"\n"):  # the line in which the writing stopped
+            self._rest = self._rest[: self._rest.rfind(b"\n") + 1]
         self.unended |= bool(self._rest) and not self._rest.endswith(b"\n")
         lines, self._rest = self._rest.rstrip(blanks), b""
         return lines or None
@@ -240,15 +246,30 @@ class Lines:
         self._rest += self._next_bytes()
 
     def _next_bytes(self) -> bytes:
-        try:
-            data = self._read(_BLOCK_BYTES)
-        except OSError as error:
-            raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
-        self._ended = not data
-        self.taken += len(data)
-        if self._hash:
-            self._hash.update(data)
-        return data
+        while True:
+            try:
+                data = self._read(_BLOCK_BYTES)
+            except OSError as error:
+                raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
+            self._ended = not data
+            self.taken += len(data)
+            if self._hash:
+                self._hash.update(data)
+            if not (data and (self.zeros or data.endswith(b"\0"))):
+                return data
+            data = self._without_zeros(data)
+            if data:
+                return data
+
+    def _without_zeros(self, data: bytes) -> bytes:
+        """Return bytes without the zeros at their end, which are counted; text behind zeros is refused."""
+        kept = data.rstrip(b"\0")
+        if self.zeros and kept:
+            raise ReadError(
+                f"{self._name}: {self.zeros} bytes of zero before byte {self.taken}: expected text, found a gap"
+            )
+        self.zeros += len(data) - len(kept)
+        return kept
 
 
 def _is_file(stream: BinaryIO) -> bool:
@@ -278,7 +299,9 @@ _NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE, _EITHER_ORDER = 1, 2, 3, 4  # problems
 _ARROW = re.compile(rb"^[ \t]*(\d?\d:\d\d:\d\d(?:[.:]\d+)?) -> ?", re.M)
 """What a serial monitor puts before each line."""
 _DATE_ELSEWHERE = re.compile(r'"?\d\d?[./-]\d\d?[./-]\d{4}\b')
+_FEW_DAMAGED, _MOST_DAMAGED = 20, 0.02  # lines, and share of lines, that may be left out as damaged
 _MOST_ABOVE = 100  # lines above the titles
+_BEFORE_BLANK = re.compile(rb",(?=[ \t\r\n])|,$")
 _UNENDED = Note("the last line has no line end: if the file was cut there, its last number is short")
 
 
@@ -295,12 +318,15 @@ class _Job(Struct, frozen=True):
         Where the numbers will be, a row of the array for each column.
     answer
         What the parser says, once it has finished.
+    parse
+        The parser from a byte of `rows` into a row of `out` on, for these fields' columns.
     """
 
     lines: bytes
     rows: bytes
     out: np.ndarray
     answer: Callable[[], tuple[int, int, int]]
+    parse: Callable[[int, int, np.ndarray], tuple[int, int, int]]
 
 
 class TextFile:
@@ -316,10 +342,14 @@ class TextFile:
         layout: Layout | None,
         units: Mapping[str, str] | None = None,
         *,
+        skip_damaged: bool = False,
         hashed: bool = True,
         whole: bool = False,
     ) -> None:
-        self._name, self._stated = name, units
+        self._name, self._stated, self._skips_damaged = name, units, skip_damaged
+        self._damaged = 0
+        self._first_damage = ""
+        self._texts: dict[str, int] = {}
         self._lines = Lines(stream, name, hashed=hashed, whole=whole)
         if layout is not None and layout.if_needed and is_native(self._lines.first().decode("utf-8", "replace")):
             layout = None
@@ -347,6 +377,7 @@ class TextFile:
         self._most_fields = 0
         self._passed = self._incomplete = 0
         self._arrow = _arrow(layout, self._lines.first()) if layout else None
+        self._labels: LabelledLines | None = None
         self._titles, self._units, self._slots = self._layout_head(layout) if layout else self._native_head()
         if layout is None or layout.header:
             self._pass_last_delimiter()
@@ -372,7 +403,7 @@ class TextFile:
     def _blocks(self) -> Iterator[Recording]:
         row = 1
         waiting: deque[_Job] = deque()
-        live = self._lines.live
+        live, counts = self._lines.live, self._chooses or self._skips_damaged or self._labels is not None
         with ParserThreads() as threads:
             while True:
                 lines = self._lines.block(self._blanks)
@@ -381,13 +412,17 @@ class TextFile:
                 # A file is read ahead while threads parse; lines of a pipe are passed on at once.
                 while waiting and (lines is None or live or len(waiting) > threads.size):
                     job = waiting.popleft()
-                    rows, problem, field = job.answer()
+                    rows, problem, field = self._mended(job, row, *job.answer())
                     try:
                         recording = self._finish(job.out[:, :rows], row)
                     except BackwardsError as error:
                         if live and error.index:
                             yield self._finish(job.out[:, : error.index], row)
                         raise
+                    if (live or (lines is None and not waiting)) and (notes := self._notes()):
+                        recording = replace(recording, notes=(*recording.notes, *notes))
+                    if self._lines.zeros and lines is None and not waiting:
+                        recording = replace(recording, notes=(*recording.notes, self._zeros()))
                     if self._lines.unended and not waiting:
                         recording = replace(recording, notes=(*recording.notes, _UNENDED))
                     # The good rows of a stream are kept if a bad one follows them.
@@ -396,7 +431,7 @@ class TextFile:
                     if problem:
                         self._refuse(job, row, rows, problem, field)
                     row += rows
-                    self._passed += job.lines.count(b"\n") + (not job.lines.endswith(b"\n")) if self._chooses else rows
+                    self._passed += job.lines.count(b"\n") + (not job.lines.endswith(b"\n")) if counts else rows
                 if lines is None:
                     break
         if self._lines.overlong:
@@ -408,6 +443,9 @@ class TextFile:
             raise ReadError(f"{self._name}: no rows of data: {self._skipped()}")
         if row == 1:
             raise ReadError(f"{self._name}: no rows of data below the header")
+
+    def _zeros(self) -> str:
+        return f"truncated: {self._lines.zeros} bytes of zero behind the rows, and a line cut there, are left out"
 
     def _skipped(self) -> str:
         return self._layout.skipped(self._incomplete, so_far=self._lines.live) if self._layout else ""
@@ -455,9 +493,31 @@ class TextFile:
                 raise ReadError(f"{self._name}: line {self._lines.before}: column {name} appears twice")
             titles.append(name)
             units[name] = unit
-        return titles, units, np.arange(len(titles), dtype=np.int32)
+        return self._without_text(titles, units)
+
+    def _without_text(self, titles: list[str], units: dict[str, str]) -> tuple[list[str], dict[str, str], np.ndarray]:
+        """Return the columns without those that imulab does not know and whose first field is text."""
+        fields = [field.strip(' "\t\r') for field in fields_of(self._lines.first().decode("utf-8", "replace"), ",")]
+        texts = [
+            name
+            for name, field in zip(titles, fields, strict=False)
+            if kind_of(measured(name)) is None and field and not is_number(field)
+        ]
+        kept = [name for name in titles if name not in texts]
+        if not texts or not kept:
+            return titles, units, np.arange(len(titles), dtype=np.int32)
+        holds = f"column {texts[0]} holds" if len(texts) == 1 else f"columns {' '.join(texts)} hold"
+        self.doubts.append(Note(f"{holds} text, which is left out"))
+        slots = np.array([-1 if name in texts else kept.index(name) for name in titles], dtype=np.int32)
+        return kept, {name: units[name] for name in kept}, slots
 
     def _layout_head(self, layout: Layout) -> tuple[list[str], dict[str, str], np.ndarray]:
+        if layout.labelled:
+            labels = [str(column.origin) for column in layout.columns.values()]
+            self._labels = LabelledLines(labels, self._name, layout.name, skips=self._skips)
+            self._labels.check(self._lines.head(HEAD).decode("utf-8", "replace"))
+            self._chooses = self._skips = False
+            return list(layout.columns), layout.units, np.arange(len(labels), dtype=np.int32)
         for _ in range(layout.skip_lines):
             line = self._lines.line(layout.encoding, "replace")
             if line is None:
@@ -580,6 +640,11 @@ class TextFile:
         rows = self._unstamped(lines)
         if self._layout and self._layout.decimal == ",":
             rows = rows.replace(b",", b".")
+        if self._labels is not None:
+            rows = self._labels.read(rows)
+            self._incomplete = self._labels.incomplete
+        if self._delimiter == " " and b"," in rows:  # 0.1, 0.2, 0.3
+            rows = _BEFORE_BLANK.sub(b"", rows)
         if self._chooses:
             rows, _ = self._chosen(rows, -1)
         # A row has at least one character for each of its fields; a shorter one is refused.
@@ -587,7 +652,64 @@ class TextFile:
         room, first = self._place_for(capacity, len(lines))
         job = partial(_text.parse, rows, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
         answer = threads.begin(job) if len(rows) >= WORTH_SHARING else job
-        return _Job(lines, rows, room[:, first : first + capacity], answer)
+
+        def parse(start: int, row: int, slots: np.ndarray) -> tuple[int, int, int]:
+            return _text.parse(rows, self._delimiter, slots, room, room.shape[1], start, -1, first + row)
+
+        return _Job(lines, rows, room[:, first : first + capacity], answer, parse)
+
+    def _mended(self, job: _Job, row: int, rows: int, problem: int, field: int) -> tuple[int, int, int]:
+        """Return the parser's answer once what may be passed over is.
+
+        Text in a column that imulab does not know is no reading, and becomes nan; a damaged line is left out where that
+        was asked for. With a problem that remains, the first number is the index of its line.
+        """
+        if not problem:
+            return rows, problem, field
+        ends = np.flatnonzero(np.frombuffer(job.rows, np.uint8) == ord("\n"))
+        slots, line, good = self._slots, rows, rows
+        while problem:
+            foreign = problem == _NOT_A_NUMBER and self._foreign(int(self._slots[field]))
+            if foreign:
+                slots = np.where(np.arange(len(slots)) == field, np.int32(-1), slots)
+                column = int(self._slots[field])
+                job.out[column, good:] = np.nan
+                self._texts.setdefault(self._titles[column], row + good)
+            elif self._skips_damaged:
+                self._count_damage(job, row, line, problem, field, row + good)
+                line += 1
+            else:
+                return line, problem, field
+            start = int(ends[line - 1]) + 1 if 0 < line <= len(ends) else 0 if not line else len(job.rows)
+            rows, problem, field = job.parse(start, good, slots)
+            good, line = good + rows, line + rows
+        return good, 0, field
+
+    def _foreign(self, slot: int) -> bool:
+        """Return whether a column of a native file is none that imulab knows."""
+        return self._layout is None and kind_of(measured(self._titles[slot])) is None
+
+    def _count_damage(self, job: _Job, row: int, line: int, problem: int, field: int, good: int) -> None:
+        self._damaged += 1
+        try:
+            self._refuse(job, row, line, problem, field)
+        except ReadError as error:
+            self._first_damage = self._first_damage or str(error).removeprefix(f"{self._name}: ")
+        if self._damaged > max(_FEW_DAMAGED, _MOST_DAMAGED * good):
+            raise ReadError(
+                f"{self._name}: {self._damaged} lines of the first {good + self._damaged} cannot be read, which are no "
+                f"torn lines; the first: {self._first_damage}"
+            )
+
+    def _notes(self) -> list[str]:
+        """Return notes on what was passed over."""
+        lines = "line is" if self._damaged == 1 else "lines are"
+        notes = [self._skipped()] if self._labels and self._incomplete else []
+        notes += [f"{self._damaged} damaged {lines} left out; the first: {self._first_damage}"] if self._damaged else []
+        return notes + [
+            f"column {name} holds text from row {row} on, which is no reading (nan)"
+            for name, row in self._texts.items()
+        ]
 
     def _chosen(self, lines: bytes, most: int) -> tuple[bytes, int]:
         """Return the rows that prefix and skip_incomplete leave, at most so many, and the number of lines for them."""
@@ -614,7 +736,7 @@ class TextFile:
     def _finish(self, out: np.ndarray, row: int) -> Recording:
         """Return the rows of a block, which begin at row `row` of the file."""
         columns = dict(zip(self._titles, out, strict=True))
-        before = None if self._chooses else self._lines.before
+        before = None if self._chooses or self._damaged or self._labels else self._lines.before
         if self._readings is not None:
             columns = self._readings.of(columns, row, before)
         return Recording(
