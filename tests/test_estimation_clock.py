@@ -1,15 +1,17 @@
 """The rule of the clock: mean rate, jitter, gaps, coarse and repeated stamps, by times made with a known truth."""
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 import imulab as il
+from imulab.cli.show import recording_json
 from imulab.errors import DataError
 from imulab.estimation.clock import read_clock, same_rows
 from imulab.estimation.column_noise import analyse
-from imulab.estimation.sampling import mend_stamps, sampling_rate
+from imulab.estimation.sampling import mend_blocks, mend_stamps, sampling_rate
 from imulab.recording import Recording
 
 N = 30_000
@@ -210,8 +212,8 @@ def test_a_window_that_misses_times_since_1970_says_how_to_type_one(imulab, tmp_
     done = imulab("show", "r.csv", "--window", "0:60")
     assert done.returncode == 2
     assert done.stderr == (
-        "imulab: r.csv: nothing in the window 0 to 60 s; the file runs from 1655928838.5 to 1655928842.5 s; a window such "
-        "as +0:+60 counts from the start\n"
+        "imulab: r.csv: nothing in the window 0 to 60 s; the file runs from 1655928838.5 to 1655928842.5 s; "
+        "a window such as +0:+60 counts from the start\n"
     )
 
 
@@ -231,3 +233,43 @@ def test_times_since_1970_are_drawn_from_the_start():
     (rest,) = [figure for figure in report.plot() if figure.figure.title == "Where the unit was at rest"]
     assert rest.figure.layout["xaxis"]["title"]["text"].startswith("time from 2022-06-22")
     assert 0 <= min(shape["x0"] for shape in rest.figure.layout["shapes"]) < 20
+
+
+@pytest.mark.parametrize("kind", ["coarse", "twice"])
+def test_blocks_are_mended_as_the_whole_is(kind):
+    if kind == "coarse":
+        recording = log(np.floor(NUMBER / 100 + 0.3))
+    else:
+        rows = np.sort(np.concatenate([NUMBER, [1, 10_001, 20_000]]))
+        recording = log(rows / 100, noise(N)[rows])
+    edges = [0, 7000, 15_000, len(recording)]
+    blocks = [
+        Recording({name: values[a:b] for name, values in recording.columns.items()}, recording.units, first_row=a + 1)
+        for a, b in pairwise(edges)
+    ]
+    whole, parts = mend_stamps(recording), list(mend_blocks(iter(blocks)))
+    assert np.concatenate([part.time for part in parts]).tolist() == whole.time.tolist()
+    assert len(whole) == N
+
+
+def test_late_stamps_are_no_gaps_of_an_array():
+    array = il.simulate_array(experiment="static", duration=60.0)
+    time = array.column("time")
+    late = np.where(np.arange(len(time)) % 100 == 50, 0.8 * (time[1] - time[0]), 0.0)
+    rough = array.with_columns({"time": time + late}, {})
+    assert il.fuse(rough).notes == il.fuse(array).notes
+
+
+def test_a_long_file_is_read_in_parts_by_the_same_rule(imulab, tmp_path, monkeypatch):
+    """The summary of parts is that of the whole, but for the steps between them."""
+    keep = np.random.default_rng(2).random(N) > 0.01
+    recording = log(lose(keep, 100))
+    monkeypatch.setattr("imulab.cli.show._MOST_ROWS", 4000)
+    blocks = [
+        Recording({name: values[a : a + 1000] for name, values in recording.columns.items()}, recording.units)
+        for a in range(0, len(recording), 1000)
+    ]
+    parts, whole = (json.loads(recording_json(each)) for each in (blocks, [recording]))
+    assert parts["sample_rate"]["value"] == pytest.approx(whole["sample_rate"]["value"], rel=1e-9)
+    assert (parts["gaps"], parts["missing"]) == (whole["gaps"], whole["missing"])
+    assert (parts["start"], parts["end"], parts["duration"]) == (whole["start"], whole["end"], whole["duration"])

@@ -381,6 +381,10 @@ def check_finite(recording: Recording, names: list[str]) -> None:
             )
 
 
+EVEN_SAMPLES = "where samples are even, state sample_rate in a layout instead of this column (in Python rate=)"
+"""What to do about time stamps that do not tell the rate."""
+
+
 def check_time(recording: Recording) -> Array:
     """Check that time rises from sample to sample and return it, s, shape (n,).
 
@@ -397,9 +401,10 @@ def check_time(recording: Recording) -> Array:
         raw = recording.column("time")
         verb = "stands still" if step[index - 1] == 0 else "runs backwards"
         unit = recording.units["time"]
+        advice = f"; {EVEN_SAMPLES}" if step[index - 1] == 0 else ""
         raise DataError(
             f"{recording.name}: {recording.place(index)}, column time: time {verb}: "
-            f"expected more than {raw[index - 1]:.15g} {unit}, found {raw[index]:.15g} {unit}"
+            f"expected more than {raw[index - 1]:.15g} {unit}, found {raw[index]:.15g} {unit}{advice}"
         )
     return time
 

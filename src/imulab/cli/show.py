@@ -152,6 +152,7 @@ def finish_check(
 # Records and recordings in a few lines of plain text.
 
 
+_MOST_ROWS = 1 << 21  # whose times are held at once
 _LEAST_JITTER = 1e-6  # s: a smaller one is that of rounding
 _SHOWN = 0.1  # s: times are shown to this
 
@@ -265,48 +266,71 @@ class _Column(Struct):
 
 
 class _Clock(Struct):
-    """Times of the blocks, and which rows equal the row before: what `read_clock` wants."""
+    """Times of the blocks, and which rows equal the row before: what `read_clock` wants; of long files by parts."""
 
     time: list[Array] = []
     same: list[Any] = []
     last: dict[str, float] = {}
+    end: float = nan
+    rows: int = 0
+    parts: list[_Summary] = []
 
     def add(self, block: Recording) -> None:
+        import numpy as np
+
         from imulab.estimation.clock import same_rows
 
-        if block.time is None or not len(block):
+        time = block.time
+        if time is None or not len(block):
             return
-        self.time.append(block.time)
-        self.same.append(same_rows(block.columns, self.last or None))
-        self.last = {name: float(values[-1]) for name, values in block.columns.items()}
+        still = time[0] == self.end or (time[1:] == time[:-1]).any()
+        self.time.append(time)
+        self.same.append(same_rows(block.columns, self.last or None) if still else np.zeros(len(time), dtype=bool))
+        self.last, self.end = {name: float(values[-1]) for name, values in block.columns.items()}, float(time[-1])
+        self.rows += len(time)
+        if self.rows > _MOST_ROWS:
+            self.parts.append(self._part())
+            self.time, self.same, self.rows = [time[-1:].copy()], [np.zeros(1, dtype=bool)], 0
 
     def summary(self, metadata: Mapping[str, str]) -> _Summary:
         """Return what the clock shows."""
-        import numpy as np
-
-        from imulab.estimation.clock import epoch_of, read_clock, utc
-        from imulab.estimation.sampling import steady_rows
+        from imulab.estimation.clock import epoch_of, utc
 
         if not self.time:
             return _Summary()
+        last = [self._part()] if self.rows or not self.parts else []  # nothing but the end of the part before
+        parts = [part for part in (*self.parts, *last) if part.first is not None]
+        if not parts:
+            return _Summary()
+        first, whole = parts[0].first or 0.0, parts[0]
+        for part in parts[1:]:
+            whole = whole.joined(part)
+        epoch = epoch_of(metadata, first)
+        whole.utc = None if epoch is None else utc(epoch + first)
+        return whole
+
+    def _part(self) -> _Summary:
+        import numpy as np
+
+        from imulab.estimation.clock import read_clock
+        from imulab.estimation.sampling import steady_rows
+
         time = np.concatenate(self.time)
         clock = read_clock(time, np.concatenate(self.same))
         finite = time[np.isfinite(time)]
         if not finite.size:
             return _Summary()
-        first, last = float(finite[0]), float(finite[-1])
-        epoch = epoch_of(metadata, first)
-        summary = _Summary(first, last, None if epoch is None else utc(epoch + first), doubt=clock.doubt)
-        summary.backwards, summary.repeated, summary.tick = clock.backwards, clock.repeated, clock.tick
+        summary = _Summary(float(finite[0]), float(finite[-1]), doubt=clock.doubt, backwards=clock.backwards)
         if clock.doubt:
             return summary
+        summary.repeated, summary.tick, lossy = clock.repeated, clock.tick, clock.kept is not None
         rising = time if clock.kept is None else time[clock.kept]
         rising = rising if clock.even is None else clock.even
-        start, stop = steady_rows(rising, lossy=clock.kept is not None)
+        start, stop = steady_rows(rising, lossy=lossy)
         if (start, stop) != (0, len(rising)):
-            clock = read_clock(rising[start:stop], lossy=clock.kept is not None)
+            clock = read_clock(rising[start:stop], lossy=lossy)
             summary.steady = (float(rising[start]), float(rising[stop - 1]))
-        summary.rate, summary.jitter, summary.tick = clock.rate, clock.jitter, max(summary.tick, clock.tick)
+        summary.rate, summary.jitter, summary.steps = clock.rate, clock.jitter, stop - start - 1 - len(clock.gaps)
         summary.gaps, summary.missing = len(clock.gaps), int(clock.missing.sum())
         summary.widest = clock.widest if summary.gaps else 0.0
         return summary
@@ -328,6 +352,27 @@ class _Summary(Struct):
     backwards: int = 0
     steady: tuple[float, float] | None = None
     doubt: str = ""
+    steps: int = 0
+
+    def joined(self, later: _Summary) -> _Summary:
+        """Return the summary of two parts of a recording."""
+        steps = self.steps + later.steps
+        duration = self.steps / self.rate + later.steps / later.rate
+        return _Summary(
+            first=self.first,
+            last=later.last,
+            rate=steps / duration,
+            jitter=((self.steps * self.jitter**2 + later.steps * later.jitter**2) / max(steps, 1)) ** 0.5,
+            gaps=self.gaps + later.gaps,
+            missing=self.missing + later.missing,
+            widest=max(self.widest, later.widest),
+            repeated=self.repeated + later.repeated,
+            tick=max(self.tick, later.tick),
+            backwards=self.backwards + later.backwards,
+            steady=self.steady or later.steady,
+            doubt=self.doubt or later.doubt,
+            steps=steps,
+        )
 
     def text(self) -> list[str]:
         if self.first is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from imulab.display import Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.clock import GAP, Clock, read_clock, same_rows
 from imulab.estimation.rows import median, quantile
-from imulab.recording import Array, Recording, check_finite, check_time, stored_as
+from imulab.recording import EVEN_SAMPLES, Array, Recording, check_finite, check_time, stored_as
 from imulab.units import to_si
 
 WIDEST_GAP = 10.0
@@ -68,15 +69,32 @@ def mend_stamps(recording: Recording) -> Recording:
     )
 
 
+def mend_blocks(blocks: Iterable[Recording]) -> Iterator[Recording]:
+    """Yield the blocks of a recording with `mend_stamps`: as one where the first shares stamps, else each by itself."""
+    rest = iter(blocks)
+    for block in rest:
+        time = block.time
+        if time is None or not (time[1:] == time[:-1]).any():
+            yield block
+            yield from map(mend_stamps, rest)
+            return
+        parts = [block, *rest]
+        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in block.columns}
+        yield mend_stamps(
+            replace(block, columns=columns, notes=tuple(dict.fromkeys(n for p in parts for n in p.notes)))
+        )
+
+
 def _standstill(recording: Recording, clock: Clock) -> str:
     row = clock.doubtful_row
     raw, unit = recording.column("time"), recording.units["time"]
     place = f"{recording.name}: {recording.place(row)}, column time"
-    advice = "where the samples are even, state sample_rate in a layout instead of this column (in Python rate=)"
     if clock.doubt == "time stands still":
         found = f"{raw[row]:.15g} {unit}"
-        return f"{place}: time stands still: expected more than {raw[row - 1]:.15g} {unit}, found {found}; {advice}"
-    return f"{place}: {clock.doubt}: the sampling rate cannot be told; {advice}"
+        return (
+            f"{place}: time stands still: expected more than {raw[row - 1]:.15g} {unit}, found {found}; {EVEN_SAMPLES}"
+        )
+    return f"{place}: {clock.doubt}: the sampling rate cannot be told; {EVEN_SAMPLES}"
 
 
 def _stamp_notes(clock: Clock, rows: int) -> list[str]:

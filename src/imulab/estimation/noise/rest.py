@@ -567,6 +567,9 @@ class _Log:
         steps = np.diff(np.concatenate([self._time, time]))
         if len(steps) and not steps.min() > 0:
             raise _AsWholeError
+        wide = 0 if self._head is None else int(np.count_nonzero(steps > self._longest))
+        if wide and wide != len(read_clock(np.concatenate([self._time, time])).gaps):
+            raise _AsWholeError  # late stamps among the gaps
         if self._head is None:
             self._begin(block, steps, columns)
         elif len(steps) >= _FEWEST_STEPS and abs(np.log(usual_step(steps)[0] / self._usual)) > SAME_RATE:

@@ -16,7 +16,7 @@ import numpy as np
 
 from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, RecordError, UnitError
-from imulab.estimation.clock import GAP
+from imulab.estimation.clock import GAP, read_clock
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.sampling import mend_stamps, usual_step
 from imulab.procedures.gyro_array.schema import array_of
@@ -308,6 +308,8 @@ class SampleClock:
         if self.steps:
             longest = usual_step(np.array(self.steps))[1] if self.nominal is None else GAP / self.nominal
             wide = np.flatnonzero(step > longest)
+            if wide.size:  # a late stamp whose followers catch up is no gap
+                wide = np.intersect1d(wide, read_clock(known).gaps)
             for index in wide.tolist():
                 self.count += 1
                 self.total += float(step[index])

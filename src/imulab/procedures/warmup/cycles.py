@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, UnitError
+from imulab.estimation.sampling import mend_blocks
 from imulab.recording import (
     LATEST_START,
     Array,
@@ -160,7 +161,7 @@ def find_power_cycle(
     head: Recording | None = None
     axes: tuple[str, ...] = ()
     temperature, first, last, reading, zeros = np.nan, 0.0, -np.inf, None, 0
-    for block in blocks:
+    for block in mend_blocks(blocks):
         time = check_time(block)
         if not time.size:
             continue
