@@ -7,6 +7,7 @@ import pytest
 
 import imulab as il
 from imulab.errors import ImulabError, OptionError, ReadError
+from imulab.readers.streams import one_clock
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from reference.flightlogs import dataflash, ulog
 
@@ -72,13 +73,14 @@ def streams():
 
 def check(recording, streams, sign=1, warm=20.0):
     accel_times, gyro_times, accel, gyro = streams
-    np.testing.assert_array_equal(recording.time, accel_times / 1e6)
-    np.testing.assert_array_equal(recording.triad("accel"), sign * accel.astype(float))
-    np.testing.assert_array_equal(recording.column("temperature"), np.float32(warm) + 0.5 * np.arange(len(accel)))
+    own = recording.stream("accel")
+    np.testing.assert_array_equal(own.time, accel_times / 1e6)
+    np.testing.assert_array_equal(own.triad("accel"), sign * accel.astype(float))
+    np.testing.assert_array_equal(own.column("temperature"), np.float32(warm) + 0.5 * np.arange(len(accel)))
     if gyro is not None:
-        for i, axis in enumerate(AXES):
-            expected = np.interp(accel_times, gyro_times, gyro[:, i].astype(float))
-            np.testing.assert_allclose(recording.column(f"gyro_{axis}"), expected, atol=1e-12)
+        own = recording.stream("gyro")
+        np.testing.assert_array_equal(own.time, gyro_times / 1e6)
+        np.testing.assert_array_equal(own.triad("gyro"), gyro.astype(float))
 
 
 # --- PX4 -----------------------------------------------------------------------------------------------------------
@@ -91,11 +93,12 @@ def test_accelerometer_gyroscope_and_temperature_of_a_ulog(file, streams):
         "time": "s",
         **{f"accel_{a}": "m/s^2" for a in AXES},
         "temperature": "degC",
+        "time_gyro": "s",
         **{f"gyro_{a}": "rad/s" for a in AXES},
     }
     assert recording.metadata["autopilot"] == "PX4"
     assert recording.metadata["hardware"] == "FMU_V6X"
-    assert any("gyroscope (800 Hz) interpolated to the clock of the accelerometer" in note for note in recording.notes)
+    assert not any("interpolated" in note for note in recording.notes)
     assert any(note.startswith("instance 0 of sensor_accel 0, sensor_accel 1") for note in recording.notes)
 
 
@@ -143,7 +146,7 @@ def test_sensor_combined_with_its_own_clock_for_the_accelerometer(file):
         for i, t in enumerate(times.tolist())
     ]
     path = file(ulog(FORMATS, [(0, 1, "sensor_combined")], rows))
-    recording = il.read(path)
+    recording = one_clock(il.read(path), "accel")
     there = (np.arange(300) != 100) & (np.arange(300) != 0)  # before the first sample of the gyroscope
     np.testing.assert_array_equal(recording.time, (times - 500)[there] / 1e6)
     np.testing.assert_array_equal(recording.triad("accel"), accel[there])
@@ -156,7 +159,7 @@ def test_sensor_combined_with_its_own_clock_for_the_accelerometer(file):
 def test_a_gap_of_the_gyroscope_is_not_bridged(file, streams):
     accel_times, gyro_times, accel, gyro = streams
     there = (gyro_times < 5_500_000) | (gyro_times > 5_900_000)
-    recording = il.read(file(px4_log(accel_times, gyro_times[there], accel, gyro[there])))
+    recording = one_clock(il.read(file(px4_log(accel_times, gyro_times[there], accel, gyro[there]))), "accel")
     missing = np.isnan(recording.column("gyro_x"))
     np.testing.assert_array_equal(
         missing,
@@ -165,7 +168,7 @@ def test_a_gap_of_the_gyroscope_is_not_bridged(file, streams):
     )
 
 
-def test_streams_one_behind_the_other_are_joined_or_refused_but_never_lost(file, streams, monkeypatch):
+def test_streams_one_behind_the_other_are_read_and_joined(file, streams, monkeypatch):
     """A log that holds all accelerometer samples, then all of the gyroscope's."""
     accel_times, gyro_times, accel, gyro = streams
     mine, theirs = list(sensor(3, accel_times, accel)), list(sensor(4, gyro_times, gyro))
@@ -179,11 +182,13 @@ def test_streams_one_behind_the_other_are_joined_or_refused_but_never_lost(file,
     monkeypatch.setattr("imulab.readers.streams._ROWS", 50)
     monkeypatch.setattr("imulab.readers.streams._PATIENCE", 200)
     monkeypatch.setattr("imulab.readers.logs.BLOCK_BYTES", 1000)
-    with pytest.raises(ReadError, match=r"samples of the gyroscope lie more than 100 samples behind those of the acc"):
-        il.read(path)
+    check(il.read(path), streams)
     # One that only ends early does not hold up the other.
     ended = log(sorted([*mine, *theirs[:200]], key=lambda m: m[0]), "ended.ulg")
     recording = il.read(ended)
+    np.testing.assert_array_equal(recording.stream("accel").triad("accel"), accel)
+    assert recording.notes[-1].startswith("truncated stream: the gyroscope ends 1.7")
+    recording = one_clock(recording, "accel")
     there = accel_times <= gyro_times[199]
     assert (~there).sum() > 300
     np.testing.assert_array_equal(recording.triad("accel"), accel[there])
@@ -200,7 +205,7 @@ def test_nothing_is_made_up_where_a_stream_has_not_begun_or_has_ended(file, stre
     # Much longer than the steps of the gyroscope, 1.25 ms: the first rows stay, without its readings.
     part = (gyro_times > 5_300_000) & (gyro_times < 6_700_000)
     first, last = gyro_times[part][0], gyro_times[part][-1]
-    recording = il.read(file(px4_log(accel_times, gyro_times[part], accel, gyro[part])))
+    recording = one_clock(il.read(file(px4_log(accel_times, gyro_times[part], accel, gyro[part]))), "accel")
     before_end = accel_times <= last
     np.testing.assert_array_equal(recording.triad("accel"), accel[before_end])
     known = accel_times[before_end] >= first
@@ -214,7 +219,7 @@ def test_nothing_is_made_up_where_a_stream_has_not_begun_or_has_ended(file, stre
     near = (gyro_times > accel_times[0] + 100) & (gyro_times < accel_times[-1] - 6000)
     first, last = gyro_times[near][0], gyro_times[near][-1]
     kept = (accel_times >= first) & (accel_times <= last)
-    recording = il.read(file(px4_log(accel_times, gyro_times[near], accel, gyro[near])))
+    recording = one_clock(il.read(file(px4_log(accel_times, gyro_times[near], accel, gyro[near]))), "accel")
     assert 2 <= np.count_nonzero(~kept) <= 4
     np.testing.assert_array_equal(recording.time, accel_times[kept] / 1e6)
     np.testing.assert_array_equal(recording.triad("accel"), accel[kept])
@@ -273,7 +278,7 @@ def test_the_combined_topic_is_not_read_where_one_sensor_has_plainly_more(file):
     data = ordered(sensor(3, slow, vectors(20, 1)), sensor(4, fast, gyro), combined)
     subscriptions = [(0, 3, "sensor_accel"), (0, 4, "sensor_gyro"), (0, 9, "sensor_combined")]
     recording = il.read(file(ulog(FORMATS, subscriptions, data)))
-    np.testing.assert_array_equal(recording.triad("gyro"), gyro[::10])
+    np.testing.assert_array_equal(recording.stream("gyro").triad("gyro"), gyro)
     assert (
         "sensor_combined, which has 50 samples, is not read: there are 20 of sensor_accel and 200 of sensor_gyro; "
         "a topic chooses" in recording.notes
@@ -319,9 +324,10 @@ def test_a_cut_ulog_is_read_up_to_the_cut_with_a_warning(file, streams, imulab):
     recording = il.read(path)
     (note,) = [n for n in recording.notes if n.startswith("truncated")]
     assert f"at byte {len(whole) // 2 + 7}"[:-3] in note
-    n = len(recording)
+    own = recording.stream("accel")
+    n = len(own)
     assert 150 < n < 250
-    np.testing.assert_array_equal(recording.triad("accel"), streams[2][:n])
+    np.testing.assert_array_equal(own.triad("accel"), streams[2][:n])
     done = imulab("convert", path, "-o", "out.csv")
     assert done.returncode == 0
     assert [line for line in done.stderr.splitlines() if "warning" in line and "truncated" in line]
@@ -425,11 +431,10 @@ def test_raw_accelerometer_and_gyroscope_messages(file):
         ((t, ("GYR", (t, 0, t - 90, *gyro[i].tolist()))) for i, t in enumerate(gyro_times.tolist())),
     )
     recording = il.read(file(dataflash(RAW, rows), "raw.bin"))
-    np.testing.assert_array_equal(recording.triad("accel"), accel)
-    for i, axis in enumerate(AXES):
-        expected = np.interp(accel_times, gyro_times, gyro[:, i].astype(float))
-        np.testing.assert_allclose(recording.column(f"gyro_{axis}"), expected, atol=1e-12)
-    assert any("interpolated" in note for note in recording.notes)
+    for sensor, times, values in (("accel", accel_times, accel), ("gyro", gyro_times, gyro)):
+        own = recording.stream(sensor)
+        np.testing.assert_allclose(np.diff(own.time), np.diff(times) / 1e6, atol=1e-12)
+        np.testing.assert_array_equal(own.triad(sensor), values)
 
 
 def test_old_logs_have_one_message_name_an_instance_and_milliseconds(file):

@@ -10,10 +10,18 @@ import bags
 import imulab as il
 from imulab.display import Note
 from imulab.errors import OptionError
+from imulab.readers.streams import on_clock_of, one_clock
 from imulab.units import to_si
 from reference.flightlogs import dataflash, ulog
 
 AXES = "xyz"
+
+
+def read(path, **options):
+    """Return a recording with its magnetometers in the rows of the accelerometers."""
+    return one_clock(il.read(path, **options), "accel")
+
+
 EPOCH = bags.EPOCH
 IMU, FIELD, TEMPERATURE = (f"sensor_msgs/msg/{name}" for name in ("Imu", "MagneticField", "Temperature"))
 SENSOR = "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;"
@@ -78,7 +86,7 @@ def clocks(seed=0, rows=400, step=5_000_000, slower=7):
 def test_a_field_stands_in_the_row_nearest_in_time_and_nowhere_else(tmp_path, kind):
     clock, ticks = clocks()
     values = vectors(len(ticks), 2, 4e-5)
-    recording = il.read(bags.write(tmp_path, kind, merged(imus(clock), fields(ticks, values))))
+    recording = read(bags.write(tmp_path, kind, merged(imus(clock), fields(ticks, values))))
     assert recording.units["mag_x"] == "T"
     expected = nearest(clock, ticks, values, np.median(np.diff(clock)))
     np.testing.assert_array_equal(recording.triad("mag"), expected)
@@ -95,7 +103,7 @@ def test_a_faster_magnetometer_leaves_its_nearest_samples(tmp_path):
     ticks, clock = clocks(4, rows=300, slower=3)
     clock = clock[(clock > ticks[0]) & (clock < ticks[-1])]
     values = vectors(len(ticks), 5, 4e-5)
-    recording = il.read(bags.write(tmp_path, "mcap", merged(imus(clock), fields(ticks, values))))
+    recording = read(bags.write(tmp_path, "mcap", merged(imus(clock), fields(ticks, values))))
     expected = nearest(clock, ticks, values, np.median(np.diff(clock)))
     assert np.isfinite(expected).all()
     np.testing.assert_array_equal(recording.triad("mag"), expected)
@@ -105,7 +113,7 @@ def test_a_faster_magnetometer_leaves_its_nearest_samples(tmp_path):
 def test_a_field_in_every_row_needs_no_note(tmp_path):
     clock, _ = clocks()
     values = vectors(400, 6, 4e-5)
-    recording = il.read(bags.write(tmp_path, "mcap", merged(imus(clock), fields(clock, values))))
+    recording = read(bags.write(tmp_path, "mcap", merged(imus(clock), fields(clock, values))))
     np.testing.assert_array_equal(recording.triad("mag"), values)
     assert recording.notes == ()
 
@@ -122,7 +130,7 @@ def test_a_magnetometer_whose_clock_is_wrong_does_not_cost_the_rest(tmp_path):
 
     for number, (stamps, kept) in enumerate(((back, 390), (np.zeros(400, dtype=np.int64), 0))):
         path = bags.write(tmp_path, "mcap", merged(imus(clock), at(stamps)), name=f"rec{number}")
-        recording = il.read(path)
+        recording = read(path)
         assert len(recording) == 400
         assert np.isfinite(recording.column("mag_x")).sum() == kept
         assert f"{kept} of its 400 samples" in recording.notes[-1]
@@ -131,7 +139,7 @@ def test_a_magnetometer_whose_clock_is_wrong_does_not_cost_the_rest(tmp_path):
 def test_a_field_that_is_not_reported_is_nan(tmp_path):
     clock, _ = clocks()
     messages = merged(imus(clock), fields(clock, vectors(400, 6, 4e-5), first_covariance=-1.0))
-    assert np.isnan(il.read(bags.write(tmp_path, "mcap", messages)).triad("mag")).all()
+    assert np.isnan(read(bags.write(tmp_path, "mcap", messages)).triad("mag")).all()
 
 
 @pytest.mark.parametrize("unit", ["T", "mT", "gauss", "uT", "mgauss", "nT"])
@@ -141,7 +149,7 @@ def test_a_driver_that_does_not_write_tesla_is_found_out(tmp_path, unit, size):
     values = vectors(50, 7)
     values *= size / np.linalg.norm(values, axis=1)[:, None]
     written = values / to_si(1.0, unit)
-    recording = il.read(bags.write(tmp_path, "mcap", merged(imus(clock), fields(clock, written))))
+    recording = read(bags.write(tmp_path, "mcap", merged(imus(clock), fields(clock, written))))
     np.testing.assert_allclose(recording.triad("mag"), values, rtol=1e-12)
     said = [n for n in recording.notes if "none on Earth is" in n]
     assert [n.endswith(f"its readings are taken as {unit}") for n in said] == ([True] if unit != "T" else [])
@@ -150,7 +158,7 @@ def test_a_driver_that_does_not_write_tesla_is_found_out(tmp_path, unit, size):
 def test_a_field_of_no_unit_is_left_and_said(tmp_path):
     clock, _ = clocks(rows=50)
     values = np.full((50, 3), 3.0e7)
-    recording = il.read(bags.write(tmp_path, "mcap", merged(imus(clock), fields(clock, values))))
+    recording = read(bags.write(tmp_path, "mcap", merged(imus(clock), fields(clock, values))))
     np.testing.assert_array_equal(recording.triad("mag"), values)
     assert "no other unit fits: its readings are left as they are" in recording.notes[0]
 
@@ -160,20 +168,20 @@ def test_the_magnetometer_of_the_namespace_is_read_and_a_topic_chooses_another(t
     near, far = np.full((50, 3), 4e-5), np.full((50, 3), 3e-5)
     messages = merged(imus(clock), fields(clock, near), fields(clock, far, "/gps/mag"))
     path = bags.write(tmp_path, "mcap", messages)
-    assert il.read(path).column("mag_x")[0] == 4e-5
+    assert read(path).column("mag_x")[0] == 4e-5
     for topic in ("/imu/data,/gps/mag", "/gps/mag", "gps/mag"):
-        recording = il.read(path, topic=topic)
+        recording = read(path, topic=topic)
         assert recording.column("mag_x")[0] == 3e-5
         assert recording.metadata["topic"] == "/imu/data,/gps/mag"
     with pytest.raises(OptionError, match="no Imu topic /mag; Imu topics found: /imu/data; of MagneticField: /imu/mag"):
-        il.read(path, topic="/imu/data,/mag")
+        read(path, topic="/imu/data,/mag")
 
 
 def test_magnetometers_that_could_belong_to_it_are_named_not_chosen(tmp_path):
     clock, _ = clocks(rows=50)
     values = np.full((50, 3), 4e-5)
     messages = merged(imus(clock), fields(clock, values, "/a/mag"), fields(clock, values, "/b/mag"))
-    recording = il.read(bags.write(tmp_path, "mcap", messages))
+    recording = read(bags.write(tmp_path, "mcap", messages))
     assert "mag_x" not in recording
     (note,) = recording.notes
     assert note == (
@@ -232,26 +240,26 @@ def test_sensor_mag_of_a_ulog_and_its_instances(file, boot):
         np.testing.assert_array_equal(one.data["z"], mine[:, 2])
     path = file(data)
     step = np.median(np.diff(clock))
-    recording = il.read(path)
+    recording = read(path)
     assert recording.units["mag_y"] == "gauss"
     np.testing.assert_array_equal(recording.triad("mag"), nearest(clock, slow, values[0].astype(float), step))
     assert "instance 0 of 2 of sensor_mag; a topic chooses: sensor_mag:1" in recording.notes
-    second = il.read(path, topic="sensor_accel,sensor_mag:1")
+    second = read(path, topic="sensor_accel,sensor_mag:1")
     np.testing.assert_array_equal(second.triad("mag"), nearest(clock, other, values[1].astype(float), step))
-    assert "gyro_x" in il.read(path, topic="sensor_mag:1")
+    assert "gyro_x" in read(path, topic="sensor_mag:1")
     with pytest.raises(OptionError, match="no sensor_mag of instance 2; magnetometers found: sensor_mag 0, sensor_mag"):
-        il.read(path, topic="sensor_mag:2")
+        read(path, topic="sensor_mag:2")
     with pytest.raises(OptionError, match="expected sensor_mag or sensor_mag:N once"):
-        il.read(path, topic="sensor_mag:x")
+        read(path, topic="sensor_mag:x")
 
 
 def test_blocks_join_to_the_whole(file, boot, monkeypatch):
     clock, (slow, _) = boot
     path = file(px4(clock, [(slow, vectors(len(slow), 9, 0.3))]))
-    whole = il.read(path)
+    whole = read(path)
     monkeypatch.setattr("imulab.readers.logs.BLOCK_BYTES", 3001)
     monkeypatch.setattr("imulab.readers.streams._ROWS", 7)
-    blocks = list(il.read_blocks(path))
+    blocks = list(on_clock_of(il.read_blocks(path), "accel"))
     assert len(blocks) > 4
     np.testing.assert_array_equal(np.vstack([b.triad("mag") for b in blocks]), whole.triad("mag"))
     counts = [re.sub(r"\(.*? Hz\)", "", note) for note in (blocks[-1].notes[-1], whole.notes[-1])]
@@ -261,7 +269,7 @@ def test_blocks_join_to_the_whole(file, boot, monkeypatch):
 def test_the_corrected_magnetometer_is_read_where_the_measured_one_is_not_logged(file, boot):
     clock, (slow, _) = boot
     values = vectors(len(slow), 9, 0.3).astype(np.float32)
-    recording = il.read(file(px4(clock, [(slow, values)], ["vehicle_magnetometer"])))
+    recording = read(file(px4(clock, [(slow, values)], ["vehicle_magnetometer"])))
     step = np.median(np.diff(clock))
     np.testing.assert_array_equal(recording.triad("mag"), nearest(clock, slow, values.astype(float), step))
     assert "vehicle_magnetometer holds fields that PX4 has already corrected and turned" in recording.notes
@@ -290,21 +298,21 @@ def test_mag_messages_of_a_dataflash_log_and_their_instances(file, boot):
     log.close()
     np.testing.assert_array_equal(theirs, np.column_stack([other, values[1]]))
     step = np.median(np.diff(clock))
-    recording = il.read(path)
+    recording = read(path)
     assert recording.units["mag_x"] == "mgauss"
     np.testing.assert_array_equal(recording.triad("mag"), nearest(clock, slow, values[0].astype(float), step))
     assert "instance 0 of 2 of MAG; a topic chooses: MAG:1" in recording.notes
     assert any("corrected by its COMPASS_ parameters" in note for note in recording.notes)
-    second = il.read(path, topic="IMU,MAG:1")
+    second = read(path, topic="IMU,MAG:1")
     np.testing.assert_array_equal(second.triad("mag"), nearest(clock, other, values[1].astype(float), step))
     with pytest.raises(OptionError, match="no MAG of instance 3; instances found: 0 1"):
-        il.read(path, topic="MAG:3")
+        read(path, topic="MAG:3")
 
 
 def test_a_compass_that_does_not_answer_has_no_field(file, boot):
     clock, (slow, _) = boot
     values = np.rint(vectors(len(slow), 9, 300)).astype(int)
-    recording = il.read(file(ardupilot(clock, [(slow, values)], healthy=lambda i: i % 2)))
+    recording = read(file(ardupilot(clock, [(slow, values)], healthy=lambda i: i % 2)))
     step = np.median(np.diff(clock))
     expected = nearest(clock, slow[1::2], values[1::2].astype(float), step)
     np.testing.assert_array_equal(recording.triad("mag"), expected)
@@ -313,7 +321,7 @@ def test_a_compass_that_does_not_answer_has_no_field(file, boot):
 def test_mag_messages_of_another_kind_do_not_cost_the_rest(file, boot):
     clock, (slow, _) = boot
     odd = {**MESSAGES, "MAG": (130, "QBhhhhhhhhhBI", "TimeUS,I,A,B,C,OfsX,OfsY,OfsZ,MOX,MOY,MOZ,Health,S")}
-    recording = il.read(file(ardupilot(clock, [(slow, np.ones((len(slow), 3), dtype=int))], odd)))
+    recording = read(file(ardupilot(clock, [(slow, np.ones((len(slow), 3), dtype=int))], odd)))
     assert "mag_x" not in recording
     assert len(recording) == len(clock)
 
@@ -321,5 +329,5 @@ def test_mag_messages_of_another_kind_do_not_cost_the_rest(file, boot):
 def test_the_accelerometers_of_a_log_are_judged_as_without_its_magnetometer(file, boot):
     """What is said of a magnetometer does not lower the verdict on other sensors."""
     clock, (slow, _) = boot
-    recording = il.read(file(ardupilot(clock, [(slow, np.ones((len(slow), 3), dtype=int))])))
+    recording = read(file(ardupilot(clock, [(slow, np.ones((len(slow), 3), dtype=int))])))
     assert all(isinstance(note, Note) for note in recording.notes if "agnetometer" in note or "MAG" in note)

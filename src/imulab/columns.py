@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from msgspec import Struct
 
@@ -140,8 +140,16 @@ def example_unit(name: str) -> str:
     return KINDS[kind_of(measured(name)) or "time"].example
 
 
+def clocks_of(names: Iterable[str]) -> dict[str, str]:
+    """Return the column of time that stamps each column: ``time``, or its sensor's own, such as ``time_gyro``."""
+    names = list(names)
+    own = {name.removeprefix("time_"): name for name in names if name.startswith("time_")}
+    own = {sensor: clock for sensor, clock in own.items() if sensor in KINDS}
+    return {name: name if name in own.values() else own.get(kind_of(measured(name)) or "", "time") for name in names}
+
+
 def measured(name: str) -> str:
-    """Return the column that a truth or a standard deviation belongs to."""
+    """Return the column that a truth or a standard deviation belongs to: ``gyro_x`` of ``truth_gyro_x``."""
     return name.removeprefix("truth_").removeprefix("std_")
 
 

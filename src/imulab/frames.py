@@ -14,11 +14,11 @@ from msgspec import Struct, field
 from numpy.typing import NDArray
 
 from imulab.arguments import described
-from imulab.columns import TRIADS, check_name, example_unit, expected_quantities
+from imulab.columns import TRIADS, check_name, clocks_of, example_unit, expected_quantities
 from imulab.errors import DataError, OptionError, UnitError, listed, meant, quoted
 from imulab.units import parse_unit
 
-DEFAULT_UNITS = {"time": "s", "temperature": "degC"}
+DEFAULT_UNITS = {"time": "s", **{f"time_{sensor}": "s" for sensor in (*TRIADS, "temperature")}, "temperature": "degC"}
 """Units of arrays without a stated one; a data frame states all its units."""
 _LIBRARIES = ("pandas", "polars")
 _WORDS = (*TRIADS, "temperature", "time", "rate", "unit", "units", "metadata", "name")
@@ -355,15 +355,17 @@ def _kind(column: Any, values: NDArray[Any]) -> str:
 def _put_together(
     entries: list[tuple[str, str | None, NDArray[Any]]], units: Units, rate: float | None
 ) -> tuple[Columns, dict[str, str]]:
-    """Return columns and units of equal length, with a time of the stated rate."""
+    """Return columns and units of equal length, with a time of the stated rate; few samples are followed by NaN."""
     columns: Columns = {}
     symbols: dict[str, str] = {}
+    clocks = clocks_of(key for key, _, _ in entries)
     for key, stated, values in entries:
         if key in columns:
             raise DataError(f"{units.name}: column {key} appears twice")
-        if columns and len(values) != len(first := next(iter(columns.values()))):
+        first = next((name for name in columns if clocks[name] == clocks[key]), key)
+        if key != first and len(values) != len(columns[first]):
             raise DataError(
-                f"{units.name}: {key} has {len(values)} rows, {next(iter(columns))} has {len(first)}: expected as many"
+                f"{units.name}: {key} has {len(values)} rows, {first} has {len(columns[first])}: expected as many"
             )
         if values.dtype.kind in "mM":
             columns[key], symbols[key] = _seconds(values), "s"
@@ -374,6 +376,10 @@ def _put_together(
     if rate is not None:
         columns, symbols = _with_rate(columns, symbols, rate, units.name)
     units.check_used(columns)
+    rows = max(map(len, columns.values()))
+    for key, values in columns.items():
+        if len(values) < rows:
+            columns[key] = np.concatenate([values, np.full(rows - len(values), np.nan)])
     return columns, symbols
 
 

@@ -1,8 +1,6 @@
-"""Recording: the samples of one test as read, with their units; and how a caller describes data.
+"""Recording: the samples of one test as read, with their units and clocks; and how a caller describes data.
 
-The temperature at power-on and how data are to be understood; the columns of large ones in temporary files.
-
-The columns of large ones in temporary files, and the temperature at power-on.
+Also the columns of large recordings in temporary files, and the temperature and time at power-on.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ import errno
 import math
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -21,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imulab.arguments import checked, described
-from imulab.columns import check_unit, element_number, expected_quantities, triad
+from imulab.columns import check_unit, clocks_of, element_number, expected_quantities, kind_of, triad
 from imulab.display import has_hidden, printable
 from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
@@ -38,13 +36,14 @@ if TYPE_CHECKING:
 # Recording: the samples of one test, as they were read, with their units.
 
 
-# Recording: the samples of one test, as they were read, with their units.
-
-
 Array = NDArray[np.float64]
 
 CORRECTED_BY = "corrected_by"
 """Key, in the head of a file, of each record that its samples were corrected by."""
+
+
+RESAMPLED = "resampled"
+"""Key of the head: which sensors were interpolated to another clock, and from which rate to which."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +57,9 @@ class Source:
 @dataclass(frozen=True)
 class Recording:
     """The samples of one test: columns as read with their units; SI arrays are derived on request.
+
+    A sensor may have a clock of its own, a column such as ``time_gyro``; the samples of sensors with fewer of them than
+    others are followed by rows without numbers.
 
     Attributes
     ----------
@@ -186,6 +188,37 @@ class Recording:
         """Time of each sample, s, shape (n,), or None for a table without a time column."""
         return self.si("time") if "time" in self.columns else None
 
+    @property
+    def clocks(self) -> dict[str, list[str]]:
+        """Names of columns by the column of time that stamps them: ``time``, or a clock of their own, ``time_gyro``."""
+        stamped: dict[str, list[str]] = {"time": []}
+        for name, clock in clocks_of(self.columns).items():
+            if name not in ("time", clock):
+                stamped.setdefault(clock, []).append(name)
+        return stamped if stamped["time"] else {clock: names for clock, names in stamped.items() if names}
+
+    def stream(self, clock: str) -> Recording:
+        """Return the columns that a clock stamps, with it as ``time``, without the rows that have none of its samples.
+
+        Parameters
+        ----------
+        clock
+            One of `clocks`, or a sensor, such as ``gyro``.
+        """
+        clocks = self.clocks
+        if len(clocks) < 2 and "time" in clocks:
+            return self
+        chosen = clock if clock in clocks else f"time_{clock}" if f"time_{clock}" in clocks else "time"
+        kept = [name for name in (chosen, *clocks[chosen]) if name in self.columns]
+        there = np.zeros(len(self), dtype=np.bool_)
+        for name in kept:
+            there |= np.isfinite(self.columns[name])
+        called = {name: "time" if name == chosen else name for name in kept}
+        columns = {called[name]: self.columns[name] for name in kept}
+        if not there.all():
+            columns = {name: stored_as(values[there], values) for name, values in columns.items()}
+        return replace(self, columns=columns, units={called[name]: self.units[name] for name in kept})
+
     def triad(self, sensor: str) -> Array:
         """Return the three columns ``<sensor>_x``, ``_y``, ``_z`` as read, shape (n, 3).
 
@@ -259,7 +292,8 @@ class Recording:
         accel, gyro, mag
             Outputs of a triad, shape (n, 3).
         temperature, time
-            Shape (n,), in degC and s unless `units` says otherwise; times may be dates (`datetime64`).
+            Shape (n,), in degC and s unless `units` says otherwise; times may be dates (`datetime64`). A sensor with a
+            clock of its own has its times as ``time_gyro``, and as many samples as these.
         rate
             Sampling rate, Hz, instead of `time`; with neither, the rows are attitudes at rest.
         unit
@@ -360,6 +394,51 @@ def _is_column(values: object) -> bool:
     return isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "iufb"
 
 
+def padded(parts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    """Return columns of one length, those of fewer samples followed by NaN."""
+    rows = max(len(values) for part in parts for values in part.values())
+    columns = {name: values for part in parts for name, values in part.items()}
+    short = {name: values for name, values in columns.items() if len(values) < rows}
+    rest = np.full(rows, np.nan)
+    return columns | {
+        name: stored_as(np.concatenate([values, rest[len(values) :]]), values) for name, values in short.items()
+    }
+
+
+def packed(recording: Recording) -> Recording:
+    """Return a recording with the samples of each clock together, and what pads them at the end."""
+    return recording if len(recording.clocks) < 2 else by_clock(recording, lambda part: part)
+
+
+def by_clock(recording: Recording, change: Callable[[Recording], Recording]) -> Recording:
+    """Return a recording of several clocks with the samples of each as `change` returns them."""
+    parts, notes = [], dict.fromkeys(recording.notes)
+    for clock in recording.clocks:
+        part = change(recording.stream(clock))
+        parts.append({clock if name == "time" else name: values for name, values in part.columns.items()})
+        notes |= dict.fromkeys(part.notes)
+    columns = padded(parts)
+    return replace(recording, columns={name: columns[name] for name in recording.columns}, notes=tuple(notes))
+
+
+def check_not_resampled(recording: Recording, names: Iterable[str]) -> None:
+    """Refuse columns whose noise was changed when they were interpolated to another clock.
+
+    Raises
+    ------
+    DataError
+        The head of the file says so of one of them.
+    """
+    for sentence in recording.metadata.get(RESAMPLED, "").split(";"):
+        sensors, _, rates = sentence.strip().partition(" from ")
+        changed = [name for name in names if kind_of(name) in sensors.split(" and ")]
+        if changed:
+            raise DataError(
+                f"{recording.name}: {' '.join(changed)}: resampled from {rates}, which changes the noise; expected the "
+                "log as it was recorded, each sensor on its own clock (convert without --one-clock)"
+            )
+
+
 def check_finite(recording: Recording, names: list[str]) -> None:
     """Check that the named columns hold finite numbers only.
 
@@ -443,7 +522,7 @@ def on_disk(blocks: Iterator[Recording]) -> Recording:
             break
         block = following
     columns = {name: _mapped(stream) for name, stream in files.items()}
-    return replace(head, columns=columns, units=first.units, notes=tuple(notes))
+    return packed(replace(head, columns=columns, units=first.units, notes=tuple(notes)))
 
 
 def stored_as(values: Array, like: Array) -> Array:

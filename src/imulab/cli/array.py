@@ -190,6 +190,7 @@ def fuse(file: RecordingFile, *, output: OutputFile = None, **options: Any) -> N
     from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, carried, fusion_text
     from imulab.quantities import interval
     from imulab.readers import read_blocks
+    from imulab.readers.streams import on_clock_of
     from imulab.writers import check_writable, write, write_csv_to
 
     calibration, initial_bias, rate, still = (
@@ -214,7 +215,7 @@ def fuse(file: RecordingFile, *, output: OutputFile = None, **options: Any) -> N
         still=None if still is None else interval(still, "--still"),
     )
     fuser = Fuser(settings, tell=warn) if file == "-" else Fuser(settings)  # a stream may never end
-    blocks = (part.recording() for part in fuser.fuse(with_notes(read_blocks(file, **how))))
+    blocks = (part.recording() for part in fuser.fuse(with_notes(on_clock_of(read_blocks(file, **how)))))
     if output:
         write(blocks, output)
     else:
@@ -306,11 +307,14 @@ def compare(
     from imulab.procedures.gyro_array.compare import compare_methods
     from imulab.procedures.gyro_array.fuse import carried, fusion_text
     from imulab.readers import read
+    from imulab.readers.streams import one_clock
 
     record = None if calibration is None else _load(calibration, "--calibration")
     by = fusion_text(None, options["memory"], held=carried(record))
     kept = "growing" if by.memory is None else by.memory
-    comparison = compare_methods(read(str(file), **how), calibration=record, memory=kept, count_from=by.start)
+    comparison = compare_methods(
+        one_clock(read(str(file), **how)), calibration=record, memory=kept, count_from=by.start
+    )
     write_both(comparison.record, output, report)
     if not json:
         print("\n".join(verdict_lines(comparison.record.verdict)))

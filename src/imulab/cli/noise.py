@@ -72,20 +72,25 @@ def describe(analysis: dict[str, Any]) -> str:
     from imulab.report.parameters import small_unit
     from imulab.report.traces import plain_number
 
-    lines = [
-        f"{printable(analysis['file'])}: {analysis['samples']} samples at {analysis['sample_rate']['value']:.6g} Hz",
-        "",
-    ]
+    sizes: dict[tuple[int, float], list[str]] = {}
+    for name, column in analysis["columns"].items():
+        of = {**analysis, **column}
+        sizes.setdefault((of["samples"], of["sample_rate"]["value"]), []).append(name)
+    texts = [f"{n} samples at {rate:.6g} Hz" for n, rate in sizes]
+    if len(sizes) > 1:
+        texts = [f"{text} ({' '.join(names)})" for text, names in zip(texts, sizes.values(), strict=True)]
+    lines = [f"{printable(analysis['file'])}: {', '.join(texts)}", ""]
     lines += aligned(["column", "coefficient", "value", "u", "unit"], coefficient_rows(analysis))
     names = list(analysis["columns"])
     units = {name: small_unit(analysis["columns"][name]["unit"]).scale for name in names}
     lines += ["", "Allan deviation"]
-    tau = analysis["columns"][names[0]]["tau"]
-    body = [
-        [plain_number(t, 4), *(plain_number(analysis["columns"][n]["deviation"][k] * units[n][1], 4) for n in names)]
-        for k, t in enumerate(tau)
-    ]
-    lines += aligned(["tau s", *(f"{n} {units[n][0]}" for n in names)], body)
+    by_times: dict[tuple[float, ...], list[str]] = {}
+    for name in names:
+        by_times.setdefault(tuple(analysis["columns"][name]["tau"]), []).append(name)
+    for times, together in by_times.items():
+        deviations = [[d * units[n][1] for d in analysis["columns"][n]["deviation"]] for n in together]
+        body = [[plain_number(each, 4) for each in row] for row in zip(times, *deviations, strict=True)]
+        lines += aligned(["tau s", *(f"{n} {units[n][0]}" for n in together)], body)
     return "\n".join(lines)
 
 

@@ -47,10 +47,13 @@ def convert(
         list[str] | None,
         option(
             "FILE[@LAYOUT]",
-            "Another sensor of the same unit, on the same clock, whose columns are added; repeatable.",
+            "Another sensor of the same unit, whose columns are added with their times; repeatable.",
             repeated=True,
         ),
     ] = None,
+    one_clock: Annotated[
+        bool, option("", "Interpolate sensors with clocks of their own to the fastest; its noise is not theirs.")
+    ] = False,
     output: OutputFile = None,
     **options: Any,
 ) -> None:
@@ -59,7 +62,7 @@ def convert(
     Native CSV or Parquet to OUT, or CSV to standard output.
     """
     from imulab.readers import read, read_blocks
-    from imulab.readers.streams import file_and_layout, join_recordings
+    from imulab.readers.streams import file_and_layout, join_recordings, on_clock_of
 
     others = [file_and_layout(text) for text in with_ or []]
     inputs = [name for pair in ((file, options["layout"]), *others) for name in pair if name]
@@ -69,7 +72,7 @@ def convert(
     if others:
         first = read(file, **how)
         blocks = [join_recordings(first, [read(other, layout) for other, layout in others])]
-    write_out(with_notes(blocks), output)
+    write_out(with_notes(on_clock_of(blocks) if one_clock else blocks), output)
 
 
 def write_out(blocks: Iterable[Recording], output: str | None) -> None:
@@ -123,6 +126,7 @@ def apply(
     from imulab.procedures.apply import add_heading, apply_blocks, loaded
     from imulab.procedures.registry import load_any
     from imulab.readers import read_blocks
+    from imulab.readers.streams import on_clock_of
     from imulab.recording import with_power_on_temperature
 
     if len(files) < 2:
@@ -151,7 +155,7 @@ def apply(
             )
     if options["heading"]:
         chain = add_heading(chain, records)
-    blocks = with_notes(read_blocks(file, **how), notes=False)
+    blocks = with_notes(on_clock_of(read_blocks(file, **how)), notes=False)
     if options["temperature_column"] and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)
     rows = _Rows()

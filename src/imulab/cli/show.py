@@ -406,24 +406,28 @@ class _Contents(Struct):
 
     last: Recording
     columns: dict[str, _Column]
-    clock: _Clock
+    clocks: dict[str, _Clock]
     samples: int
     notes: list[str]
 
 
 def _contents(blocks: Iterable[Recording]) -> _Contents:
     columns: dict[str, _Column] = {}
-    clock, samples, notes = _Clock(), 0, dict[str, None]()
+    clocks, samples, notes = {"time": _Clock()}, 0, dict[str, None]()
     block = None
     for block in blocks:
         samples += len(block)
         notes |= dict.fromkeys(block.notes)
-        clock.add(block)
-        for name, values in block.columns.items():
-            columns.setdefault(name, _Column()).add(values)
+        for name in block.columns:
+            columns.setdefault(name, _Column())
+        for clock in block.clocks:
+            part = block.stream(clock)
+            clocks.setdefault(clock, _Clock()).add(part)
+            for name, values in part.columns.items():
+                columns[clock if name == "time" else name].add(values)
     if block is None:
         raise ReadError("the recording is empty")
-    return _Contents(block, columns, clock, samples, list(notes))
+    return _Contents(block, columns, clocks, samples, list(notes))
 
 
 def describe_recording(blocks: Iterable[Recording]) -> str:
@@ -433,12 +437,14 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
     contents = _contents(blocks)
     last = contents.last
     lines = [f"{printable(last.name)}: {contents.samples} samples"]
-    lines += (
-        contents.clock.summary(last.metadata).text()
-        if "time" in last
-        else ["no time column: a table of attitudes, a row each"]
-    )
-    steps = {"time": _SHOWN / to_si(1.0, last.units["time"])} if "time" in last else {}
+    for clock, names in last.clocks.items() if "time" in last else ():
+        text = contents.clocks[clock].summary(last.metadata).text()
+        if len(last.clocks) > 1:
+            text[:1] = [f"{clock} ({' '.join(names)}): {contents.columns[clock].finite} samples, {text[0]}"]
+        lines += text
+    if "time" not in last:
+        lines.append("no time column: a table of attitudes, a row each")
+    steps = {clock: _SHOWN / to_si(1.0, last.units[clock]) for clock in last.clocks if clock in last}
     rows = [[name, last.units[name], *column.texts(steps.get(name))] for name, column in contents.columns.items()]
     lines += ["", *aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]
     if last.metadata:
@@ -447,25 +453,37 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
     return "\n".join(lines)
 
 
+def _clock_json(clock: _Summary) -> dict[str, Any]:
+    known = clock.first is not None
+    return {
+        "start": {"value": clock.first, "unit": "s", "utc": clock.utc},
+        "end": {"value": clock.last if known else None, "unit": "s"},
+        "duration": {"value": clock.last - clock.first if clock.first is not None else None, "unit": "s"},
+        "sample_rate": {"value": clock.rate if clock.rate > 0 else None, "unit": "Hz"},
+        "jitter": {"value": clock.jitter if clock.rate > 0 else None, "unit": "s"},
+        "gaps": clock.gaps,
+        "missing": clock.missing,
+        "repeated": clock.repeated,
+    }
+
+
 def recording_json(blocks: Iterable[Recording]) -> str:
     """Return the same as JSON, each column in its own unit; null for unknown values."""
     from imulab.records.calibration import json_text
 
     contents = _contents(blocks)
-    last, clock = contents.last, contents.clock.summary(contents.last.metadata)
-    known = clock.first is not None
+    last = contents.last
+    about = {clock: _clock_json(each.summary(last.metadata)) for clock, each in contents.clocks.items()}
     return json_text(
         {
             "file": last.name,
             "samples": contents.samples,
-            "start": {"value": clock.first, "unit": "s", "utc": clock.utc},
-            "end": {"value": clock.last if known else None, "unit": "s"},
-            "duration": {"value": clock.last - clock.first if clock.first is not None else None, "unit": "s"},
-            "sample_rate": {"value": clock.rate if clock.rate > 0 else None, "unit": "Hz"},
-            "jitter": {"value": clock.jitter if clock.rate > 0 else None, "unit": "s"},
-            "gaps": clock.gaps,
-            "missing": clock.missing,
-            "repeated": clock.repeated,
+            **about["time"],
+            **(
+                {"clocks": {name: {**about[name], "columns": columns} for name, columns in last.clocks.items()}}
+                if len(about) > 1
+                else {}
+            ),
             "columns": {
                 name: {"unit": last.units[name], **column.values()} for name, column in contents.columns.items()
             },

@@ -31,7 +31,7 @@ from imulab.estimation.noise_coefficients import (
 )
 from imulab.estimation.rows import Step, deviation_of_steps, find_step, leave_out
 from imulab.estimation.sampling import bridged, mend_stamps, sampling_rate, steady_part
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Recording, check_not_resampled
 from imulab.units import from_si, parse_unit, si_unit
 
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
@@ -104,28 +104,36 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         raise DataError(
             f"{recording.name}: no sensor column ({' '.join(INERTIAL)}); found {' '.join(recording.columns)}"
         )
-    recording, rate, noises, notes = curves_and_noise(recording, names, taus)
+    clocks = {clock: [name for name in names if name in stamped] for clock, stamped in recording.clocks.items()}
+    parts = [curves_and_noise(recording.stream(clock), stamped, taus) for clock, stamped in clocks.items() if stamped]
     columns: dict[str, Any] = {}
-    for name, noise in noises.items():
-        columns[name] = {
-            "unit": si_unit(recording.units[name]),
-            "mean": float(recording.si(name).mean()),
-            **coefficients_dict(noise.coefficients, si_unit(recording.units[name])),
-            "tau": noise.curve.tau.tolist(),
-            "deviation": noise.curve.deviation.tolist(),
-            "standard_uncertainty": noise.curve.standard_uncertainty.tolist(),
-            "fitted": _listed(noise.fitted(noise.curve.tau)),
-        }
+    for part, its_rate, noises, _ in parts:
+        own = {"samples": len(part), "sample_rate": {"value": its_rate, "unit": "Hz"}} if len(parts) > 1 else {}
+        for name, noise in noises.items():
+            columns[name] = {**_column(part, name, noise), **own}
+    first, rate, _, _ = parts[0]
     return {
         "format": "imulab.noise",
         "version": 1,
         "file": recording.name,
         "sensor": {key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
-        "samples": len(recording),
+        "samples": len(first),
         "sample_rate": {"value": rate, "unit": "Hz"},
         "taus": taus,
-        "warnings": notes,
-        "columns": columns,
+        "warnings": list(dict.fromkeys(note for *_, notes in parts for note in notes)),
+        "columns": {name: columns[name] for name in names},
+    }
+
+
+def _column(recording: Recording, name: str, noise: ColumnNoise) -> dict[str, Any]:
+    return {
+        "unit": si_unit(recording.units[name]),
+        "mean": float(recording.si(name).mean()),
+        **coefficients_dict(noise.coefficients, si_unit(recording.units[name])),
+        "tau": noise.curve.tau.tolist(),
+        "deviation": noise.curve.deviation.tolist(),
+        "standard_uncertainty": noise.curve.standard_uncertainty.tolist(),
+        "fitted": _listed(noise.fitted(noise.curve.tau)),
     }
 
 
@@ -143,6 +151,7 @@ def curves_and_noise(
         As for `allan_deviation`; also without a time column.
     """
     names = list(noise_columns(recording))  # of all sensors: each may show that a row is no reading
+    check_not_resampled(recording, wanted)
     recording, rate, notes = _mended(recording, names)
     noises, more = _noises(recording, rate, names, wanted, taus)
     return recording, rate, noises, [*notes, *more]

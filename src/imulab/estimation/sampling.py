@@ -11,7 +11,7 @@ from imulab.display import Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.clock import GAP, Clock, read_clock, same_rows
 from imulab.estimation.rows import median, quantile
-from imulab.recording import EVEN_SAMPLES, Array, Recording, check_finite, check_time, stored_as
+from imulab.recording import EVEN_SAMPLES, Array, Recording, by_clock, check_finite, check_time, stored_as
 from imulab.units import to_si
 
 WIDEST_GAP = 10.0
@@ -50,6 +50,8 @@ def mend_stamps(recording: Recording) -> Recording:
     DataError
         Time stands still, or the rate cannot be told from coarse stamps; the message names the row, and `sample_rate`.
     """
+    if len(recording.clocks) > 1:
+        return by_clock(recording, mend_stamps)
     time = recording.time
     if time is None or len(time) < 2 or not (time[1:] == time[:-1]).any():
         return recording

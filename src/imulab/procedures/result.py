@@ -24,6 +24,7 @@ from imulab.frames import columns_of_arrays, is_frame, unmasked
 from imulab.options import file
 from imulab.readers import read, read_blocks
 from imulab.readers.selection import Selection
+from imulab.readers.streams import on_clock_of, one_clock
 from imulab.recording import Data, Reading, Recording, Sampling, Source, Window
 from imulab.records.calibration import Calibration
 from imulab.report import render_page, render_plan
@@ -145,6 +146,8 @@ _OF_ARRAYS = ("rate", "time", "unit")
 _OF_FILES = ("layout", "topic", "instance", "damaged")
 _UNITS = ("units",)
 _PART = ("window", "element")
+OWN_CLOCKS = "own"
+"""What leaves each sensor on its own clock."""
 _TITLED = "a file says itself, by its titles or a layout"
 _EXPECTED = "a file name, a Recording, a data frame of pandas or polars, or arrays"
 
@@ -155,9 +158,15 @@ def as_recording(
     function: Callable[..., Any],
     columns: Callable[[NDArray[Any]], Mapping[str, ArrayLike]] | None = None,
     name: str = "data",
+    clock: str | None = None,
 ) -> Recording:
-    """Return data as a recording whose time rises (`mend_stamps`); else as for `as_read`."""
-    return mend_stamps(as_read(data, reading, function, columns, name))
+    """Return data as a recording whose time rises (`mend_stamps`); else as for `as_read`.
+
+    `clock` is the sensor to whose clock all are brought where they have clocks of their own, the fastest if not given;
+    `OWN_CLOCKS` leaves them as they are.
+    """
+    recording = mend_stamps(_own_clocks(data, reading, function, columns, name))
+    return recording if clock == OWN_CLOCKS else one_clock(recording, clock)
 
 
 def as_read(
@@ -167,7 +176,7 @@ def as_read(
     columns: Callable[[NDArray[Any]], Mapping[str, ArrayLike]] | None = None,
     name: str = "data",
 ) -> Recording:
-    """Return data as a recording, row by row.
+    """Return data as a recording, row by row, on the clock of the fastest sensor.
 
     Parameters
     ----------
@@ -189,6 +198,16 @@ def as_read(
     DataError
         The data are something else; and what reading them raises.
     """
+    return one_clock(_own_clocks(data, reading, function, columns, name))
+
+
+def _own_clocks(
+    data: Data,
+    reading: Mapping[str, Any] | Reading | Sampling,
+    function: Callable[..., Any],
+    columns: Callable[[NDArray[Any]], Mapping[str, ArrayLike]] | None,
+    name: str,
+) -> Recording:
     called = function.__name__
     check_keywords(reading, function)
     stated = {key: value for key, value in reading.items() if value is not None}
@@ -217,11 +236,15 @@ def as_read(
 
 
 def as_blocks(
-    data: Data, reading: Mapping[str, Any] | Reading | Sampling, function: Callable[..., Any], name: str = "data"
+    data: Data,
+    reading: Mapping[str, Any] | Reading | Sampling,
+    function: Callable[..., Any],
+    name: str = "data",
+    clock: str | None = None,
 ) -> tuple[Iterator[Recording], Source | None]:
     """Return data in blocks, for means over long files, and the source file; else as for `as_recording`."""
     if not isinstance(data, str | os.PathLike):
-        whole = as_recording(data, reading, function, name=name)
+        whole = as_recording(data, reading, function, name=name, clock=clock)
         return iter((whole,)), whole.source
     check_keywords(reading, function)
     stated = {key: value for key, value in reading.items() if value is not None}
@@ -231,7 +254,8 @@ def as_blocks(
     if path.is_file():
         with path.open("rb") as stream:
             source = Source(str(data), hashlib.file_digest(stream, "sha256").hexdigest())
-    return read_blocks(path, **_pick(stated, (*_OF_FILES, *_UNITS)), **part), source
+    blocks = read_blocks(path, **_pick(stated, (*_OF_FILES, *_UNITS)), **part)
+    return (blocks if clock == OWN_CLOCKS else on_clock_of(blocks, clock)), source
 
 
 def as_record(record: Record, called: str) -> Calibration:

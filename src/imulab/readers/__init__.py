@@ -25,7 +25,7 @@ from imulab.readers.layout import IfNeeded, load_layout, spread_packets
 from imulab.readers.packed import is_packed, unpacked
 from imulab.readers.selection import Selection
 from imulab.readers.text import TextFile
-from imulab.recording import Array, Layout, Recording, Source, Window
+from imulab.recording import Array, Layout, Recording, Source, Window, packed
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
@@ -101,7 +101,7 @@ def read(
     first = replace(first, columns={})
     # The parts of a column are freed as soon as they are joined, so that a large file is not in memory twice.
     joined = {key: _join([part.pop(key) for part in parts]) for key in list(parts[0])}
-    return replace(first, columns=joined, units=units, source=source, notes=notes)
+    return packed(replace(first, columns=joined, units=units, source=source, notes=notes))
 
 
 def _gather(blocks: Iterator[Recording]) -> tuple[Recording, list[dict[str, Array]], tuple[str, ...]]:

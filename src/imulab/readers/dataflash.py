@@ -18,7 +18,7 @@ from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError
 from imulab.readers import logs
 from imulab.readers.selection import Selection
-from imulab.readers.streams import LoggedStream, Piece, on_one_clock
+from imulab.readers.streams import LoggedStream, Piece, side_by_side
 from imulab.recording import Array, Recording
 
 MAGIC = b"\xa3\x95\x80"
@@ -120,7 +120,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
     contents = _survey(path, name)
     streams, sources = _choose(contents, selection, name)
     metadata = {"autopilot": contents.version or "ArduPilot", "time_origin": "boot"}
-    yield from on_one_clock(
+    yield from side_by_side(
         streams,
         _pieces(path, contents, sources, name),
         name=name,

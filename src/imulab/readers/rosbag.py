@@ -34,7 +34,7 @@ from imulab.errors import OptionError, ReadError, listed
 from imulab.readers import logs
 from imulab.readers.formats import Budget, unpack
 from imulab.readers.selection import Selection
-from imulab.readers.streams import LoggedStream, Piece, on_one_clock
+from imulab.readers.streams import LoggedStream, Piece, side_by_side
 from imulab.recording import Array, Recording
 from imulab.units import parse_unit
 
@@ -494,7 +494,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
     if warm is not None:
         taken.append(slice(0, 1))
         streams.append(LoggedStream("temperature", {"temperature": "degC"}, slow=True))
-    yield from on_one_clock(
+    yield from side_by_side(
         streams,
         (Piece(p.stream, p.ticks, p.values[:, taken[p.stream]]) for p in pieces),
         name=name,

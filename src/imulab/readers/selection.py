@@ -12,7 +12,7 @@ from imulab.columns import check_unit, element_number, kind_of, stated_unit
 from imulab.display import Note
 from imulab.errors import OptionError, listed
 from imulab.quantities import FromStart, span
-from imulab.recording import DAMAGED, Ends, Recording, Window
+from imulab.recording import DAMAGED, Array, Ends, Recording, Window, packed
 from imulab.units import parse_unit
 
 
@@ -133,24 +133,29 @@ def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Ite
     first, last = -np.inf, np.inf
     low, high, any_row, any_time = np.inf, -np.inf, False, False
     for block in blocks:
-        time = block.time
-        if time is None:
+        if "time" not in block:
             raise OptionError(f"{name}: no time column, so there is no window of it to read")
-        finite = time[np.isfinite(time)]
+        times = {clock: block.si(clock) for clock in block.clocks}
+        finite = np.concatenate([time[np.isfinite(time)] for time in times.values()])
         if finite.size and not any_time:
             any_time = True
             first, last = _from(window[0], float(finite[0]), -np.inf), _from(window[1], float(finite[0]), np.inf)
         if finite.size:
             low, high = min(low, float(finite.min())), max(high, float(finite.max()))
-        inside = (time >= first) & (time <= last)
-        edges = np.flatnonzero(np.diff(inside, prepend=False, append=False))
-        for start, stop in edges.reshape(-1, 2).tolist():
-            any_row = True
-            yield replace(
-                block,
-                columns={key: values[start:stop] for key, values in block.columns.items()},
-                first_row=block.first_row + start,
-            )
+        if len(times) > 1:
+            part = _within(block, times, first, last)
+            any_row |= len(part) > 0
+            yield from [part] if len(part) else []
+        else:
+            inside = (times["time"] >= first) & (times["time"] <= last)
+            edges = np.flatnonzero(np.diff(inside, prepend=False, append=False))
+            for start, stop in edges.reshape(-1, 2).tolist():
+                any_row = True
+                yield replace(
+                    block,
+                    columns={key: values[start:stop] for key, values in block.columns.items()},
+                    first_row=block.first_row + start,
+                )
         if any_row and finite.size and finite.min() > last:
             break
     if not any_row:
@@ -174,6 +179,16 @@ def _time(seconds: float) -> str:
 
 def _from_start(low: float) -> str:
     return "; a window such as +0:+60 counts from the start" if abs(low) >= 1e5 else ""
+
+
+def _within(block: Recording, times: Mapping[str, Array], first: float, last: float) -> Recording:
+    """Return a block of several clocks without what lies outside of a window by the clock of each sensor."""
+    columns = dict(block.columns)
+    for clock, names in block.clocks.items():
+        outside = ~((times[clock] >= first) & (times[clock] <= last))
+        for name in (clock, *names):
+            columns[name] = np.where(outside, np.nan, columns[name])
+    return packed(replace(block, columns=columns))
 
 
 def keep_element(blocks: Iterator[Recording], element: int | None, name: str) -> Iterator[Recording]:

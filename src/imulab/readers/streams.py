@@ -1,16 +1,20 @@
-"""Streams with different clocks, and recordings of one unit with a file for each sensor, joined to one recording.
+"""Streams of one unit, each on its own clock in one recording, or all brought to one clock.
 
-Logs interleave the samples of several sensors. The accelerometer's samples (or whatever stream comes first) are the
-clock; the others are interpolated linearly between their neighbours, as they pass, without holding the file. Before a
-stream's first sample and after its last nothing is known of it, and nothing is made up: rows end with the first stream
-that ends, and the few rows before one that begins a little later are left out; more of them hold no numbers of it.
-Magnetometers are not interpolated: each of their samples stands in the row nearest in time, other rows hold no number.
+Logs interleave the samples of several sensors, and phones write a file for each. Their samples are kept as they are: a
+stream whose time stamps are not those of the first has a column of time of its own, such as ``time_gyro``.
+
+Where one clock is needed, one stream's samples are the clock, and the others are interpolated linearly between their
+neighbours, as they pass, without holding the file. Before a stream's first sample and after its last nothing is known
+of it, and nothing is made up: rows end with the first stream that ends, and the few rows before one that begins a
+little later are left out; more of them hold no numbers of it. Magnetometers are not interpolated: each of their samples
+stands in the row nearest in time, other rows hold no number.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +24,7 @@ from imulab.columns import kind_of
 from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, ReadError
 from imulab.estimation.sampling import WIDEST_GAP
-from imulab.recording import Array, Recording, check_time
+from imulab.recording import RESAMPLED, Array, Recording, check_time, packed, padded
 
 # Streams of different clocks to one recording.
 
@@ -28,9 +32,10 @@ from imulab.recording import Array, Recording, check_time
 Ticks = NDArray[np.int64]
 
 _ROWS = 1 << 16  # samples of the slowest stream after which rows are joined
-_PATIENCE = 1 << 20  # most samples that wait for a late stream
+_PATIENCE = 1 << 20  # most samples that wait for a late stream in a log
 _MUCH = 0.1
 """Lost part of a stream from which every command warns."""
+_WHOLE = "check that the log is whole, or record again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +50,11 @@ class LoggedStream:
     units: Mapping[str, str]
     slow: bool = False
     placed: bool = False
+
+    @property
+    def sensor(self) -> str:
+        """What its columns measure first: ``gyro``, by which its clock is called ``time_gyro``."""
+        return kind_of(next(iter(self.units))) or "other"
 
     @property
     def bounds(self) -> bool:
@@ -111,6 +121,7 @@ def on_one_clock(
     origin: int | None,
     metadata: Callable[[int], Mapping[str, str]],
     notes: Sequence[str] = (),
+    patience: int = _PATIENCE,
 ) -> Iterator[Recording]:
     """Yield blocks on the clock of the first stream.
 
@@ -128,6 +139,8 @@ def on_one_clock(
         Of the recording, for a given origin.
     notes
         What is known of the data; what is added to a list while pieces are taken is in the blocks from there on.
+    patience
+        Most samples of the clock that wait for a late stream.
 
     Raises
     ------
@@ -153,7 +166,7 @@ def on_one_clock(
         whole = _ready(clock, others)
         ready = clock.count if piece is None else whole
         ended = piece is None
-        if clock.count > _PATIENCE and whole < clock.count // 2:
+        if clock.count > patience and whole < clock.count // 2:
             # A stream that has ended does not delay the others; a late one may lag by half of the waiting samples.
             ended = True
             ready = clock.count // 2
@@ -279,7 +292,7 @@ def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
                     f"{'truncated stream: ' if share > _MUCH else ''}the {first.stream.what} ends {lost} before the "
                     f"{buffer.stream.what}: rows end there, and {lost} ({100 * share:.2g} %) of the "
                     f"{buffer.stream.what} are left out",
-                    "check that the log is whole, or record again",
+                    _WHOLE,
                 )
             )
     return messages
@@ -370,6 +383,137 @@ def _note(buffer: _Buffer, clock: _Buffer, per_second: int) -> str:
     )
 
 
+# Streams that keep their clocks in one recording.
+
+
+_SHOWN = 64  # samples of a stream that show whether it has the time stamps of another
+_LOOKED_AT = 1 << 16  # samples of a log that are read until that is known
+
+
+def side_by_side(
+    streams: Sequence[LoggedStream],
+    pieces: Iterable[Piece],
+    *,
+    name: str,
+    per_second: int,
+    origin: int | None,
+    metadata: Callable[[int], Mapping[str, str]],
+    notes: Sequence[str] = (),
+) -> Iterator[Recording]:
+    """Yield blocks in which a stream with other time stamps than the first keeps them, as ``time_gyro``.
+
+    Parameters and errors are those of `on_one_clock`. Slow streams are interpolated to the first, and so are samples of
+    a stream whose first time stamps are the same but later ones are not.
+    """
+    begun: list[Piece] = []
+    shared = _sharing(streams, pieces := iter(pieces), begun)
+    place = {number: k for k, number in enumerate(shared)}
+    apart: dict[int, list[Piece]] = {number: [] for number in range(len(streams)) if number not in place}
+    spans = [_Span(stream) for stream in streams]
+    first: list[int] = []
+
+    def common() -> Iterator[Piece]:
+        for piece in (*begun, *pieces):
+            spans[piece.stream].add(piece.ticks)
+            if piece.stream in place:
+                yield replace(piece, stream=place[piece.stream])
+            else:
+                apart[piece.stream].append(piece)
+
+    def known(tick: int) -> Mapping[str, str]:
+        first[:] = [tick]
+        return metadata(tick)
+
+    row, held = 1, None
+    for block in on_one_clock(
+        [streams[k] for k in shared], common(), name=name, per_second=per_second, origin=origin, metadata=known,
+        notes=notes,
+    ):  # fmt: skip
+        columns, units = [block.columns], dict(block.units)
+        for number, waiting in apart.items():
+            stream = streams[number]
+            ticks = np.concatenate([np.empty(0, dtype=np.int64), *(piece.ticks for piece in waiting)])
+            values = np.concatenate([np.empty((0, len(stream.units))), *(piece.values for piece in waiting)])
+            waiting.clear()
+            clock = f"time_{stream.sensor}"
+            columns.append({clock: (ticks - first[0]) / per_second, **dict(zip(stream.units, values.T, strict=True))})
+            units |= {clock: "s", **stream.units}
+        if held is not None:
+            yield held
+        held = replace(block, columns=padded(columns), units=units, first_row=row)
+        row += len(held)
+    assert held is not None  # without samples of the first stream it has been refused
+    yield replace(held, notes=(*held.notes, *_ends_apart(spans, apart, per_second, name)))
+
+
+class _Span:
+    """The first and last time stamp of a stream, and how many there are."""
+
+    def __init__(self, stream: LoggedStream) -> None:
+        self.stream, self.count = stream, 0
+        self.first, self.last = np.iinfo(np.int64).max, np.iinfo(np.int64).min
+
+    def add(self, ticks: Ticks) -> None:
+        if ticks.size:
+            self.first, self.last = min(self.first, int(ticks.min())), max(self.last, int(ticks.max()))
+            self.count += len(ticks)
+
+    @property
+    def step(self) -> float:
+        return (self.last - self.first) / max(self.count - 1, 1)
+
+
+def _ends_apart(spans: list[_Span], apart: Iterable[int], per_second: int, name: str) -> list[str]:
+    """Return a note by how much a stream with a clock of its own ends before the others, or the others before it.
+
+    Raises
+    ------
+    ReadError
+        It has no time in common with them.
+    """
+    timed = [spans[0], *(spans[k] for k in apart if spans[k].stream.bounds and spans[k].count)]
+    for span in timed[1:]:
+        if span.first > timed[0].last or span.last < timed[0].first:
+            what = f"{timed[0].stream.what} and the {span.stream.what}"
+            raise ReadError(f"{name}: the {what} have no time in common")
+    ends = min(timed, key=lambda span: span.last)
+    messages: list[str] = []
+    for span in timed:
+        left, length = span.last - ends.last, max(span.last - span.first, 1)
+        if left > WIDEST_GAP * max(ends.step, span.step):
+            cut = "truncated stream: " if left > _MUCH * length else ""
+            messages.append(
+                Finding(
+                    f"{cut}the {ends.stream.what} ends {left / per_second:.4g} s ({100 * left / length:.2g} %) before "
+                    f"the {span.stream.what}",
+                    _WHOLE,
+                )
+            )
+    return messages
+
+
+def _sharing(streams: Sequence[LoggedStream], pieces: Iterator[Piece], begun: list[Piece]) -> list[int]:
+    """Return the numbers of the streams with the first's time stamps, and the slow; `begun` gets what was read."""
+    ticks: list[list[Ticks]] = [[] for _ in streams]
+    wanted = {k for k, stream in enumerate(streams) if k == 0 or not stream.slow}
+    total = 0
+    while total < _LOOKED_AT and any(sum(map(len, ticks[k])) < _SHOWN for k in wanted):
+        if (piece := next(pieces, None)) is None:
+            break
+        begun.append(piece)
+        ticks[piece.stream].append(piece.ticks)
+        total += len(piece.ticks)
+    stamps = [np.concatenate([np.empty(0, dtype=np.int64), *each]) for each in ticks]
+    return [k for k, stream in enumerate(streams) if k == 0 or stream.slow or _same_stamps(stamps[0], stamps[k])]
+
+
+def _same_stamps(first: Ticks, other: Ticks) -> bool:
+    if not first.size or not other.size:
+        return False
+    low, high = max(first[0], other[0]), min(first[-1], other[-1])
+    return np.array_equal(*(ticks[(ticks >= low) & (ticks <= high)] for ticks in (first, other))) and low <= high
+
+
 # Recordings with a file for each sensor, as of phones and the x-IMU3.
 
 
@@ -377,17 +521,17 @@ _PER_SECOND = 10**9  # ticks that times are joined by: 1 ns
 
 
 def join_recordings(recording: Recording, others: Sequence[Recording]) -> Recording:
-    """Join recordings of one unit's sensors, whose times count from the same instant, on the clock of the first.
+    """Join recordings of one unit's sensors, whose times count from the same instant.
 
-    Magnetometers are not interpolated: each sample stands in the row nearest in time, other rows hold NaN. All else is
-    interpolated linearly, but not across gaps; rows end with the first recording that ends.
+    A sensor whose times are not those of the first recording keeps them, as ``time_gyro``. A recording that holds
+    nothing but temperature is interpolated to the first.
 
     Parameters
     ----------
     recording
         Whose rows, metadata and source are kept.
     others
-        Whose columns are added, but for their time.
+        Whose columns are added.
 
     Returns
     -------
@@ -409,13 +553,15 @@ def join_recordings(recording: Recording, others: Sequence[Recording]) -> Record
     >>> mag = il.Recording.from_arrays(mag=nine.triad("mag")[::5], time=nine.time[::5], unit="uT", name="mag.csv")
     >>> accel = il.Recording.from_arrays(accel=nine.triad("accel"), time=nine.time, unit="m/s^2")
     >>> list(il.join_recordings(accel, [mag]).columns)
-    ['time', 'accel_x', 'accel_y', 'accel_z', 'mag_x', 'mag_y', 'mag_z']
+    ['time', 'accel_x', 'accel_y', 'accel_z', 'time_mag', 'mag_x', 'mag_y', 'mag_z']
     """
     if not others:
         raise OptionError("others: expected one recording or more to join, found none")
     every = [recording, *others]
-    streams, pieces, taken = [], [], {"time": recording.name}
-    for number, part in enumerate(every):
+    streams: list[LoggedStream] = []
+    pieces: list[Piece] = []
+    taken = {"time": recording.name}
+    for part in (stream for each in every for stream in _streams_of(each)):
         if part.time is None:
             raise DataError(f"{part.name}: no column time, by which it could be joined")
         time = check_time(part)
@@ -425,16 +571,17 @@ def join_recordings(recording: Recording, others: Sequence[Recording]) -> Record
             if name in taken:
                 raise DataError(f"{part.name}: column {name}, which {taken[name]} has too; expected other sensors")
             taken[name] = part.name
-        kinds = {kind_of(name) for name in names}
-        units = {name: part.units[name] for name in names}
-        streams.append(
-            LoggedStream(part.name, units, slow=kinds == {"temperature"}, placed="mag" in kinds and number > 0)
+        pieces.append(
+            Piece(
+                len(streams),
+                np.rint(time * _PER_SECOND).astype(np.int64),
+                np.column_stack([part.columns[name] for name in names]),
+            )
         )
-        ticks = np.rint(time * _PER_SECOND).astype(np.int64)
-        pieces.append(Piece(number, ticks, np.column_stack([part.columns[name] for name in names])))
+        streams.append(_stream(part.name, part, names, placed=bool(streams)))
     # The first recording comes last, when all samples that its rows need have been read.
     blocks = list(
-        on_one_clock(
+        side_by_side(
             streams,
             [*pieces[1:], pieces[0]],
             name=recording.name,
@@ -443,14 +590,25 @@ def join_recordings(recording: Recording, others: Sequence[Recording]) -> Record
             metadata=lambda _: recording.metadata,
         )
     )
-    columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
+    joined = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
     notes = dict.fromkeys(note for part in (*every, *blocks) for note in part.notes)
-    return replace(blocks[0], columns=columns, source=recording.source, notes=tuple(notes))
+    return packed(replace(blocks[0], columns=joined, source=recording.source, notes=tuple(notes)))
+
+
+def _streams_of(recording: Recording) -> list[Recording]:
+    return [recording.stream(clock) for clock in recording.clocks]
+
+
+def _stream(what: str, part: Recording, names: Sequence[str], *, placed: bool) -> LoggedStream:
+    kinds = {kind_of(name) for name in names}
+    units = {name: part.units[name] for name in names}
+    return LoggedStream(what, units, slow=kinds == {"temperature"}, placed=placed and "mag" in kinds)
 
 
 def _check_overlap(first: Recording, other: Recording) -> None:
     """Refuse recordings of different times."""
-    ends = [(float(part.si("time")[0]), float(part.si("time")[-1])) for part in (first, other)]
+    times = [part.stream("time").si("time") for part in (first, other)]
+    ends = [(float(time[0]), float(time[-1])) for time in times]
     if ends[1][0] > ends[0][1] or ends[0][0] > ends[1][1]:
         (a, b), (c, d) = ends
         raise DataError(
@@ -473,3 +631,104 @@ def file_and_layout(text: str) -> tuple[str, str | None]:
     if not file or not layout:
         raise OptionError(f"{text!r}: expected FILE or FILE@LAYOUT")
     return file, layout
+
+
+# A recording whose sensors have clocks of their own, brought to one clock.
+
+
+_NEARLY = 0.05  # relative: of clocks whose rates are this close, ``time`` is taken
+_ENDLESS = 1 << 62
+_WORDS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
+
+
+def one_clock(recording: Recording, sensor: str | None = None) -> Recording:
+    """Return a recording with all sensors on one clock; see `on_clock_of`."""
+    if len(recording.clocks) < 2:
+        return recording
+    blocks = list(on_clock_of([recording], sensor))
+    columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
+    notes = dict.fromkeys(note for block in blocks for note in block.notes)
+    return replace(blocks[0], columns=columns, source=recording.source, notes=tuple(notes))
+
+
+def on_clock_of(blocks: Iterable[Recording], sensor: str | None = None) -> Iterator[Recording]:
+    """Yield blocks with all sensors on the clock of one, or of the fastest; those of one clock as they are.
+
+    What was interpolated is said in the notes, and in the head, as ``resampled``.
+
+    Raises
+    ------
+    ReadError
+        Two clocks have no time in common, or one runs backwards.
+    """
+    blocks = iter(blocks)
+    if (first := next(blocks, None)) is None:
+        return
+    clocks = first.clocks
+    if len(clocks) < 2:
+        yield first
+        yield from blocks
+        return
+    parts = {clock: first.stream(clock) for clock in clocks}
+    rates = {clock: _mean_rate(part) for clock, part in parts.items()}
+    chosen = next((clock for clock, names in clocks.items() if sensor in map(kind_of, names)), None)
+    if chosen is None:
+        chosen = max(rates, key=lambda clock: rates[clock] * (1 + _NEARLY * (clock == "time")))
+    order = [chosen, *(clock for clock in clocks if clock != chosen)]
+    streams, resampled = [], []
+    for clock in order:
+        kinds = list(dict.fromkeys(kind for name in clocks[clock] if (kind := kind_of(name)) in _WORDS))
+        what = " and ".join(map(_WORDS.__getitem__, kinds)) or f"column {clocks[clock][0]}"
+        streams.append(_stream(what, first, clocks[clock], placed=clock != chosen))
+        if clock != chosen and streams[-1].bounds:
+            sensors = " and ".join(kinds or clocks[clock])
+            resampled.append(f"{sensors} from {rates[clock]:.6g} Hz to {rates[chosen]:.6g} Hz")
+    notes: list[str] = []
+    head = {**first.metadata, **({RESAMPLED: "; ".join(resampled)} if resampled else {})}
+
+    def pieces() -> Iterator[Piece]:
+        for block in chain([first], blocks):
+            notes.extend(note for note in block.notes if note not in notes)
+            for number, clock in reversed([*enumerate(order)]):
+                part = block.stream(clock)
+                time = part.si("time")
+                timed = np.isfinite(time)
+                yield Piece(
+                    number,
+                    np.rint(time[timed] * _PER_SECOND).astype(np.int64),
+                    np.column_stack([part.columns[name][timed] for name in clocks[clock]]),
+                )
+
+    kept = [name for name in first.columns if name != "time" and name not in clocks]
+    for block in on_one_clock(
+        streams, pieces(), name=first.name, per_second=_PER_SECOND, origin=0, metadata=lambda _: head, notes=notes,
+        patience=_ENDLESS,
+    ):  # fmt: skip
+        columns = {name: block.columns[name] for name in ("time", *kept)}
+        yield replace(
+            block, columns=columns, units={name: block.units[name] for name in columns}, corrected_by=first.corrected_by
+        )
+
+
+def own_clock(recording: Recording, sensor: str) -> Recording:
+    """Return the samples of a sensor on its own clock, as ``time``, with the temperature interpolated to it.
+
+    A recording of one clock is returned as it is.
+    """
+    if len(recording.clocks) < 2:
+        return recording
+    part, name = recording.stream(sensor), "temperature"
+    if name in part or name not in recording or "time" not in part:
+        return part
+    other = recording.stream(name)
+    if other.time is None:
+        return part
+    values = np.interp(part.si("time"), other.si("time"), other.column(name))
+    return part.with_columns({name: values}, {name: recording.units[name]})
+
+
+def _mean_rate(part: Recording) -> float:
+    """Return the mean rate of a stream by its first and last time, Hz, 0 where that is not known."""
+    time = part.si("time")
+    time = time[np.isfinite(time)]
+    return (len(time) - 1) / float(time[-1] - time[0]) if len(time) > 1 and time[-1] > time[0] else 0.0

@@ -18,7 +18,7 @@ from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError
 from imulab.readers import logs
 from imulab.readers.selection import Selection
-from imulab.readers.streams import LoggedStream, Piece, on_one_clock
+from imulab.readers.streams import LoggedStream, Piece, side_by_side
 from imulab.recording import Recording
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -81,7 +81,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
     """
     contents = _survey(path, name)
     streams, sources = _choose(contents, selection, name)
-    yield from on_one_clock(
+    yield from side_by_side(
         streams,
         _pieces(path, contents, sources, name),
         name=name,

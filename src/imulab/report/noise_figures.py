@@ -164,7 +164,7 @@ def exhibits_of_noise(analysis: dict[str, Any], recording: Recording) -> Exhibit
         + (f"{'; '.join(known[:_MOST_NAMED])}{more}{lost}." if known else "not determined."),
         facts=[
             ("length", f"{length:.4g} s"),
-            ("sampling rate", f"{analysis['sample_rate']['value']:.6g} Hz"),
+            ("sampling rate", rates_of({name: _rate(analysis, name) for name in analysis["columns"]})),
             ("columns", str(len(analysis["columns"]))),
         ],
         items=items,
@@ -238,19 +238,31 @@ def _model_curve(column: dict[str, Any], factor: float, name: str, colour: str) 
     ]
 
 
+def _rate(analysis: dict[str, Any], name: str) -> float:
+    return float(analysis["columns"][name].get("sample_rate", analysis["sample_rate"])["value"])
+
+
+def rates_of(rates: Mapping[str, float]) -> str:
+    """Return the sampling rates of columns for a fact of a report: one, or one for each clock with its columns."""
+    by_rate: dict[str, list[str]] = {}
+    for name, rate in rates.items():
+        by_rate.setdefault(f"{rate:.6g} Hz", []).append(name)
+    return next(iter(by_rate)) if len(by_rate) == 1 else ", ".join(f"{r} ({' '.join(n)})" for r, n in by_rate.items())
+
+
 def _samples_figure(analysis: dict[str, Any], recording: Recording, names: Sequence[str]) -> Figure:
     """Return range and mean of the samples in equal blocks, so that spikes show in recordings of any length."""
     layout = panels.grid()
     traces: list[dict[str, Any]] = []
     beyond = 0
-    rate = analysis["sample_rate"]["value"]
     for index, name in enumerate(names):
         unit, factor = sample_unit(analysis["columns"][name]["unit"]).scale
         values = recording.si(name)
         values = factor * (values[np.isfinite(values)] - analysis["columns"][name]["mean"])
+        rate = _rate(analysis, name)
         size = max(1, len(values) // _BLOCKS)
         blocks = values[: len(values) // size * size].reshape(-1, size)
-        time = (np.arange(len(blocks)) + 0.5) * size / rate
+        time = np.asarray((np.arange(len(blocks)) + 0.5) * size / rate, dtype=np.float64)
         low, mean, high = blocks.min(axis=1), blocks.mean(axis=1), blocks.max(axis=1)
         x, y = panels.names(index)
         line = {"line": {"color": GOOD, "width": 1}, "hoverinfo": "skip", "xaxis": x, "yaxis": y}

@@ -50,10 +50,11 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
         The file cannot be read.
     """
     from imulab.readers import read_blocks
+    from imulab.readers.streams import on_clock_of
 
     options = read_options(options_of(Reading), reading, "--{}")
     writer, notes, last_sent, block = Writer(folder), dict[str, None](), 0.0, None
-    for block in read_blocks(file, options["layout"], **part_of(options)):
+    for block in on_clock_of(read_blocks(file, options["layout"], **part_of(options))):
         writer.add(block)
         notes |= dict.fromkeys(block.notes)
         if monotonic() - last_sent > _EVERY:

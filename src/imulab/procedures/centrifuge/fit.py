@@ -26,6 +26,7 @@ from imulab.procedures.centrifuge.record import make_record
 from imulab.procedures.centrifuge.run import LoadedRun, StaticRun, reduce_run, reduce_static
 from imulab.procedures.result import Result
 from imulab.readers import read_blocks
+from imulab.readers.streams import on_clock_of
 from imulab.recording import Array, Recording, Source
 from imulab.records.calibration import Calibration
 
@@ -162,7 +163,7 @@ def _read_beside(
             raise ReadError(f"{test.place(index)}: no such file")
 
     def blocks(run: Run) -> Iterable[Recording]:
-        return read_blocks(paths[run.file], None if layout is None else fspath(layout), window=run.window)
+        return on_clock_of(read_blocks(paths[run.file], None if layout is None else fspath(layout), window=run.window))
 
     def sources() -> list[Source]:
         return [_source(called, path) for called, path in ((file, Path(file)), *paths.items())]

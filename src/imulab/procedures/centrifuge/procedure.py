@@ -28,6 +28,7 @@ def _fit(
 ) -> Calibration:
     from imulab.procedures.centrifuge.fit import fit_centrifuge
     from imulab.procedures.centrifuge.manifest import load_manifest
+    from imulab.readers.streams import on_clock_of
 
     (manifest,) = files
     test = load_manifest(access.path(manifest), manifest)
@@ -42,7 +43,7 @@ def _fit(
 
     return fit_centrifuge(
         test,
-        lambda run: access.blocks(names[run.file], values["layout"], window=run.window),
+        lambda run: on_clock_of(access.blocks(names[run.file], values["layout"], window=run.window)),
         method=values["method"],
         curve=values["curve"],
         sources=sources,

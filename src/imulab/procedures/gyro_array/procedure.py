@@ -26,10 +26,14 @@ def _fit(
     files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
 ) -> Calibration:
     from imulab.procedures.gyro_array.fit import calibrate_array
+    from imulab.readers.streams import one_clock
 
     part = values["part"]
-    still = access.recording(files[0], values["layout"], **{**part, "window": values["interval"] or part["window"]})
-    moving = access.recording(files[1], values["layout"], **{**part, "window": None}) if len(files) > 1 else None
+    at_rest = {**part, "window": values["interval"] or part["window"]}
+    still = one_clock(access.recording(files[0], values["layout"], **at_rest))
+    moving = None
+    if len(files) > 1:
+        moving = one_clock(access.recording(files[1], values["layout"], **{**part, "window": None}))
     noise = None if values["noise"] is None else access.record(values["noise"])
     return calibrate_array(
         still, moving, averaging_time=values["averaging"], fusion=values["fusion"], noise=noise

@@ -16,7 +16,7 @@ from imulab.estimation.noise_coefficients import NoiseCoefficients, coefficients
 from imulab.estimation.sampling import sampling_rate
 from imulab.frames import is_frame, unmasked
 from imulab.options import PROGRAM, READING, choice, parsed
-from imulab.procedures.result import Drawn, as_blocks, as_recording
+from imulab.procedures.result import OWN_CLOCKS, Drawn, as_blocks, as_recording
 from imulab.quantities import span
 from imulab.recording import Array, Data, Part, Recording, Window, check_finite, is_large, on_disk
 from imulab.report.traces import Exhibits, Figure, ReportTable, format_uncertain
@@ -146,16 +146,18 @@ def allan_deviation(
         return _samples_curve(unmasked(data).astype(np.float64), rate, taus)
     stated: dict[str, Any] = {**reading, "rate": rate, "window": window}
     if isinstance(data, str | PathLike) and is_large(data):
-        recording = on_disk(as_blocks(data, stated, allan_deviation)[0])
+        recording = on_disk(as_blocks(data, stated, allan_deviation, clock=OWN_CLOCKS)[0])
     else:
-        recording = as_recording(data, stated, allan_deviation)
-    names = [name for name in recording.columns if name != "time"]
+        recording = as_recording(data, stated, allan_deviation, clock=OWN_CLOCKS)
+    clocks = recording.clocks
+    names = [name for stamped in clocks.values() for name in stamped]
     chosen = column or (names[0] if len(names) == 1 else None)
     if chosen not in names:
         problem = "several columns" if column is None else f"no column {column!r}"
         raise OptionError(
             f"allan_deviation: {recording.name}: {problem}; expected column=, one of {listed(names, column)}"
         )
+    recording = recording.stream(next(clock for clock, stamped in clocks.items() if chosen in stamped))
     unit = si_unit(recording.units[chosen])
     if chosen in noise_columns(recording) and len(recording) >= FEWEST:
         _, _, noises, notes = curves_and_noise(recording, [chosen], taus)

@@ -21,6 +21,7 @@ from imulab.procedures.noise.schema import (
 )
 from imulab.records.calibration import Calibration
 from imulab.report import traces as panels
+from imulab.report.noise_figures import rates_of
 from imulab.report.parameters import density_unit, reading_unit, small_unit
 from imulab.report.traces import (
     BAD,
@@ -57,7 +58,7 @@ def exhibits(record: Calibration) -> Exhibits:
     pages = panels.pages(names)
     items += [_ratios(record, fit, page, k, len(pages)) for k, page in enumerate(pages)]
     units = dict.fromkeys(column.unit for column in fit.columns.values())
-    facts = [("length", f"{fit.length.value:.4g} s"), ("sampling rate", f"{fit.sample_rate.value:.6g} Hz")]
+    facts = [("length", f"{fit.length.value:.4g} s"), ("sampling rate", _rates(fit))]
     for unit in units:
         facts += _largest(fit, unit)
     return Exhibits(_headline(record, fit), facts, items)
@@ -75,6 +76,11 @@ def _largest(fit: NoiseSummary, unit: str) -> list[tuple[str, str]]:
         (f"{kind}, white", f"{plain_number(white * factor, 3)} {symbol}"),
         (f"{kind}, walk at {h:g} s", f"{walk:.3g} {unit}/√s"),
     ]
+
+
+def _rates(fit: NoiseSummary) -> str:
+    rates = {name: 1 / column.interval.value for name, column in fit.columns.items()}
+    return rates_of(rates if max(rates.values()) > 1.01 * min(rates.values()) else {"": fit.sample_rate.value})
 
 
 def _headline(record: Calibration, fit: NoiseSummary) -> str:

@@ -63,9 +63,10 @@ from imulab.procedures.noise import (
     rejected,
 )
 from imulab.procedures.noise.schema import term_unit
-from imulab.procedures.result import Result, as_blocks, as_recording
+from imulab.procedures.result import OWN_CLOCKS, Result, as_blocks, as_recording
 from imulab.quantities import in_si
-from imulab.recording import Array, Data, Reading, Recording, Source, is_large, on_disk
+from imulab.readers.streams import own_clock
+from imulab.recording import Array, Data, Reading, Recording, Source, check_not_resampled, is_large, on_disk
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
 from imulab.report.parameters import density_unit, small_unit
@@ -142,8 +143,8 @@ def given_log(
     """Return a log from the data of a call, as a recording or as `read_log` does; errors as for `as_recording`."""
     return read_log(
         Path(data) if isinstance(data, str | PathLike) else None,
-        lambda: as_blocks(data, reading, function),
-        lambda: as_recording(data, reading, function, columns=named),
+        lambda: as_blocks(data, reading, function, clock=OWN_CLOCKS),
+        lambda: as_recording(data, reading, function, columns=named, clock=OWN_CLOCKS),
         choose,
     )
 
@@ -173,7 +174,7 @@ def read_log(
         return whole()
     read, source = blocks()
     first = next(read)
-    names = choose(first)
+    names = choose(first) if len(first.clocks) == 1 else []
     rest = long_rest(chain([first], read), names) if names else None
     if rest is None:
         return replace(on_disk(blocks()[0]), source=source)
@@ -329,11 +330,12 @@ def no_tables(record: Calibration) -> NoReturn:
 
 def make_record(
     columns: Mapping[str, ColumnModel],
-    rests: Sequence[Rest],
+    groups: Sequence[Sequence[Rest]],
     options: Mapping[str, Any],
     sources: tuple[Source, ...] = (),
 ) -> Calibration:
-    """Turn fitted models into a record."""
+    """Turn fitted models into a record; the logs at rest come in a group for each clock."""
+    rests = [rest for group in groups for rest in group]
     more = terms("NBK" if options["terms"] == "auto" else options["terms"])
     parameters, names, blocks = _parameters(columns, more, short=all(rest.short for rest in rests))
     size = sum(map(len, blocks))
@@ -357,9 +359,9 @@ def make_record(
         },
         fit={
             "horizon": {"value": horizon, "unit": "s"},
-            "sample_rate": {"value": 1 / rests[0].interval, "unit": "Hz"},
-            "length": {"value": sum(rest.duration for rest in rests), "unit": "s"},
-            "logs": len(rests),
+            "sample_rate": {"value": max(1 / rest.interval for rest in rests), "unit": "Hz"},
+            "length": {"value": sum(rest.duration for rest in groups[0]), "unit": "s"},
+            "logs": len(groups[0]),
             "band": {name: _value(column.analysis.band.highest, "Hz") for name, column in columns.items()},
             "test": {name: _number(column.analysis.test.probability) for name, column in columns.items()},
             "filter_white": {name: column_use["white"] for name, column_use in use.items()},
@@ -766,28 +768,30 @@ def fit_recordings(
     """Return noise models fitted to recordings at rest, or to stretches of long ones: as `fit_noise`."""
     # A record holds only options that are not the default, so that older records can be fitted again.
     regress, steps = None if regress == NO_COVARIATE else regress, None if steps == SAY_STEPS else steps
-    rests = read_rests(recordings, columns)
-    names = chosen_columns(rests[0].recording, columns)
-    longest = max(stop[1] - stop[0] for rest in rests for stop in rest.parts) * rests[0].interval
+    groups = read_rests(recordings, columns)
+    longest = min(
+        max(stop[1] - stop[0] for rest in rests for stop in rest.parts) * rests[0].interval for rests in groups
+    )
     if horizon is not None and horizon > longest:
         raise OptionError(
             f"horizon {horizon:g} s: expected at most the length of the record, {longest:.4g} s in one stretch"
         )
-    temperatures = [rest.slow("temperature") for rest in rests]
-    if regress == "temperature" and None in temperatures:
-        where = rests[temperatures.index(None)].recording.name
-        raise DataError(
-            f"{where}: regress temperature: expected a column temperature that changes, by more than one step of its "
-            "readings, found none"
-        )
     horizon = min(HORIZON, longest) if horizon is None else horizon
     candidates = CANDIDATES if terms == "auto" else (terms,)
-    models = {
-        name: _fit_column(name, rests, temperatures, candidates, band, regress, steps == "remove") for name in names
-    }
+    models: dict[str, ColumnModel] = {}
+    for rests in groups:
+        temperatures = [rest.slow("temperature") for rest in rests]
+        if regress == "temperature" and None in temperatures:
+            where = rests[temperatures.index(None)].recording.name
+            raise DataError(
+                f"{where}: regress temperature: expected a column temperature that changes, by more than one step of "
+                "its readings, found none"
+            )
+        for name in _columns_there(rests[0].recording, columns):
+            models[name] = _fit_column(name, rests, temperatures, candidates, band, regress, steps == "remove")
     options = {"terms": terms, "horizon": horizon, "band": band, "regress": regress, "steps": steps}
-    record = make_record(models, rests, {**options, "columns": None if columns is None else names}, tuple(sources))
-    return NoiseFit(record, models)
+    options["columns"] = None if columns is None else list(models)
+    return NoiseFit(make_record(models, groups, options, tuple(sources)), models)
 
 
 def chosen_columns(recording: Recording, columns: Sequence[str] | None) -> list[str]:
@@ -800,7 +804,7 @@ def chosen_columns(recording: Recording, columns: Sequence[str] | None) -> list[
     DataError
         There is no output of a sensor.
     """
-    names = [name for name in recording.columns if name != "time"]
+    names = [name for stamped in recording.clocks.values() for name in stamped]
     if columns is not None:
         if not columns:
             raise OptionError("columns: expected one or more, found none")
@@ -816,15 +820,30 @@ def chosen_columns(recording: Recording, columns: Sequence[str] | None) -> list[
     return sensors
 
 
-def read_rests(recordings: Iterable[Recording | Rest], columns: Sequence[str] | None) -> list[Rest]:
-    """Return recordings of one unit as stretches at rest; errors as for `fit_noise`."""
-    rests: list[Rest] = []
+def read_rests(recordings: Iterable[Recording | Rest], columns: Sequence[str] | None) -> list[list[Rest]]:
+    """Return recordings of one unit as stretches at rest, a list for each clock; errors as for `fit_noise`."""
+    groups: dict[str, list[Rest]] = {}
     for log in recordings:
-        rest = log if isinstance(log, Rest) else at_rest(log, chosen_columns(log, columns))
-        if rests:
-            _check_alike(rests[0], rest, columns)
-        rests.append(rest)
-    return rests
+        for clock, rest in [("time", log)] if isinstance(log, Rest) else _rests_by_clock(log, columns):
+            rests = groups.setdefault(clock, [])
+            if rests:
+                _check_alike(rests[0], rest, columns)
+            rests.append(rest)
+    return list(groups.values())
+
+
+def _rests_by_clock(log: Recording, columns: Sequence[str] | None) -> Iterator[tuple[str, Rest]]:
+    names = chosen_columns(log, columns)
+    check_not_resampled(log, names)
+    for clock, stamped in log.clocks.items():
+        mine = [name for name in names if name in stamped]
+        if mine:
+            yield clock, at_rest(own_clock(log, clock), mine)
+
+
+def _columns_there(recording: Recording, columns: Sequence[str] | None) -> list[str]:
+    """Return the columns to fit that stand on the clock of a recording."""
+    return chosen_columns(recording, None if columns is None else [name for name in columns if name in recording])
 
 
 def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> None:
@@ -834,8 +853,8 @@ def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> Non
             f"{name}: {1 / other.interval:.4g} samples in a second, but {first_log.name} has {1 / first.interval:.4g}; "
             "expected logs of one rate"
         )
-    names = chosen_columns(first_log, columns)
-    if chosen_columns(other.recording, columns) != names:
+    names = _columns_there(first_log, columns)
+    if _columns_there(other.recording, columns) != names:
         raise DataError(f"{name}: other columns than {first_log.name}; expected {several(names)}")
     for column in names:
         unit, expected = (si_unit(each.units[column]) for each in (other.recording, first_log))

@@ -147,13 +147,13 @@ def fit_rate(
         else:
             path = Path(os.fspath(data))  # type: ignore[arg-type]
             test = load_test(path)
-            recordings = [as_recording(path.parent / run.file, reading, fit_rate) for run in test.runs]
+            recordings = [as_recording(path.parent / run.file, reading, fit_rate, clock="gyro") for run in test.runs]
     else:
         if axis not in MOUNTINGS:
             raise OptionError(f"axis {axis!r}: expected one of {listed(MOUNTINGS, axis)}")
         if isinstance(data, str | os.PathLike):
             refuse_folder(Path(os.fspath(data)), os.fspath(data))
-        recordings = [as_recording(data, reading, fit_rate, name_gyroscopes)]
+        recordings = [as_recording(data, reading, fit_rate, name_gyroscopes, clock="gyro")]
         steps = parse_rates(rates, "rates") if isinstance(rates, str) else None if rates is None else tuple(rates)
         test = RateTest((Run(recordings[0].name, axis, steps),), name=recordings[0].name)
     if place is not None:

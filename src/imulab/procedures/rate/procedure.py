@@ -37,6 +37,7 @@ def _fit(
 ) -> Calibration:
     from imulab.procedures.rate.fit import fit_rate, fit_test
     from imulab.procedures.rate.schema import load_test, refuse_folder
+    from imulab.readers.streams import one_clock
 
     (name,) = files
     part = part_of(values)
@@ -55,7 +56,10 @@ def _fit(
         test = replace(test, latitude=checked_latitude(values["latitude"]))
     if values["table_uncertainty"] is not None:
         test = replace(test, relative_uncertainty=values["table_uncertainty"])
-    recordings = [access.recording(access.beside(name, run.file), values["layout"], **part) for run in test.runs]
+    recordings = [
+        one_clock(access.recording(access.beside(name, run.file), values["layout"], **part), "gyro")
+        for run in test.runs
+    ]
     record = fit_test(test, recordings, str(values["order"]), accel, prior).calibration
     manifest = source_of(access, name)
     return record if manifest is None else replace(record, sources=(manifest, *record.sources))

@@ -592,7 +592,7 @@ def fit_turns(
     stated = None if turns is None else _parse_counts(turns)
     held = None if accel is None else as_record(accel, "fit_turns: accel")
     tilted = lean if held is None else 0.0  # accelerometers show the axis
-    recording = as_recording(data, reading, fit_turns, name_gyroscopes)
+    recording = as_recording(data, reading, fit_turns, name_gyroscopes, clock="gyro")
     if held is not None:
         check_accel(held, recording)
     motions = find_motions(recording, width)

@@ -462,7 +462,7 @@ def check_thermal(
         raise OptionError(f"limit {largest:g} m/s^2: expected more than 0")
     single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
     listed: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
-    recordings = [as_recording(item, reading, check_thermal) for item in listed]
+    recordings = [as_recording(item, reading, check_thermal, clock="accel") for item in listed]
     if not recordings:
         raise OptionError("check_thermal: data: expected one recording or more, found none")
     column = temperature_column or held.options.get("temperature_column")

@@ -17,7 +17,7 @@ from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import Observability
 from imulab.gravity import EarthRate, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
 from imulab.options import FURTHER_TRIADS, measure, parsed, text
-from imulab.procedures.result import Record, Result, as_record, as_recording
+from imulab.procedures.result import OWN_CLOCKS, Record, Result, as_record, as_recording
 from imulab.procedures.thermal import check_degrees, parse_further, parse_laws
 from imulab.procedures.thermal.degrees import (
     Degrees,
@@ -35,12 +35,20 @@ from imulab.procedures.thermal.gyro import (
     scale_from_turns,
 )
 from imulab.procedures.thermal.hidden import cover_hidden
-from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepare_recordings, read_sides
+from imulab.procedures.thermal.holds import (
+    Holds,
+    check_holds,
+    find_holds,
+    prepare_gyroscopes,
+    prepare_recordings,
+    read_sides,
+)
 from imulab.procedures.thermal.model import GROUPS, Laws, forces
 from imulab.procedures.thermal.record import make_record, with_gyroscopes
 from imulab.procedures.thermal.solve import ThermalProblem, ThermalSolution
 from imulab.quantities import in_si
-from imulab.recording import Array, Data, Reading
+from imulab.readers.streams import one_clock, own_clock
+from imulab.recording import Array, Data, Reading, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, parse_unit
 
@@ -148,13 +156,12 @@ def fit_thermal(
     further = parse_further(with_, "with_")
     wanted, spline = parse_laws(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
     settling = None if settle is None else in_si(settle, "settle", "time", "s")
-    recordings = [as_recording(item, reading, fit_thermal) for item in items]
-    recordings = prepare_recordings(recordings, temperature_column, settling)
-    if further:
-        check_gyroscopes(recordings)
+    as_read = [as_recording(item, reading, fit_thermal, clock=OWN_CLOCKS) for item in items]
+    recordings = prepare_recordings([one_clock(each, "accel") for each in as_read], temperature_column, settling)
+    gyroscopes = _gyroscopes(as_read, recordings, temperature_column, settling) if further else recordings
     earth = at_latitude(latitude) if further else None
     local = local_gravity(at_place(gravity, latitude, height, beside=earth is not None), recordings[0])
-    holds = find_holds(recordings)
+    holds = replace(find_holds(recordings), gyroscopes=tuple(gyroscopes))
     nominal = conversion_factor(holds.unit, "m/s^2") if parse_unit(holds.unit).quantity == "acceleration" else None
     doubts = check_holds(holds, local.value, nominal)
     scale, zero = _nominal_scale(holds, local.value, nominal)
@@ -188,6 +195,16 @@ def fit_thermal(
     if further:
         record = _with_gyroscopes(record, holds, problem, choice.solution, scale, wanted, spline, rates, name, earth)
     return ThermalFit(record, choice.view, tuple(choice.steps), tuple(choice.left_out))
+
+
+def _gyroscopes(
+    as_read: Sequence[Recording], recordings: list[Recording], temperature_column: str | None, settling: float | None
+) -> list[Recording]:
+    """Return the recordings on the gyroscopes' clock, which may be that of the accelerometers."""
+    check_gyroscopes(recordings)
+    if all(len(each.clocks) == 1 for each in as_read):
+        return recordings
+    return prepare_gyroscopes([own_clock(each, "gyro") for each in as_read], temperature_column, settling)
 
 
 def _as_list(data: Data | Sequence[Data]) -> list[Any]:

@@ -219,10 +219,10 @@ def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
     UnitError
         Their units differ between recordings.
     """
-    unit = check_gyroscopes(holds.recordings)
+    unit = check_gyroscopes(holds.gyroscopes)
     cuts: list[Cut | None] = [None] * len(holds)
     notes: list[str] = []
-    for number, recording in enumerate(holds.recordings):
+    for number, recording in enumerate(holds.gyroscopes):
         check_finite(recording, _COLUMNS)
         left_out = leave_out(recording, _COLUMNS)
         output = scale_output(left_out.recording, size)
@@ -876,22 +876,25 @@ def _turn_problem(
     holds: Holds, number: int, record: Calibration, size: Array, gyros: ThermalGyroscopes | None, unit: str
 ) -> tuple[TurnProblem, Stamps]:
     """Return the turns of one recording, less biases and g-sensitivities, and the times of its samples."""
-    recording, attitudes = holds.recordings[number], holds.attitudes[number]
-    kept = leave_out(recording, triad("gyro")).recording
-    time, temperature = recording.si("time"), recording.si("temperature")
+    recording, gyroscopes, attitudes = holds.recordings[number], holds.gyroscopes[number], holds.attitudes[number]
+    kept = leave_out(gyroscopes, triad("gyro")).recording
+    accel_time, time = recording.si("time"), gyroscopes.si("time")
     unit_of = DeviceUnit.of(tables_of(record)[0])
     force = np.column_stack(unit_of.thermal(_mean_temperatures(holds, number, attitudes), list(attitudes.mean.T))[0])
-    force_at_samples = np.column_stack(unit_of.thermal(temperature, list(recording.triad("accel").T))[0])
+    accel_force = np.column_stack(unit_of.thermal(recording.si("temperature"), list(recording.triad("accel").T))[0])
     output = scale_output(kept, size)
     if gyros is not None:
         clipped = beyond_range(output)
-        output = output - gyros.at_rest(temperature)
+        output = output - gyros.at_rest(gyroscopes.si("temperature"))
         if gyros.sensitivity:
-            output = output - force_at_samples @ gyros.sensitivities(record.model["gravity"]["value"]).T
+            felt = accel_force
+            if gyroscopes is not recording:
+                felt = np.column_stack([np.interp(time, accel_time, axis) for axis in accel_force.T])
+            output = output - felt @ gyros.sensitivities(record.model["gravity"]["value"]).T
         output[clipped] = 2 * np.abs(output).max()  # a saturated sample stays one, so that its turn is left out
     knocked: NDArray[np.bool_] = np.zeros(len(attitudes), dtype=np.bool_)
     case = TurnProblem(
-        recording.name, attitudes, force, time, force_at_samples, output, unit, fit_bias=False, knocked=knocked
+        recording.name, attitudes, force, accel_time, accel_force, output, unit, fit_bias=False, knocked=knocked
     )
     return case, Stamps(time, time)
 

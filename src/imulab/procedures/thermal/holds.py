@@ -137,7 +137,9 @@ class Holds:
     unit
         Unit of the outputs.
     recordings
-        The recordings after their settling time.
+        The recordings after their settling time, on the accelerometers' clock.
+    gyroscopes
+        The same on the gyroscopes' clock.
     attitudes
         Attitudes of each recording; one where it rests throughout.
     wander
@@ -161,6 +163,7 @@ class Holds:
     attitudes: tuple[Attitudes, ...]
     wander: Array
     notes: tuple[str, ...] = ()
+    gyroscopes: tuple[Recording, ...] = ()
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -235,6 +238,7 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
         stop=np.array([cut.stop for cut in cuts]),
         unit=attitudes[0].unit,
         recordings=tuple(recordings),
+        gyroscopes=tuple(recordings),
         attitudes=tuple(attitudes),
         wander=wander,
         notes=(
@@ -425,6 +429,11 @@ def prepare_recordings(
             f"{span:g} K: imulab tumble fit calibrates at one temperature"
         )
     return [_skip_settling(recording, settle) for recording in with_temperature]
+
+
+def prepare_gyroscopes(recordings: Sequence[Recording], column: str | None, settle: float | None) -> list[Recording]:
+    """Return the same of gyroscopes on their own clock, whose recordings `prepare_recordings` has accepted."""
+    return [_skip_settling(_choose_temperature(recording, column), settle) for recording in recordings]
 
 
 def _choose_temperature(recording: Recording, column: str | None) -> Recording:

@@ -27,7 +27,8 @@ from imulab.display import Finding
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
 from imulab.estimation.sampling import stamp_notes
-from imulab.procedures.result import as_recording
+from imulab.procedures.result import OWN_CLOCKS, as_recording
+from imulab.readers.streams import one_clock
 from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time
 from imulab.units import conversion_factor
 
@@ -123,9 +124,11 @@ class Attitudes:
     unit
         Unit of the outputs as in the file.
     recording
-        Where they come from.
+        Where they come from, on the clock of the accelerometers.
     temperature
         Mean temperature of the test, degC, if known.
+    as_read
+        The same, each sensor on its own clock.
     trace
         The variance trace that the attitudes were found in; None for a table.
     pieces
@@ -155,6 +158,7 @@ class Attitudes:
     unit: str
     recording: Recording
     temperature: float | None = None
+    as_read: Recording | None = None
     trace: Trace | None = None
     pieces: NDArray[np.int64] | None = None
     swing: Array | None = None
@@ -564,9 +568,9 @@ def find_attitudes(
     for name, value in (("window", window), ("settling", settling), ("shortest", shortest)):
         if value < 0:
             raise OptionError(f"{name} {value:g} s: expected 0 or more")
-    recording = as_recording(data, reading, find_attitudes, lambda samples: {sensor: samples})
-    unit = recording.triad_unit(sensor)
-    names = triad(sensor)
+    as_read = as_recording(data, reading, find_attitudes, lambda samples: {sensor: samples}, clock=OWN_CLOCKS)
+    recording = one_clock(as_read, sensor)
+    unit, names = recording.triad_unit(sensor), triad(sensor)
     if not len(recording):
         raise SegmentError(f"{recording.name}: no samples")
     check_finite(recording, names)
@@ -575,8 +579,7 @@ def find_attitudes(
         check_clipped_rows(recording, names)
         attitudes = attitude_table(recording, sensor, names, unit, temperature)
         return replace(attitudes, notes=(*_recording_notes(recording), *attitudes.notes))
-    time = check_time(recording)
-    left_out = leave_out(recording, names)
+    time, left_out = check_time(recording), leave_out(recording, names)
     original, recording = recording, left_out.recording
     blocks = _form_blocks(recording, names, time, window)
     width = _window_width(blocks, recording, time, window)
@@ -602,6 +605,7 @@ def find_attitudes(
         unit=unit,
         recording=original,
         temperature=temperature,
+        as_read=as_read,
         trace=trace,
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
@@ -820,7 +824,7 @@ def as_attitudes(
                 raise OptionError(f"{called}: {key} does not go with attitudes, which were found already")
         attitudes = data
     else:
-        attitudes = find_attitudes(as_recording(data, reading, function))
+        attitudes = find_attitudes(as_recording(data, reading, function, clock=OWN_CLOCKS))
     if covariance is None:
         return attitudes
     if attitudes.covariance is not None:

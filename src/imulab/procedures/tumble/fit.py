@@ -29,6 +29,7 @@ from imulab.procedures.tumble.record import Estimate, Scaling, make_record
 from imulab.procedures.tumble.schema import OrderRow, model_of
 from imulab.procedures.tumble.solve import SOURCE_THRESHOLD, Threshold
 from imulab.quantities import in_si, whole
+from imulab.readers.streams import own_clock
 from imulab.recording import Array, Reading
 from imulab.records.calibration import Calibration
 
@@ -283,8 +284,8 @@ def _with_further(
     if "gyro" in further:
         from imulab.procedures.tumble.gyro.fit import fit_gyro_triad, with_gyro
 
-        recording = attitudes.recording
-        gyro_fit = fit_gyro_triad(record, attitudes, recording, earth=at_latitude(latitude))
+        recording = own_clock(attitudes.as_read or attitudes.recording, "gyro")
+        gyro_fit = fit_gyro_triad(record, attitudes, recording, apart=False, earth=at_latitude(latitude))
         record = with_gyro(record, gyro_fit, recording, recording)
     return record
 

@@ -227,7 +227,7 @@ def _cycles(
 
 def _averaged(data: Data, reading: Mapping[str, Any], latest_start: float, *, from_column: bool) -> Cycle:
     """Return one power cycle averaged over bins of a second."""
-    blocks, source = as_blocks(data, reading, fit_warmup, name="cycles")
+    blocks, source = as_blocks(data, reading, fit_warmup, name="cycles", clock="gyro")
     return find_power_cycle(blocks, source=source, latest_start=latest_start, temperature_from_column=from_column)
 
 

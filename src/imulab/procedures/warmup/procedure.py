@@ -28,10 +28,11 @@ def _fit(
 ) -> Calibration:
     from imulab.procedures.warmup.cycles import find_power_cycle
     from imulab.procedures.warmup.fit import fit_warmup
+    from imulab.readers.streams import on_clock_of
 
     def cycle(name: str) -> Cycle:
         return find_power_cycle(
-            access.blocks(name, values["layout"], **values["part"]),
+            on_clock_of(access.blocks(name, values["layout"], **values["part"]), "gyro"),
             latest_start=values["latest_start"],
             temperature_from_column=values["temperature_column"],
             source=source_of(access, name),

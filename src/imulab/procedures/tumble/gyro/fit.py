@@ -29,7 +29,7 @@ from imulab.estimation.least_squares import Observability, coverage_factor, obse
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.gravity import EARTH, EarthRate, at_latitude
 from imulab.options import PROGRAM, choice, measure
-from imulab.procedures.result import Record, Result, as_record, as_recording
+from imulab.procedures.result import OWN_CLOCKS, Record, Result, as_record, as_recording
 from imulab.procedures.tumble import CLOCKS, SENSITIVITIES
 from imulab.procedures.tumble.attitudes import Attitudes, find_attitudes
 from imulab.procedures.tumble.device import specific_force
@@ -61,6 +61,7 @@ from imulab.procedures.tumble.schema import (
     model_of,
 )
 from imulab.quantities import in_si
+from imulab.readers.streams import own_clock
 from imulab.recording import Array, Data, Reading, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
@@ -152,6 +153,7 @@ def fit_gyro_triad(
     attitudes: Attitudes,
     recording: Recording,
     *,
+    apart: bool | None = None,
     fit_bias: bool = False,
     sensitivity: str = "auto",
     clock: float = CRYSTAL,
@@ -162,9 +164,11 @@ def fit_gyro_triad(
     """Calibrate a gyroscope triad from the turns between static attitudes.
 
     The options and what is raised are those of `imulab.fit_gyro`; `attitudes` are of the accelerometers' recording, and
-    `recording`, which may be the same, has ``time`` and ``gyro_x``, ``_y``, ``_z`` on the same clock.
+    `recording`, which may be the same, has ``time`` and ``gyro_x``, ``_y``, ``_z``; `apart` says whether another clock
+    may have stamped it, by default where it is another recording.
     """
     _check_request(record, attitudes, sensitivity, clock, clock_of)
+    apart = attitudes.recording is not recording if apart is None else apart
     unit = recording.triad_unit("gyro")
     check_finite(recording, triad("gyro"))
     left_out = leave_out(recording, triad("gyro"))
@@ -176,7 +180,6 @@ def fit_gyro_triad(
     accel_force = specific_force(record, moving.triad("accel") * factor)
     force, knocked = specific_force(record, means), aside_of(record, attitudes)
     case = TurnProblem(recording.name, attitudes, force, accel_time, accel_force, output, unit, fit_bias, knocked)
-    apart = attitudes.recording is not recording
     alike = not apart or np.array_equal(time, accel_time)
     stamps = Stamps(time, time if alike else _on_accel_clock(case, time, sensitivity))
     case, solved = _solve_with_earth(case, stamps, sensitivity, earth)
@@ -689,14 +692,15 @@ def fit_gyro(
     known = as_record(accel, "fit_gyro: accel")
     units, named = reading.get("units"), isinstance(accel_data, str | PathLike)
     of_gyro = reading if not named else {**reading, "units": units_without("accel", units)}
-    recording = as_recording(data, of_gyro, fit_gyro, lambda samples: {"gyro": samples})
-    accel_recording = recording
-    if accel_data is not None:
+    as_read = as_recording(data, of_gyro, fit_gyro, lambda samples: {"gyro": samples}, clock=OWN_CLOCKS)
+    accel_recording = as_read
+    if accel_data is not None and accel_data is not data:
         accel_reading: dict[str, Any] = {key: reading.get(key) for key in ("layout", "element") if named}
         accel_reading |= {"units": units_without("gyro", units)} if named else {}
-        accel_recording = as_recording(accel_data, accel_reading, fit_gyro, name="accel_data")
+        accel_recording = as_recording(accel_data, accel_reading, fit_gyro, name="accel_data", clock=OWN_CLOCKS)
+    attitudes, recording = find_attitudes(accel_recording), own_clock(as_read, "gyro")
     gyro_fit = fit_gyro_triad(
-        known, find_attitudes(accel_recording), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
+        known, attitudes, recording, apart=accel_recording is not as_read, fit_bias=fit_bias, sensitivity=g_sensitivity,
         clock=in_si(clock, "clock", "number", "ppm"), clock_of=clock_of,
         noise=None if noise is None else as_record(noise, "fit_gyro: noise"), earth=at_latitude(latitude),
     )  # fmt: skip
