@@ -15,7 +15,7 @@ G = 9.80665
 REFUSED = {"kitti-oxts", "motioncal", "movella-dot", "movella-dot-mag", "sensorlogger-accel", "sensorlogger-gyro"}
 """Layouts whose heads hold no titles, or no unit of a sensor in titles or in readings that are random."""
 LATER = {"fusion", "fusion-mag", "gcsv", "gcsv-gyro", "kalibr", "mt-manager", "mt-manager-mag", "picoquake", "shimmer"}
-LATER |= {"ulog2csv", "ulog2csv-accel", "ulog2csv-gyro"}
+LATER |= {"actigraph", "actigraph-us", "witmotion", "ulog2csv", "ulog2csv-accel", "ulog2csv-gyro"}
 """Layouts that came after the 27 by which the guess is measured."""
 
 
@@ -253,3 +253,21 @@ def test_a_clock_without_a_unit_asks_for_it_and_takes_it(imulab, tmp_path):
         assert done.returncode == 2
         assert done.stderr.startswith("imulab: --unit ")
         assert words in done.stderr
+
+
+def test_dates_and_times_of_day_are_a_time(tmp_path):
+    titles = "Timestamp,Accelerometer X (g),Accelerometer Y (g),Accelerometer Z (g)\n"
+    path = tmp_path / "f.csv"
+    for date, more in (
+        ("2024-11-22 17:41:4{}", ""),
+        ("17:41:4{}.000", ""),
+        ("22/11/2024 17:41:4{}.000", ", day_first = true"),
+        ("11/22/2024 17:41:4{}", ", day_first = false"),
+    ):
+        path.write_text(titles + "".join(f"{date.format(k)},0.1,0.2,0.9\n" for k in range(8)))
+        found = il.guess_layout(path)
+        assert f'time = {{ from = "Timestamp", unit = "iso"{more} }}\n' in found.toml
+        assert il.read(path, found.layout).time.tolist() == list(range(8))
+    path.write_text(titles + "".join(f"11/12/2024 17:41:4{k},0.1,0.2,0.9\n" for k in range(8)))
+    with pytest.raises(ReadError, match="'11/12/2024 17:41:40' may be day or month first"):
+        il.guess_layout(path)

@@ -178,7 +178,29 @@ def fusion(*, mag=False):
     return ",".join(titles) + "\n" + lines(TIME, *np.degrees(GYRO).T, *(ACCEL / G).T, *((MAG * 1e6).T if mag else ()))
 
 
+def actigraph(date_format, pattern):
+    head = f"------------ Data File Created By ActiGraph GT3X+ ActiLife v6.13.3 date format {date_format} at "
+    head += "100 Hz  Filter Normal -----------\nSerial Number: SN0001\nStart Time 17:16:00\nStart Date 11/12/2024\n"
+    head += (
+        "Epoch Period (hh:mm:ss) 00:00:00\n"
+        + "-" * 50
+        + "\nTimestamp,Accelerometer X,Accelerometer Y,Accelerometer Z\n"
+    )
+    return head + lines([pattern.format(t) for t in stamps(1e3)], *(ACCEL / G).T)
+
+
+def witmotion():
+    titles = ["address", "Time(s)", "ChipTime", *xyz("a{0}(g)"), *xyz("w{0}(deg/s)"), "T(°)"]
+    clock = [f" 23:59:59.{t:03d}" for t in stamps(1e3, 900)]
+    chip = [f"2024-12-11 23:59:59.{t}" for t in stamps(1e3, 900)]
+    rows = lines(["0x50"] * ROWS, clock, chip, *(ACCEL / G).T, *np.degrees(GYRO).T, CELSIUS, delimiter="\t")
+    return "StartTime: 2024-12-11 17:41:40.000\n" + "\t".join(titles) + "\t\n" + rows.replace("\n", "\t\n")
+
+
 FILES = {
+    "actigraph": lambda: actigraph("dd/MM/yyyy", "11/12/2024 17:41:40.{:03d}"),
+    "actigraph-us": lambda: actigraph("M/d/yyyy", "12/11/2024 17:41:40.{:03d}"),
+    "witmotion": witmotion,
     "fusion": fusion,
     "fusion-mag": lambda: fusion(mag=True),
     "gcsv": gcsv,
@@ -266,6 +288,7 @@ SENSORS = {
     **{f"{app}-mag": list(OF_ALL) for app in APPS},
     **{f"ulog2csv-{sensor}": [sensor] for sensor in ("accel", "gyro")},
     "gcsv-gyro": ["gyro"],
+    **{name: ["accel"] for name in ("actigraph", "actigraph-us")},
     "motioncal": list(OF_ALL),
     "phyphox": ["accel"],
     "phyphox-gyro": ["gyro"],
@@ -393,7 +416,7 @@ def test_formats_lists_them_and_prints_one(imulab):
     assert one == tomllib.loads(shipped_file("euroc").read_text())
     refused = imulab("show", "--formats", "nothing")
     assert refused.returncode == 2
-    assert "nothing: expected the name of a layout: androsensor" in refused.stderr
+    assert "nothing: expected the name of a layout: actigraph" in refused.stderr
 
 
 def test_a_fleet_takes_a_layout_by_name(imulab, tmp_path):

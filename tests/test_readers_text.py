@@ -373,7 +373,8 @@ LAYOUTS = {
     "no unit": ("[columns]\naccel_x = { from = 1 }\n", "column accel_x: expected accel_x = { from = 1, unit ="),
     "column key": (
         '[columns]\nfog = { from = 0, unit = "V", scal = 2 }\n',
-        "column fog: unknown key 'scal'; known keys: from unit scale zero scale_factor day_first bits; did y mean 'scale'?",
+        "column fog: unknown key 'scal'; known keys: from unit scale zero scale_factor day_first bits; did you "
+        "mean 'scale'?",
     ),
     "from": ('[columns]\nfog = { from = -1, unit = "V" }\n', "column fog: from = -1; expected a column number from 0"),
     "unit of rate": (

@@ -54,6 +54,10 @@ _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
 _NAMED = 50  # score of a table whose sensor the file's name speaks of
 _TURNING = 20  # tenths of a second that may show a turn
 _AGREE = 0.9  # least correlation of the turns that rates and accelerometers show
+_TIME_OF_DAY = re.compile(r"\d?\d:\d\d:\d\d(?:\.\d+)?$")
+_DAY_AND_MONTH = re.compile(r"(\d\d?)[./-](\d\d?)[./-]\d{4} +\d?\d:\d\d")
+_EITHER = "either"
+_DATES = {"day first": '"iso", day_first = true', "month first": '"iso", day_first = false'}
 _EXAMPLES = {"accel": "m/s^2", "gyro": "deg/s", "mag": "uT"}
 
 
@@ -452,7 +456,8 @@ def _text(
         title = table.titles[place].strip()
         comments = [*([_toml(title)] if numbered else []), *([reason] if reason else [])]
         comment = f"  # {'; '.join(comments)}" if comments else ""
-        lines.append(f"{column} = {{ from = {_toml(place if numbered else title)}, unit = {_toml(unit)} }}{comment}")
+        origin, written = _toml(place if numbered else title), _DATES.get(unit) or _toml(unit)
+        lines.append(f"{column} = {{ from = {origin}, unit = {written} }}{comment}")
     return "\n".join([*lines, ""])
 
 
@@ -607,7 +612,7 @@ def _step(times: Array, unit: str) -> float | None:
     """Return the median step of a clock, s."""
     steps = np.diff(times)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
-    return usual * parse_unit(unit).factor if unit != "iso" and np.isfinite(usual) else None
+    return usual * parse_unit(unit).factor if np.isfinite(usual) else None
 
 
 def _rate_unit(table: _Table, accel: Sequence[int], gyro: Sequence[int], step: float) -> tuple[str, str]:
@@ -687,8 +692,14 @@ def _clock(
         if title.sensor != "time":
             continue
         values = table.numbers(place)
-        if table.delimiter != " " and _are_dates([row[place] for row in table.rows if place < len(row)]):
-            ranked.append(((True, False, place), place, "iso", "", None))
+        date = _date_unit([row[place] for row in table.rows if place < len(row)]) if table.delimiter != " " else ""
+        if date == _EITHER:
+            raise GuessError(
+                f"{name}: column {quoted(title.text.strip())}: {quoted(table.rows[0][place])} may be day or month "
+                "first; expected a layout that says so: day_first = true or false (docs/recordings.md)"
+            )
+        if date:
+            ranked.append(((True, False, place), place, date, "", None))
             continue
         steps = np.diff(values)
         back = int((steps < 0).sum())  # a counter may begin again
@@ -719,15 +730,21 @@ def _clock(
     )
 
 
-def _are_dates(texts: Sequence[str]) -> bool:
-    """Return whether texts are dates of ISO 8601 that rise."""
-    if not all(_ISO.match(text) for text in texts):
-        return False
-    try:
-        dates = [datetime.fromisoformat(f"{text[:10]}T{text[11:]}") for text in texts]
-        return all(before <= after for before, after in pairwise(dates))
-    except (ValueError, TypeError):  # no dates, or only some with a zone
-        return False
+def _date_unit(texts: Sequence[str]) -> str:
+    """Return the unit of dates that rise, or of times of day; `_EITHER` where day and month cannot be told apart."""
+    if all(_ISO.match(text) for text in texts):
+        try:
+            dates = [datetime.fromisoformat(f"{text[:10]}T{text[11:]}") for text in texts]
+            return "iso" if all(before <= after for before, after in pairwise(dates)) else ""
+        except (ValueError, TypeError):  # no dates, or only some with a zone
+            return ""
+    if all(_TIME_OF_DAY.match(text) for text in texts):
+        return "iso"
+    days = [match for text in texts if (match := _DAY_AND_MONTH.match(text))]
+    if len(days) < len(texts):
+        return ""
+    first, second = (max(int(match[k]) for match in days) for k in (1, 2))
+    return _EITHER if first <= 12 and second <= 12 else "day first" if first > 12 else "month first"
 
 
 def _time_unit(title: Title, values: Array, step: float, seconds: float | None) -> tuple[str, str]:

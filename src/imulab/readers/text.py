@@ -350,6 +350,7 @@ class TextFile:
         self._damaged = 0
         self._first_damage = ""
         self._texts: dict[str, int] = {}
+        self._is_ours = False
         self._lines = Lines(stream, name, hashed=hashed, whole=whole)
         if layout is not None and layout.if_needed and is_native(self._lines.first().decode("utf-8", "replace")):
             layout = None
@@ -497,6 +498,7 @@ class TextFile:
 
     def _without_text(self, titles: list[str], units: dict[str, str]) -> tuple[list[str], dict[str, str], np.ndarray]:
         """Return the columns without those that imulab does not know and whose first field is text."""
+        self._is_ours = any(kind_of(measured(name)) not in (None, "time") for name in titles)
         fields = [field.strip(' "\t\r') for field in fields_of(self._lines.first().decode("utf-8", "replace"), ",")]
         texts = [
             name
@@ -504,7 +506,7 @@ class TextFile:
             if kind_of(measured(name)) is None and field and not is_number(field)
         ]
         kept = [name for name in titles if name not in texts]
-        if not texts or not kept:
+        if not texts or not self._is_ours:
             return titles, units, np.arange(len(titles), dtype=np.int32)
         holds = f"column {texts[0]} holds" if len(texts) == 1 else f"columns {' '.join(texts)} hold"
         self.doubts.append(Note(f"{holds} text, which is left out"))
@@ -687,7 +689,7 @@ class TextFile:
 
     def _foreign(self, slot: int) -> bool:
         """Return whether a column of a native file is none that imulab knows."""
-        return self._layout is None and kind_of(measured(self._titles[slot])) is None
+        return self._layout is None and self._is_ours and kind_of(measured(self._titles[slot])) is None
 
     def _count_damage(self, job: _Job, row: int, line: int, problem: int, field: int, good: int) -> None:
         self._damaged += 1
