@@ -202,13 +202,24 @@ def work(unit: FleetUnit, job: Job) -> Outcome:
         return outcome
 
 
+def kept(unit: FleetUnit, base: str, store: Store) -> Outcome | None:
+    """Return the outcome of a unit that has a record of its present files and options, else None."""
+    with UnitFiles(base) as files:
+        return _kept(unit, files, store)
+
+
+def _kept(unit: FleetUnit, files: UnitFiles, store: Store) -> Outcome | None:
+    there = store.made_for(unit)
+    if there is None or not files.unchanged(there[0].sections["fleet"].get("inputs", ())):
+        return None
+    return Outcome(unit.serial, KEPT, summary=summarise(*there))
+
+
 def _fit(unit: FleetUnit, job: Job, store: Store | None) -> Outcome:
     try:
         with UnitFiles(job.base) as files:
-            if store is not None:
-                there = store.made_for(unit)
-                if there is not None and files.unchanged(there[0].sections["fleet"].get("inputs", ())):
-                    return Outcome(unit.serial, KEPT, summary=summarise(*there))
+            if store is not None and (there := _kept(unit, files, store)) is not None:
+                return there
             record = make_record(unit, files)
         content_sha256, text = record.sealed()
         if store is not None:
@@ -298,12 +309,12 @@ class Engine(Protocol):
 class LocalEngine:
     """Processes of this machine; with a single one, no second process is started."""
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int | None) -> None:
         self.workers = workers
 
     def run(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
         """Yield the outcomes of units from several processes."""
-        workers = min(self.workers, max(len(units), 1))
+        workers = min(self.workers or available(), max(len(units), 1))
         calls = ((unit, job) for unit in units)
         return (work(*call) for call in calls) if workers == 1 else run(work, calls, workers)
 
@@ -420,7 +431,7 @@ def open_engine(kind: str, *, scheduler: str | None, workers: int | None) -> Ite
     if workers is not None and workers < 1:
         raise OptionError(f"--workers {workers}: expected 1 or more")
     if kind == "local":
-        yield LocalEngine(workers or available())
+        yield LocalEngine(workers)
         return
     with ExitStack() as stack:
         yield _dask(scheduler, workers, stack)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import PathLike
@@ -15,7 +15,7 @@ from typing import Annotated
 from imulab._version import VERSION
 from imulab.arguments import Folder
 from imulab.display import SENTENCES, Shown
-from imulab.errors import OptionError, first_of
+from imulab.errors import ImulabError, OptionError, first_of
 from imulab.files import real_path, write_text
 from imulab.fleet import ENGINES
 from imulab.fleet.engine import (
@@ -28,6 +28,7 @@ from imulab.fleet.engine import (
     Outcome,
     Summary,
     WorkersLostError,
+    kept,
     open_engine,
     summarise,
 )
@@ -41,6 +42,7 @@ from imulab.quantities import whole, whole_number
 
 _FRUITLESS = 5
 """Losses of workers in a row, with no unit done between them, after which the run gives up."""
+_QUICK = 2.0  # s of this process that are spent on looking before others are started
 _FLUSH = 2.0  # s between two writings of what is done
 _NAMED = 3  # units that a sentence names
 TABLE, HISTORY = "parameters.csv", "history.sqlite"
@@ -271,7 +273,7 @@ class _Keeper:
         self._over: dict[str, Outcome] = {}
         self._new: list[Summary] = []
         self._flushed = time.monotonic()
-        self._before = {path.stem for path in store.folder.glob("*.json")}
+        self.before = {path.stem for path in store.folder.glob("*.json")}
 
     def take(self, outcome: Outcome) -> None:
         """Take one outcome in."""
@@ -286,7 +288,7 @@ class _Keeper:
         if outcome.status == FAILED and self.store.reason(unit.serial) is None:
             self.store.fail(unit, outcome.reason)
         # A record that was not there before was made by a process that ended before it could say so.
-        self.kept += outcome.status == KEPT and unit.serial in self._before
+        self.kept += outcome.status == KEPT and unit.serial in self.before
         self._over[unit.serial] = replace(outcome, text=None)
         if outcome.summary is not None:
             self._new.append(outcome.summary)
@@ -339,8 +341,21 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
+def _take_kept(base: str, keeper: _Keeper) -> None:
+    """Take the units that are done already, if that takes no longer than to start processes would."""
+    until = time.process_time() + _QUICK
+    for unit in () if is_url(base) else list(keeper.left.values()):
+        if time.process_time() > until:
+            return
+        if unit.serial in keeper.before and not any(map(is_url, unit.files)):
+            with suppress(ImulabError):  # said when the unit is worked on
+                if (outcome := kept(unit, base, keeper.store)) is not None:
+                    keeper.take(outcome)
+
+
 def _work_through(engine: Engine, job: Job, keeper: _Keeper) -> None:
     """Work until every unit is done or has failed, also if processes end meanwhile."""
+    _take_kept(job.base, keeper)
     fruitless = 0
     while keeper.left:
         before = len(keeper.left)

@@ -96,7 +96,8 @@ def shipped_names() -> list[str]:
 
 def shipped_file(name: str) -> Path | None:
     """Return the file of a layout that comes with imulab, or None if there is none of this name."""
-    return _SHIPPED / f"{name}.toml" if name in shipped_names() else None
+    path = _SHIPPED / f"{name}.toml"
+    return path if Path(name).name == name and path.is_file() else None
 
 
 def load_layout(path: str | Path, name: str | None = None) -> Layout:
