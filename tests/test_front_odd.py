@@ -103,7 +103,10 @@ FILE = "data: expected a file name, a Recording, a data frame of pandas or polar
 RATE = "rate {}: expected a number of samples per second, such as 100.0"
 LINES = {
     "complex": (lambda g: (g["a"].astype(complex), READ), "expected an array of numbers"),
-    "a clock that froze": (lambda g: (g["frame"].assign(**{"time [s]": g["frame"].iloc[:, 0].clip(upper=20)}), {}), "time stands still for"),
+    "a clock that froze": (
+        lambda g: (g["frame"].assign(**{"time [s]": g["frame"].iloc[:, 0].clip(upper=20)}), {}),
+        "time stands still for",
+    ),
     "a text among numbers": (
         lambda g: (g["frame"].astype(object).replace({g["frame"].iloc[5, 1]: "x"}), {}),
         f"column accel_x [m/s^2]: {NUMBERS}",
