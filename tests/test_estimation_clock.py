@@ -71,11 +71,26 @@ def test_lost_samples_are_gaps_and_leave_the_rate_as_it_is(jitter):
         (np.round(NUMBER / 190 + 12, 2), 190),
         (np.floor(NUMBER / 102.4 + 0.3), 102.4),
         (np.floor(NUMBER / 50), 50),
+        (np.floor(NUMBER * 1.2 + 1e-6) / 1e3, 1000 / 1.2),
+        (np.floor(NUMBER / 100 / 0.02) * 0.02, 100),
         (np.repeat(NUMBER[: N // 2] / 100, 2), 200),
         (np.floor(NUMBER / 100 / 0.015625) * 0.015625, 100),
         (np.floor(NUMBER[:1000] / 100 + 0.3), 100),
     ],
-    ids=["ms 1600", "ms 850", "ms 700", "2 digits 200", "2 digits 190", "s 102.4", "s 50", "pairs", "15.6 ms", "10 s"],
+    ids=[
+        "ms 1600",
+        "ms 850",
+        "ms 700",
+        "2 digits 200",
+        "2 digits 190",
+        "s 102.4",
+        "s 50",
+        "1.2 ms",
+        "20 ms",
+        "pairs",
+        "15.6 ms",
+        "10 s",
+    ],
 )
 def test_coarse_stamps_give_the_rate_by_number_over_time(time, rate):
     recording = log(time)

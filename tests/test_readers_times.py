@@ -183,3 +183,13 @@ def test_several_columns_of_dates_need_the_name_of_time():
     frame["a"] = frame["b"] = datetime.datetime(2024, 12, 11)
     with pytest.raises(DataError, match=r"several columns hold dates \(a b\); expected the one of the samples called"):
         il.Recording.from_frame(frame)
+
+
+def test_dates_in_json_have_an_order_too(tmp_path):
+    (tmp_path / "a.json").write_text('{"t": ["11/12/2024 0:00:00", "11/12/2024 0:00:01"], "x": [1, 2]}')
+    layout = '[columns]\ntime = { from = "t", unit = "iso" }\naccel_x = { from = "x", unit = "g" }\n'
+    (tmp_path / "l.toml").write_text(layout)
+    with pytest.raises(ReadError, match="row 1, key 't': '11/12/2024 0:00:00' may be day or month first"):
+        il.read(tmp_path / "a.json", tmp_path / "l.toml")
+    (tmp_path / "l.toml").write_text(layout.replace('"iso"', '"iso", day_first = false'))
+    assert il.read(tmp_path / "a.json", tmp_path / "l.toml").time.tolist() == [0, 1]

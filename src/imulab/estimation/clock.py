@@ -25,6 +25,7 @@ _MANY, _SHARE = 5, 0.001  # rows, and share of the rows, that share a stamp wher
 _FROZEN, _FEW_MORE = 3, 2  # times the usual number of rows at a stamp, and so many more: the clock stood still
 _FEWEST_MARKS = 3  # stamps that show a rate
 _UNEQUAL = 0.05  # scatter of the readings at a stamp, over their number, from which readings may be lost
+_SHORTEST_LOSS = 9  # steps: a long step every so often, or less often, is a sample lost by a program, and no beat
 _NEAR = 0.2  # of the median step: steps this close to a multiple of it are multiples
 _APART, _WANDERS = 8, 3.0  # growth of the variance of delays from one step to eight, which random losses exceed
 _FAR = 3.0  # steps: longer delays are none of coarse stamps
@@ -203,7 +204,8 @@ def _usual(time: Array, step: Array, *, lossy: bool) -> tuple[float, bool]:
     multiple = step / middle
     if not short and np.mean(np.abs(multiple - np.rint(multiple)) < _NEAR) > 1 - _NEAR:
         apart = np.diff(long)
-        beats = apart.size > _BESIDE and np.ptp(apart) and apart.std() < _BEAT * apart.mean()
+        even = apart.size > _BESIDE and apart.std() < _BEAT * apart.mean()
+        beats = even and (np.ptp(apart) > 0 or apart[0] < _SHORTEST_LOSS)
         many = long.size > _COARSE * len(step)
         if (beats or many) and not lossy and not _wander(step / over_many - 1):
             return over_many, True
@@ -304,8 +306,8 @@ def _shared_stamps(time: Array) -> Clock:
     tick = median(np.diff(stamps))
     lag = min(max(1, len(marks) // 10), 200, len(marks) - 1)
     usual = median((stamps[lag:] - stamps[:-lag]) / (marks[lag:] - marks[:-lag]))
-    scatter = 1.4826 * median(np.abs(np.diff(stamps) / usual - np.diff(marks)))
-    usual, places, missing = _find_gaps(marks, stamps, usual, max(0.75, 3 * scatter), coarse=True)
+    scatter = quantile(np.abs(np.diff(stamps) / usual - np.diff(marks)), 0.9)
+    usual, places, missing = _find_gaps(marks, stamps, usual, max(0.75, 1.5 * scatter), coarse=True)
     lost = np.zeros(len(marks))
     lost[places + 1] = missing
     late = stamps / usual - marks - np.cumsum(lost)

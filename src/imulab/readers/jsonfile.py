@@ -18,7 +18,7 @@ import imulab.readers._text as _text
 from imulab.display import Note
 from imulab.errors import ReadError, meant
 from imulab.readers.arrays import FLAT, origins, recordings
-from imulab.readers.text import date_flags
+from imulab.readers.text import EITHER_ORDER, date_flags
 from imulab.recording import Array, Layout, Recording
 from imulab.records.calibration import FORMAT
 
@@ -196,6 +196,11 @@ def _column(column: str, values: list[Any], rows: np.ndarray, layout: Layout, na
             read, problem, _ = _text.parse(lines, "\x1f", np.array([date_flags(entry)], np.int32), out, len(values))
             if not problem and read == len(values):
                 return out[0, :read]
+            if problem == EITHER_ORDER:
+                raise ReadError(
+                    f"{name}: row {rows[read]}, key {entry.origin!r}: {values[read]!r} may be day or month first; "
+                    "expected day_first = true or false for this column in the layout"
+                )
             wrong = read
         expected = "a date and time such as 2026-11-22T15:04:05.250Z"
     row = wrong + 1 if wrong >= len(rows) else rows[wrong]

@@ -295,7 +295,7 @@ _text.prepare(powers_of_five())
 _TITLE = re.compile(r"[^,\[\]]+\[[^,\[\]]+\]")
 _DATE, _DAY_FIRST, _MONTH_FIRST = 1 << 30, 1 << 28, 1 << 29  # flags of a column of dates, beyond any column's number
 _COLUMN = _DAY_FIRST - 1  # the number without flags
-_NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE, _EITHER_ORDER = 1, 2, 3, 4  # problems that the parser in C reports
+_NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE, EITHER_ORDER = 1, 2, 3, 4  # problems that the parser in C reports
 _ARROW = re.compile(rb"^[ \t]*(\d?\d:\d\d:\d\d(?:[.:]\d+)?) -> ?", re.M)
 """What a serial monitor puts before each line."""
 _DATE_ELSEWHERE = re.compile(r'"?\d\d?[./-]\d\d?[./-]\d{4}\b')
@@ -765,7 +765,7 @@ class TextFile:
         entry = fields_of(line, self._delimiter)[field].strip(" \t\r")
         column = self._titles[int(self._slots[field]) & _COLUMN]
         shown = entry if len(entry) <= 40 else entry[:37] + "..."
-        if problem == _EITHER_ORDER:
+        if problem == EITHER_ORDER:
             raise ReadError(
                 f"{place}, column {column}: {shown!r} may be day or month first; expected day_first = true or false "
                 "for this column in the layout"

@@ -26,7 +26,6 @@ from imulab.columns import triad
 from imulab.display import Finding
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
-from imulab.estimation.sampling import stamp_notes
 from imulab.procedures.result import OWN_CLOCKS, as_recording
 from imulab.readers.streams import one_clock
 from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time
@@ -578,7 +577,7 @@ def find_attitudes(
     if "time" not in recording:
         check_clipped_rows(recording, names)
         attitudes = attitude_table(recording, sensor, names, unit, temperature)
-        return replace(attitudes, notes=(*_recording_notes(recording), *attitudes.notes))
+        return replace(attitudes, notes=(*_corrected_notes(recording), *attitudes.notes))
     time, left_out = check_time(recording), leave_out(recording, names)
     original, recording = recording, left_out.recording
     blocks = _form_blocks(recording, names, time, window)
@@ -611,7 +610,7 @@ def find_attitudes(
         swing=np.ptp(blocks.mean, axis=0),
         motion=motion,
         notes=(
-            *_recording_notes(recording),
+            *_corrected_notes(recording),
             *left_out.notes(_at_rest(stretches, len(time))),
             *_notes(blocks, variance),
         ),
@@ -637,8 +636,8 @@ def _at_rest(stretches: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
     return rest
 
 
-def _recording_notes(recording: Recording) -> tuple[str, ...]:
-    corrected = (
+def _corrected_notes(recording: Recording) -> tuple[str, ...]:
+    return tuple(
         Finding(
             f"the recording was corrected by {entry.rpartition(' sha256:')[0]}: what is found is what that left; "
             "expected the recording as it was measured",
@@ -646,7 +645,6 @@ def _recording_notes(recording: Recording) -> tuple[str, ...]:
         )
         for entry in recording.corrected_by
     )
-    return (*corrected, *stamp_notes(recording))
 
 
 def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
