@@ -288,3 +288,18 @@ def test_a_long_file_is_read_in_parts_by_the_same_rule(imulab, tmp_path, monkeyp
     assert parts["sample_rate"]["value"] == pytest.approx(whole["sample_rate"]["value"], rel=1e-9)
     assert (parts["gaps"], parts["missing"]) == (whole["gaps"], whole["missing"])
     assert (parts["start"], parts["end"], parts["duration"]) == (whole["start"], whole["end"], whole["duration"])
+
+
+def test_a_replay_of_coarse_stamps_gives_what_the_file_gives(imulab, tmp_path):
+    """A tumble test at 100 Hz with stamps of whole hundredths rounded to two readings each."""
+    recording = il.simulate_tumble(gravity=9.81, attitudes=12)
+    coarse = recording.with_columns({"time": np.floor(recording.column("time") / 0.02 + 1e-9) * 0.02}, {})
+    il.write_csv(coarse, tmp_path / "coarse.csv")
+    how = ["--gravity", "9.81", "--order", "1"]
+    done = imulab("live", "replay:coarse.csv@0", *how, "--plain", "--save", "r.csv", "-o", "live.json")
+    assert done.returncode == 0, done.stderr
+    assert len(il.read(tmp_path / "r.csv")) == len(coarse)
+    assert imulab("tumble", "fit", "coarse.csv", *how, "-o", "file.json").returncode == 0
+    live, file = (il.load(tmp_path / name) for name in ("live.json", "file.json"))
+    for name, parameter in file.parameters.items():
+        assert abs(live.value(name) - parameter.value) < 0.3 * parameter.standard_uncertainty, name

@@ -543,6 +543,7 @@ def _why_no_address(error: OSError) -> str:
 
 
 def _replay(rest: str, layout: str | None) -> LiveSource:
+    from imulab.estimation.sampling import mend_blocks
     from imulab.readers import read_blocks
     from imulab.readers.streams import on_clock_of
 
@@ -554,7 +555,7 @@ def _replay(rest: str, layout: str | None) -> LiveSource:
         path = rest
     if not 0 <= speed <= 1e6:
         raise OptionError(f"replay:{rest}: speed {speed:g}; expected 0 (as fast as it goes) to 1e6")
-    return Paced(f"replay:{path}", _slices(on_clock_of(read_blocks(path, layout))), speed)
+    return Paced(f"replay:{path}", _slices(mend_blocks(on_clock_of(read_blocks(path, layout)))), speed)
 
 
 def _slices(blocks: Iterator[Recording]) -> Iterator[Recording]:
