@@ -80,7 +80,7 @@ compare: $(STAMP) $(VENV)/.bench
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/comparison.py
 
 # Coverage, warnings and errors under the disturbances and defaults that people have; writes docs/truth.md, or with
-# TRUTH="turns scatter" these sections of it. truth-all makes ten times the trials.
+# TRUTH="turns scatter" these sections of it. truth-all makes ten times the trials, 500 at least (some hours).
 truth truth-all: $(STAMP)
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/truth/run.py $(if $(filter truth-all,$@),--all) $(TRUTH)
 

@@ -71,7 +71,7 @@ def _trial(seed: int, *, fault: str, word: str, corner: float = 0.0, rate: float
     return Trial(tuple(covered), bool(hits), error)
 
 
-def _row(name: str, fault: str, word: str, *, states: bool = True, corner: float = 0.0, trials: int = 60) -> Scenario:
+def _row(name: str, fault: str, word: str, *, states: bool = True, corner: float = 0.0, trials: int = 24) -> Scenario:
     clean = not word
     return Scenario(
         "Allan deviation",
@@ -91,10 +91,10 @@ SCENARIOS = [
     _row("behind a low-pass filter of 42 Hz", "", "correlated from sample to sample", corner=42.0),
     _row("behind a low-pass filter of 5 Hz", "", "correlated from sample to sample", corner=5.0),
     _row("a line of five sigma at 17.3 Hz, taken out", "line", "spectral lines"),
-    _row("irregular sway of 0.2 deg/s: no number for B", "sway", "not that of the model", trials=20),
+    _row("irregular sway of 0.2 deg/s: no number for B", "sway", "not that of the model", trials=10),
     _row("steps of six sigma: no number", "coarse", "steps that are", states=False, trials=30),
-    _row("milliseconds labelled s", "ms as s", "unit of time", states=False, trials=20),
-    _row("the rate doubles after a third", "rate", "sampling rate changes", trials=60),
-    _row("one row without a number", "bad row", "bridged", trials=60),
+    _row("milliseconds labelled s", "ms as s", "unit of time", states=False, trials=10),
+    _row("the rate doubles after a third", "rate", "sampling rate changes", trials=24),
+    _row("one row without a number", "bad row", "bridged", trials=24),
     _row("a dead gyro", "dead", "dead sensor", states=False, trials=10),
 ]

@@ -45,7 +45,7 @@ SCENARIOS = [
     case(1000, 20),
     case(400, 20, names=SCALE),
     case(100, 60),
-    case(200, 60, least=90.0),  # q is hardly seen, and moves biases by 150 ug: 90.5 % of 1,980 intervals
+    case(200, 60, least=90.0),  # q is hardly seen, and moves biases by 150 ug: 90.6 % of 1,800 intervals
     case(400, 60),
     case(1000, 60),
     case(400, 60, names=SCALE),

@@ -55,7 +55,7 @@ _WIDE = "nested models, chosen: never below 92 %, and wider at none (methods/tum
 
 def _curve(name: str, rig: Rig) -> Scenario:
     return Scenario(
-        "Centrifuge", f"curve chosen by auto, {name}", partial(curve, rig), 24, (92.0, 100.0), unit="% of K at 20 g",
+        "Centrifuge", f"curve chosen by auto, {name}", partial(curve, rig), 12, (92.0, 100.0), unit="% of K at 20 g",
         source=_WIDE,
     )  # fmt: skip
 
@@ -67,7 +67,7 @@ SCENARIOS = [
     _curve("K grows by 2 % over 20 g, as a parabola", replace(_ONE, c2=5e-5)),
     _curve("K rises and falls by 1 %", replace(_ONE, c1=2e-3, c2=-8e-5)),
     Scenario(
-        "Centrifuge", "FOG 1 ms late, both senses", partial(factors, replace(_BOTH, delay=1e-3), "late against"), 20,
+        "Centrifuge", "FOG 1 ms late, both senses", partial(factors, replace(_BOTH, delay=1e-3), "late against"), 12,
         warned=95, unit="% of K at 20 g",
     ),
     Scenario(
@@ -75,7 +75,7 @@ SCENARIOS = [
         None, warned=95, unit="% of K at 20 g", source="told by the line on one sense of rotation, not found",
     ),
     Scenario(
-        "Centrifuge", "nothing wrong, both senses", partial(factors, _BOTH, ""), 20, false_alarms=5,
+        "Centrifuge", "nothing wrong, both senses", partial(factors, _BOTH, ""), 12, false_alarms=5,
         unit="% of K at 20 g",
     ),
 ]  # fmt: skip

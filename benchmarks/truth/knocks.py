@@ -34,7 +34,7 @@ def case(knocks: int, k2: float, count: int = 24, stated: float | None = 1.0) ->
         GROUP,
         f"{of} of {count} knocked by 3 to 50 mg, k2 of {k2:g} ug/g^2{extra}",
         partial(run, knocks=knocks, k2=k2, count=count, stated=stated),
-        trials=60,
+        trials=40,
         coverage=(92.0, 100.0),
         warned=95.0 if knocks else None,
         false_alarms=None if knocks else 2.3,

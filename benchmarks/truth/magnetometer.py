@@ -77,7 +77,7 @@ def row(
         GROUP,
         name,
         partial(trial, disturbance=disturbance, accelerometers=accelerometers),
-        trials=60,
+        trials=30,
         coverage=coverage,
         warned=warned,
         false_alarms=4.0 if warned is None else None,

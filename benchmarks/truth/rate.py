@@ -59,10 +59,10 @@ def sine_trial(seed: int, table_noise: float, sweep: bool) -> Trial:
 def noisy(name: str, noise: float, sweep: bool, largest_error: float) -> Scenario:
     """One scenario of a noisy rate."""
     trial = partial(sine_trial, table_noise=noise, sweep=sweep)
-    return Scenario(GROUP, name, trial, 60, (93.0, 100.0), false_alarms=4.0, largest_error=largest_error, unit="ppm")
+    return Scenario(GROUP, name, trial, 40, (93.0, 100.0), false_alarms=4.0, largest_error=largest_error, unit="ppm")
 
 
-def row(name: str, table: Table, trials: int = 20, **asked: Any) -> Scenario:
+def row(name: str, table: Table, trials: int = 12, **asked: Any) -> Scenario:
     """One scenario of hysteresis."""
     return Scenario(GROUP, name, partial(loop_trial, table=table), trials, unit="ppm of the loop", **asked)
 

@@ -45,7 +45,7 @@ def trial(seed: int, *, both: bool = False, **disturbance: float) -> Trial:
 def row(name: str, lowest: float, *, both: bool = False, **disturbance: float) -> Scenario:
     """Return a scenario of one disturbance, whose intervals hold the truth in `lowest` % at least."""
     return Scenario(
-        GROUP, name, partial(trial, both=both, **disturbance), trials=24, coverage=(lowest, 100.0), false_alarms=4.0,
+        GROUP, name, partial(trial, both=both, **disturbance), trials=12, coverage=(lowest, 100.0), false_alarms=4.0,
         unit="mg of bias",
     )  # fmt: skip
 

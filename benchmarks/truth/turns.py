@@ -32,7 +32,7 @@ def trial(seed: int, hand: Hand, word: str) -> Trial:
 
 def row(name: str, hand: Hand, word: str = "gyro", **asked: Any) -> Scenario:
     """One scenario of a hand."""
-    asked = {"coverage": (92.0, 99.5), "false_alarms": 5.0, "trials": 20} | asked
+    asked = {"coverage": (92.0, 99.5), "false_alarms": 5.0, "trials": 10} | asked
     return Scenario(GROUP, name, partial(trial, hand=hand, word=word), unit="ppm", **asked)
 
 

@@ -189,11 +189,11 @@ SCENARIOS = [
         largest_error=12.0, unit="deg/h",
     ),
     Scenario(
-        "Warm-up", "stated for the worst temperature, smooth law", partial(worst, 0.0), 16, (90.0, 100.0), unit="",
+        "Warm-up", "stated for the worst temperature, smooth law", partial(worst, 0.0), 8, (90.0, 100.0), unit="",
         source=_STATED,
     ),
     Scenario(
-        "Warm-up", "stated for the worst temperature, bent law", partial(worst, 20.0), 16, (90.0, 100.0), unit="",
+        "Warm-up", "stated for the worst temperature, bent law", partial(worst, 20.0), 8, (90.0, 100.0), unit="",
         source=_STATED,
     ),
 ]  # fmt: skip
