@@ -20,8 +20,10 @@ from typing import Any, Literal, Self
 # Texts from files, made safe to print: no character that ends a line, moves the cursor or reverses text.
 
 
-_HIDDEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
-_HIDDEN_IN_LINES = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
+# Lone surrogates stand in file names that are not UTF-8; they and noncharacters are in no text that is exchanged.
+_NEVER_SHOWN = "\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufdd0-\ufdef\ufeff\ufffe\uffff"
+_HIDDEN = re.compile(f"[\x00-\x1f{_NEVER_SHOWN}]")
+_HIDDEN_IN_LINES = re.compile(f"[\x00-\x09\x0b-\x1f{_NEVER_SHOWN}]")
 
 _PLAIN = bytes([*b"\t\n\r", *range(0x20, 0x7F)])
 

@@ -41,6 +41,7 @@ from imulab.exporters.model import (
     single_precision,
     write_one,
 )
+from imulab.exporters.texts import hash_comments
 from imulab.procedures.registry import procedure_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -326,7 +327,7 @@ def _write_px4(
         "",
         "Vehicle-Id Component-Id Name Value Type",
     ]
-    lines = [f"# {line}".rstrip() for line in comments]
+    lines = hash_comments(comments)
     lines += [f"1\t1\t{name}\t{value}\t{kind}" for name, value, kind in rows]
     if not all(np.isfinite(float(value)) for _, value, _ in rows):
         raise OptionError("px4: a parameter is beyond single precision")
@@ -422,7 +423,7 @@ def _save_ardupilot(
         "no axes are turned: the record's axes are taken as ArduPilot's body axes (FRD, after the board's rotation)",
         *remarks,
     ]
-    lines = [f"# {line}" for line in comments] + [f"{name},{single_precision(value)}" for name, value in rows]
+    lines = hash_comments(comments) + [f"{name},{single_precision(value)}" for name, value in rows]
     return write_one(folder, "imulab.param", lines)
 
 

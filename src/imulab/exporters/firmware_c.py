@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from imulab._version import VERSION
 from imulab.device.tables import KINDS, DeviceTable, Field
 from imulab.device.unit import make_blob
-from imulab.display import printable
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
+from imulab.exporters.texts import c_comment, in_c_comment, markdown_code, property_value
 from imulab.files import replacing
 from imulab.procedures.apply import tables_of_all
 from imulab.procedures.registry import section
@@ -66,8 +66,8 @@ def libraries(unit: str) -> dict[str, str]:
     }
     sources = (f"{NAME}.h", "imulab_core.c", "imulab_numbers.c")
     return {
-        "library.properties": "".join(f"{key}={value}\n" for key, value in properties.items()),
-        "library.json": json.dumps(manifest, indent=2, ensure_ascii=False) + "\n",
+        "library.properties": "".join(f"{key}={property_value(value)}\n" for key, value in properties.items()),
+        "library.json": json.dumps(manifest, indent=2) + "\n",
         **{f"src/{name}": firmware_file(name) for name in sources},
         **{f"zephyr/{name}": firmware_file(name) for name in ("module.yml", "Kconfig", "CMakeLists.txt")},
     }
@@ -128,7 +128,7 @@ def export_c(records: Sequence[Calibration], folder: Path, options: ExportOption
         "selftest.c": firmware_file("selftest.c"),
         "Makefile": firmware_file("Makefile"),
         "README.md": _rendered("README.md.j2", words),
-        **libraries(words["serial"]),
+        **libraries(_unit_name(records)),
         "examples/Corrected/Corrected.ino": _rendered("Corrected.ino.j2", words),
     }
     try:
@@ -188,22 +188,18 @@ def _amalgamation() -> str:
 
 
 def _unit_name(records: Sequence[Calibration]) -> str:
-    serial = next((record.sensor["serial"] for record in records if "serial" in record.sensor), None)
-    return _comment_text(serial) if serial else "a unit without serial number"
+    """Return the serial number as the records have it, or words for a unit without one."""
+    return _serial(records) or "a unit without serial number"
 
 
-def _comment_text(text: str) -> str:
-    """Return a text that neither ends a C comment nor makes a compiler warn in one."""
-    text = printable(text)
-    for wrong, right in (("\\", "|"), ("*/", "* /"), ("/*", "/ *"), ("??", "? ?")):
-        text = text.replace(wrong, right)
-    return text
+def _serial(records: Sequence[Calibration]) -> str:
+    return next((record.sensor["serial"] for record in records if record.sensor.get("serial")), "")
 
 
 def _unit_h(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> str:
     kinds = {table.kind: table for table in tables}
     lines = [
-        f"/* The numbers of {_unit_name(records)}. */",
+        *c_comment(f"The numbers of {_unit_name(records)}."),
         "#ifndef UNIT_H",
         "#define UNIT_H",
         "",
@@ -224,12 +220,12 @@ def _unit_h(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> st
 
 
 def _unit_c(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> str:
-    lines = [f"/* The numbers of {_unit_name(records)}; made from the records"]
-    lines += [
-        f" *   {record.procedure} {_comment_text(record.created)} SHA-256 {_digest(record)}" for record in records
-    ]
-    lines += [
-        " * by " + _comment_text(records[0].software) + ". */",
+    lines = [
+        *c_comment(
+            f"The numbers of {_unit_name(records)}; made from the records",
+            *(f"  {record.procedure} {record.created} SHA-256 {_digest(record)}" for record in records),
+            f"by {records[0].software}.",
+        ),
         '#include "unit.h"',
         "",
         "#define R(x) ((il_real)(x))",
@@ -317,20 +313,33 @@ def _nested(value: NDArray[Any]) -> str:
 
 def _words(records: Sequence[Calibration], tables: Sequence[DeviceTable], blob_size: int) -> dict[str, Any]:
     """Return the words for the README and the sketch; `use` is the code that calls the core for this unit."""
+    serial = _serial(records)
     words = {
-        "serial": _unit_name(records),
-        "software": _comment_text(records[0].software),
+        "unit": _unit_name(records),
+        "unit_in_markdown": _Safe(markdown_code(serial) if serial else _unit_name(records)),
+        "software_in_markdown": _Safe(markdown_code(records[0].software)),
         "blob_size": blob_size,
         "kinds": {table.kind: table.columns for table in tables},
         "first": tables[0].kind,
         "most_elements": _most_elements(tables),
     }
-    return {**words, "use": _rendered("use.c.j2", words)}
+    return {**words, "use": _Safe(_rendered("use.c.j2", words))}
+
+
+class _Safe(str):
+    """A text that is in its form already."""
+
+
+def _word(value: Any) -> Any:
+    """Return a word of a template as it may stand in a C comment, where all texts of records stand."""
+    return in_c_comment(value) if isinstance(value, str) and not isinstance(value, _Safe) else value
 
 
 def _rendered(name: str, words: Mapping[str, Any]) -> str:
+    """Return a template with its words in their places."""
     from jinja2 import Environment, StrictUndefined
 
-    # The output is Markdown and C, not HTML: nothing is escaped.
-    environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
+    environment = Environment(
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False, finalize=_word
+    )  # Markdown and C, not HTML
     return environment.from_string(firmware_file(name)).render(words).rstrip("\n") + "\n"

@@ -31,6 +31,7 @@ from imulab.exporters.model import (
     yaml_matrix,
     yaml_number,
 )
+from imulab.exporters.texts import hash_comments
 from imulab.records.calibration import Calibration
 
 # Common to both files: noise keys, and the comment on biases.
@@ -161,7 +162,7 @@ def export_kalibr(records: Sequence[Calibration], folder: Path, options: ExportO
         *bias_lines(unit),
         *lost,
     ]
-    lines = [f"# {line}" for line in comments]
+    lines = hash_comments(comments)
     lines += ["imu0:", "  T_i_b:", *yaml_matrix(np.eye(4), "  ")]
     lines += ["  accelerometers:", "    M:", *yaml_matrix(accel.gain, "    ")]
     lines += ["  gyroscopes:", "    A:", *yaml_matrix(sensitivity, "    ")]
@@ -197,7 +198,7 @@ def export_openvins(records: Sequence[Calibration], folder: Path, options: Expor
         *bias_lines(unit),
         *lost,
     ]
-    lines = ["%YAML:1.0", *(f"# {line}" for line in comments), "", "imu0:", "  T_i_b:", *yaml_matrix(np.eye(4), "    ")]
+    lines = ["%YAML:1.0", *hash_comments(comments), "", "imu0:", "  T_i_b:", *yaml_matrix(np.eye(4), "    ")]
     lines += [*noise_lines(options, "  "), "  rostopic: /imu0", "  time_offset: 0.0", '  model: "kalibr"']
     for key, matrix in (
         ("Tw", lower),

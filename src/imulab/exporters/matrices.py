@@ -42,6 +42,7 @@ from imulab.exporters.model import (
     write_one,
     yaml_number,
 )
+from imulab.exporters.texts import c_comment, hash_comments
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.triads import Accelerometers, Gyroscopes, Magnetometers
@@ -266,7 +267,7 @@ def export_fusion(records: Sequence[Calibration], folder: Path, options: ExportO
         "no axes are turned: the results are in the record's axes",
         *lost,
     ]
-    head = ["/*", *(f" * {line}" for line in comments), " */", "#ifndef IMULAB_FUSION_H", "#define IMULAB_FUSION_H", ""]
+    head = [*c_comment(*comments), "#ifndef IMULAB_FUSION_H", "#define IMULAB_FUSION_H", ""]
     return write_one(folder, "imulab_fusion.h", [*head, *lines, "#endif"])
 
 
@@ -277,7 +278,7 @@ def _inertial(name: str, triad: Accelerometers | Gyroscopes, si: str) -> list[st
     raw = engineering if triad.unit == si else triad.unit
     taken = result if triad.unit == si else 1.0
     return [
-        f"/* raw in {raw}, calibrated in {engineering} */",
+        *c_comment(f"raw in {raw}, calibrated in {engineering}"),
         _matrix(f"{name}Misalignment", np.asarray(np.linalg.inv(triad.matrix), dtype=np.float64)),
         _vector(f"{name}Sensitivity", result / taken / triad.scale),
         _vector(f"{name}Offset", taken * triad.scale * triad.bias),
@@ -296,10 +297,10 @@ def _magnetic(mag: Magnetometers) -> list[str]:
     else:
         calibrated, soft, hard = "units of the local field", mag.soft_iron, mag.hard_iron
     return [
-        f"/* raw in {raw}, calibrated in {calibrated} */",
+        *c_comment(f"raw in {raw}, calibrated in {calibrated}"),
         _matrix("softIronMatrix", soft),
         _vector("hardIronOffset", hard),
-        f"/* before Fusion 1.2, softIronMatrix raw - hardIronOffset: hardIronOffset = {_numbers(soft @ hard)} */",
+        *c_comment(f"before Fusion 1.2, softIronMatrix raw - hardIronOffset: hardIronOffset = {_numbers(soft @ hard)}"),
         "",
     ]
 
@@ -349,7 +350,7 @@ def export_ros(records: Sequence[Calibration], folder: Path, options: ExportOpti
         *lost,
         *more,
     ]
-    lines = [f"# {line}" for line in comments]
+    lines = hash_comments(comments)
     lines += ["SM:", *(f"  - {yaml_number(value)}" for value in matrix.ravel())]
     lines += ["bias:", *(f"  - {yaml_number(value)}" for value in bias)]
     return write_one(folder, "imu_calib.yaml", lines + of_mag)
@@ -399,7 +400,7 @@ def export_motioncal(records: Sequence[Calibration], folder: Path, options: Expo
         "no axes are turned: raw must be in the axes of the record's magnetometer outputs",
         *lost,
     ]
-    lines = [f"# {line}" for line in comments]
+    lines = hash_comments(comments)
     lines += [f"V    {_row(offset)}", f"B    {single_precision(field)}", *(f"invW {_row(row)}" for row in matrix)]
     lines += ["", "# in a sketch with Adafruit_Sensor_Calibration:"]
     for name, values in zip(_NAMES, (offset, matrix.ravel()), strict=True):

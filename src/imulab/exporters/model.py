@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from imulab._version import VERSION
-from imulab.display import printable
 from imulab.errors import OptionError, RecordError
 from imulab.exporters import ExportOptions
 from imulab.files import write_text
@@ -43,10 +42,10 @@ class UnitModel:
 def origin_of(record: Calibration) -> list[str]:
     """Return the program that wrote the file, the unit, and the record, for a comment."""
     content = record.to_dict()["content_sha256"]
-    serial = printable(str(record.sensor.get("serial", "without serial number")))
+    serial = record.sensor.get("serial", "without serial number")
     return [
         f"written by imulab {VERSION} for unit {serial}",
-        f"from the record of {printable(record.created)}, content_sha256 {content}",
+        f"from the record of {record.created}, content_sha256 {content}",
     ]
 
 
