@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from imulab.errors import ReadError
+from imulab.errors import OptionError, ReadError
 from imulab.live.formats import STRAIGHTENED, LineStream, UnknownFormatError
 from imulab.live.sources import open_source
 from imulab.readers import Layout, load_layout
@@ -295,3 +295,31 @@ def test_each_over_a_pseudo_terminal(name, monkeypatch):
     for column in sent:
         found = np.concatenate([block.columns[column] for block in blocks])
         np.testing.assert_allclose(found, sent[column], rtol=1e-15)
+
+
+def test_a_counter_of_stated_width_is_carried_on_in_a_stream(tmp_path):
+    """20 bits of ms wrap after 17.5 minutes, which no guess would find."""
+    layout = tmp_path / "l.toml"
+    layout.write_text(
+        'delimiter = ","\n[columns]\ntime = { from = 0, unit = "ms", bits = 20 }\n'
+        + "".join(f'accel_{axis} = {{ from = {k}, unit = "g" }}\n' for k, axis in enumerate("xyz", start=1))
+    )
+    stamps = (2**20 - 2000 + 10 * np.arange(600)) % 2**20
+    stream = LineStream("device", load_layout(layout))
+    blocks = []
+    for k in range(0, 600, 10):
+        rows = "".join(f"{stamp},0,0,1\n" for stamp in stamps[k : k + 10])
+        blocks += stream.feed(rows.encode(), 0.1 * k)
+    blocks += stream.finish()
+    assert np.diff(np.concatenate([block.column("time") for block in blocks])) == pytest.approx(10)
+    assert (stream.counts.restarts, stream.counts.lost) == (0, 0)
+
+
+def test_a_stream_takes_no_packets(tmp_path):
+    layout = tmp_path / "l.toml"
+    columns = 'time = { from = 0, unit = "ms" }\naccel_x = { from = 1, unit = "g" }\n'
+    layout.write_text(f'delimiter = ","\npacket = "last"\n[columns]\n{columns}')
+    stream = LineStream("device", load_layout(layout))
+    stream.feed(b"1,2\n" * 100, 0.0)
+    with pytest.raises(OptionError, match="takes no packets"):
+        stream.feed(b"1,2\n" * 100, 3.0)

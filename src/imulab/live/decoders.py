@@ -44,6 +44,8 @@ class LineDecoder:
 
     name = over = ""
     units: Mapping[str, str] = {}
+    wraps: float | None = None
+    """Where the column time begins again, in its unit, if a layout says so."""
 
     def __init__(self, counts: Counts) -> None:
         self.counts = counts
@@ -186,11 +188,15 @@ class LayoutDecoder(LineDecoder):
         super().__init__(counts)
         if any(column.date for column in layout.columns.values()):
             raise OptionError(f"{layout.name}: a live stream takes no dates; expected a time in s, ms or us")
+        if layout.packet:
+            raise OptionError(f"{layout.name}: a live stream takes no packets; expected a time of each row, or no time")
         if layout.named_numbers:
             raise OptionError(f"{layout.name}: a live stream has no head; expected scale and sample_rate as numbers")
         self.name = f"layout {layout.name}"
         self.units = {name: column.unit for name, column in layout.columns.items()}
         self._layout = layout
+        time = layout.columns.get("time")
+        self.wraps = abs(time.scale) * 2.0**time.bits if time is not None and time.bits else None
         if layout.sample_rate is not None:
             self.units = {"time": "s"} | self.units | {"time": "s"}
         self.metadata = dict(layout.metadata or {})

@@ -274,7 +274,7 @@ class LineStream:
         self.format = decoder.name
         self._polled = self._polled and isinstance(decoder, Msp)
         if "time" in decoder.units:
-            self._device = DeviceClock(decoder.units["time"], self.counts)
+            self._device = DeviceClock(decoder.units["time"], self.counts, getattr(decoder, "wraps", None))
         else:
             self._arrival = ArrivalClock(self.counts)
         held, self._held = self._held, self._held[-1:]

@@ -79,14 +79,15 @@ class DeviceClock:
     """Time stamps of a device in their unit, without wrap-around; they rise from sample to sample.
 
     A stamp that jumps is accepted once the next one continues it, or the next two do in similar steps: a damaged digit
-    moves one stamp, while a gap, a wrap-around, a restart or a slower rate moves all that follow.
+    moves one stamp, while a gap, a wrap-around, a restart or a slower rate moves all that follow. `wraps` is where
+    stamps begin again, if that is known.
     """
 
-    def __init__(self, unit: str, counts: Counts) -> None:
+    def __init__(self, unit: str, counts: Counts, wraps: float | None = None) -> None:
         factor = parse_unit(unit).factor
         self._restart, self._set_anew = _RESTART / factor, _SET_ANEW / factor
         self._near, self._slowest = _NEAR / factor, _SLOWEST / factor
-        lengths = sorted(count * tick for count, tick in _WRAPS)
+        lengths = sorted({count * tick for count, tick in _WRAPS} | ({wraps * factor} if wraps else set()))
         self._wraps = [(length / factor, min(_SOON, _SOON_PART * length) / factor) for length in lengths]
         self._counts = counts
         self._offset = 0.0

@@ -376,6 +376,20 @@ class BackwardsError(ReadError):
         self.index = index
 
 
+class Counter:
+    """A counter of so many bits, carried on where it begins again: it fell by more than half of what they hold."""
+
+    def __init__(self, bits: int) -> None:
+        self._size = 2.0**bits
+        self._last, self._carried = np.nan, 0.0
+
+    def carry(self, numbers: Array) -> Array:
+        """Return the next numbers, finite, shape (n,) with n > 0, carried on."""
+        carried = self._carried + self._size * np.cumsum(np.diff(numbers, prepend=self._last) < -self._size / 2)
+        self._last, self._carried = float(numbers[-1]), float(carried[-1])
+        return np.asarray(numbers + carried)
+
+
 class Readings:
     """The columns of a file as its layout describes them, block by block: converted, and with their time."""
 
@@ -385,7 +399,7 @@ class Readings:
         self._step = np.inf
         self._carried = 0.0
         self._dates: dict[str, tuple[int, int]] = {}
-        self._begun: dict[str, tuple[float, float]] = {}
+        self._counters = {name: Counter(column.bits) for name, column in layout.columns.items() if column.bits}
 
     def of(self, columns: Mapping[str, Array], first_row: int, lines_before: int | None = None) -> dict[str, Array]:
         """Return the readings of a block that begins at row `first_row`; the arrays are changed in place.
@@ -457,10 +471,7 @@ class Readings:
                 f"{self._name}: {_place(first_row + row, lines_before)}, column {name}: expected a counter below "
                 f"2^{self._layout.columns[name].bits} (bits in {self._layout.name}), found {values[row]:.15g}"
             )
-        last, carried = self._begun.get(name, (float(numbers[0]), 0.0))
-        carry = carried + size * np.cumsum(np.diff(numbers, prepend=last) < -size / 2)
-        self._begun[name] = float(numbers[-1]), float(carry[-1])
-        values[known] = numbers + carry
+        values[known] = self._counters[name].carry(numbers)
 
     def _unwrap(self, numbers: Array) -> Array:
         """Return a counter without wrap-around, where it wraps within a few of its steps of 2^8, 2^16 or 2^32.
