@@ -158,7 +158,7 @@ def _not_a_number(recording):
 
 
 def _hot(recording):
-    return replace(recording, metadata={"power_on_temperature": "20.4"})
+    return replace(recording, metadata={"power_on_temperature": "21.4"})
 
 
 _STATED = "actual error at the worst temperature at most 1.4 times the stated one; rms error: actual over stated"
@@ -185,7 +185,7 @@ SCENARIOS = [
     _refused("apply: a time that is not a number", _not_a_number, "row 201"),
     _refused("apply: 0.4 K beyond the table", _hot, "temperature"),
     Scenario(
-        "Warm-up", "start 0.4 K beyond the table, --beyond hold", partial(corrected, 20.4, "hold"), 8, None,
+        "Warm-up", "start 0.4 K beyond the table, --beyond hold", partial(corrected, 21.4, "hold"), 8, None,
         largest_error=12.0, unit="deg/h",
     ),
     Scenario(
