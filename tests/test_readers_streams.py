@@ -158,6 +158,16 @@ def test_thermal_gyroscopes_are_calibrated_on_their_clock():
         assert record.parameters[name].value == pytest.approx(parameter.value, rel=1e-9, abs=1e-12)
 
 
+def test_a_recording_of_two_clocks_shows_itself():
+    recording = at_rest(20.0)
+    assert "8000 samples over 19.99 s" in recording._repr_html_()
+    accel, gyro = (recording.plot(name) for name in ("accel", "gyro"))
+    assert len(recording.plot()) == 2
+    assert accel.figure.traces[0]["x"][-1] == pytest.approx(19.99, abs=0.1)
+    assert gyro.figure.traces[0]["x"][0] == pytest.approx(1.25e-3, abs=0.05)
+    assert il.Recording.from_frame(recording.to_frame()).clocks == recording.clocks
+
+
 def test_one_clock_is_the_fastest_and_apply_says_what_it_interpolated(tmp_path, imulab):
     recording = at_rest(3.0)
     joined = one_clock(recording)

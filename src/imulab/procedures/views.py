@@ -294,6 +294,7 @@ def recording_html(recording: Recording) -> str:
         missing = str(len(values) - finite.size) if finite.size < len(values) else ""
         rows.append([name, recording.units[name], *([f"{end:.6g}" for end in ends] or ["–"] * 3), missing])
     time = recording.time
+    time = None if time is None else time[np.isfinite(time)]
     length = "" if time is None or len(time) < 2 else f" over {time[-1] - time[0]:.6g} s"
     head = "".join(f"<br>{escape(key)}: {escape(value)}" for key, value in recording.metadata.items())
     return (

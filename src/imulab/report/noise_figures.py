@@ -50,14 +50,17 @@ _DASHES = ("solid", "dot", "dash", "dashdot")
 
 def channel_figures(recording: Recording) -> list[Figure]:
     """Return a figure for each sensor of a recording: its columns over time, or over their rows."""
-    groups: dict[tuple[str, str], list[str]] = {}
-    for name, unit in recording.units.items():
-        if name != "time":
+    figures: list[Figure] = []
+    for clock, stamped in recording.clocks.items():
+        groups: dict[tuple[str, str], list[str]] = {}
+        for name in stamped:
             stem = name.partition("_")[0] if not name.startswith(("truth_", "std_")) else "_".join(name.split("_")[:2])
-            groups.setdefault((stem, unit), []).append(name)
-    time = recording.time
-    place = np.arange(1.0, len(recording) + 1) if time is None else time
-    return [_channel_figure(recording, names, stem, unit, place) for (stem, unit), names in groups.items()]
+            groups.setdefault((stem, recording.units[name]), []).append(name)
+        part = recording.stream(clock)
+        time = part.time
+        place = np.arange(1.0, len(part) + 1) if time is None else time
+        figures += [_channel_figure(part, names, stem, unit, place) for (stem, unit), names in groups.items()]
+    return figures
 
 
 def thinned(place: Array, values: Array, points: int = _POINTS) -> tuple[Array, Array]:
