@@ -179,12 +179,12 @@ def test_show_and_noise_have_one_rule(imulab, tmp_path):
     shown = imulab("show", "r.csv").stdout
     assert "rate 100.062 Hz, gaps 0, jitter 2.8 ms" in shown
     assert "start 1655928838.6 s, end 1655929138.4 s" in shown
-    assert "time 1655928838.6 to 1655929138.4 s (2022-06-22 20:13:58 UTC)" in shown
+    assert "time 1655928838.6 to 1655929138.4 s (2022-06-22 20:13:58 UTC), until 2022-06-22 20:18:58 UTC" in shown
     assert "  1655928838604082  " in shown
     told = json.loads(imulab("show", "r.csv", "--json").stdout)
     assert told["sample_rate"]["value"] == pytest.approx(analyse(il.read(tmp_path / "r.csv"))["sample_rate"]["value"])
     assert told["start"] == {"value": pytest.approx(time[0]), "unit": "s", "utc": "2022-06-22 20:13:58"}
-    assert told["end"]["value"] == pytest.approx(time[-1])
+    assert told["end"] == {"value": pytest.approx(time[-1]), "unit": "s", "utc": "2022-06-22 20:18:58"}
     assert (told["gaps"], told["missing"], told["repeated"]) == (0, 0, 0)
 
 

@@ -306,7 +306,8 @@ class _Clock(Struct):
         for part in parts[1:]:
             whole = whole.joined(part)
         epoch = epoch_of(metadata, first)
-        whole.utc = None if epoch is None else utc(epoch + first)
+        if epoch is not None:
+            whole.utc, whole.utc_end = utc(epoch + first), utc(epoch + whole.last)
         return whole
 
     def _part(self) -> _Summary:
@@ -342,6 +343,7 @@ class _Summary(Struct):
     first: float | None = None
     last: float = 0.0
     utc: str | None = None
+    utc_end: str | None = None
     rate: float = nan
     jitter: float = nan
     gaps: int = 0
@@ -385,7 +387,8 @@ class _Summary(Struct):
         lines = [f"duration {self.last - self.first:.6g} s, rate {rate}{gaps}{repeated}{jitter}"]
         lines.append(f"start {self.first:.1f} s, end {self.last:.1f} s")
         if self.utc:
-            lines.append(f"time {self.first:.1f} to {self.last:.1f} s ({self.utc} UTC)")
+            until = f", until {self.utc_end} UTC" if self.utc_end != self.utc else ""
+            lines.append(f"time {self.first:.1f} to {self.last:.1f} s ({self.utc} UTC){until}")
         if self.steady:
             lines.append(f"the rate changes: it is that of {self.steady[0]:.1f} to {self.steady[1]:.1f} s")
         if self.repeated:
@@ -457,7 +460,7 @@ def _clock_json(clock: _Summary) -> dict[str, Any]:
     known = clock.first is not None
     return {
         "start": {"value": clock.first, "unit": "s", "utc": clock.utc},
-        "end": {"value": clock.last if known else None, "unit": "s"},
+        "end": {"value": clock.last if known else None, "unit": "s", "utc": clock.utc_end},
         "duration": {"value": clock.last - clock.first if clock.first is not None else None, "unit": "s"},
         "sample_rate": {"value": clock.rate if clock.rate > 0 else None, "unit": "Hz"},
         "jitter": {"value": clock.jitter if clock.rate > 0 else None, "unit": "s"},
