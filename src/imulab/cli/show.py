@@ -324,7 +324,7 @@ class _Clock(Struct):
         summary = _Summary(float(finite[0]), float(finite[-1]), doubt=clock.doubt, backwards=clock.backwards)
         if clock.doubt:
             return summary
-        summary.repeated, summary.tick, lossy = clock.repeated, clock.tick, clock.kept is not None
+        summary.repeated, summary.tick, lossy = clock.repeated, clock.tick, clock.replaced
         rising = time if clock.kept is None else time[clock.kept]
         rising = rising if clock.even is None else clock.even
         start, stop = steady_rows(rising, lossy=lossy)

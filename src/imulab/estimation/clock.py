@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,8 @@ class Clock:
         The rows without those that came again, shape (n,); None where all are.
     even
         The times of the kept rows in order, s, where readings share stamps; else None.
+    replaced
+        Whether rows that came again stand for others, which are missing.
     backwards
         Number of steps back in time.
     doubt
@@ -70,6 +72,7 @@ class Clock:
     tick: float = 0.0
     kept: NDArray[np.bool_] | None = None
     even: Array | None = None
+    replaced: bool = False
     backwards: int = 0
     doubt: str = ""
     doubtful_row: int = 0
@@ -119,11 +122,10 @@ def read_clock(time: Array, same: NDArray[np.bool_] | None = None, *, lossy: boo
     kept = None if same is None else _without_repeats(step, same)
     if kept is None:
         return _shared_stamps(time)
-    left = read_clock(time[kept], lossy=True)  # where one came twice, another is missing
+    replaced = _replaced(time, kept)
+    left = read_clock(time[kept], lossy=replaced)
     row = int(np.flatnonzero(kept)[left.doubtful_row])
-    return Clock(
-        left.rate, left.jitter, left.gaps, left.missing, left.widest, left.tick, kept, left.even, 0, left.doubt, row
-    )
+    return replace(left, kept=kept, replaced=replaced, doubtful_row=row)
 
 
 def same_rows(columns: Mapping[str, Array], above: Mapping[str, float] | None = None) -> NDArray[np.bool_]:
@@ -180,6 +182,14 @@ def _without_repeats(step: Array, same: NDArray[np.bool_]) -> NDArray[np.bool_] 
     if not count or by_chance > _REPEATS or others > _OTHERWISE_UNIQUE * (count + others):
         return None
     return ~again
+
+
+def _replaced(time: Array, kept: NDArray[np.bool_]) -> bool:
+    """Return whether rows that came again stand for others that did not come: the steps that hold them are long."""
+    step = np.diff(time[kept])
+    before = np.cumsum(kept)[~kept] - 1
+    before = before[before < len(step)]
+    return bool(before.size) and float(np.mean(step[before] > GAP * median(step))) > 1 - _OTHERWISE_UNIQUE
 
 
 def _unique_stamps(time: Array, step: Array, *, lossy: bool) -> Clock:

@@ -27,6 +27,9 @@ BRIDGED, FEW = 0.01, 0.001
 """Largest share of rows without numbers; share of the rows below which what is bridged or left out is only noted."""
 
 
+_IN_PLACE = "; another one is missing for each"
+
+
 class StampNote(Note):
     """What was done to rows because of their time stamps."""
 
@@ -103,7 +106,7 @@ def _stamp_notes(clock: Clock, rows: int) -> list[str]:
     notes: list[str] = []
     if clock.repeated:
         many = f"{clock.repeated} row{'s' if clock.repeated > 1 else ''} that came twice, with stamp and all values,"
-        text = f"{many} {'are' if clock.repeated > 1 else 'is'} dropped"
+        text = f"{many} {'are' if clock.repeated > 1 else 'is'} dropped{_IN_PLACE if clock.replaced else ''}"
         few = clock.repeated == 1 or clock.repeated < FEW * rows
         notes.append(StampNote(text) if few else StampFinding(text, "record each message once"))
     if clock.even is not None:
@@ -117,8 +120,8 @@ def _stamp_notes(clock: Clock, rows: int) -> list[str]:
 
 
 def is_lossy(recording: Recording) -> bool:
-    """Return whether rows of a recording were dropped because they came twice: where one did, another is missing."""
-    return any("came twice" in note for note in stamp_notes(recording))
+    """Return whether rows of a recording were dropped that came twice, each in place of another."""
+    return any(note.endswith(_IN_PLACE) for note in stamp_notes(recording))
 
 
 def stamp_notes(recording: Recording) -> list[str]:
