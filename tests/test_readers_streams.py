@@ -196,3 +196,9 @@ def test_clocks_that_cannot_be_are_refused_by_name():
         il.fit_noise(recording.with_columns({"time_gyro": back}, {}), columns=["gyro_x"])
     with pytest.raises(DataError, match="time_gyro has 300 rows, gyro_x has 1200: expected as many"):
         il.Recording.from_arrays(gyro=np.zeros((1200, 3)), time_gyro=np.arange(300.0), unit="deg/s", name="arrays")
+
+
+def test_a_report_names_the_rate_of_each_sensor():
+    page = il.fit_noise(at_rest(20.0), terms="N").calibration
+    facts = il.procedures.noise.figures.exhibits(page).facts
+    assert ("sampling rate", "accel 100 Hz, gyro 400 Hz") in facts

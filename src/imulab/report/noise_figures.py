@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from imulab._version import VERSION
+from imulab.columns import kind_of
 from imulab.display import Note, verdict_of
 from imulab.estimation.distributions import chi_square_upper_quantile
 from imulab.recording import Array, Recording
@@ -246,11 +247,11 @@ def _rate(analysis: dict[str, Any], name: str) -> float:
 
 
 def rates_of(rates: Mapping[str, float]) -> str:
-    """Return the sampling rates of columns for a fact of a report: one, or one for each clock with its columns."""
-    by_rate: dict[str, list[str]] = {}
+    """Return the sampling rates of columns for a fact of a report: one, or one for each clock with its sensors."""
+    by_rate: dict[str, dict[str, None]] = {}
     for name, rate in rates.items():
-        by_rate.setdefault(f"{rate:.6g} Hz", []).append(name)
-    return next(iter(by_rate)) if len(by_rate) == 1 else ", ".join(f"{r} ({' '.join(n)})" for r, n in by_rate.items())
+        by_rate.setdefault(f"{rate:.6g} Hz", {})[kind_of(name) or name] = None
+    return next(iter(by_rate)) if len(by_rate) == 1 else ", ".join(f"{' '.join(n)} {r}" for r, n in by_rate.items())
 
 
 def _samples_figure(analysis: dict[str, Any], recording: Recording, names: Sequence[str]) -> Figure:
