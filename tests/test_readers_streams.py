@@ -7,6 +7,7 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError
+from imulab.procedures.noise.figures import exhibits
 from imulab.readers.streams import one_clock
 
 G = 9.81362
@@ -200,5 +201,4 @@ def test_clocks_that_cannot_be_are_refused_by_name():
 
 def test_a_report_names_the_rate_of_each_sensor():
     page = il.fit_noise(at_rest(20.0), terms="N").calibration
-    facts = il.procedures.noise.figures.exhibits(page).facts
-    assert ("sampling rate", "accel 100 Hz, gyro 400 Hz") in facts
+    assert ("sampling rate", "accel 100 Hz, gyro 400 Hz") in exhibits(page).facts

@@ -286,7 +286,7 @@ def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
         left = last - end
         if left > WIDEST_GAP * np.nan_to_num(max(first.step, buffer.step)):
             lost = f"{left / per_second:.4g} s"
-            share = left / (last - start)
+            share = left / max(last - start, 1)
             messages.append(
                 Finding(
                     f"{'truncated stream: ' if share > _MUCH else ''}the {first.stream.what} ends {lost} before the "
