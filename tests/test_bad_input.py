@@ -50,7 +50,7 @@ def in_unit(recording, unit):
 
 CASES = {
     "nan": (
-        lambda r: changed(r, accel_y=put(r.columns["accel_y"], 49, np.nan)),
+        lambda r: changed(r, accel_y=put(r.columns["accel_y"], slice(49, 55), np.nan)),
         ["bad.csv", "row 50 (line ", "column accel_y", "expected a finite number, found nan"],
     ),
     "infinity": (

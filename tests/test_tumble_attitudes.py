@@ -349,7 +349,7 @@ def test_a_recording_without_a_hold_is_refused_with_what_its_trace_shows():
 def test_samples_that_cannot_be_are_refused_with_their_row(column, value, content):
     samples, time, _ = tumble(DIRECTIONS)
     bad = recording(samples, time)
-    bad.columns[column][3000] = value
+    bad.columns[column][3000 : 3005 if np.isnan(value) else 3001] = value
     with pytest.raises(DataError) as caught:
         find_attitudes(bad)
     assert f"hall 3.csv: {content}" in str(caught.value)

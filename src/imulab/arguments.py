@@ -6,12 +6,12 @@ import builtins
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
 from numbers import Integral, Real
 from os import PathLike
 from types import UnionType
-from typing import Annotated, Any, ForwardRef, ParamSpec, TypeAlias, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ForwardRef, ParamSpec, TypeAlias, TypeVar, Union, Unpack, get_args, get_origin
 
 from imulab.errors import OptionError, listed, quoted
 
@@ -141,17 +141,35 @@ def _check_call(function: Callable[..., Any], args: tuple[Any, ...], kwargs: Map
     try:
         bound = signature.bind(*args, **kwargs).arguments
     except TypeError as error:
-        for key in kwargs.keys() - parameters.keys():
-            raise OptionError(f"{name}: unknown option {key!r}; known: {listed(parameters, key)}") from None
-        shown = (
-            f"{key}=" if p.kind is p.KEYWORD_ONLY else key
-            for key, p in parameters.items()
-            if key not in ("self", "cls")
-        )
-        raise OptionError(f"{name}: {error}; expected {name}({', '.join(shown)})") from None
+        unknown = [key for key in kwargs if key not in parameters]
+        if unknown and not any(p.kind is p.VAR_KEYWORD for p in signature.parameters.values()):
+            raise OptionError(unknown_options(name, unknown, parameters)) from None
+        taken = {*list(parameters)[: len(args)], *kwargs}
+        required = [key for key, p in parameters.items() if p.default is p.empty]
+        missing = [key for key in required if key not in taken] if str(error).startswith("missing") else []
+        problem = f"missing required arguments: {', '.join(map(repr, missing))}" if len(missing) > 1 else str(error)
+        shown = [f"{key}=" if p.kind is p.KEYWORD_ONLY else key for key, p in parameters.items()]
+        shown = [key for key in shown if key not in ("self", "cls")] + [f"{key}=" for key in _further(function)]
+        raise OptionError(f"{name}: {problem}; expected {name}({', '.join(shown)})") from None
     for key, hint in hints(function).items():
         if key in parameters and key in bound:
             check(bound[key], hint, f"{name}: {key}")
+
+
+def unknown_options(name: str, unknown: Sequence[str], known: Iterable[str]) -> str:
+    """Return a refusal of all keywords that a function does not have, with the nearest to the first."""
+    names = list(known)
+    options = "options" if len(unknown) > 1 else "option"
+    return f"{name}: unknown {options} {', '.join(map(repr, unknown))}; known: {listed(names, unknown[0])}"
+
+
+def _further(function: Callable[..., Any]) -> list[str]:
+    """Return the keywords that a function takes by ``**options: Unpack[...]``."""
+    for key, parameter in inspect.signature(function).parameters.items():
+        hint = types_of(function).get(key) if parameter.kind is parameter.VAR_KEYWORD else None
+        if get_origin(hint) is Unpack:
+            return [*get_args(hint)[0].__annotations__]
+    return []
 
 
 def _fits(value: object, hint: Any) -> bool:

@@ -210,6 +210,11 @@ def is_frame(value: object) -> bool:
     return hasattr(value, "shape") and hasattr(value, "columns") and hasattr(value, "__getitem__")
 
 
+def frame_library(frame: object) -> str:
+    """Return the library of a data frame, as `data_frame` takes it."""
+    return type(frame).__module__.partition(".")[0]
+
+
 def data_frame(columns: Mapping[str, Any], library: str | None = None) -> Any:
     """Return columns as a data frame of pandas or polars; without a `library` of pandas, or else of polars.
 

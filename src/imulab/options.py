@@ -378,5 +378,5 @@ def names_of_columns(typed: str, called: str) -> list[str]:
 
 def part_of(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of `imulab.read` that choose a part of a file."""
-    names = ("topic", "instance", "window", "element", "units", "damaged")
+    names = ("topic", "instance", "window", "element", "units", "damaged", "serial")
     return {name: values[name] for name in names if name in values}

@@ -807,6 +807,8 @@ class Part(TypedDict, total=False):
         One IMU of a file of several, from 1.
     damaged
         Lines of text that cannot be read: refuse them, or skip and count them.
+    serial
+        Serial number of the unit, in place of the one in the data's head.
     """
 
     time: Annotated[ArrayLike | None, PROGRAM]
@@ -817,6 +819,7 @@ class Part(TypedDict, total=False):
     instance: Annotated[int | None, parsed(whole_number, "N"), READING]
     element: Annotated[int | None, parsed(whole_number, "N"), READING]
     damaged: Annotated[str | None, choice(DAMAGED), READING]
+    serial: Annotated[str | None, text("TEXT"), READING]
 
 
 class Sampling(Part, total=False):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Annotated, Any
 
 import imulab as il
@@ -15,6 +16,8 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    is_json,
+    naming,
     quantity,
     reading,
     warn,
@@ -97,6 +100,9 @@ def describe(analysis: dict[str, Any]) -> str:
 # Model the noise of sensors at rest, for filters.
 
 
+_LISTED = "kalibr, openvins, vins, px4, ardupilot, gtsam, ros or matlab"
+
+
 def _programs() -> tuple[str, ...]:
     from imulab.procedures.noise.wants import PROGRAMS
 
@@ -110,7 +116,8 @@ def fit(
     report: ReportFile = None,
     json: AsJson = False,
     program: Annotated[
-        str | None, option("PROGRAM", "Print what its filter wants, key: value.", "--for", words=_programs)
+        str | None,
+        option("PROGRAM", f"Print what {_LISTED} wants, key: value.", "--for", words=_programs),
     ] = None,
     rate: Annotated[str | None, option("HZ", "--for: samples that it gets; as the logs.")] = None,
     step: Annotated[str | None, option("TIME", "--for: between predictions; px4 10 ms, ardupilot 12 ms.")] = None,
@@ -119,11 +126,11 @@ def fit(
     """Fit a model of the noise to logs at rest.
 
     Column by column; several logs of a unit add up. Prints the terms with their 95 % intervals, and what a filter
-    wants; -o writes the record, --report its figures.
+    wants; -o writes the record, --report its figures. With --for, a noise record in place of the logs gives the same.
     """
     from imulab.cli.show import finish
     from imulab.procedures.noise.wants import check_program, noise_for
-    from imulab.procedures.registry import run_task
+    from imulab.procedures.registry import load, run_task
 
     check_outputs([output, report], [*files, *([options["layout"]] if options["layout"] else [])])
     hertz = None if rate is None else quantity(rate, "--rate", "frequency", "Hz")
@@ -132,11 +139,12 @@ def fit(
         check_program(program, "--for")
     elif rate is not None or step is not None:
         raise OptionError("--rate and --step say how the filter of --for runs: expected --for")
-    record = run_task("noise", files, options, GivenFiles())
+    saved = program is not None and len(files) == 1 and is_json(files[0])
+    record = load(files[0]) if saved else run_task("noise", files, options, GivenFiles())
     if program is None:
         finish(record, output, report, json=json)
         return
-    with labelled("--{}", ["rate", "step"]):
+    with labelled("--{}", ["rate", "step"]), naming(files[0]) if saved else nullcontext():
         wanted = noise_for(record, program, rate=hertz, step=seconds)
     finish(record, output, report, json=json, describe=lambda _: "\n".join(f"{k}: {v:.4g}" for k, v in wanted.items()))
 

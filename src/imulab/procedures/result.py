@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imulab._version import VERSION
-from imulab.arguments import check, checked, described, types_of
+from imulab.arguments import check, checked, described, types_of, unknown_options
 from imulab.display import Bad, Note, Shown, aligned, verdict_of
-from imulab.errors import DataError, OptionError, listed
+from imulab.errors import DataError, OptionError
 from imulab.estimation.sampling import mend_stamps
 from imulab.files import write_page
 from imulab.frames import columns_of_arrays, is_frame, unmasked
@@ -89,8 +89,8 @@ class Result:
         return self.calibration.cov(*names)
 
     @checked
-    def apply(self, data: Data, *, again: bool = False, heading: bool = False, **reading: Unpack[Reading]) -> Recording:
-        """Return data corrected by the record; see `Calibration.apply`."""
+    def apply(self, data: Data, *, again: bool = False, heading: bool = False, **reading: Unpack[Reading]) -> Any:
+        """Return data corrected by the record, of a data frame a data frame; see `Calibration.apply`."""
         return self.calibration.apply(data, again=again, heading=heading, **reading)
 
     @checked
@@ -145,7 +145,7 @@ _HINTS = types_of(Reading)
 _OF_ARRAYS = ("rate", "time", "unit")
 _OF_FILES = ("layout", "topic", "instance", "damaged")
 _UNITS = ("units",)
-_PART = ("window", "element")
+_PART = ("window", "element", "serial")
 OWN_CLOCKS = "own"
 """What leaves each sensor on its own clock."""
 _TITLED = "a file says itself, by its titles or a layout"
@@ -287,9 +287,9 @@ def check_keywords(keywords: Mapping[str, Any], function: Callable[..., Any]) ->
     """
     parameters = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
     known = dict.fromkeys([*parameters, *Sampling.__annotations__, *Reading.__annotations__])
+    if unknown := [key for key in keywords if key not in known]:
+        raise OptionError(unknown_options(function.__name__, unknown, known))
     for key in keywords:
-        if key not in known:
-            raise OptionError(f"{function.__name__}: unknown option {key!r}; known: {listed(known, key)}")
         if (hint := _HINTS.get(key)) is not None and keywords[key] is not None:
             check(keywords[key], hint, f"{function.__name__}: {key}")
 
@@ -308,9 +308,9 @@ def _as_array(data: object, called: str, name: str) -> NDArray[Any]:
     raise DataError(f"{called}: {name}: expected {_EXPECTED}, found {described(data)}")
 
 
-def _select_part(recording: Recording, window: Window | None, element: int | None) -> Recording:
-    """Return the part of a recording within a window of time, and one IMU of several."""
-    parts = list(Selection(window=window, element=element).of(iter([recording]), recording.name))
+def _select_part(recording: Recording, window: Window | None, element: int | None, serial: str | None) -> Recording:
+    """Return the part of a recording within a window of time, and one IMU of several, with a serial number."""
+    parts = list(Selection(window=window, element=element, serial=serial).of(iter([recording]), recording.name))
     if len(parts) == 1:
         return parts[0]
     joined = {key: np.concatenate([part.columns[key] for part in parts]) for key in parts[0].columns}

@@ -18,6 +18,7 @@ from imulab import report
 from imulab.display import LINES, SENTENCES, WIDTH, aligned, html_table
 from imulab.errors import OptionError, RecordError, listed
 from imulab.files import write_page
+from imulab.frames import frame_library, is_frame
 from imulab.procedures.registry import joined_of, procedure_of
 from imulab.procedures.registry import load as load
 from imulab.procedures.result import Drawn, Record, as_read, as_record
@@ -267,11 +268,14 @@ def plots(record: Calibration, name: str | int | None) -> Plots | Plot:
 
 def apply_to(
     record: Calibration, data: Any, reading: Mapping[str, Any] | Reading, *, again: bool, heading: bool
-) -> Recording:
-    """Return data corrected by a record."""
+) -> Any:
+    """Return data corrected by a record: of a data frame a frame of the same library, of all else a recording."""
     from imulab.procedures.apply import apply
 
-    return apply(record, as_read(data, reading, Calibration.apply), again=again, heading=heading)
+    corrected = apply(record, as_read(data, reading, Calibration.apply), again=again, heading=heading)
+    if not is_frame(data):
+        return corrected
+    return corrected.to_frame("polars" if frame_library(data) == "polars" else "pandas")
 
 
 def export_to(record: Calibration, target: str, folder: str | Path, **options: Any) -> list[Path]:
@@ -347,8 +351,7 @@ def _grouped(record: Calibration) -> list[str]:
 
 
 def _format_row(row: Row) -> tuple[str, str]:
-    value, uncertainty = format_uncertain(row.value, row.standard_uncertainty)
-    return value, uncertainty
+    return row.text()
 
 
 def _shorten(line: str) -> str:

@@ -32,7 +32,7 @@ __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 _LOG = logging.getLogger(__name__)
 """Logger of each file's format, rows, times, and reading time."""
 _HEAD = 1 << 16  # bytes that show the format
-_SOUND_ROWS = 10  # above a line that cannot be read: it is damaged, and not the layout wrong
+_SOUND_ROWS = 40  # above a line that cannot be read: it is damaged, and not the layout wrong
 _PART = 1 << 22
 """Rows up to which blocks are joined as they are read."""
 
@@ -47,6 +47,7 @@ def read(
     element: int | None = None,
     units: Mapping[str, str] | None = None,
     damaged: str | None = None,
+    serial: str | None = None,
     name: str | None = None,
 ) -> Recording:
     """Read a recording as a whole.
@@ -69,6 +70,8 @@ def read(
         Units of sensors or columns, ``{"accel": "g"}``, in place of those that the file says.
     damaged
         ``"skip"`` passes over lines of text that cannot be read, and counts them; they are refused if not given.
+    serial
+        Serial number of the unit, in place of the one in the file's head.
     name
         What messages and the source call the file; its path if not given.
 
@@ -92,7 +95,7 @@ def read(
     >>> recording.units["gyro_x"], recording.metadata["gravity"], recording.source.file
     ('deg/s', '9.81 m/s^2', 'tumble.csv')
     """
-    selection = Selection(topic, instance, window, element, units, damaged)
+    selection = Selection(topic, instance, window, element, units, damaged, serial)
     name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
     blocks = _log_reading(selection.of(_blocks(file, name, known, selection, hashed), name))
@@ -132,6 +135,7 @@ def read_blocks(
     element: int | None = None,
     units: Mapping[str, str] | None = None,
     damaged: str | None = None,
+    serial: str | None = None,
     name: str | None = None,
 ) -> Iterator[Recording]:
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
@@ -145,7 +149,7 @@ def read_blocks(
     >>> sum(len(block) for block in il.read_blocks("recording.csv")) == len(il.read("recording.csv"))
     True
     """
-    selection = Selection(topic, instance, window, element, units, damaged)
+    selection = Selection(topic, instance, window, element, units, damaged, serial)
     name = name or _name(file)
     yield from _log_reading(selection.of(_blocks(file, name, _layout(layout), selection, None), name))
 

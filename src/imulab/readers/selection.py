@@ -35,6 +35,8 @@ class Selection:
         Units of sensors or columns, in place of those that the file says.
     damaged
         What to do with lines of text that cannot be read: one of `DAMAGED`.
+    serial
+        Serial number of the unit, in place of the one in the head.
     """
 
     topic: str | None = None
@@ -43,6 +45,7 @@ class Selection:
     element: int | None = None
     units: Mapping[str, str] | None = None
     damaged: str | None = None
+    serial: str | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -79,11 +82,11 @@ class Selection:
         return (others or None), (int(number) if number else None)
 
     def of(self, blocks: Iterator[Recording], name: str) -> Iterator[Recording]:
-        """Yield the rows of the element within the window, in the stated units.
+        """Yield the rows of the element within the window, with the stated units and serial number.
 
         Errors are those of `with_units`, `keep_element` and `windowed`.
         """
-        stated = with_units(blocks, self.units, name)
+        stated = with_serial(with_units(blocks, self.units, name), self.serial)
         return windowed(keep_element(stated, self.element, name), self.ends, name)
 
     def refuse(self, name: str, kind: str, *, topic: bool = True, instance: bool = True) -> None:
@@ -92,6 +95,12 @@ class Selection:
             raise OptionError(f"{name}: {kind} has no topics to choose from; leave out the topic {self.topic!r}")
         if instance and self.instance is not None:
             raise OptionError(f"{name}: {kind} has no instances to choose from; leave out the instance {self.instance}")
+
+
+def with_serial(blocks: Iterator[Recording], serial: str | None) -> Iterator[Recording]:
+    """Yield blocks whose head has a serial number, in place of the one there, where one is stated."""
+    for block in blocks:
+        yield block if serial is None else replace(block, metadata={**block.metadata, "serial": serial})
 
 
 def with_units(blocks: Iterator[Recording], units: Mapping[str, str] | None, name: str) -> Iterator[Recording]:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import pandas
     import polars
 
-    from imulab.recording import Data, Reading, Recording
+    from imulab.recording import Data, Reading
 
 
 # Plain JSON values as text: with an indent as a file, without spaces and with sorted keys to be hashed.
@@ -165,6 +165,17 @@ class Parameter:
     unit: str
     standard_uncertainty_given_order: float | None = None
     interval_95: tuple[float, float] | None = None
+
+    @property
+    def unseen_limit(self) -> float | None:
+        """What a parameter is below that was not seen; None for one that was, or without a limit."""
+        return unseen_limit(self.value, self.standard_uncertainty, self.interval_95)
+
+
+def unseen_limit(value: float, uncertainty: float | None, interval: tuple[float, float] | None) -> float | None:
+    """Return the limit of a parameter without which the data are as well described: 0, with an interval above it."""
+    unseen = value == 0 and uncertainty is None and interval is not None and interval[1] > 0
+    return interval[1] if interval is not None and unseen else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,6 +385,8 @@ class Calibration:
     def to_frame(self, library: str | None = None) -> pandas.DataFrame | polars.DataFrame:
         """Return the parameters in SI as a data frame of pandas, or of the `library` ``"polars"``.
 
+        A parameter that was not seen has no value (nan), and its limit in the column ``below``.
+
         Raises
         ------
         DataError
@@ -381,15 +394,15 @@ class Calibration:
         """
         parameters = self.parameters.values()
         nan = math.nan
-        return data_frame(
-            {
-                "parameter": list(self.parameters),
-                "value": [p.value for p in parameters],
-                "standard_uncertainty": [nan if (u := p.standard_uncertainty) is None else u for p in parameters],
-                "unit": [p.unit for p in parameters],
-            },
-            library,
-        )
+        columns: dict[str, list[Any]] = {
+            "parameter": list(self.parameters),
+            "value": [nan if p.unseen_limit else p.value for p in parameters],
+            "standard_uncertainty": [nan if (u := p.standard_uncertainty) is None else u for p in parameters],
+            "unit": [p.unit for p in parameters],
+        }
+        if any(p.unseen_limit for p in parameters):
+            columns["below"] = [p.unseen_limit or nan for p in parameters]
+        return data_frame(columns, library)
 
     def cov(self, *names: str) -> NDArray[np.float64]:
         """Return the covariance of these parameters, or of all in ``covariance.names``, shape (p, p), SI.
@@ -402,10 +415,12 @@ class Calibration:
         return self.covariance.block(names) if names else self.covariance.array()
 
     @checked
-    def apply(self, data: Data, *, again: bool = False, heading: bool = False, **reading: Unpack[Reading]) -> Recording:
-        """Return data corrected by the record: a file, a recording, a data frame or arrays; see `imulab.apply`."""
-        corrected: Recording = views().apply_to(self, data, reading, again=again, heading=heading)
-        return corrected
+    def apply(self, data: Data, *, again: bool = False, heading: bool = False, **reading: Unpack[Reading]) -> Any:
+        """Return data corrected by the record: a file, a recording, a data frame or arrays; see `imulab.apply`.
+
+        Of a data frame this is a frame of the same library, with titles ``name [unit]``; of all else a `Recording`.
+        """
+        return views().apply_to(self, data, reading, again=again, heading=heading)
 
     @checked
     def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:
@@ -422,7 +437,8 @@ class Calibration:
         lines = [f"{self.procedure} calibration of {self.sensor.get('serial', 'a unit without serial number')}"]
         for name, p in self.parameters.items():
             uncertainty = "" if p.standard_uncertainty is None else f" ± {p.standard_uncertainty:.2g}"
-            lines.append(f"  {name} = {p.value:.9g}{uncertainty} {p.unit}")
+            value = f"< {p.unseen_limit:.2g}" if p.unseen_limit else f"= {p.value:.9g}"
+            lines.append(f"  {name} {value}{uncertainty} {p.unit}")
         return "\n".join(lines)
 
 

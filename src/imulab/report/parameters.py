@@ -18,7 +18,7 @@ from typing import overload
 from msgspec import Struct
 
 from imulab.recording import Array
-from imulab.records.calibration import Calibration
+from imulab.records.calibration import Calibration, unseen_limit
 from imulab.report.traces import ReportTable, format_uncertain, plain_number
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
@@ -107,7 +107,10 @@ class Row(Struct, frozen=True):
     interval: tuple[float, float] | None = None
 
     def text(self) -> tuple[str, str]:
-        """Return value and uncertainty as text."""
+        """Return value and uncertainty as text; of what was not seen, what it is below."""
+        limit = unseen_limit(self.value, self.standard_uncertainty, self.interval)
+        if limit is not None:
+            return f"< {plain_number(limit, 2)}", ""
         return format_uncertain(self.value, self.standard_uncertainty)
 
 

@@ -32,7 +32,6 @@ def calibrate_array(
     moving: Annotated[Data | None, file()] = None,
     *,
     averaging: Annotated[float | str, measure("time", "s")] = "1 s",
-    serial: Annotated[str | None, PROGRAM] = None,
     method: Annotated[str | None, text("METHOD", METHODS)] = None,
     memory: Annotated[str | float | None, text("growing|growing:N|GAIN", ("growing",))] = None,
     noise: Record | None = None,
@@ -54,8 +53,6 @@ def calibrate_array(
         Recording in motion, for alignment and scale. As `still`.
     averaging
         Averaging time of the covariance matrix. In s.
-    serial
-        Of the array, for the record.
     method
         Method that fuse and export take from the record; robust if not given.
     memory
@@ -96,7 +93,8 @@ def calibrate_array(
     if method is not None or memory is not None:
         fusion = fusion_text(method, None if memory is None else str(memory), _LABEL)
     return fit.calibrate_array(
-        at_rest, in_motion, averaging_time=in_si(averaging, "averaging", "time", "s"), serial=serial, fusion=fusion,
+        at_rest, in_motion, averaging_time=in_si(averaging, "averaging", "time", "s"),
+        serial=reading.get("serial"), fusion=fusion,
         noise=None if noise is None else as_record(noise, "calibrate_array: noise"),
     )  # fmt: skip
 

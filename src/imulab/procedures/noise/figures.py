@@ -138,20 +138,21 @@ def _for_filters(fit: NoiseSummary) -> ReportTable:
             [
                 name,
                 f"{white.value:.3g}",
-                f"{walk.value:.2g}",
+                f"{column.unit}/sqrt(Hz)",
+                f"{walk.value:.2g}" if walk.value else f"< {walk.interval_95[1]:.2g}",
                 f"{walk.interval_95[0]:.2g} to {walk.interval_95[1]:.2g}",
-                column.unit,
+                f"{column.unit}/sqrt(s)",
                 *(plain_number(means[t] * factor, 2) if t in means else "–" for t in times),
                 unit,
             ]
         )
     return ReportTable(
         "For filters, and means at rest",
-        f"A filter knows white noise and a random walk alone. N_h in unit/√Hz and K_h in unit/√s are such that over "
+        f"A filter knows white noise and a random walk alone. N_h and K_h are such that over "
         f"{fit.horizon.value:g} s without aiding it predicts what the fitted noise does; the 95 % interval is that of "
         "K_h. Then the standard uncertainty of a mean over so many seconds at rest as a measure of the bias. "
         "Vibration is not in a log at rest.",
-        ["column", "N_h", "K_h", "95 % of K_h", "unit", *(f"u, {t:.3g} s" for t in times), "unit of u"],
+        ["column", "N_h", "unit", "K_h", "95 % of K_h", "unit", *(f"u, {t:.3g} s" for t in times), "unit of u"],
         rows,
     )
 

@@ -722,7 +722,7 @@ def _count_turns(angle: Array, motions: Motions, members: list[int], name: str) 
         if whole == 0 or missing > (_WHOLE if done or whole == 1 else _FIRST):
             raise DataError(
                 f"{where} is of {360 * number:.0f} deg: {number:.2f} turns; expected a whole number, back to the same "
-                "place at the fence"
+                "place at the fence; where the turns were whole, --turns says how many each was, such as --turns 1,-1"
             )
         count[k] = np.sign(ratio[k]) * round(number)
         done.append(k)

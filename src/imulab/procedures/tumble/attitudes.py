@@ -26,6 +26,7 @@ from imulab.columns import triad
 from imulab.display import Finding
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
+from imulab.estimation.sampling import bridged
 from imulab.procedures.result import OWN_CLOCKS, as_recording
 from imulab.readers.streams import one_clock
 from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time
@@ -480,6 +481,7 @@ def resolutions(recording: Recording, names: list[str], part: int | None = None)
 _BLOCK_SECONDS = 0.1  # s over which the scatter of samples is computed
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap; no window reaches across it."""
+_LONGEST_BRIDGE = 3  # rows without numbers that a line may stand for
 TIME_DOUBTED = "is the unit of time right?"
 _SLOW = 5.0  # Hz: of slower samples too few fall into a hold
 _MUCH_LOST = 0.05  # share of the time that gaps may take without a warning
@@ -572,7 +574,7 @@ def find_attitudes(
     unit, names = recording.triad_unit(sensor), triad(sensor)
     if not len(recording):
         raise SegmentError(f"{recording.name}: no samples")
-    check_finite(recording, names)
+    recording, bridges = without_single_gaps(recording, names)
     temperature = recording.mean_temperature()
     if "time" not in recording:
         check_clipped_rows(recording, names)
@@ -610,11 +612,33 @@ def find_attitudes(
         swing=np.ptp(blocks.mean, axis=0),
         motion=motion,
         notes=(
-            *_corrected_notes(recording),
+            *[*_corrected_notes(recording), *bridges],
             *left_out.notes(_at_rest(stretches, len(time))),
             *_notes(blocks, variance),
         ),
     )
+
+
+def without_single_gaps(recording: Recording, names: list[str]) -> tuple[Recording, list[str]]:
+    """Return a recording in which single rows without numbers are the line through their neighbours, and notes.
+
+    A line over more than a few rows would look like a hold.
+
+    Raises
+    ------
+    DataError
+        More than three rows in a row hold no numbers, or more than 1 % of all, one is infinite, or it is a table of
+        attitudes.
+    """
+    bad = ~np.logical_and.reduce([np.isfinite(recording.column(name)) for name in names])
+    if not bad.any():
+        return recording, []
+    edges = np.flatnonzero(np.diff(bad, prepend=False, append=False))
+    infinite = any(np.isinf(recording.column(name)).any() for name in names)
+    longest = int((edges[1::2] - edges[::2]).max())
+    if "time" not in recording or longest > _LONGEST_BRIDGE or infinite or bad[0] or bad[-1]:
+        check_finite(recording, names)
+    return bridged(recording, names)
 
 
 def _quietest(variance: Array, recording: Recording, names: list[str]) -> tuple[float, Array]:

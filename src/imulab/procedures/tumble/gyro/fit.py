@@ -31,7 +31,7 @@ from imulab.gravity import EARTH, EarthRate, at_latitude
 from imulab.options import PROGRAM, choice, measure
 from imulab.procedures.result import OWN_CLOCKS, Record, Result, as_record, as_recording
 from imulab.procedures.tumble import CLOCKS, SENSITIVITIES
-from imulab.procedures.tumble.attitudes import Attitudes, find_attitudes
+from imulab.procedures.tumble.attitudes import Attitudes, find_attitudes, without_single_gaps
 from imulab.procedures.tumble.device import specific_force
 from imulab.procedures.tumble.gyro.estimate import Nonlinearity, TurnEstimate, estimate_turns
 from imulab.procedures.tumble.gyro.rest import clock_notes, direction_covariance, find_holds
@@ -62,7 +62,7 @@ from imulab.procedures.tumble.schema import (
 )
 from imulab.quantities import in_si
 from imulab.readers.streams import own_clock
-from imulab.recording import Array, Data, Reading, Recording, check_finite, check_time
+from imulab.recording import Array, Data, Reading, Recording, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
 from imulab.records.mean_noise import mean_uncertainties
@@ -170,7 +170,7 @@ def fit_gyro_triad(
     _check_request(record, attitudes, sensitivity, clock, clock_of)
     apart = attitudes.recording is not recording if apart is None else apart
     unit = recording.triad_unit("gyro")
-    check_finite(recording, triad("gyro"))
+    recording, bridges = without_single_gaps(recording, triad("gyro"))
     left_out = leave_out(recording, triad("gyro"))
     time, output = check_time(recording), left_out.recording.triad("gyro")
     factor = output_factor(attitudes.recording.name, triad("accel"), attitudes.unit, model_of(record).output_unit)
@@ -196,6 +196,7 @@ def fit_gyro_triad(
     solved, noise_notes = (solved, []) if noise is None else _with_noise_record(solved, noise, attitudes, recording)
     known = clock_of_scale(comparison, clock, clock_of, counted=is_counted(check_time(recording)))
     notes = [
+        *bridges,
         *(prefixed("gyro", note) for note in left_out.notes(_at_rest(attitudes, stamps.on_accel, left_out))),
         *stamp_notes,
         *noise_notes,

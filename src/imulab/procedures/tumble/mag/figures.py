@@ -22,6 +22,7 @@ from imulab.report.traces import (
     scatter,
 )
 
+_AS_NAMED = "+x +y +z"
 _LABEL = "%{text}<extra></extra>"
 _PLANES = (("x", "y"), ("y", "z"), ("z", "x"))
 
@@ -30,9 +31,12 @@ def mag_headline(record: Calibration) -> str:
     """Return the result for the magnetometer triad as a sentence without its full stop."""
     fit = _read_fit(record)
     heading = np.degrees(fit.heading.standard_uncertainty.value)
+    columns = mag_model_of(record).mag_axes
+    turned = f"; mag_bias_x and all others are along body axes, whose x y z are the columns {columns}"
     return (
         f"the field of {fit.attitudes} attitudes has one magnitude within {100 * fit.magnitude.rms:.2g} % rms and one "
         f"dip within {np.degrees(fit.dip.rms):.2g} deg rms: magnetic heading is known to {heading:.2g} deg"
+        f"{'' if columns == _AS_NAMED else turned}"
     )
 
 
