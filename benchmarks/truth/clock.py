@@ -112,12 +112,12 @@ def array(seed: int, *, late: tuple[float, ...], axes: int = 1) -> Trial:
 def row(name: str, **options: object) -> Scenario:
     """Return a scenario of the gyroscopes: settings of `Scenario` and arguments of `gyro`."""
     settings = {key: options.pop(key) for key in ("coverage", "warned", "false_alarms", "trials") if key in options}
-    settings = {"trials": 12, "unit": "ppm of scale factor", **settings}
+    settings = {"trials": 8, "unit": "ppm of scale factor", **settings}
     return Scenario(GYRO, name, partial(gyro, **options), **settings)  # type: ignore[arg-type]
 
 
 SCENARIOS = [
-    row("nothing wrong, clocks of 50 ppm", false_alarms=5.0, trials=40),
+    row("nothing wrong, clocks of 50 ppm", false_alarms=5.0, trials=24),
     row("the same, each triad on a clock of its own", apart=True, false_alarms=5.0),
     row("clock 2000 ppm fast, the accelerometers' true", apart=True, fast=2e-3, words="clock runs", coverage=None,
         warned=95.0),
@@ -134,12 +134,12 @@ SCENARIOS = [
     row("12 samples lost in a turn, stamps run on", lost=(12, False), words="set aside", warned=95.0),
     row("12 samples lost in a turn, stamps show it", lost=(12, True), words="samples are missing", warned=95.0),
     row("a range of 130 deg/s", limit=np.radians(130.0)),
-    row("deg/s labelled rad/s", scale=57.29578, words="in deg/s?", coverage=None, warned=95.0, trials=10),
-    row("time stamps of half the rate", fast=1.0, words="twice what", coverage=None, warned=95.0, trials=10),
-    Scenario(ARRAY, "no latency", partial(array, late=()), 16, false_alarms=5.0, unit="ppm"),
-    Scenario(ARRAY, "one element 10 ms late", partial(array, late=(0.01,)), 16, warned=95.0, largest_error=50,
+    row("deg/s labelled rad/s", scale=57.29578, words="in deg/s?", coverage=None, warned=95.0, trials=8),
+    row("time stamps of half the rate", fast=1.0, words="twice what", coverage=None, warned=95.0, trials=8),
+    Scenario(ARRAY, "no latency", partial(array, late=()), 10, false_alarms=5.0, unit="ppm"),
+    Scenario(ARRAY, "one element 10 ms late", partial(array, late=(0.01,)), 10, warned=95.0, largest_error=50,
              unit="ppm"),
-    Scenario(ARRAY, "three late: 10, -20, 5 ms", partial(array, late=(0.01, -0.02, 0.005)), 16, warned=95.0,
+    Scenario(ARRAY, "three late: 10, -20, 5 ms", partial(array, late=(0.01, -0.02, 0.005)), 10, warned=95.0,
              largest_error=50, unit="ppm"),
     Scenario(ARRAY, "the same, three axes", partial(array, late=(0.01, -0.02, 0.005), axes=3), 8, None, warned=95.0,
              largest_error=100, unit="ppm"),

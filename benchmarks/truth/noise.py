@@ -143,7 +143,7 @@ def _row(name: str, fault: str, word: str, coverage: tuple[float, float] | None 
         "Noise at rest",
         name,
         partial(_trial, fault=fault, word=word),
-        trials=16,
+        trials=12,
         coverage=coverage,
         warned=95.0 if word else None,
         false_alarms=None if word else 5.0,
@@ -164,7 +164,7 @@ SCENARIOS = [
     _row("rad/s read as deg/s, a gyro of 16 bits", "radians", "right?", None),
     _row("a step of 25 deg/h, 10 u, that looks like a random walk", "small step", "the level changes by"),
     Scenario("Noise at rest", "vibration of 8 to 15 Hz that swings, one to six sigma: no change of level",
-             partial(_trial, fault="vibration", word="level changes"), trials=16, coverage=None, false_alarms=5.0),
+             partial(_trial, fault="vibration", word="level changes"), trials=12, coverage=None, false_alarms=5.0),
     *[
         Scenario("Noise at rest", f"accelerometers of 9.8 m/s^2, f: {kind}", partial(_gravity, kind=kind), trials=5,
                  coverage=None, warned=None if kind == "right" else 95.0,
@@ -173,12 +173,12 @@ SCENARIOS = [
     ],
     *[
         Scenario("Noise at rest", f"--regress temperature, {'in whole degrees' if rounded else 'fine'}: slope; no walk",
-                 partial(_degrees, rounded=rounded), trials=16, coverage=(92.0, 100.0),
+                 partial(_degrees, rounded=rounded), trials=12, coverage=(92.0, 100.0),
                  false_alarms=5.0, unit="(deg/h)/K")
         for rounded in (False, True)
     ],
-    Scenario("Noise at rest", "a temperature that the gyro does not follow", partial(_drift, slope=0.0), trials=16,
+    Scenario("Noise at rest", "a temperature that the gyro does not follow", partial(_drift, slope=0.0), trials=12,
              coverage=(92.0, 98.0), false_alarms=6.0, unit="(deg/s)/K"),
     Scenario("Noise at rest", "a gyro that follows its temperature by 0.002 (deg/s)/K", partial(_drift, slope=KELVIN),
-             trials=16, coverage=(92.0, 98.0), warned=95.0, unit="(deg/s)/K"),
+             trials=12, coverage=(92.0, 98.0), warned=95.0, unit="(deg/s)/K"),
 ]  # fmt: skip
