@@ -6,6 +6,7 @@ import shutil
 import socket
 import subprocess
 import tempfile
+import traceback
 from pathlib import Path
 
 import pytest
@@ -150,6 +151,44 @@ def test_an_unreachable_postgresql_is_reported_without_its_password(tmp_path, ca
     assert error.count("\n") == 1
     assert f"imulab: --history postgresql://line:***@127.0.0.1:{port}/x: " in error
     assert "secret" not in error
+
+
+SECRETS = [
+    "postgresql://127.0.0.1:{port}/x?user=u&password=hunter2",
+    "postgresql://u:hunter2@b@127.0.0.1:{port}/x",
+    "postgresql://u:a@hunter2@127.0.0.1:{port}/x",
+    "postgresql://u:hunter2/c@127.0.0.1:{port}/x",
+    "postgresql://u:hunter2?d@127.0.0.1:{port}/x",
+    "postgresql://u:hunter2%40e@127.0.0.1:{port}/x",
+    "postgresql://u@127.0.0.1:{port}/x?sslpassword=hunter2&sslmode=disable",
+    "postgresql://127.0.0.1:{port}/x?sslmode=disable;PASSWORD=hunter2",
+    "postgresql://127.0.0.1:{port}/x?odd=1&password=hunter2",
+    "postgresql://u:hunter2@127.0.0.1:port/x",
+    "postgresql://:hunter2@127.0.0.1:{port}/x",
+    "mysql://u:hunter2@127.0.0.1:{port}/x",
+    "mysql://u:a@hunter2@127.0.0.1:{port}/x?password=hunter2",
+    "sqlite://u:hunter2@host/history.sqlite",
+    "nonsense://u:hunter2@",
+]
+
+
+@pytest.mark.parametrize("url", SECRETS)
+def test_no_form_of_a_url_shows_its_password(url, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("psycopg")
+    monkeypatch.chdir(tmp_path)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with pytest.raises(OptionError) as caught, open_history(url.format(port=port)):
+        pass
+    told = "".join(traceback.format_exception(caught.value))
+    assert "hunter2" not in told
+    manifest = make_fleet(tmp_path / "in", 1, order=1)
+    assert main(["fleet", "run", str(manifest), "-o", "out", "--workers", "1", "--history", url.format(port=port)]) == 2
+    shown = capsys.readouterr()
+    assert "hunter2" not in shown.out + shown.err
+    assert shown.err.count("\n") == 1
+    assert not [f for f in Path("out").rglob("*") if f.is_file() and b"hunter2" in f.read_bytes()]
 
 
 def test_the_table_is_written_where_the_history_fails(tmp_path):

@@ -7,8 +7,13 @@ found. The command line prints the message alone and exits with 2.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+
+from imulab.display import printable
+
+_DIGITS = re.compile(r"\d{60,}")
 
 
 def listed(known: Iterable[str], word: object) -> str:
@@ -74,7 +79,9 @@ class ImulabError(Exception):
     """
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(" ".join(message.splitlines()))  # names out of damaged files may hold ends of lines
+        # Texts out of files may hold ends of lines and what a terminal obeys, and numbers thousands of digits.
+        text = printable(" ".join(message.splitlines()))
+        super().__init__(_DIGITS.sub(lambda match: f"{match[0][:12]}...({len(match[0])} digits)", text))
 
 
 class ReadError(ImulabError):

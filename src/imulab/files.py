@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from imulab.errors import OptionError, ReadError, UnitError, file_name, listed, quoted
+from imulab.quantities import LARGEST
 from imulab.units import Unit, parse_scale_factor, parse_unit
 
 # Writing files whole or not at all.
@@ -226,6 +227,8 @@ def number_of(value: Any, place: str) -> float:
     """Return a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ReadError(f"{place}: expected a number, found {quoted(value)}")
+    if abs(value) > LARGEST:
+        raise ReadError(f"{place}: expected a number of at most {LARGEST:g}, found {quoted(value)}")
     return float(value)
 
 

@@ -12,6 +12,9 @@ from imulab.errors import OptionError, RecordError, UnitError, quoted
 from imulab.units import parse_unit, to_si
 
 _BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
+LARGEST, SMALLEST = 1e100, 1e-100
+"""Sizes of quantities whose squares, cubes and reciprocals are finite; 0 is one too."""
+_WHOLE = 10**15
 _FRACTIONS = {"1": 1.0, "%": 1e-2, "ppm": 1e-6}
 RANDOM_WALK = {"deg/sqrt(h)": 0.01745329251994329577 / 60, "deg/√h": 0.01745329251994329577 / 60, "rad/sqrt(s)": 1.0}
 """Units of an angle random walk in texts, in SI."""
@@ -29,18 +32,28 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
         It is no number with a unit of this kind.
     """
     if re.search(r"\d,\d", text):
-        raise OptionError(f"{option} {text!r}: a decimal comma? expected a point")
+        raise OptionError(f"{option} {quoted(text)}: a decimal comma? expected a point")
     match = _QUANTITY.fullmatch(text)
-    expected = f"{option} {text!r}: expected a number, or one with a unit of {kind} such as 1 {default_unit}"
+    expected = f"{option} {quoted(text)}: expected a number, or one with a unit of {kind} such as 1 {default_unit}"
     if match is None:
         raise OptionError(expected)
     try:
         unit = parse_unit(match[2].strip() if match[2] else default_unit, (kind,))
     except UnitError as error:
-        raise OptionError(f"{option} {text!r}: {error}") from None
+        raise OptionError(f"{option} {quoted(text)}: {error}") from None
     if unit.quantity != kind:
         raise OptionError(expected)
-    return to_si(float(match[1]), unit.symbol)
+    return to_si(_sized(match[1], option, text), unit.symbol)
+
+
+def _sized(digits: str, option: str, text: str) -> float:
+    """Return a number of a text; refuse one whose square or reciprocal no double holds."""
+    value = float(digits)
+    if value and not SMALLEST <= abs(value) <= LARGEST:
+        raise OptionError(
+            f"{option} {quoted(text)}: expected 0, or a number of a size from {SMALLEST:g} to {LARGEST:g}"
+        )
+    return value
 
 
 def with_uncertainty(text: str) -> tuple[str, str | None]:
@@ -59,8 +72,8 @@ def split_quantity(text: str, option: str, example: str) -> tuple[float, str]:
     """
     match = _QUANTITY.fullmatch(text)
     if match is None or re.search(r"\d,\d", text):
-        raise OptionError(f"{option} {text!r}: expected a number with a unit such as {example}")
-    return float(match[1]), (match[2] or "").strip()
+        raise OptionError(f"{option} {quoted(text)}: expected a number with a unit such as {example}")
+    return _sized(match[1], option, text), (match[2] or "").strip()
 
 
 def in_si(value: float | str, option: str, kind: str, default_unit: str) -> float:
@@ -77,7 +90,7 @@ def in_si(value: float | str, option: str, kind: str, default_unit: str) -> floa
         raise OptionError(
             f"{option} {quoted(value)}: expected a number in SI, or a text with a unit such as '1 {default_unit}'"
         )
-    return float(value)
+    return float(value) if not math.isfinite(value) else _sized(str(float(value)), option, str(value))
 
 
 def of_units(value: float | str, option: str, units: Mapping[str, float]) -> float:
@@ -93,8 +106,8 @@ def of_units(value: float | str, option: str, units: Mapping[str, float]) -> flo
     match = _QUANTITY.fullmatch(value)
     unit = (match[2] or next(iter(units))).strip() if match else ""
     if match is None or unit not in units:
-        raise OptionError(f"{option} {value!r}: expected a number with one of {', '.join(units)}")
-    return float(match[1]) * units[unit]
+        raise OptionError(f"{option} {quoted(value)}: expected a number with one of {', '.join(units)}")
+    return _sized(match[1], option, value) * units[unit]
 
 
 def fraction(value: float | str, option: str, bare: str = "1") -> float:
@@ -120,9 +133,12 @@ def temperature_list(values: Sequence[float] | str, option: str = "--temperature
         It is no such list.
     """
     try:
-        return [float(part) for part in (values.split(",") if isinstance(values, str) else values)]
+        temperatures = [float(part) for part in (values.split(",") if isinstance(values, str) else values)]
+        if not all(map(math.isfinite, temperatures)):
+            raise ValueError
     except (TypeError, ValueError):
         raise OptionError(f"{option} {quoted(values)}: expected numbers such as -40,-30,0") from None
+    return [_sized(repr(value), option, repr(value)) for value in temperatures]
 
 
 def whole(value: int | str, option: str) -> int:
@@ -151,7 +167,7 @@ def size(text: str, option: str) -> int:
     match = _QUANTITY.fullmatch(text)
     factor = _BYTES.get((match[2] or "B").strip()) if match else None
     if match is None or factor is None or not 1 <= float(match[1]) * factor < 2**63:
-        raise OptionError(f"{option} {text!r}: expected a size such as 500MB, 20GB or 8GiB")
+        raise OptionError(f"{option} {quoted(text)}: expected a size such as 500MB, 20GB or 8GiB")
     return int(float(match[1]) * factor)
 
 
@@ -164,9 +180,12 @@ def whole_number(text: str, option: str) -> int:
         It is none.
     """
     try:
-        return int(text)
+        value = int(text)
     except ValueError:
-        raise OptionError(f"{option} {text!r}: expected a whole number") from None
+        raise OptionError(f"{option} {quoted(text)}: expected a whole number") from None
+    if abs(value) >= _WHOLE:
+        raise OptionError(f"{option} {quoted(text)}: expected a whole number of at most 15 digits")
+    return value
 
 
 class FromStart(float):
@@ -188,7 +207,8 @@ def span(text: str, option: str) -> tuple[float | None, float | None]:
     ends = _BETWEEN.split(text.strip())
     if len(ends) != 2 or not any(end.strip() for end in ends):
         raise OptionError(
-            f"{option} {text!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60, or +10:+60 from the start"
+            f"{option} {quoted(text)}: expected FROM:TO in seconds, such as 10:60, 10: or :60, "
+            "or +10:+60 from the start"
         )
     first, last = (_end(end.strip(), option) for end in ends)
     return first, last
@@ -211,7 +231,7 @@ def interval(text: str, option: str) -> tuple[float, float]:
     """
     ends = [quantity(end, option, "time", "s") for end in _BETWEEN.split(text.strip())]
     if len(ends) != 2 or not ends[0] < ends[1]:
-        raise OptionError(f"{option} {text!r}: expected FROM:TO in seconds, such as 468:496")
+        raise OptionError(f"{option} {quoted(text)}: expected FROM:TO in seconds, such as 468:496")
     return ends[0], ends[1]
 
 
@@ -242,8 +262,8 @@ def number(text: str, option: str) -> float:
     except ValueError:
         value = float("nan")
     if not math.isfinite(value):
-        raise OptionError(f"{option} {text!r}: expected a number")
-    return value
+        raise OptionError(f"{option} {quoted(text)}: expected a number")
+    return _sized(text, option, text)
 
 
 def parse_units(text: str, called: str) -> dict[str, str]:
@@ -258,7 +278,9 @@ def parse_units(text: str, called: str) -> dict[str, str]:
     for part in text.split(","):
         name, sign, unit = part.partition("=")
         if not sign or not name.strip() or not unit.strip() or name.strip() in units:
-            raise OptionError(f"{called} {text!r}: expected NAME=UNIT, each name once, such as accel=g,gyro=deg/s")
+            raise OptionError(
+                f"{called} {quoted(text)}: expected NAME=UNIT, each name once, such as accel=g,gyro=deg/s"
+            )
         try:
             units[name.strip()] = parse_unit(unit).symbol
         except UnitError as error:

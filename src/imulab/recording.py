@@ -24,7 +24,7 @@ from imulab.display import has_hidden, printable
 from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.options import PROGRAM, READING, choice, file, parsed, text
-from imulab.quantities import parse_units, span, whole_number
+from imulab.quantities import LARGEST, parse_units, span, whole_number
 from imulab.units import parse_unit, to_si
 from imulab.views import AnyPlot, AnyPlots, views
 
@@ -440,23 +440,24 @@ def check_not_resampled(recording: Recording, names: Iterable[str]) -> None:
 
 
 def check_finite(recording: Recording, names: list[str]) -> None:
-    """Check that the named columns hold finite numbers only.
+    """Check that the named columns hold finite numbers only, and none beyond any quantity of a sensor.
 
     Raises
     ------
     DataError
-        NaN or infinity; the message names column and row of the first, and their count.
+        NaN, infinity or a size beyond 1e100; the message names column and row of the first, and their count.
     """
     for name in names:
         values = recording.column(name)
-        finite = np.isfinite(values)
+        finite = np.abs(values) <= LARGEST  # neither NaN nor infinite, nor of a size whose square is
         if not finite.all():
             index = int(np.argmin(finite))
             count = int(np.size(finite) - np.count_nonzero(finite))
             more = f" (and {count - 1} more)" if count > 1 else ""
+            expected = "a finite number" if not np.isfinite(values[index]) else f"a number of at most {LARGEST:g}"
             raise DataError(
                 f"{recording.name}: {recording.place(index)}, column {name}: "
-                f"expected a finite number, found {values[index]}{more}"
+                f"expected {expected}, found {values[index]}{more}"
             )
 
 

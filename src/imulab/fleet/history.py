@@ -12,7 +12,7 @@ from typing import Any
 
 from imulab.errors import OptionError
 from imulab.fleet.engine import Summary
-from imulab.fleet.manifest import masked
+from imulab.fleet.manifest import masked, without_secrets
 from imulab.records.calibration import Parameter
 
 _SERIALS_AT_ONCE = 500  # serials in one query: SQLite takes at least 999 variables
@@ -40,11 +40,11 @@ def sources_of(summary: Summary) -> str:
 class History:
     """An open history."""
 
-    def __init__(self, engine: Any, name: str) -> None:
+    def __init__(self, engine: Any, name: str, url: str) -> None:
         import sqlalchemy as sa
 
         self._engine = engine
-        self._name = name
+        self._name, self._url = name, url
         tables = sa.MetaData()
         self._calibrations = sa.Table(
             "imulab_calibrations",
@@ -84,7 +84,7 @@ class History:
         dialect = import_module(f"sqlalchemy.dialects.{self._engine.dialect.name}")
         insert = dialect.insert(self._calibrations).on_conflict_do_nothing().returning(self._calibrations.c.id)
         rows: list[dict[str, Any]] = []
-        with _in_one_line(self._name), self._engine.begin() as connection:
+        with _in_one_line(self._name, self._url), self._engine.begin() as connection:
             for summary in summaries:
                 calibration = connection.execute(
                     insert,
@@ -121,7 +121,7 @@ class History:
         c, p = self._calibrations.c, self._parameters.c
         calibrations: dict[int, Past] = {}
         values: dict[int, dict[str, Parameter]] = {}
-        with _in_one_line(self._name), self._engine.connect() as connection:
+        with _in_one_line(self._name, self._url), self._engine.connect() as connection:
             for start in range(0, len(serials), _SERIALS_AT_ONCE):
                 query = (
                     sa.select(
@@ -169,7 +169,10 @@ def open_history(url: str, *, there: bool = False) -> Iterator[History]:
         address = sa.make_url(url)
     except (SQLAlchemyError, ValueError):  # a port that is no number
         raise OptionError(f"history {masked(url)!r}: {expected}") from None
-    name = address.render_as_string(hide_password=True)
+    name = masked(url)
+    if address.username is not None:  # which is no secret of a database, as it may be of a file's address
+        login = address.username if address.password is None else f"{address.username}:***"
+        name = name.replace("://***@", f"://{login}@", 1)
     kind = address.get_backend_name()
     if kind not in ("sqlite", "postgresql"):
         raise OptionError(f"history {name}: {expected}")
@@ -177,7 +180,7 @@ def open_history(url: str, *, there: bool = False) -> Iterator[History]:
         raise OptionError(f"history {name}: no such file")
     if address.drivername == "postgresql":
         address = address.set(drivername="postgresql+psycopg")
-    with _in_one_line(name):
+    with _in_one_line(name, url, opening=True):
         try:
             engine = sa.create_engine(address, connect_args={"timeout" if kind == "sqlite" else "connect_timeout": 20})
         except ImportError as error:
@@ -185,20 +188,22 @@ def open_history(url: str, *, there: bool = False) -> Iterator[History]:
                 f"history {name}: its driver is missing ({error}): pip install 'imulab[postgres]'"
             ) from None
     try:
-        with _in_one_line(name):
-            history = History(engine, name)
+        with _in_one_line(name, url, opening=True):
+            history = History(engine, name, url)
         yield history
     finally:
         engine.dispose()
 
 
 @contextmanager
-def _in_one_line(name: str) -> Iterator[None]:
-    """Raise a refusal of the database as an error of one line."""
+def _in_one_line(name: str, url: str, *, opening: bool = False) -> Iterator[None]:
+    """Raise a refusal of the database as an error of one line; drivers refuse options of a URL in their own ways."""
     from sqlalchemy.exc import SQLAlchemyError
 
     try:
         yield
-    except SQLAlchemyError as error:
-        reason = " ".join(str(getattr(error, "orig", None) or error).split())[:300]
+    except (SQLAlchemyError, TypeError, ValueError) as error:
+        if not (opening or isinstance(error, SQLAlchemyError)):
+            raise
+        reason = without_secrets(" ".join(str(getattr(error, "orig", None) or error).split()), url)[:300]
         raise OptionError(f"history {name}: {reason}") from None

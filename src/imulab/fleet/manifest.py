@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 from imulab.errors import ImulabError, OptionError, ReadError, listed, readable, several
 from imulab.procedures.registry import PROCEDURES
@@ -35,8 +35,9 @@ _BLOCK = 1 << 22  # bytes copied at once
 SCHEMES = ("file", "https", "s3", "gs", "az")
 """Allowed protocols: a manifest may come from somebody else, and fsspec knows dozens of others."""
 _LARGEST = 1 << 33  # bytes of a file that is fetched: 8 GiB
-_LOGIN = re.compile(r"(?<=://)[^/@\s]*@")
-_SECRET = re.compile(r"([?&][\w-]*(?:pass|pwd|token|secret|key|sig|auth)[\w-]*=)[^&\s]+", re.IGNORECASE)
+# A password may hold any character, "/" and "@" among them: where there is a colon, to the last "@".
+_LOGIN = re.compile(r"(?<=://)(?:[^/@\s:]*:[^\s]*|[^/\s]*)@")
+_SECRET = re.compile(r"([?&;][\w%-]*(?:pass|pwd|token|secret|key|sig|auth|cred)[\w%-]*=)([^&;\s]+)", re.IGNORECASE)
 
 
 def is_url(name: str) -> bool:
@@ -47,6 +48,17 @@ def is_url(name: str) -> bool:
 def masked(text: str) -> str:
     """Return a text with the credentials of URLs replaced by asterisks."""
     return _SECRET.sub(r"\1***", _LOGIN.sub("***@", text))
+
+
+def without_secrets(text: str, url: str) -> str:
+    """Return a text, such as what a database says, with each part of a URL that is a credential as asterisks."""
+    login = _LOGIN.search(url)
+    parts = re.split("[:@]", login[0].rstrip("@"))[1:] if login else []
+    parts += [login[0].rstrip("@").partition(":")[2]] if login else []
+    parts += [match[2] for match in _SECRET.finditer(url)]
+    for part in sorted({*parts, *map(unquote, parts)}, key=len, reverse=True):
+        text = text.replace(part, "***") if part else text
+    return masked(text)
 
 
 def parent_of(path: str) -> str:

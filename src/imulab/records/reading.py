@@ -14,10 +14,12 @@ import numpy as np
 from imulab._version import VERSION
 from imulab.display import as_judged, first_hidden, may_hide
 from imulab.errors import RecordError
+from imulab.quantities import SMALLEST
 from imulab.records.calibration import BLOB_MAGIC, FORMAT, SCHEMA_VERSION, Calibration, content_sha256, sealed_bytes
 from imulab.records.sections import check_sizes, read
 
 _CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
+_SCALE_FACTOR = re.compile(r"(?:\w+_)?scale_factor_[xyz](?:_at_\d+)?")
 _ROUNDING = 1.0 + 1e-6  # of a covariance in decimals, relative
 _NEEDED = ("procedure", "sensor", "created", "software", "sources", "model", "parameters", "covariance", "fit")
 
@@ -118,6 +120,8 @@ def _validated(content: dict[str, Any], name: str, *, plain: bool) -> Calibratio
 def _check_numbers(record: Calibration) -> None:
     """Refuse uncertainties below zero, and a covariance of unknown parameters."""
     for key, p in record.parameters.items():
+        if _SCALE_FACTOR.fullmatch(key) and not abs(p.value) >= SMALLEST:
+            raise RecordError(f"parameters.{key}: a scale factor of {p.value:g}; expected another than 0")
         for value in (p.standard_uncertainty, p.standard_uncertainty_given_order):
             if value is not None and value < 0:
                 raise RecordError(f"parameters.{key}: a standard uncertainty of {value:g}; expected 0 or more")
@@ -134,6 +138,13 @@ def _check_numbers(record: Calibration) -> None:
         raise RecordError("covariance.matrix: a correlation beyond 1, or a variance below 0")
     if (np.abs(matrix - matrix.T) > (_ROUNDING - 1) * np.outer(spread, spread)).any():
         raise RecordError("covariance.matrix: expected a symmetric matrix")
+    stated = spread > 0
+    correlation = matrix[np.ix_(stated, stated)] / np.outer(spread[stated], spread[stated])
+    if correlation.size and (least := float(np.linalg.eigvalsh(correlation)[0])) < 1 - _ROUNDING:
+        raise RecordError(
+            f"covariance.matrix: a combination of parameters has a variance below 0 (the correlations have an "
+            f"eigenvalue of {least:.3g})"
+        )
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -32,14 +32,12 @@ import msgspec
 from msgspec import NODEFAULT
 from msgspec import field as field
 
-from imulab.errors import RecordError
+from imulab.errors import RecordError, quoted
+from imulab.quantities import LARGEST
 
 if TYPE_CHECKING:
     from imulab.gravity import Gravity
     from imulab.records.calibration import Calibration
-
-LARGEST = 1e100
-"""Largest quantity of a sensor; its square and cube are finite."""
 
 P = TypeVar("P", bound="Part")
 T = TypeVar("T")
@@ -263,7 +261,8 @@ def _reader(kind: Any) -> _Reader:
     if origin is list:
         return _list_reader(arguments[0], None)
     if origin is tuple:
-        items = _list_reader(arguments[0], None)
+        count = None if arguments[-1] is Ellipsis else len(arguments)
+        items = _list_reader(arguments[0], count)
         return lambda value, where, counts: tuple(items(value, where, counts))
     if origin in (dict, Mapping):
         return _mapping_reader(_reader(arguments[1]), lacks_named=origin is dict)
@@ -399,5 +398,4 @@ def _text(where: Place) -> str:
 
 
 def _mistake(where: Place, expected: str, value: Any) -> RecordError:
-    text = repr(value)
-    return RecordError(f"{_text(where)}: expected {expected}, found {text if len(text) <= 60 else text[:57] + '...'}")
+    return RecordError(f"{_text(where)}: expected {expected}, found {quoted(value)}")

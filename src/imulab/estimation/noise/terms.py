@@ -47,6 +47,11 @@ def terms(letters: str) -> NDArray[np.bool_]:
     return present
 
 
+def is_model(letters: str) -> bool:
+    """Return whether a text is the letters of a model: each known, each once, G up to twice."""
+    return all(letter in "NBKQG" and letters.count(letter) <= (2 if letter == "G" else 1) for letter in letters)
+
+
 def letters(present: NDArray[np.bool_]) -> str:
     """Return the letters of a model, white noise first, from which parameters it has, shape (8,).
 

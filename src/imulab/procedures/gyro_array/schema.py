@@ -212,10 +212,13 @@ def array_of(record: Calibration) -> ArrayRecord:
     for number, element in enumerate(array.elements if holds(array, "elements") else ()):
         values = {name: getattr(element, name) for name in element.__struct_fields__ if holds(element, name)}
         for name, value in values.items():
-            if isinstance(value, PerGyro) and holds(value, "value") and isinstance(value.value, list) is not many:
-                raise RecordError(
-                    f"elements[{number}].{name}.value: expected {'a list over the axes' if many else 'a number'}"
-                )
+            stated = ("value", "standard_uncertainty") if isinstance(value, PerGyro) else ()
+            for part_of in (key for key in stated if holds(value, key)):
+                if isinstance(getattr(value, part_of), list) is not many:
+                    raise RecordError(
+                        f"elements[{number}].{name}.{part_of}: expected "
+                        f"{'a list over the axes' if many else 'a number'}"
+                    )
     known = holds(array, "correlation") and holds(array.correlation, "covariance")
     for axis, matrix in enumerate(array.correlation.covariance if known else ()):
         if not all(row[i] > 0 for i, row in enumerate(matrix)):

@@ -10,8 +10,8 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from imulab.errors import OptionError, RecordError, UnitError
-from imulab.estimation.noise.terms import NAMES, SIGMA, TIME
+from imulab.errors import OptionError, RecordError, UnitError, quoted
+from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, is_model
 from imulab.quantities import in_si, split_quantity
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -171,8 +171,22 @@ class ColumnFigures:
 
 def check(record: Calibration) -> None:
     """Check the sections of a record as it is read from its file; raises RecordError."""
-    for name in part(record, Noise).fit.columns:
+    noise = part(record, Noise)
+    models = {f"model.terms.{name}": letters for name, letters in noise.model.terms.items()}
+    for name, column in noise.fit.columns.items():
         drawn_of(record, name)
+        where = f"fit.columns.{name}"
+        models |= {f"{where}.candidates[{k}].model": each.model for k, each in enumerate(column.candidates)}
+        if column.chosen not in (each.model for each in column.candidates):
+            raise RecordError(f"{where}.chosen: expected the model of a candidate, found {quoted(column.chosen)}")
+    for place, letters in models.items():
+        if not is_model(letters):
+            raise RecordError(f"{place}: expected letters of NBKQG, each once, G up to twice, found {quoted(letters)}")
+    for name in record.parameters:
+        if split(name)[0] not in noise.fit.columns or not split(name)[1]:
+            raise RecordError(
+                f"parameters.{name}: expected a column of fit.columns and one of the terms {' '.join(_LONGEST_FIRST)}"
+            )
 
 
 def fit_of(record: Calibration) -> NoiseSummary:

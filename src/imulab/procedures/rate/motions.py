@@ -217,6 +217,8 @@ def even_stamps(time: Array, name: str) -> tuple[Array, list[str]]:
     A quarter of the steps or more are shorter than a quarter of the mean, as no sensor samples, and the stamps keep to
     a straight line within 0.1 s and ten samples.
     """
+    if len(time) < 2:
+        raise DataError(f"{name}: {len(time)} row of readings; expected turns between rests, of thousands")
     step = np.diff(time)
     mean = float(step.mean())
     if float((step < _QUICK * mean).mean()) < _SHARE_IN_BURSTS:

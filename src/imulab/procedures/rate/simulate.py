@@ -27,6 +27,7 @@ from imulab.writers import write_csv
 
 _ACCELERATION = np.radians(200.0)  # rad/s^2, of the table
 _LOWEST, _HIGHEST, _SHORTEST = 0.05, 2.0, 20.0  # Hz and s, of a sweep
+_MOST_SAMPLES, _MOST_RUNS = 1e7, 1000  # of a run, and of all
 _FINER = 8  # points between samples at which the lag is integrated
 _SCALE, _TILT, _ZERO = 5e-3, 3e-3, np.radians(0.3)
 
@@ -143,8 +144,7 @@ def simulate_rate(
     if sizes.size < 2 or not duration >= 1 or not 0 < period <= 0.1:
         raise OptionError("rates, hold, rate: expected two rates or more, a hold of 1 s or more, and 10 Hz or more")
     swept, constant = None if sweep is None else in_si(sweep, "sweep", "time", "s"), in_si(lag, "lag", "time", "s")
-    if swept is not None and not (swept >= _SHORTEST and period <= 0.1 / _HIGHEST):
-        raise OptionError(f"sweep, rate: expected {_SHORTEST:g} s or longer, and {_HIGHEST / 0.1:g} Hz or more")
+    _check_length(duration * (4 * sizes.size - 3), swept, period, whole(cycles, "cycles") * len(words))
     if not 0 <= constant <= 1:
         raise OptionError(f"lag {lag}: expected a time constant of 0 to 1 s")
     rng = np.random.default_rng(whole(seed, "seed"))
@@ -174,6 +174,17 @@ def simulate_rate(
             runs.append(Run(name, word, tuple(way.tolist()) if swept is None else None, sweep=swept is not None))
     test = RateTest(tuple(runs), common, 0.0, 0.0, place, name="test.toml")
     return RateRecordings(test, tuple(recordings), _name_truth(scale, zero, turn, k3, swept and constant))
+
+
+def _check_length(steps: float, swept: float | None, period: float, runs: int) -> None:
+    """Refuse a sweep, s, that is too short, runs that are too long to be kept in memory, and too many of them."""
+    if swept is not None and not (swept >= _SHORTEST and period <= 0.1 / _HIGHEST):
+        raise OptionError(f"sweep, rate: expected {_SHORTEST:g} s or longer, and {_HIGHEST / 0.1:g} Hz or more")
+    samples, option = (steps, "hold") if swept is None else (swept, "sweep")
+    if samples / period > _MOST_SAMPLES:
+        raise OptionError(f"{option}: {samples / period:.3g} samples in a run; expected at most {_MOST_SAMPLES:.0e}")
+    if runs > _MOST_RUNS:
+        raise OptionError(f"cycles: {runs} runs in all; expected at most {_MOST_RUNS}")
 
 
 def _step_through(way: Array, hold: float, period: float) -> tuple[Array, Array, Array]:
