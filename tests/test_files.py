@@ -1,6 +1,7 @@
 """What a file system, a shell and a number can be: closed streams, links in a circle, odd names, absurd values."""
 
 import os
+import stat
 import subprocess
 import sys
 from time import perf_counter
@@ -9,9 +10,10 @@ import numpy as np
 import pytest
 
 from imulab.cli import main
-from imulab.errors import ReadError
-from imulab.files import load_toml
+from imulab.errors import OptionError, ReadError
+from imulab.files import load_toml, write_text
 from imulab.fleet.manifest import local_file
+from imulab.fleet.store import Store
 from imulab.readers import load_layout, read
 
 
@@ -287,3 +289,35 @@ def test_messages_of_the_command_line_call_options_as_they_are_typed(tmp_path, m
         assert capsys.readouterr().err.startswith(f"imulab: {said}")
     assert main(["tumble", "check", "r.json", "a.csv", "--threshold", "5"]) == 2
     assert "did you mean" not in capsys.readouterr().err
+
+
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path):
+    closed, new = tmp_path / "closed.csv", tmp_path / "new.csv"
+    closed.write_text("x")
+    closed.chmod(0o600)
+    for path in (closed, new):
+        write_text(path, "y")
+    assert stat.S_IMODE(closed.stat().st_mode) == 0o600
+    assert stat.S_IMODE(new.stat().st_mode) != 0o600
+
+
+def test_a_message_obeys_no_terminal_and_has_no_endless_numbers():
+    assert str(ReadError("a\x1b[31m\u202e" + "9" * 300)) == "a\\x1b[31m\\u202e999999999999...(300 digits)"
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no limit of a file's size on this system")
+def test_a_full_disk_is_told_with_the_file_of_the_fleet(tmp_path):
+    """The lock is the first that is written; a limit of the size of files stands for a disk without room."""
+    import resource
+    import signal
+
+    limited = Store(tmp_path / "out")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        with pytest.raises(OptionError, match=r"out/\.fleet/lock: cannot be written: File too large"), limited.run():
+            pass
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)

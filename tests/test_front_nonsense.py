@@ -8,6 +8,7 @@ import copy
 import json
 import os
 import random
+import shutil
 from pathlib import Path
 
 import pytest
@@ -60,9 +61,8 @@ def inputs(made_once):
 
 @pytest.fixture
 def there(inputs, tmp_path, monkeypatch):
-    """A folder of links to the inputs, in which outputs do not meet those of other tests."""
-    for path in inputs.iterdir():
-        (tmp_path / path.name).symlink_to(path)
+    """A folder of copies of the inputs, which some nonsense names as output."""
+    shutil.copytree(inputs, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -216,3 +216,11 @@ def test_a_full_disk_is_one_sentence_and_keeps_whole_lines(tmp_path):
     assert (tmp_path / "rec.csv").stat().st_size <= limit
     assert (tmp_path / "rec.csv").read_bytes()[-1:] == b"\n"
     same_as_sent(tmp_path, recording, unit)
+
+
+def test_a_session_without_a_usable_row_says_so(imulab_process, tmp_path):
+    titles = "time [s],accel_x [g],accel_y [g],accel_z [g]\n"
+    done = imulab_process("live", "-", "--plain", "--save", "l.csv", "-o", "l.json", stdin=titles)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == "imulab: l.csv: not written, as no row of readings came that could be used"
+    assert not list(tmp_path.glob("l.*"))

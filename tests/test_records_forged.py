@@ -298,10 +298,16 @@ def test_a_blob_with_hidden_characters_is_refused(tmp_path):
 
 
 def test_the_terminal_sees_no_escape_sequences_of_a_file(tmp_path, capsys):
-    (tmp_path / "evil.csv").write_text("# serial: \x1b]0;owned\x07SN\u202e1\ntime [s],accel_x [g]\n0,1\n1,1\n")
+    (tmp_path / "evil.csv").write_text(
+        "# serial: \x1b]0;owned\x07SN1\n# place: a\u202eb\ntime [s],accel_x [g]\n0,1\n1,1\n"
+    )
     assert main(["show", str(tmp_path / "evil.csv")]) == 0
     shown = capsys.readouterr()
-    assert "serial: \\x1b]0;owned\\x07SN\\u202e1" in shown.out
+    assert "serial: \\x1b]0;owned\\x07SN1" in shown.out
+    assert "place: a\\u202eb" in shown.out
+    (tmp_path / "other.csv").write_text("# serial: SN\u202e1\ntime [s],accel_x [g]\n0,1\n1,1\n")
+    assert main(["show", str(tmp_path / "other.csv")]) == 2
+    assert "serial 'SN\\\\u202e1' holds a character that reverses text" in capsys.readouterr().err
     (tmp_path / "title.csv").write_text("time [s],acc\x1b[31mel [g]\n0,1\n")
     assert main(["show", str(tmp_path / "title.csv")]) == 2
     assert "\x1b" not in capsys.readouterr().err

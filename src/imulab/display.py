@@ -22,6 +22,7 @@ from typing import Any, Literal, Self
 
 # Lone surrogates stand in file names that are not UTF-8; they and noncharacters are in no text that is exchanged.
 _NEVER_SHOWN = "\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufdd0-\ufdef\ufeff\ufffe\uffff"
+_REVERSES = re.compile("[\u202a-\u202e\u2066-\u2069]")
 _HIDDEN = re.compile(f"[\x00-\x1f{_NEVER_SHOWN}]")
 _HIDDEN_IN_LINES = re.compile(f"[\x00-\x09\x0b-\x1f{_NEVER_SHOWN}]")
 
@@ -31,6 +32,11 @@ _PLAIN = bytes([*b"\t\n\r", *range(0x20, 0x7F)])
 def has_hidden(text: str) -> bool:
     """Return whether a text has a control or bidirectional character."""
     return _HIDDEN.search(text) is not None
+
+
+def reverses(text: str) -> bool:
+    """Return whether a text has a bidirectional embedding, override or isolate."""
+    return _REVERSES.search(text) is not None
 
 
 def may_hide(data: bytes) -> bool:

@@ -69,7 +69,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-        part.chmod(0o666 & ~_umask())
+        part.chmod(_mode(target))
         part.replace(target)
     except OSError as error:
         part.unlink(missing_ok=True)
@@ -77,6 +77,14 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def _mode(target: Path) -> int:
+    """Return the permissions of the file that is replaced, which may be closed to others, or those of a new one."""
+    try:
+        return stat.S_IMODE(target.stat().st_mode) & 0o777
+    except FileNotFoundError:
+        return 0o666 & ~_umask()
 
 
 def check_no_paper(path: str | Path) -> None:

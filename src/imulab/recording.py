@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imulab.arguments import checked, described
 from imulab.columns import check_unit, clocks_of, element_number, expected_quantities, kind_of, triad
-from imulab.display import has_hidden, printable
+from imulab.display import has_hidden, printable, reverses
 from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.options import PROGRAM, READING, choice, file, parsed, text
@@ -116,6 +116,11 @@ class Recording:
             if has_hidden(name):
                 raise DataError(f"{self.name}: column name {printable(name)!r} holds a control character")
             check_unit(name, self.units.get(name, ""), self.name)
+        if reverses(serial := self.metadata.get("serial", "")):
+            raise DataError(
+                f"{self.name}: serial {printable(serial)!r} holds a character that reverses text: it would read as "
+                "another unit's"
+            )
         if any(has_hidden(text) for pair in self.metadata.items() for text in pair):
             clean = {printable(key): printable(value) for key, value in self.metadata.items()}
             object.__setattr__(self, "metadata", clean)

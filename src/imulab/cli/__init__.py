@@ -67,6 +67,10 @@ def _main(arguments: Sequence[str] | None) -> int:
         return 0 if not error.code else _stop_writing(BrokenPipeError())
     except OSError as error:
         return _stop_writing(error)
+    except MemoryError as error:
+        return _refuse(
+            f"not enough memory ({error or 'for this much data at once'}): expected less data or smaller options"
+        )
     except Exception as error:
         if os.environ.get("IMULAB_DEBUG"):
             raise

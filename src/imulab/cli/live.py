@@ -238,6 +238,8 @@ def _make_record(save: str, fitted: dict[str, str | None], output: str | None, r
     """Fit the recording with all triads that it has, write and show the record, and say how to make it."""
     from imulab.cli.show import finish
 
+    if not Path(save).exists():
+        raise OptionError(f"{save}: not written, as no row of readings came that could be used")
     record, further, why = _all_triads(save, fitted)
     finish(record, output, report, json=False)
     _say_how(save, further, why)

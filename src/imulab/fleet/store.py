@@ -69,16 +69,17 @@ class Store:
         try:
             for name in ("failed", "active"):
                 (self.hidden / name).mkdir(parents=True, exist_ok=True)
-            stream = (self.hidden / "lock").open("a+", encoding="utf-8")
+            stream = (self.hidden / "lock").open("a+b", buffering=0)  # nothing is left to be written when it is closed
         except OSError as error:
             raise OptionError(f"{self.folder}: cannot be written: {error.strerror}") from None
         with stream:
             if not any(_lock_attempts(stream.fileno())):
                 raise OptionError(f"{self.folder}: another run is at work on it ({self._holder()})")
-            stream.seek(0)
-            stream.truncate()
-            stream.write(f"process {os.getpid()} on {socket.gethostname()}")
-            stream.flush()
+            try:
+                stream.truncate(0)
+                stream.write(f"process {os.getpid()} on {socket.gethostname()}".encode())
+            except OSError as error:
+                raise OptionError(f"{self.hidden / 'lock'}: cannot be written: {error.strerror}") from None
             token = uuid.uuid4().hex
             write_text(self.hidden / "run", token)
             self._wait_for_orphans()
