@@ -255,3 +255,21 @@ def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, capsys):
     assert "no room in " in found.err
     assert "TMPDIR" in found.err
     assert len(found.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("lost", "words"), [(0.1, "random walk comes out 5"), (0.3, "random walk comes out 20 % too large")]
+)
+def test_many_lost_samples_are_said_with_what_they_do_to_the_walk(lost, words):
+    rng = np.random.default_rng(7)
+    kept = np.sort(rng.choice(60_000, round(60_000 * (1 - lost)), replace=False))
+    samples = rng.normal(0, 0.1, (60_000, 3))[kept]
+    recording = il.Recording.from_arrays(gyro=samples, time=kept * 0.02, unit="deg/s", name="lossy.csv")
+    record = il.fit_noise(recording, terms="N").calibration
+    assert record.verdict.state == "look"
+    assert any(
+        "% of the samples are lost in short gaps, which were closed up" in r and words in r
+        for r in record.verdict.reasons
+    ), record.verdict
+    assert "record again without lost samples" in record.verdict.next
+    assert np.degrees(record.value("gyro_x_white")) == pytest.approx(0.1 * np.sqrt(0.02), rel=0.02)

@@ -268,13 +268,23 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
         raise DataError(f"{recording.name}: column {name}: {why} Expected a unit at rest; choose its rest by --window")
     time = check_time(recording)
     usual = 1 / rate
-    parts, filled, left_out = _parts(time, lossy=is_lossy(recording))
+    parts, filled, left_out, closed = _parts(time, lossy=is_lossy(recording))
     if not parts:
         raise _too_few(recording, left_out)
     # Lines about gaps come from notes_of_gaps: they say what follows for the noise, not for an Allan curve.
     notes += [line for line in timing if " in time, the longest " not in line]
     notes += [*notes_of_steps(recording, names), *doubtful_units(recording, names, rate)]
     notes += notes_of_gaps(recording.name, usual, list(map(_length, parts)), filled, left_out, len(time))
+    if closed:
+        # In less time than the samples took, a random walk went as far.
+        high = 100 * (1 / math.sqrt(1 - closed) - 1)
+        notes.append(
+            Finding(
+                f"{recording.name}: {100 * closed:.2g} % of the samples are lost in short gaps, which were closed up: "
+                f"random walk comes out {high:.2g} % too large, time constants {100 * closed:.2g} % too short",
+                "record again without lost samples",
+            )
+        )
     return Rest(recording, usual, tuple(parts), filled, tuple(notes))
 
 
@@ -301,8 +311,9 @@ def notes_of_gaps(
     """Return notes on what was bridged and left out of a log, and on short stretches; lengths in samples."""
     notes: list[str] = []
     if filled:
-        kind: type[str] = Note if filled < 0.01 * rows else str
-        notes.append(kind(f"{name}: {filled} samples missing in short gaps are bridged by straight lines"))
+        kind = Note if filled < 0.01 * rows else Finding
+        text = f"{name}: {filled} samples missing in short gaps are bridged by straight lines"
+        notes.append(kind(text, "record again without lost samples"))
     duration = sum(lengths) * interval
     if len(lengths) > 1 or left_out:
         words = f"{len(lengths)} stretches of {duration:.4g} s in all" if len(lengths) > 1 else "one stretch"
@@ -329,11 +340,18 @@ def _length(part: tuple[int, int, Array | None]) -> int:
     return stop - start if place is None else int(place[-1]) + 1
 
 
-def _parts(time: Array, *, lossy: bool) -> tuple[list[tuple[int, int, Array | None]], int, int]:
-    """Return stretches between gaps, the number of samples bridged within them, and of samples outside them."""
+def _parts(time: Array, *, lossy: bool) -> tuple[list[tuple[int, int, Array | None]], int, int, float]:
+    """Return stretches between gaps, how many samples are bridged within them, how many lie outside them, and a share.
+
+    The share is that of the samples lost in short gaps where these are so many that lines across them would change the
+    noise: then the samples on both sides are taken as neighbours.
+    """
     clock = read_clock(time, lossy=lossy)
     wide, steps = clock.gaps, clock.missing + 1
-    if int(clock.missing[steps <= WIDEST_GAP].sum()) > _MOST_BRIDGED * len(time):  # lines would change the noise
+    lost = int(clock.missing[steps <= WIDEST_GAP].sum())
+    closed = 0.0
+    if lost > _MOST_BRIDGED * len(time):
+        closed = lost / (lost + len(time))
         wide, steps = wide[steps > WIDEST_GAP], steps[steps > WIDEST_GAP]
     edges = [0, *(wide[steps > WIDEST_GAP] + 1).tolist(), len(time)]
     parts: list[tuple[int, int, Array | None]] = []
@@ -351,7 +369,7 @@ def _parts(time: Array, *, lossy: bool) -> tuple[list[tuple[int, int, Array | No
     order = np.argsort(-lengths, kind="stable")[:MOST]
     kept = [parts[k] for k in sorted(order.tolist()) if lengths[k] >= least]
     filled = sum(_length(part) - (part[1] - part[0]) for part in kept)
-    return kept, filled, int(len(time) - sum(stop - start for start, stop, _ in kept))
+    return kept, filled, int(len(time) - sum(stop - start for start, stop, _ in kept)), closed
 
 
 def is_clipped(piled: int, next_to: int) -> bool:
@@ -407,8 +425,8 @@ class LongRest(Rest):
         return self.temperature if name == "temperature" else None
 
     def hidden(self, name: str) -> list[Array]:
-        """Return what the rounding of a covariate hides of it, stretch by stretch: see `hidden_by_rounding`."""
-        return [hidden_by_rounding(each, self.interval) for each in self.samples(name)]
+        """Return nothing for each stretch: a log with coarse readings is read as a whole."""
+        return [np.empty((0, 0))] * len(self.parts)
 
     def rounding(self, name: str) -> float:
         """Return 0: a log with coarse readings is read as a whole."""
