@@ -1,4 +1,7 @@
-"""Layouts for files of other programs. Alone here, because each group of commands has a module of its own."""
+"""Write a layout for a file of another program.
+
+A file of its own, as each group of commands has.
+"""
 
 from __future__ import annotations
 
