@@ -8,7 +8,9 @@ import pytest
 
 import imulab as il
 from imulab.cli.app import commands
-from imulab.errors import OptionError
+from imulab.display import Finding, one_thing
+from imulab.errors import ObservabilityError, OptionError
+from imulab.live.formats import LineStream, UnknownFormatError
 from imulab.procedures.noise.wants import PROGRAMS
 
 FITS = ("tumble fit", "tumble gyro", "tumble mag", "array calibrate", "warmup fit", "noise fit", "thermal fit")
@@ -139,3 +141,59 @@ def test_single_rows_without_numbers_are_bridged_in_a_tumble_test():
     columns["accel_y"][700:706] = np.nan
     with pytest.raises(il.ImulabError, match=r"row 701.*, column accel_y: expected a finite number, found nan"):
         il.fit_tumble(recording.with_columns(columns, {}), order=1, gravity=9.81)
+
+
+def level(rng, samples):
+    """Specific force, m/s^2, and field, uT, of a unit on a table that is turned about the vertical between holds."""
+    headings = np.repeat(np.arange(16) * 2 * np.pi / 16, samples)
+    field = 20 * np.column_stack([np.cos(headings), -np.sin(headings), np.full(len(headings), -2.0)])
+    noise = rng.normal(0, 0.01, (2, len(headings), 3))
+    return np.array([0.0, 0.0, 9.81]) + noise[0], field + noise[1]
+
+
+def test_a_unit_that_was_never_tilted_is_told_so_as_a_table_and_as_a_recording():
+    rng = np.random.default_rng(11)
+    accel, mag = level(rng, 200)
+    units = {"accel": "m/s^2", "mag": "uT"}
+    recording = il.Recording.from_arrays(accel=accel, mag=mag, rate=50.0, units=units)
+    table = il.Recording.from_arrays(accel=accel[::200], mag=mag[::200], units=units)
+    for data in (recording, table):
+        with pytest.raises(
+            ObservabilityError, match="order 1: the unit was never tilted, the same axis is up within 1 deg"
+        ):
+            il.fit_tumble(data, order=1, gravity=9.81)
+        with pytest.raises(il.ImulabError, match="never tilted"):
+            il.fit_mag(data, gravity=9.81)
+    with pytest.raises(ObservabilityError) as caught:
+        il.fit_tumble(recording, order=1, gravity=9.81)
+    assert re.search(
+        r"(1 attitude \(found .*\) determines|\d attitudes \(found .*\) determine) 0 of", str(caught.value)
+    )
+    assert str(caught.value).endswith("would help most")
+
+
+def test_one_is_no_plural():
+    assert one_thing("f.csv: 1 attitudes, 21 attitudes, 1 spikes") == "f.csv: 1 attitude, 21 attitudes, 1 spike"
+    assert str(OptionError("1 samples")) == "1 sample"
+    assert str(Finding("1 rows are bridged; 0.1 rows")) == "1 row are bridged; 0.1 rows"
+
+
+def streamed(pattern):
+    stream, blocks = LineStream("live"), []
+    for k in range(300):
+        blocks += stream.feed(f"{pattern.format(k % 5)}\r\n".encode(), 0.01 * k)
+    return stream, blocks + stream.finish()
+
+
+def test_raw_lines_with_decimals_are_those_of_motioncal_where_their_size_is():
+    whole, blocks = streamed("Raw:12,-33,819{},1,-4,1,201,-30,410")
+    assert (whole.format, len(blocks[-1])) == ("MotionCal Raw:", 1)
+    decimal, blocks = streamed("Raw:12.25,-33.1,819{}.5,1.2,-0.4,0.1,201.5,-30.2,410.9")
+    assert decimal.format == "MotionCal Raw:"
+    assert decimal.counts.damaged == 0
+    assert blocks[-1].columns["accel_x"][0] == 12.25 / 8192
+    with pytest.raises(UnknownFormatError) as caught:
+        streamed("Raw:0.12,-0.33,9.8{},0.01,-0.02,0.03,20.15,-3.02,41.09")
+    assert caught.value.guess is not None
+    assert 'prefix = "Raw:"\n' in caught.value.guess.toml
+    assert 'accel_z = { from = 2, unit = "m/s^2" }' in caught.value.guess.toml

@@ -148,6 +148,16 @@ _IMPERATIVE = re.compile(
 )
 
 
+_ONE = re.compile(
+    r"(?<![\w.,:/-])1 (attitude|spike|sample|row|turn|hold|soak|log|cycle|column|line|field|run|gyro|dwell|stop)s\b"
+)
+
+
+def one_thing(text: str) -> str:
+    """Return a text with ``1 attitude`` in place of ``1 attitudes``."""
+    return _ONE.sub(r"1 \1", text) if "1 " in text else text
+
+
 class Finding(str):
     """What a user should know of a result; `action` is what to do about it, where the text does not end with that."""
 
@@ -156,7 +166,7 @@ class Finding(str):
 
     def __new__(cls, text: str, action: str = "") -> Self:
         """Return a text as a finding."""
-        finding = super().__new__(cls, text)
+        finding = super().__new__(cls, one_thing(text))
         finding.action = action
         return finding
 

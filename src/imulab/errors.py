@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-from imulab.display import printable
+from imulab.display import one_thing, printable
 
 _DIGITS = re.compile(r"\d{60,}")
 
@@ -80,7 +80,7 @@ class ImulabError(Exception):
 
     def __init__(self, message: str = "") -> None:
         # Texts out of files may hold ends of lines and what a terminal obeys, and numbers thousands of digits.
-        text = printable(" ".join(message.splitlines()))
+        text = one_thing(printable(" ".join(message.splitlines())))
         super().__init__(_DIGITS.sub(lambda match: f"{match[0][:12]}...({len(match[0])} digits)", text))
 
 

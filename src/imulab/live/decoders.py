@@ -137,7 +137,7 @@ class Native(LineDecoder):
 
 
 class MotionCal(LineDecoder):
-    """``Raw:`` and nine whole numbers, as MotionCal and Adafruit's sketches write them."""
+    """``Raw:`` and nine numbers in steps of its own, as MotionCal and Adafruit's sketches write them."""
 
     name = "MotionCal Raw:"
     units = units_of("accel", "g") | units_of("gyro", "deg/s") | units_of("mag", "uT")
@@ -148,7 +148,7 @@ class MotionCal(LineDecoder):
             if line[:4] in (b"Uni:", b"Cal1", b"Cal2"):
                 return None
             raise ValueError
-        numbers = [int(field) for field in line[4:].split(b",")]
+        numbers = [float(field) for field in line[4:].split(b",")]
         if len(numbers) != 9 or max(map(abs, numbers)) > 1 << 15:
             raise ValueError
         return [number / scale for number, scale in zip(numbers, self._SCALES, strict=True)]

@@ -6,6 +6,7 @@ The format is recognised from the first two seconds; for an unknown stream of nu
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any, Protocol
@@ -35,6 +36,7 @@ from imulab.units import STANDARD_GRAVITY
 # Offered layout for an unknown stream of numbers; it is never used without the user's consent.
 
 
+_FEWEST_STEPS = 1000.0  # of 1/8192 g that gravity has at least
 _FEWEST = 5  # lines that show the columns
 _UNITS = (("m/s^2", STANDARD_GRAVITY), ("g", 1.0), ("mg", 1000.0))
 _NEAR = 0.25  # relative: a mean this near to g in some unit is a specific force
@@ -68,7 +70,10 @@ def guess_stream(lines: list[str], seconds: float) -> LayoutGuess | None:
     if not any(delimiter in line for line in lines):
         split, shown = str.split, '"whitespace"'
     rows = [split(line) for line in lines]
-    prefix = _prefix(rows)
+    glued = _glued(lines)
+    if glued:
+        rows = [[glued, *split(line.removeprefix(glued))] for line in lines if line.startswith(glued)]
+    prefix = glued or _prefix(rows)
     rows = [row[1:] for row in rows if row[0] == prefix] if prefix else rows
     numbers = [row for row in rows if all(map(is_number, row))]
     width = max(map(len, numbers), default=0)
@@ -77,6 +82,12 @@ def guess_stream(lines: list[str], seconds: float) -> LayoutGuess | None:
         return None
     head = [f"delimiter = {shown}", *([f"prefix = {json.dumps(prefix)}"] if prefix else [])]
     return _guess(head, list(range(width)), table, seconds)
+
+
+def _glued(lines: list[str]) -> str:
+    """Return what most lines begin with up to a colon, ``Raw:`` before numbers; nothing without it."""
+    begins = [match[0] for line in lines if (match := re.match(r"[A-Za-z/]+:(?=[-+\d.])", line))]
+    return max(set(begins), key=begins.count) if len(begins) > len(lines) / 2 else ""
 
 
 def _by_titles(table: Callable[[], Any], seconds: float) -> LayoutGuess | None:
@@ -343,7 +354,9 @@ class LineStream:
             return Native(titles, self.counts)
         kinds = {line[:1].encode() for line in lines if line[1:2] == ","}
         if _share(lines, lambda line: line.startswith("Raw:") and line.count(",") == 8) > 0.5:
-            return MotionCal(self.counts)
+            if _in_steps(lines):
+                return MotionCal(self.counts)
+            raise self._unknown(head, [line for line in lines if line])
         if b"I" in kinds and _share(lines, lambda line: line[:2] in ("I,", "M,", "T,")) > 0.5:
             return XImu3(kinds, self.counts)
         if self._layout is not None:
@@ -375,6 +388,16 @@ class LineStream:
             shown,
             guess,
         )
+
+
+def _in_steps(lines: list[str]) -> bool:
+    """Return whether accelerations behind ``Raw:`` are in steps of 1/8192 g: not those of readings in g or m/s^2."""
+    lengths = []
+    for line in lines:
+        fields = line[4:].split(",")
+        if line.startswith("Raw:") and len(fields) == 9 and all(map(is_number, fields)):
+            lengths.append(float(np.linalg.norm([float(field) for field in fields[:3]])))
+    return not lengths or float(np.median(lengths)) > _FEWEST_STEPS or not any("." in line for line in lines)
 
 
 def _share(lines: list[str], fits: Callable[[str], bool]) -> float:

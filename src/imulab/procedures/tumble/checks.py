@@ -16,6 +16,7 @@ from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import from_si, parse_unit, to_si
 
+_TILTED = 20.0  # deg: smaller changes of the upward direction are no tilts
 _MANY_ROWS = 200  # rows of a table of means from which samples may have been taken for attitudes
 _ENOUGH_TO_TELL = 5  # attitudes in which an axis that works has turned
 _DEAD_SPAN = 0.02  # of the largest span of the three axes: an axis that spans less is dead
@@ -80,9 +81,19 @@ def _check_turned(attitudes: Attitudes) -> None:
         )
 
 
+def untilted(means: Array) -> str:
+    """Return that a unit was never tilted, where its mean outputs have one direction; else nothing."""
+    directions = means / np.linalg.norm(means, axis=1, keepdims=True)
+    middle = directions.mean(axis=0)
+    spread = np.degrees(np.arccos(np.clip(directions @ middle / np.linalg.norm(middle), -1, 1)).max())
+    if not spread < _TILTED:
+        return ""
+    return f": the unit was never tilted, the same axis is up within {max(spread, 1.0):.0f} deg in all of them"
+
+
 def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
     unit = parse_unit(attitudes.unit)
-    if unit.quantity != "acceleration":
+    if unit.quantity != "acceleration" or untilted(attitudes.mean):  # an offset and gravity cannot be told apart
         return
     lengths = to_si(np.linalg.norm(attitudes.mean - far_zero(attitudes.mean), axis=1), unit.symbol)
     force = median(lengths)

@@ -18,7 +18,7 @@ from imulab.gravity import Gravity
 from imulab.procedures.tumble import FROM_DATA, FURTHER, HIGHEST_ORDER, LOSSES, METHODS
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.blend import Blended, blend_orders, with_known_spread
-from imulab.procedures.tumble.checks import check_residuals, far_zero
+from imulab.procedures.tumble.checks import check_residuals, far_zero, untilted
 from imulab.procedures.tumble.gyro.rotation import check_axes
 from imulab.procedures.tumble.model import GROUPS, MISALIGNMENTS, parameter_count, parameter_names
 from imulab.procedures.tumble.orders import (
@@ -402,10 +402,11 @@ def _solve(
         help_from = helpful_attitudes(problem.order, solution, count=2)
         times = f" (found at {attitudes.times()})" if attitudes.trace is not None and n < size else ""
         trace = f"; {attitudes.trace.describe()}" if attitudes.trace is not None and n < size else ""
+        many = f"{n} attitudes{times} determine" if n != 1 else f"1 attitude{times} determines"
         raise ObservabilityError(
-            f"{attitudes.recording.name}: {n} attitudes{times} determine {ranks.rank} of the {size} parameters of "
-            f"order {problem.order}; they cannot separate {shown}; attitudes with the upward direction near "
-            f"{help_from} would help most{trace}"
+            f"{attitudes.recording.name}: {many} {ranks.rank} of the {size} parameters of order {problem.order}"
+            f"{untilted(attitudes.mean)}; they cannot separate {shown}{trace}; attitudes with the upward direction "
+            f"near {help_from} would help most"
         )
     if not solution.converged[0]:
         raise DataError(

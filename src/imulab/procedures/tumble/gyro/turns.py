@@ -168,7 +168,10 @@ def choose_turns(attitudes: Attitudes, stamps: Stamps, output: Array, name: str)
     if len(chosen) < _FEWEST_TURNS:
         aside = f" ({int(clipped.any(axis=1).sum())} more are clipped)" if clipped.any() else ""
         aside += f" ({int(broken.sum())} more have gaps)" if broken.any() else ""
-        raise SegmentError(f"{name}: {len(chosen)} turns between attitudes{aside}; expected at least {_FEWEST_TURNS}")
+        tilt = "" if len(chosen) else ": the unit was never tilted"
+        raise SegmentError(
+            f"{name}: {len(chosen)} turns between attitudes{aside}{tilt}; expected at least {_FEWEST_TURNS}"
+        )
     return chosen, notes
 
 

@@ -27,6 +27,7 @@ from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import FIELD_FOLLOWS_TURNS
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes, stated_covariance
+from imulab.procedures.tumble.checks import untilted
 from imulab.procedures.tumble.model import invert
 from imulab.recording import Array, Recording, check_finite
 from imulab.units import parse_unit
@@ -244,7 +245,8 @@ def field_means(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
         As for `average_outputs`.
     """
     means = average_outputs(attitudes, kept)
-    _check_means(replace(means, mean=means.mean[kept]), attitudes.recording.name, triad_of_columns("mag"))
+    tilt = untilted(attitudes.mean)
+    _check_means(replace(means, mean=means.mean[kept]), attitudes.recording.name, triad_of_columns("mag"), tilt)
     _check_far(means.mean[kept], [attitudes.label(i) for i in kept], kept, attitudes.recording.name)
     return means
 
@@ -424,14 +426,17 @@ def _smallest_step(values: Array) -> float:
     return float(np.diff(different).min()) if len(different) > 1 else 0.0
 
 
-def _check_means(means: FieldMeans, name: str, names: list[str]) -> None:
-    """Refuse too few attitudes, a dead or saturated axis, and outputs in one plane."""
+def _check_means(means: FieldMeans, name: str, names: list[str], tilt: str) -> None:
+    """Refuse too few attitudes, a dead or saturated axis, and outputs in one plane; `tilt` says that it never was."""
     n = len(means.mean)
     if n < FEWEST:
-        raise DataError(f"{name}: {n} attitudes; a magnetometer needs {FEWEST} or more, better 16, at several headings")
+        raise DataError(
+            f"{name}: {n} attitudes{tilt}; a magnetometer needs {FEWEST} or more, better 16, of several tilts and "
+            "headings"
+        )
     span = np.ptp(means.mean, axis=0)
     for axis, column in enumerate(names):
-        if span[axis] <= _DEAD * span.max():
+        if span[axis] <= _DEAD * span.max() and not tilt:
             raise DataError(
                 f"{name}: column {column}: the output changes by {span[axis]:.3g} {means.unit} over the {n} attitudes, "
                 f"other axes by {span.max():.3g} {means.unit}: a dead axis?"
@@ -447,7 +452,8 @@ def _check_means(means: FieldMeans, name: str, names: list[str]) -> None:
     if flat[2] < _FLAT * flat[0]:
         raise DataError(
             f"{name}: the outputs of {' '.join(names)} lie in one plane over the {n} attitudes (spread across it "
-            f"{100 * flat[2] / flat[0]:.1f} % of that along it); turn the unit about two axes"
+            f"{100 * flat[2] / flat[0]:.1f} % of that along it){tilt}; turn the unit "
+            "about two axes"
         )
 
 
