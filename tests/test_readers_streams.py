@@ -202,3 +202,15 @@ def test_clocks_that_cannot_be_are_refused_by_name():
 def test_a_report_names_the_rate_of_each_sensor():
     page = il.fit_noise(at_rest(20.0), terms="N").calibration
     assert ("sampling rate", "accel 100 Hz, gyro 400 Hz") in exhibits(page).facts
+
+
+def test_sensors_in_a_file_each_are_told_how_to_be_joined(tmp_path, imulab):
+    recording = at_rest(20.0)
+    il.write(recording.stream("accel"), tmp_path / "a.csv")
+    il.write(recording.stream("gyro"), tmp_path / "g.csv")
+    done = imulab("noise", "fit", "a.csv", "g.csv")
+    assert done.returncode == 2
+    assert done.stderr == (
+        "imulab: g.csv: no sensor of a.csv in it; sensors of one unit in a file each are joined by "
+        "imulab convert a.csv --with g.csv -o both.csv\n"
+    )

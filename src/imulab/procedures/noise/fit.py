@@ -848,6 +848,11 @@ def _columns_there(recording: Recording, columns: Sequence[str] | None) -> list[
 
 def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> None:
     name, first_log = other.recording.name, first.recording
+    if not set(noise_columns(other.recording)) & set(noise_columns(first_log)):
+        raise DataError(
+            f"{name}: no sensor of {first_log.name} in it; sensors of one unit in a file each are joined by "
+            f"imulab convert {first_log.name} --with {name} -o both.csv"
+        )
     if abs(other.interval / first.interval - 1) > _SAME_RATE:
         raise DataError(
             f"{name}: {1 / other.interval:.4g} samples in a second, but {first_log.name} has {1 / first.interval:.4g}; "
