@@ -197,3 +197,17 @@ def test_raw_lines_with_decimals_are_those_of_motioncal_where_their_size_is():
     assert caught.value.guess is not None
     assert 'prefix = "Raw:"\n' in caught.value.guess.toml
     assert 'accel_z = { from = 2, unit = "m/s^2" }' in caught.value.guess.toml
+
+
+def test_the_gravest_reason_stands_once_on_a_terminal(imulab, tmp_path, monkeypatch):
+    recording = il.simulate_tumble(gravity=9.81, attitudes=12, order=1)
+    axes = [f"accel_{axis}" for axis in "xyz"]
+    il.write(recording.with_columns({axis: recording.columns[axis] * 1.3 for axis in axes}, {}), tmp_path / "f.csv")
+    words = ["tumble", "fit", "f.csv", "--gravity", "9.81", "--order", "1", "-o", "r.json"]
+    apart = imulab(*words)
+    (reason, *_) = il.load(tmp_path / "r.json").verdict.reasons
+    assert reason in apart.stdout
+    assert reason in apart.stderr
+    monkeypatch.setattr("imulab.cli.show._on_terminal", lambda: True)
+    together = imulab(*words)
+    assert (together.stdout + together.stderr).count(reason) == 1

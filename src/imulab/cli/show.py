@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from math import inf, nan
@@ -57,11 +58,18 @@ def finish(
         for name, what in ((output, "record"), (report, "report")):
             if name:
                 print(f"{what}: {name}")
+    # Both streams of a terminal are one to its reader, who has the gravest reason in the first line already.
+    there = record.verdict.reasons[:1] if not json and describe is None and _on_terminal() else ()
     for message in record.warnings:
-        (warn if message in record.verdict.reasons else note)(message)
+        if message not in there:
+            (warn if message in record.verdict.reasons else note)(message)
     if record.verdict.state == "bad" and (json or speech().quiet):
         for action in record.verdict.next:
             warn(f"next: {action}")
+
+
+def _on_terminal() -> bool:
+    return sys.stdout.isatty() and sys.stderr.isatty()
 
 
 # ``imulab tumble plan`` and ``thermal plan``: a plan to CSV, sheet and what is printed.
