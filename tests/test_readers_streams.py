@@ -180,6 +180,7 @@ def test_one_clock_is_the_fastest_and_apply_says_what_it_interpolated(tmp_path, 
     il.write(two_clocks(tumble), tmp_path / "own.csv")
     done = imulab("apply", "r.json", "own.csv", "-o", "out.csv")
     assert done.returncode == 0
+    assert "imulab: note: own.csv: resampled: accel from 100 Hz to 400 Hz" in done.stderr
     corrected = il.read(tmp_path / "out.csv")
     assert corrected.metadata["resampled"] == "accel from 100 Hz to 400 Hz"
     expected = np.interp(corrected.time, tumble.time[::4], tumble.column("truth_accel_x")[::4])

@@ -155,7 +155,7 @@ def apply(
             )
     if options["heading"]:
         chain = add_heading(chain, records)
-    blocks = with_notes(on_clock_of(read_blocks(file, **how)), notes=False)
+    blocks = with_notes(_say_resampled(on_clock_of(read_blocks(file, **how))), notes=False)
     if options["temperature_column"] and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)
     rows = _Rows()
@@ -163,6 +163,16 @@ def apply(
     by = " and ".join(dict.fromkeys(Path(name).name for name in names))
     what = "standard input" if file == "-" else file
     note(f"{rows.count} rows of {what} corrected by {by}: {output or 'standard output'}")
+
+
+def _say_resampled(blocks: Iterable[Recording]) -> Iterator[Recording]:
+    """Yield blocks, and say once which sensors were interpolated to the clock of another."""
+    from imulab.recording import RESAMPLED
+
+    for number, block in enumerate(blocks):
+        yield block
+        if number == 0 and RESAMPLED in block.metadata:
+            note(f"{block.name}: {RESAMPLED}: {block.metadata[RESAMPLED]}")
 
 
 @dataclass
