@@ -1,6 +1,6 @@
 """Write a layout for a file of another program.
 
-A file of its own, as each group of commands has.
+Alone, as each group of commands has a file of its own.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Texts of records in the files of other programs, each in the form that its place there takes as a text.
+"""Texts of records in exported files, apart from the exporters so that none has a way around it.
 
-A serial, a time or a unit of a record is somebody else's text. What writes a file takes such texts through this module
-alone: whole comments, so that no part of one is forgotten.
+A serial, a time or a unit of a record is somebody else's text, which is brought into the form that its place takes as
+a text. What writes a file takes such texts through this module alone: whole comments, so that no part is forgotten.
 
 Source: ISO C99, 5.1.1.2 (trigraphs and joined lines come before comments) and 6.4.9; YAML 1.2, 5.1 (characters);
 CommonMark 0.31, 6.1 (code spans).

@@ -1,4 +1,4 @@
-"""Files that are packed as a whole, ``.gz`` and ``.zip`` of one file, which are unpacked within bounds."""
+"""Files packed as a whole, ``.gz`` and ``.zip`` of one file: their own room, since the bounds of unpacking are here."""
 
 from __future__ import annotations
 
