@@ -3,12 +3,13 @@
 import gzip
 import json
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import imulab as il
-from imulab.errors import OptionError, ReadError
+from imulab.errors import OptionError, ReadError, RecordError
 from imulab.readers import read_blocks
 from imulab.readers.labelled import pairs
 from imulab.readers.text import LONGEST_LINE
@@ -311,3 +312,28 @@ def test_records_of_json_are_guessed(imulab, tmp_path):
     done = imulab("layout", "guess", "f.json")
     assert 'accel_z = { from = "acc.z", unit = "m/s^2" }' in done.stdout
     assert 'gyro_y = { from = "gyro_dps[1]", unit = "deg/s" }' in done.stdout
+
+
+def test_parquet_of_repeated_values_has_a_budget(tmp_path):
+    """173 kB that unpacked to 40 million rows took 1.6 GB of memory."""
+    arrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    path = tmp_path / "rle.parquet"
+    zeros = arrow.array(np.zeros(3_000_000))
+    names = ["time [s]", "gyro_x [rad/s]", "gyro_y [rad/s]", "gyro_z [rad/s]"]
+    parquet.write_table(arrow.table(dict.fromkeys(names, zeros)), path)
+    assert path.stat().st_size < 300_000
+    with pytest.raises(
+        ReadError, match=r"rle.parquet: unpacks to more than 67 MB, which no measured data of this size"
+    ):
+        list(il.read_blocks(path))
+    noise = np.random.default_rng(1).normal(size=200_000)
+    parquet.write_table(arrow.table(dict.fromkeys(names[1:], noise)), path)
+    assert len(il.read(path)) == 200_000
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="a device that never ends is needed")
+def test_a_record_without_end_is_refused():
+    with pytest.raises(RecordError, match="/dev/zero: more than 256 MiB; expected a record"):
+        il.load("/dev/zero")

@@ -75,6 +75,10 @@ def section(kind: str) -> Section | None:
 # Records and blobs from their files; a record is checked by the procedure that it names.
 
 
+_LARGEST = 1 << 28
+"""Most bytes of a file that are read as a record."""
+
+
 def load(path: str | Path) -> Calibration:
     """Read a calibration record.
 
@@ -96,8 +100,10 @@ def load(path: str | Path) -> Calibration:
 
 def load_sealed(path: str | Path) -> tuple[Calibration, str]:
     """Return a calibration record and its ``content_sha256``; errors as for `load`."""
-    with readable(path, RecordError):
-        data = Path(file_name(path)).read_bytes()
+    with readable(path, RecordError), Path(file_name(path)).open("rb") as stream:
+        data = stream.read(_LARGEST + 1)
+    if len(data) > _LARGEST:
+        raise RecordError(f"{path}: more than {_LARGEST >> 20} MiB; expected a record, of some kilobytes")
     return loads_sealed(data, str(path))
 
 

@@ -34,11 +34,11 @@ def raise_limit(size: int | None) -> None:
 
 
 class Budget:
-    """Bytes that a file may still unpack to."""
+    """Bytes that a file may still unpack to; where its rows are not held together, only its size limits them."""
 
-    def __init__(self, path: Path, name: str) -> None:
-        usual = max(_SMALL, min(_LARGEST, _RATIO * path.stat().st_size))
-        self._name, self._limit = name, _raised.get() or usual
+    def __init__(self, path: Path, name: str, *, most: float = _LARGEST) -> None:
+        usual = max(_SMALL, min(most, _RATIO * path.stat().st_size))
+        self._name, self._limit = name, _raised.get() or int(usual)
         self.left = self._limit
 
     def take(self, size: int) -> None:
@@ -49,8 +49,12 @@ class Budget:
         ReadError
             They are more than the file may have.
         """
+        self.check(size)
         self.left -= size
-        if self.left < 0:
+
+    def check(self, size: int) -> None:
+        """Refuse bytes that are more than the file may have; error as for `take`."""
+        if size > self.left:
             raise ReadError(
                 f"{self._name}: unpacks to more than {self._limit / 1e6:.0f} MB, which no measured data of this size "
                 "do; where the file is to be trusted, --unpack-limit SIZE raises the limit"
