@@ -116,6 +116,16 @@ def test_the_command_prints_key_and_value_a_line(home, record, capsys, monkeypat
     assert printed == {key: pytest.approx(value, rel=1e-3) for key, value in noise_for(record, program).items()}
 
 
+def test_a_walk_that_was_not_seen_is_no_silent_zero(tmp_path, imulab):
+    samples = np.random.default_rng(3).normal(0, 0.02, (6000, 3))
+    il.write(
+        il.Recording.from_arrays(accel=samples + np.array([0, 0, 9.8]), rate=100.0, unit="m/s^2"), tmp_path / "a.csv"
+    )
+    done = imulab("noise", "fit", "a.csv", "--terms", "N", "--for", "kalibr")
+    assert "accelerometer_random_walk: 0\n" in done.stdout
+    assert "accelerometer_random_walk: none was seen in 60 s, and 0 makes a filter trust a bias for ever" in done.stderr
+
+
 def test_export_takes_the_record(home, record, tmp_path, capsys):
     parameters = {f"bias_{a}": Parameter(0.0, 1e-4, "m/s^2") for a in "xyz"}
     parameters |= {f"scale_factor_{a}": Parameter(1.0, 1e-4, "m/s^2/(m/s^2)") for a in "xyz"}

@@ -129,6 +129,7 @@ def fit(
     wants; -o writes the record, --report its figures. With --for, a noise record in place of the logs gives the same.
     """
     from imulab.cli.show import finish
+    from imulab.procedures.noise.schema import fit_of
     from imulab.procedures.noise.wants import check_program, noise_for
     from imulab.procedures.registry import load, run_task
 
@@ -147,6 +148,11 @@ def fit(
     with labelled("--{}", ["rate", "step"]), naming(files[0]) if saved else nullcontext():
         wanted = noise_for(record, program, rate=hertz, step=seconds)
     finish(record, output, report, json=json, describe=lambda _: "\n".join(f"{k}: {v:.4g}" for k, v in wanted.items()))
+    for key in [key for key, value in wanted.items() if value == 0]:
+        warn(
+            f"{key}: none was seen in {fit_of(record).length.value:.4g} s, and 0 makes a filter trust a bias for ever; "
+            "record longer, or take a value below the limits that noise fit prints without --for"
+        )
 
 
 def plan(
