@@ -474,7 +474,7 @@ REFUSED = {
     ),
     "zero huge": (
         FOG % 'zero = { value = 1e300, unit = "V" }',
-        "column fog: zero: expected a size from 1e-30 to 1e+30, found 1e+300",
+        "column fog: zero: expected a number of at most 1e+100, found 1e+300",
     ),
     "rate tiny": (
         "sample_rate = 1e-308\n" + FOG % "scale = 1",

@@ -320,7 +320,7 @@ def test_too_short_a_recording_is_refused():
         find_attitudes(recording(samples[:150], time[:150]))
     assert "hall 3.csv: 150 samples over 1.49 s are too few" in str(caught.value)
     assert "window of 1 s" in str(caught.value)
-    with pytest.raises(SegmentError, match="1 samples"):
+    with pytest.raises(SegmentError, match="1 sample over"):
         find_attitudes(recording(samples[:1], time[:1]))
 
 

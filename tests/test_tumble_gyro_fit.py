@@ -237,7 +237,7 @@ def test_clipped_turns_are_left_out_and_named(case):
     warnings = with_gyro(record, fit, clipped, clipped).warnings
     assert any("turns left out, clipped: gyro_" in w and "at the end of their range (from " in w for w in warnings)
     narrow = recording.with_columns({"gyro_x": np.clip(recording.columns["gyro_x"], -5, 5)}, {})
-    with pytest.raises(SegmentError, match=r"turns between attitudes \(\d+ more are clipped\); expected at least 8"):
+    with pytest.raises(SegmentError, match=r"turns? between attitudes \(\d+ more are clipped\); expected at least 8"):
         fit_gyro_triad(record, attitudes, narrow)
 
 
@@ -287,9 +287,13 @@ def test_bad_input_is_named(case):
     swapped = recording.with_columns({"gyro_x": recording.columns["gyro_y"], "gyro_y": recording.columns["gyro_x"]}, {})
     with pytest.raises(DataError, match=r"gyro_x gyro_y gyro_z: the turns miss .* swapped or reversed axes"):
         fit_gyro_triad(record, attitudes, swapped)
-    hole = recording.with_columns({"gyro_y": np.where(np.arange(len(recording)) == 99, np.nan, 0.0)}, {})
+    rows = np.arange(len(recording))
+    hole = recording.with_columns({"gyro_y": np.where((rows >= 99) & (rows < 110), np.nan, rows % 2)}, {})
     with pytest.raises(DataError, match=r"row 100.*column gyro_y"):
         fit_gyro_triad(record, attitudes, hole)
+    dead = recording.with_columns({"gyro_y": np.zeros(len(recording))}, {})
+    with pytest.raises(DataError, match="column gyro_y: the same output in every sample: a dead axis"):
+        fit_gyro_triad(record, attitudes, dead)
     with pytest.raises(OptionError, match="expected one of auto yes no"):
         fit_gyro_triad(record, attitudes, recording, sensitivity="maybe")
     later = recording.with_columns({"time": recording.columns["time"] + 1e4}, {})

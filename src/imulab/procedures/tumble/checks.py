@@ -83,8 +83,11 @@ def _check_turned(attitudes: Attitudes) -> None:
 
 def untilted(means: Array) -> str:
     """Return that a unit was never tilted, where its mean outputs have one direction; else nothing."""
-    directions = means / np.linalg.norm(means, axis=1, keepdims=True)
+    lengths = np.linalg.norm(means, axis=1, keepdims=True)
+    directions = means / np.where(lengths > 0, lengths, 1.0)
     middle = directions.mean(axis=0)
+    if not lengths.all() or not middle.any():
+        return ""
     spread = np.degrees(np.arccos(np.clip(directions @ middle / np.linalg.norm(middle), -1, 1)).max())
     if not spread < _TILTED:
         return ""

@@ -171,8 +171,7 @@ def fit_gyro_triad(
     apart = attitudes.recording is not recording if apart is None else apart
     unit = recording.triad_unit("gyro")
     recording, bridges = without_single_gaps(recording, triad("gyro"))
-    left_out = leave_out(recording, triad("gyro"))
-    time, output = check_time(recording), left_out.recording.triad("gyro")
+    left_out, time, output = _outputs(recording)
     factor = output_factor(attitudes.recording.name, triad("accel"), attitudes.unit, model_of(record).output_unit)
     means = attitudes.mean * factor
     accel_time = attitudes.recording.si("time")
@@ -214,6 +213,16 @@ def fit_gyro_triad(
     notes += estimate.notes(float(np.median(np.diff(stamps.time))))
     fit = _triad_of_estimate(estimate, unit, fit_bias, conditioning, known, tuple(notes))
     return _on_earth(fit, case, earth)
+
+
+def _outputs(recording: Recording) -> tuple[LeftOut, Array, Array]:
+    """Return what is left out of the gyroscopes' samples, their times and outputs; a dead axis is refused."""
+    left_out = leave_out(recording, triad("gyro"))
+    time, output = check_time(recording), left_out.recording.triad("gyro")
+    if (dead := np.ptp(output, axis=0) == 0).any():
+        column = triad("gyro")[int(np.argmax(dead))]
+        raise DataError(f"{recording.name}: column {column}: the same output in every sample: a dead axis")
+    return left_out, time, output
 
 
 def _on_accel_clock(case: TurnProblem, time: Array, sensitivity: str) -> Array:
