@@ -58,6 +58,17 @@ def test_a_recording_knows_the_clock_of_each_column():
     assert list(array.clocks) == ["time"]
 
 
+def test_a_sensor_alone_with_a_clock_of_its_own_has_a_time():
+    recording = at_rest(20.0)
+    alone = il.Recording(
+        {name: values for name, values in recording.columns.items() if "gyro" in name},
+        {name: unit for name, unit in recording.units.items() if "gyro" in name},
+    )
+    assert alone.time is None
+    assert one_clock(alone).time[1] == pytest.approx(3.75e-3)
+    assert il.fit_noise(alone, terms="N").calibration.fit["sample_rate"]["value"] == pytest.approx(RATE)
+
+
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_files_keep_the_clocks(tmp_path, monkeypatch, ending):
     monkeypatch.chdir(tmp_path)

@@ -143,9 +143,10 @@ def example_unit(name: str) -> str:
 def clocks_of(names: Iterable[str]) -> dict[str, str]:
     """Return the column of time that stamps each column: ``time``, or its sensor's own, such as ``time_gyro``."""
     names = list(names)
-    own = {name.removeprefix("time_"): name for name in names if name.startswith("time_")}
-    own = {sensor: clock for sensor, clock in own.items() if sensor in KINDS}
-    return {name: name if name in own.values() else own.get(kind_of(measured(name)) or "", "time") for name in names}
+    clocks = {sensor: clock for sensor in KINDS if (clock := f"time_{sensor}") in names}
+    return {
+        name: name if name in clocks.values() else clocks.get(kind_of(measured(name)) or "", "time") for name in names
+    }
 
 
 def measured(name: str) -> str:

@@ -202,6 +202,11 @@ class Recording:
                 stamped.setdefault(clock, []).append(name)
         return stamped if stamped["time"] else {clock: names for clock, names in stamped.items() if names}
 
+    @property
+    def on_one_clock(self) -> bool:
+        """Whether the column ``time`` stamps all sensors, or nothing does."""
+        return list(self.clocks) == ["time"]
+
     def stream(self, clock: str) -> Recording:
         """Return the columns that a clock stamps, with it as ``time``, without the rows that have none of its samples.
 
@@ -211,7 +216,7 @@ class Recording:
             One of `clocks`, or a sensor, such as ``gyro``.
         """
         clocks = self.clocks
-        if len(clocks) < 2 and "time" in clocks:
+        if self.on_one_clock:
             return self
         chosen = clock if clock in clocks else f"time_{clock}" if f"time_{clock}" in clocks else "time"
         kept = [name for name in (chosen, *clocks[chosen]) if name in self.columns]
@@ -412,7 +417,7 @@ def padded(parts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
 
 def packed(recording: Recording) -> Recording:
     """Return a recording with the samples of each clock together, and what pads them at the end."""
-    return recording if len(recording.clocks) < 2 else by_clock(recording, lambda part: part)
+    return recording if recording.on_one_clock else by_clock(recording, lambda part: part)
 
 
 def by_clock(recording: Recording, change: Callable[[Recording], Recording]) -> Recording:
@@ -424,6 +429,13 @@ def by_clock(recording: Recording, change: Callable[[Recording], Recording]) -> 
         notes |= dict.fromkeys(part.notes)
     columns = padded(parts)
     return replace(recording, columns={name: columns[name] for name in recording.columns}, notes=tuple(notes))
+
+
+def joined(blocks: Sequence[Recording]) -> Recording:
+    """Return consecutive blocks as one recording, with the notes of all."""
+    columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
+    notes = dict.fromkeys(note for block in blocks for note in block.notes)
+    return replace(blocks[0], columns=columns, notes=tuple(notes))
 
 
 def check_not_resampled(recording: Recording, names: Iterable[str]) -> None:

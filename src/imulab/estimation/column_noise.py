@@ -108,9 +108,9 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     parts = [curves_and_noise(recording.stream(clock), stamped, taus) for clock, stamped in clocks.items() if stamped]
     columns: dict[str, Any] = {}
     for part, its_rate, noises, _ in parts:
-        own = {"samples": len(part), "sample_rate": {"value": its_rate, "unit": "Hz"}} if len(parts) > 1 else {}
+        sampled = {"samples": len(part), "sample_rate": {"value": its_rate, "unit": "Hz"}} if len(parts) > 1 else {}
         for name, noise in noises.items():
-            columns[name] = {**_column(part, name, noise), **own}
+            columns[name] = {**_column(part, name, noise), **sampled}
     first, rate, _, _ = parts[0]
     return {
         "format": "imulab.noise",

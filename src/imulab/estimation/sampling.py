@@ -11,7 +11,7 @@ from imulab.display import Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.clock import GAP, Clock, read_clock, same_rows
 from imulab.estimation.rows import median, quantile
-from imulab.recording import EVEN_SAMPLES, Array, Recording, by_clock, check_finite, check_time, stored_as
+from imulab.recording import EVEN_SAMPLES, Array, Recording, by_clock, check_finite, check_time, joined, stored_as
 from imulab.units import to_si
 
 WIDEST_GAP = 10.0
@@ -53,7 +53,7 @@ def mend_stamps(recording: Recording) -> Recording:
     DataError
         Time stands still, or the rate cannot be told from coarse stamps; the message names the row, and `sample_rate`.
     """
-    if len(recording.clocks) > 1:
+    if not recording.on_one_clock:
         return by_clock(recording, mend_stamps)
     time = recording.time
     if time is None or len(time) < 2 or not (time[1:] == time[:-1]).any():
@@ -83,11 +83,7 @@ def mend_blocks(blocks: Iterable[Recording]) -> Iterator[Recording]:
             yield block
             yield from map(mend_stamps, rest)
             return
-        parts = [block, *rest]
-        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in block.columns}
-        yield mend_stamps(
-            replace(block, columns=columns, notes=tuple(dict.fromkeys(n for p in parts for n in p.notes)))
-        )
+        yield mend_stamps(joined([block, *rest]))
 
 
 def _standstill(recording: Recording, clock: Clock) -> str:
@@ -95,9 +91,9 @@ def _standstill(recording: Recording, clock: Clock) -> str:
     raw, unit = recording.column("time"), recording.units["time"]
     place = f"{recording.name}: {recording.place(row)}, column time"
     if clock.doubt == "time stands still":
-        found = f"{raw[row]:.15g} {unit}"
         return (
-            f"{place}: time stands still: expected more than {raw[row - 1]:.15g} {unit}, found {found}; {EVEN_SAMPLES}"
+            f"{place}: time stands still: expected more than {raw[row - 1]:.15g} {unit}, found {raw[row]:.15g} {unit}; "
+            f"{EVEN_SAMPLES}"
         )
     return f"{place}: {clock.doubt}: the sampling rate cannot be told; {EVEN_SAMPLES}"
 

@@ -7,7 +7,6 @@ import inspect
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias, overload
 
@@ -25,7 +24,7 @@ from imulab.options import file
 from imulab.readers import read, read_blocks
 from imulab.readers.selection import Selection
 from imulab.readers.streams import on_clock_of, one_clock
-from imulab.recording import Data, Reading, Recording, Sampling, Source, Window
+from imulab.recording import Data, Reading, Recording, Sampling, Source, Window, joined
 from imulab.records.calibration import Calibration
 from imulab.report import render_page, render_plan
 from imulab.report.traces import Exhibits, Figure, ReportTable
@@ -313,8 +312,7 @@ def _select_part(recording: Recording, window: Window | None, element: int | Non
     parts = list(Selection(window=window, element=element, serial=serial).of(iter([recording]), recording.name))
     if len(parts) == 1:
         return parts[0]
-    joined = {key: np.concatenate([part.columns[key] for part in parts]) for key in parts[0].columns}
-    return replace(parts[0], columns=joined)
+    return joined(parts)
 
 
 def _refuse(stated: Mapping[str, Any], keys: Iterable[str], called: str, reason: str) -> None:

@@ -176,8 +176,8 @@ def guess_of_head(
     if kind.module == "jsonfile":
         return layout_of_table(_table_of_json(head, name), name, units=units, sample_rate=sample_rate)
     if kind is not TEXT or b"\0" in head[:4096]:
-        found = "binary data" if kind is TEXT else kind.name
-        raise GuessError(f"{name}: a layout is guessed from the titles of text, found {found}")
+        content = "binary data" if kind is TEXT else kind.name
+        raise GuessError(f"{name}: a layout is guessed from the titles of text, found {content}")
     encoding = "utf-8"
     try:
         text = head[: head.rfind(b"\n") + 1 if len(head) == HEAD else None].decode("utf-8-sig")
@@ -271,8 +271,8 @@ def _labelled_table(lines: Sequence[str]) -> _Table | None:
     """Return the table of numbers with a label each, ``Acceleration X: -2.76, Y: ..``; None for other text."""
     counts: dict[str, int] = {}
     units: dict[str, str] = {}
-    found = [list(pairs(line)) for line in lines[:_MOST_LABELLED]]
-    for label, _, unit in (pair for line in found for pair in line):
+    labelled = [list(pairs(line)) for line in lines[:_MOST_LABELLED]]
+    for label, _, unit in (pair for line in labelled for pair in line):
         counts[label] = counts.get(label, 0) + 1
         units[label] = units.get(label) or unit
     often = [label for label, count in counts.items() if count > _FEWEST and count > max(counts.values()) / 2]
@@ -413,14 +413,14 @@ def layout_of_table(
         chosen.append(("time", *clock[:3]))
     if sample_rate is not None:
         step = 1 / sample_rate
-    told = {sensor: titles[places[0]].unit for sensor, places in sensors.items()}
+    titled = {sensor: titles[places[0]].unit for sensor, places in sensors.items()}
     for sensor, places in sensors.items():
-        unit, reason = _unit(sensor, places, titles, table, told, known)
+        unit, reason = _unit(sensor, places, titles, table, titled, known)
         if not unit and sensor == "gyro" and step is not None and "accel" in sensors:
             unit, reason = _rate_unit(table, sensors["accel"], places, step)
         if not unit:
             raise _unknown_unit(sensor, places, titles, name)
-        told[sensor] = unit
+        titled[sensor] = unit
         if titles[places[0]].increment and "@" not in unit:
             unit, reason = _increments(unit, rate, titles[places[0]].text, name)
         for column, place in zip(triad(sensor), places, strict=True):
@@ -480,11 +480,11 @@ def _sensors(
     whole = {key: [axes[k] for k in range(3)] for key, axes in groups.items() if len(axes) == 3}
     sensors: dict[str, list[int]] = {}
     for sensor in _EXAMPLES:
-        found = [key for key in whole if key[0] == sensor]
+        triads = [key for key in whole if key[0] == sensor]
         # Calibrated readings go before raw ones; acceleration that may be without gravity goes last.
-        found.sort(key=lambda key: ("linear" in key[1], "raw" in key[1] or titles[whole[key][0]].unit == "count"))
-        if found and not _is_linear(found[0], table, whole):
-            sensors[sensor] = whole[found[0]]
+        triads.sort(key=lambda key: ("linear" in key[1], "raw" in key[1] or titles[whole[key][0]].unit == "count"))
+        if triads and not _is_linear(triads[0], table, whole):
+            sensors[sensor] = whole[triads[0]]
     used = {place for places in sensors.values() for place in places}
     if not sensors:
         unknown = next((t.text for t in titles if t.sensor not in ("time", "counter")), table.titles[0])
@@ -540,7 +540,7 @@ def _unit(
     places: Sequence[int],
     titles: Sequence[Title],
     table: _Table,
-    told: Mapping[str, str],
+    titled: Mapping[str, str],
     known: Mapping[str, str],
 ) -> tuple[str, str]:
     """Return the unit of a sensor, and why where no title says it; nothing where it cannot be told."""
@@ -554,7 +554,7 @@ def _unit(
     if len(stated) == 1 and first.unit and _fits(sensor, first):
         return first.unit, ""
     if len(stated) == 1 and not first.unit:
-        return _supposed(sensor, places, titles, table, told)
+        return _supposed(sensor, places, titles, table, titled)
     return "", ""
 
 
@@ -580,13 +580,13 @@ def _fits(sensor: str, title: Title) -> bool:
 
 
 def _supposed(
-    sensor: str, places: Sequence[int], titles: Sequence[Title], table: _Table, told: Mapping[str, str]
+    sensor: str, places: Sequence[int], titles: Sequence[Title], table: _Table, titled: Mapping[str, str]
 ) -> tuple[str, str]:
     """Return the unit that readings show, and why; nothing where they do not."""
     words, length = titles[places[0]].stem, _length(table, places)
     if titles[places[0]].increment:
         return "", ""
-    if _is_whole(table, places) or "count" in {unit for other, unit in told.items() if other != sensor}:
+    if _is_whole(table, places) or "count" in {unit for other, unit in titled.items() if other != sensor}:
         return "count", "no unit in the titles; whole numbers are taken as counts"
     if sensor == "accel":
         if "gf" in words:
@@ -599,7 +599,7 @@ def _supposed(
     if sensor == "gyro" and words[:1] in (("w",), ("omega",), ("angular",)):
         largest = float(np.nanmax(np.abs([table.numbers(place) for place in places])))
         by_name = any("gf" in t.stem for t in titles)
-        if largest < _FASTEST and (told.get("accel") == "m/s^2" or by_name):
+        if largest < _FASTEST and (titled.get("accel") == "m/s^2" or by_name):
             return "rad/s", "no unit in the titles; supposed as SI, as the symbol w is"
     if sensor == "mag":
         for unit, (low, high) in _FIELDS.items():

@@ -61,8 +61,8 @@ class LabelledLines:
         there = dict.fromkeys(label for line in head.splitlines() for label, _, _ in pairs(line))
         missing = next((label for label in self._labels if label not in there), None)
         if missing is not None:
-            found = several(there, 200) or "no labelled numbers, such as ax: 0.1"
-            raise ReadError(f"{self._name}: {self._layout} takes a number labelled {missing!r}, found {found}")
+            labels = several(there, 200) or "no labelled numbers, such as ax: 0.1"
+            raise ReadError(f"{self._name}: {self._layout} takes a number labelled {missing!r}, found {labels}")
 
     def read(self, lines: bytes) -> bytes:
         """Return the rows that these whole lines complete.

@@ -62,9 +62,9 @@ def _with_separators(layout: Layout, lines: list[str]) -> Layout:
     """Return a layout with the delimiter, and the decimal comma, of the lines."""
     begin, delimiter = 0, ""
     for number, line in enumerate(lines):
-        found = next((sign for sign in _SEPARATORS if holds(layout, line, sign)), "")
-        if found:
-            begin, delimiter = number + 1, found
+        delimiter = next((sign for sign in _SEPARATORS if holds(layout, line, sign)), "")
+        if delimiter:
+            begin = number + 1
             break
     rows = [line for line in lines[max(begin, layout.skip_lines) :] if line.strip() and not line.startswith("#")]
     if not delimiter:
@@ -121,12 +121,12 @@ def _with_numbers(layout: Layout, lines: list[str], name: str) -> Layout:
     def number(word: str, what: str) -> float:
         words = "|".join(map(re.escape, word.split("|")))
         pattern = re.compile(rf"(?<![\w.])(?:{words}){_NUMBER}")
-        found = next((match for line in above if (match := pattern.search(line))), None)
-        if found is None or float(found[1]) == 0:
+        written = next((match for line in above if (match := pattern.search(line))), None)
+        if written is None or float(written[1]) == 0:
             raise ReadError(
                 f"{name}: {layout.name} takes {what} from the number behind {word!r} above the rows, found none"
             )
-        return float(found[1])
+        return float(written[1])
 
     columns: Mapping[str, LayoutColumn] = {
         key: replace(column, scale=column.scale * number(column.scale_from, f"the scale of {key}"), scale_from="")

@@ -24,7 +24,7 @@ from imulab.columns import kind_of
 from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, ReadError
 from imulab.estimation.sampling import WIDEST_GAP
-from imulab.recording import RESAMPLED, Array, Recording, check_time, packed, padded
+from imulab.recording import RESAMPLED, Array, Recording, check_time, joined, packed, padded
 
 # Streams of different clocks to one recording.
 
@@ -590,9 +590,8 @@ def join_recordings(recording: Recording, others: Sequence[Recording]) -> Record
             metadata=lambda _: recording.metadata,
         )
     )
-    joined = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
     notes = dict.fromkeys(note for part in (*every, *blocks) for note in part.notes)
-    return packed(replace(blocks[0], columns=joined, source=recording.source, notes=tuple(notes)))
+    return packed(replace(joined(blocks), source=recording.source, notes=tuple(notes)))
 
 
 def _streams_of(recording: Recording) -> list[Recording]:
@@ -643,12 +642,9 @@ _WORDS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
 
 def one_clock(recording: Recording, sensor: str | None = None) -> Recording:
     """Return a recording with all sensors on one clock; see `on_clock_of`."""
-    if len(recording.clocks) < 2:
+    if recording.on_one_clock:
         return recording
-    blocks = list(on_clock_of([recording], sensor))
-    columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
-    notes = dict.fromkeys(note for block in blocks for note in block.notes)
-    return replace(blocks[0], columns=columns, source=recording.source, notes=tuple(notes))
+    return replace(joined(list(on_clock_of([recording], sensor))), source=recording.source)
 
 
 def on_clock_of(blocks: Iterable[Recording], sensor: str | None = None) -> Iterator[Recording]:
@@ -665,7 +661,7 @@ def on_clock_of(blocks: Iterable[Recording], sensor: str | None = None) -> Itera
     if (first := next(blocks, None)) is None:
         return
     clocks = first.clocks
-    if len(clocks) < 2:
+    if first.on_one_clock:
         yield first
         yield from blocks
         return
@@ -715,7 +711,7 @@ def own_clock(recording: Recording, sensor: str) -> Recording:
 
     A recording of one clock is returned as it is.
     """
-    if len(recording.clocks) < 2:
+    if recording.on_one_clock:
         return recording
     part, name = recording.stream(sensor), "temperature"
     if name in part or name not in recording or "time" not in part:

@@ -20,7 +20,7 @@ from imulab.estimation.clock import GAP, read_clock
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.sampling import mend_stamps, usual_step
 from imulab.procedures.gyro_array.schema import array_of
-from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.recording import Array, Recording, check_finite, check_time, joined
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, from_si, parse_unit
 
@@ -369,15 +369,15 @@ def to_one_clock(blocks: Iterable[Recording]) -> Iterator[Recording]:
             continue
         if "time" not in block:
             raise DataError(f"{block.name}: columns time_1 .. but no column time; expected the clock to interpolate to")
-        joined = block if held is None else _join(held, block)
-        time, element_times = check_time(joined), _clock_times(joined, clocks)
+        pending = block if held is None else joined([held, block])
+        time, element_times = check_time(pending), _clock_times(pending, clocks)
         start, stop = max(t[0] for t in element_times.values()), min(t[-1] for t in element_times.values())
         ready = np.flatnonzero((time > until) & (time >= start) & (time <= stop))
         if ready.size:
             until = float(time[ready[-1]])
-            yield _interpolate(joined, time[ready], element_times, clocks, ready)
+            yield _interpolate(pending, time[ready], element_times, clocks, ready)
         keep = min(int(np.searchsorted(t, until, side="right")) - 1 for t in (*element_times.values(), time))
-        held = _rows(joined, np.arange(max(keep, 0), len(time)))
+        held = _rows(pending, np.arange(max(keep, 0), len(time)))
 
 
 def on_one_clock(recording: Recording) -> Recording:
@@ -391,11 +391,6 @@ def on_one_clock(recording: Recording) -> Recording:
     for block in to_one_clock([mend_stamps(recording)]):
         return block
     raise DataError(f"{recording.name}: the clocks of the elements have no time in common with column time")
-
-
-def _join(first: Recording, second: Recording) -> Recording:
-    columns = {name: np.concatenate([values, second.columns[name]]) for name, values in first.columns.items()}
-    return replace(first, columns=columns)
 
 
 def _clock_times(recording: Recording, clocks: dict[int, str]) -> dict[int, Array]:

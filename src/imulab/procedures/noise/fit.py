@@ -174,7 +174,7 @@ def read_log(
         return whole()
     read, source = blocks()
     first = next(read)
-    names = choose(first) if len(first.clocks) == 1 else []
+    names = choose(first) if first.on_one_clock else []
     rest = long_rest(chain([first], read), names) if names else None
     if rest is None:
         return replace(on_disk(blocks()[0]), source=source)

@@ -202,7 +202,7 @@ def _gyroscopes(
 ) -> list[Recording]:
     """Return the recordings on the gyroscopes' clock, which may be that of the accelerometers."""
     check_gyroscopes(recordings)
-    if all(len(each.clocks) == 1 for each in as_read):
+    if all(each.on_one_clock for each in as_read):
         return recordings
     return prepare_gyroscopes([own_clock(each, "gyro") for each in as_read], temperature_column, settling)
 

@@ -395,14 +395,14 @@ def _warn_sign_of_dip(dip: float, axes: Array) -> str:
     reversed axis, explain the data more simply.
     """
     where, other = ("northern", "southern") if dip > 0 else ("southern", "northern")
-    said = (
+    sentence = (
         f"mag: the dip of {np.degrees(dip):+.1f} deg is one of the {where} hemisphere; if this is the {other}, a "
         "magnetometer axis is reversed, two are exchanged, or the accelerometers read minus the specific force"
     )
     if np.count_nonzero(axes < 0) < 2:
-        return Note(f"{said} (--hemisphere checks it)")
+        return Note(f"{sentence} (--hemisphere checks it)")
     return Finding(
-        f"{said}: x y z are taken from the columns {_name_columns(axes)}, and would be {_name_columns(-axes)}",
+        f"{sentence}: x y z are taken from the columns {_name_columns(axes)}, and would be {_name_columns(-axes)}",
         "state the hemisphere (--hemisphere)",
     )
 
