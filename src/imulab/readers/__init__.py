@@ -20,9 +20,8 @@ from numpy.lib.stride_tricks import as_strided
 from imulab.columns import kind_of
 from imulab.display import Note
 from imulab.errors import ImulabError, ReadError, UnitError, file_name
-from imulab.readers.formats import FORMATS, TEXT, recognised
+from imulab.readers.formats import FORMATS, TEXT, is_packed, recognised, unpacked
 from imulab.readers.layout import IfNeeded, load_layout, spread_packets
-from imulab.readers.packed import is_packed, unpacked
 from imulab.readers.selection import Selection
 from imulab.readers.text import TextFile
 from imulab.recording import Array, Layout, Recording, Source, Window, packed

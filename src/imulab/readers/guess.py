@@ -27,10 +27,9 @@ from imulab.columns import KINDS, triad
 from imulab.errors import ReadError, file_name, first_of, quoted, readable
 from imulab.options import measure, parsed, text
 from imulab.quantities import parse_units
-from imulab.readers.formats import TEXT, recognised
+from imulab.readers.formats import TEXT, is_packed, recognised, unpacked
 from imulab.readers.jsonfile import LARGEST, parsed_document
 from imulab.readers.labelled import LabelledLines, pairs
-from imulab.readers.packed import is_packed, unpacked
 from imulab.readers.shipped import advice
 from imulab.readers.text import is_native
 from imulab.readers.titles import Title, is_number, is_units_row, read_title
