@@ -7,6 +7,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.estimation.noise.simulate import simulated
 from imulab.procedures import registry
+from imulab.procedures.noise.figures import exhibits
 from imulab.procedures.noise.wants import STEPS, noise_for
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
@@ -170,3 +171,15 @@ def test_mistakes_are_refused_in_one_line(home, tmp_path, capsys, arguments, mes
     assert captured.err.count("\n") == 1
     assert message in captured.err
     assert not output.exists()
+
+
+def test_the_table_for_filters_has_the_limit_of_a_walk_that_was_not_seen():
+    samples = np.random.default_rng(3).normal(0, 0.02, (20_000, 3))
+    record = il.fit_noise({"gyro": samples}, rate=100.0, unit="rad/s").calibration
+    table = next(item for item in exhibits(record).items if getattr(item, "title", "").startswith("For filters"))
+    zero = [row for row in table.rows if record.fit["filter_walk"][row[0]]["value"] == 0]
+    assert zero
+    for name, _, _, walk, interval, *_ in zero:
+        limit = record.parameters[f"{name}_walk"].unseen_limit
+        assert limit > 0
+        assert (walk, interval) == (f"< {limit:.2g}", f"0 to {limit:.2g}")

@@ -53,7 +53,7 @@ def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
     fit = fit_of(record)
     names = list(fit.columns)
-    items: list[Figure | ReportTable] = [_terms(record), _for_filters(fit), _models(fit)]
+    items: list[Figure | ReportTable] = [_terms(record), _for_filters(record, fit), _models(fit)]
     items += [_curve(record, fit, name) for name in names[:_MOST_CURVES]]
     pages = panels.pages(names)
     items += [_ratios(record, fit, page, k, len(pages)) for k, page in enumerate(pages)]
@@ -126,7 +126,7 @@ def _between(value: float, low: float, high: float) -> tuple[str, str]:
     return f"{value:.{places}f}", f"{low:.{places}f} to {high:.{places}f}"
 
 
-def _for_filters(fit: NoiseSummary) -> ReportTable:
+def _for_filters(record: Calibration, fit: NoiseSummary) -> ReportTable:
     rows = []
     times = fit.bias_uncertainty[next(iter(fit.columns))].time.value
     for name, column in fit.columns.items():
@@ -134,13 +134,17 @@ def _for_filters(fit: NoiseSummary) -> ReportTable:
         bias = fit.bias_uncertainty[name]
         means = dict(zip(bias.time.value, bias.standard_uncertainty.value, strict=False))
         white, walk = fit.filter_white[name], fit.filter_walk[name]
+        most = walk.interval_95[1]
+        # Models without slow noise may have all the weight; what the log leaves room for is the limit of K.
+        if not most and (slow := record.parameters.get(f"{name}_walk")) is not None:
+            most = slow.unseen_limit or 0.0
         rows.append(
             [
                 name,
                 f"{white.value:.3g}",
                 f"{column.unit}/sqrt(Hz)",
-                f"{walk.value:.2g}" if walk.value else f"< {walk.interval_95[1]:.2g}",
-                f"{walk.interval_95[0]:.2g} to {walk.interval_95[1]:.2g}",
+                f"{walk.value:.2g}" if walk.value else f"< {most:.2g}" if most else "not seen",
+                f"{walk.interval_95[0]:.2g} to {most:.2g}" if most else "–",
                 f"{column.unit}/sqrt(s)",
                 *(plain_number(means[t] * factor, 2) if t in means else "–" for t in times),
                 unit,
