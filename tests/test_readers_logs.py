@@ -505,7 +505,7 @@ def test_a_text_log_of_ardupilot_asks_for_the_binary_one(file):
 
 def test_a_refusal_stays_one_line_where_there_is_also_something_to_warn_of(file, streams, imulab, tmp_path):
     cut = file(px4_log(*streams)[:-5], "cut.ulg")
-    for unit, lines in (("count", 1), ("m/s^2", 3)):
+    for unit, lines in (("count", 1), ("m/s^2", 4)):
         terms = {"bias": (0.0, "m/s^2"), "scale_factor": (1.0, f"{unit}/(m/s^2)")}
         parameters = {f"{stem}_{a}": Parameter(v, None, of) for stem, (v, of) in terms.items() for a in AXES}
         parameters |= {f"misalignment_{pair}": Parameter(0.0, None, "rad") for pair in ("yx", "zx", "zy")}
@@ -517,6 +517,7 @@ def test_a_refusal_stays_one_line_where_there_is_also_something_to_warn_of(file,
         assert ("outputs in count" in done.stderr) == (done.returncode == 2) == (unit == "count")
     assert "truncated" in done.stderr
     assert "K away" in done.stderr
+    assert "resampled: accel from 199.721 Hz to 800 Hz" in done.stderr
     assert "corrected by rec.json: out.csv" in done.stderr
 
 
