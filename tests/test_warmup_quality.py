@@ -98,8 +98,9 @@ def test_an_axis_of_one_value_has_no_time_constants_to_speak_of():
     assert said == [True, False]
 
 
+@pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("exchanged", [None, (1, 2), (0, 3)])
-def test_exchanged_temperatures_are_named(exchanged):
+def test_exchanged_temperatures_are_named(exchanged, count):
     """The amplitude of a curve goes as a parabola of the temperature: what fits no neighbours is no such law."""
     at, labels = [-40, -20, 0, 20, 40], [-40, -20, 0, 20, 40]
     if exchanged:
@@ -114,7 +115,7 @@ def test_exchanged_temperatures_are_named(exchanged):
     cycles = [
         cycle_of(curve(true), label, name=f"c{true}_{number}")
         for true, label in zip(at, labels, strict=True)
-        for number in (1, 2)
+        for number in range(1, count + 1)
     ]
     warnings = il.fit_warmup(cycles, temperatures=at, settling_time=END, model="knot-cubic").calibration.warnings
     lines = [line for line in warnings if "only when they are exchanged" in line]

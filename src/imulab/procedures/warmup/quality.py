@@ -363,6 +363,8 @@ _LATE = 0.5  # s after power-on: the fastest part of the curve is missing
 _DRIFT_SHARE = 0.5  # of the residual: a smaller drift of the settled part is not warned of
 _FEWEST_TEMPERATURES, _EXCHANGED = 5, 3.0
 """Temperatures that show two of them exchanged; by how many times the bends between neighbours must then lessen."""
+_USUAL_SCATTER = 0.04
+"""Of a curve, from cycle to cycle: taken where there is one cycle at each temperature."""
 _MOST_NAMED = 3  # cycles that a warning names
 _WIDE = 20.0  # K between knots from which one curve for the whole interval is doubted
 _AT_LIMIT = 1.02  # a time constant within 2 % of the limit of the search is at the limit
@@ -629,11 +631,12 @@ def _warn_exchanged(curves: Curves) -> list[str]:
     bend = np.zeros((count - 2, count))
     for k in range(count - 2):
         bend[k, k : k + 3] = share[k] - 1, 1.0, -share[k]
-    apart = np.square((curves.mean - means[curves.group]) * width / scale).sum(axis=(1, 2))
     cycles = np.bincount(curves.group, minlength=count)
-    if (cycles < 2).all():
-        return []  # nothing tells what cycles scatter by
-    scatter = float(apart.sum()) / max(int((cycles - 1).sum()), 1)
+    if (cycles < 2).all():  # nothing tells what cycles scatter by
+        scatter = _USUAL_SCATTER**2 * float(np.square(flat).sum()) / count
+    else:
+        apart = np.square((curves.mean - means[curves.group]) * width / scale).sum(axis=(1, 2))
+        scatter = float(apart.sum()) / int((cycles - 1).sum())
     floor = float((np.square(bend).sum(axis=0) / cycles).sum()) * scatter
 
     def roughness(order: Sequence[int]) -> float:
