@@ -64,6 +64,13 @@ def test_one_attitude_of_outputs_that_never_change_is_refused_by_name(up, loss):
         il.fit_tumble(np.tile(up, (60, 1)), rate=10.0, unit="g", gravity=G, loss=loss)
 
 
+@pytest.mark.parametrize(("unit", "size"), [("g", 1.0), ("count", 8192.0), ("V", 2.5)])
+def test_one_attitude_is_refused_as_too_few_in_any_unit(unit, size):
+    one = il.Recording.from_arrays(accel=size * np.array([[0.01, -0.02, 1.0]]), units={"accel": unit})
+    with pytest.raises(ObservabilityError, match=r"1 attitude determines \d of the 9 parameters of order 1"):
+        il.fit_tumble(one, order=1, gravity=9.81)
+
+
 @pytest.mark.parametrize("unit", ["m/s^2", "g"])
 @pytest.mark.parametrize("offset", [-2.0, 1.0, 1.5])
 def test_zeros_of_one_to_two_g_are_found_in_any_unit(unit, offset):

@@ -188,6 +188,8 @@ class Session:
         As for `Guide`.
     source
         Name of the source, as shown.
+    guide
+        The attitudes and the plan.
     """
 
     order: int | str = "auto"
@@ -197,7 +199,7 @@ class Session:
     source: str = ""
     state: str = "waiting"
     events: list[Event] = field(default_factory=list)
-    _guide: Guide | None = None
+    guide: Guide = field(init=False)
     _still: Stillness = field(default_factory=Stillness)
     _watch: Watch = field(default_factory=Watch)
     _counts: Counts = field(default_factory=Counts)
@@ -216,6 +218,10 @@ class Session:
     _further: tuple[KnownUnit, ...] = ()
     _magnetometers: bool = False
 
+    def __post_init__(self) -> None:
+        """Make the guide, which gets the unit of the outputs with the first samples."""
+        self.guide = Guide(self.order, self.gravity, self.targets, self.planned)
+
     def feed(self, block: Recording, counts: Counts | None = None) -> list[Event]:
         """Take samples, with the faults of the stream so far, and return what happened.
 
@@ -233,10 +239,10 @@ class Session:
                 f"{self.source or block.name}: expected time and accel_x accel_y accel_z, found "
                 f"{' '.join(block.columns)}"
             )
-        if self._guide is None:
+        if self._first is None:
+            self._first = float(times[0])
             self._begin(block)
         self._counts = counts or self._counts
-        self._first = float(times[0]) if self._first is None else self._first
         self._time, self._samples = float(times[-1]), self._samples + len(block)
         if "temperature" in block and block.units["temperature"] in ("degC", "K"):
             self._temperature = float(to_si(float(block.column("temperature")[-1]), block.units["temperature"]))
@@ -244,13 +250,6 @@ class Session:
         for moment in self._still.feed(times, block.triad("accel")):
             self._at(moment)
         return self.events
-
-    @property
-    def guide(self) -> Guide:
-        """The attitudes and the plan; they exist once samples have come."""
-        if self._guide is None:
-            self._guide = Guide(self.order, self.gravity, self.targets, self.planned)
-        return self._guide
 
     @property
     def enough(self) -> bool:

@@ -375,6 +375,8 @@ def nominal_scaling(attitudes: Attitudes, gravity: float, method: str = "norm") 
         zero = far_zero(attitudes.mean) if method == "norm" else np.zeros(3)
         return Scaling(zero, np.full(3, gravity / to_si(1.0, unit.symbol)))
     high, low = attitudes.mean.max(axis=0), attitudes.mean.min(axis=0)
+    if np.array_equal(high, low):  # a single attitude has no span: its length is 1 g
+        return Scaling(np.zeros(3), np.full(3, float(np.linalg.norm(high)) or 1.0))
     return Scaling((high + low) / 2, np.maximum((high - low) / 2, (high - low).max() / 20))
 
 
