@@ -446,32 +446,120 @@ rates = {{ unit = "deg/s" }}
 file = {file!r}
 power_cycle = 1
 role = "static"
+[[run]]
+file = "other.csv"
+power_cycle = 1
+role = "loaded"
+arm_rate = 126.87
+table_rate = 10
+sense = 1
+spin_axis = "up"
 """
 
 
-@pytest.mark.parametrize("file", ["/etc/passwd", "../secret.csv", "sub/rec.csv", "link.csv"])
-def test_a_manifest_that_was_dropped_names_no_file_outside_the_folder(bench, file):
-    Path("secret.csv").write_text("time [s],fog [deg/s]\n0,1\n")
-    Path("session/link.csv").symlink_to("../secret.csv")
-    bench.ask("files/m.csv", MANIFEST.format(file=file).encode(), "PUT")
-    values = {"manifest": "session/m.csv", "output": True}
-    for what in ("command", "jobs"):
-        answer = bench.ask(what, {"command": "centrifuge reduce", "values": values})
-        assert answer.status == 400
-        assert answer.json()["error"].startswith(f"session/m.csv: {file!r}: expected the name of a file in the session")
-    assert bench.part._jobs.jobs == {}
+RATE_MANIFEST = """
+rates.unit = "deg/s"
+rates.relative_standard_uncertainty = 0.0
+mounting = {{ standard_uncertainty = 0, unit = "mrad" }}
+latitude = {{ value = 48, unit = "deg" }}
+[[run]]
+file = {file!r}
+mounting = "+x"
+rates = [0, 100, -100, 0]
+"""
+REDUCE, FIT = ("centrifuge reduce", "manifest", MANIFEST), ("rate fit", "file", RATE_MANIFEST)
+
+
+@pytest.mark.parametrize(
+    ("file", "command"),
+    [("/etc/passwd", FIT), ("sub/link.csv", FIT), ("../secret.csv", REDUCE), ("linked/secret.csv", REDUCE)],
+)
+def test_a_manifest_that_was_dropped_reads_no_file_outside_the_folder(bench, file, command):
+    path, field, manifest = command
+    Path("secret.csv").write_text("secret,time\n0,1\n")
+    Path("session/sub").mkdir()
+    Path("session/sub/link.csv").symlink_to(Path("secret.csv").absolute())
+    Path("session/linked").symlink_to(Path.cwd())
+    bench.ask("files/m.toml", manifest.format(file=file).encode(), "PUT")
+    job = run(bench, path, **{field: "session/m.toml"})
+    assert (job.state, job.status) == ("refused", 2)
+    assert job.messages[-1].endswith("lies elsewhere; expected a file in the session's folder")
+    assert "secret,time" not in "".join(job.messages) + job.text
+    assert "root:" not in "".join(job.messages) + job.text
+
+
+def test_a_manifest_that_is_exchanged_after_the_form_was_checked_reads_nothing_more(bench, monkeypatch):
+    Path("secret.csv").write_text("secret,time\n0,1\n")
+    bench.ask("files/m.toml", MANIFEST.format(file="own.csv").encode(), "PUT")
+    begin = Jobs._begin
+
+    def exchanged(jobs: Jobs, job: Any) -> None:
+        Path("session/m.toml").write_text(MANIFEST.format(file="../secret.csv"))
+        begin(jobs, job)
+
+    monkeypatch.setattr(Jobs, "_begin", exchanged)
+    job = run(bench, "centrifuge reduce", manifest="session/m.toml", output=True)
+    assert job.messages[-1].endswith("../secret.csv: lies elsewhere; expected a file in the session's folder")
+
+
+def test_a_link_that_is_exchanged_between_check_and_opening_opens_nothing(tmp_path, monkeypatch):
+    from imulab import files as module
+
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/a").write_text("inside")
+    (tmp_path / "secret").write_text("secret")
+    monkeypatch.setenv(module.WITHIN, json.dumps([str((tmp_path / "in").resolve())]))
+    with module.open_file(tmp_path / "in/a") as stream:
+        assert stream.read() == b"inside"
+    check, times = module.check_within, []
+
+    def exchanging(path: Any) -> str:
+        found = check(path)
+        if not times:  # after the check, before the file is opened
+            (tmp_path / "in/a").unlink()
+            (tmp_path / "in/a").symlink_to(tmp_path / "secret")
+        times.append(path)
+        return found
+
+    monkeypatch.setattr(module, "check_within", exchanging)
+    with pytest.raises(OptionError, match="lies elsewhere"):
+        module.open_file(tmp_path / "in/a")
+
+
+def test_every_file_that_a_name_of_the_input_leads_to_is_opened_by_the_shared_opener():
+    """What reads by a name of its input: no ``open``, ``read_bytes`` or ``read_text`` of a path but in `open_file`."""
+    root = Path(il.__file__).parent
+    other = re.compile(r"\.open\(\"r?b?\"\)|\.read_(bytes|text)\(|[^._a-z]open\(")
+    for room in ("readers", "records", "device", "procedures"):
+        for path in sorted((root / room).rglob("*.py")):
+            if path.name != "shipped.py":  # reads what comes with imulab
+                assert not other.search(path.read_text(encoding="utf-8")), path
 
 
 def test_a_manifest_of_the_command_line_names_files_where_they_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("m.toml").write_text(MANIFEST.format(file="/data/one.csv"))
-    files = FolderFiles(Path("session"), ["m.toml"])
-    files.make()
-    files.check_manifest("m.toml")
-    Path("session/own.toml").write_text(MANIFEST.format(file="one.csv"))
-    files.check_manifest("session/own.toml")
-    Path("session/none.toml").write_text("[[")
-    files.check_manifest("session/none.toml")  # what is wrong with it the command says
+    Path("L.toml").write_text("")
+    files = FolderFiles(Path("session"), ["m.toml", "L.toml"])
+    assert files.within(["rate", "fit", "m.toml"]) is None
+    for words in (["session/m.toml"], ["x.csv", "--layout", "L.toml"], ["session/m.toml", "--layout", "m.toml"]):
+        assert files.within(["rate", "fit", *words]) == ["session", "m.toml", "L.toml"]
+
+
+def test_no_more_jobs_run_than_there_are_cores_and_the_others_wait(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told: list[tuple[int, str]] = []
+    jobs = Jobs(lambda job: told.append((job.number, job.state)), most=1)
+    found = [jobs.run("show", ["show", "--formats"], []) for _ in range(4)]
+    assert [job.state for job in found] == ["running", "waiting", "waiting", "waiting"]
+    jobs.cancel(3)
+    until(lambda: all(job.ended for job in found))
+    assert [job.state for job in found] == ["done", "done", "cancelled", "done"]
+    assert found[0].ended <= found[1].began <= found[1].ended <= found[3].began
+    assert [state for number, state in told if number == 4] == ["waiting", "running", "done"]
+    last = [jobs.run("show", ["show", "--formats"], []) for _ in range(3)]
+    jobs.end()
+    assert {job.state for job in last} == {"cancelled"}
 
 
 @pytest.mark.parametrize("name", ["con.csv", "NUL", "com1.txt", "lpt² .csv", "a?.csv", "rec.csv.", "rec "])

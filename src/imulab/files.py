@@ -11,6 +11,8 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BufferedReader
+from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -118,6 +120,66 @@ def _umask() -> int:
     return mask
 
 
+# Reading files, within the folders to which a command of a page is confined.
+
+
+WITHIN = "IMULAB_WITHIN"
+"""Variable of the environment: JSON list of folders and files that a process may read by names in its input."""
+_PACKAGE = os.path.dirname(os.path.realpath(__file__))  # noqa: PTH120 -- layouts that come with imulab
+_permitted: list[str] = []
+
+
+def permit(path: Path) -> None:
+    """Permit a file to be read that this process has made, or that the project file is or names."""
+    _permitted.append(os.path.realpath(path))
+
+
+def check_within(path: str | PathLike[str]) -> str:
+    """Return the real path of a file; refuse one elsewhere than where this process may read, if it is confined.
+
+    Raises
+    ------
+    OptionError
+        It lies elsewhere, perhaps through a link.
+    """
+    real = os.path.realpath(path)
+    if WITHIN not in os.environ:
+        return real
+    import json
+
+    roots = (*json.loads(os.environ[WITHIN]), _PACKAGE, *_permitted)
+    if not any(real == root or real.startswith(os.path.join(root, "")) for root in roots):  # noqa: PTH118
+        raise OptionError(f"{path}: lies elsewhere; expected a file in the session's folder")
+    return real
+
+
+def open_file(path: str | PathLike[str]) -> BufferedReader:
+    """Return a file opened for reading. It is what its real path names, so that no link can change between the two.
+
+    Raises
+    ------
+    OSError
+        It cannot be opened.
+    OptionError
+        As for `check_within`.
+    """
+    if WITHIN not in os.environ:
+        return Path(path).open("rb")
+    stream = Path(check_within(path)).open("rb")  # noqa: SIM115
+    try:
+        if os.path.samestat(os.fstat(stream.fileno()), os.lstat(check_within(path))):
+            return stream
+        raise OptionError(f"{path}: was replaced while it was opened")
+    except BaseException:
+        stream.close()
+        raise
+
+
+def within(path: Path) -> Path | BufferedReader:
+    """Return a path for a library that opens files itself, or the open file where this process is confined."""
+    return open_file(path) if WITHIN in os.environ else path
+
+
 # TOML files: layouts, manifests of tests, limits, the project file.
 
 
@@ -162,12 +224,13 @@ def load_toml(path: str | Path, name: str, what: str) -> dict[str, Any]:
 def _text(path: Path, name: str, what: str) -> str:
     """Return the text of a regular file of no more than the largest size."""
     try:
+        check_within(path)
         mode = path.stat().st_mode  # before it is opened: opening a pipe waits for a writer
         if stat.S_ISDIR(mode):
             raise ReadError(f"{name}: expected a {what} file, found a folder")
         if not stat.S_ISREG(mode):
             raise ReadError(f"{name}: expected a {what} file, found a device or a pipe")
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             data = stream.read(_LARGEST + 1)
     except FileNotFoundError:
         if os.path.lexists(path):

@@ -12,7 +12,7 @@ from typing import Any
 from imulab.cli.command import KEYS, NAME, Command
 from imulab.cli.options import choose, note, speech, tell
 from imulab.errors import OptionError, listed, quoted
-from imulab.files import load_toml
+from imulab.files import load_toml, permit
 
 # The project file ``imulab.toml``, which replaces options of every command.
 
@@ -45,6 +45,7 @@ def load(path: Path, shown: str) -> dict[str, str]:
     ReadError, OptionError
         It cannot be read, or has a key or value that it cannot have.
     """
+    permit(path)
     table = load_toml(path, shown, "project")
     settings: dict[str, str] = {}
     for key, value in table.items():
@@ -70,6 +71,7 @@ def _file(key: str, value: str, shown: str) -> str:
     if key == "layout" and shipped_file(value):
         return value
     path = Path(os.path.normpath(Path(shown).parent / value))
+    permit(path)
     if path.is_dir():
         raise OptionError(f"{shown}: {key} = {quoted(value)}: expected the name of a file, found a folder")
     if not path.is_file():

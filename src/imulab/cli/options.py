@@ -245,7 +245,11 @@ class GivenFiles:
 
     def beside(self, name: str, file: str) -> str:
         """Return the name of a file that is named relative to another."""
-        return str(Path(name).parent / file)
+        from imulab.files import check_within
+
+        path = Path(name).parent / file
+        check_within(path)  # before it is asked whether there is such a file
+        return str(path)
 
 
 def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:

@@ -25,6 +25,7 @@ from imulab.columns import triad
 from imulab.device.tables import KINDS, TEXT, ArraySettings, DeviceTable, array_table, field_of, pack
 from imulab.display import first_hidden
 from imulab.errors import DataError, OptionError, RecordError, UnitError
+from imulab.files import open_file
 from imulab.recording import Array, Recording
 from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
 from imulab.records.sections import Part, Positive, Size, check_sizes, holds, read
@@ -461,7 +462,7 @@ def is_blob(path: str | Path) -> bool:
     try:
         if not Path(path).is_file():
             return False  # a pipe can be read only once
-        with Path(path).open("rb") as stream:
+        with open_file(path) as stream:
             return stream.read(len(BLOB_MAGIC)) == BLOB_MAGIC
     except OSError:
         return False
@@ -476,7 +477,8 @@ def load_blob(path: str | Path) -> Blob:
         The file is missing, cut, corrupt, of a newer version, or no blob.
     """
     try:
-        data = Path(path).read_bytes()
+        with open_file(path) as stream:
+            data = stream.read()
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
     try:

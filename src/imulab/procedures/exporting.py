@@ -16,6 +16,7 @@ from imulab.device.tables import Fusion
 from imulab.display import SENTENCES
 from imulab.errors import ImulabError, OptionError, listed
 from imulab.exporters import EXPORTERS, MAG_MOUNTS, ExportOptions
+from imulab.files import open_file
 from imulab.options import choice, file, text
 from imulab.procedures.apply import tables_of
 from imulab.procedures.registry import load, procedure_of
@@ -145,7 +146,8 @@ def _state_noise(record: Calibration, name: str) -> Mapping[str, Any]:
 def _read_noise(file: str) -> Mapping[str, Any]:
     """Return the noise in the file of a noise record, or of ``allan --json``."""
     try:
-        content = json.loads(Path(file).read_text(encoding="utf-8"))
+        with open_file(file) as stream:
+            content = json.loads(stream.read().decode("utf-8"))
     except FileNotFoundError:
         raise OptionError(f"{file}: no such file") from None
     except (OSError, ValueError) as error:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 from msgspec import Struct
 
 from imulab.errors import OptionError
+from imulab.files import open_file
 from imulab.options import Option, options_of
 
 if TYPE_CHECKING:
@@ -307,5 +308,5 @@ def source_of(access: Files, name: str, called: str | None = None) -> Source | N
     path = access.path(name)
     if name == "-" or not path.is_file():
         return None
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         return Source(called or name, hashlib.file_digest(stream, "sha256").hexdigest())

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import RecordError, file_name, readable
+from imulab.files import open_file
 from imulab.options import FLAG
 from imulab.procedures.centrifuge.procedure import CentrifugeProcedure
 from imulab.procedures.gyro_array.procedure import GyroArrayProcedure
@@ -100,7 +101,7 @@ def load(path: str | Path) -> Calibration:
 
 def load_sealed(path: str | Path) -> tuple[Calibration, str]:
     """Return a calibration record and its ``content_sha256``; errors as for `load`."""
-    with readable(path, RecordError), Path(file_name(path)).open("rb") as stream:
+    with readable(path, RecordError), open_file(file_name(path)) as stream:
         data = stream.read(_LARGEST + 1)
     if len(data) > _LARGEST:
         raise RecordError(f"{path}: more than {_LARGEST >> 20} MiB; expected a record, of some kilobytes")

@@ -18,7 +18,7 @@ from imulab.arguments import check, checked, described, types_of, unknown_option
 from imulab.display import Bad, Note, Shown, aligned, verdict_of
 from imulab.errors import DataError, OptionError
 from imulab.estimation.sampling import mend_stamps
-from imulab.files import write_page
+from imulab.files import open_file, write_page
 from imulab.frames import columns_of_arrays, is_frame, unmasked
 from imulab.options import file
 from imulab.readers import read, read_blocks
@@ -251,7 +251,7 @@ def as_blocks(
     part = _pick(stated, _PART)
     path, source = Path(data), None
     if path.is_file():
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             source = Source(str(data), hashlib.file_digest(stream, "sha256").hexdigest())
     blocks = read_blocks(path, **_pick(stated, (*_OF_FILES, *_UNITS)), **part)
     return (blocks if clock == OWN_CLOCKS else on_clock_of(blocks, clock)), source

@@ -20,6 +20,7 @@ from numpy.lib.stride_tricks import as_strided
 from imulab.columns import kind_of
 from imulab.display import Note
 from imulab.errors import ImulabError, ReadError, UnitError, file_name
+from imulab.files import open_file
 from imulab.readers.formats import FORMATS, TEXT, is_packed, recognised, unpacked
 from imulab.readers.layout import IfNeeded, load_layout, spread_packets
 from imulab.readers.selection import Selection
@@ -201,7 +202,7 @@ class _Hash:
 
             parts = files_of(path, str(file))
         for part in parts:
-            with part.open("rb") as stream:
+            with open_file(part) as stream:
                 while data := stream.read(1 << 22):
                     total.update(data)
         return total.hexdigest()
@@ -320,7 +321,7 @@ def _head(file: str | Path, size: int = _HEAD) -> bytes:
     if is_pipe(file):
         return b""
     try:
-        with Path(file).open("rb") as stream:
+        with open_file(file) as stream:
             return stream.read(size)
     except OSError:
         return b""
@@ -366,7 +367,7 @@ def _open(file: str | Path, name: str) -> BinaryIO:
             raise ReadError(f"{name}: was read before; expected one file that is '-'")
         return sys.stdin.buffer
     try:
-        return Path(file).open("rb")
+        return open_file(file)
     except FileNotFoundError:
         raise ReadError(f"{name}: no such file") from None
     except IsADirectoryError:

@@ -16,6 +16,7 @@ import numpy as np
 from imulab.columns import triad
 from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError
+from imulab.files import open_file
 from imulab.readers import logs
 from imulab.readers.selection import Selection
 from imulab.readers.streams import LoggedStream, Piece, side_by_side
@@ -143,7 +144,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
 def _survey(path: Path, name: str) -> _Contents:
     contents = _Contents()
     ending: list[logs.Ending] = []
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         for records in logs.walk_stream(stream, logs.DATAFLASH, 0, path.stat().st_size, ending):
             for index in records.of(_FMT).tolist():
                 _define(contents, records.payload(index), name)
@@ -179,7 +180,7 @@ def _survey(path: Path, name: str) -> _Contents:
 
 
 def _is_fill(path: Path, position: int) -> bool:
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         stream.seek(position)
         first = stream.read(1)
         if first not in (b"\x00", b"\xff"):
@@ -341,7 +342,7 @@ def _add_magnetometer(
 def _pieces(
     path: Path, contents: _Contents, sources: dict[int, list[tuple[int, int | None, tuple[str, ...]]]], name: str
 ) -> Iterator[Piece]:
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         for records in logs.walk_stream(stream, logs.DATAFLASH, 0, path.stat().st_size, []):
             for kind, parts in sources.items():
                 form = contents.formats[kind]

@@ -20,6 +20,7 @@ from typing import IO, Any
 from msgspec import Struct
 
 from imulab.errors import ReadError, first_of
+from imulab.files import open_file, permit
 
 # Unpacking within limits: a few kilobytes can unpack to terabytes.
 
@@ -117,7 +118,7 @@ def unpacked(path: Path, name: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="imulab-") as folder:
         target = Path(folder) / "unpacked"
         try:
-            with path.open("rb") as stream, target.open("wb") as out, _content(stream, name) as content:
+            with open_file(path) as stream, target.open("wb") as out, _content(stream, name) as content:
                 budget = Budget(path, name)
                 while data := content.read(_PIECE):
                     budget.take(len(data))
@@ -126,6 +127,7 @@ def unpacked(path: Path, name: str) -> Iterator[Path]:
             raise ReadError(f"{name}: truncated or damaged, cannot be unpacked: {error}") from None
         except OSError as error:
             raise ReadError(f"{name}: cannot be unpacked: {error.strerror or error}") from None
+        permit(target)
         yield target
 
 

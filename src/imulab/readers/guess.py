@@ -25,6 +25,7 @@ from msgspec import Struct, field
 
 from imulab.columns import KINDS, triad
 from imulab.errors import ReadError, file_name, first_of, quoted, readable
+from imulab.files import open_file
 from imulab.options import measure, parsed, text
 from imulab.quantities import parse_units
 from imulab.readers.formats import TEXT, is_packed, recognised, unpacked
@@ -150,10 +151,10 @@ def guess_layout(
     'm/s^2'
     """
     name = os.fsencode(file_name(file)).decode("utf-8", "backslashreplace")
-    with readable(name), Path(file).open("rb") as stream:
+    with readable(name), open_file(file) as stream:
         head = stream.read(HEAD)
         packed = unpacked(Path(file), name) if is_packed(head) else nullcontext(Path(file))
-    with packed as content, content.open("rb") as stream:
+    with packed as content, open_file(content) as stream:
         head = stream.read(HEAD)
         if recognised(head[:1024]).module == "jsonfile":
             head += stream.read(LARGEST)

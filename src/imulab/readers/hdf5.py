@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from imulab.errors import ReadError
+from imulab.files import within
 from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
 from imulab.readers.formats import Budget, library
 from imulab.recording import Array, Layout, Recording
@@ -26,22 +27,21 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
     """
     h5py = library("h5py", "HDF5", "hdf5", name)
     try:
-        file = h5py.File(path, "r")
+        file = h5py.File(within(path), "r")
     except Exception as error:  # h5py raises OSError, RuntimeError, KeyError ...
         raise ReadError(f"{name}: not a whole HDF5 file: {_short(error)}") from None
     with file:
         try:
-            yield from _recordings(h5py, file, name, layout)
+            yield from _recordings(h5py, file, Budget(path, name), name, layout)
         except (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError) as error:
             raise ReadError(f"{name}: damaged: {_short(error)}") from None
 
 
-def _recordings(h5py: Any, file: Any, name: str, layout: Layout | None) -> Iterator[Recording]:
+def _recordings(h5py: Any, file: Any, budget: Budget, name: str, layout: Layout | None) -> Iterator[Recording]:
     if layout is None:
         raise ReadError(
             f"{name}: say with --layout FILE.toml which dataset is which column; datasets found: {_list(h5py, file)}"
         )
-    budget = Budget(Path(file.filename), name)
     counted: set[Any] = set()
     take: dict[str, Callable[[int, int], Array]] = {}
     lengths: dict[str, int] = {}

@@ -17,6 +17,7 @@ import numpy as np
 import imulab.readers._text as _text
 from imulab.display import Note
 from imulab.errors import ReadError, meant
+from imulab.files import open_file
 from imulab.readers.arrays import FLAT, origins, recordings
 from imulab.readers.text import EITHER_ORDER, date_flags
 from imulab.recording import Array, Layout, Recording
@@ -46,7 +47,8 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
             "as a whole: write CSV, or several files"
         )
     try:
-        document = parsed_document(path.read_bytes(), name)
+        with open_file(path) as stream:
+            document = parsed_document(stream.read(), name)
         if isinstance(document, dict) and document.get("format") == FORMAT:
             raise ReadError(f"{name}: expected a recording, found JSON (a calibration record?)")
         if layout is None:

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from imulab.errors import ReadError
+from imulab.files import open_file
 from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
 from imulab.readers.formats import Budget, unpack
 from imulab.recording import Array, Layout, Recording
@@ -67,7 +68,7 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
     roots = {variable.partition("/")[0] for variable, _ in wanted.values()}
     try:
         budget = Budget(path, name)
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             variables = {known.name: known for known in _variables(stream.read(), roots if layout else None, budget)}
     except (_DamagedError, EOFError, zlib.error, struct.error, UnicodeDecodeError, ValueError, MemoryError) as error:
         raise ReadError(f"{name}: truncated or damaged, not a whole MATLAB file: {error}") from None

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from imulab.display import Finding, Note
 from imulab.errors import ReadError
+from imulab.files import open_file
 from imulab.readers.selection import Selection
 from imulab.recording import Array, Recording, Source
 from imulab.units import STANDARD_GRAVITY
@@ -42,7 +43,7 @@ def is_mimu(start: bytes) -> bool:
 def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
     """Yield the whole log, ten minutes of which are 25 MB."""
     selection.refuse(name, "such a log")
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         yield read_mimu(stream, name)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 from imulab.columns import kind_of, measured, parse_column_title
 from imulab.display import Note
 from imulab.errors import ReadError
+from imulab.files import within
 from imulab.readers.arrays import ROWS, origins, to_floats
 from imulab.readers.formats import Budget, library
 from imulab.readers.layout import Readings
@@ -41,7 +42,7 @@ def blocks(
 
     row, budget = 1, Budget(path, name, most=math.inf)
     try:
-        with parquet.ParquetFile(path, memory_map=False, pre_buffer=False, buffer_size=1 << 20) as file:
+        with parquet.ParquetFile(within(path), memory_map=False, pre_buffer=False, buffer_size=1 << 20) as file:
             there = file.schema_arrow.names
             columns, units = _columns(there, name, layout, stated)
             notes: tuple[Note, ...] = ()

@@ -31,6 +31,7 @@ import numpy as np
 from imulab.columns import triad
 from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError, listed
+from imulab.files import open_file
 from imulab.readers import logs
 from imulab.readers.formats import Budget, unpack
 from imulab.readers.selection import Selection
@@ -75,7 +76,8 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def _text(path: Path) -> str:
-    return path.read_bytes().decode("utf-8", "replace")
+    with open_file(path) as stream:
+        return stream.read().decode("utf-8", "replace")
 
 
 # The containers that ROS messages come in: ROS 1 bag, MCAP, ROS 2 sqlite.
@@ -119,7 +121,7 @@ def open_container(path: Path, name: str) -> Container:
     ReadError
         It is none of these, is cut, or is damaged.
     """
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         head = stream.read(16)
     if head.startswith(BAG_MAGIC):
         return Bag(path, name)
@@ -139,7 +141,7 @@ class Bag:
     def __init__(self, path: Path, name: str) -> None:
         self._path, self._name = path, name
         self._size = path.stat().st_size
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             line = stream.read(len(_BAG_LINE))
             if line != _BAG_LINE:
                 shown = line.decode("ascii", "replace").strip()
@@ -165,7 +167,7 @@ class Bag:
         """Yield the messages of some connections, a chunk at a time."""
         wanted = [2 | number << 8 for number in numbers]
         budget = Budget(self._path, self._name)
-        with self._path.open("rb") as stream:
+        with open_file(self._path) as stream:
             stream.seek(self._start)
             while stream.tell() < self._end:
                 place = stream.tell()
@@ -245,7 +247,7 @@ class Mcap:
         self._path, self._name = path, name
         size = path.stat().st_size
         start = len(MCAP_MAGIC)
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             if size >= 2 * start + _FOOTER:
                 stream.seek(size - start - _FOOTER)
             tail = stream.read()
@@ -294,7 +296,7 @@ class Mcap:
     def _blocks(self) -> Iterator[logs.Records]:
         ending: list[logs.Ending] = []
         budget = Budget(self._path, self._name)
-        with self._path.open("rb") as stream:
+        with open_file(self._path) as stream:
             for records in logs.walk_stream(stream, logs.MCAP, len(MCAP_MAGIC), self._end, ending):
                 for index in records.of(6).tolist():
                     yield self._chunk(records.payload(index), budget)
@@ -329,7 +331,7 @@ class Sqlite:
 
     def __init__(self, path: Path, name: str) -> None:
         self._path, self._name = path, name
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             head = stream.read(100)
         page, count = int.from_bytes(head[16:18], "big"), int.from_bytes(head[28:32], "big")
         expected = count * (65536 if page == 1 else page)

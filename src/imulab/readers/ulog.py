@@ -16,6 +16,7 @@ import numpy as np
 from imulab.columns import triad
 from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError
+from imulab.files import open_file
 from imulab.readers import logs
 from imulab.readers.selection import Selection
 from imulab.readers.streams import LoggedStream, Piece, side_by_side
@@ -97,7 +98,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
 
 def _survey(path: Path, name: str) -> _Contents:
     contents = _Contents(limit=path.stat().st_size)
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         head = stream.read(_HEADER)
         if len(head) < _HEADER or not head.startswith(MAGIC):
             raise ReadError(f"{name}: not a ULog: expected a header of {_HEADER} bytes, found {len(head)}")
@@ -304,7 +305,7 @@ def _needed(title: str, layout: dict[str, _Field]) -> list[str]:
 def _pieces(
     path: Path, contents: _Contents, sources: dict[int, tuple[int, str, dict[str, _Field]]], name: str
 ) -> Iterator[Piece]:
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         for records in logs.walk_stream(stream, logs.ULOG, _HEADER, contents.limit, []):
             for number, (slot, title, fields) in sources.items():
                 indices = records.of(ord("D") | number << 8)

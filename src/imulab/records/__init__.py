@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from imulab.errors import readable
+from imulab.files import open_file
 
 # Recognition of records by the first bytes of a file.
 
@@ -18,7 +19,7 @@ def is_json(file: str) -> bool:
 
     if file == "-" or (Path(file).exists() and not Path(file).is_file()):
         return False  # a pipe can be read only once, as a recording
-    with readable(file), Path(file).open("rb") as stream:
+    with readable(file), open_file(file) as stream:
         if not stream.read(64).lstrip().startswith(b"{"):
             return False
         stream.seek(0)

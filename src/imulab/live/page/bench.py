@@ -83,7 +83,7 @@ class Workbench(PagePart):
         self._hub = hub
         first = next((entry.name for entry in self._files.entries() if entry.kind == "recording"), None)
         if first is not None and self._files.is_given(first):
-            self._openings.open(first, {})
+            self._openings.open(first, {}, self._files.readable)
 
     def greet(self) -> Iterable[Message]:
         """Yield the files and the commands that were run."""
@@ -170,7 +170,7 @@ class Workbench(PagePart):
         layout = reading.get("layout", "")
         if set(layout) & {"/", "\\"} or Path(layout or "\0").exists():
             reading = {**reading, "layout": self._files.path(layout)}
-        return _json(_opening_message(self._openings.open(name, reading)))
+        return _json(_opening_message(self._openings.open(name, reading, self._files.readable)))
 
     async def _curves(self, request: Request) -> Response:
         query = request.query_params
@@ -189,7 +189,7 @@ class Workbench(PagePart):
             raise OptionError(f"command {quoted(asked.get('command'))}: not among those offered")
         inputs = [Path(each) for field in form.fields if not field.flag for each in _listed(values.get(field.name))]
         outputs: list[str] = []
-        running = {path for job in self._jobs.jobs.values() if job.state == "running" for path in job.outputs}
+        running = {path for job in self._jobs.jobs.values() if job.is_open for path in job.outputs}
         taken = running | self._coming
 
         def output(name: str, ending: str) -> str:
@@ -207,9 +207,6 @@ class Workbench(PagePart):
             return outputs[-1]
 
         words = form.words(values, self._files.path, output)
-        for field in form.fields:
-            for name in _listed(values.get(field.name)) if field.shows == "MANIFEST" else ():
-                self._files.check_manifest(name)
         return form, words, outputs
 
     async def _command(self, request: Request) -> Response:
@@ -218,7 +215,7 @@ class Workbench(PagePart):
 
     async def _run(self, request: Request) -> Response:
         form, words, outputs = self._fill_form(await _object(request))
-        return _json(_job_message(self._jobs.run(form.path, words, outputs)))
+        return _json(_job_message(self._jobs.run(form.path, words, outputs, self._files.within(words))))
 
     async def _cancel(self, request: Request) -> Response:
         await run_in_threadpool(self._jobs.cancel, request.path_params["number"])
@@ -235,7 +232,7 @@ def _json(value: Any) -> Response:
 
 def _job_message(job: PageJob) -> Message:
     there = [path for path in job.outputs if os.path.lexists(path)] if job.ended is not None else []
-    return {"type": "job", **asdict(job), "outputs": there}
+    return {"type": "job", **asdict(job), "within": None, "outputs": there}
 
 
 def _opening_message(opening: Opening) -> Message:

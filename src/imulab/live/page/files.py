@@ -13,13 +13,14 @@ import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from imulab.device.unit import is_blob
 from imulab.display import has_hidden
 from imulab.errors import ImulabError, OptionError, quoted
-from imulab.files import load_toml
+from imulab.files import WITHIN
 from imulab.live.page.curves import CurveView, Head, view
 from imulab.live.page.server import inside
 from imulab.records import is_json
@@ -128,26 +129,20 @@ class FolderFiles:
         """Return whether a file lies in the session's folder, and was not named on the command line."""
         return name not in self._given and Path(name).parent == self.folder
 
-    def check_manifest(self, name: str) -> None:
-        """Refuse a manifest in the session's folder that names a file elsewhere; one of the command line may.
+    @property
+    def readable(self) -> list[str]:
+        """The session's folder, and what the command line named."""
+        return [str(self.folder), *self._given]
 
-        Raises
-        ------
-        OptionError
-            It names a file elsewhere; the message says which.
+    def within(self, words: Sequence[str]) -> list[str] | None:
+        """Return what the command of these words may read: the session's folder, and what the command line named.
+
+        None, all files, where it has a manifest of the command line, which names files where they are.
         """
-        if not self.owns(name):
-            return
-        try:
-            runs = load_toml(name, name, "manifest").get("run")
-        except ImulabError:  # the command says so itself
-            return
-        for run in runs if isinstance(runs, list) else ():
-            if isinstance(run, dict) and isinstance(file := run.get("file"), str):
-                try:
-                    inside(self.folder, file)
-                except OptionError as error:
-                    raise OptionError(f"{name}: {error}") from None
+        manifests = [word for before, word in pairwise(words) if word.endswith(".toml") and before[:1] != "-"]
+        if manifests and all(word in self._given for word in manifests):
+            return None
+        return self.readable
 
     def new(self, name: str, taken: Collection[str] = ()) -> str:
         """Return the path of a new file in the session's folder.
@@ -281,8 +276,10 @@ class Openings:
         self._place = Path(tempfile.mkdtemp(prefix="imulab-curves-"))
         self._number = 0
 
-    def open(self, name: str, reading: Mapping[str, str]) -> Opening:
+    def open(self, name: str, reading: Mapping[str, str], within: Sequence[str]) -> Opening:
         """Return a file that is being read; reading starts if it has not, or if the file has changed.
+
+        `within` names the folders and files that reading it may open.
 
         Raises
         ------
@@ -310,6 +307,7 @@ class Openings:
         opening.process = subprocess.Popen(
             [sys.executable, "-P", "-m", "imulab.live.page.contents", name, str(folder), json.dumps(chosen)],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, encoding="utf-8",
+            env={**os.environ, WITHIN: json.dumps([os.path.realpath(root) for root in within])},
         )  # fmt: skip
         threading.Thread(target=self._listen, args=(opening,), daemon=True).start()
         return opening

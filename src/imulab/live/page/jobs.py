@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -18,6 +19,7 @@ from time import time
 from typing import IO, Any
 
 from imulab.errors import OptionError, listed, quoted
+from imulab.files import WITHIN
 from imulab.options import Option
 
 # Forms, made from the definitions of the command line.
@@ -231,11 +233,13 @@ class PageJob:
     outputs
         Paths of its outputs.
     state
-        ``running``, ``done``, ``refused`` (exit status 2, or 1 of a test that failed), ``cancelled``.
+        ``waiting``, ``running``, ``done``, ``refused`` (exit status 2, or 1 of a test that failed), ``cancelled``.
     messages, text
         Lines of standard error, and standard output.
     began, ended
-        Seconds since 1970.
+        Seconds since 1970; it begins when it no longer waits.
+    within
+        Folders and files that it may read; None for all.
     """
 
     number: int
@@ -243,47 +247,83 @@ class PageJob:
     command: str
     words: list[str]
     outputs: list[str]
-    state: str = "running"
+    state: str = "waiting"
     status: int | None = None
     messages: list[str] = dataclass_field(default_factory=list)
     text: str = ""
     began: float = dataclass_field(default_factory=time)
     ended: float | None = None
+    within: list[str] | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it runs or waits."""
+        return self.state in ("waiting", "running")
 
 
 class Jobs:
-    """The commands of a session; `tell` is called with every change, from other threads."""
+    """The commands of a session, `most` at a time; `tell` is called with every change, from other threads."""
 
-    def __init__(self, tell: Callable[[PageJob], object]) -> None:
+    def __init__(self, tell: Callable[[PageJob], object], most: int | None = None) -> None:
         self.jobs: dict[int, PageJob] = {}
-        self._tell = tell
+        self._tell, self._most = tell, most or _cores()
+        self._lock = threading.RLock()
         self._processes: dict[int, subprocess.Popen[str]] = {}
         self._watches: dict[int, threading.Thread] = {}
         self._due: set[int] = set()
 
-    def run(self, path: str, words: Sequence[str], outputs: Sequence[str]) -> PageJob:
-        """Start a command in the working folder, and return its job.
+    def run(
+        self, path: str, words: Sequence[str], outputs: Sequence[str], within: Sequence[str] | None = None
+    ) -> PageJob:
+        """Start a command in the working folder, or let it wait while as many run as may; return its job.
+
+        `within` names the folders and files that it may read, None for all.
 
         Raises
         ------
         OptionError
             It cannot be started.
         """
-        number = len(self.jobs) + 1
-        job = PageJob(number, path, shlex.join(["imulab", *words]), list(words), list(outputs))
-        process = _start(words)
-        self.jobs[number], self._processes[number] = job, process
-        self._watches[number] = threading.Thread(target=self._watch, args=(job, process), daemon=True)
-        self._watches[number].start()
+        roots = None if within is None else [os.path.realpath(root) for root in within]
+        with self._lock:
+            number = len(self.jobs) + 1
+            command = shlex.join(["imulab", *words])
+            job = PageJob(number, path, command, list(words), list(outputs), within=roots)
+            if len(self._processes) < self._most:
+                self._begin(job)
+            self.jobs[number] = job
         self._tell(job)
         return job
 
+    def _begin(self, job: PageJob) -> None:
+        process = self._processes[job.number] = _start(job)
+        job.state, job.began = "running", time()
+        watch = self._watches[job.number] = threading.Thread(target=self._watch, args=(job, process), daemon=True)
+        watch.start()
+
+    def _begin_next(self) -> None:
+        """Start the jobs that waited longest, as many as may run."""
+        with self._lock:
+            for job in [job for job in self.jobs.values() if job.state == "waiting"]:
+                if len(self._processes) >= self._most:
+                    return
+                try:
+                    self._begin(job)
+                except OptionError as error:
+                    job.state, job.status, job.messages, job.ended = "refused", 2, [f"imulab: {error}"], time()
+                self._tell(job)
+
     def cancel(self, number: int) -> None:
         """End a command and remove its unfinished outputs."""
-        job, process = self.jobs.get(number), self._processes.get(number)
-        if job is None or process is None or job.state != "running":
+        with self._lock:
+            job, process = self.jobs.get(number), self._processes.get(number)
+            if job is None or not job.is_open:
+                return
+            job.state = "cancelled"
+        if process is None:  # it waited
+            job.ended = time()
+            self._tell(job)
             return
-        job.state = "cancelled"
         _signal(process, signal.SIGTERM)
         try:
             process.wait(_GRACE)
@@ -292,9 +332,9 @@ class Jobs:
         self._watches[number].join(_GRACE)
 
     def end(self) -> None:
-        """End all commands."""
-        for number in list(self._processes):
-            self.cancel(number)
+        """End all commands, those that wait first."""
+        for job in sorted(self.jobs.values(), key=lambda job: job.state == "running"):
+            self.cancel(job.number)
 
     def _watch(self, job: PageJob, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
@@ -310,8 +350,10 @@ class Jobs:
         for path in [] if job.state == "done" else job.outputs:
             with suppress(OSError):
                 Path(path).rmdir()  # a folder that the command made before it was refused
-        del self._processes[job.number]
+        with self._lock:
+            del self._processes[job.number]
         self._tell(job)
+        self._begin_next()
 
     def _listen(self, job: PageJob, stream: IO[str]) -> None:
         with stream:
@@ -334,6 +376,10 @@ class Jobs:
             self._tell(job)
 
 
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _read(stream: IO[str]) -> str:
     more = 0
     with stream:
@@ -352,21 +398,22 @@ def _signal(process: subprocess.Popen[str], number: int) -> None:
             os.killpg(process.pid, number)
 
 
-def _start(words: Sequence[str]) -> subprocess.Popen[str]:
+def _start(job: PageJob) -> subprocess.Popen[str]:
     """Return the process of a command; raise OptionError where it cannot be started."""
+    confined = {} if job.within is None else {WITHIN: json.dumps(job.within)}
     try:
         # -P: no imports from the working folder.
         return subprocess.Popen(
-            [sys.executable, "-P", "-m", "imulab", *words],
+            [sys.executable, "-P", "-m", "imulab", *job.words],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             encoding="utf-8",
             errors="replace",
-            env={**os.environ, "PYTHONUTF8": "1", "NO_COLOR": "1"},
+            env={**os.environ, "PYTHONUTF8": "1", "NO_COLOR": "1", **confined},
             start_new_session=not _WINDOWS,
         )
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "a text that is none"
-        raise OptionError(f"imulab {words[0]}: cannot be started: {reason}") from None
+        raise OptionError(f"imulab {job.words[0]}: cannot be started: {reason}") from None

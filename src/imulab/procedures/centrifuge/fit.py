@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 
 from imulab.errors import DataError, OptionError, ReadError, listed, quoted
+from imulab.files import open_file
 from imulab.options import READING, choice, file
 from imulab.procedures.centrifuge import CURVES, METHODS
 from imulab.procedures.centrifuge.levels import Levels, level_numbers, pool_levels
@@ -172,7 +173,7 @@ def _read_beside(
 
 
 def _source(called: str, path: Path) -> Source:
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         return Source(called, file_digest(stream, "sha256").hexdigest())
 
 

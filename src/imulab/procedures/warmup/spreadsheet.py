@@ -16,7 +16,7 @@ import numpy as np
 from imulab.device.unit import is_blob
 from imulab.display import Finding, Shown
 from imulab.errors import OptionError, ReadError, RecordError, UnitError, listed
-from imulab.files import write_text
+from imulab.files import open_file, write_text
 from imulab.procedures.result import Record, as_record
 from imulab.procedures.warmup import MODELS
 from imulab.procedures.warmup.model import WarmupTable, amplitude_slopes, check_table, record_table
@@ -174,7 +174,8 @@ def read_table(path: str | Path) -> tuple[WarmupTable, str | None]:
         The file is no such table; the message names the line.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
+        with open_file(path) as stream:
+            text = stream.read().decode("utf-8-sig")
     except FileNotFoundError:
         raise ReadError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -302,11 +303,13 @@ def _value(place: str, text: str) -> float:
 
 def make_table_record(read: tuple[WarmupTable, str | None], file: str) -> Calibration:
     """Return a record that holds an edited table; it has no uncertainties."""
-    from hashlib import sha256
+    from hashlib import file_digest
 
     from imulab.recording import Source
 
     table, serial = read
+    with open_file(file) as stream:
+        digest = file_digest(stream, "sha256").hexdigest()
     model: dict[str, Any] = {
         "model": table.model,
         "settling_time": {"value": table.settling_time, "unit": "s", "from": "table"},
@@ -319,7 +322,7 @@ def make_table_record(read: tuple[WarmupTable, str | None], file: str) -> Calibr
         fit={},
         options={},
         sensor={"serial": serial} if serial else {},
-        sources=(Source(file, sha256(Path(file).read_bytes()).hexdigest()),),
+        sources=(Source(file, digest),),
         warnings=(
             Finding(
                 "made from an edited table: no uncertainties, and no test data behind it",

@@ -4,7 +4,7 @@ import { h, put, show } from "../dom.js";
 import { commandLine } from "./form.js";
 import { address, ask } from "./net.js";
 
-const STATES = { running: "running", done: "done", refused: "refused", cancelled: "cancelled" };
+const STATES = { waiting: "waiting", running: "running", done: "done", refused: "refused", cancelled: "cancelled" };
 const FAILED_TEST = /^fail\b/;
 
 // `act.look(name)` shows a file, `act.kind(name)` is its kind.
@@ -24,7 +24,8 @@ export function card(job, act) {
 
   function tick() {
     const seconds = (now.ended ?? Date.now() / 1000) - now.began;
-    put(time, `${seconds < 10 ? Math.max(seconds, 0).toFixed(1) : Math.round(seconds)} s`);
+    if (now.state === "waiting") put(time, "until one of those that run has ended: as many run as there are cores");
+    else put(time, `${seconds < 10 ? Math.max(seconds, 0).toFixed(1) : Math.round(seconds)} s`);
     if (now.ended === null) setTimeout(tick, 500);
   }
 
@@ -51,7 +52,7 @@ export function card(job, act) {
     const failed = FAILED_TEST.test(now.text);
     put(state, failed ? "fail" : STATES[now.state]);
     state.className = `chip ${failed ? "refused" : now.state}`;
-    show(cancel.parentElement, now.state === "running");
+    show(cancel.parentElement, now.ended === null);
     for (const line of now.messages.slice(said.children.length)) {
       const own = line.replace(/^imulab: /, "");
       said.append(h("li", { class: /^(note|warning)/.test(own) ? own.split(":")[0] : now.status === 0 ? "" : "bad" }, own));
