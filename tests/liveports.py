@@ -163,6 +163,11 @@ class Process:
     def running(self) -> bool:
         return self._process.poll() is None
 
+    def peak_memory(self) -> float:
+        """Bytes that it has taken at most."""
+        status = Path(f"/proc/{self._process.pid}/status").read_text()
+        return 1024.0 * int(status.partition("VmHWM:")[2].split()[0])
+
     def kill(self) -> None:
         self._process.kill()
         self.ended()

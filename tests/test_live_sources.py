@@ -7,13 +7,18 @@ import os
 import socket
 import threading
 import time
+from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import imulab as il
 from imulab.errors import ImulabError, OptionError, ReadError
-from imulab.live.sources import LiveSource, open_source
+from imulab.live.session import Session
+from imulab.live.sources import LiveSource, Threaded, open_source
+from imulab.live.stamps import Counts
+from imulab.live.terminal import draw
 from streams import terminal, wait_for
 
 serial = pytest.importorskip("serial", reason="pyserial is in the extra [live]")
@@ -218,3 +223,41 @@ def test_what_cannot_be_opened_is_one_line(text, said):
 def test_only_a_simulated_unit_follows():
     with pytest.raises(OptionError, match="--follow"):
         open_source("udp:5005", follow=True)
+
+
+@pytest.mark.parametrize("held_back", [True, False])
+def test_what_waits_is_bounded_and_a_sender_waits_or_its_losses_are_counted(held_back, monkeypatch):
+    monkeypatch.setattr("imulab.live.sources._MOST_QUEUED", 20_000)
+    sent = 0
+
+    def read() -> bytes | None:
+        nonlocal sent
+        sent += 1
+        return bytes([sent % 251]) * 1000 if sent <= 100 else None
+
+    source = Threaded("flood", read, held_back=held_back)
+    assert wait_for(lambda: sent >= 21)
+    time.sleep(0.1)
+    assert (sent == 21) == held_back  # one more than fits is read, and waits
+    got = b""
+    while not source.ended:
+        got += b"".join(piece.data for piece in source.get(0.05))
+    source.close()
+    whole = b"".join(bytes([number % 251]) * 1000 for number in range(1, 101))
+    assert got == (whole if held_back else whole[:20_000])
+    assert source.unread_share == pytest.approx(0 if held_back else 0.8)
+
+
+def test_lost_bytes_are_said_with_their_share():
+    recording = il.simulate_tumble(attitudes=2, gyro=False)
+    session, counts = Session(), Counts(unread_share=0.125)
+    (said,) = [e.text for e in session.feed(recording, counts) if e.kind == "warning"]
+    assert said.startswith("12 % of the bytes come faster than they are read and are lost: a lower rate")
+    assert counts.summary() == "12 % of the bytes, which came faster than they are read"
+    assert "12 % of bytes lost" in shown_facts(session)
+
+
+def shown_facts(session: Session) -> str:
+    console = Console(width=120, height=30, record=True, file=StringIO())
+    console.print(draw(session.view(), 120, 30))
+    return console.export_text()

@@ -258,6 +258,7 @@ class Runner:
         """
         events: list[Event] = []
         arrived = self.source.get(wait)
+        self._stream.counts.unread_share = self.source.unread_share
         for piece in arrived:
             events += self._take(self._fed(piece.data, piece.time), piece.time)
             self._answer()

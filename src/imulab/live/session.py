@@ -122,7 +122,7 @@ class Watch:
         return messages
 
     def counts(self, counts: Counts, samples: int) -> list[str]:
-        """Return warnings on lost, damaged, repeated and misplaced samples."""
+        """Return warnings on lost, damaged, repeated and misplaced samples, and on bytes that nobody read."""
         messages = []
         came = samples + counts.repeated + counts.reordered + counts.stray
         if counts.stray:
@@ -130,6 +130,12 @@ class Watch:
                 "stray",
                 "a sample whose time fits neither those before nor those after is left out, as any more will be: is "
                 "the cable all right?",
+            )
+        if counts.unread_share:
+            messages += self._once(
+                "unread",
+                f"{100 * counts.unread_share:.2g} % of the bytes come faster than they are read and are lost: a lower "
+                "rate, or fewer columns?",
             )
         if came > _FEWEST:
             for key, number, text in (

@@ -13,10 +13,10 @@ import socket
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
-from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -204,7 +204,8 @@ KINDS = ("serial:PORT[@BAUD]", "udp:PORT", "tcp:HOST:PORT", "-", "replay:FILE[@S
 BAUD = 115_200  # of a serial port, where none is stated
 _PATIENCE = 0.1  # s that one read waits, so that its thread can be ended
 _STEP = 0.05  # s of a block of a replay or a simulation
-_CHUNK = 1 << 16  # bytes of one read; a UDP datagram has fewer
+_CHUNK = 1 << 16  # bytes of one read, and about those that are handed on at once; a UDP datagram has fewer
+_MOST_QUEUED = 1 << 22  # bytes that wait to be handed on: 10 s of a fast port, for the longest fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,11 +229,14 @@ class LiveSource:
         Whether nothing more will come.
     lost
         Reason of an unexpected end.
+    unread_share
+        Share of the bytes that were lost because they came faster than they were handed on.
     by_hand
         Whether it is a simulated unit, which `turn_by_hand` turns.
     """
 
     polled = by_hand = False
+    unread_share = 0.0
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -261,7 +265,11 @@ class LiveSource:
 
 
 class Threaded(LiveSource):
-    """A source that a thread reads: `read` returns bytes, empty for a moment without any, None at the end."""
+    """A source that a thread reads: `read` returns bytes, empty for a moment without any, None at the end.
+
+    What waits to be handed on is bounded. Beyond that a sender that can be `held_back` (a pipe, TCP) has to wait; bytes
+    of any other are lost, and counted.
+    """
 
     def __init__(
         self,
@@ -271,11 +279,15 @@ class Threaded(LiveSource):
         write: Callable[[bytes], object] | None = None,
         close: Callable[[], object] = lambda: None,
         polled: bool = False,
+        held_back: bool = False,
     ) -> None:
         super().__init__(name)
         self.polled = polled
-        self._read, self._write, self._close = read, write, close
-        self._queue: SimpleQueue[Arrived | None] = SimpleQueue()
+        self._read, self._write, self._close, self._held_back = read, write, close, held_back
+        self._changed = threading.Condition()
+        self._pieces: deque[Arrived] = deque()
+        self._queued = self._taken = self._unread = 0
+        self._over = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name=f"imulab {name}")
         self._thread.start()
@@ -287,7 +299,7 @@ class Threaded(LiveSource):
                 if data is None:
                     break
                 if data:
-                    self._queue.put(Arrived(data, time.monotonic()))
+                    self._put(Arrived(data, time.monotonic()), len(data))
         except (
             OSError,
             TypeError,
@@ -295,19 +307,36 @@ class Threaded(LiveSource):
         ) as error:  # the last two: pyserial's, of a port that is gone
             if not self._stop.is_set():
                 self.lost = f"{self.name}: the connection is lost ({_reason(error)}): unplugged?"
-        self._queue.put(None)
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+
+    def _put(self, piece: Arrived, size: int) -> None:
+        """Queue bytes once there is room, or lose them."""
+        with self._changed:
+            if self._held_back:
+                self._changed.wait_for(lambda: self._queued < _MOST_QUEUED or self._stop.is_set())
+            self._taken += size
+            if self._queued >= _MOST_QUEUED:
+                self._unread += size
+                self.unread_share = self._unread / self._taken
+                return
+            self._pieces.append(piece)
+            self._queued += size
+            self._changed.notify_all()
 
     def get(self, wait: float) -> list[Arrived]:
-        """Return what comes within `wait` seconds."""
+        """Return what comes within `wait` seconds, not all at once where much has waited."""
         arrived: list[Arrived] = []
-        try:
-            piece = self._queue.get(timeout=wait)
-            while piece is not None:
-                arrived.append(piece)
-                piece = self._queue.get_nowait()
-            self.ended = True
-        except Empty:
-            pass
+        size = 0
+        with self._changed:
+            self._changed.wait_for(lambda: self._pieces or self._over, wait)
+            while self._pieces and size < _CHUNK:
+                arrived.append(self._pieces.popleft())
+                size += len(arrived[-1].data)
+            self._queued -= size
+            self.ended = self.ended or (self._over and not self._pieces)
+            self._changed.notify_all()
         return arrived
 
     def send(self, data: bytes) -> None:
@@ -322,6 +351,8 @@ class Threaded(LiveSource):
     def close(self) -> None:
         """End the thread and close the port."""
         self._stop.set()
+        with self._changed:
+            self._changed.notify_all()
         self._thread.join(0.5)
         self._close()
 
@@ -405,7 +436,7 @@ def open_source(text: str, layout: str | None = None, *, follow: bool = False) -
     if follow and kind != "simulate":
         raise OptionError(f"--follow: expected a simulated unit (simulate), found {text!r}")
     if text == "-":
-        return Threaded("standard input", lambda: os.read(0, _CHUNK) or None)
+        return Threaded("standard input", lambda: os.read(0, _CHUNK) or None, held_back=True)
     makers: dict[str, Callable[[str], LiveSource]] = {"serial": _serial, "udp": _udp, "tcp": _tcp}
     if kind in makers and rest:
         return makers[kind](rest)
@@ -518,7 +549,7 @@ def _tcp(rest: str) -> LiveSource:
         except TimeoutError:
             return b""
 
-    return Threaded(name, read, write=link.sendall, close=link.close, polled=True)
+    return Threaded(name, read, write=link.sendall, close=link.close, polled=True, held_back=True)
 
 
 def _port(text: str, name: str) -> int:

@@ -52,6 +52,8 @@ class Counts:
         Lines or messages that could not be read, or stretches of bytes between them.
     restarts
         How often the device started its time again, or its clock was set.
+    unread_share
+        Share of the bytes that came faster than they were read, and are lost.
     """
 
     lost: int = 0
@@ -61,6 +63,7 @@ class Counts:
     stray: int = 0
     damaged: int = 0
     restarts: int = 0
+    unread_share: float = 0.0
 
     def summary(self) -> str:
         """Return the faults in words; empty without any."""
@@ -72,7 +75,10 @@ class Counts:
             (self.damaged, "damaged lines or messages"),
             (self.restarts, "times that the device started again or its clock was set"),
         )
-        return ", ".join(f"{number} {words}" for number, words in parts if number)
+        words = [f"{number} {text}" for number, text in parts if number]
+        if self.unread_share:
+            words.append(f"{100 * self.unread_share:.2g} % of the bytes, which came faster than they are read")
+        return ", ".join(words)
 
 
 class DeviceClock:

@@ -79,12 +79,14 @@ def _share(share: float) -> str:
 
 def _facts(view: View) -> Text:
     counts = {name: number for name, number in vars(view.counts).items() if number and name != "gaps"}
+    share = counts.pop("unread_share", 0.0)
     parts = [
         f"{view.seconds:.0f} s",
         f"{view.rate:.4g} Hz",
         "" if view.length is None else f"|f| {view.length:.5g} {view.unit}",
         "" if view.temperature is None else f"{view.temperature:.1f} °C",
         *(f"{number} {name}" for name, number in counts.items()),
+        f"{100 * share:.2g} % of bytes lost" if share else "",
         view.source,
         view.format,
     ]

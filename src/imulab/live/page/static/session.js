@@ -175,13 +175,14 @@ function byHand(event) {
 const lastUp = () => orientation[2];
 
 function facts(now) {
-  const wrong = Object.entries(now.counts).filter(([name, number]) => number && name !== "gaps");
+  const { gaps, unread_share: unread, ...wrong } = now.counts;
   const rows = [
     ["|f| now", now.length === null ? "–" : `${now.length.toPrecision(5)} ${now.unit.replace("^2", "²")}`],
     ["stream", now.rate ? `${now.rate.toPrecision(3)} Hz` : "–"],
     ["recorded", duration(now.seconds)],
     ...(now.temperature === null ? [] : [["temperature", `${now.temperature.toFixed(1)} °C`]]),
-    ...wrong.map(([name, number]) => [`samples ${name}`, `${number}`]),
+    ...Object.entries(wrong).filter(([, number]) => number).map(([name, number]) => [`samples ${name}`, `${number}`]),
+    ...(unread ? [["bytes lost", `${(100 * unread).toPrecision(2)} %`]] : []),
   ];
   if (parts.facts.children.length !== rows.length) {
     parts.facts.replaceChildren(...rows.map(() => h("div", {}, h("dt", {}), h("dd", {}))));
