@@ -154,4 +154,24 @@ def test_what_cannot_be_read_is_a_sentence(tmp_path, text, reading, said):
     ran = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
     assert ran.returncode == 2
     assert ran.stderr == ""
-    assert said in json.loads(ran.stdout.splitlines()[-1])["error"]
+    assert said in next(filter(None, (json.loads(line).get("error") for line in ran.stdout.splitlines())))
+
+
+@pytest.mark.parametrize("rows", [100, 120_000], ids=["within the first block", "beyond it"])
+def test_of_a_file_that_breaks_the_rows_before_are_shown(tmp_path, rows):
+    file = tmp_path / "tumble.csv"
+    il.write_csv(il.simulate_tumble(attitudes=6, hold="1 s", gravity=9.81), file)
+    lines = file.read_text().splitlines()
+    head = next(k for k, line in enumerate(lines) if not line.startswith("#"))
+    values = lines[head + 1].partition(",")[2]
+    whole = [*lines[: head + 1], *(f"{0.01 * k:.2f},{values}" for k in range(rows))]
+    file.write_text("\n".join([*whole, f"{0.01 * rows:.2f},broken"]) + "\n")
+    (tmp_path / "curves").mkdir()
+    *heads, last = contents.contents(str(file), tmp_path / "curves", {})
+    assert f"row {rows + 1} (line {len(whole) + 1})" in heads[-1]["error"]
+    assert heads[-1]["done"]
+    assert heads[-1]["head"]["rows"] == rows
+    assert heads[-1]["head"]["last"] == pytest.approx(0.01 * (rows - 1))
+    assert heads[-1]["metadata"]["serial"] == "SIM-0001"
+    assert "attitudes" in last
+    assert sorted(path.suffix for path in (tmp_path / "curves").iterdir() if path.suffix == ".csv") == []

@@ -190,6 +190,20 @@ def test_a_file_of_foreign_columns_asks_for_a_layout(workbench, new_page):
     assert "--layout imulab-files/mine.toml" in command(page)
 
 
+def test_a_file_that_breaks_shows_its_good_part(workbench, new_page):
+    page = new_page(workbench.address)
+    text = tumble("own.csv")
+    drop(page, "rec.csv", text + text.splitlines()[-1].replace(",", ",x", 1) + "\n")
+    page.get_by_text("Read up to where it breaks: ").wait_for()
+    page.locator("svg.plot").first.wait_for()
+    rows = len(il.read("own.csv"))
+    assert f"{rows:,} samples".replace(",", " ") in page.locator(".file .message").inner_text()
+    assert f"row {rows + 1} (" in page.locator(".file .refused").inner_text()
+    drop(page, "none.csv", "time [s],accel_x [g]\n0,1\n1,2\nx,2\n")  # and closing it leaves no fault behind
+    page.get_by_role("heading", name="none.csv").wait_for()
+    page.wait_for_timeout(500)
+
+
 def test_an_older_list_of_files_takes_no_file_off(workbench, new_page):
     page = new_page(workbench.address)
     held: list[Any] = []

@@ -7,9 +7,12 @@ or large file costs the server nothing, and can be given up at any time.
 from __future__ import annotations
 
 import json
+import re
 import sys
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, replace
+from itertools import islice
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -19,8 +22,10 @@ import numpy as np
 from imulab.columns import triad
 from imulab.errors import ImulabError
 from imulab.estimation.clock import read_clock
+from imulab.files import open_file, permit
 from imulab.live.page.curves import Head, Writer
 from imulab.options import options_of, part_of, read_options
+from imulab.readers.formats import is_packed
 from imulab.recording import Array, Reading, Recording
 
 _EVERY = 0.15  # s between two messages of progress
@@ -42,28 +47,65 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
     ------
     dict
         ``head``: the fields of `Head`, with ``metadata`` and ``notes``, again and again, the last with ``done``; then
-        ``attitudes``: begin and end of each, s, or ``unknown``: why there are none.
+        ``attitudes``: begin and end of each, s, or ``unknown``: why there are none. Of a file that breaks, ``error``
+        says where, and the others are of the rows before.
 
     Raises
     ------
     ImulabError
-        The file cannot be read.
+        The file cannot be read, not even its first rows.
     """
+    options = read_options(options_of(Reading), reading, "--{}")
+    writer, notes, last_sent, metadata = Writer(folder), dict[str, None](), 0.0, dict[str, str]()
+    broken: dict[str, str] = {}
+    try:
+        for block in _blocks(file, options):
+            writer.add(block)
+            notes |= dict.fromkeys(block.notes)
+            metadata = dict(block.metadata)
+            if monotonic() - last_sent > _EVERY:
+                last_sent = monotonic()
+                yield {"head": asdict(writer.head), "metadata": metadata, "notes": list(notes)}
+    except ImulabError as error:
+        metadata = _add_good_rows(file, folder, options, str(error), writer) or metadata
+        if not writer.head.rows:
+            raise
+        broken = {"error": str(error)}
+    writer.head.usual = usual_step(folder, writer.head)
+    yield {"head": asdict(writer.head), "metadata": metadata, "notes": list(notes), **broken, "done": True}
+    yield attitudes(folder, writer.head, Path(file).name)
+
+
+def _blocks(file: str | Path, options: Mapping[str, Any]) -> Iterator[Recording]:
     from imulab.readers import read_blocks
     from imulab.readers.streams import on_clock_of
 
-    options = read_options(options_of(Reading), reading, "--{}")
-    writer, notes, last_sent, block = Writer(folder), dict[str, None](), 0.0, None
-    for block in on_clock_of(read_blocks(file, options["layout"], **part_of(options))):
-        writer.add(block)
-        notes |= dict.fromkeys(block.notes)
-        if monotonic() - last_sent > _EVERY:
-            last_sent = monotonic()
-            yield {"head": asdict(writer.head), "metadata": dict(block.metadata), "notes": list(notes)}
-    about = {"metadata": dict(block.metadata) if block else {}, "notes": list(notes)}
-    writer.head.usual = usual_step(folder, writer.head)
-    yield {"head": asdict(writer.head), **about, "done": True}
-    yield attitudes(folder, writer.head, Path(file).name)
+    return on_clock_of(read_blocks(file, options["layout"], **part_of(options)))
+
+
+def _add_good_rows(file: str, folder: Path, options: Mapping[str, Any], error: str, writer: Writer) -> dict[str, str]:
+    """Write the rows of a text file above the line that an error names, and return their metadata."""
+    named = re.search(r"\(line (\d+)\)", error)
+    good = folder / Path(file).name
+    metadata: dict[str, str] = {}
+    if named is None:
+        return metadata
+    with open_file(file) as lines, good.open("wb") as out:
+        if is_packed(lines.peek(4)):
+            return metadata
+        out.writelines(islice(lines, int(named[1]) - 1))
+    permit(good)
+    row = 0
+    with suppress(ImulabError):
+        for block in _blocks(good, options):
+            new = max(writer.head.rows - row, 0)
+            row += len(block)
+            metadata = dict(block.metadata)
+            if new < len(block):
+                columns = {name: values[new:] for name, values in block.columns.items()}
+                writer.add(replace(block, columns=columns))
+    good.unlink()
+    return metadata
 
 
 def usual_step(folder: Path, head: Head) -> float:
@@ -95,18 +137,20 @@ def _all(path: Path, count: int) -> Array:
 
 
 def main() -> int:
-    """Read the file that the command line names; return 2 where it cannot be read."""
+    """Read the file that the command line names; return 2 where it cannot be read to its end."""
     file, folder, reading = sys.argv[1:4]
+    broken = False
     try:
         for message in contents(file, Path(folder), json.loads(reading)):
             print(json.dumps(message), flush=True)
+            broken |= "error" in message
     except ImulabError as error:
         print(json.dumps({"error": str(error)}), flush=True)
         return 2
     except MemoryError:
         print(json.dumps({"error": f"{Path(file).name}: too large for the memory of this machine"}), flush=True)
         return 2
-    return 0
+    return 2 if broken else 0
 
 
 if __name__ == "__main__":

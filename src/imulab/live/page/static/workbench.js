@@ -181,13 +181,13 @@ function opened(message) {
   const error = message.error;
   put(ui.refused, error || "");
   show(ui.refused, Boolean(error));
-  if (error) {
+  if (error && !head?.rows) {
     put(ui.summary, "This file cannot be read as it is.");
     ui.reading.open = true;
     ui.plots.close();
     return;
   }
-  put(ui.summary, head ? summary(message) : "reading…");
+  put(ui.summary, head ? `${error ? "Read up to where it breaks: " : ""}${summary(message)}` : "reading…");
   const notes = [...(message.notes || []), ...(message.unknown ? [message.unknown] : [])];
   const told = Object.entries(message.metadata || {}).map(([key, value]) => `${key}: ${value}`);
   show(ui.head, notes.length + told.length > 0);

@@ -85,12 +85,12 @@ export function plots(place) {
     const began = performance.now();
     try {
       const found = await ask(`curves?${query}`, undefined, { signal: own.signal });
-      if (own !== asked) return;
+      if (own !== asked || !known) return;
       shown = found;
       draw();
       area.dataset.took = Math.round(performance.now() - began);
     } catch (error) {
-      if (error.name !== "AbortError") put(status, error.message);
+      if (error.name !== "AbortError" && known) put(status, error.message);
     }
   }
 
@@ -258,11 +258,11 @@ export function plots(place) {
         waiting = true;
         fetch().finally(() => setTimeout(() => {
           waiting = false;
-          if (known.head && shown && known.head.rows !== message.head.rows) fetch();
+          if (known?.head && shown && known.head.rows !== message.head.rows) fetch();
         }, 250));
       }
     },
-    close() { known = null; shown = null; area.replaceChildren(); put(status, ""); show(tools, false); },
+    close() { asked?.abort(); known = null; shown = null; area.replaceChildren(); put(status, ""); show(tools, false); },
     go,
   };
 }
