@@ -8,7 +8,7 @@ ALONE := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.alone)
 # For what runs as several programs: two at a time, if make was not told otherwise.
 BOTH = $(if $(findstring jobserver,$(MAKEFLAGS)),,-j 2)
 
-.PHONY: demo test test-all pytest pytest-reduced pytest-all core fuzz dist wheel-names lint format bench compare footprint truth truth-all docs clean
+.PHONY: demo test test-all pytest pytest-reduced pytest-all core fuzz fuzz-core fuzz-readers dist wheel-names lint format bench compare footprint truth truth-all docs clean
 
 demo: $(ALONE)
 	$(BIN)/imulab demo demo
@@ -41,9 +41,15 @@ test-all: core pytest-all
 core:
 	$(MAKE) $(BOTH) -C runtime test
 
-# Long by default; FUZZ_SECONDS or FUZZ_RUNS bound it.
-fuzz:
+# The C core, then the readers. Long by default; FUZZ_SECONDS or FUZZ_RUNS bound the core, FUZZ_FILES the changed files
+# of each reader.
+fuzz: fuzz-core fuzz-readers
+
+fuzz-core:
 	$(MAKE) $(BOTH) -C runtime fuzz FUZZ_SECONDS=$(or $(FUZZ_SECONDS),3600)
+
+fuzz-readers: $(STAMP)
+	IMULAB_FUZZ=$(or $(FUZZ_FILES),20000) $(BIN)/python -m pytest -q tests/test_readers_fuzz.py
 
 # sdist and wheel; on Linux with the manylinux tag that the wheel earns.
 dist: $(VENV)/.release

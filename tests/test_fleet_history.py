@@ -1,18 +1,23 @@
 """History: SQLite by default, PostgreSQL where a server can be started; the next run knows the last."""
 
 import csv
+import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
 import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from sqlalchemy import create_engine, text
 
-from fleets import attitudes, make_fleet, write_attitudes, write_manifest
+from fleets import attitudes, children, command, make_fleet, wait_for, workers_of, write_attitudes, write_manifest
 from imulab.cli import main
 from imulab.errors import OptionError
 from imulab.fleet.history import open_history
@@ -86,9 +91,33 @@ def test_a_file_that_is_no_history_is_refused_with_its_name(tmp_path, capsys):
     assert "other.sqlite: " in error
 
 
+@dataclass(frozen=True)
+class Server:
+    """A private PostgreSQL server on the loopback."""
+
+    url: str
+    start: Callable[[], None]
+    processes: Callable[[], list[int]]
+
+    def kill(self) -> None:
+        """End all of its processes without a warning, as a power cut would."""
+        there = self.processes()
+        for process in there:
+            with suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+        wait_for(lambda: not any(Path(f"/proc/{process}/exe").exists() for process in there))
+
+    def tell(self, statement: str) -> None:
+        """Let the server execute a statement."""
+        database = create_engine(self.url.replace("postgresql:", "postgresql+psycopg:"))
+        with database.begin() as connection:
+            connection.execute(text(statement))
+        database.dispose()
+
+
 @pytest.fixture(scope="module")
-def postgres():
-    """URL of a private PostgreSQL server on the loopback, run by a user other than root."""
+def server():
+    """A server that a user other than root runs; what it has written survives its kill, as on a disk."""
     found = [shutil.which("postgres"), *sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))]
     programs = [Path(path).parent for path in found if path]
     if not programs:
@@ -108,16 +137,31 @@ def postgres():
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     run_as = {"cwd": folder, "check": True, "capture_output": True, **user}
-    data = str(folder / "data")
+    data = folder / "data"
     subprocess.run(
         [programs[-1] / "initdb", "-D", data, "-U", "line", "--auth=trust", "--no-sync", "-E", "UTF8"], **run_as
     )
     options = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={folder} -c fsync=off"
     pg_ctl = [programs[-1] / "pg_ctl", "-D", data, "-w", "-l", str(folder / "log")]
-    subprocess.run([*pg_ctl, "-o", options, "start"], **run_as)
-    yield f"postgresql://line@127.0.0.1:{port}/postgres"
+
+    def processes() -> list[int]:
+        first = int((data / "postmaster.pid").read_text().split()[0])
+        return [first, *children(first)]
+
+    def start() -> None:
+        subprocess.run([*pg_ctl, "-o", options, "start"], **run_as)
+
+    start()
+    yield Server(f"postgresql://line@127.0.0.1:{port}/postgres", start, processes)
     subprocess.run([*pg_ctl, "-m", "immediate", "stop"], **run_as)
     shutil.rmtree(folder)
+
+
+@pytest.fixture
+def postgres(server):
+    """URL of the server, whose history is empty."""
+    server.tell("DROP TABLE IF EXISTS imulab_parameters, imulab_calibrations")
+    return server.url
 
 
 def test_postgresql(tmp_path, postgres):
@@ -137,6 +181,70 @@ def test_two_lines_write_into_one_history(tmp_path, postgres):
         run(write_manifest(tmp_path / line / "m.csv", rows), tmp_path / line / "out", history=postgres)
     with open_history(postgres) as history:
         assert len(history.of(["BOTH"])["BOTH"]) == 2
+
+
+def check_once(url, *folders):
+    """Each record of the folders is in the history once, with all of its parameters, and nothing else is.
+
+    Records that two runs make of one unit within a second are the same to the last byte: one calibration.
+    """
+    made: dict[str, set] = {}
+    for path in (path for folder in folders for path in folder.glob("*.json")):
+        content = json.loads(path.read_text())
+        made.setdefault(path.stem, set()).add((content["content_sha256"], len(content["parameters"])))
+    with open_history(url) as history:
+        past = history.of(list(made))
+    kept = {serial: [(item.content_sha256, len(item.parameters)) for item in items] for serial, items in past.items()}
+    assert {serial: sorted(items) for serial, items in kept.items()} == {s: sorted(items) for s, items in made.items()}
+
+
+UNITS = 40
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """Enough units for a run to be caught at its work."""
+    return make_fleet(tmp_path_factory.mktemp("fleet"), UNITS, order=1)
+
+
+def begun(fleet, folder, url):
+    """A run in a process of its own that has made some records."""
+    process = command("fleet", "run", fleet, "-o", folder, "--workers", 2, "--history", url)
+    wait_for(lambda: len(list(folder.glob("*.json"))) >= 5)
+    return process
+
+
+@pytest.mark.parametrize("lost", ["server", "connection", pytest.param("worker", marks=pytest.mark.slow)])
+def test_what_is_lost_during_a_run_leaves_each_calibration_in_the_history_once(fleet, server, postgres, tmp_path, lost):
+    folder = tmp_path / "out"
+    process = begun(fleet, folder, postgres)
+    if lost == "server":
+        server.kill()
+    elif lost == "connection":
+        server.tell("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE pid <> pg_backend_pid()")
+    else:
+        os.kill(workers_of(process.pid)[0], signal.SIGKILL)
+    out, error = process.communicate()
+    assert process.returncode == 0, error
+    assert out.startswith(f"{UNITS} units: {UNITS} done, 0 failed")
+    if lost == "server":
+        assert "the history is not complete: " in out + error
+        assert "Traceback" not in error
+        refused = command("fleet", "run", fleet, "-o", folder, "--history", postgres)
+        message = refused.communicate()[1]
+        assert (refused.returncode, message.count("\n")) == (2, 1)
+        server.start()
+    assert run(fleet, folder, history=postgres).kept == UNITS
+    check_once(postgres, folder)
+
+
+def test_two_runs_at_once_into_an_empty_history_lose_nothing(fleet, postgres, tmp_path):
+    folders = [tmp_path / line for line in ("a", "b")]
+    runs = [command("fleet", "run", fleet, "-o", f, "--workers", 1, "--history", postgres) for f in folders]
+    for process in runs:
+        out, error = process.communicate()
+        assert (process.returncode, error) == (0, ""), out
+    check_once(postgres, *folders)
 
 
 def test_an_unreachable_postgresql_is_reported_without_its_password(tmp_path, capsys):

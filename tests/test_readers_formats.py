@@ -77,26 +77,29 @@ def test_several_streams_one_behind_the_other_are_one():
     assert unpack(bz2.BZ2Decompressor, bz2.compress(b"one ") + bz2.compress(b"two"), 100) == b"one two"
 
 
-def mat_variable(size: int) -> bytes:
-    """A variable x of `size` zeros (MathWorks, MAT-File Format), compressed."""
+MAT_HEAD = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
+
+
+def mat_variable(size: int, letter: bytes = b"x") -> bytes:
+    """A variable of `size` zeros (MathWorks, MAT-File Format), compressed."""
     flags = struct.pack("<IIII", 6, 8, 6, 0)
     shape = struct.pack("<IIii", 5, 8, size, 1)
-    name = struct.pack("<II", 1, 1) + b"x" + bytes(7)
+    name = struct.pack("<II", 1, 1) + letter + bytes(7)
     packer = zlib.compressobj(9)
     total = len(flags) + len(shape) + len(name) + 8 + 8 * size
     parts = [packer.compress(struct.pack("<II", 14, total) + flags + shape + name + struct.pack("<II", 9, 8 * size))]
     zeros = bytes(1 << 20)
     parts += [packer.compress(zeros) for _ in range(8 * size >> 20)]
     data = b"".join(parts) + packer.flush()
-    return b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(data)) + data
+    return struct.pack("<II", 15, len(data)) + data
 
 
 def test_a_matlab_variable_of_zeros(tmp_path):
-    (tmp_path / "bomb.mat").write_bytes(mat_variable(1 << 26))  # 512 MB in 0.5 MB
+    (tmp_path / "bomb.mat").write_bytes(MAT_HEAD + mat_variable(1 << 26))  # 512 MB in 0.5 MB
     said = refused(tmp_path / "bomb.mat", "--layout", layout(tmp_path, 'accel_x = { from = "x", unit = "g" }'))
     assert "bomb.mat: unpacks to more than" in said
     small = tmp_path / "small.mat"
-    small.write_bytes(mat_variable(1 << 24))  # 128 MB in 130 kB
+    small.write_bytes(MAT_HEAD + mat_variable(1 << 24))  # 128 MB in 130 kB
     table = layout(tmp_path, 'accel_x = { from = "x", unit = "g" }')
     assert "unpacks to more than 67 MB" in refused(small, "--layout", table)
     done = subprocess.run(
@@ -104,6 +107,12 @@ def test_a_matlab_variable_of_zeros(tmp_path):
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert "small.mat: 16777216 samples" in done.stdout, done.stderr
+
+
+def test_a_matlab_variable_that_no_column_takes_is_not_unpacked(tmp_path, imulab):
+    (tmp_path / "a.mat").write_bytes(MAT_HEAD + mat_variable(1 << 26) + mat_variable(1 << 17, b"y"))
+    done = imulab("show", "a.mat", "--layout", layout(tmp_path, 'accel_x = { from = "y", unit = "g" }'))
+    assert "a.mat: 131072 samples" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize("kind", ["bag", "mcap"])

@@ -132,6 +132,21 @@ def test_a_changed_file_is_read_or_refused(files, kind):
     run()
 
 
+FAULTS = ["tumble_one_still_1Hz.csv", "live_huge_time_steps_h30.csv", "plot_null.txt", "ulg_one_gyro_late.ulg"]
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_file_that_once_failed_is_read_or_refused_however_it_is_changed(real_data, tmp_path, name):
+    content = (real_data / "faults" / name).read_bytes()
+
+    @FUZZ
+    @given(EDITS)
+    def run(edits):
+        survives(tmp_path / name, edited(content, edits), None)
+
+    run()
+
+
 @pytest.mark.parametrize("kind", [0, 1, 2, 3])
 def test_the_walk_never_leaves_the_block(kind):
     heads = [b"\x05\0D\1\0abc", b"\xa3\x95\x80\x81\x09", b"\x05\x1a\0\0\0\0\0\0\0", b"\x10\0\0\0\x04\0\0\0op=\x02"]

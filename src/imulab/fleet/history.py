@@ -85,7 +85,8 @@ class History:
         insert = dialect.insert(self._calibrations).on_conflict_do_nothing().returning(self._calibrations.c.id)
         rows: list[dict[str, Any]] = []
         with _in_one_line(self._name, self._url), self._engine.begin() as connection:
-            for summary in summaries:
+            # In one order: runs that add the same calibrations at once would wait for each other otherwise.
+            for summary in sorted(summaries, key=lambda summary: summary.serial):
                 calibration = connection.execute(
                     insert,
                     {

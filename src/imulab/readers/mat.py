@@ -7,6 +7,7 @@ matrix is an element that holds flags, dimensions, name and numbers.
 
 from __future__ import annotations
 
+import mmap
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from math import prod
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -24,6 +26,8 @@ from imulab.readers.formats import Budget, unpack
 from imulab.recording import Array, Layout, Recording
 
 _HEAD = 128  # bytes of the head of a MAT-file, level 5
+_NAMED = 4096  # bytes of a variable that hold its name: the format allows 63 letters
+_ORDERS = {b"IM": "<", b"MI": ">"}
 _MATRIX, _COMPRESSED = 14, 15  # miMATRIX and miCOMPRESSED of the MAT-file format
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 # MxSTRUCT_CLASS, mxDOUBLE_CLASS and mxUINT64_CLASS of the MAT-file format
@@ -57,7 +61,7 @@ class _Variable:
 
 
 def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
-    """Yield the columns that a layout names; the variables are held in memory, as the format requires.
+    """Yield the columns that a layout names; packed variables that it names are held in memory, as the format requires.
 
     Raises
     ------
@@ -69,7 +73,8 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
     try:
         budget = Budget(path, name)
         with open_file(path) as stream:
-            variables = {known.name: known for known in _variables(stream.read(), roots if layout else None, budget)}
+            data = _content(stream)
+            variables = {known.name: known for known in _variables(data, roots if layout else None, budget)}
     except (_DamagedError, EOFError, zlib.error, struct.error, UnicodeDecodeError, ValueError, MemoryError) as error:
         raise ReadError(f"{name}: truncated or damaged, not a whole MATLAB file: {error}") from None
     if layout is None:
@@ -104,13 +109,19 @@ def _numbers(variables: dict[str, _Variable], path: str, where: str) -> np.ndarr
 # --- the format ----------------------------------------------------------------------------------------------------
 
 
-def _variables(data: bytes, wanted: set[str] | None, budget: Budget) -> Iterator[_Variable]:
-    """Yield the variables of a file, with numbers only for the wanted ones; all if None."""
-    if len(data) < _HEAD:
-        raise _DamagedError(f"the head has {len(data)} bytes, expected {_HEAD}")
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
-    if order is None:
+def _content(stream: BinaryIO) -> memoryview:
+    """Return the bytes of the file, of which memory holds only what is looked at."""
+    head = stream.read(_HEAD)
+    if len(head) < _HEAD:
+        raise _DamagedError(f"the head has {len(head)} bytes, expected {_HEAD}")
+    if head[126:128] not in _ORDERS:
         raise _DamagedError("the head does not tell the order of bytes")
+    return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+def _variables(data: memoryview, wanted: set[str] | None, budget: Budget) -> Iterator[_Variable]:
+    """Yield the variables of a file, with numbers only for the wanted ones; all if None."""
+    order = _ORDERS[bytes(data[126:128])]
     at = _HEAD
     while at < len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at) if at + 8 <= len(data) else (0, len(data))
@@ -119,6 +130,11 @@ def _variables(data: bytes, wanted: set[str] | None, budget: Budget) -> Iterator
         payload: bytes | memoryview = data[at + 8 : at + 8 + size]
         at += 8 + size
         if kind == _COMPRESSED:
+            if wanted is not None:
+                named = _matrix(zlib.decompressobj().decompress(payload, _NAMED)[8:], order, set(), 0)
+                if named.name not in wanted:
+                    yield named
+                    continue
             payload = unpack(zlib.decompressobj, payload, budget.left)
             budget.take(len(payload))
             elements = list(_elements(payload, order))
