@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import os
 import queue
+import re
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -17,7 +20,10 @@ import pytest
 
 pytest.importorskip("starlette", reason="the page needs imulab[live]")
 
+import imulab as il
 from imulab.cli import main
+from liveports import lines_of
+from test_live_link import Sender
 
 SLOW = 60_000
 """What takes longer than this many ms hangs."""
@@ -221,9 +227,19 @@ def test_finishing_too_early_is_answered_and_the_session_goes_on(live, new_page)
     growing = page.evaluate("fetch('/api/session/recording').then(answer => answer.json())")
     assert growing == {"error": "the recording still grows, and there is no record yet: finish the session first"}
     assert page.locator("#session").get_attribute("role") == "tabpanel"
-    page.get_by_role("button", name="Finish now").click()
-    page.wait_for_selector("#said .bad")
-    assert "attitudes" in page.locator("#said").inner_text()
+    finish = page.get_by_role("button", name="Finish now")
+    assert finish.is_disabled()
+    assert re.fullmatch(r"needs at least \d (more )?attitudes?", page.inner_text("#missing"))
+    page.evaluate(
+        """() => new Promise(done => {
+      const other = new WebSocket(location.href.replace("http", "ws") + "ws");
+      other.onopen = () => { other.send('{"type": "finish"}'); done(); };
+    })"""
+    )
+    page.wait_for_selector(
+        "#said .bad:has-text('attitude')"
+    )  # a program may ask for it: refused, until another is held
+    page.wait_for_selector("#said .bad", state="detached")
     page.locator(".sphere .held").nth(3).wait_for(state="attached")
     running.process.send_signal(signal.SIGINT)
     page.wait_for_selector("#said .bad:has-text('The program has ended')")
@@ -338,3 +354,44 @@ def test_what_is_not_installed_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("imulab.live.page.find_spec", lambda name: None if name == "uvicorn" else name)
     assert main(["live", "simulate", "--save", "rec.csv", "--page"]) == 2
     assert "the page needs uvicorn, which is not here: pip install 'imulab[live]'" in capsys.readouterr().err
+
+
+def test_a_link_that_is_lost_keeps_the_page_and_comes_back(live, new_page, tmp_path):
+    options = {"hold": "3 s", "move": "1 s", "gyro": False, "noise": "0.3 mg"}
+    lines = lines_of(il.simulate_tumble(attitudes=16, order=1, gravity=9.81, **options))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(20)
+        running = live(
+            f"tcp:127.0.0.1:{server.getsockname()[1]}", "--attitudes", "12", *FIT, "--save", "rec.csv", "-o", "rec.json"
+        )
+        page = new_page(running.address)
+        first = server.accept()[0]
+        sender = Sender(first.sendall, lines)
+        page.locator("section:has(> h2:text-is('Attitudes')) tbody tr").nth(2).wait_for()
+        gone = sender.stop()
+        first.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        first.close()
+        page.wait_for_selector(r".advice:text-matches('^Link lost at \\d+ of 12; reconnecting\\.$')")
+        assert "--resume goes on with it. In " in page.inner_text(".outlook")
+        assert page.locator("section:has(> h2:text-is('Attitudes')) tbody tr").count() >= 3
+        second = server.accept()[0]
+        sender = Sender(second.sendall, lines[gone:])
+        page.wait_for_selector(".outlook", state="hidden")
+        page.get_by_role("button", name="Make the record").click()
+        page.wait_for_selector(".result")
+        sender.stop()
+        second.close()
+
+
+def test_a_session_that_ends_without_a_record_keeps_its_tables(live, new_page, tmp_path):
+    il.write_csv(il.simulate_tumble(attitudes=5, order=1, gravity=9.81, gyro=False), tmp_path / "few.csv")
+    running = live("replay:few.csv@20", *FIT, "--save", "rec.csv", "-o", "rec.json")
+    page = new_page(running.address)
+    page.wait_for_selector("#said .bad:has-text('For a record it needs at least 4 more attitudes.')")
+    assert page.inner_text(".advice") == "The session has ended without a record."
+    assert page.locator("section:has(> h2:text-is('Attitudes')) tbody tr").count() == 5
+    assert "rec.csv keeps 5 attitudes: --resume goes on with it." in page.inner_text("main")
+    assert not page.locator("#session button:enabled").count()
+    status, error = running.end()
+    assert status == 2
+    assert "rec.csv keeps 5 attitudes: --resume goes on with it" in error

@@ -146,20 +146,6 @@ def test_titles_that_become_others_end_a_session_that_can_be_gone_on_with(tmp_pa
     assert len(il.read(tmp_path / "rec.csv")) == 3999 - 1
 
 
-def test_unplugged_in_the_middle(tmp_path):
-    with device(lines_of(tumble(20)), 100 * SPEED) as unit:
-        words = [f"serial:{unit.port}", "--plain", "--save", "rec.csv", "-o", "live.json", *FIT]
-        with live(words, tmp_path) as process:
-            process.said("attitude 3 accepted")
-            unit.unplug()
-            assert process.ended(5.0) == 2
-    last = process.lines[-1][1]
-    assert last.startswith(f"imulab: serial:{unit.port}@115200: the connection is lost (")
-    assert last.endswith(" attitudes: --resume goes on with it")
-    assert not (tmp_path / "live.json").exists()
-    assert len(il.find_attitudes(il.read(tmp_path / "rec.csv"))) >= 3
-
-
 @pytest.mark.slow
 def test_the_gyroscopes_follow_the_accelerometers(tmp_path):
     recording = tumble(20, gyro=True)

@@ -15,8 +15,9 @@ from rich.console import Console
 
 import imulab as il
 from imulab.errors import ImulabError, OptionError, ReadError
+from imulab.live.links import Link, LinkKind
 from imulab.live.session import Session
-from imulab.live.sources import LiveSource, Threaded, open_source
+from imulab.live.sources import Linked, LiveSource, open_source
 from imulab.live.stamps import Counts
 from imulab.live.terminal import draw
 from streams import terminal, wait_for
@@ -49,7 +50,7 @@ def test_an_unplugged_device_is_named():
         os.write(device, b"1,2,3\n")
         assert everything(source, 6) == b"1,2,3\n"
         os.close(device)
-        assert wait_for(lambda: bool(source.get(0.05) or source.ended))
+        assert wait_for(lambda: bool(source.lost))
         assert f"serial:{port}@115200: the connection is lost" in source.lost
         assert "unplugged?" in source.lost
         source.close()
@@ -235,7 +236,7 @@ def test_what_waits_is_bounded_and_a_sender_waits_or_its_losses_are_counted(held
         sent += 1
         return bytes([sent % 251]) * 1000 if sent <= 100 else None
 
-    source = Threaded("flood", read, held_back=held_back)
+    source = Linked(LinkKind("flood", lambda: Link(read), held_back=held_back))
     assert wait_for(lambda: sent >= 21)
     time.sleep(0.1)
     assert (sent == 21) == held_back  # one more than fits is read, and waits

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import imulab as il
 from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, warn, whole_number
-from imulab.errors import OptionError
+from imulab.errors import ImulabError, OptionError
 from imulab.options import FLAG, OUTPUT
 
 if TYPE_CHECKING:
@@ -129,7 +129,8 @@ def on_page(
     finally:
         files.end()
     if part.error is not None:
-        raise part.error
+        with _saying_what_is_kept(runner):
+            raise part.error
 
 
 # ``imulab open``: the workbench, in the browser of this machine.
@@ -264,7 +265,8 @@ def _in_terminal(runner: Runner, made: Callable[[], Calibration], *, plain: bool
     runner.recorder.close()
     if wrong := runner.session.view().counts.summary():
         note(f"of what came beside {runner.recorder.rows} samples: {wrong}")
-    record = made()
+    with _saying_what_is_kept(runner):
+        record = made()
     if not plain and typed:
         _show_corrected(runner, record)
 
@@ -303,13 +305,24 @@ def _layout(name: str | None) -> Layout | None:
 
 
 def _list_ports() -> None:
-    from imulab.live.sources import serial_ports
+    from imulab.live.links import serial_ports
 
     ports = serial_ports()
     for port, what in ports:
         print(f"serial:{port}  {what}")
     if not ports:
         print("no serial port on this machine")
+
+
+@contextmanager
+def _saying_what_is_kept(runner: Runner) -> Iterator[None]:
+    """Say what the recording keeps of a session that ends without a record."""
+    try:
+        yield
+    except ImulabError as error:
+        if runner.recorder.rows and runner.kept() not in str(error):
+            note(runner.kept())
+        raise
 
 
 @contextmanager

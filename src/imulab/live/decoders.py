@@ -83,6 +83,10 @@ class LineDecoder:
         """Return no rows: a last line without an end may be cut."""
         return self._table([])
 
+    def cut(self) -> None:
+        """Forget a line whose end has not come; the next may begin in its middle, which is no damage."""
+        self._rest, self._begun = b"", False
+
     def _table(self, rows: Rows) -> Array:
         return np.array(rows, dtype=np.float64).reshape(len(rows), len(self.units))
 
@@ -323,6 +327,10 @@ class PacketDecoder:
     def finish(self) -> Array:
         """Return the rows that waited for the rest of a frame that never came."""
         return self._table(ended=True)
+
+    def cut(self) -> None:
+        """Forget a frame whose end has not come; the next may begin in its middle, which is no damage."""
+        self._buffer, self._begun = b"", False
 
     def _table(self, *, ended: bool) -> Array:
         rows, place, buffer = [], 0, self._buffer

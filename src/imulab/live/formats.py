@@ -214,6 +214,9 @@ class Decoder(Protocol):
     def finish(self) -> Array:
         """Return the rows left at the end."""
 
+    def cut(self) -> None:
+        """Forget what is incomplete, as nothing will complete it."""
+
 
 class LineStream:
     """One stream: bytes with their arrival times to recordings of a few rows.
@@ -273,6 +276,16 @@ class LineStream:
         if self._decoder is None:
             return blocks
         return blocks + self._timed([(self._decoder.finish(), self._held[-1][1])])
+
+    def cut(self) -> None:
+        """Go on after an interruption: what was incomplete is left out, and the pause counts as no lost samples."""
+        if self._decoder is None:
+            self._held, self._first = [], None
+            return
+        self._decoder.cut()
+        for clock in (self._device, self._arrival):
+            if clock is not None:
+                clock.cut()
 
     @property
     def over(self) -> str:

@@ -170,7 +170,6 @@ class Guide:
     metadata: Mapping[str, str] = field(default_factory=dict)
     attitudes: list[Attitude] = field(default_factory=list)
     fit: TumbleFit | None = None
-    why_not: str = ""
     beyond: bool = False
     _outstanding: Array = field(default_factory=lambda: np.empty((0, 3)))
     _known: bool = False
@@ -238,6 +237,16 @@ class Guide:
             f"scatters by itself: more of them help little; {higher} may"
         )
 
+    @property
+    def missing(self) -> str:
+        """What is missing for a record, in a few words; empty if one can be made."""
+        if self.fit is not None:
+            return ""
+        short = parameter_count(self.order if isinstance(self.order, int) else 1) - len(self.kept)
+        if short > 0:
+            return f"at least {short} {'more ' if self.kept else ''}attitude{'s' * (short > 1)}"
+        return "attitudes that differ more from each other"
+
     def too_simple(self) -> str:
         """Return a message where a higher order explains attitudes that would pass for knocked ones; else empty."""
         if self.fit is None:
@@ -257,9 +266,9 @@ class Guide:
     def refit(self) -> None:
         """Fit the attitudes that are kept."""
         try:
-            self.fit, self.why_not = fit_tumble(self._kept_attitudes(), order=self.order, gravity=self.gravity), ""
-        except ImulabError as error:
-            self.fit, self.why_not = None, str(error)
+            self.fit = fit_tumble(self._kept_attitudes(), order=self.order, gravity=self.gravity)
+        except ImulabError:
+            self.fit = None
 
     def _kept_attitudes(self) -> Attitudes:
         kept = self.kept

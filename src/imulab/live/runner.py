@@ -16,7 +16,7 @@ from imulab.files import replacing
 from imulab.live.formats import LineStream
 from imulab.live.session import Event, Session
 from imulab.live.sources import LiveSource
-from imulab.live.view import FurtherFits, further_triads
+from imulab.live.view import FurtherFits, Trouble, further_triads
 from imulab.readers import read_blocks
 from imulab.recording import Array, Layout, Recording
 from imulab.units import from_si
@@ -203,6 +203,7 @@ def _head_lines(text: bytes) -> int:
 
 
 _SILENT = 3.0  # s without samples after which a message is given
+_GIVEN_UP = 30.0  # s without samples after which a session ends with what it has
 _BEFORE, _BEHIND = 1.0, 0.6
 """s that are cut out around a dropped attitude: the settling before it, and the moment of lifting after it."""
 
@@ -214,7 +215,7 @@ class Runner:
         self.source, self.session, self.recorder = source, session, recorder
         self._stream = LineStream(source.name, layout, polled=source.polled)
         self._last_arrival = source.now()
-        self._silent = False
+        self._given_up = False
         self._further: FurtherFits | None = None
         self._fit_due = False
         session.source = source.name
@@ -240,8 +241,8 @@ class Runner:
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will come."""
-        return self.source.ended
+        """Whether nothing more will come, or nothing has come for too long."""
+        return self.source.ended or self._given_up
 
     def step(self, wait: float) -> list[Event]:
         """Take the samples that come within `wait` seconds, and return what happened.
@@ -249,30 +250,31 @@ class Runner:
         Raises
         ------
         ReadError
-            The connection is lost, or the stream is none of the known, or its columns have changed; the recording so
+            The stream cannot be read any more, or is none of the known, or its columns have changed; the recording so
             far is kept.
         OptionError
             The recording cannot be written any more.
         DataError
             The stream is not one of an accelerometer triad.
         """
-        events: list[Event] = []
-        arrived = self.source.get(wait)
+        arrived, now = self.source.get(wait), self.source.now()
         self._stream.counts.unread_share = self.source.unread_share
+        events = self._check_link(any(len(piece.data) for piece in arrived), now)
         for piece in arrived:
+            if not len(piece.data):  # the link is open again
+                self._stream.cut()
+                continue
             events += self._take(self._fed(piece.data, piece.time), piece.time)
             self._answer()
-        now = self.source.now()
         if not arrived:
             events += self._take(self._fed(b"", now), now)
             self._answer()
             self.recorder.tick(now)
         if self.source.ended:
             events += self._take(self._stream.finish(), now)
-        events += self._check_silence(bool(arrived), now)
         if self._stream.over:
             raise ReadError(f"{self._stream.over}. {self.kept()}")
-        if self.source.lost:
+        if self.source.lost and not self.source.comes_back:
             raise ReadError(f"{self.source.lost} {self.kept()}")
         events += self._further_triads(events)
         if self.session.state == "accepted" and not self.session.enough and self.session.next is not None:
@@ -349,14 +351,33 @@ class Runner:
         if self._stream.to_send:
             self.source.send(self._stream.to_send)
 
-    def _check_silence(self, arrived: bool, now: float) -> list[Event]:
-        """Return an event when samples stop coming, or come again."""
+    def _check_link(self, arrived: bool, now: float) -> list[Event]:
+        """Return an event when samples stop coming, come again, or have not come for too long."""
+        session, source, before = self.session, self.source, self.session.trouble
         if arrived:
-            self._last_arrival = now
-            again, self._silent = self._silent, False
-            return [Event("again", "samples come again", self.recorder.last)] if again else []
-        if self._silent or now - self._last_arrival < _SILENT or self.source.ended:
+            self._last_arrival, session.trouble = now, None
+            if before is None:
+                return []
+            self._stream.cut()
+            return [Event("again", "samples come again" if session.begun else "samples come", self.recorder.last)]
+        waited = now - self._last_arrival
+        if source.ended or not (source.lost or waited >= _SILENT):
             return []
-        self._silent = True
-        text = f"nothing has come from {self.source.name} for {_SILENT:.0f} s: is the unit on, and does it send?"
-        return [Event("silent", text, self.recorder.last)]
+        silence = f"nothing has come from {source.name} for"
+        if session.begun and source.comes_back and waited >= _GIVEN_UP:
+            self._given_up = True
+            text = f"{silence} {_GIVEN_UP:.0f} s: the session ends with what there is"
+            return [Event("gone", text, self.recorder.last)]
+        why = source.lost or f"Nothing has come from {source.name} for {waited:.0f} s."
+        outlook = f"{why} {self.kept()}."
+        if session.begun and source.comes_back:
+            outlook += f" In {max(_GIVEN_UP - waited, 0):.0f} s the record is made of what there is."
+        if source.lost:
+            at = f" at {len(session.guide.kept)} of {session.wanted}" if session.wanted else ""
+            session.trouble = Trouble("lost", f"link lost{at}; reconnecting", outlook)
+            text = f"{session.trouble.advice}: {source.lost}"
+        else:
+            session.trouble = Trouble("silent", "no samples come: is the unit on, and does it send?", outlook)
+            text = f"{silence} {_SILENT:.0f} s: is the unit on, and does it send?"
+        changed = before is None or before.state != session.trouble.state
+        return [Event(session.trouble.state, text, self.recorder.last)] if changed else []

@@ -16,7 +16,7 @@ from imulab.gravity import Gravity
 from imulab.live.guide import Attitude, Guide, Target
 from imulab.live.holds import SHORTEST, SURE, Hold, Moment, Stillness
 from imulab.live.stamps import Counts
-from imulab.live.view import FURTHER, HeldValues, KnownUnit, View, in_words
+from imulab.live.view import FURTHER, HeldValues, KnownUnit, Trouble, View, in_words
 from imulab.procedures.views import parameter_rows
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, parse_unit, to_si
@@ -196,6 +196,8 @@ class Session:
         Name of the source, as shown.
     guide
         The attitudes and the plan.
+    trouble
+        Why no samples come, as who feeds the session knows; None while they do.
     """
 
     order: int | str = "auto"
@@ -206,6 +208,7 @@ class Session:
     state: str = "waiting"
     events: list[Event] = field(default_factory=list)
     guide: Guide = field(init=False)
+    trouble: Trouble | None = None
     _still: Stillness = field(default_factory=Stillness)
     _watch: Watch = field(default_factory=Watch)
     _counts: Counts = field(default_factory=Counts)
@@ -245,7 +248,7 @@ class Session:
                 f"{self.source or block.name}: expected time and accel_x accel_y accel_z, found "
                 f"{' '.join(block.columns)}"
             )
-        if self._first is None:
+        if not self.begun:
             self._first = float(times[0])
             self._begin(block)
         self._counts = counts or self._counts
@@ -256,6 +259,16 @@ class Session:
         for moment in self._still.feed(times, block.triad("accel")):
             self._at(moment)
         return self.events
+
+    @property
+    def begun(self) -> bool:
+        """Whether samples have come."""
+        return self._first is not None
+
+    @property
+    def wanted(self) -> int:
+        """How many attitudes there will be, as far as known; 0 where nothing is known."""
+        return self.guide.wanted() if self.guide.kept else (self.guide.planned or 0)
 
     @property
     def enough(self) -> bool:
@@ -334,8 +347,9 @@ class Session:
         return View(
             source=self.source,
             format=self._format,
-            state=self.state,
-            advice=self._advice(),
+            state=self.trouble.state if self.trouble else self.state,
+            advice=self.trouble.advice if self.trouble else self._advice(),
+            outlook=self.trouble.outlook if self.trouble else "",
             seconds=seconds,
             samples=self._samples,
             rate=(self._samples - 1) / seconds if seconds > 0 else 0.0,
@@ -346,13 +360,13 @@ class Session:
             temperature=self._temperature,
             hold=self._seconds,
             attitudes=held,
-            wanted=guide.wanted() if guide.kept else (guide.planned or 0),
+            wanted=self.wanted,
             parameters=known + (self._further if known else ()),
             targets=tuple(zip((f"{t.stem} {t.text}" for t in self.targets), guide.shares(), strict=True)),
             next=None if self._next is None else tuple(self._next.tolist()),
             next_words="" if self._next is None else self._in_words(self._next),
             enough=self._enough,
-            why_not=guide.why_not,
+            missing=guide.missing,
             warnings=tuple(self._watch.given_texts.values()),
         )
 

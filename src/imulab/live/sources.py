@@ -1,20 +1,18 @@
 """Sources of a live stream: serial ports, sockets, standard input, files, and a simulated unit.
 
 Each source returns the bytes that came with their time of arrival. Reads that block run in a thread, so that neither a
-fit nor a slow screen overflows the operating system's buffer.
+fit nor a slow screen overflows the operating system's buffer. `imulab.live.links` opens ports and sockets.
 """
 
 from __future__ import annotations
 
-import errno
 import math
 import os
-import socket
-import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
 from typing import Any
@@ -22,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import OptionError, ReadError, listed
+from imulab.live.links import CHUNK, GONE, Link, LinkKind, reason, serial_link, tcp_link, udp_link
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.quantities import number, quantity, whole_number
 from imulab.recording import Array, Recording
@@ -201,10 +200,8 @@ def _random_direction(rng: np.random.Generator) -> Array:
 
 
 KINDS = ("serial:PORT[@BAUD]", "udp:PORT", "tcp:HOST:PORT", "-", "replay:FILE[@SPEED]", "simulate[:key=value,..]")
-BAUD = 115_200  # of a serial port, where none is stated
-_PATIENCE = 0.1  # s that one read waits, so that its thread can be ended
 _STEP = 0.05  # s of a block of a replay or a simulation
-_CHUNK = 1 << 16  # bytes of one read, and about those that are handed on at once; a UDP datagram has fewer
+_AGAIN = 0.5  # s between two attempts to open a lost link
 _MOST_QUEUED = 1 << 22  # bytes that wait to be handed on: 10 s of a fast port, for the longest fit
 
 
@@ -228,14 +225,16 @@ class LiveSource:
     ended
         Whether nothing more will come.
     lost
-        Reason of an unexpected end.
+        Why the link is lost, while it is; the reason of an unexpected end.
+    comes_back
+        Whether a lost link is opened again.
     unread_share
         Share of the bytes that were lost because they came faster than they were handed on.
     by_hand
         Whether it is a simulated unit, which `turn_by_hand` turns.
     """
 
-    polled = by_hand = False
+    polled = by_hand = comes_back = False
     unread_share = 0.0
 
     def __init__(self, name: str) -> None:
@@ -264,62 +263,64 @@ class LiveSource:
         """Release what the source holds."""
 
 
-class Threaded(LiveSource):
-    """A source that a thread reads: `read` returns bytes, empty for a moment without any, None at the end.
+class Linked(LiveSource):
+    """A unit at a link, which a thread reads and opens again where it is lost, and standard input.
 
-    What waits to be handed on is bounded. Beyond that a sender that can be `held_back` (a pipe, TCP) has to wait; bytes
-    of any other are lost, and counted.
+    What waits to be handed on is bounded. Beyond that a sender that can be held back (a pipe, TCP) has to wait; bytes
+    of any other are lost, and counted. No bytes, with a time, are handed on where a link is open again.
     """
 
-    def __init__(
-        self,
-        name: str,
-        read: Callable[[], bytes | None],
-        *,
-        write: Callable[[bytes], object] | None = None,
-        close: Callable[[], object] = lambda: None,
-        polled: bool = False,
-        held_back: bool = False,
-    ) -> None:
-        super().__init__(name)
-        self.polled = polled
-        self._read, self._write, self._close, self._held_back = read, write, close, held_back
+    def __init__(self, kind: LinkKind, *, comes_back: bool = True) -> None:
+        super().__init__(kind.name)
+        self.polled, self.comes_back = kind.polled, comes_back
+        self._kind, self._link = kind, kind.open()
         self._changed = threading.Condition()
         self._pieces: deque[Arrived] = deque()
         self._queued = self._taken = self._unread = 0
         self._over = False
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True, name=f"imulab {name}")
+        self._thread = threading.Thread(target=self._run, daemon=True, name=f"imulab {self.name}")
         self._thread.start()
 
     def _run(self) -> None:
-        try:
-            while not self._stop.is_set():
-                data = self._read()
-                if data is None:
+        while not self._stop.is_set():
+            try:
+                data = self._link.read()
+            except GONE as error:
+                if self._stop.is_set():
                     break
-                if data:
-                    self._put(Arrived(data, time.monotonic()), len(data))
-        except (
-            OSError,
-            TypeError,
-            ValueError,
-        ) as error:  # the last two: pyserial's, of a port that is gone
-            if not self._stop.is_set():
-                self.lost = f"{self.name}: the connection is lost ({_reason(error)}): unplugged?"
+                self.lost = f"{self.name}: the connection is lost ({reason(error)}): unplugged?"
+                if not self.comes_back or not self._open_again():
+                    break
+                continue
+            if data is None:
+                break
+            if data:
+                self._put(Arrived(data, time.monotonic()), len(data))
         with self._changed:
             self._over = True
             self._changed.notify_all()
 
+    def _open_again(self) -> bool:
+        """Open a lost link again; return whether it is open, and not the source closed."""
+        with suppress(*GONE):
+            self._link.close()
+        while not self._stop.wait(_AGAIN):
+            with suppress(ReadError, OSError):
+                self._link, self.lost = self._kind.open(), ""
+                self._put(Arrived(b"", time.monotonic()), 0)
+                return True
+        return False
+
     def _put(self, piece: Arrived, size: int) -> None:
         """Queue bytes once there is room, or lose them."""
         with self._changed:
-            if self._held_back:
+            if self._kind.held_back:
                 self._changed.wait_for(lambda: self._queued < _MOST_QUEUED or self._stop.is_set())
             self._taken += size
             if self._queued >= _MOST_QUEUED:
                 self._unread += size
-                self.unread_share = self._unread / self._taken
+                self.unread_share = self._unread / max(self._taken, 1)
                 return
             self._pieces.append(piece)
             self._queued += size
@@ -331,7 +332,7 @@ class Threaded(LiveSource):
         size = 0
         with self._changed:
             self._changed.wait_for(lambda: self._pieces or self._over, wait)
-            while self._pieces and size < _CHUNK:
+            while self._pieces and size < CHUNK:
                 arrived.append(self._pieces.popleft())
                 size += len(arrived[-1].data)
             self._queued -= size
@@ -340,21 +341,19 @@ class Threaded(LiveSource):
         return arrived
 
     def send(self, data: bytes) -> None:
-        """Send bytes; a lost connection is also found by the reading thread."""
-        if self._write is not None:
-            try:
-                self._write(data)
-            except OSError as error:
-                self.lost = self.lost or f"{self.name}: the connection is lost ({_reason(error)}): unplugged?"
-                self.ended = True
+        """Send bytes; that the link is lost is found by the reading thread."""
+        if self._link.write is not None:
+            with suppress(*GONE):
+                self._link.write(data)
 
     def close(self) -> None:
-        """End the thread and close the port."""
+        """End the thread and close the link."""
         self._stop.set()
         with self._changed:
             self._changed.notify_all()
         self._thread.join(0.5)
-        self._close()
+        with suppress(*GONE):
+            self._link.close()
 
 
 class Paced(LiveSource):
@@ -436,141 +435,17 @@ def open_source(text: str, layout: str | None = None, *, follow: bool = False) -
     if follow and kind != "simulate":
         raise OptionError(f"--follow: expected a simulated unit (simulate), found {text!r}")
     if text == "-":
-        return Threaded("standard input", lambda: os.read(0, _CHUNK) or None, held_back=True)
-    makers: dict[str, Callable[[str], LiveSource]] = {"serial": _serial, "udp": _udp, "tcp": _tcp}
-    if kind in makers and rest:
-        return makers[kind](rest)
+        pipe = Link(lambda: os.read(0, CHUNK) or None)
+        return Linked(LinkKind("standard input", lambda: pipe, held_back=True), comes_back=False)
+    kinds = {"serial": serial_link, "udp": udp_link, "tcp": tcp_link}
+    if kind in kinds and rest:
+        return Linked(kinds[kind](rest))
     if kind == "replay" and rest:
         return _replay(rest, layout)
     if kind == "simulate":
         unit, speed = simulated_unit(rest, follow=follow)
         return Simulated("simulated unit", unit, speed)
     raise OptionError(f"source {text!r}: expected one of {listed(KINDS, text)}")
-
-
-def serial_ports() -> list[tuple[str, str]]:
-    """Return the serial ports of this machine with the devices at them.
-
-    Raises
-    ------
-    OptionError
-        pyserial is not installed.
-    """
-    _pyserial()
-    from serial.tools.list_ports import comports
-
-    return sorted((port.device, port.description or "") for port in comports())
-
-
-def _pyserial() -> Any:
-    try:
-        import serial
-    except ImportError:
-        raise OptionError("serial ports need pyserial, which is not here: pip install 'imulab[live]'") from None
-    return serial
-
-
-def _serial(rest: str) -> LiveSource:
-    serial = _pyserial()
-    port, at, rate = rest.rpartition("@")
-    if not at:
-        port, rate = rest, str(BAUD)
-    baud = whole_number(rate, f"serial:{rest}: baud rate")
-    name = f"serial:{port}@{baud}"
-    if not 50 <= baud <= 20_000_000:
-        raise OptionError(f"{name}: expected a baud rate of 50 to 20000000")
-    try:
-        device = serial.Serial(port, baud, timeout=_PATIENCE, write_timeout=1.0, exclusive=True)
-    except (OSError, ValueError) as error:
-        raise ReadError(f"{name}: {_why_no_port(port, error)}") from None
-    return Threaded(
-        name, lambda: bytes(device.read(max(1, device.in_waiting))), write=device.write, close=device.close, polled=True
-    )
-
-
-def _why_no_port(port: str, error: Exception) -> str:
-    number = getattr(error, "errno", None)
-    reason = str(error).lower()
-    if number == errno.ENOENT or "filenotfound" in reason:
-        known = " ".join(device for device, _ in serial_ports()) or "none"
-        return f"no such port; ports of this machine: {known}"
-    if number in (errno.EACCES, errno.EPERM) and "lock" not in reason:
-        return (
-            "not permitted; add yourself to the group that owns the port (on most Linux systems: sudo usermod -aG "
-            "dialout $USER, then log in anew)"
-        )
-    if number in (errno.EBUSY, errno.EAGAIN) or "lock" in reason:
-        return "the port is busy: another program has it open (a serial monitor? close it)"
-    return f"cannot be opened: {_reason(error)}"
-
-
-def _udp(rest: str) -> LiveSource:
-    name = f"udp:{rest}"
-    port = _port(rest, name)
-    link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-        link.bind(("", port))
-    except OSError as error:
-        link.close()
-        raise ReadError(f"{name}: {_why_no_address(error)}") from None
-    link.settimeout(_PATIENCE)
-    sender: list[Any] = []
-
-    def read() -> bytes:
-        try:
-            data, address = link.recvfrom(_CHUNK)
-        except TimeoutError:
-            return b""
-        sender[:] = sender or [address]
-        if address != sender[0]:
-            return b""  # one unit only: the one that sent first
-        # A line of text in its own datagram often has no end of line.
-        return data + b"\n" if data[-1:] != b"\n" and data.isascii() and data.decode().isprintable() else data
-
-    return Threaded(name, read, close=link.close)
-
-
-def _tcp(rest: str) -> LiveSource:
-    name = f"tcp:{rest}"
-    host, colon, text = rest.rpartition(":")
-    if not colon or not host:
-        raise OptionError(f"{name}: expected tcp:HOST:PORT")
-    port = _port(text, name)
-    try:
-        link = socket.create_connection((host.strip("[]"), port), timeout=5.0)
-    except OSError as error:
-        raise ReadError(f"{name}: {_why_no_address(error)}") from None
-    link.settimeout(_PATIENCE)
-
-    def read() -> bytes | None:
-        try:
-            return link.recv(_CHUNK) or None
-        except TimeoutError:
-            return b""
-
-    return Threaded(name, read, write=link.sendall, close=link.close, polled=True, held_back=True)
-
-
-def _port(text: str, name: str) -> int:
-    port = whole_number(text, f"{name}: port")
-    if not 1 <= port <= 65535:
-        raise OptionError(f"{name}: expected a port of 1 to 65535")
-    return port
-
-
-def _why_no_address(error: OSError) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return "the port is busy: another program listens there"
-    if error.errno in (errno.EACCES, errno.EPERM):
-        return "not permitted: ports below 1024 belong to the administrator; expected another"
-    if isinstance(error, ConnectionRefusedError):
-        return "nobody listens there: is the unit on, and is the port right?"
-    if isinstance(error, TimeoutError):
-        return "no answer within 5 s: is the address right, and on the same network?"
-    if isinstance(error, socket.gaierror):
-        return "no machine of this name"
-    return f"cannot be opened: {_reason(error)}"
 
 
 def _replay(rest: str, layout: str | None) -> LiveSource:
@@ -601,12 +476,3 @@ def _slices(blocks: Iterator[Recording]) -> Iterator[Recording]:
         for start, stop in zip([0, *ends.tolist()], [*ends.tolist(), len(times)], strict=True):
             columns = {name: column[start:stop] for name, column in block.columns.items()}
             yield Recording(columns, block.units, block.metadata, block.name)
-
-
-def _reason(error: Exception) -> str:
-    return " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
-
-
-def is_interactive() -> bool:
-    """Return whether keys can be read: standard input is a terminal."""
-    return sys.stdin is not None and sys.stdin.isatty()

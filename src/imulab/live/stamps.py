@@ -101,6 +101,11 @@ class DeviceClock:
         self._step: float | None = None
         self._recent: Array = np.empty(0)
         self._missing: Array = np.empty(0)
+        self._paused = False
+
+    def cut(self) -> None:
+        """Count no samples as lost before the next one: the stream was interrupted."""
+        self._paused = True
 
     def times(self, stamps: Array) -> tuple[Array, NDArray[np.bool_], list[int]]:
         """Return the times of stamps.
@@ -122,7 +127,8 @@ class DeviceClock:
             times, kept, again = self._judged(stamps.tolist(), usual)
         good = times[kept]
         if good.size:
-            self._count(np.diff(good) if self._last is None else np.diff(good, prepend=self._last))
+            self._count(np.diff(good) if self._last is None or self._paused else np.diff(good, prepend=self._last))
+            self._paused = False
             self._last = float(good[-1])
         return times, kept, again
 
@@ -226,6 +232,11 @@ class ArrivalClock:
         self._count = 0
         self._last = 0.0
         self._origin: float | None = None
+        self._paused = False
+
+    def cut(self) -> None:
+        """Count no samples as lost before the next one: the stream was interrupted."""
+        self._paused = True
 
     def times(self, count: int, arrival: float) -> Array:
         """Return the times of the next `count` samples, s from about the first, shape (count,)."""
@@ -235,11 +246,13 @@ class ArrivalClock:
         number = self._count + count - 1.0
         slope, level = self._line()
         if slope and arrival - (level + slope * number) > max(_PAUSE, _PAUSE_STEPS * slope):
-            self._counts.gaps += 1
-            self._counts.lost += round((arrival - level) / slope - number)
+            if not self._paused:
+                self._counts.gaps += 1
+                self._counts.lost += round((arrival - level) / slope - number)
             shift = arrival - (level + slope * number)
             self._arrivals = [each + shift for each in self._arrivals]
             level += shift
+        self._paused = False
         known = self._numbers[-1] if self._numbers else -1.0
         if number > known and (len(self._numbers) < _POINTS or arrival - self._arrivals[-1] >= _APART):
             self._numbers.append(number)

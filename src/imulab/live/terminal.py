@@ -16,7 +16,10 @@ from imulab.recording import Array
 from imulab.report.traces import format_uncertain
 from imulab.units import STANDARD_GRAVITY
 
-_COLOURS = {"waiting": "white", "moving": "yellow", "settling": "yellow", "still": "cyan", "accepted": "green"}
+_COLOURS = {
+    "waiting": "white", "moving": "yellow", "settling": "yellow", "still": "cyan", "accepted": "green",
+    "silent": "red", "lost": "red",
+}  # fmt: skip
 _ROWS, _COLUMNS = 9, 37  # of the sphere on the terminal
 _MILLI = 1e3  # to mg
 _BAR = 14  # characters of a bar
@@ -56,6 +59,7 @@ def _advice(view: View, width: int) -> list[Text]:
     style = f"bold reverse {_COLOURS[view.state]}"
     advice = f"{view.advice}: {view.hold:.1f} s" if view.state == "still" and view.hold else view.advice
     lines = [Text(f" {line}".ljust(width), style=style) for line in wrap(advice, width - 2) or [""]]
+    lines += [Text(line) for line in wrap(view.outlook, width)]
     if view.up is not None:
         now = Text.assemble(("now ", "dim"), in_words(np.array(view.up)))
         if view.next is not None:

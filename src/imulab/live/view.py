@@ -57,6 +57,15 @@ class KnownUnit:
 
 
 @dataclass(frozen=True)
+class Trouble:
+    """Why no samples come: a state, ``silent`` or ``lost``, what to do, and what will happen, in words."""
+
+    state: str
+    advice: str
+    outlook: str
+
+
+@dataclass(frozen=True)
 class View:
     """A session at one moment.
 
@@ -65,9 +74,11 @@ class View:
     source, format
         Name of the stream's source, and its format.
     state
-        ``waiting``, ``moving``, ``settling``, ``still`` or ``accepted``.
+        ``waiting``, ``moving``, ``settling``, ``still`` or ``accepted``; ``silent`` or ``lost`` while no samples come.
     advice
         What to do now, in one sentence.
+    outlook
+        What will happen if no samples come; empty while they do.
     seconds, samples, rate
         Length of the stream, s; its samples; samples per second.
     counts
@@ -90,8 +101,8 @@ class View:
         Upward direction to take next, None where none is needed; the same in words.
     enough
         A sentence once the target is met, with the gain of five more attitudes; empty before.
-    why_not
-        Why there is no fit; empty if there is one.
+    missing
+        What is missing for a record, a few words; empty if one can be made.
     warnings
         All warnings so far.
     """
@@ -100,6 +111,7 @@ class View:
     format: str
     state: str
     advice: str
+    outlook: str
     seconds: float
     samples: int
     rate: float
@@ -116,7 +128,7 @@ class View:
     next: tuple[float, ...] | None
     next_words: str
     enough: str
-    why_not: str
+    missing: str
     warnings: tuple[str, ...]
 
 

@@ -5,8 +5,8 @@ Messages to the page, beside those of `parts`:
 ``view``
     The `View` as JSON, at most ten a second: numbers in SI or as `View` says, parameters as texts (`name`, `value`,
     `uncertainty`, `unit`) with `share`, their standard uncertainty over the target's; each attitude in `words`; `phase`
-    (``measuring``, ``computing`` or ``done``); `silent`, a sentence while nothing comes; `recording`, its file;
-    `by_hand`, whether the unit is one that ``turn`` turns.
+    (``measuring``, ``computing``, ``done`` or ``failed``); `recording`, its file; `by_hand`, whether the unit is one
+    that ``turn`` turns.
 ``event``
     Something that happened: `kind`, `text`, `time`, as `Event`.
 ``done``
@@ -15,7 +15,8 @@ Messages to the page, beside those of `parts`:
 ``corrected``
     After that, ten times a second: `length`, `raw` and `gravity`, m/s², of the reading now.
 ``failed``
-    The session has ended: `text` says why; `lines` are the first of an unknown stream, `guess` a layout for it.
+    The session has ended: `text` says why, `missing` what a record would need where that is the reason, `kept` what the
+    recording keeps; `lines` are the first of an unknown stream, `guess` a layout for it.
 
 Messages from the page: ``drop`` (`attitude`: its number), ``turn`` (`up`: the direction of the body that a simulated
 unit is to have upward), ``finish`` and ``quit``.
@@ -91,7 +92,7 @@ class GuidedPart(PagePart):
         self._done: Message = {}
         self._failed: Message = {}
         self._events: deque[Message] = deque(maxlen=_EVENTS)
-        self._phase, self._silent, self._finish = "measuring", "", False
+        self._phase, self._finish = "measuring", False
         self._stop = threading.Event()
         self._hub = Hub()
         self._thread = threading.Thread(target=partial(copy_context().run, self._run), daemon=True, name="imulab live")
@@ -140,7 +141,8 @@ class GuidedPart(PagePart):
                     return
             self._follow()
         except Exception as error:
-            self.error, self._failed = error, _failure(error)
+            self.error, self._failed, self._phase = error, self._failure(error), "failed"
+            self._show()
             self._tell(self._failed)
             given_up = monotonic() + _PATIENCE  # a page that is being opened gets the message too
             while not (self._hub.pages or self._stop.is_set()) and monotonic() < given_up:
@@ -197,10 +199,6 @@ class GuidedPart(PagePart):
             return events
 
     def _publish(self, event: Event) -> None:
-        if event.kind == "again":
-            self._silent = ""
-        elif event.kind == "silent":
-            self._silent = event.text
         if event.kind != "state":
             self._events.append({"type": "event", **asdict(event)})
             self._tell(self._events[-1])
@@ -209,7 +207,6 @@ class GuidedPart(PagePart):
         self._view = {
             **view_message(self._runner.session.view()),
             "phase": self._phase,
-            "silent": self._silent,
             "recording": self._runner.recorder.path,
             "by_hand": self._runner.source.by_hand,
         }
@@ -230,6 +227,22 @@ class GuidedPart(PagePart):
                 shown = corrected_reading(ready, blocks[-1], gyro=gyro and "gyro_x" in blocks[-1])
                 self._tell({"type": "corrected", **asdict(shown), "gravity": gravity}, latest=True)
                 last_shown = monotonic()
+
+    def _failure(self, error: Exception) -> Message:
+        lines: Iterable[str] = ()
+        guess = ""
+        if isinstance(error, UnknownFormatError):
+            lines, guess = error.lines, error.guess.toml if error.guess else ""
+        text = str(error) if isinstance(error, ImulabError) else f"a fault of imulab: {type(error).__name__}: {error}"
+        kept = self._runner.kept() if self._runner.recorder.rows else ""
+        return {
+            "type": "failed",
+            "text": text,
+            "missing": self._runner.session.guide.missing if self._phase == "computing" else "",
+            "kept": "" if kept in text else kept,
+            "lines": list(lines),
+            "guess": guess,
+        }
 
     def _result(self, record: Calibration) -> Message:
         names = {"record": self._record_name, "report": "report", "recording": Path(self._runner.recorder.path).name}
@@ -272,15 +285,6 @@ def view_message(view: View) -> Message:
 def _parameter(name: str, value: float, uncertainty: float | None, unit: str) -> Message:
     texts = format_uncertain(value, uncertainty)
     return {"name": name, "value": texts[0], "uncertainty": texts[1], "unit": unit}
-
-
-def _failure(error: Exception) -> Message:
-    lines: Iterable[str] = ()
-    guess = ""
-    if isinstance(error, UnknownFormatError):
-        lines, guess = error.lines, error.guess.toml if error.guess else ""
-    text = str(error) if isinstance(error, ImulabError) else f"a fault of imulab: {type(error).__name__}: {error}"
-    return {"type": "failed", "text": text, "lines": list(lines), "guess": guess}
 
 
 def _ascii(name: str) -> str:

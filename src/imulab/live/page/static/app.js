@@ -3,7 +3,7 @@
 // An area is a module with `title`, `mount(place, page)`, which is called once, `hear(message)`, which gets every
 // message of the socket, and `kept()`, which says what stays when the program has ended; `shown()`, where it has one, is
 // called whenever it comes into sight. `page.send(message)` answers, `page.say(text, kind)` says something above all areas
-// (kind: "note" or "bad"; no text takes it away).
+// (kind: "note" or "bad"; no text takes it away), and `page.forget()` takes a refusal away once its cause has gone.
 
 import { h, put, show } from "./dom.js";
 import * as session from "./session.js";
@@ -16,8 +16,10 @@ const tabs = document.getElementById("tabs");
 const mounted = {};
 let socket = null;
 let ended = false;
+let refused = false;
 
 function say(text, kind = "note") {
+  refused = false;
   const place = document.getElementById("said");
   if (place.textContent === text) return;
   place.replaceChildren(...(text ? [h("p", { class: `said ${kind}` }, text)] : []));
@@ -30,6 +32,9 @@ const page = {
     else say(gone(), "bad");
   },
   // Says that the program ends by itself now, and why: that it is gone is then no news.
+  forget() {
+    if (refused) say("");
+  },
   others: () => Object.keys(mounted),
   end(text, kind) {
     ended = true;
@@ -91,6 +96,7 @@ function hear(message) {
     put(document.getElementById("where"), `version ${message.version}`);
   } else if (message.type === "refused") {
     say(message.text, "bad");
+    refused = true;
   }
   for (const name of Object.keys(mounted)) AREAS[name].hear(message);
 }

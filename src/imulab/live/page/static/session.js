@@ -26,12 +26,15 @@ export function mount(into, given) {
   parts.hold = h("span", { class: "hold" });
   parts.progress = h("progress", { max: 1, value: 0, "aria-label": "Attitudes" });
   parts.count = h("span", {});
-  parts.finish = h("button", { onclick: () => page.send({ type: "finish" }) }, "Finish");
+  parts.finish = h("button", { "aria-describedby": "missing", onclick: () => page.send({ type: "finish" }) }, "Finish");
+  parts.missing = h("span", { id: "missing", class: "missing" });
+  parts.outlook = h("p", { class: "outlook" });
   parts.enough = h("p", { class: "enough", role: "status" });
   parts.now = h("div", { class: "now" },
     parts.advice,
+    parts.outlook,
     parts.where = h("div", { class: "where" }, h("ol", { class: "steps", "aria-label": "State" }, parts.steps), parts.hold),
-    parts.toward = h("div", { class: "toward" }, parts.progress, parts.count, h("span", { class: "actions" }, soundButton(), parts.finish)),
+    parts.toward = h("div", { class: "toward" }, parts.progress, parts.count, h("span", { class: "actions" }, parts.missing, soundButton(), parts.finish)),
     parts.enough);
   parts.knocked = h("div", { role: "alert" });
   parts.warnings = h("div", { role: "alert" });
@@ -78,6 +81,7 @@ const sentence = text => text.charAt(0).toUpperCase() + text.slice(1) + (/[.?!]$
 function view(now) {
   const measuring = now.phase === "measuring";
   put(parts.advice, advice(now));
+  put(parts.outlook, measuring ? now.outlook : "");
   parts.now.dataset.state = measuring ? now.state : now.phase;
   document.title = `${measuring ? now.state : now.phase} · imulab`;
   parts.steps.forEach((item, k) => {
@@ -94,14 +98,16 @@ function view(now) {
   once("attitudes", [now.attitudes, measuring], () =>
     parts.attitudes.replaceChildren(attitudeTable(now, measuring ? drop : null)));
   once("knocked", [now.attitudes.filter(each => each.aside), measuring], () => knocked(now, measuring));
-  once("warnings", [now.warnings, now.silent], () =>
-    parts.warnings.replaceChildren(...[now.silent, ...now.warnings].filter(Boolean).map(text =>
-      h("p", { class: "said look" }, sentence(text)))));
+  once("warnings", now.warnings, () =>
+    parts.warnings.replaceChildren(...now.warnings.map(text => h("p", { class: "said look" }, sentence(text)))));
+  once("cause", [now.missing, now.attitudes.map(each => each.number)], page.forget);
 }
 
 export function advice(now) {
   if (now.phase === "computing") return "Computing the record.";
   if (now.phase === "done") return "Done: the record is made.";
+  if (now.phase === "failed") return "The session has ended without a record.";
+  if (now.outlook) return sentence(now.advice);
   const off = now.attitudes.find(each => each.aside);
   if (now.enough && off) return `Enough, but attitude ${off.number} looks knocked: drop it first.`;
   if (now.enough && now.state === "accepted") return "Enough: make the record.";
@@ -125,7 +131,8 @@ function progress(now, measuring) {
   show(parts.enough, measuring && Boolean(now.enough));
   for (const part of [parts.where, parts.toward, parts.known]) show(part, now.phase !== "done");
   show(parts.finish, measuring);
-  parts.finish.disabled = !count;
+  parts.finish.disabled = Boolean(now.missing);
+  put(parts.missing, measuring && now.missing ? `needs ${now.missing}` : "");
   parts.finish.className = now.enough ? "main" : "";
   put(parts.finish, now.enough ? "Make the record" : "Finish now");
 }
@@ -210,12 +217,18 @@ function happened(event) {
   beep(event.kind);
 }
 
+// The session has ended: what it knew stays on the page.
 function failed(message) {
-  page.end(sentence(message.text), "bad");
-  const below = message.lines.length ? [h("p", {}, "The first lines of the stream:"), h("pre", {}, message.lines.join("\n"))] : [];
+  page.end(sentence(message.missing ? `For a record it needs ${message.missing}` : message.text), "bad");
+  const below = [];
+  if (message.kept) below.push(h("p", {}, `${message.kept}.`));
+  if (message.missing) below.push(h("details", {}, h("summary", {}, "The reason in full"), h("p", {}, message.text)));
+  if (message.lines.length) below.push(h("p", {}, "The first lines of the stream:"), h("pre", {}, message.lines.join("\n")));
   if (message.guess) {
     below.push(h("p", {}, "A guess of its columns; check it, save it as layout.toml, and add --layout layout.toml:"),
       h("pre", {}, message.guess));
   }
-  place.replaceChildren(...(below.length ? [h("section", {}, below)] : []));
+  if (below.length) parts.knocked.replaceChildren(h("section", {}, below));
+  for (const part of [parts.where, parts.toward, parts.outlook]) show(part, false);
+  for (const button of place.querySelectorAll("button")) button.disabled = true;
 }
