@@ -76,6 +76,9 @@ def test_lost_samples_are_gaps_and_leave_the_rate_as_it_is(jitter):
         (np.repeat(NUMBER[: N // 2] / 100, 2), 200),
         (np.floor(NUMBER / 100 / 0.015625) * 0.015625, 100),
         (np.floor(NUMBER[:1000] / 100 + 0.3), 100),
+        (np.floor(NUMBER / 0.99 + 1e-6) / 1e3, 990),
+        (np.floor(NUMBER / 0.98 + 1e-6) / 1e3, 980),
+        (np.floor(NUMBER / 1.99 + 1e-6) / 1e3, 1990),
     ],
     ids=[
         "ms 1600",
@@ -90,6 +93,9 @@ def test_lost_samples_are_gaps_and_leave_the_rate_as_it_is(jitter):
         "pairs",
         "15.6 ms",
         "10 s",
+        "ms 990",
+        "ms 980",
+        "ms 1990",
     ],
 )
 def test_coarse_stamps_give_the_rate_by_number_over_time(time, rate):
@@ -102,6 +108,16 @@ def test_coarse_stamps_give_the_rate_by_number_over_time(time, rate):
     tick = np.diff(np.unique(time)).max()
     assert np.abs(mended.time - time).max() < 1.1 * tick
     assert (np.diff(mended.time) > 0).all()
+
+
+def test_a_gap_beside_the_beat_of_a_clock_stays():
+    clock = read_clock(np.delete(np.floor(NUMBER / 0.99 + 1e-6) / 1e3, slice(7010, 7310)))
+    assert (clock.rate, clock.missing.tolist()) == (pytest.approx(990, rel=1e-4), [300])
+
+
+def test_a_sample_that_a_program_loses_now_and_then_is_a_gap():
+    clock = read_clock(np.delete(NUMBER / 100, slice(50, None, 50)))
+    assert (clock.rate, clock.missing.sum()) == (pytest.approx(100, rel=1e-9), N // 50 - 1)
 
 
 def test_samples_lost_under_coarse_stamps_stay_a_gap():
@@ -313,3 +329,41 @@ def test_a_replay_of_coarse_stamps_gives_what_the_file_gives(imulab, tmp_path):
     live, file = (il.load(tmp_path / name) for name in ("live.json", "file.json"))
     for name, parameter in file.parameters.items():
         assert abs(live.value(name) - parameter.value) < 0.3 * parameter.standard_uncertainty, name
+
+
+@pytest.mark.parametrize("kind", ["pairs", "whole seconds", "twice"])
+def test_an_array_with_shared_stamps_is_fused_as_its_readings_are(imulab, tmp_path, kind):
+    even = il.simulate_array(duration=30.0, rate=100.0)
+    rows = np.arange(len(even))
+    if kind == "twice":
+        rows = np.sort(np.concatenate([rows, [100, 1000]]))
+        stamps = even.column("time")[rows]
+    else:
+        stamps = np.floor(even.column("time") / (1.0 if kind == "whole seconds" else 0.02) + 1e-9)
+        stamps = stamps * (1.0 if kind == "whole seconds" else 0.02)
+    shared = {name: values[rows] for name, values in even.columns.items()} | {"time": stamps}
+    il.write_csv(even, tmp_path / "even.csv")
+    il.write_csv(Recording(shared, even.units, name="shared.csv"), tmp_path / "shared.csv")
+    for name in ("even", "shared"):
+        assert imulab("array", "fuse", f"{name}.csv", "-o", f"{name}_rate.csv").returncode == 0
+    fused, known = (il.read(tmp_path / f"{name}_rate.csv") for name in ("shared", "even"))
+    assert len(fused) == len(known)
+    for name in known.columns:
+        tolerance = 0.02 if name == "time" else 1e-9
+        np.testing.assert_allclose(
+            fused.column(name) - fused.column(name)[0], known.column(name) - known.column(name)[0], atol=tolerance
+        )
+    np.testing.assert_allclose(il.fuse(tmp_path / "shared.csv").rate, il.fuse(tmp_path / "even.csv").rate, atol=1e-9)
+
+
+def test_a_unit_of_time_that_makes_the_rate_unusual_is_doubted(imulab, tmp_path):
+    recording = il.simulate_tumble(gravity=9.81, attitudes=12)
+    wrong = recording.with_columns({"time": np.round(1.7339389e12 + recording.time * 1e3)}, {})
+    il.write_csv(wrong, tmp_path / "ms.csv")
+    doubt = "column time [s]: 10 s from row to row (0.1 Hz): is the unit of time right: 100 Hz if it is in ms?"
+    assert f"\n{doubt} --unit time=UNIT states it\n" in imulab("show", "ms.csv").stdout
+    fit = ("tumble", "fit", "ms.csv", "--gravity", "9.81", "--with", "gyro", "-o", "r.json")
+    done = imulab(*fit)
+    assert (done.returncode, done.stderr) == (2, f"imulab: ms.csv: {doubt} --unit time=UNIT states it\n")
+    assert imulab(*fit, "--unit", "time=ms").returncode == 0
+    assert "is the unit" not in imulab("show", "ms.csv", "--unit", "time=ms").stdout

@@ -323,3 +323,36 @@ def test_a_stream_takes_no_packets(tmp_path):
     stream.feed(b"1,2\n" * 100, 0.0)
     with pytest.raises(OptionError, match="takes no packets"):
         stream.feed(b"1,2\n" * 100, 3.0)
+
+
+@pytest.mark.parametrize("unit", ["g", "m/s^2"])
+def test_stated_units_stand_for_those_of_a_stream(unit):
+    pieces, sent = native()
+    stream = LineStream("device", units={"accel": unit, "time": "ms"})
+    blocks = [block for k, piece in enumerate(pieces) for block in stream.feed(piece, 0.01 * k)]
+    assert {blocks[0].units[f"accel_{axis}"] for axis in "xyz"} == {unit}
+    assert blocks[0].units["time"] == "ms"
+    np.testing.assert_array_equal(
+        np.concatenate([block.columns["accel_x"] for block in blocks]), sent["accel_x"][: sum(map(len, blocks))]
+    )
+    wrong = LineStream("device", units={"pressure": "g"})
+    with pytest.raises(OptionError, match=r"device: unit of pressure: no such column"):
+        [wrong.feed(piece, 0.01 * k) for k, piece in enumerate(pieces)]
+
+
+def test_a_stated_unit_is_used_in_the_layout_that_is_offered():
+    lines = b"".join(b"%d,%.3f,0.1,0.2,0.01,0.02,0.03\n" % (10 * k, 9.8 + 1e-3 * (k % 7)) for k in range(400))
+    stream = LineStream("device", units={"gyro": "rad/s"})
+    with pytest.raises(UnknownFormatError) as caught:
+        stream.feed(b"t,ax,ay,az,gx,gy,gz\n" + lines, 0.0), stream.feed(b"", 3.0)
+    assert caught.value.guess is not None
+    assert 'gyro_x = { from = "gx", unit = "rad/s" }' in caught.value.guess.toml
+    assert "supposed" not in " ".join(caught.value.guess.supposed)
+
+
+def test_a_clock_that_stands_still_among_shared_stamps_is_refused(monkeypatch):
+    monkeypatch.setattr("imulab.live.formats._MOST_WAITING", 500)
+    stream = LineStream("device")
+    rows = b"".join(b"7,1,0,%d\n" % k for k in range(2000))
+    with pytest.raises(ReadError, match=r"device: time stands still at 7 ms for more than 500 samples"):
+        stream.feed(b"time [ms],accel_x [g],accel_y [g],accel_z [g]\n" + rows, 0.0), stream.feed(b"", 3.0)

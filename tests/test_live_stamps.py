@@ -12,11 +12,11 @@ from imulab.recording import Recording
 
 
 def stamped(
-    stamps: np.ndarray | list[float], unit: str = "ms", sizes: int | list[int] = 5
+    stamps: np.ndarray | list[float], unit: str = "ms", sizes: int | list[int] = 5, sent: int = 1
 ) -> tuple[LineStream, Recording]:
-    """Samples whose accel_z is their number, with these stamps, in pieces of so many."""
+    """Samples whose accel_z is their number, each sent so many times, with these stamps, in pieces of so many."""
     stream = LineStream("device")
-    rows = [f"{stamp:.10g},1,0,{k}\n" for k, stamp in enumerate(stamps)]
+    rows = [f"{stamp:.10g},1,0,{k // sent}\n" for k, stamp in enumerate(stamps)]
     ends = np.cumsum(sizes) if isinstance(sizes, list) else np.arange(sizes, len(rows) + sizes, sizes)
     pieces = ["".join(rows[a:b]).encode() for a, b in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)]
     pieces[0] = f"time [{unit}],accel_x [g],accel_y [g],accel_z [g]\n".encode() + pieces[0]
@@ -78,9 +78,38 @@ def test_a_gap_is_believed_and_a_clock_that_was_set_is_no_gap():
 
 
 def test_a_sample_that_is_sent_twice_is_counted_once():
-    stream, found = stamped([10.0 * (k // 2) for k in range(600)])
-    np.testing.assert_array_equal(found.columns["accel_z"], 2 * np.arange(300))
+    stream, found = stamped([10.0 * (k // 2) for k in range(600)], sent=2)
+    np.testing.assert_array_equal(found.columns["accel_z"], np.arange(300))
     assert vars(stream.counts) == vars(Counts(repeated=300))
+
+
+@pytest.mark.parametrize("sizes", [1, 7, 64])
+@pytest.mark.parametrize(
+    ("rate", "unit", "tick"), [(200.0, "ms", 10.0), (1600.0, "ms", 1.0), (50.0, "s", 1.0), (100.0, "s", 0.02)]
+)
+def test_samples_that_share_stamps_are_all_kept_and_lie_evenly(rate, unit, tick, sizes):
+    """By the number of samples, which the stamps themselves do not show."""
+    ticks = rate * tick * {"ms": 1e-3, "s": 1.0}[unit]
+    count = int(max(20 * ticks, 4 * rate))
+    stamps = tick * np.floor(np.arange(count) / ticks + 1e-9) + (2**32 - 5000 if unit == "ms" else 0)
+    stamps = stamps % 2**32 if unit == "ms" else stamps
+    stream, found = stamped(stamps, unit, sizes)
+    kept = found.columns["accel_z"].astype(int)
+    np.testing.assert_array_equal(kept, np.arange(len(kept)))
+    assert len(kept) > count - 2 * ticks - 2
+    time = found.si("time") - found.si("time")[0]
+    assert (np.diff(time) > 0).all()
+    seconds = tick * {"ms": 1e-3, "s": 1.0}[unit]
+    assert np.abs(time - kept / rate).max() < seconds
+    assert time[-1] == pytest.approx(kept[-1] / rate, abs=0.25 * seconds)
+    assert vars(stream.counts) == vars(Counts())
+
+
+def test_samples_lost_under_shared_stamps_are_a_gap():
+    number = np.delete(np.arange(4000), slice(2000, 2400))
+    stream, found = stamped(10.0 * (number // 2))
+    assert np.diff(found.columns["time"]).max() == pytest.approx(5 * 401, abs=10)
+    assert (stream.counts.gaps, stream.counts.lost) == (1, pytest.approx(400, abs=2))
 
 
 def test_another_rate_is_no_loss():

@@ -144,6 +144,55 @@ def test_with_joins_files_of_two_rates_without_touching_a_sample(tmp_path, imula
         np.testing.assert_array_equal(again.stream(sensor).triad(sensor), recording.stream(sensor).triad(sensor))
 
 
+def test_units_and_a_window_are_stated_for_all_files_that_are_joined(tmp_path, imulab):
+    recording = at_rest(3.0)
+    for sensor in ("accel", "gyro"):
+        il.write(recording.stream(sensor), tmp_path / f"{sensor}.csv")
+    both = ("convert", "accel.csv", "--with", "gyro.csv", "-o", "own.csv")
+    assert imulab(*both, "--unit", "accel=g,gyro_x=deg/s", "--window", "+1:+2").returncode == 0
+    joined = il.read(tmp_path / "own.csv")
+    assert [joined.units[name] for name in ("accel_z", "gyro_x", "gyro_y")] == ["g", "deg/s", "rad/s"]
+    for sensor in ("accel", "gyro"):
+        part, known = joined.stream(sensor), recording.stream(sensor)
+        inside = (known.time >= 1) & (known.time <= 2)
+        np.testing.assert_array_equal(part.triad(sensor), known.triad(sensor)[inside])
+    (tmp_path / "own.csv").unlink()
+    done = imulab(*both, "--unit", "accel=g,mag=uT")
+    assert (done.returncode, done.stderr) == (2, "imulab: --unit mag: no such column in accel.csv, gyro.csv\n")
+    assert not (tmp_path / "own.csv").exists()
+
+
+@pytest.mark.parametrize(("clock", "late"), [("2024-12-31T23:59:59.{:03}Z", 0.253), ("23:59:59.{:03}", 0.253)])
+def test_files_with_dates_of_their_own_are_joined_by_them(tmp_path, clock, late):
+    """A second of each sensor, the gyroscope's a quarter of a second later."""
+    for name, first in (("accel", 0), ("gyro", 1000 * late)):
+        rows = "".join(f"{clock.format(round(first + 10 * k))},{k},0,1\n" for k in range(70))
+        (tmp_path / f"{name}.csv").write_text(rows)
+        axes = "".join(
+            f'{name}_{axis} = {{ from = {k}, unit = "{unit}" }}\n'
+            for k, axis, unit in zip((1, 2, 3), "xyz", ["g" if name == "accel" else "deg/s"] * 3, strict=True)
+        )
+        (tmp_path / f"{name}.toml").write_text(
+            f'delimiter = ","\n[columns]\ntime = {{ from = 0, unit = "iso" }}\n{axes}'
+        )
+    accel, gyro = (il.read(tmp_path / f"{name}.csv", tmp_path / f"{name}.toml") for name in ("accel", "gyro"))
+    joined = il.join_recordings(accel, [gyro])
+    times = joined.stream("gyro").time
+    np.testing.assert_allclose(times, late + gyro.time, atol=2e-9)
+    assert any(f"begins {late} s after" in note for note in joined.notes)
+    backwards = il.join_recordings(gyro, [accel])
+    np.testing.assert_allclose(backwards.stream("accel").time, accel.time - late, atol=2e-9)
+
+
+def test_files_whose_readings_share_stamps_are_joined(tmp_path):
+    recording = at_rest(3.0)
+    accel, gyro = (recording.stream(sensor) for sensor in ("accel", "gyro"))
+    coarse = gyro.with_columns({"time": np.floor(gyro.time / 0.01 + 1e-9) * 0.01}, {})
+    joined = il.join_recordings(accel, [coarse])
+    np.testing.assert_array_equal(joined.stream("gyro").triad("gyro"), gyro.triad("gyro"))
+    assert any("share time stamps" in note for note in joined.notes)
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_gyroscopes_are_calibrated_by_all_their_samples(seed):
     """As on one clock at the full rate, within what a quarter of the accelerometers' samples may move them."""

@@ -31,6 +31,23 @@ def test_times_of_day_go_on_past_midnight(read, size):
     assert read(clock, size=size).time == pytest.approx(np.arange(200) * 0.1, abs=1e-6)
 
 
+def test_dates_keep_their_epoch_and_times_of_day_theirs(read):
+    dated = read(["2024-12-11T17:41:40.250Z,1", "2024-12-11T17:41:40.500Z,1"])
+    at = datetime.datetime(2024, 12, 11, 17, 41, 40, 250_000, datetime.UTC).timestamp()
+    number, _, unit = dated.metadata["epoch"].partition(" ")
+    assert (float(number), unit) == (at, "s")
+    assert read(["17:41:40.250,1", "17:41:40.500,1"]).metadata["epoch"] == "63700.250000000 s after midnight"
+
+
+def test_show_says_the_date_of_a_file_with_dates(imulab, tmp_path):
+    (tmp_path / "a.csv").write_text("".join(f"2024-12-11T17:41:{40 + k}Z,1\n" for k in range(9)))
+    (tmp_path / "l.toml").write_text('delimiter = ","\n' + COLUMNS.format('unit = "iso"', 1))
+    shown = imulab("show", "a.csv", "--layout", "l.toml").stdout
+    assert "time 0.0 to 8.0 s (2024-12-11 17:41:40 UTC), until 2024-12-11 17:41:48 UTC" in shown
+    assert imulab("convert", "a.csv", "--layout", "l.toml", "-o", "b.csv").returncode == 0
+    assert "(2024-12-11 17:41:40 UTC)" in imulab("show", "b.csv").stdout
+
+
 def test_a_time_of_day_that_falls_by_less_than_half_a_day_runs_backwards(read):
     with pytest.raises(ReadError, match=r"row 2 \(line 2\), column time: time runs backwards: expected 17:41:40.500"):
         read(["17:41:40.500,1", "17:41:40.250,1"])
@@ -193,3 +210,41 @@ def test_dates_in_json_have_an_order_too(tmp_path):
         il.read(tmp_path / "a.json", tmp_path / "l.toml")
     (tmp_path / "l.toml").write_text(layout.replace('"iso"', '"iso", day_first = false'))
     assert il.read(tmp_path / "a.json", tmp_path / "l.toml").time.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("how", ['unit = "iso"', 'unit = "s"'])
+@pytest.mark.parametrize("size", [256, 1 << 21])
+@pytest.mark.parametrize("stray", ["back", "ahead", "swapped"])
+def test_a_row_whose_time_alone_is_off_is_a_damaged_line(read, tmp_path, how, size, stray):
+    at = 3600 + np.arange(300) / 100
+    at[150] = {"back": 3000.25, "ahead": 9000.0, "swapped": at[151] + 0.001}[stray]
+    clock = [f"2024-12-11T{int(s // 3600):02}:{int(s // 60 % 60):02}:{s % 60:06.3f}" for s in (at + 1e-6).tolist()]
+    lines = [f"{clock[k] if 'iso' in how else format(at[k], '.3f')},{k}" for k in range(300)]
+    if how == 'unit = "iso"':
+        with pytest.raises(ReadError, match=r"time runs backwards"):
+            read(lines, how, size=size)
+    else:
+        read(lines, how, size=size)
+    found = il.read(tmp_path / "a.txt", tmp_path / "l.toml", damaged="skip", name="a.txt")
+    np.testing.assert_array_equal(found.column("accel_x"), np.delete(np.arange(300), 150))
+    np.testing.assert_allclose(np.diff(found.time)[:149], 0.01, atol=1e-9)
+    assert [note for note in found.notes if "off alone" in note] == [
+        "1 row whose time is off alone left out; the first: row 151 (line 151)"
+    ]
+
+
+def test_a_device_that_began_again_is_no_damaged_line(read, tmp_path):
+    read([f"{t:.2f},{k}" for k, t in enumerate([*np.arange(50) / 100, *np.arange(50) / 100])], 'unit = "s"')
+    found = il.read(tmp_path / "a.txt", tmp_path / "l.toml", damaged="skip")
+    assert len(found) == 100
+    with pytest.raises(DataError, match="a file of several runs is to be split there"):
+        il.find_attitudes(
+            found.with_columns(
+                {f"accel_{axis}": found.column("accel_x") for axis in "xyz"},
+                dict.fromkeys(("accel_x", "accel_y", "accel_z"), "g"),
+            )
+        )
+    many = [f"{0 if k % 25 == 9 else k},1" for k in range(1000)]
+    read(many, 'unit = "s"')
+    with pytest.raises(ReadError, match=r"the times of 40 rows are off, the first at row 10 \(line 10\)"):
+        il.read(tmp_path / "a.txt", tmp_path / "l.toml", damaged="skip")

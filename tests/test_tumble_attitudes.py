@@ -784,3 +784,33 @@ def test_a_scatter_below_the_stated_noise_is_said():
         table = Recording(columns | stated, dict.fromkeys(columns | stated, "m/s^2"), name="table.csv")
         warnings = fitted(il.find_attitudes(table)).warnings
         assert any("scatter less than their own noise" in each for each in warnings) == said
+
+
+def test_samples_without_a_time_are_no_table_of_attitudes(imulab, tmp_path):
+    """The next command that the refusal names leads to the fit of the recording with its time."""
+    recording = il.simulate_tumble(gravity=9.81, attitudes=16, gyro=False)
+    columns = {name: values for name, values in recording.columns.items() if name.startswith("accel_")}
+    il.write_csv(Recording(columns, recording.units, name="r"), tmp_path / "r.csv")
+    fit = ("tumble", "fit", "r.csv", "--gravity", "9.81", "--order", "1", "-o", "r.json")
+    done = imulab(*fit)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert f"{len(recording)} rows without a time that go over into each other: samples of a recording" in done.stderr
+    guess = "layout guess r.csv --sample-rate 100Hz -o L.toml"
+    assert guess in done.stderr
+    assert imulab(*guess.split()).returncode == 0
+    assert imulab(*fit, "--layout", "L.toml").returncode == 0
+    il.write_csv(recording, tmp_path / "r.csv")
+    known = il.fit_tumble(tmp_path / "r.csv", gravity=9.81, order=1).calibration
+    assert il.load(tmp_path / "r.json").value("bias_x") == pytest.approx(known.value("bias_x"), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("rows", "each", "doubted"), [(400, 1, False), (400, 5, False), (300, 75, True), (1500, 1, True)]
+)
+def test_tables_of_many_attitudes_are_taken_and_those_like_samples_doubted(rows, each, doubted):
+    rng = np.random.default_rng(3)
+    up = rng.standard_normal((rows // each, 3))
+    up = np.repeat(9.81 * up / np.linalg.norm(up, axis=1, keepdims=True), each, axis=0)
+    attitudes = il.find_attitudes(up + 0.01 * rng.standard_normal(up.shape), unit="m/s^2")
+    assert len(attitudes) == rows
+    assert any("no time column" in note for note in attitudes.notes) == doubted

@@ -337,3 +337,38 @@ def test_the_worst_temperature_is_what_the_gap_makes_of_a_bent_law() -> None:
     assert misfit["unit"] == "rad/s"
     assert misfit["value"][0] / HOUR > 0.01  # a cubic is no exponential, most of all at first
     assert exhibits_of(record).facts[2][0] == "at worst, near 15 °C"
+
+
+@pytest.mark.parametrize("kind", ["whole seconds", "twice"])
+def test_shared_stamps_are_corrected_as_the_readings_they_are(folder: Path, kind: str) -> None:
+    """The rows, their order and their stamps stay; the correction is that of even times, or of the stamp."""
+    from imulab.procedures.apply import apply_blocks
+
+    even = cycle(3.0, 1)
+    rows = np.arange(len(even))
+    if kind == "twice":
+        rows = np.sort(np.append(rows, 70))
+    stamps = np.floor(even.columns["time"] + 1e-9) if kind == "whole seconds" else even.columns["time"][rows]
+    shared = replace(even, columns={name: values[rows] for name, values in even.columns.items()} | {"time": stamps})
+    record = il.load(folder / "zero.json")
+    known = il.apply(record, even)
+    blocks = [
+        replace(shared, columns={n: v[a : a + 501] for n, v in shared.columns.items()}, first_row=a + 1)
+        for a in range(0, len(rows), 501)
+    ]
+    for found in ([il.apply(record, shared)], list(apply_blocks([record], blocks))):
+        time = np.concatenate([block.columns["time"] for block in found])
+        np.testing.assert_array_equal(time, stamps)
+        for axis in AXES:
+            values = np.concatenate([block.columns[axis] for block in found])
+            np.testing.assert_allclose(
+                values, known.columns[axis][rows], rtol=0, atol=1e-9 * HOUR if kind == "twice" else 0.5
+            )
+
+
+def test_a_clock_that_stood_still_is_not_corrected(folder: Path) -> None:
+    start = cycle(3.0, 1)
+    time = start.columns["time"].copy()
+    time[500:600] = time[500]
+    with pytest.raises(il.ImulabError, match=r"row 502.*time stands still for 100 rows"):
+        il.apply(il.load(folder / "zero.json"), replace(start, columns={**start.columns, "time": time}))

@@ -205,7 +205,7 @@ class Recording:
     @property
     def on_one_clock(self) -> bool:
         """Whether the column ``time`` stamps all sensors, or nothing does."""
-        return list(self.clocks) == ["time"]
+        return list(self.clocks) in ([], ["time"])
 
     def stream(self, clock: str) -> Recording:
         """Return the columns that a clock stamps, with it as ``time``, without the rows that have none of its samples.
@@ -480,6 +480,7 @@ def check_finite(recording: Recording, names: list[str]) -> None:
 
 EVEN_SAMPLES = "where samples are even, state sample_rate in a layout instead of this column (in Python rate=)"
 """What to do about time stamps that do not tell the rate."""
+_BACKWARDS = "--damaged skip leaves out single rows of text that are torn; a file of several runs is to be split there"
 
 
 def check_time(recording: Recording) -> Array:
@@ -498,10 +499,10 @@ def check_time(recording: Recording) -> Array:
         raw = recording.column("time")
         verb = "stands still" if step[index - 1] == 0 else "runs backwards"
         unit = recording.units["time"]
-        advice = f"; {EVEN_SAMPLES}" if step[index - 1] == 0 else ""
+        advice = EVEN_SAMPLES if step[index - 1] == 0 else _BACKWARDS
         raise DataError(
             f"{recording.name}: {recording.place(index)}, column time: time {verb}: "
-            f"expected more than {raw[index - 1]:.15g} {unit}, found {raw[index]:.15g} {unit}{advice}"
+            f"expected more than {raw[index - 1]:.15g} {unit}, found {raw[index]:.15g} {unit}; {advice}"
         )
     return time
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from json import dumps
 from typing import TYPE_CHECKING, Annotated, Any
@@ -187,9 +187,10 @@ def fuse(file: RecordingFile, *, output: OutputFile = None, **options: Any) -> N
 
     CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes.
     """
+    from imulab.estimation.sampling import mend_blocks
     from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, carried, fusion_text
     from imulab.quantities import interval
-    from imulab.readers import read_blocks
+    from imulab.readers import is_pipe, read_blocks
     from imulab.readers.streams import on_clock_of
     from imulab.writers import check_writable, write, write_csv_to
 
@@ -215,7 +216,9 @@ def fuse(file: RecordingFile, *, output: OutputFile = None, **options: Any) -> N
         still=None if still is None else interval(still, "--still"),
     )
     fuser = Fuser(settings, tell=warn) if file == "-" else Fuser(settings)  # a stream may never end
-    blocks = (part.recording() for part in fuser.fuse(with_notes(on_clock_of(read_blocks(file, **how)))))
+    rows: Iterable[Recording] = on_clock_of(read_blocks(file, **how))
+    rows = rows if is_pipe(file) else mend_blocks(rows)  # a stream is fused as it comes
+    blocks = (part.recording() for part in fuser.fuse(with_notes(rows)))
     if output:
         write(blocks, output)
     else:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import imulab as il
 from imulab.cli.command import Argument, Command, option
-from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, warn, whole_number
+from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, reading, warn, whole_number
 from imulab.errors import ImulabError, OptionError
 from imulab.options import FLAG, OUTPUT
 
@@ -213,14 +213,15 @@ def live(
     listened = checked_page(page, port, host, no_browser=no_browser, plain=plain)
     if save is None:
         raise OptionError("--save: expected the name of the recording to write, such as --save rec.csv")
-    layout = options["layout"]
+    layout, units = options["layout"], reading({"units": options.pop("units")})["units"]
     values = TASK.values({name: text for name, text in options.items() if text is not None}, FLAG)
     planned = _number_of_attitudes(attitudes, target)
     session = Session(values["order"], values["gravity"], read_targets(target), planned)
     check_outputs([save, output, report], [name for name in (_source_name(source), layout) if name])
     fitted = {**options, "layout": None}
     known = _layout(layout)
-    runner = Runner.open(lambda: open_source(source, layout, follow=follow), session, save, known, resume=resume)
+    opened = partial(open_source, source, layout, units=units, follow=follow)
+    runner = Runner.open(opened, session, save, known, resume=resume, units=units)
     made = partial(_make_record, save, fitted, output, report)
     plain = plain or not sys.stdout.isatty()
     with _offer_layout(), closing(runner):
@@ -399,6 +400,6 @@ def _draw_view(runner: Runner, *, typed: bool) -> None:
 
 
 COMMANDS = (
-    Command("live", live, lambda: [il.fit_tumble], only=("order", "gravity", "latitude", "height", "layout")),
+    Command("live", live, lambda: [il.fit_tumble], only=("order", "gravity", "latitude", "height", "layout", "units")),
     Command("open", open),
 )

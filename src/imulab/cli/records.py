@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from json import dumps
@@ -61,18 +61,33 @@ def convert(
 
     Native CSV or Parquet to OUT, or CSV to standard output.
     """
-    from imulab.readers import read, read_blocks
-    from imulab.readers.streams import file_and_layout, join_recordings, on_clock_of
+    from imulab.readers import read_blocks
+    from imulab.readers.streams import file_and_layout, on_clock_of
 
     others = [file_and_layout(text) for text in with_ or []]
     inputs = [name for pair in ((file, options["layout"]), *others) for name in pair if name]
     check_outputs([output], inputs)
     how = reading(options)
-    blocks: Iterable[Recording] = read_blocks(file, **how)
-    if others:
-        first = read(file, **how)
-        blocks = [join_recordings(first, [read(other, layout) for other, layout in others])]
+    blocks = _read_joined(file, others, how) if others else read_blocks(file, **how)
     write_out(with_notes(on_clock_of(blocks) if one_clock else blocks), output)
+
+
+def _read_joined(file: str, others: Sequence[tuple[str, str | None]], how: Mapping[str, Any]) -> Iterator[Recording]:
+    """Yield the rows of files and layouts that hold other sensors, joined to `file`.
+
+    Units, the window, and what to do with damaged lines are stated for all of them together.
+    """
+    from imulab.readers import read
+    from imulab.readers.selection import Selection, SharedUnits, windowed
+    from imulab.readers.streams import join_recordings
+
+    units, ends = SharedUnits(how["units"]), Selection(window=how["window"]).ends
+    first = read(file, **{**how, "units": units, "window": None})
+    more = [read(other, layout, units=units, damaged=how["damaged"]) for other, layout in others]
+    if units.unused:
+        names = ", ".join([file, *(other for other, _ in others)])
+        raise OptionError(f"--unit {units.unused[0]}: no such column in {names}")
+    yield from windowed(iter([join_recordings(first, more)]), ends, file)
 
 
 def write_out(blocks: Iterable[Recording], output: str | None) -> None:

@@ -163,6 +163,7 @@ def finish_check(
 _MOST_ROWS = 1 << 21  # whose times are held at once
 _LEAST_JITTER = 1e-6  # s: a smaller one is that of rounding
 _SHOWN = 0.1  # s: times are shown to this
+_SLOWEST = 0.5  # Hz: at a lower rate the unit of time is doubted
 
 
 def describe_record(record: Calibration, *, provenance: bool = True) -> str:
@@ -406,7 +407,7 @@ class _Summary(Struct):
             lines.append(f"readings share time stamps, which are {self.tick:.3g} s apart: taken in order and as even")
         if self.backwards:
             times = "once" if self.backwards == 1 else f"{self.backwards} times"
-            lines.append(f"time runs backwards {times}: procedures refuse it")
+            lines.append(f"time runs backwards {times}: procedures refuse it (--damaged skip leaves out torn rows)")
         elif not self.rate > 0 and self.doubt != "a single sample":
             lines.append("procedures refuse this time: where samples are even, state sample_rate in a layout instead")
         return lines
@@ -443,16 +444,19 @@ def _contents(blocks: Iterable[Recording]) -> _Contents:
 
 def describe_recording(blocks: Iterable[Recording]) -> str:
     """Return a recording in lines: samples, rate, gaps, duration, and each column's range."""
+    from imulab.estimation.sampling import doubt_unit_of_time
     from imulab.units import to_si
 
     contents = _contents(blocks)
     last = contents.last
     lines = [f"{printable(last.name)}: {contents.samples} samples"]
     for clock, names in last.clocks.items() if "time" in last else ():
-        text = contents.clocks[clock].summary(last.metadata).text()
+        summary = contents.clocks[clock].summary(last.metadata)
+        text = summary.text()
         if len(last.clocks) > 1:
             text[:1] = [f"{clock} ({' '.join(names)}): {contents.columns[clock].finite} samples, {text[0]}"]
-        lines += text
+        doubt = doubt_unit_of_time(last.units[clock], summary.rate, _SLOWEST) if summary.rate > 0 else ""
+        lines += [*text, *([f"{doubt} --unit time=UNIT states it"] if doubt else [])]
     if "time" not in last:
         lines.append("no time column: a table of attitudes, a row each")
     steps = {clock: _SHOWN / to_si(1.0, last.units[clock]) for clock in last.clocks if clock in last}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.estimation.rows import median, medians, quantile
-from imulab.recording import Array
+from imulab.recording import Array, Recording
 
 Rows = NDArray[np.int64]
 
@@ -25,7 +25,10 @@ _MANY, _SHARE = 5, 0.001  # rows, and share of the rows, that share a stamp wher
 _FROZEN, _FEW_MORE = 3, 2  # times the usual number of rows at a stamp, and so many more: the clock stood still
 _FEWEST_MARKS = 3  # stamps that show a rate
 _UNEQUAL = 0.05  # scatter of the readings at a stamp, over their number, from which readings may be lost
-_SHORTEST_LOSS = 9  # steps: a long step every so often, or less often, is a sample lost by a program, and no beat
+_SHORTEST_LOSS = 9  # steps: a long step exactly every so often, or less often, is a sample lost by a program
+_MILLISECOND = (
+    1.0005e-3  # s: but at steps as short it is the beat of a clock of milliseconds with a rate such as 990 Hz
+)
 _NEAR = 0.2  # of the median step: steps this close to a multiple of it are multiples
 _APART, _WANDERS = 8, 3.0  # growth of the variance of delays from one step to eight, which random losses exceed
 _FAR = 3.0  # steps: longer delays are none of coarse stamps
@@ -165,6 +168,24 @@ def epoch_of(metadata: Mapping[str, str], first: float) -> float | None:
     return epoch if unit.strip() in ("", "s") and is_epoch(epoch) else None
 
 
+_AFTER_MIDNIGHT, _DAY = "s after midnight", 86_400.0
+
+
+def begins_later(first: Recording, other: Recording) -> float:
+    """Return by how much later than that of `first` the time 0 of `other` is, s; 0 where their heads do not tell.
+
+    The heads of bags, and of files with dates or times of day, hold an ``epoch``.
+    """
+    epochs = [epoch_of(each.metadata, float(each.si("time")[0])) for each in (first, other)]
+    if epochs[0] is not None and epochs[1] is not None:
+        return round(epochs[1] - epochs[0], 6)  # what a number of s since 1970 resolves
+    clocks = [each.metadata.get("epoch", "").partition(" ") for each in (first, other)]
+    if all(clock[2] == _AFTER_MIDNIGHT for clock in clocks):
+        late = float(clocks[1][0]) - float(clocks[0][0])
+        return late - _DAY * round(late / _DAY)
+    return 0.0
+
+
 def utc(seconds: float) -> str:
     """Return a time since 1970, s, as a date: ``2022-06-22 20:13:58``."""
     return str(np.datetime64(int(seconds), "s")).replace("T", " ")
@@ -213,9 +234,10 @@ def _usual(time: Array, step: Array, *, lossy: bool) -> tuple[float, bool]:
     short = step.min() <= _SHORT * middle
     multiple = step / middle
     if not short and np.mean(np.abs(multiple - np.rint(multiple)) < _NEAR) > 1 - _NEAR:
-        apart = np.diff(long)
-        even = apart.size > _BESIDE and apart.std() < _BEAT * apart.mean()
-        beats = even and (np.ptp(apart) > 0 or apart[0] < _SHORTEST_LOSS)
+        beats, apart = _are_even(long), np.diff(long)
+        if beats and not lossy and middle <= _MILLISECOND:
+            return over_many, True
+        beats = beats and (np.ptp(apart) > 0 or apart[0] < _SHORTEST_LOSS)
         many = long.size > _COARSE * len(step)
         if (beats or many) and not lossy and not _wander(step / over_many - 1):
             return over_many, True
@@ -223,6 +245,12 @@ def _usual(time: Array, step: Array, *, lossy: bool) -> tuple[float, bool]:
     if long.size > _COARSE * len(step) or middle < _SHORT * over_many:
         return over_many, True
     return middle if short else float(regular.mean()), False
+
+
+def _are_even(places: Rows) -> bool:
+    """Return whether places of long steps follow each other at even distances: losses do so seldom."""
+    apart = np.diff(places)
+    return apart.size > _BESIDE and bool(apart.std() < _BEAT * apart.mean())
 
 
 def _wander(late: Array) -> bool:
@@ -265,6 +293,10 @@ def _find_gaps(
             usual = left / outside
         if settled:
             break
+    if coarse and _are_even(places[missing == 1]):  # the beat of a rate with a clock
+        places = places[missing > 1]
+        usual = float(span - steps[places].sum()) / (count - int(many[places].sum()))
+        missing = np.rint(steps[places] / usual - many[places]).astype(np.int64)
     return usual, places, missing
 
 

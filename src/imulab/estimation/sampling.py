@@ -55,14 +55,9 @@ def mend_stamps(recording: Recording) -> Recording:
     """
     if not recording.on_one_clock:
         return by_clock(recording, mend_stamps)
-    time = recording.time
-    if time is None or len(time) < 2 or not (time[1:] == time[:-1]).any():
+    clock = _clock_of_shared(recording)
+    if clock is None:
         return recording
-    clock = read_clock(time, same_rows(recording.columns))
-    if clock.doubt:
-        if clock.backwards or not np.isfinite(time).all():
-            return recording  # refused by `check_time`, or bridged
-        raise DataError(_standstill(recording, clock))
     columns = dict(recording.columns)
     if clock.kept is not None:
         columns = {name: stored_as(values[clock.kept], values) for name, values in columns.items()}
@@ -70,20 +65,60 @@ def mend_stamps(recording: Recording) -> Recording:
         columns["time"] = stored_as(clock.even / to_si(1.0, recording.units["time"]), columns["time"])
     lines = recording.lines_before if clock.kept is None else None
     return replace(
-        recording, columns=columns, lines_before=lines, notes=(*recording.notes, *_stamp_notes(clock, len(time)))
+        recording, columns=columns, lines_before=lines, notes=(*recording.notes, *_stamp_notes(clock, len(recording)))
     )
 
 
+def times_in_order(recording: Recording) -> Array:
+    """Return a time for each row by the rule of `mend_stamps`, s, shape (n,); one that came twice has its stamp.
+
+    Raises
+    ------
+    DataError
+        As for `mend_stamps` and `check_time`.
+    """
+    clock = _clock_of_shared(recording)
+    if clock is None:
+        return check_time(recording)
+    kept = np.ones(len(recording), dtype=bool) if clock.kept is None else clock.kept
+    times = recording.si("time")[kept] if clock.even is None else clock.even
+    return np.asarray(times[np.cumsum(kept) - 1])
+
+
 def mend_blocks(blocks: Iterable[Recording]) -> Iterator[Recording]:
-    """Yield the blocks of a recording with `mend_stamps`: as one where the first shares stamps, else each by itself."""
+    """Yield the blocks of `whole_where_shared` with `mend_stamps`."""
+    return map(mend_stamps, whole_where_shared(blocks))
+
+
+def whole_where_shared(blocks: Iterable[Recording]) -> Iterator[Recording]:
+    """Yield the blocks of a recording; as one where rows of the first share stamps, whose rate takes all of them."""
     rest = iter(blocks)
     for block in rest:
-        time = block.time
-        if time is None or not (time[1:] == time[:-1]).any():
-            yield block
-            yield from map(mend_stamps, rest)
-            return
-        yield mend_stamps(joined([block, *rest]))
+        yield joined([block, *rest]) if _shares(block.time) else block
+        yield from rest
+
+
+def _shares(time: Array | None) -> bool:
+    return time is not None and bool((time[1:] == time[:-1]).any())
+
+
+def _clock_of_shared(recording: Recording) -> Clock | None:
+    """Return what stamps show that rows share; None where none do, or where time runs backwards or is no number.
+
+    Raises
+    ------
+    DataError
+        Time stands still, or the rate cannot be told from coarse stamps.
+    """
+    time = recording.time
+    if time is None or not _shares(time):
+        return None
+    clock = read_clock(time, same_rows(recording.columns))
+    if not clock.doubt:
+        return clock
+    if clock.backwards or not np.isfinite(time).all():
+        return None  # refused by `check_time`, or bridged
+    raise DataError(_standstill(recording, clock))
 
 
 def _standstill(recording: Recording, clock: Clock) -> str:
@@ -285,18 +320,24 @@ def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
 
 def mislabelled(recording: Recording, rate: float) -> list[str]:
     """Return a warning where no sensor is logged at this rate, with the unit of time that would make it a usual one."""
-    if _SLOWEST < rate < _FASTEST:
+    doubt = doubt_unit_of_time(recording.units["time"], rate)
+    if not doubt:
         return []
-    unit = recording.units["time"]
+    return [
+        Finding(
+            f"{recording.name}: {doubt} If not, every figure that depends on time is wrong",
+            "correct the unit of the column time, or state it: --unit time=UNIT",
+        )
+    ]
+
+
+def doubt_unit_of_time(unit: str, rate: float, slowest: float = _SLOWEST) -> str:
+    """Return the question whether a unit of time is right, where a rate, Hz, is beyond `slowest` to 20 kHz; else ""."""
+    if slowest < rate < _FASTEST:
+        return ""
     others = {other: rate * to_si(1.0, unit) / to_si(1.0, other) for other in ("us", "ms", "s") if other != unit}
     likely = [
         f"{value:.4g} Hz if it is in {other}" for other, value in others.items() if _USUAL[0] <= value < _USUAL[1]
     ]
     guess = f": {' or '.join(likely)}" if likely else ""
-    return [
-        Finding(
-            f"{recording.name}: column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): is the unit of "
-            f"time right{guess}? If not, every figure that depends on time is wrong",
-            "correct the unit of the column time",
-        )
-    ]
+    return f"column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): is the unit of time right{guess}?"

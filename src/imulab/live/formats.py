@@ -16,6 +16,7 @@ import numpy as np
 from imulab.columns import triad
 from imulab.display import printable
 from imulab.errors import ReadError, quoted
+from imulab.estimation.clock import same_rows
 from imulab.live.decoders import (
     LayoutDecoder,
     Mavlink,
@@ -27,8 +28,9 @@ from imulab.live.decoders import (
     looks_like_mavlink,
     looks_like_msp,
 )
-from imulab.live.stamps import ArrivalClock, Counts, DeviceClock
+from imulab.live.stamps import ArrivalClock, Counts, DeviceClock, SharedClock
 from imulab.readers.guess import GuessError, LayoutGuess, guess_table, layout_of_table, table_of_records
+from imulab.readers.selection import units_of_columns
 from imulab.readers.text import is_number
 from imulab.recording import Array, Layout, Recording
 from imulab.units import STANDARD_GRAVITY
@@ -47,7 +49,7 @@ _SUPPOSED = {"gyro": "deg/s", "accel": "count", "mag": "count"}
 """Units that are offered where neither titles nor readings say them."""
 
 
-def guess_stream(lines: list[str], seconds: float) -> LayoutGuess | None:
+def guess_stream(lines: list[str], seconds: float, units: Mapping[str, str] | None = None) -> LayoutGuess | None:
     """Return a layout that may fit, or None where the lines hold no rows of numbers.
 
     Titles are read as those of files are; without titles the readings alone are looked at.
@@ -58,10 +60,13 @@ def guess_stream(lines: list[str], seconds: float) -> LayoutGuess | None:
         The first lines of the stream.
     seconds
         Time in which they came, s, which shows the unit of a time column.
+    units
+        Those that are stated for sensors or columns.
     """
+    units = units or {}
     if sum(line.startswith("{") for line in lines) > len(lines) / 2:
-        return _guess_json(lines, seconds)
-    titled = _by_titles(lambda: guess_table(lines, "stream"), seconds)
+        return _guess_json(lines, seconds, units)
+    titled = _by_titles(lambda: guess_table(lines, "stream"), seconds, units)
     if titled is not None:
         return titled
     delimiter = max(",;\t", key=lambda sign: sum(line.count(sign) for line in lines))
@@ -90,22 +95,24 @@ def _glued(lines: list[str]) -> str:
     return max(set(begins), key=begins.count) if len(begins) > len(lines) / 2 else ""
 
 
-def _by_titles(table: Callable[[], Any], seconds: float) -> LayoutGuess | None:
+def _by_titles(table: Callable[[], Any], seconds: float, stated: Mapping[str, str]) -> LayoutGuess | None:
     """Return the layout that titles give; a unit that they do not say is supposed, and that is said."""
-    units: dict[str, str] = {}
+    units = dict(stated)
     for sensor in ("", *_SUPPOSED):
         if sensor:
-            units[sensor] = _SUPPOSED[sensor]
+            units.setdefault(sensor, _SUPPOSED[sensor])
         try:
             guess = layout_of_table(table(), "stream", units=units, seconds=seconds, timed=False)
         except GuessError:
             continue
-        more = tuple(f"the unit of {name}, {unit}, is only supposed" for name, unit in units.items())
+        more = tuple(
+            f"the unit of {name}, {unit}, is only supposed" for name, unit in units.items() if name not in stated
+        )
         return LayoutGuess(guess.toml, (*guess.supposed, *more))
     return None
 
 
-def _guess_json(lines: list[str], seconds: float) -> LayoutGuess | None:
+def _guess_json(lines: list[str], seconds: float, units: Mapping[str, str]) -> LayoutGuess | None:
     rows = []
     for line in lines:
         try:
@@ -118,7 +125,7 @@ def _guess_json(lines: list[str], seconds: float) -> LayoutGuess | None:
     rows = [row for row in rows if list(row) == keys]
     if len(rows) < _FEWEST or len(keys) < 3:
         return None
-    titled = _by_titles(lambda: table_of_records(rows), seconds)
+    titled = _by_titles(lambda: table_of_records(rows), seconds, units)
     return titled or _guess([], list(keys), np.array([list(row.values()) for row in rows]), seconds)
 
 
@@ -186,6 +193,10 @@ _TEXT = bytes(range(32, 127)) + b"\r\n\t"
 _MOSTLY = 0.9  # least share of printable bytes in text
 STRAIGHTENED = "arrival time, straightened by a robust line"
 """Entry in the head of a recording for times without a device's stamps."""
+SHARED = "shared by several samples, which lie evenly on a robust line through the stamps"
+"""The same for stamps of several samples each."""
+_MOST_WAITING = 50_000  # samples of one stamp
+_SHARED = 0.05  # share of rows with the stamp of the row before and other readings from which stamps are shared
 
 
 class UnknownFormatError(ReadError):
@@ -229,18 +240,28 @@ class LineStream:
         Layout of a foreign stream.
     polled
         Whether the other side may have to be polled (serial ports and TCP).
+    units
+        Units of sensors or columns, in place of those that the stream or the layout says.
     """
 
-    def __init__(self, source: str, layout: Layout | None = None, *, polled: bool = False) -> None:
+    def __init__(
+        self,
+        source: str,
+        layout: Layout | None = None,
+        *,
+        polled: bool = False,
+        units: Mapping[str, str] | None = None,
+    ) -> None:
         self.counts = Counts()
         self.format = ""
         self.to_send = b""
-        self._source, self._layout, self._polled = source, layout, polled
+        self._source, self._layout, self._polled, self._stated = source, layout, polled, units or {}
+        self._units: dict[str, str] = {}
         self._held: list[tuple[bytes, float]] = []
         self._first: float | None = None
         self._asked: float | None = None
         self._decoder: Decoder | None = None
-        self._device: DeviceClock | None = None
+        self._device: DeviceClock | SharedClock | None = None
         self._again: Array | None = None
         self._arrival: ArrivalClock | None = None
 
@@ -296,10 +317,10 @@ class LineStream:
         head = b"".join(data for data, _ in self._held)
         self._decoder = decoder = self._recognise(head)
         self.format = decoder.name
+        stated = units_of_columns(decoder.units, self._stated, self._source) if self._stated else {}
+        self._units = {**decoder.units, **stated}
         self._polled = self._polled and isinstance(decoder, Msp)
-        if "time" in decoder.units:
-            self._device = DeviceClock(decoder.units["time"], self.counts, getattr(decoder, "wraps", None))
-        else:
+        if "time" not in decoder.units:
             self._arrival = ArrivalClock(self.counts)
         held, self._held = self._held, self._held[-1:]
         return self._blocks(held)
@@ -313,19 +334,28 @@ class LineStream:
         pieces = [(rows, arrival) for rows, arrival in pieces if len(rows)]
         if self._arrival is not None and len(pieces) > 1:
             self._arrival.begin([len(rows) for rows, _ in pieces], [arrival for _, arrival in pieces])
+        if self._arrival is None and self._device is None and pieces:
+            self._device = self._clock_of_stamps(np.concatenate([rows for rows, _ in pieces]))
         blocks = [self._recording(rows, arrival) for rows, arrival in pieces]
         return [block for block in blocks if len(block)]
 
     def _recording(self, rows: Array, arrival: float) -> Recording:
         assert self._decoder is not None
-        units = dict(self._decoder.units)
+        units = dict(self._units)
         if self._again is not None:
             rows = np.concatenate([self._again, rows])
         columns = dict(zip(units, rows.T, strict=True))
         metadata = {"format": self.format, **self._decoder.metadata}
+        if isinstance(self._device, SharedClock):
+            metadata["time"] = SHARED
         if self._device is not None:
             times, kept, again = self._device.times(columns["time"])
             self._again = rows[again] if again else None
+            if len(again) > _MOST_WAITING:
+                raise ReadError(
+                    f"{self._source}: time stands still at {columns['time'][-1]:.15g} {units['time']} for more than "
+                    f"{_MOST_WAITING} samples; expected stamps that rise, or a layout that takes no column time"
+                )
             columns = {name: np.ascontiguousarray(column[kept]) for name, column in columns.items()}
             columns["time"] = times[kept]
         elif self._arrival is not None:
@@ -333,6 +363,15 @@ class LineStream:
             units = {"time": "s"} | units
             metadata["time"] = STRAIGHTENED
         return Recording(columns, units, metadata, self._source)
+
+    def _clock_of_stamps(self, rows: Array) -> DeviceClock | SharedClock:
+        """Return the clock of a device by its first rows: whether other readings share the stamps of those before."""
+        assert self._decoder is not None
+        columns = dict(zip(self._decoder.units, rows.T, strict=True))
+        again = np.diff(columns["time"], prepend=np.nan) == 0
+        shared = float(np.mean(again & ~same_rows(columns))) > _SHARED
+        kind = SharedClock if shared else DeviceClock
+        return kind(self._units["time"], self.counts, getattr(self._decoder, "wraps", None))
 
     def _poll(self, answered: bool, now: float) -> None:
         """Poll a flight controller: when nothing comes without a poll, and again after each answer."""
@@ -392,7 +431,7 @@ class LineStream:
             return UnknownFormatError(
                 f"{self._source}: no line of text has an end among the first {len(head)} bytes; expected lines"
             )
-        guess = guess_stream(lines, self._held[-1][1] - self._held[0][1])
+        guess = guess_stream(lines, self._held[-1][1] - self._held[0][1], self._stated)
         shown = tuple(printable(line)[:120] for line in lines[1:6] or lines)
         offered = "--layout FILE.toml says what its columns are" + (", and a guess is offered" if guess else "")
         return UnknownFormatError(

@@ -211,9 +211,16 @@ _BEFORE, _BEHIND = 1.0, 0.6
 class Runner:
     """Passes samples from the source to the session and the recording."""
 
-    def __init__(self, source: LiveSource, session: Session, recorder: Recorder, layout: Layout | None = None) -> None:
+    def __init__(
+        self,
+        source: LiveSource,
+        session: Session,
+        recorder: Recorder,
+        layout: Layout | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> None:
         self.source, self.session, self.recorder = source, session, recorder
-        self._stream = LineStream(source.name, layout, polled=source.polled)
+        self._stream = LineStream(source.name, layout, polled=source.polled, units=units)
         self._last_arrival = source.now()
         self._given_up = False
         self._further: FurtherFits | None = None
@@ -224,14 +231,21 @@ class Runner:
 
     @classmethod
     def open(
-        cls, source: Callable[[], LiveSource], session: Session, save: str, layout: Layout | None, *, resume: bool
+        cls,
+        source: Callable[[], LiveSource],
+        session: Session,
+        save: str,
+        layout: Layout | None,
+        *,
+        resume: bool,
+        units: Mapping[str, str] | None = None,
     ) -> Runner:
         """Return a runner with open recording and source; if the source fails, no empty recording is left."""
         recorder = Recorder(save, resume=resume)
         try:
             opened = source()
             try:
-                return cls(opened, session, recorder, layout)
+                return cls(opened, session, recorder, layout, units)
             except BaseException:
                 opened.close()
                 raise

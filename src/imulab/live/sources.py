@@ -11,7 +11,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
@@ -411,7 +411,9 @@ class Simulated(Paced):
         self.unit.turn_by_hand(direction)
 
 
-def open_source(text: str, layout: str | None = None, *, follow: bool = False) -> LiveSource:
+def open_source(
+    text: str, layout: str | None = None, *, units: Mapping[str, str] | None = None, follow: bool = False
+) -> LiveSource:
     """Return the open source that a text names.
 
     Parameters
@@ -419,8 +421,8 @@ def open_source(text: str, layout: str | None = None, *, follow: bool = False) -
     text
         ``serial:PORT[@BAUD]``, ``udp:PORT``, ``tcp:HOST:PORT``, ``-``, ``replay:FILE[@SPEED]`` or
         ``simulate[:key=value,..]``.
-    layout
-        Layout of a replayed file.
+    layout, units
+        Layout, and stated units, of a replayed file.
     follow
         Whether a simulated unit follows the guide.
 
@@ -441,14 +443,18 @@ def open_source(text: str, layout: str | None = None, *, follow: bool = False) -
     if kind in kinds and rest:
         return Linked(kinds[kind](rest))
     if kind == "replay" and rest:
-        return _replay(rest, layout)
+        return _replay(rest, layout, units)
     if kind == "simulate":
+        if units:
+            raise OptionError(
+                "--unit: expected a source that is connected or replayed; simulate:unit=g is of a simulated unit"
+            )
         unit, speed = simulated_unit(rest, follow=follow)
         return Simulated("simulated unit", unit, speed)
     raise OptionError(f"source {text!r}: expected one of {listed(KINDS, text)}")
 
 
-def _replay(rest: str, layout: str | None) -> LiveSource:
+def _replay(rest: str, layout: str | None, units: Mapping[str, str] | None) -> LiveSource:
     from imulab.estimation.sampling import mend_blocks
     from imulab.readers import read_blocks
     from imulab.readers.streams import on_clock_of
@@ -461,7 +467,8 @@ def _replay(rest: str, layout: str | None) -> LiveSource:
         path = rest
     if not 0 <= speed <= 1e6:
         raise OptionError(f"replay:{rest}: speed {speed:g}; expected 0 (as fast as it goes) to 1e6")
-    return Paced(f"replay:{path}", _slices(mend_blocks(on_clock_of(read_blocks(path, layout)))), speed)
+    blocks = mend_blocks(on_clock_of(read_blocks(path, layout, units=units)))
+    return Paced(f"replay:{path}", _slices(blocks), speed)
 
 
 def _slices(blocks: Iterator[Recording]) -> Iterator[Recording]:

@@ -32,6 +32,8 @@ _ALIKE = 5
 _POINTS, _APART = 48, 0.5  # pairs of number and arrival that show the rate; s between them
 _PAUSE, _PAUSE_STEPS = 0.5, 20.0
 """A stream without stamps that falls behind by more than both, s and steps, has paused."""
+_PART = 0.1  # s of samples with shared stamps that are placed together
+_FEWEST_PARTS, _FIRST_PART = 3, 1.5  # of these, and s of them, that show the rate of samples that share stamps
 
 
 @dataclass
@@ -216,6 +218,56 @@ def _middle(steps: Array) -> float:
 
 def _alike(steps: Sequence[float]) -> bool:
     return max(steps) < _LATE * min(steps)
+
+
+class SharedClock:
+    """Time stamps of a device that several samples share: samples lie evenly, on a line through the stamps.
+
+    The line is that of `ArrivalClock`, through the last sample of each stamp; the interface is that of `DeviceClock`.
+    """
+
+    def __init__(self, unit: str, counts: Counts, wraps: float | None = None) -> None:
+        self._unit, self._factor, self._wraps = unit, parse_unit(unit).factor, wraps
+        self._counts, self._of_stamps = counts, Counts()
+        self._device: DeviceClock | None = None
+        self._line, self._origin = ArrivalClock(counts), 0.0
+
+    def times(self, stamps: Array) -> tuple[Array, NDArray[np.bool_], list[int]]:
+        """Return the times of stamps, as `DeviceClock.times` does; the samples of the last stamp wait for the next."""
+        begins = np.concatenate([[0], np.flatnonzero(np.diff(stamps)) + 1])
+        times, kept = np.empty(len(stamps)), np.zeros(len(stamps), dtype=np.bool_)
+        whole = len(begins) - 1
+        waits = times, kept, list(range(len(stamps)))
+        if not whole or (self._device is None and abs(stamps[-1] - stamps[0]) * self._factor < _FIRST_PART):
+            return waits
+        device = self._device or DeviceClock(self._unit, self._of_stamps, self._wraps)
+        of_stamp, good, undecided = device.times(stamps[begins[:whole]])
+        whole = undecided[0] if undecided else whole
+        parts = self._parts(begins, of_stamp, np.flatnonzero(good[:whole]).tolist())
+        if self._device is None:
+            if len(parts) < _FEWEST_PARTS:
+                vars(self._of_stamps).update(vars(Counts()))
+                return waits
+            self._device, self._origin = device, parts[0][1]
+            self._line.begin([len(rows) for rows, _ in parts], [stamp for _, stamp in parts])
+        for rows, stamp in parts:
+            times[rows] = (self._origin + self._line.times(len(rows), stamp)) / self._factor
+            kept[rows] = True
+        self._counts.restarts, self._counts.stray = self._of_stamps.restarts, self._of_stamps.stray
+        return times, kept, list(range(int(begins[whole]), len(stamps)))
+
+    def _parts(self, begins: NDArray[np.intp], of_stamp: Array, places: list[int]) -> list[tuple[list[int], float]]:
+        """Return the samples of a tenth of a second each, or of one stamp, and their last stamp, s."""
+        parts: list[tuple[list[int], float]] = []
+        begun = -np.inf
+        for place in places:
+            stamp, rows = float(of_stamp[place]) * self._factor, range(int(begins[place]), int(begins[place + 1]))
+            if stamp - begun < _PART:
+                parts[-1] = [*parts[-1][0], *rows], stamp
+            else:
+                parts.append(([*rows], stamp))
+                begun = stamp
+        return parts
 
 
 class ArrivalClock:

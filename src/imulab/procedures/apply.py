@@ -15,6 +15,7 @@ from imulab.device.tables import DeviceTable, Fusion
 from imulab.device.unit import Blob, DeviceUnit
 from imulab.display import SENTENCES, Note
 from imulab.errors import DataError, OptionError, RecordError
+from imulab.estimation.sampling import whole_where_shared
 from imulab.options import measure
 from imulab.procedures.correction_order import check_after, check_order, name_correction, parse_thermals
 from imulab.procedures.procedure import Procedure, Section
@@ -280,9 +281,9 @@ def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterabl
     check_order([part.kind for ready in chain for part, _ in ready.sections])
     since_power_on = any(part.since_power_on for ready in chain for part, _ in ready.sections)
     end = -math.inf
-    for number, raw in enumerate(blocks):
+    for number, raw in enumerate(whole_where_shared(blocks) if since_power_on else blocks):
         if since_power_on and raw.time is not None and len(raw):  # within a block `apply` looks itself
-            if not raw.time[0] > end:
+            if raw.time[0] < end:
                 raise DataError(
                     f"{raw.name}: {raw.place(0)}, column time: time does not rise: expected more than {end:.9g} s, "
                     f"found {raw.time[0]:.9g} s"

@@ -24,7 +24,7 @@ from imulab.files import open_file
 from imulab.readers.formats import FORMATS, TEXT, is_packed, recognised, unpacked
 from imulab.readers.layout import IfNeeded, load_layout, spread_packets
 from imulab.readers.selection import Selection
-from imulab.readers.text import TextFile
+from imulab.readers.text import TextFile, without_stray_times
 from imulab.recording import Array, Layout, Recording, Source, Window, packed
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
@@ -275,7 +275,8 @@ def _text_blocks(
         if hashed is not None:
             hashed.text = text
         notes: list[str] | None = None
-        for block in text.blocks():
+        rows = text.blocks()
+        for block in without_stray_times(rows, name) if selection.damaged == "skip" else rows:
             if notes is None:
                 notes = text.doubts if layout or any(map(_is_known, block.columns)) else _note_layout(file, name)
             yield replace(block, notes=(*block.notes, *notes)) if notes else block

@@ -134,10 +134,11 @@ def recordings(
     for start in range(0, total, ROWS):
         stop = min(start + ROWS, total)
         columns = {column: function(start, stop) for column, function in take.items()}
+        converted = readings.of(columns, start + 1)
         yield Recording(
-            columns=readings.of(columns, start + 1),
+            columns=converted,
             units=layout.units,
-            metadata=dict(layout.metadata or {}),
+            metadata={**(layout.metadata or {}), **readings.epoch},
             name=name,
             first_row=start + 1,
         )

@@ -184,7 +184,8 @@ def guess_of_head(
     except UnicodeDecodeError:
         encoding, text = "latin-1", head.decode("latin-1")
     lines = text.splitlines()
-    if _is_native(next((line for line in lines if line.strip() and not line.startswith("#")), "")):
+    titles = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    if _is_native(titles) and (sample_rate is None or "time" in titles):
         raise GuessError(f"{name}: titles with units, as imulab writes them; it needs no layout")
     try:
         table = _labelled_table(lines) or guess_table(lines, name, prefix=prefix, encoding=encoding)

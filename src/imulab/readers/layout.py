@@ -371,7 +371,7 @@ def _date_text(stamp: int) -> str:
 class BackwardsError(ReadError):
     """A date is before the one above it; the first `index` rows of the block are good."""
 
-    def __init__(self, message: str, index: int) -> None:
+    def __init__(self, message: str, index: int = 0) -> None:
         super().__init__(message)
         self.index = index
 
@@ -393,13 +393,22 @@ class Counter:
 class Readings:
     """The columns of a file as its layout describes them, block by block: converted, and with their time."""
 
-    def __init__(self, layout: Layout, name: str) -> None:
-        self._layout, self._name = layout, name
+    def __init__(self, layout: Layout, name: str, *, skip_damaged: bool = False) -> None:
+        self._layout, self._name, self._skips = layout, name, skip_damaged
         self._last = np.nan
         self._step = np.inf
         self._carried = 0.0
         self._dates: dict[str, tuple[int, int]] = {}
         self._counters = {name: Counter(column.bits) for name, column in layout.columns.items() if column.bits}
+
+    @property
+    def epoch(self) -> dict[str, str]:
+        """The entry ``epoch`` of the head: the date, s since 1970, or time of day of the first row; {} if unknown."""
+        first = self._dates.get("time")
+        if first is None:
+            return {}
+        seconds, rest = divmod(first[0], 1_000_000_000)
+        return {"epoch": f"{seconds}.{rest:09d} s{' after midnight' * (0 <= first[0] < _DAY)}"}
 
     def of(self, columns: Mapping[str, Array], first_row: int, lines_before: int | None = None) -> dict[str, Array]:
         """Return the readings of a block that begins at row `first_row`; the arrays are changed in place.
@@ -445,7 +454,7 @@ class Readings:
             rise = np.diff(stamps, prepend=last % _DAY)
             stamps += (last // _DAY + np.cumsum(rise < -_DAY // 2)) * _DAY
         back = np.diff(stamps, prepend=last) < 0
-        if back.any():
+        if back.any() and not self._skips:  # else `without_stray_times` looks at them
             index = int(np.argmax(back))
             above = int(stamps[index - 1]) if index else last
             dates = (_date_text(stamp) for stamp in (above, int(stamps[index])))

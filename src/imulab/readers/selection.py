@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,6 +97,17 @@ class Selection:
             raise OptionError(f"{name}: {kind} has no instances to choose from; leave out the instance {self.instance}")
 
 
+class SharedUnits(dict[str, str]):
+    """Units that a caller states for several files together, of which each takes those of its columns.
+
+    `unused` are the names that no file had so far.
+    """
+
+    def __init__(self, units: Mapping[str, str] | None) -> None:
+        super().__init__(units or {})
+        self.unused = list(self)
+
+
 def with_serial(blocks: Iterator[Recording], serial: str | None) -> Iterator[Recording]:
     """Yield blocks whose head has a serial number, in place of the one there, where one is stated."""
     for block in blocks:
@@ -117,15 +128,24 @@ def with_units(blocks: Iterator[Recording], units: Mapping[str, str] | None, nam
         if not units:
             yield block
             continue
-        stated = {column: parse_unit(unit).symbol for column in block.columns if (unit := stated_unit(column, units))}
-        for key in units:
-            if not any(key in (column, kind_of(column)) for column in block.columns):
-                raise OptionError(f"{name}: unit of {key}: no such column; columns: {listed(block.columns, key)}")
-        for column, unit in stated.items():
-            check_unit(column, unit, name)
+        stated = units_of_columns(block.columns, units, name)
         before = {kind_of(c) or c: (block.units[c], unit) for c, unit in stated.items() if block.units[c] != unit}
         notes = [Note(f"{key} is read in {new} as stated, not in {old}") for key, (old, new) in before.items()]
         yield replace(block, units={**block.units, **stated}, notes=(*block.notes, *notes))
+
+
+def units_of_columns(columns: Iterable[str], units: Mapping[str, str], name: str) -> dict[str, str]:
+    """Return the units that a caller states by column; errors as for `with_units`."""
+    columns = list(columns)
+    unused = [key for key in units if not any(key in (column, kind_of(column)) for column in columns)]
+    if isinstance(units, SharedUnits):
+        units.unused = [key for key in units.unused if key in unused]
+    elif unused:
+        raise OptionError(f"{name}: unit of {unused[0]}: no such column; columns: {listed(columns, unused[0])}")
+    stated = {column: parse_unit(unit).symbol for column in columns if (unit := stated_unit(column, units))}
+    for column, unit in stated.items():
+        check_unit(column, unit, name)
+    return stated
 
 
 def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Iterator[Recording]:

@@ -23,8 +23,10 @@ from numpy.typing import NDArray
 from imulab.columns import kind_of
 from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, ReadError
-from imulab.estimation.sampling import WIDEST_GAP
+from imulab.estimation.clock import begins_later
+from imulab.estimation.sampling import WIDEST_GAP, mend_stamps
 from imulab.recording import RESAMPLED, Array, Recording, check_time, joined, packed, padded
+from imulab.units import from_si
 
 # Streams of different clocks to one recording.
 
@@ -557,13 +559,15 @@ def join_recordings(recording: Recording, others: Sequence[Recording]) -> Record
     """
     if not others:
         raise OptionError("others: expected one recording or more to join, found none")
-    every = [recording, *others]
+    every = [recording, *(_from_instant_of(recording, each) for each in others)]
     streams: list[LoggedStream] = []
     pieces: list[Piece] = []
-    taken = {"time": recording.name}
+    taken, mended = {"time": recording.name}, list[Recording]()
     for part in (stream for each in every for stream in _streams_of(each)):
         if part.time is None:
             raise DataError(f"{part.name}: no column time, by which it could be joined")
+        part = mend_stamps(part)
+        mended.append(part)
         time = check_time(part)
         _check_overlap(recording, part)
         names = [name for name in part.columns if name != "time"]
@@ -590,8 +594,23 @@ def join_recordings(recording: Recording, others: Sequence[Recording]) -> Record
             metadata=lambda _: recording.metadata,
         )
     )
-    notes = dict.fromkeys(note for part in (*every, *blocks) for note in part.notes)
+    notes = dict.fromkeys(note for part in (*every, *mended, *blocks) for note in part.notes)
     return packed(replace(joined(blocks), source=recording.source, notes=tuple(notes)))
+
+
+def _from_instant_of(first: Recording, other: Recording) -> Recording:
+    """Return a recording whose times count from the same instant as those of the first, where both heads tell theirs.
+
+    A note says by how much they were moved.
+    """
+    late = begins_later(first, other) if len(first) and len(other) and "time" in first and "time" in other else 0.0
+    if not late:
+        return other
+    clocks = {clock: other.column(clock) + from_si(late, other.units[clock]) for clock in other.clocks}
+    moved = (
+        f"{other.name}: begins {abs(late):.9g} s {'after' if late > 0 else 'before'} {first.name}, by the dates of both"
+    )
+    return replace(other.with_columns(clocks, {}), notes=(*other.notes, Note(moved)))
 
 
 def _streams_of(recording: Recording) -> list[Recording]:

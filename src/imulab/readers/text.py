@@ -12,7 +12,7 @@ import re
 import stat
 from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -29,7 +29,7 @@ from imulab.readers.labelled import LabelledLines
 from imulab.readers.layout import BackwardsError, Readings
 from imulab.readers.opened import HEAD, opened, unit_row
 from imulab.readers.titles import fields_of, titles_of
-from imulab.recording import CORRECTED_BY, Layout, LayoutColumn, Recording
+from imulab.recording import CORRECTED_BY, Array, Layout, LayoutColumn, Recording
 from imulab.writers import powers_of_five
 
 # Lines of a file: one by one for the head, in whole blocks below.
@@ -272,6 +272,54 @@ class Lines:
         return kept
 
 
+def without_stray_times(blocks: Iterable[Recording], name: str) -> Iterator[Recording]:
+    """Yield blocks without rows whose time alone is off: it falls, or leaps ahead, and the next goes on as before.
+
+    The last block has a note that counts them. Rows after which time goes on from there stay.
+
+    Raises
+    ------
+    ReadError
+        More rows are so than are torn.
+    """
+    count, rows, first, last = 0, 0, "", -np.inf
+    held: Recording | None = None
+    for block in blocks:
+        time = block.time
+        stray = np.zeros(len(block), dtype=bool) if time is None else _stray(time, last)
+        if time is not None and stray.any():
+            first = first or block.place(int(np.argmax(stray)))
+            count += int(stray.sum())
+            kept = {key: values[~stray] for key, values in block.columns.items()}
+            block = replace(block, columns=kept, lines_before=None)
+        rows += len(block)
+        if count > max(_FEW_DAMAGED, _MOST_DAMAGED * rows):
+            raise ReadError(f"{name}: the times of {count} rows are off, the first at {first}: these are no torn lines")
+        if time is not None and len(block):
+            last = float(time[~stray][-1])
+        if held is not None:
+            yield held
+        held = block
+    if held is not None:
+        many = "1 row whose time is" if count == 1 else f"{count} rows whose times are"
+        note = (f"{many} off alone left out; the first: {first}",) if count else ()
+        yield replace(held, notes=(*held.notes, *note))
+
+
+def _stray(time: Array, last: float) -> np.ndarray:
+    """Return which rows have a time that falls or leaps, with the next going on from the row before, shape (n,)."""
+    stray = np.zeros(len(time), dtype=bool)
+    before = np.concatenate([[last], time])
+    for row in np.flatnonzero(np.diff(before) < 0).tolist():  # earlier than the row above it
+        ahead = time[row + 1] if row + 1 < len(time) else np.inf
+        above = row - 1
+        if above >= 0 and before[above] < time[row] < ahead:
+            stray[above] = True
+        elif ahead > before[row]:
+            stray[row] = True
+    return stray
+
+
 def _is_file(stream: BinaryIO) -> bool:
     """Return whether the stream is an open file with a known size."""
     try:
@@ -364,7 +412,7 @@ class TextFile:
                     "units those of this file?"
                 )
         self._layout = layout
-        self._readings = Readings(layout, name) if layout else None
+        self._readings = Readings(layout, name, skip_damaged=skip_damaged) if layout else None
         self._room: np.ndarray | None = None
         self._used = 0
         self._corrected_by: list[str] = []
@@ -741,6 +789,7 @@ class TextFile:
         before = None if self._chooses or self._damaged or self._labels else self._lines.before
         if self._readings is not None:
             columns = self._readings.of(columns, row, before)
+            self._metadata |= self._readings.epoch
         return Recording(
             columns=columns,
             units=self._units,

@@ -19,7 +19,7 @@ from imulab.procedures.gyro_array.fit import ArrayFit
 from imulab.procedures.gyro_array.fuse import RATE_WALK, Fused, FuseOptions, carried, fusion_text
 from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
 from imulab.procedures.gyro_array.merge import Merged, merge_recordings
-from imulab.procedures.result import Record, as_read, as_record, as_recording, check_keywords
+from imulab.procedures.result import Record, as_record, as_recording, check_keywords
 from imulab.quantities import in_si, interval, span
 from imulab.recording import Data, Part, Reading, Recording, Window
 from imulab.records.calibration import Calibration
@@ -170,7 +170,7 @@ def fuse(
     check_keywords(reading, fuse)
     nominal, sampling = (hertz, None) if _has_time(data) else (None, hertz)
     stated: dict[str, Any] = {**reading, "window": window, "rate": sampling}
-    recording = _timed(as_read(data, stated, fuse, gyros_of), "fuse")
+    recording = _timed(as_recording(data, stated, fuse, gyros_of), "fuse")
     named = (method, memory, calibration, rate_walk, rest, None if initial_bias == "first" else initial_bias, nominal)
     if options is None:
         options = _options(method, memory, initial_bias, calibration, rate_walk, rest)

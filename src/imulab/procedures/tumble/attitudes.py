@@ -26,7 +26,7 @@ from imulab.columns import triad
 from imulab.display import Finding
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
-from imulab.estimation.sampling import bridged
+from imulab.estimation.sampling import bridged, doubt_unit_of_time
 from imulab.procedures.result import OWN_CLOCKS, as_recording
 from imulab.readers.streams import one_clock
 from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time
@@ -203,6 +203,8 @@ class Attitudes:
 
 
 _LONG_TABLE = 1000  # rows: more are hardly means of attitudes, but samples whose time is missing
+_NEIGHBOURS = 0.1  # of the scatter from row to row if in no order: rows so alike go over into each other, as samples do
+_SOME_ROWS, _ALIKE = 100, 0.03  # rows of a shorter table, and the same, that are doubted
 _NO_TIME = (
     "no time column: each of the {} rows was taken as an attitude at rest; is this a recording with "
     "motion? Then it needs a column time, or a layout with sample_rate"
@@ -212,11 +214,26 @@ _NO_TIME = (
 def attitude_table(
     recording: Recording, sensor: str, names: list[str], unit: str, temperature: float | None
 ) -> Attitudes:
-    """Return the rows of a table as attitudes; a row that repeats an earlier one exactly is not measured again."""
-    mean, covariance = recording.triad(sensor), stated_covariance(recording, names, unit)
+    """Return the rows of a table as attitudes; a row that repeats an earlier one exactly is not measured again.
+
+    Raises
+    ------
+    SegmentError
+        The rows are samples without a time, and no attitudes.
+    """
+    mean = recording.triad(sensor)
+    apart = float((np.diff(mean, axis=0) ** 2).sum() / max(2 * ((mean - mean.mean(axis=0)) ** 2).sum(), 1e-300))
+    if len(mean) > _LONG_TABLE and apart < _NEIGHBOURS:
+        raise SegmentError(
+            f"{recording.name}: {len(mean)} rows without a time that go over into each other: samples of a recording, "
+            "no attitudes; state their rate: sample_rate in a layout (imulab layout guess "
+            f"{recording.name} --sample-rate 100Hz -o L.toml writes one; in Python rate=100)"
+        )
+    covariance = stated_covariance(recording, names, unit)
     kept = np.sort(np.unique(mean, axis=0, return_index=True)[1])
     row = (kept + recording.first_row).astype(np.float64)
-    notes = [_NO_TIME.format(len(recording))] if len(recording) > _LONG_TABLE else []
+    doubted = len(mean) > _LONG_TABLE or (len(mean) > _SOME_ROWS and apart < _ALIKE)
+    notes = [_NO_TIME.format(len(recording))] if doubted else []
     if len(kept) < len(mean):
         again = int(np.setdiff1d(np.arange(len(mean)), kept)[0])
         first = int(np.argmax((mean == mean[again]).all(axis=1)))
@@ -711,9 +728,11 @@ def _window_width(blocks: _Blocks, recording: Recording, time: Array, window: fl
     """Return the length of the window in blocks; refuse a recording of less than two."""
     width = max(3, round(window / blocks.duration))
     if len(blocks.mean) < 2 * width:
+        duration = float(time[-1] - time[0])
+        doubt = doubt_unit_of_time(recording.units["time"], len(time) / duration) if duration else ""
         raise SegmentError(
-            f"{recording.name}: {len(recording)} samples over {time[-1] - time[0]:.3g} s are too few to find static "
-            f"attitudes with a window of {window:g} s"
+            f"{recording.name}: {len(recording)} samples over {duration:.3g} s are too few to find static attitudes "
+            f"with a window of {window:g} s{f'; {doubt} --unit time=UNIT states it' if doubt else ''}"
         )
     return width
 

@@ -13,9 +13,10 @@ from imulab.device.tables import DeviceTable, Field, field_of, whole
 from imulab.device.unit import DeviceUnit
 from imulab.display import Note
 from imulab.errors import DataError, RecordError, UnitError
+from imulab.estimation.sampling import times_in_order
 from imulab.procedures.warmup import EXITS, MODELS
 from imulab.procedures.warmup.model import record_table
-from imulab.recording import LATEST_START, Array, Recording, check_clock, check_start, check_time, power_on_temperature
+from imulab.recording import LATEST_START, Array, Recording, check_clock, check_start, power_on_temperature
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor
 
@@ -215,7 +216,7 @@ def _slice_columns(columns: Sequence[Array | None], piece: slice) -> list[Array 
 
 def _check_time(recording: Recording, latest: float) -> Array:
     """Return the column time, s, after a check that it counts from power-on (only in a recording's first block)."""
-    time = check_time(recording)
+    time = times_in_order(recording)
     if time.size and recording.first_row == 1:
         check_start(recording, float(time[0]), latest)
         check_clock(recording, time)
