@@ -105,6 +105,18 @@ def test_samples_that_share_stamps_are_all_kept_and_lie_evenly(rate, unit, tick,
     assert vars(stream.counts) == vars(Counts())
 
 
+def test_an_interruption_under_shared_stamps_loses_nothing():
+    stream = LineStream("device")
+    rows = [f"{10 * (k // 2) + (30_000 if k >= 2000 else 0)},1,0,{k}\n".encode() for k in range(4000)]
+    stream.feed(b"time [ms],accel_x [g],accel_y [g],accel_z [g]\n" + b"".join(rows[:2000]), 0.0)
+    blocks = stream.feed(b"", 3.0)
+    stream.cut()
+    blocks += stream.feed(b"".join(rows[2000:]), 40.0)
+    kept = np.concatenate([block.columns["accel_z"] for block in blocks])
+    assert (kept[0], kept[-1], len(kept)) == (0, 3997, 3998)
+    assert (stream.counts.lost, stream.counts.gaps) == (0, 0)
+
+
 def test_samples_lost_under_shared_stamps_are_a_gap():
     number = np.delete(np.arange(4000), slice(2000, 2400))
     stream, found = stamped(10.0 * (number // 2))

@@ -232,6 +232,12 @@ class SharedClock:
         self._device: DeviceClock | None = None
         self._line, self._origin = ArrivalClock(counts), 0.0
 
+    def cut(self) -> None:
+        """Count no samples as lost before the next one: the stream was interrupted."""
+        if self._device is not None:
+            self._device.cut()
+        self._line.cut()
+
     def times(self, stamps: Array) -> tuple[Array, NDArray[np.bool_], list[int]]:
         """Return the times of stamps, as `DeviceClock.times` does; the samples of the last stamp wait for the next."""
         begins = np.concatenate([[0], np.flatnonzero(np.diff(stamps)) + 1])
