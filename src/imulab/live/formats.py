@@ -304,6 +304,8 @@ class LineStream:
             self._held, self._first = [], None
             return
         self._decoder.cut()
+        if isinstance(self._device, SharedClock):
+            self._again = None  # samples that waited for the next stamp
         for clock in (self._device, self._arrival):
             if clock is not None:
                 clock.cut()
