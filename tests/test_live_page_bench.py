@@ -32,7 +32,7 @@ from imulab.errors import OptionError
 from imulab.live.page import bench as bench_module
 from imulab.live.page import server
 from imulab.live.page.bench import Workbench
-from imulab.live.page.files import FolderFiles, checked
+from imulab.live.page.files import FolderFiles, Openings, checked
 from imulab.live.page.jobs import Jobs, forms
 from imulab.live.page.server import to_json
 
@@ -660,3 +660,20 @@ def test_closing_the_terminal_ends_the_workbench(tmp_path):
         process.send_signal(signal.SIGHUP)
         assert process.wait(20) == 0
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folders_of_a_killed_program_go_at_the_next_start(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    script = (
+        "import os\nfrom imulab.live.page.files import Openings\nopen_files = Openings(print)\nos.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", script], env={**os.environ, "TMPDIR": str(tmp_path)}, check=False, timeout=60)
+    (left,) = tmp_path.iterdir()
+    running = Openings(print)
+    assert not left.exists()
+    (place,) = tmp_path.iterdir()
+    other = Openings(print)  # another program beside it
+    assert place.exists()
+    for each in (other, running):
+        each.end()
+    assert not list(tmp_path.iterdir())

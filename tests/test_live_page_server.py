@@ -327,3 +327,25 @@ def test_a_port_that_is_taken_is_one_sentence():
     with pytest.raises(OptionError, match=f"--port {number}: cannot be listened at: .*; 0 takes a free one"):
         server.serve([], number, browser=False)
     taken.close()
+
+
+def test_half_requests_are_closed_and_whole_ones_are_not(running, monkeypatch):
+    monkeypatch.setattr(server, "_HEAD", 0.4)
+    monkeypatch.setattr(server, "_STALLED", 0.4)
+    host, _, port = running.host.partition(":")
+    begun = f"GET / HTTP/1.1\r\nHost: {running.host}\r\n"
+    body = f"PUT /api/files/half HTTP/1.1\r\nHost: {running.host}\r\nX-Imulab-Token: {running.token}\r\n"
+    halves = ["", "GET", begun, f"{begun}\r\n{begun}", f"{body}Content-Length: 100\r\n\r\nsome"]
+    links = [socket.create_connection((host, int(port)), timeout=5) for _ in halves]
+    with running.socket() as page:  # a page that says nothing stays
+        for link, half in zip(links, halves, strict=True):
+            link.sendall(half.encode())
+        for link in links:
+            while link.recv(1 << 16):
+                pass
+            link.close()
+        page.send('{"type": "say", "text": "still here"}')
+        while "still here" not in page.recv(timeout=5):
+            pass
+    assert running.ask("/", **running.key).status == 200
+    assert not (running.part.folder / "half").exists()

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from imulab.device.unit import is_blob
 from imulab.display import has_hidden
@@ -233,6 +233,7 @@ def _kind(path: Path) -> str:
 _MOST = 6
 """Most recordings whose curves are kept; the one viewed longest ago makes room."""
 _KNOWN = {each.name for each in fields(Head)}
+_CURVES, _LOCK = "imulab-curves-", "lock"  # beginning of the folder's name, and a file in it
 
 
 @dataclass
@@ -267,13 +268,29 @@ class Opening:
         return Head(**{key: value for key, value in described.items() if key in _KNOWN})
 
 
+def _new_place() -> tuple[Path, IO[bytes] | None]:
+    """Return a new folder for curves, and its lock, which shows that it is used; remove those of killed programs."""
+    place = Path(tempfile.mkdtemp(prefix=_CURVES))
+    if sys.platform == "win32":
+        return place, None
+    import fcntl
+
+    lock = (place / _LOCK).open("wb")
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    for old in place.parent.glob(f"{_CURVES}*/{_LOCK}"):
+        with suppress(OSError), old.open("rb") as held:  # another user's, or locked
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(old.parent, ignore_errors=True)
+    return place, lock
+
+
 class Openings:
     """The files that the page has opened; `tell` is called with new content, from other threads."""
 
     def __init__(self, tell: Callable[[Opening], object]) -> None:
         self._tell = tell
         self._open: dict[str, Opening] = {}  # by file and options, the latest viewed last
-        self._place = Path(tempfile.mkdtemp(prefix="imulab-curves-"))
+        self._place, self._lock = _new_place()
         self._number = 0
 
     def open(self, name: str, reading: Mapping[str, str], within: Sequence[str]) -> Opening:
@@ -334,6 +351,8 @@ class Openings:
         for opening in self._open.values():
             _close(opening)
         shutil.rmtree(self._place, ignore_errors=True)
+        if self._lock is not None:
+            self._lock.close()
 
     def _listen(self, opening: Opening) -> None:
         process = opening.process

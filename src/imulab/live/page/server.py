@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 from urllib.parse import parse_qs
 
+import h11
 import numpy as np
 import uvicorn
 from starlette.applications import Starlette
@@ -45,6 +46,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.types import Message as AsgiMessage
 from starlette.websockets import WebSocket, WebSocketDisconnect
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from imulab._version import VERSION
 from imulab.errors import ImulabError, OptionError, quoted
@@ -370,6 +372,41 @@ UPLOAD_LIMIT = 4 << 30
 """Largest request, bytes: 4 GiB."""
 _SOCKET_LIMIT = 1 << 16  # bytes of a message from a page
 _GRACE = 2  # s for open requests when the server ends
+_HEAD, _STALLED = 10.0, 60.0
+"""s in which the head of a request has to come, and s without a byte of its body, after which a connection is closed."""
+
+
+class Patient(H11Protocol):
+    """uvicorn's protocol, which would wait for ever for the rest of a request, with a limit."""
+
+    _late: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for the head of a request."""
+        super().connection_made(transport)
+        self._wait(_HEAD)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes, and wait for the rest of the head or of the body, if there is one."""
+        began = self.conn.their_state is not h11.IDLE or self._late is None
+        super().data_received(data)
+        state = self.conn.their_state
+        if self.transport.get_protocol() is not self:
+            self._wait(None)  # it has become a socket
+        elif state is not h11.IDLE:
+            self._wait(_STALLED if state is h11.SEND_BODY else None)
+        elif began:
+            self._wait(_HEAD)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait no longer."""
+        self._wait(None)
+        super().connection_lost(exc)
+
+    def _wait(self, seconds: float | None) -> None:
+        if self._late is not None:
+            self._late.cancel()
+        self._late = None if seconds is None else self.loop.call_later(seconds, self.transport.close)
 
 
 def application(token: str, parts: Sequence[PagePart], *, host: str = LOCAL, limit: int = UPLOAD_LIMIT) -> Starlette:
@@ -460,6 +497,7 @@ def serve(
         app,
         log_level="critical",
         access_log=False,
+        http=Patient,
         ws="websockets-sansio",
         ws_max_size=_SOCKET_LIMIT,
         timeout_graceful_shutdown=_GRACE,
