@@ -182,3 +182,19 @@ def test_an_order_that_is_too_low_for_the_target_is_said_and_is_no_last_attitude
     else:
         assert warned == []
         assert not any(text.startswith("over ") for text in to_go)
+
+
+def test_a_hold_is_needed_until_twice_its_length_would_help_little():
+    rng = np.random.default_rng(3)
+    unit, guide, now = Unit(5), Guide(1, Gravity(G, "test"), (), 12), 1.5
+    lengths = []
+    for number, up in enumerate(rng.normal(size=(11, 3)), start=1):
+        next_one = unit.at(up / np.linalg.norm(up), number)
+        mean, covariance = next_one.mean, 4 * next_one.covariance
+        needed = guide.hold_needed(mean, covariance, now)
+        lengths.append(needed)
+        for length in np.arange(now, needed + 0.1, 0.5):  # the same hold, so much longer, until it is accepted
+            assert guide.hold_needed(mean, covariance * now / length, length) == pytest.approx(needed)
+        guide.accept(next_one)
+    assert min(lengths) == now
+    assert max(lengths) > now

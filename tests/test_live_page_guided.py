@@ -395,3 +395,71 @@ def test_a_session_that_ends_without_a_record_keeps_its_tables(live, new_page, t
     status, error = running.end()
     assert status == 2
     assert "rec.csv keeps 5 attitudes: --resume goes on with it" in error
+
+
+def test_the_page_shows_readings_progress_and_cover_and_reads_out_what_to_do(live, new_page):
+    running = live(f"{UNIT},speed=4", "--follow", "--attitudes", "14", *FIT, "--save", "rec.csv")
+    page = new_page(running.address)
+    page.evaluate(
+        """() => {
+      window.spoken = [];
+      speechSynthesis.speak = said => spoken.push(said.text);
+    }"""
+    )
+    page.get_by_role("button", name="Voice").click()
+    page.wait_for_function("() => spoken.includes('Hold still.') && spoken.some(text => text.startsWith('Turn it: '))")
+    assert page.evaluate("spoken.every((text, k) => text !== spoken[k - 1])")
+    page.wait_for_selector(".now[data-state='still'] .ring text:text-matches('^[1-9][.][0-9] s$')")
+    full, round_ = map(float, page.get_attribute(".ring .full", "stroke-dasharray").split())
+    assert 0 < full <= round_
+    page.locator(".sphere .held").nth(2).wait_for(state="attached")
+    covered = page.locator(".sphere .covered-part polygon").count()
+    assert covered >= page.locator(".sphere .held").count() >= 3
+    assert sorted(set(page.locator(".sphere text").all_text_contents())) == [
+        "x",
+        "y",
+        "z down",
+        "z up",
+    ]  # nothing over a mark
+    assert page.locator(".strip .band").count() == 3
+    assert re.fullmatch(r"x −?\d+\.\d+", page.locator(".readings .values span").first.inner_text())
+    same = """() => [".sphere .axis-x", ".strip .axis-x", ".body .axis-x", ".readings .axis-x"].map(
+        each => getComputedStyle(document.querySelector(each)).color)"""
+    assert set(page.evaluate(same)) == {"rgb(31, 111, 139)"}  # that of x in reports, #1f6f8b
+
+
+@pytest.mark.parametrize("width", [768, 390])
+def test_every_button_is_inside_and_print_has_none(live, new_page, width):
+    running = live(
+        f"{UNIT},speed=25,knock=3", "--follow", "--attitudes", "14", *FIT, "--save", "rec.csv", "-o", "r.json"
+    )
+    page = new_page(running.address)
+    page.set_viewport_size({"width": width, "height": 844})
+    outside = """width => [...document.querySelectorAll("#session button, #session a.button")].filter(each => {
+        const box = each.getBoundingClientRect();
+        return each.offsetParent && (box.left < 0 || box.right > width);
+    }).map(each => each.textContent)"""
+    page.locator(".said.bad button").wait_for()
+    assert page.evaluate(outside, width) == []
+    page.locator(".said.bad button").click()
+    page.get_by_role("button", name="Make the record").click()
+    page.wait_for_selector(".result")
+    assert page.evaluate(outside, width) == []
+    assert page.get_attribute(".now", "data-verdict") in ("good", "look")
+    page.emulate_media(media="print")
+    shown = "[...document.querySelectorAll('button, a.button, input, select')].filter(each => each.offsetParent).length"
+    assert page.evaluate(shown) == 0
+    assert "scale_factor_x" in page.inner_text(".result")
+
+
+def test_lost_samples_stand_in_the_headline(live, new_page):
+    lines = lines_of(il.simulate_tumble(attitudes=8, order=1, gravity=9.81, gyro=False))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(20)
+        running = live(f"tcp:127.0.0.1:{server.getsockname()[1]}", *FIT, "--save", "rec.csv")
+        page = new_page(running.address)
+        link = server.accept()[0]
+        sender = Sender(link.sendall, [line for k, line in enumerate(lines) if k % 20 != 7])
+        page.wait_for_selector(".now .loss:text-matches('^5([.][0-9])? % of the samples lost$')")
+        sender.stop()
+        link.close()

@@ -247,3 +247,27 @@ def test_it_is_not_enough_before_the_degrees_of_freedom_that_a_record_is_not_rem
     assert len(accepted) == 9 + 5
     assert session.guide.fit is not None
     assert not [w for w in session.guide.fit.calibration.verdict.reasons if "of freedom" in w]
+
+
+def test_the_view_has_the_last_ten_seconds_of_readings():
+    recording = il.simulate_tumble(attitudes=4, order=1, gravity=9.81, hold="4 s", move="1 s", gyro=False)
+    session, _ = session_of(recording)
+    rows = np.array(session.view().strip)
+    assert rows.shape == (100, 7)
+    np.testing.assert_allclose(np.diff(rows[:, 0]), 0.1, atol=0.011)
+    assert -0.1 <= rows[-1, 0] <= 0
+    times, values = recording.time, recording.triad("accel")
+    end = times[len(times) // 10 * 10 - 1]
+    for time, *ranges in rows[::9].tolist():
+        tenth = values[(times > end + time - 0.095) & (times < end + time + 0.005)]
+        assert len(tenth) == 10
+        np.testing.assert_allclose(ranges, [*tenth.min(axis=0), *tenth.max(axis=0)], rtol=1e-4)
+
+
+def test_where_the_unit_lies_as_wanted_it_is_to_be_put_down():
+    session, _ = session_of(il.simulate_tumble(attitudes=4, order=1, gravity=9.81, gyro=False), planned=12)
+    session.state, wanted = "moving", session.next
+    session._reading = 9.81 * wanted
+    assert session.view().advice == "that is it: put it down"
+    session._reading = -9.81 * wanted
+    assert session.view().advice.startswith("turn it: ")

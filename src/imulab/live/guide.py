@@ -108,7 +108,8 @@ _MORE = 1.5
 """Attitudes per parameter where neither a number nor a target is stated."""
 _SPARE = FEW_DEGREES
 """Attitudes beyond the parameters that a fit needs to find a knocked attitude and to test its order."""
-_NEAR = np.cos(np.radians(12.0))
+NEAR = np.cos(np.radians(12.0))
+"""Cosine of the angle within which an attitude counts as the planned one."""
 _HORIZON = 60
 """Most attitudes that are planned ahead: more take seconds, and hardly change which one is next."""
 _OFF = 2.0
@@ -118,6 +119,7 @@ _MUCH = 10.0
 _FIVE = 5  # attitudes ahead whose gain is computed together
 _LOWERS = 0.05  # least relative gain in uncertainty for which a longer hold is asked
 _LONGEST = 10.0  # s, the longest hold that is asked for
+_PACE = 0.5  # s between two lengths that are looked at
 _ROUNDS = 4  # of the search for the number of attitudes still needed
 _SEED = 1  # of the search, so that the same attitudes get the same advice
 _OTHERS = 0.1
@@ -205,7 +207,7 @@ class Guide:
         self.refit()
         direction = self.directions()[-1]
         near = self._outstanding @ direction if len(self._outstanding) else np.empty(0)
-        if near.size and near.max() > _NEAR:
+        if near.size and near.max() > NEAR:
             self._outstanding = np.delete(self._outstanding, int(np.argmax(near)), axis=0)
             self._known = len(self._outstanding) > 0 and not self._plan_is_off()
         else:
@@ -319,23 +321,29 @@ class Guide:
             return 0.0
         return float(fit_of(self.fit.calibration).excess.value) / self.local_gravity
 
-    def wants_longer(self, mean: Array, covariance: Array, seconds: float) -> bool:
-        """Return whether a hold twice as long lowers the standard uncertainty of some parameter by more than 5 %.
+    def hold_needed(self, mean: Array, covariance: Array, seconds: float) -> float:
+        """Return from which length, s, twice as long a hold lowers no parameter's standard uncertainty by 5 %.
 
-        The planned attitudes count as measured, each with the usual noise.
+        The planned attitudes count as measured, each with the usual noise. Searched from the present length on.
         """
         if seconds >= _LONGEST:
-            return False
+            return seconds
         hold_noise, excess, usual = self._attitude_noise(mean, covariance), self._excess(), self.noise()
         others = np.vstack([self.directions(), self.outstanding()])
         rows = information_rows(others, self.model_order) / usual
         row = information_rows((mean / np.linalg.norm(mean))[None], self.model_order)[0]
         base = rows.T @ rows + np.eye(rows.shape[1]) / _PRIOR**2
-        now, longer = (
-            np.diag(np.linalg.inv(base + np.outer(row, row) / (hold_noise**2 / times + excess**2)))
-            for times in (1.0, 2.0)
-        )
-        return bool(np.sqrt((longer / now).min()) < 1 - _LOWERS)
+        lengths = np.append(np.arange(seconds, _LONGEST, _PACE), _LONGEST)
+        for length in lengths.tolist():
+            now, longer = (
+                np.diag(
+                    np.linalg.inv(base + np.outer(row, row) / (hold_noise**2 * seconds / (times * length) + excess**2))
+                )
+                for times in (1.0, 2.0)
+            )
+            if np.sqrt((longer / now).min()) >= 1 - _LOWERS:
+                return float(length)
+        return _LONGEST
 
     @property
     def met(self) -> bool:

@@ -52,11 +52,13 @@ class Hold:
 
 @dataclass(frozen=True)
 class Moment:
-    """State after a block (``moving``, ``settling`` or ``still``), its mean, and the present or the ended hold."""
+    """State after a block (``moving``, ``settling`` or ``still``), its mean and range, the present or ended hold."""
 
     time: float
     state: str
     mean: Array
+    low: Array
+    high: Array
     constant: tuple[bool, bool, bool]
     hold: Hold | None = None
     ended: Hold | None = None
@@ -121,8 +123,9 @@ class Stillness:
         hold = None if self._hold is None else self._made(self._hold)
         constant = scatter == 0
         return Moment(
-            float(times[-1]), state, mean, (bool(constant[0]), bool(constant[1]), bool(constant[2])), hold, ended
-        )
+            float(times[-1]), state, mean, values.min(axis=0), values.max(axis=0),
+            (bool(constant[0]), bool(constant[1]), bool(constant[2])), hold, ended,
+        )  # fmt: skip
 
     def _variance(self) -> float:
         """Return the variance of the window, summed over the axes; infinite until it is full."""

@@ -383,7 +383,7 @@ class Runner:
             text = f"{silence} {_GIVEN_UP:.0f} s: the session ends with what there is"
             return [Event("gone", text, self.recorder.last)]
         why = source.lost or f"Nothing has come from {source.name} for {waited:.0f} s."
-        outlook = f"{why} {self.kept()}."
+        outlook = f"{why} {self.kept()}." if session.begun else f"{why} The session begins with the first sample."
         if session.begun and source.comes_back:
             outlook += f" In {max(_GIVEN_UP - waited, 0):.0f} s the record is made of what there is."
         if source.lost:

@@ -5,6 +5,7 @@ It has no clock, thread or file: the same samples give the same events.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -13,8 +14,8 @@ import numpy as np
 from imulab.columns import triad
 from imulab.errors import DataError, OptionError
 from imulab.gravity import Gravity
-from imulab.live.guide import Attitude, Guide, Target
-from imulab.live.holds import SHORTEST, SURE, Hold, Moment, Stillness
+from imulab.live.guide import NEAR, Attitude, Guide, Target
+from imulab.live.holds import BLOCK, SHORTEST, SURE, Hold, Moment, Stillness
 from imulab.live.stamps import Counts
 from imulab.live.view import FURTHER, HeldValues, KnownUnit, Trouble, View, in_words
 from imulab.procedures.views import parameter_rows
@@ -167,6 +168,7 @@ class Watch:
 # The session: samples in, events out, and a view of its state.
 
 
+_STRIP = 100  # tenths of a second that a view shows
 _ADVICE = {
     "waiting": "waiting for samples",
     "moving": "put the unit down",
@@ -219,6 +221,8 @@ class Session:
     _reading: Array | None = None
     _temperature: float | None = None
     _seconds: float = 0.0
+    _needed: float = 0.0
+    _strip: deque[tuple[float, ...]] = field(default_factory=lambda: deque(maxlen=_STRIP))
     _accepted: Attitude | None = None
     _dropping: bool = False
     _next: Array | None = None
@@ -359,6 +363,10 @@ class Session:
             unit=guide.unit,
             temperature=self._temperature,
             hold=self._seconds,
+            hold_needed=self._needed,
+            strip=tuple(
+                (round(time - self._time, 2), *(float(f"{v:.5g}") for v in some)) for time, *some in self._strip
+            ),
             attitudes=held,
             wanted=self.wanted,
             parameters=known + (self._further if known else ()),
@@ -382,13 +390,14 @@ class Session:
     def _at(self, moment: Moment) -> None:
         """Process a tenth of a second."""
         self._reading, self._time = moment.mean, moment.time
+        self._strip.append((moment.time, *moment.low.tolist(), *moment.high.tolist()))
         self._warn(self._watch.moment(moment))
         if moment.ended is not None:
             self._ended(moment.ended)
         state = moment.state
         if state != "still":
             self._dropping = self._dropping and state == "settling"
-            self._seconds = 0.0
+            self._seconds, self._needed = 0.0, SURE * BLOCK
         hold = moment.hold
         if hold is not None:
             self._seconds = hold.seconds
@@ -396,7 +405,8 @@ class Session:
                 state = "accepted"
             elif not self._dropping and hold.blocks >= SURE:
                 self._warn(self._watch.hold(hold, self.guide.unit, self.guide.local_gravity))
-                if not self.guide.wants_longer(hold.mean, hold.covariance, hold.seconds):
+                self._needed = self.guide.hold_needed(hold.mean, hold.covariance, hold.seconds)
+                if hold.seconds >= self._needed:
                     self._accept(hold)
                     state = "accepted"
         if state != self.state:
@@ -467,6 +477,8 @@ class Session:
                 return self._enough or "accepted"
             return f"accepted; turn it: {self._in_words(self._next)}"
         if self.state == "moving" and self._next is not None:
+            if self._reading is not None and self._reading @ self._next > NEAR * np.linalg.norm(self._reading):
+                return "that is it: put it down"
             return f"turn it: {self._in_words(self._next)}, and put it down"
         return _ADVICE[self.state]
 

@@ -89,6 +89,10 @@ class View:
         degC, if the stream has it.
     hold
         Length of the present hold after trimming, s.
+    hold_needed
+        Length at which it will be accepted, s, as far as known.
+    strip
+        The last 10 s, a row each tenth of a second: time before now, s, lowest x y z and highest x y z, in `unit`.
     attitudes
         The kept attitudes.
     wanted
@@ -121,6 +125,8 @@ class View:
     unit: str
     temperature: float | None
     hold: float
+    hold_needed: float
+    strip: tuple[tuple[float, ...], ...]
     attitudes: tuple[HeldValues, ...]
     wanted: int
     parameters: tuple[KnownUnit, ...]

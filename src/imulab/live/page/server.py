@@ -373,7 +373,7 @@ UPLOAD_LIMIT = 4 << 30
 _SOCKET_LIMIT = 1 << 16  # bytes of a message from a page
 _GRACE = 2  # s for open requests when the server ends
 _HEAD, _STALLED = 10.0, 60.0
-"""s in which the head of a request has to come, and s without a byte of its body, after which a connection is closed."""
+"""s in which the head of a request has to come, and s without a byte of its body; then its connection is closed."""
 
 
 class Patient(H11Protocol):

@@ -14,7 +14,7 @@ export class ResultArea {
 
   done(message) {
     this.length = h("dd", {}, "–");
-    this.beside = h("p", { class: "caption" });
+    this.beside = h("p", { class: "caption live" });
     const files = message.files.map(file => h("a", {
       class: "button", href: file.href, ...(file.kind === "report" ? { target: "_blank", rel: "noopener" } : { download: file.name }),
     }, FILES[file.kind]));
@@ -28,7 +28,7 @@ export class ResultArea {
       h("dl", { class: "facts" }, h("div", {}, h("dt", {}, "|f| now, corrected by the record"), this.length)),
       this.beside,
       h("p", { class: "caption" }, "The same record, from the recording:"),
-      h("pre", {}, message.command),
+      h("pre", { tabindex: 0, role: "region", "aria-label": "Command" }, message.command),
       parameterTable({ parameters: message.parameters })));
   }
 

@@ -3,12 +3,14 @@
 import { bodyPlace, degreesBetween, dragged, drawBody, product, shortest, upright } from "./body.js";
 import { h, put, show } from "./dom.js";
 import { ResultArea } from "./result.js";
-import { beep, soundButton } from "./sound.js";
+import { Ring } from "./ring.js";
+import { beep, soundButton, speak, voiceButton } from "./sound.js";
 import { drawSphere, spherePlace } from "./sphere.js";
+import { Strip } from "./strip.js";
 import { attitudeTable, milli, parameterTable, targetList } from "./tables.js";
 
 export const title = "Session";
-const STEPS = ["moving", "settling", "still", "accepted"];
+const LOOK = 0.001, BAD = 0.05;
 const NEAR = 12;
 const PER_PIXEL = Math.PI / 180;
 const LOG = 60;
@@ -22,8 +24,9 @@ export function mount(into, given) {
   page = given;
   place = into;
   parts.advice = h("p", { class: "advice", role: "status", "aria-live": "assertive" }, "Connecting");
-  parts.steps = STEPS.map(step => h("li", {}, step));
-  parts.hold = h("span", { class: "hold" });
+  parts.ring = new Ring();
+  parts.state = h("span", { class: "state" });
+  parts.loss = h("span", { class: "loss", role: "status" });
   parts.progress = h("progress", { max: 1, value: 0, "aria-label": "Attitudes" });
   parts.count = h("span", {});
   parts.finish = h("button", { "aria-describedby": "missing", onclick: () => page.send({ type: "finish" }) }, "Finish");
@@ -31,11 +34,10 @@ export function mount(into, given) {
   parts.outlook = h("p", { class: "outlook" });
   parts.enough = h("p", { class: "enough", role: "status" });
   parts.now = h("div", { class: "now" },
-    parts.advice,
-    parts.outlook,
-    parts.where = h("div", { class: "where" }, h("ol", { class: "steps", "aria-label": "State" }, parts.steps), parts.hold),
-    parts.toward = h("div", { class: "toward" }, parts.progress, parts.count, h("span", { class: "actions" }, parts.missing, soundButton(), parts.finish)),
-    parts.enough);
+    h("div", { class: "sign" }, parts.ring.place, parts.state),
+    h("div", { class: "say" }, parts.advice, parts.outlook, parts.enough),
+    parts.toward = h("div", { class: "toward" }, parts.progress, parts.count, parts.loss,
+      h("span", { class: "actions" }, parts.missing, soundButton(), voiceButton(() => parts.advice.textContent), parts.finish)));
   parts.knocked = h("div", { role: "alert" });
   parts.warnings = h("div", { role: "alert" });
   parts.next = bodyPlace("Next attitude");
@@ -49,18 +51,19 @@ export function mount(into, given) {
     parts.nextFigure, h("figure", {}, h("h2", {}, "Now"), parts.live, parts.liveText, parts.hand));
   for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel"]) parts.live.addEventListener(kind, byHand);
   parts.sphere = spherePlace();
+  parts.strip = new Strip();
   parts.facts = h("dl", { class: "facts" });
   parts.parameters = h("div", {});
   parts.attitudes = h("div", {});
   parts.log = h("ol", { class: "log" });
   result = new ResultArea(page);
-  place.append(parts.now, parts.knocked, parts.warnings, result.place,
-    h("div", { class: "beside" }, parts.bodies,
-      h("section", { class: "covered" }, h("h2", {}, "What is covered"), parts.sphere,
-        h("p", { class: "caption" }, "Numbers: held. Ring: next. Cross: now."))),
-    parts.facts,
-    parts.known = h("section", {}, h("h2", {}, "Parameters"), parts.parameters),
-    h("section", {}, h("h2", {}, "Attitudes"), parts.attitudes),
+  const beside = h("div", { class: "beside" }, parts.bodies,
+    h("section", { class: "covered" }, h("h2", {}, "What is covered"), parts.sphere,
+        h("p", { class: "caption" }, "Shaded: within 22° of an attitude held. Ring: next. Cross: now.")));
+  const attitudes = h("section", {}, h("h2", {}, "Attitudes"), parts.attitudes);
+  parts.known = h("section", {}, h("h2", {}, "Parameters"), parts.parameters);
+  parts.later = [beside, attitudes];
+  place.append(parts.now, parts.knocked, parts.warnings, result.place, beside, parts.strip.place, parts.facts, parts.known, attitudes,
     h("details", {}, h("summary", {}, "What happened"), parts.log));
 }
 
@@ -68,7 +71,10 @@ export function hear(message) {
   if (message.type === "hello") parts.log.replaceChildren();  // what happened comes again
   if (message.type === "view") view(message);
   else if (message.type === "event") happened(message);
-  else if (message.type === "done") result.done(message);
+  else if (message.type === "done") {
+    parts.now.dataset.verdict = message.verdict;
+    result.done(message);
+  }
   else if (message.type === "corrected") result.corrected(message);
   else if (message.type === "failed") failed(message);
 }
@@ -82,13 +88,17 @@ function view(now) {
   const measuring = now.phase === "measuring";
   put(parts.advice, advice(now));
   put(parts.outlook, measuring ? now.outlook : "");
+  speak(parts.advice.textContent);
   parts.now.dataset.state = measuring ? now.state : now.phase;
+  parts.now.toggleAttribute("data-aside", measuring && Boolean(now.enough) && now.attitudes.some(each => each.aside));
+  for (const part of parts.later) show(part, now.samples > 0);
   document.title = `${measuring ? now.state : now.phase} · imulab`;
-  parts.steps.forEach((item, k) => {
-    if (STEPS[k] === now.state && measuring) item.setAttribute("aria-current", "step");
-    else item.removeAttribute("aria-current");
-  });
-  put(parts.hold, now.hold && measuring ? `${now.hold.toFixed(1)} s` : "");
+  put(parts.state, now.phase === "failed" ? "ended" : parts.now.dataset.state);
+  const away = now.up && now.next && measuring ? Math.round(degreesBetween(now.up, now.next) / 5) * 5 : null;
+  parts.ring.draw(parts.now.dataset.state, now.hold, now.hold_needed, away);
+  loss(now, measuring);
+  show(parts.strip.place, measuring);
+  if (measuring) parts.strip.draw(now);
   progress(now, measuring);
   bodies(now, measuring);
   facts(now);
@@ -129,7 +139,8 @@ function progress(now, measuring) {
   put(parts.count, now.wanted ? `${count} of about ${Math.max(now.wanted, count)} attitudes` : `${count} attitudes`);
   put(parts.enough, now.enough ? sentence(now.enough.replace(/^enough: /, "")) : "");
   show(parts.enough, measuring && Boolean(now.enough));
-  for (const part of [parts.where, parts.toward, parts.known]) show(part, now.phase !== "done");
+  show(parts.toward, now.phase !== "done");
+  show(parts.known, now.phase !== "done" && now.samples > 0);
   show(parts.finish, measuring);
   parts.finish.disabled = Boolean(now.missing);
   put(parts.missing, measuring && now.missing ? `needs ${now.missing}` : "");
@@ -137,9 +148,18 @@ function progress(now, measuring) {
   put(parts.finish, now.enough ? "Make the record" : "Finish now");
 }
 
+// The share of samples or bytes that are lost, where it matters.
+function loss(now, measuring) {
+  const { lost, unread_share: unread } = now.counts, share = Math.max(unread, lost / Math.max(now.samples + lost, 1));
+  put(parts.loss, measuring && share >= LOOK ? `${(100 * share).toPrecision(2)} % ${unread ? "of the bytes" : "of the samples"} lost` : "");
+  parts.loss.dataset.share = share >= BAD ? "bad" : "look";
+}
+
 function bodies(now, measuring) {
-  show(parts.bodies, Boolean(now.up));
-  if (!now.up) return;
+  const shown = Boolean(now.up) && (measuring || now.phase === "computing");
+  show(parts.bodies, shown);
+  show(parts.facts, shown);
+  if (!shown) return;
   const wanted = measuring ? now.next : null;
   const key = JSON.stringify(wanted);
   if (!orientation) orientation = upright(now.up);
@@ -217,18 +237,20 @@ function happened(event) {
   beep(event.kind);
 }
 
+const pre = (label, text) => h("pre", { tabindex: 0, role: "region", "aria-label": label }, text);
+
 // The session has ended: what it knew stays on the page.
 function failed(message) {
   page.end(sentence(message.missing ? `For a record it needs ${message.missing}` : message.text), "bad");
   const below = [];
   if (message.kept) below.push(h("p", {}, `${message.kept}.`));
   if (message.missing) below.push(h("details", {}, h("summary", {}, "The reason in full"), h("p", {}, message.text)));
-  if (message.lines.length) below.push(h("p", {}, "The first lines of the stream:"), h("pre", {}, message.lines.join("\n")));
+  if (message.lines.length) below.push(h("p", {}, "The first lines of the stream:"), pre("Lines of the stream", message.lines.join("\n")));
   if (message.guess) {
     below.push(h("p", {}, "A guess of its columns; check it, save it as layout.toml, and add --layout layout.toml:"),
-      h("pre", {}, message.guess));
+      pre("Layout", message.guess));
   }
   if (below.length) parts.knocked.replaceChildren(h("section", {}, below));
-  for (const part of [parts.where, parts.toward, parts.outlook]) show(part, false);
+  for (const part of [parts.toward, parts.outlook]) show(part, false);
   for (const button of place.querySelectorAll("button")) button.disabled = true;
 }

@@ -9,7 +9,7 @@ export const milli = residual => (residual * MILLI_G).toFixed(2).replace(/^-(0\.
 
 const table = (label, titles, rows) =>
   h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, h("table", {},
-    h("thead", {}, h("tr", {}, titles.map(([text, kind]) => h("th", { scope: "col", class: kind }, text)))),
+    h("thead", {}, h("tr", {}, titles.map(([text, kind]) => (text ? h("th", { scope: "col", class: kind }, text) : h("td", {}))))),
     h("tbody", {}, rows)));
 
 // How far a standard uncertainty is from its target, in words and as a bar that is full where it is met.
@@ -36,12 +36,12 @@ export function parameterTable(now) {
 
 export function attitudeTable(now, drop) {
   if (!now.attitudes.length) return h("p", { class: "caption" }, "None yet.");
-  const titles = [["no."], ["up", "text words"], ["|f| − g, mg"], ["held, s"], ...(drop ? [["", "text"]] : [])];
+  const titles = [["no."], ["up", "text words"], ["|f| − g, mg"], ["held, s", "held-for"], ...(drop ? [["", "text"]] : [])];
   return table("Attitudes", titles, now.attitudes.map(each => h("tr", { class: each.aside ? "aside" : null },
     h("td", {}, each.aside ? `${each.number} (off)` : each.number),
     h("td", { class: "text words" }, each.words),
     h("td", {}, each.residual === null ? "–" : milli(each.residual)),
-    h("td", {}, each.seconds.toFixed(1)),
+    h("td", { class: "held-for" }, each.seconds.toFixed(1)),
     drop && h("td", { class: "text" },
       h("button", { class: "small", "aria-label": `Drop attitude ${each.number}`, onclick: () => drop(each.number) }, "drop")))).reverse());
 }
