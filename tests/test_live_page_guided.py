@@ -463,3 +463,32 @@ def test_lost_samples_stand_in_the_headline(live, new_page):
         page.wait_for_selector(".now .loss:text-matches('^5([.][0-9])? % of the samples lost$')")
         sender.stop()
         link.close()
+
+
+def test_the_place_is_asked_for_where_gravity_is_not_stated(live, new_page, tmp_path):
+    lines = lines_of(il.simulate_tumble(attitudes=14, order=1, gravity=9.8073, hold="3 s", move="1 s", gyro=False))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(20)
+        words = ["--attitudes", "12", "--order", "1", "--save", "rec.csv", "-o", "rec.json"]
+        running = live(f"tcp:127.0.0.1:{server.getsockname()[1]}", *words)
+        page = new_page(running.address)
+        link = server.accept()[0]
+        sender = Sender(link.sendall, lines)
+        use = page.get_by_role("button", name="Use")
+        use.click()
+        page.wait_for_selector("#said .bad:has-text('expected the latitude, or the gravity')")
+        page.get_by_label("Latitude").fill("95")
+        use.click()
+        page.wait_for_selector("#said .bad:has-text('latitude 95 deg: expected -90 to 90 deg')")
+        page.get_by_label("Latitude").fill("48.1")
+        page.get_by_label("height").fill("500")
+        use.click()
+        page.wait_for_selector(".place", state="hidden")
+        page.wait_for_selector(".facts div:has-text('gravity here') dd:text-is('9.8075 m/s²')")
+        page.get_by_role("button", name="Make the record").click()
+        page.wait_for_selector(".result")
+        assert "--latitude 48.1 --height 500" in page.inner_text(".result pre")
+        sender.stop()
+        link.close()
+    record = il.load(tmp_path / "rec.json")
+    assert record.model["gravity"]["value"] == pytest.approx(il.normal_gravity("48.1", "500 m"), abs=1e-9)

@@ -20,6 +20,7 @@ from imulab.errors import ImulabError, OptionError
 from imulab.options import FLAG, OUTPUT
 
 if TYPE_CHECKING:
+    from imulab.gravity import Gravity
     from imulab.live.page.bench import Workbench
     from imulab.live.page.files import FolderFiles
     from imulab.live.runner import Runner
@@ -97,6 +98,7 @@ def on_page(
     made: Callable[[], Calibration],
     command: Callable[[Calibration], str],
     outputs: Sequence[str | None],
+    place: Callable[[Mapping[str, str]], Gravity],
     *,
     port: int,
     host: str | None,
@@ -104,7 +106,8 @@ def on_page(
 ) -> None:
     """Show a session on the page, with the workbench, until it is ended there or by Ctrl-C.
 
-    `outputs` are the names of the record, None where none was given, and of the other files to be written.
+    `outputs` are the names of the record, None where none was given, and of the other files to be written; `place`
+    takes what the page says of the place.
 
     Raises
     ------
@@ -116,7 +119,7 @@ def on_page(
     from imulab.live.page.guided import GuidedPart
     from imulab.live.page.server import serve
 
-    part = GuidedPart(runner, made, command, Path(outputs[0] or "record.json").name)
+    part = GuidedPart(runner, made, command, Path(outputs[0] or "record.json").name, place)
     bench, files = workbench(later=[name for name in (runner.recorder.path, *outputs) if name])
     try:
         serve([part, bench], port, host=checked_host(host), browser=browser)
@@ -228,12 +231,22 @@ def live(
         try:
             if listened is not None:
                 command_again = partial(again, save, fitted, output)
-                on_page(runner, made, command_again, (output, report), port=listened, host=host, browser=not no_browser)
+                outputs, place = (output, report), partial(_gravity_of_place, fitted)
+                on_page(runner, made, command_again, outputs, place, port=listened, host=host, browser=not no_browser)
             else:
                 _in_terminal(runner, made, plain=plain, typed=source != "-")
         except KeyboardInterrupt:
             note(runner.kept())
             raise
+
+
+def _gravity_of_place(fitted: dict[str, str | None], texts: Mapping[str, str]) -> Gravity:
+    """Return the gravity of a place by the options' texts, which the record is then fitted with."""
+    from imulab.procedures.tumble.procedure import TASK
+
+    gravity: Gravity = TASK.values(dict(texts), FLAG)["gravity"]
+    fitted.update({"gravity": None, "latitude": None, "height": None} | dict(texts))
+    return gravity
 
 
 def _make_record(save: str, fitted: dict[str, str | None], output: str | None, report: str | None) -> Calibration:

@@ -13,6 +13,7 @@ import numpy as np
 
 from imulab.errors import OptionError, ReadError
 from imulab.files import replacing
+from imulab.gravity import Gravity
 from imulab.live.formats import LineStream
 from imulab.live.session import Event, Session
 from imulab.live.sources import LiveSource
@@ -305,6 +306,14 @@ class Runner:
         times = self.session.drop(number)
         if times is not None:
             self.recorder.cut(times[0] - _BEFORE, times[1] + _BEHIND)
+        return self.session.events
+
+    def state_gravity(self, gravity: Gravity) -> list[Event]:
+        """Take local gravity, for the session and for the fits of further triads; return what happened."""
+        self.session.state_gravity(gravity)
+        if self._further is not None:
+            self._further.close()
+            self._further, self._fit_due = None, True
         return self.session.events
 
     def turn(self, direction: Array) -> None:

@@ -316,6 +316,14 @@ class Session:
         self._plan()
         return gone.start, gone.stop
 
+    def state_gravity(self, gravity: Gravity) -> None:
+        """Take local gravity, with which all attitudes are fitted anew."""
+        self.events = []
+        self.gravity = self.guide.gravity = gravity
+        self.guide.refit()
+        self._look()
+        self._plan()
+
     def know(self, further: tuple[KnownUnit, ...], why: Sequence[str]) -> list[Event]:
         """Take the parameters of further triads, or the reasons why some have none, and return what is new."""
         self.events = []

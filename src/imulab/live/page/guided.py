@@ -6,7 +6,7 @@ Messages to the page, beside those of `parts`:
     The `View` as JSON, at most ten a second: numbers in SI or as `View` says, parameters as texts (`name`, `value`,
     `uncertainty`, `unit`) with `share`, their standard uncertainty over the target's; each attitude in `words`; `phase`
     (``measuring``, ``computing``, ``done`` or ``failed``); `recording`, its file; `by_hand`, whether the unit is one
-    that ``turn`` turns.
+    that ``turn`` turns; `gravity`, that of the place, m/s², or null where nobody stated it.
 ``event``
     Something that happened: `kind`, `text`, `time`, as `Event`.
 ``done``
@@ -19,14 +19,14 @@ Messages to the page, beside those of `parts`:
     recording keeps; `lines` are the first of an unknown stream, `guess` a layout for it.
 
 Messages from the page: ``drop`` (`attitude`: its number), ``turn`` (`up`: the direction of the body that a simulated
-unit is to have upward), ``finish`` and ``quit``.
+unit is to have upward), ``place`` (`latitude` and `height`, or `gravity`, as texts), ``finish`` and ``quit``.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextvars import copy_context
 from dataclasses import asdict
 from functools import partial
@@ -40,6 +40,7 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from imulab.errors import ImulabError, OptionError, quoted
+from imulab.gravity import Gravity
 from imulab.live.formats import UnknownFormatError
 from imulab.live.page.server import Hub, Message, PagePart, report_response
 from imulab.live.runner import Runner
@@ -52,6 +53,7 @@ from imulab.report.traces import format_uncertain
 
 _WAIT, _EVERY = 0.05, 0.1  # s of one wait for the source; s between two messages to the pages
 _TOLD = 0.3  # s for the last message to reach the pages
+_LONGEST = 100  # characters of a text from the page
 _EVENTS = 60  # latest events that a new page shows
 _PATIENCE = 5.0  # s for a thread to end, and for a page that is being opened
 
@@ -69,6 +71,9 @@ class GuidedPart(PagePart):
         Words of the command, or commands, that make the same record.
     record_name
         Name of the record's file.
+    place
+        Returns the gravity of a place, from texts of latitude, height or gravity as of the options; record and command
+        are then made with it.
 
     Attributes
     ----------
@@ -81,12 +86,18 @@ class GuidedPart(PagePart):
     name = "session"
 
     def __init__(
-        self, runner: Runner, fit: Callable[[], Calibration], command: Callable[[Calibration], str], record_name: str
+        self,
+        runner: Runner,
+        fit: Callable[[], Calibration],
+        command: Callable[[Calibration], str],
+        record_name: str,
+        place: Callable[[Mapping[str, str]], Gravity],
     ) -> None:
         super().__init__()
         self.record: Calibration | None = None
         self.error: Exception | None = None
         self._runner, self._fit, self._command, self._record_name = runner, fit, command, record_name
+        self._place = place
         self._asked: SimpleQueue[Message] = SimpleQueue()
         self._view: Message = {}
         self._done: Message = {}
@@ -99,6 +110,7 @@ class GuidedPart(PagePart):
         self.handlers = {
             "drop": self._drop,
             "turn": self._turn,
+            "place": self._take_place,
             "finish": self._asked.put,
             "quit": lambda _: self._hub.stop(),
         }
@@ -133,6 +145,12 @@ class GuidedPart(PagePart):
         if not (np.isfinite(length) and length > 0):
             raise OptionError(f"turn: expected a direction, found {quoted(up)}")
         self._asked.put({"type": "turn", "up": np.array(up) / length})
+
+    def _take_place(self, message: Message) -> None:
+        texts = {key: message[key] for key in ("gravity", "latitude", "height") if message.get(key)}
+        if not texts or not all(isinstance(text, str) and len(text) <= _LONGEST for text in texts.values()):
+            raise OptionError("place: expected the latitude, or the gravity")
+        self._asked.put({"type": "place", "texts": texts})
 
     def _run(self) -> None:
         try:
@@ -191,6 +209,8 @@ class GuidedPart(PagePart):
                 try:
                     if message["type"] == "turn":
                         self._runner.turn(message["up"])
+                    elif message["type"] == "place":
+                        events += self._runner.state_gravity(self._place(message["texts"]))
                     else:
                         events += self._runner.drop(message["attitude"])
                 except OptionError as error:
@@ -209,8 +229,14 @@ class GuidedPart(PagePart):
             "phase": self._phase,
             "recording": self._runner.recorder.path,
             "by_hand": self._runner.source.by_hand,
+            "gravity": self._gravity(),
         }
         self._tell(self._view, latest=True)
+
+    def _gravity(self) -> float | None:
+        session = self._runner.session
+        stated = session.gravity is not None or "gravity" in session.guide.metadata
+        return session.guide.local_gravity if stated else None
 
     def _tell(self, message: Message, *, latest: bool = False) -> None:
         self._hub.tell(message, latest=latest)

@@ -50,6 +50,7 @@ export function mount(into, given) {
   parts.bodies = h("section", { class: "bodies" },
     parts.nextFigure, h("figure", {}, h("h2", {}, "Now"), parts.live, parts.liveText, parts.hand));
   for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel"]) parts.live.addEventListener(kind, byHand);
+  parts.place = placeForm();
   parts.sphere = spherePlace();
   parts.strip = new Strip();
   parts.facts = h("dl", { class: "facts" });
@@ -63,7 +64,7 @@ export function mount(into, given) {
   const attitudes = h("section", {}, h("h2", {}, "Attitudes"), parts.attitudes);
   parts.known = h("section", {}, h("h2", {}, "Parameters"), parts.parameters);
   parts.later = [beside, attitudes];
-  place.append(parts.now, parts.knocked, parts.warnings, result.place, beside, parts.strip.place, parts.facts, parts.known, attitudes,
+  place.append(parts.now, parts.knocked, parts.warnings, parts.place, result.place, beside, parts.strip.place, parts.facts, parts.known, attitudes,
     h("details", {}, h("summary", {}, "What happened"), parts.log));
 }
 
@@ -97,6 +98,7 @@ function view(now) {
   const away = now.up && now.next && measuring ? Math.round(degreesBetween(now.up, now.next) / 5) * 5 : null;
   parts.ring.draw(parts.now.dataset.state, now.hold, now.hold_needed, away);
   loss(now, measuring);
+  show(parts.place, measuring && now.gravity === null && now.samples > 0);
   show(parts.strip.place, measuring);
   if (measuring) parts.strip.draw(now);
   progress(now, measuring);
@@ -201,12 +203,29 @@ function byHand(event) {
 // The direction that the drawn orientation has up.
 const lastUp = () => orientation[2];
 
+// Asks for the place where nobody stated its gravity, which limits every scale factor.
+function placeForm() {
+  const field = (label, unit, hint) => h("label", {}, label, h("input", { inputmode: "decimal", size: 8, placeholder: hint, "aria-label": `${label}, ${unit}` }), unit);
+  const fields = { latitude: field("Latitude", "°", "48.14"), height: field("height", "m", "520"), gravity: field("or gravity", "m/s²", "9.80725") };
+  return h("form", {
+    class: "said note place", hidden: true,
+    onsubmit(event) {
+      event.preventDefault();
+      page.forget();
+      const texts = Object.entries(fields).map(([name, label]) => [name, label.querySelector("input").value.trim()]);
+      page.send({ type: "place", ...Object.fromEntries(texts) });
+    },
+  }, h("p", {}, "Where is this? Local gravity is not known, and every scale factor inherits up to 0.16 % from that."),
+  h("span", { class: "fields" }, Object.values(fields), h("button", {}, "Use")));
+}
+
 function facts(now) {
   const { gaps, unread_share: unread, ...wrong } = now.counts;
   const rows = [
     ["|f| now", now.length === null ? "–" : `${now.length.toPrecision(5)} ${now.unit.replace("^2", "²")}`],
     ["stream", now.rate ? `${now.rate.toPrecision(3)} Hz` : "–"],
     ["recorded", duration(now.seconds)],
+    ...(now.gravity === null ? [] : [["gravity here", `${now.gravity.toFixed(4)} m/s²`]]),
     ...(now.temperature === null ? [] : [["temperature", `${now.temperature.toFixed(1)} °C`]]),
     ...Object.entries(wrong).filter(([, number]) => number).map(([name, number]) => [`samples ${name}`, `${number}`]),
     ...(unread ? [["bytes lost", `${(100 * unread).toPrecision(2)} %`]] : []),
@@ -247,7 +266,9 @@ function failed(message) {
   if (message.missing) below.push(h("details", {}, h("summary", {}, "The reason in full"), h("p", {}, message.text)));
   if (message.lines.length) below.push(h("p", {}, "The first lines of the stream:"), pre("Lines of the stream", message.lines.join("\n")));
   if (message.guess) {
-    below.push(h("p", {}, "A guess of its columns; check it, save it as layout.toml, and add --layout layout.toml:"),
+    const file = new Blob([message.guess], { type: "application/toml" });
+    below.push(h("p", {}, "A guess of its columns; check it, save it as layout.toml, and add --layout layout.toml: ",
+      h("a", { class: "button", href: URL.createObjectURL(file), download: "layout.toml" }, "Save layout.toml")),
       pre("Layout", message.guess));
   }
   if (below.length) parts.knocked.replaceChildren(h("section", {}, below));
