@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.errors import DataError, OptionError, ReadError, UnitError
+from imulab.errors import DataError, ImulabError, OptionError, ReadError, UnitError
 from imulab.quantities import quantity
 from imulab.readers.layout import EXAMPLE, load_layout
 from imulab.recording import Recording
@@ -30,6 +30,8 @@ def recording():
         ("timestamp_ms", "column 'timestamp_ms': expected the name 'time', in a title such as 'time [ms]'"),
         ("Time (us)", "column 'Time (us)': expected the name 'time', in a title such as 'time [us]'"),
         ("t", "column 't': expected the name 'time'"),
+        ("accel_x (m/s^2)", "column 'accel_x (m/s^2)': expected a title such as 'accel_x [m/s^2]'"),
+        ("Gyro_X deg/s", "column 'Gyro_X deg/s': expected a title such as 'gyro_x [deg/s]'"),
     ],
 )
 def test_a_clock_of_another_name_is_no_table_of_attitudes(tmp_path, title, message):
@@ -167,6 +169,11 @@ def test_gravity_that_is_not_that_of_the_files_head_is_warned_of(recording):
 
 def test_a_recording_without_its_time_is_told_what_it_needs(recording):
     rows = {name: recording.columns[name].copy() for name in ("accel_x", "accel_y", "accel_z")}
+    table = Recording(columns=rows, units=dict.fromkeys(rows, "m/s^2"), name="t.csv")
+    with pytest.raises(ImulabError, match=r"imulab layout guess t.csv --sample-rate 100Hz -o L.toml writes one"):
+        il.find_attitudes(table)
+    order = np.random.default_rng(2).permutation(len(table))  # in which no row goes over into the next
+    rows |= {name: values[order] for name, values in rows.items()}
     table = Recording(columns=rows, units=dict.fromkeys(rows, "m/s^2"), name="t.csv")
     (note,) = il.find_attitudes(table).notes
     assert note.endswith("Then it needs a column time, or a layout with sample_rate")

@@ -1,7 +1,10 @@
 """Text as loggers leave it: labels, torn lines, zeros behind the end, columns of text, packed files, flat triples."""
 
+import bz2
 import gzip
 import json
+import lzma
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -39,6 +42,13 @@ def path(tmp_path):
         ("t:0,aX:0.1,aY:-1e-3", [("t", "0", ""), ("aX", "0.1", ""), ("aY", "-1e-3", "")]),
         ("ax=0.5 ay=+1. az=.25", [("ax", "0.5", ""), ("ay", "+1.", ""), ("az", ".25", "")]),
         ("Temperature: 26.01 degC", [("Temperature", "26.01", "degC")]),
+        (
+            "Accel: 6.9, 4.70, -5 | Gyro: .1 2. 3e-2",
+            [(f"Accel {axis}", number, "") for axis, number in zip("xyz", ("6.9", "4.70", "-5"), strict=True)]
+            + [(f"Gyro {axis}", number, "") for axis, number in zip("xyz", (".1", "2.", "3e-2"), strict=True)],
+        ),
+        ("Accel: 1, 2, 3, 4", [("Accel", "1", "")]),
+        ("t: 1, 2, 3", [("t", "1", "")]),
         ("12:30:15 started", []),
         ("MPU6050 Found!", []),
     ],
@@ -257,6 +267,11 @@ def test_packed_files_that_are_refused(imulab, path, tmp_path):
     path.write_text(HEAD + "".join(rows(500)))
     data = path.read_bytes()
     (tmp_path / "cut.gz").write_bytes(gzip.compress(data)[:-40])
+    (tmp_path / "f.bz2").write_bytes(bz2.compress(data))
+    (tmp_path / "f.xz").write_bytes(lzma.compress(data))
+    (tmp_path / "f.gz.gz").write_bytes(gzip.compress(gzip.compress(data)))
+    with tarfile.open(tmp_path / "f.tar.gz", "w:gz") as archive:
+        archive.add(path, "f.csv")
     (tmp_path / "bomb.gz").write_bytes(gzip.compress(b"0" * 80_000_000))
     for name, entries in (("two.zip", ["a.csv", "b.csv"]), ("none.zip", []), ("x.xlsx", ["[Content_Types].xml"])):
         with zipfile.ZipFile(tmp_path / name, "w") as archive:
@@ -269,6 +284,10 @@ def test_packed_files_that_are_refused(imulab, path, tmp_path):
         ("two.zip", "expected one file in it, found a.csv, b.csv; unpack it, and name one"),
         ("none.zip", "expected one file in it, found none"),
         ("x.xlsx", "a spreadsheet; expected text: save the sheet as CSV"),
+        ("f.bz2", "expected text, found what bzip2 packed: unpack it first"),
+        ("f.xz", "expected text, found what xz packed: unpack it first"),
+        ("f.tar.gz", "expected text, found what tar packed: unpack it first"),
+        ("f.gz.gz", "expected text, found what gzip packed: unpack it first"),
     ):
         done = imulab("show", name)
         assert (done.returncode, done.stderr.count("\n")) == (2, 1)

@@ -1,5 +1,7 @@
 """Layouts guessed from titles: from heads of the shipped layouts, which are taken away, and from titles in use."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -102,6 +104,10 @@ def test_heads_of_the_shipped_layouts_without_them(tmp_path, monkeypatch):
         ("gx (g)", "accel", 0, "g"),
         ("axisP[0]", "", 0, ""),
         ("Absolute field (µT)", "", None, "uT"),
+        ("Zeit (s)", "time", None, "s"),
+        ("Zeitstempel", "time", None, ""),
+        ("ts", "time", None, ""),
+        ("Beschleunigung x (m/s^2)", "accel", 0, "m/s^2"),
     ],
 )
 def test_a_title_says_sensor_axis_and_unit(title, sensor, axis, unit):
@@ -170,7 +176,7 @@ def test_acceleration_without_gravity_is_not_taken(tmp_path):
     rng = np.random.default_rng(5)
     columns = [np.arange(50) * 0.01, *rng.normal(0, 0.02, (3, 50))]
     titles = "Time (s),Linear Acceleration x (m/s^2),Linear Acceleration y (m/s^2),Linear Acceleration z (m/s^2)"
-    with pytest.raises(ReadError, match="no titles of three axes that are known; not known: 'Linear Acceleration x"):
+    with pytest.raises(ReadError, match=r"'Linear Acceleration x \(m/s\^2\)' has no gravity in it, by which"):
         il.guess_layout(written(tmp_path / "f.csv", titles, columns))
 
 
@@ -271,3 +277,41 @@ def test_dates_and_times_of_day_are_a_time(tmp_path):
     path.write_text(titles + "".join(f"11/12/2024 17:41:4{k},0.1,0.2,0.9\n" for k in range(8)))
     with pytest.raises(ReadError, match="'11/12/2024 17:41:40' may be day or month first"):
         il.guess_layout(path)
+
+
+def test_arrays_within_objects_and_flat_triples_alone(tmp_path):
+    turned = 9.81 * np.array([[0.6, 0.0, 0.8], [0.8, 0.6, 0.0]] * 10)
+    (tmp_path / "flat.json").write_text(json.dumps({"acc": turned.ravel().tolist(), "rate": 50}))
+    inner = {"t": (np.arange(20) / 50).tolist(), "accel": turned.tolist()}
+    (tmp_path / "inner.json").write_text(json.dumps({"meta": {"id": 7, "tags": ["a"]}, "log": inner}))
+    for name, options in (("flat", {"sample_rate": 50.0}), ("inner", {})):
+        found = il.guess_layout(tmp_path / f"{name}.json", **options)
+        read = il.read(tmp_path / f"{name}.json", found.layout)
+        np.testing.assert_allclose(read.triad("accel"), turned)
+        assert (read.units["accel_z"], read.time[-1]) == ("m/s^2", pytest.approx(19 / 50))
+
+
+def test_a_json_file_without_a_layout_names_the_command_that_writes_one(imulab, tmp_path):
+    rows = [{"ts": k / 50, "acc": {"x": 0.0, "y": 0.1, "z": 9.8}} for k in range(30)]
+    (tmp_path / "f.json").write_text(json.dumps(rows))
+    done = imulab("show", "f.json")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    command = "imulab layout guess f.json -o L.toml"
+    assert f"; {command} writes a layout for it (--layout L.toml)\n" in done.stderr
+    assert imulab(*command.split()[1:]).returncode == 0
+    assert "rate 50 Hz" in imulab("show", "f.json", "--layout", "L.toml").stdout
+
+
+def test_a_refusal_to_guess_says_what_to_do(imulab, tmp_path):
+    (tmp_path / "f.csv").write_text("t,fx,fy,fz\n0,1,2,3\n1,1,2,3\n")
+    assert imulab("layout", "guess", "f.csv").stderr.endswith(
+        "; a layout can be written by hand: imulab show --formats ends with an example\n"
+    )
+
+
+def test_native_titles_without_a_time_get_their_rate(imulab, tmp_path):
+    (tmp_path / "f.csv").write_text("accel_x [g],accel_y [g],accel_z [g]\n" + "0,0,1\n0,0.1,1\n" * 10)
+    assert "it needs no layout" in imulab("layout", "guess", "f.csv").stderr
+    assert imulab("layout", "guess", "f.csv", "--sample-rate", "20Hz", "-o", "l.toml").returncode == 0
+    found = il.read(tmp_path / "f.csv", tmp_path / "l.toml")
+    assert (found.units["accel_x"], found.time[-1]) == ("g", pytest.approx(19 / 20))

@@ -41,6 +41,8 @@ INERTIAL = tuple(name for name, kind in KINDS.items() if kind.quantity in ("acce
 _ELEMENT = re.compile(rf"(?:{'|'.join(TRIADS)})(?:_[xyz])?_(\d+)")
 _CLOCK = re.compile(r"(?:t|time|timestamp|seconds)(?:(?: ?\(|[ _.])(s|ms|us|ns|min|h)\)?)?")
 """Names of time columns in loggers, with their units."""
+_WRITTEN_UNIT = re.compile(r"(\w+?)[ _]*(?:\(([^()]*[^\d()][^()]*)\)| ([^\s()]*/[^\s()]*))")
+"""Names with a unit in round brackets, or behind a blank."""
 
 
 def kind_of(column: str) -> str | None:
@@ -122,6 +124,10 @@ def check_name(name: str, title: str, file: str) -> None:
         )
     lower = name.lower()
     clock = _CLOCK.fullmatch(lower)
+    written = None if clock else _WRITTEN_UNIT.fullmatch(name)
+    if written and expected_quantities(written[1].lower()) is not None:
+        example = f"{written[1].lower()} [{written[2] or written[3]}]"
+        raise UnitError(f"{file}: column {name!r}: expected a title such as {example!r}")
     meant = "time" if clock else lower.replace(" ", "_")
     if meant != name and expected_quantities(meant) is not None:
         example = f", in a title such as 'time [{clock[1]}]'" if clock and clock[1] else ""

@@ -244,6 +244,14 @@ def _content_blocks(
     if kind is not TEXT:
         try:
             yield from _spread(_FAMILIES[kind.module](Path(file), name, layout, selection), layout)
+        except ReadError as error:
+            from imulab.readers.guess import advice_on_guess
+            from imulab.readers.jsonfile import LARGEST, KeysError
+
+            if not isinstance(error, KeysError):
+                raise
+            more = advice_on_guess(_head(file, LARGEST), name)
+            raise ReadError(f"{error}; {more}" if more else str(error)) from None
         except OSError as error:
             raise ReadError(f"{name}: cannot be read: {error.strerror or error}") from None
         return

@@ -96,9 +96,28 @@ _ENCRYPTED = 1  # flag of an entry of a zip file
 _SPREADSHEET = "[Content_Types].xml"
 
 
+_NO_FILE = b"PK\x05\x06"  # of a zip file without one
+_PACKED = {
+    _GZIP: "gzip",
+    _ZIP: "zip",
+    b"BZh": "bzip2",
+    b"\xfd7zXZ": "xz",
+    b"7z\xbc\xaf": "7-Zip",
+    b"\x28\xb5\x2f\xfd": "zstd",
+    b"Rar!": "RAR",
+}
+
+
 def is_packed(head: bytes) -> bool:
     """Return whether the first bytes are those of a gzip or zip file."""
-    return head.startswith((_GZIP, _ZIP))
+    return head.startswith((_GZIP, _ZIP, _NO_FILE))
+
+
+def packed_by(head: bytes) -> str:
+    """Return the name of the program that packed a file, from its first bytes; empty where none did."""
+    if head[257:262] == b"ustar":
+        return "tar"
+    return next((name for begin, name in _PACKED.items() if head.startswith(begin)), "")
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from datetime import datetime
 from itertools import pairwise
@@ -58,6 +58,8 @@ _TIME_OF_DAY = re.compile(r"\d?\d:\d\d:\d\d(?:\.\d+)?$")
 _DAY_AND_MONTH = re.compile(r"(\d\d?)[./-](\d\d?)[./-]\d{4} +\d?\d:\d\d")
 _EITHER = "either"
 _DATES = {"day first": '"iso", day_first = true', "month first": '"iso", day_first = false'}
+_BY_HAND = "; a layout can be written by hand: imulab show --formats ends with an example"
+_NO_GRAVITY = {"linear", "free", "user", "without", "nog"}
 _EXAMPLES = {"accel": "m/s^2", "gyro": "deg/s", "mag": "uT"}
 
 
@@ -257,7 +259,9 @@ def guess_table(lines: Sequence[str], name: str, *, prefix: str = "", encoding: 
                     best = score, table
     if best is None:
         shown = next((line.strip() for line in lines if line.strip() and not line.startswith("#")), "")
-        raise GuessError(f"{name}: no line of titles names the axes of a sensor; the first is {quoted(shown)}")
+        raise GuessError(
+            f"{name}: no line of titles names the axes of a sensor; the first is {quoted(shown)}{_BY_HAND}"
+        )
     best[1].encoding = encoding
     return best[1]
 
@@ -291,11 +295,14 @@ def _table_of_json(data: bytes, name: str) -> _Table:
     """Return the table of a JSON file: records, or arrays by key, in which triples may lie flat."""
     document = parsed_document(data, name)
     if isinstance(document, dict):
-        arrays = {key: value for key, value in document.items() if isinstance(value, list) and value}
-        rows = min((len(value) for value in arrays.values() if not isinstance(value[0], dict | list)), default=0)
+        arrays = dict(_arrays_of(document))
+        plain = {key: len(value) for key, value in arrays.items() if not isinstance(value[0], dict | list)}
+        triples = {key: size // 3 for key, size in plain.items() if size % 3 == 0 and _is_sensor(key)}
+        sizes = [triples.get(key, len(value)) for key, value in arrays.items()]
+        rows = max(sizes, key=lambda size: (sizes.count(size), -size), default=0)
         columns: dict[str, list[Any]] = {}
         for key, value in arrays.items():
-            if len(value) == 3 * rows and rows and not isinstance(value[0], dict | list):
+            if len(value) == 3 * rows and rows and key in plain:
                 columns |= {f"{key}[{k}::3]": value[k::3] for k in range(3)}
             elif not rows or len(value) == rows:
                 flat = [_numbers_of(item, key) for item in value]
@@ -307,6 +314,21 @@ def _table_of_json(data: bytes, name: str) -> _Table:
     if not records or not records[0]:
         raise GuessError(f"{name}: no records of numbers, and no arrays of them by key")
     return table_of_records(records)
+
+
+def _arrays_of(document: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, list[Any]]]:
+    """Yield the arrays in an object of JSON, and in those within it, by name; those of text are none of readings."""
+    for key, value in document.items():
+        if isinstance(value, dict):
+            yield from _arrays_of(value, f"{before}{key}.")
+        elif isinstance(value, list) and value and (isinstance(value[0], dict | list) or _is_json_number(value[0])):
+            yield f"{before}{key}", value
+
+
+def _is_sensor(key: str) -> bool:
+    """Return whether a key names a sensor and no axis of it."""
+    title = read_title(key)
+    return title.axis is None and any(word.startswith(("acc", "gyr", "mag")) for word in title.stem)
 
 
 def _numbers_of(value: Any, name: str) -> dict[str, float]:
@@ -490,7 +512,13 @@ def _sensors(
     if not sensors:
         unknown = next((t.text for t in titles if t.sensor not in ("time", "counter")), table.titles[0])
         bare = all(any(not t.stem and t.axis == axis for t in titles) for axis in range(3))
-        hint = "; --unit accel=m/s^2 says what x, y and z are" if bare else ""
+        hint = "; --unit accel=m/s^2 says what x, y and z are" if bare else _BY_HAND
+        linear = next((t.text for t in titles if t.axis is not None and _NO_GRAVITY.intersection(t.stem)), "")
+        if linear:
+            raise GuessError(
+                f"{name}: {quoted(linear)} has no gravity in it, by which accelerometers are calibrated; expected the "
+                "sensor's acceleration with gravity, which the program that wrote the file exports too"
+            )
         raise GuessError(
             f"{name}: no titles of three axes that are known; not known: {quoted(unknown)}{hint}",
             "--unit accel=m/s^2" if bare else "",

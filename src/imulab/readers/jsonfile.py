@@ -28,6 +28,10 @@ LARGEST = 20_000_000
 _LISTED = 20  # keys that a message lists
 
 
+class KeysError(ReadError):
+    """A JSON file of which no layout says which key is what."""
+
+
 class _Literal(str):
     """NaN, Infinity or -Infinity, which some programs write and JSON does not have."""
 
@@ -53,7 +57,7 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
             raise ReadError(f"{name}: expected a recording, found JSON (a calibration record?)")
         if layout is None:
             keys = _listed(_names(document))
-            raise ReadError(
+            raise KeysError(
                 f"{name}: not a calibration record; of a recording --layout says which key is what; found {keys}"
             )
     except RecursionError:

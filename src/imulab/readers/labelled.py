@@ -1,7 +1,8 @@
 """Labelled text: ``Acceleration X: -2.76, Y: -7.99, Z: -5.00 m/s^2``, ``t:0,aX:0.1``, ``ax=0.1 ay=0.2``.
 
-Each number has its name before it. A bare axis behind another takes the words of the one before (``Acceleration Y``).
-A row holds what a layout takes, from one line or from several; it is whole when all of it is there.
+Each number has its name before it, or the three of a sensor one name (``Accel: 0.1, 0.2, 9.8`` are ``Accel x`` ..).
+A bare axis behind another takes the words of the one before (``Acceleration Y``). A row holds what a layout takes, from
+one line or from several; it is whole when all of it is there.
 """
 
 from __future__ import annotations
@@ -10,24 +11,37 @@ import re
 from collections.abc import Iterator, Sequence
 
 from imulab.errors import ReadError, several
-from imulab.readers.titles import known_unit
+from imulab.readers.titles import known_unit, read_title
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _PAIR = re.compile(
     rf"([A-Za-zµμ°_][^:=,;\t]*?)\s*[:=]\s*({_NUMBER}|nan)(?![\w:.])[ \t]*([^\s,;:=\d+-][^\s,;:=]*(?![^,;\n]*[:=]))?"
 )
+_BETWEEN = r"[ \t]*[,;\t ][ \t]*"
+_TWO_MORE = re.compile(rf"{_BETWEEN}({_NUMBER}){_BETWEEN}({_NUMBER})(?![\w:=.])(?![ \t]*[,;]?[ \t]*[-+.\d])")
 _AXES = ("x", "y", "z")
 
 
 def pairs(line: str) -> Iterator[tuple[str, str, str]]:
     """Yield label, number, and the unit behind it or nothing, of each labelled number in a line."""
     before = ""
-    for label, number, unit in _PAIR.findall(line):
+    for match in _PAIR.finditer(line):
+        label, number, unit = match.groups()
         label = " ".join(label.split())
+        if (others := _TWO_MORE.match(line, match.end(2))) and _is_sensor(label):
+            for axis, each in zip(_AXES, (number, *others.groups()), strict=True):
+                yield f"{label} {axis}", each, ""
+            before = ""
+            continue
         if label.lower() in _AXES and before[-1:].lower() in _AXES and len(before) > 1:
             label = before[:-1] + label
         before = label
         yield label, number, known_unit(unit) if unit else ""
+
+
+def _is_sensor(label: str) -> bool:
+    """Return whether three numbers behind a label are those of its axes: ``Accel: 0.1, 0.2, 9.8``."""
+    return read_title(label).axis is None and read_title(f"{label} x").sensor in ("accel", "gyro", "mag")
 
 
 class LabelledLines:

@@ -25,6 +25,7 @@ import imulab.readers._text as _text
 from imulab.columns import kind_of, measured, parse_column_title
 from imulab.display import Note
 from imulab.errors import ReadError, several
+from imulab.readers.formats import packed_by
 from imulab.readers.labelled import LabelledLines
 from imulab.readers.layout import BackwardsError, Readings
 from imulab.readers.opened import HEAD, opened, unit_row
@@ -130,6 +131,8 @@ class Lines:
             self._read_more()
         if not self._rest.strip():
             raise ReadError(f"{name}: the file is empty")
+        if packer := packed_by(self._rest):
+            raise ReadError(f"{name}: expected text, found what {packer} packed: unpack it first")
         if b"\0" in self._rest[:4096]:
             wide = " (UTF-16? expected UTF-8)" if self._rest.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else ""
             raise ReadError(f"{name}: expected text, found binary data{wide}")

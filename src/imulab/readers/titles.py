@@ -86,7 +86,8 @@ _CLOCKS = {
         "ticks",
         "tow",
     ),
-    *("realtime", "clock", "uptime", "datetime", "date", "sampletimefine", "epoch", "unix"),
+    *("realtime", "clock", "uptime", "datetime", "date", "sampletimefine", "epoch", "unix", "ts"),
+    *("zeit", "uhrzeit", "zeitstempel", "temps", "tiempo", "tempo"),
 }
 _COUNTERS = {"counter", "packet", "index", "sample", "frame", "seq", "sequence", "row"}
 _ENDINGS = {
@@ -305,7 +306,7 @@ def _sensor(words: list[str], axis: int | None, unit: str, increment: bool) -> s
     if axis is None:
         if unit in ("degC", "K") or (words == ["t"] and unit == "deg"):
             return "temperature"
-        if _CLOCKS.intersection(words) or (not words and unit in ("s", "ms", "us", "ns")):
+        if _CLOCKS.intersection(words) or unit in ("s", "ms", "us", "ns"):
             return "time"
         return "counter" if _COUNTERS.intersection(words) else ""
     quantity = parse_unit(unit).quantity if unit else ""
