@@ -16,7 +16,6 @@ from timing import measured, seconds
 
 import imulab as il
 from imulab.device.unit import array_stream
-from imulab.estimation.noise_coefficients import allan_deviation
 from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
 from imulab.recording import Recording
 
@@ -151,7 +150,7 @@ def _noise() -> list[tuple[str, str, str]]:
     found: dict[str, np.ndarray] = {}
 
     def ours() -> None:
-        found["ours"] = allan_deviation(samples, 100.0).deviation
+        found["ours"] = il.allan_deviation(samples, 100.0).deviation
 
     def theirs() -> None:
         found["theirs"] = allantools.oadev(samples, rate=100.0, data_type="freq", taus="octave")[1]
@@ -162,7 +161,7 @@ def _noise() -> list[tuple[str, str, str]]:
     peaks = [
         measured("-c", noise + call)[1]
         for call in (
-            "from imulab.estimation.noise_coefficients import allan_deviation; allan_deviation(z, 100.0)",
+            "import imulab as il; il.allan_deviation(z, 100.0)",
             "import allantools; allantools.oadev(z, rate=100.0, data_type='freq', taus='octave')",
         )
     ]

@@ -37,6 +37,7 @@ from imulab.units import from_si, parse_unit, si_unit
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 """How far the zero of a sensor at rest may drift, SI, and the unit in which messages state it."""
 _NOISE_REACH = 20.0  # standard uncertainties of a mean: means farther apart show a motion, not noise
+_SAMPLES = "samples"  # the name of samples without a column
 _LARGEST = 1e140  # beyond it, or below its inverse, squares overflow or vanish in double precision
 _MOST_NAMED, _MOST_COLUMNS = 3, 6  # lines of a column, and columns with lines, that a note names
 # Fewest samples for noise coefficients; fewest degrees of freedom of an Allan deviation that counts
@@ -157,10 +158,8 @@ def curves_and_noise(
     return recording, rate, noises, [*notes, *more]
 
 
-def samples_noise(samples: Array, rate: float, taus: str | Array) -> tuple[ColumnNoise, list[str]]:
-    """Return the noise of samples of an unknown sensor, shape (n,), n >= 50, at a rate, Hz, and notes.
-
-    Up to 1 % of them may be no numbers and are bridged; all others stay as they are.
+def bridged_samples(samples: Array, rate: float) -> tuple[Array, list[str]]:
+    """Return samples of an unknown sensor, shape (n,), of which up to 1 % are no numbers and are bridged, and notes.
 
     Raises
     ------
@@ -169,11 +168,16 @@ def samples_noise(samples: Array, rate: float, taus: str | Array) -> tuple[Colum
     """
     if not 1 / _LARGEST < rate < _LARGEST:
         raise OptionError(f"sampling rate {rate:g}: expected a positive number of Hz, such as sensors have")
-    name = "samples"
-    recording, notes = bridged(Recording({name: samples}, {name: "1"}, name=name), [name])
-    _check_squares(recording, [name])
-    noises, more = _noises(recording, rate, [], [name], taus)
-    return noises[name], [*notes, *more]
+    recording, notes = bridged(Recording({_SAMPLES: samples}, {_SAMPLES: "1"}, name=_SAMPLES), [_SAMPLES])
+    _check_squares(recording, [_SAMPLES])
+    return recording.columns[_SAMPLES], notes
+
+
+def samples_noise(samples: Array, rate: float) -> tuple[ColumnNoise, list[str]]:
+    """Return the noise of samples of an unknown sensor, shape (n,), n >= 50, at a rate, Hz, and notes."""
+    recording = Recording({_SAMPLES: samples}, {_SAMPLES: "1"}, name=_SAMPLES)
+    noises, notes = _noises(recording, rate, [], [_SAMPLES], "octave")
+    return noises[_SAMPLES], notes
 
 
 def _noises(

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property, partial
 from os import PathLike
-from typing import Annotated, Any, ClassVar, Unpack
+from typing import Annotated, Any, ClassVar, TypeAlias, Unpack
 
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
 from imulab.estimation import TAUS, noise_coefficients
-from imulab.estimation.column_noise import FEWEST, curves_and_noise, noise_columns, samples_noise
+from imulab.estimation.column_noise import FEWEST, bridged_samples, curves_and_noise, noise_columns, samples_noise
 from imulab.estimation.noise_coefficients import NoiseCoefficients, coefficients_dict
 from imulab.estimation.sampling import sampling_rate
 from imulab.frames import is_frame, unmasked
@@ -21,6 +22,12 @@ from imulab.quantities import span
 from imulab.recording import Array, Data, Part, Recording, Window, check_finite, is_large, on_disk
 from imulab.report.traces import Exhibits, Figure, ReportTable, format_uncertain
 from imulab.units import si_unit
+
+Noise: TypeAlias = tuple[NoiseCoefficients | None, tuple[str, ...]]
+
+
+def _no_noise() -> Noise:
+    return None, ()
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,19 +44,30 @@ class AllanCurve(Drawn, noise_coefficients.DeviationCurve):
         Equivalent degrees of freedom, shape (t,).
     name, unit
         Name and unit of the samples.
-    coefficients
-        Noise coefficients of a sensor's column, as ``imulab allan`` prints them, or of samples without a column; None
-        of other columns, and of fewer than 50 samples.
-    notes
-        Notes on the column and its rows, a sentence each.
     """
 
     name: str = "samples"
     unit: str = "1"
-    coefficients: NoiseCoefficients | None = None
-    notes: tuple[str, ...] = ()
+    _analyse: Callable[[], Noise] = _no_noise
 
     subject: ClassVar[str] = "Allan deviation"
+
+    @cached_property
+    def _noise(self) -> Noise:
+        return self._analyse()
+
+    @property
+    def coefficients(self) -> NoiseCoefficients | None:
+        """Noise coefficients of a sensor's column, as ``imulab allan`` prints them, or of samples without a column.
+
+        Those of samples are estimated on first use. Other columns, and fewer than 50 samples, have none.
+        """
+        return self._noise[0]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on the column, its rows and its coefficients, a sentence each."""
+        return self._noise[1]
 
     __repr__ = noise_coefficients.DeviationCurve.__repr__
 
@@ -162,7 +180,8 @@ def allan_deviation(
     if chosen in noise_columns(recording) and len(recording) >= FEWEST:
         _, _, noises, notes = curves_and_noise(recording, [chosen], taus)
         its = noises[chosen]
-        return AllanCurve(**vars(its.curve), name=chosen, unit=unit, coefficients=its.coefficients, notes=tuple(notes))
+        known = its.coefficients, tuple(notes)
+        return AllanCurve(**vars(its.curve), name=chosen, unit=unit, _analyse=lambda: known)
     check_finite(recording, [chosen])
     curve = noise_coefficients.allan_deviation(recording.si(chosen), sampling_rate(recording)[0], taus)
     return AllanCurve(**vars(curve), name=chosen, unit=unit)
@@ -171,8 +190,14 @@ def allan_deviation(
 def _samples_curve(samples: Array, rate: float, taus: str | Array) -> AllanCurve:
     if len(samples) < FEWEST:
         return AllanCurve(**vars(noise_coefficients.allan_deviation(samples, rate, taus)))
-    noise, notes = samples_noise(samples, rate, taus)
-    return AllanCurve(**vars(noise.curve), coefficients=noise.coefficients, notes=tuple(notes))
+    readings, notes = bridged_samples(samples, rate)
+    curve = noise_coefficients.allan_deviation(readings, rate, taus)
+    return AllanCurve(**vars(curve), _analyse=partial(_noise_of_samples, readings, rate, tuple(notes)))
+
+
+def _noise_of_samples(samples: Array, rate: float, notes: tuple[str, ...]) -> Noise:
+    noise, more = samples_noise(samples, rate)
+    return noise.coefficients, (*notes, *more)
 
 
 def _is_line(data: object) -> bool:
