@@ -266,16 +266,14 @@ def step_coefficients(many: int, place: float, count: int) -> Array:
 
 def _largest_step(c: Array, variances: Array, count: int) -> tuple[float, float, float]:
     """Return place, size and uncertainty of the step with the largest z, with all places tried by two transforms."""
-    from scipy.fft import dst
-
     # The spacing of places is that of the highest coefficient, but no finer than the samples.
     grid = len(c) + 1 if len(c) + 1 >= count else 1 << (len(c)).bit_length()
     grid = min(grid, count)
     used = c[: grid - 1]
     s = 2 * np.sin(np.pi * np.arange(1, len(used) + 1) / (2 * count))
-    padded = np.zeros(grid - 1)
-    padded[: len(used)] = used / variances[: len(used)] / s
-    score = -np.sqrt(2 / count) * dst(padded, type=1) / 2
+    padded = np.zeros(2 * grid)
+    padded[1 : 1 + len(used)] = used / variances[: len(used)] / s
+    score = np.sqrt(2 / count) * np.fft.rfft(padded).imag[1:grid]  # minus the sums of sines
     weight = 1 / variances[: len(used)] / s**2
     information = (weight.sum() - _cosines(weight, grid)) / count
     z = np.abs(score) / np.sqrt(np.maximum(information, 1e-300))
