@@ -233,14 +233,16 @@ class _Beside(Struct, frozen=True):
     def _blend(self, tau: float) -> Blend:
         """Blend the orders where q is normal about 0: a step of generalised least squares from each fit."""
         size, count = self.rows.shape[1] - 3, len(self.rows)
-        white = np.eye(count)
-        if tau:
-            left, values, _ = np.linalg.svd(tau * self.rows[:, size:], full_matrices=False)
-            white = white - (left * (1 - 1 / np.sqrt(1 + values**2))) @ left.T
+        left, values, _ = np.linalg.svd(tau * self.rows[:, size:], full_matrices=False)
+        shrunk = left * (1 - 1 / np.sqrt(1 + values**2))
+
+        def whitened(columns: Array) -> Array:
+            return np.asarray(columns - shrunk @ (left.T @ columns))
+
         theta, matrices, costs = np.zeros((len(self.fits), size)), np.zeros((len(self.fits), size, size)), []
         for row, (parameters, residuals) in enumerate(self.fits):
             p = len(parameters)
-            columns, missed = white @ self.rows[:, :p], white @ residuals
+            columns, missed = whitened(self.rows[:, :p]), whitened(residuals)
             matrix = covariance(columns[None], np.ones((1, count)))[0]
             change = -matrix @ (columns.T @ missed) if tau else np.zeros(p)
             theta[row, :p], matrices[row, :p, :p] = parameters + change, matrix
