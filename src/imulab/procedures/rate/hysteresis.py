@@ -111,24 +111,17 @@ def _average_models(
     """
     usual = float(np.trace(noise))
     most = max(100.0, 3 * float(values @ values) / usual)
-    steps = np.geomspace(_LEAST, most, number)
-    ladder = [(0.0, np.log(_NONE)), *((step, np.log((1 - _NONE) / len(steps))) for step in steps.tolist())]
-    rows = []
-    for combination in product(ladder, repeat=3):
-        covariance, chance = noise, 0.0
-        for (size, log_chance), part in zip(combination, parts, strict=True):
-            covariance = covariance + size * usual / max(float(np.trace(part)), 1e-300) * part
-            chance += log_chance
-        rows += [
-            (value, u, log_likelihood + chance) for value, u, log_likelihood in _fit_each(covariance, shapes, values)
-        ]
-    table = np.array(rows)
-    weight = np.exp(table[:, 2] - table[:, 2].max())
+    ladder = np.append(0.0, np.geomspace(_LEAST, most, number))
+    before = np.log(np.append(_NONE, np.full(number, (1 - _NONE) / number)))
+    places = np.array(list(product(range(number + 1), repeat=3)))
+    scaled = np.array([usual / max(float(np.trace(part)), 1e-300) * part for part in parts])
+    value, u, likelihood = _fit_each(noise + np.tensordot(ladder[places], scaled, 1), shapes, values)
+    logs = likelihood + before[places].sum(axis=1)[:, None]
+    weight = np.exp(logs - logs.max())
     weight /= weight.sum()
-    mean = float(weight @ table[:, 0])
-    u = float(np.sqrt(weight @ (table[:, 1] ** 2 + (table[:, 0] - mean) ** 2)))
-    tails = np.array([normal_cdf(-abs(value) / spread) for value, spread, _ in rows])
-    return mean, u, 2 * float(weight @ tails)
+    mean = float((weight * value).sum())
+    spread = float(np.sqrt((weight * (u**2 + (value - mean) ** 2)).sum()))
+    return mean, spread, 2 * float((weight * normal_cdf(-np.abs(value) / u)).sum())
 
 
 def _null_space(rows: Array) -> Array:
@@ -138,15 +131,19 @@ def _null_space(rows: Array) -> Array:
     return np.asarray(turn[rank:].T)
 
 
-def _fit_each(covariance: Array, shapes: Array, values: Array) -> list[tuple[float, float, float]]:
-    """Return the coefficient of each shape alone, its standard uncertainty, and the log restricted likelihood."""
-    lower = np.linalg.cholesky(covariance)
+def _fit_each(covariances: Array, shapes: Array, values: Array) -> tuple[Array, Array, Array]:
+    """Return the coefficient of each shape alone, its standard uncertainty, and the log restricted likelihood.
+
+    For m covariances, shape (m, n, n), and three shapes, shape (n, 3): three arrays of shape (m, 3).
+    """
+    lower = np.linalg.cholesky(covariances)
     white = np.linalg.solve(lower, np.column_stack([shapes, values]))
-    square = np.sum(white[:, :-1] ** 2, axis=0)
-    value = white[:, -1] @ white[:, :-1] / square
-    left = float(white[:, -1] @ white[:, -1]) - value**2 * square
-    likelihood = -float(np.log(np.diag(lower)).sum()) - np.log(square) / 2 - left / 2
-    return list(zip(value.tolist(), (1 / np.sqrt(square)).tolist(), likelihood.tolist(), strict=True))
+    columns, output = white[:, :, :-1], white[:, :, -1]
+    square = np.sum(columns**2, axis=1)
+    value = np.einsum("mn,mns->ms", output, columns) / square
+    left = np.sum(output**2, axis=1)[:, None] - value**2 * square
+    roots = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
+    return value, 1 / np.sqrt(square), -roots[:, None] - np.log(square) / 2 - left / 2
 
 
 def test_visits(
