@@ -356,3 +356,18 @@ def test_parquet_of_repeated_values_has_a_budget(tmp_path):
 def test_a_record_without_end_is_refused():
     with pytest.raises(RecordError, match="/dev/zero: more than 256 MiB; expected a record"):
         il.load("/dev/zero")
+
+
+@pytest.mark.parametrize(("torn", "state"), [(1, "good"), (12, "look")])
+def test_a_torn_line_among_thousands_does_not_lower_the_verdict(imulab, tmp_path, torn, state):
+    recording = il.simulate_tumble(order=1, gravity=9.81, attitudes=24, hold=2.0, gyro=False, seed=5)
+    il.write_csv(recording, tmp_path / "r.csv")
+    lines = (tmp_path / "r.csv").read_text().splitlines(keepends=True)
+    for place in range(1000, 1000 + 50 * torn, 50):
+        lines[place] = lines[place][:20] + lines[place + 1]
+    (tmp_path / "r.csv").write_text("".join(lines))
+    fit = ("tumble", "fit", "r.csv", "--order", "1", "--gravity", "9.81+-0", "-o", "r.json")
+    refused = imulab(*fit)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert refused.stderr.endswith("; --damaged skip passes over such lines and counts them\n")
+    assert imulab(*fit, "--damaged", "skip").stdout.startswith(f"{state}: ")

@@ -219,3 +219,20 @@ def test_text_whose_lines_begin_with_a_bracket_is_still_text(file):
 def test_an_empty_file_is_refused(file):
     with pytest.raises(ReadError, match=r"log\.json: "):
         read(file(b""), layout())
+
+
+def test_torn_lines_of_records_are_left_out_where_asked(imulab, tmp_path):
+    lines = [json.dumps({"t": k / 100, "acc": {"x": k, "y": 0.0, "z": 1.0}}) for k in range(300)]
+    lines[100], lines[-1] = lines[100][:15] + lines[101], lines[-1][:20]
+    (tmp_path / "f.jsonl").write_text("\n".join(lines))
+    axes = "".join(f'accel_{axis} = {{ from = "acc.{axis}", unit = "g" }}\n' for axis in "xyz")
+    (tmp_path / "l.toml").write_text(f'[columns]\ntime = {{ from = "t", unit = "s" }}\n{axes}')
+    done = imulab("show", "f.jsonl", "--layout", "l.toml")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert done.stderr.endswith("; --damaged skip passes over such lines and counts them\n")
+    found = read(tmp_path / "f.jsonl", tmp_path / "l.toml", damaged="skip", name="f.jsonl")
+    np.testing.assert_array_equal(found.column("accel_x"), np.delete(np.arange(299), 100))
+    assert found.notes[0].startswith("2 damaged lines are left out; the first: line 101, column ")
+    (tmp_path / "f.jsonl").write_text("\n".join(line[:20] if k % 9 == 4 else line for k, line in enumerate(lines)))
+    with pytest.raises(ReadError, match="not JSON"):
+        read(tmp_path / "f.jsonl", tmp_path / "l.toml", damaged="skip")

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imulab.arguments import checked, described
 from imulab.columns import check_unit, clocks_of, element_number, expected_quantities, kind_of, triad
-from imulab.display import has_hidden, printable, reverses
+from imulab.display import Note, has_hidden, printable, reverses
 from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.options import PROGRAM, READING, choice, file, parsed, text
@@ -472,9 +472,11 @@ def check_finite(recording: Recording, names: list[str]) -> None:
             count = int(np.size(finite) - np.count_nonzero(finite))
             more = f" (and {count - 1} more)" if count > 1 else ""
             expected = "a finite number" if not np.isfinite(values[index]) else f"a number of at most {LARGEST:g}"
+            timed = count > 1 and "time" in recording and name != "time"
+            advice = "; --window reads a part without them" if timed else ""
             raise DataError(
                 f"{recording.name}: {recording.place(index)}, column {name}: "
-                f"expected {expected}, found {values[index]}{more}"
+                f"expected {expected}, found {values[index]}{more}{advice}"
             )
 
 
@@ -798,7 +800,7 @@ class Layout:
         """Return a note on how many rows were skipped by ``skip_incomplete``."""
         what, lack = ("rows were", "lack") if count > 1 else ("row was", "lacks")
         columns, far = " ".join(self.columns), " so far" if so_far else ""
-        return f"{count} {what}{far} skipped that {lack} a reading of {columns} (skip_incomplete in {self.name})"
+        return Note(f"{count} {what}{far} skipped that {lack} a reading of {columns} (skip_incomplete in {self.name})")
 
 
 DAMAGED = ("refuse", "skip")

@@ -344,7 +344,8 @@ def _family(module: str, *, by_layout: bool) -> Callable[..., Iterator[Recording
         if by_layout:
             selection.refuse(name, "such a file")
             stated = [selection.units] if module == "parquet" else []
-            yield from reader.blocks(path, name, layout, *stated)
+            skip = {"skip_damaged": selection.damaged == "skip"} if module == "jsonfile" else {}
+            yield from reader.blocks(path, name, layout, *stated, **skip)
         else:
             yield from reader.blocks(path, name, selection)
 

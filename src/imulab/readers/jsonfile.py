@@ -19,7 +19,7 @@ from imulab.display import Note
 from imulab.errors import ReadError, meant
 from imulab.files import open_file
 from imulab.readers.arrays import FLAT, origins, recordings
-from imulab.readers.text import EITHER_ORDER, date_flags
+from imulab.readers.text import EITHER_ORDER, are_torn, date_flags, of_few
 from imulab.recording import Array, Layout, Recording
 from imulab.records.calibration import FORMAT
 
@@ -36,8 +36,8 @@ class _Literal(str):
     """NaN, Infinity or -Infinity, which some programs write and JSON does not have."""
 
 
-def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
-    """Yield the columns that a layout names; the file is held in memory.
+def blocks(path: Path, name: str, layout: Layout | None, *, skip_damaged: bool = False) -> Iterator[Recording]:
+    """Yield the columns that a layout names; the file is held in memory. Torn lines of records may be left out.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
         )
     try:
         with open_file(path) as stream:
-            document = parsed_document(stream.read(), name)
+            document, torn = _document(stream.read(), name, skip_damaged=skip_damaged)
         if isinstance(document, dict) and document.get("format") == FORMAT:
             raise ReadError(f"{name}: expected a recording, found JSON (a calibration record?)")
         if layout is None:
@@ -71,7 +71,34 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
         else:
             numbers = _values(document, flat[1], None, where, layout.skip_incomplete)
             values[column] = _every(numbers, int(flat[2]), int(flat[3]), where)
-    yield from _blocks(values, layout, name)
+    for block in _blocks(values, layout, name):
+        yield replace(block, notes=(*block.notes, *torn)) if torn else block
+
+
+def _document(data: bytes, name: str, *, skip_damaged: bool) -> tuple[Any, list[str]]:
+    """Return what a file holds, and a note on torn lines of records that are left out."""
+    try:
+        return parsed_document(data, name), []
+    except ReadError as error:
+        lines = [line for line in data.decode("utf-8-sig", "replace").splitlines() if line.strip()]
+        if sum(line.startswith("{") for line in lines) < 2:
+            raise
+        if not skip_damaged:
+            raise ReadError(f"{error}; --damaged skip passes over such lines and counts them") from None
+        records = [record for line in lines if (record := _record(line)) is not None]
+        torn = len(lines) - len(records)
+        if not are_torn(torn, len(records)):
+            raise
+        left_out = f"{torn} damaged line{'s are' if torn > 1 else ' is'} left out; the first: "
+        return records, [of_few(left_out + str(error).removeprefix(f"{name}: "), torn, len(records))]
+
+
+def _record(line: str) -> dict[str, Any] | None:
+    try:
+        record = _parsed(line.rstrip().rstrip(","))
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) else None
 
 
 def parsed_document(data: bytes, name: str) -> Any:

@@ -23,7 +23,7 @@ from msgspec import Struct
 
 import imulab.readers._text as _text
 from imulab.columns import kind_of, measured, parse_column_title
-from imulab.display import Note
+from imulab.display import Finding, Note
 from imulab.errors import ReadError, several
 from imulab.readers.formats import packed_by
 from imulab.readers.labelled import LabelledLines
@@ -296,7 +296,7 @@ def without_stray_times(blocks: Iterable[Recording], name: str) -> Iterator[Reco
             kept = {key: values[~stray] for key, values in block.columns.items()}
             block = replace(block, columns=kept, lines_before=None)
         rows += len(block)
-        if count > max(_FEW_DAMAGED, _MOST_DAMAGED * rows):
+        if not are_torn(count, rows):
             raise ReadError(f"{name}: the times of {count} rows are off, the first at {first}: these are no torn lines")
         if time is not None and len(block):
             last = float(time[~stray][-1])
@@ -305,8 +305,18 @@ def without_stray_times(blocks: Iterable[Recording], name: str) -> Iterator[Reco
         held = block
     if held is not None:
         many = "1 row whose time is" if count == 1 else f"{count} rows whose times are"
-        note = (f"{many} off alone left out; the first: {first}",) if count else ()
+        note = (of_few(f"{many} off alone left out; the first: {first}", count, rows),) if count else ()
         yield replace(held, notes=(*held.notes, *note))
+
+
+def are_torn(count: int, rows: int) -> bool:
+    """Return whether so many damaged lines among so many rows are torn ones, which may be left out."""
+    return count <= max(_FEW_DAMAGED, _MOST_DAMAGED * rows)
+
+
+def of_few(text: str, count: int, rows: int) -> str:
+    """Return a note on damaged lines where they are few, else a finding that asks for another recording."""
+    return Note(text) if count == 1 or count < _FEW * rows else Finding(text, "record again without torn lines")
 
 
 def _stray(time: Array, last: float) -> np.ndarray:
@@ -351,6 +361,7 @@ _ARROW = re.compile(rb"^[ \t]*(\d?\d:\d\d:\d\d(?:[.:]\d+)?) -> ?", re.M)
 """What a serial monitor puts before each line."""
 _DATE_ELSEWHERE = re.compile(r'"?\d\d?[./-]\d\d?[./-]\d{4}\b')
 _FEW_DAMAGED, _MOST_DAMAGED = 20, 0.02  # lines, and share of lines, that may be left out as damaged
+_FEW = 0.001  # share of lines below which those that are left out are only noted
 _MOST_ABOVE = 100  # lines above the titles
 _BEFORE_BLANK = re.compile(rb",(?=[ \t\r\n])|,$")
 _UNENDED = Note("the last line has no line end: if the file was cut there, its last number is short")
@@ -471,7 +482,7 @@ class TextFile:
                         if live and error.index:
                             yield self._finish(job.out[:, : error.index], row)
                         raise
-                    if (live or (lines is None and not waiting)) and (notes := self._notes()):
+                    if (live or (lines is None and not waiting)) and (notes := self._notes(row + rows)):
                         recording = replace(recording, notes=(*recording.notes, *notes))
                     if self._lines.zeros and lines is None and not waiting:
                         recording = replace(recording, notes=(*recording.notes, self._zeros()))
@@ -748,17 +759,19 @@ class TextFile:
             self._refuse(job, row, line, problem, field)
         except ReadError as error:
             self._first_damage = self._first_damage or str(error).removeprefix(f"{self._name}: ")
-        if self._damaged > max(_FEW_DAMAGED, _MOST_DAMAGED * good):
+        if not are_torn(self._damaged, good):
             raise ReadError(
                 f"{self._name}: {self._damaged} lines of the first {good + self._damaged} cannot be read, which are no "
                 f"torn lines; the first: {self._first_damage}"
             )
 
-    def _notes(self) -> list[str]:
-        """Return notes on what was passed over."""
+    def _notes(self, rows: int) -> list[str]:
+        """Return notes on what was passed over in a file of so many rows."""
         lines = "line is" if self._damaged == 1 else "lines are"
         notes = [self._skipped()] if self._labels and self._incomplete else []
-        notes += [f"{self._damaged} damaged {lines} left out; the first: {self._first_damage}"] if self._damaged else []
+        if self._damaged:
+            damage = f"{self._damaged} damaged {lines} left out; the first: {self._first_damage}"
+            notes.append(of_few(damage, self._damaged, rows))
         return notes + [
             f"column {name} holds text from row {row} on, which is no reading (nan)"
             for name, row in self._texts.items()
