@@ -49,7 +49,7 @@ def session(browser: Browser, folder: Path) -> None:
     ) as page:
         page.locator(".sphere .held").nth(3).wait_for(state="attached")
         page.wait_for_selector(".now[data-state='moving']")
-        picture("live", 690)
+        picture("live", 960)
         page.wait_for_selector(".said.bad:has-text('Attitude 5')")
         picture("live_knocked", 400)
         page.locator(".said.bad button").click()

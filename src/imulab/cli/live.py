@@ -222,19 +222,18 @@ def live(
     session = Session(values["order"], values["gravity"], read_targets(target), planned)
     check_outputs([save, output, report], [name for name in (_source_name(source), layout) if name])
     fitted = {**options, "layout": None}
-    known = _layout(layout)
     opened = partial(open_source, source, layout, units=units, follow=follow)
-    runner = Runner.open(opened, session, save, known, resume=resume, units=units)
+    runner = Runner.open(opened, session, save, _layout(layout), resume=resume, units=units)
     made = partial(_make_record, save, fitted, output, report)
-    plain = plain or not sys.stdout.isatty()
     with _offer_layout(), closing(runner):
         try:
             if listened is not None:
-                command_again = partial(again, save, fitted, output)
-                outputs, place = (output, report), partial(_gravity_of_place, fitted)
-                on_page(runner, made, command_again, outputs, place, port=listened, host=host, browser=not no_browser)
+                command, place = partial(again, save, fitted, output), partial(_gravity_of_place, fitted)
+                on_page(
+                    runner, made, command, (output, report), place, port=listened, host=host, browser=not no_browser
+                )
             else:
-                _in_terminal(runner, made, plain=plain, typed=source != "-")
+                _in_terminal(runner, made, plain=plain or not sys.stdout.isatty(), typed=source != "-")
         except KeyboardInterrupt:
             note(runner.kept())
             raise

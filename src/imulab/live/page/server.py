@@ -494,15 +494,9 @@ def serve(
     listening = _listen(port, host or LOCAL)
     app = application(new_token(), parts, host=host or LOCAL, limit=limit)
     config = uvicorn.Config(
-        app,
-        log_level="critical",
-        access_log=False,
-        http=Patient,
-        ws="websockets-sansio",
-        ws_max_size=_SOCKET_LIMIT,
-        timeout_graceful_shutdown=_GRACE,
-        server_header=False,
-    )
+        app, log_level="critical", access_log=False, http=Patient, ws="websockets-sansio", ws_max_size=_SOCKET_LIMIT,
+        timeout_graceful_shutdown=_GRACE, server_header=False,
+    )  # fmt: skip
     server = uvicorn.Server(config)
 
     def stop() -> None:
