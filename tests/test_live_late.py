@@ -161,7 +161,7 @@ def test_a_late_stream_in_a_full_screen_terminal(tmp_path):
     with late_unit("tcp", lines_of(tumble("g", attitudes=14)), 1600) as (words, begin, _):
         screen = Screen([words, *WORDS], tmp_path)
         try:
-            assert screen.until("waiting for samples"), screen.text
+            assert screen.until("waiting for samples"), screen.text[-2000:]
             begin()
             assert screen.until("enough: ", 40), screen.text
             assert "is its unit" not in screen.text
@@ -184,7 +184,7 @@ def test_a_late_stream_on_the_page(tmp_path, new_page):
     ):
         assert process.said("http://") < float("inf"), process.text
         page = new_page(next(line for _, line in process.lines if line.startswith("http://")))
-        page.wait_for_selector(".advice:text-is('Waiting for samples.')")
+        page.wait_for_selector(".now[data-state='waiting'], .now[data-state='silent']")
         begin()
         page.wait_for_selector("figure figcaption:has-text('a quarter turn about the vertical')")
         page.get_by_role("button", name="Make the record").click()

@@ -185,7 +185,7 @@ def live(
         ),
     ],
     *,
-    save: Annotated[str | None, option("REC.csv", "Recording to write."), OUTPUT] = None,
+    save: Annotated[str | None, option("REC.csv", "Recording to write; needed."), OUTPUT] = None,
     output: OutputFile = None,
     report: ReportFile = None,
     target: Annotated[str | None, option('"bias 100 ug, .."', "Standard uncertainties at which it is enough.")] = None,
@@ -218,8 +218,7 @@ def live(
         raise OptionError("--save: expected the name of the recording to write, such as --save rec.csv")
     layout, units = options["layout"], reading({"units": options.pop("units")})["units"]
     values = TASK.values({name: text for name, text in options.items() if text is not None}, FLAG)
-    planned = _number_of_attitudes(attitudes, target)
-    session = Session(values["order"], values["gravity"], read_targets(target), planned)
+    session = Session(values["order"], values["gravity"], read_targets(target), _number_of_attitudes(attitudes, target))
     check_outputs([save, output, report], [name for name in (_source_name(source), layout) if name])
     fitted = {**options, "layout": None}
     opened = partial(open_source, source, layout, units=units, follow=follow)
@@ -229,9 +228,8 @@ def live(
         try:
             if listened is not None:
                 command, place = partial(again, save, fitted, output), partial(_gravity_of_place, fitted)
-                on_page(
-                    runner, made, command, (output, report), place, port=listened, host=host, browser=not no_browser
-                )
+                paged = partial(on_page, port=listened, host=host, browser=not no_browser)
+                paged(runner, made, command, (output, report), place)
             else:
                 _in_terminal(runner, made, plain=plain or not sys.stdout.isatty(), typed=source != "-")
         except KeyboardInterrupt:
