@@ -315,3 +315,45 @@ def test_native_titles_without_a_time_get_their_rate(imulab, tmp_path):
     assert imulab("layout", "guess", "f.csv", "--sample-rate", "20Hz", "-o", "l.toml").returncode == 0
     found = il.read(tmp_path / "f.csv", tmp_path / "l.toml")
     assert (found.units["accel_x"], found.time[-1]) == ("g", pytest.approx(19 / 20))
+
+
+@pytest.mark.parametrize(
+    ("titles", "time"),
+    [("ax,ay,az", 'from = 0, unit = "iso"'), ("millis,ax,ay,az", 'from = "millis", unit = "ms"')],
+)
+def test_the_times_of_a_serial_monitor(tmp_path, titles, time):
+    rows = [f"23:59:{50 + k // 10:02}.{k % 10}00 -> " + ("" if titles[0] == "a" else f"{100 * k},") for k in range(90)]
+    text = f"23:59:49.900 -> {titles}\n" + "".join(f"{row}0.1,{k}e-3,9.8\n" for k, row in enumerate(rows))
+    (tmp_path / "f.txt").write_text(text)
+    found = il.guess_layout(tmp_path / "f.txt")
+    assert f"time = {{ {time} }}" in found.toml
+    read = il.read(tmp_path / "f.txt", found.layout)
+    np.testing.assert_allclose(read.time, np.arange(90) / 10, atol=1e-9)
+    np.testing.assert_allclose(read.column("accel_y"), np.arange(90) * 1e-3)
+
+
+def test_a_counter_that_begins_again_is_guessed_with_its_bits(tmp_path):
+    counts = (2**32 - 1_000_000 + 20_000 * np.arange(200)) % 2**32
+    rows = "".join(f"{count},0.1,0.2,9.8\n" for count in counts)
+    (tmp_path / "f.csv").write_text(f"micros,ax,ay,az\n{rows}")
+    found = il.guess_layout(tmp_path / "f.csv")
+    assert 'time = { from = "micros", unit = "us", bits = 32 }' in found.toml
+    np.testing.assert_allclose(np.diff(il.read(tmp_path / "f.csv", found.layout).time), 0.02, atol=1e-9)
+    (tmp_path / "n.csv").write_text(f"time [us],accel_x [g],accel_y [g],accel_z [g]\n{rows}")
+    with pytest.raises(
+        il.ImulabError, match=r"found 0 us; a counter that began again at 2\^32: bits = 32 beside its unit"
+    ):
+        il.fit_tumble(tmp_path / "n.csv")
+
+
+def test_dates_that_are_not_read_are_shown_and_points_have_the_day_first(tmp_path):
+    for date, told in (("11-Dec-2024", None), ("11.12.2024", True)):
+        rows = "".join(f"{date} 08:00:{k:02}.500,0.1,0.2,9.8\n" for k in range(50))
+        (tmp_path / "f.csv").write_text(f"Timestamp,Acc X,Acc Y,Acc Z\n{rows}")
+        if told:
+            assert il.guess_layout(tmp_path / "f.csv").layout.columns["time"].day_first is True
+            continue
+        with pytest.raises(
+            ReadError, match=r"found 'Timestamp', which holds '11-Dec-2024 08:00:00.500', no number and"
+        ):
+            il.guess_layout(tmp_path / "f.csv")

@@ -485,6 +485,11 @@ EVEN_SAMPLES = "where samples are even, state sample_rate in a layout instead of
 _BACKWARDS = "--damaged skip leaves out single rows of text that are torn; a file of several runs is to be split there"
 
 
+def bits_of_wrap(last: float, first: float) -> int:
+    """Return the bits of a counter that begins again with `first` behind `last`: near 2^16, 2^24 or 2^32; else 0."""
+    return next((bits for bits in (16, 24, 32) if 0.95 * 2**bits < last < 2**bits and 0 <= first < 0.05 * 2**bits), 0)
+
+
 def check_time(recording: Recording) -> Array:
     """Check that time rises from sample to sample and return it, s, shape (n,).
 
@@ -501,7 +506,9 @@ def check_time(recording: Recording) -> Array:
         raw = recording.column("time")
         verb = "stands still" if step[index - 1] == 0 else "runs backwards"
         unit = recording.units["time"]
-        advice = EVEN_SAMPLES if step[index - 1] == 0 else _BACKWARDS
+        bits = bits_of_wrap(float(raw[index - 1]), float(raw[index]))
+        wraps = f"a counter that began again at 2^{bits}: bits = {bits} beside its unit in a layout carries it on"
+        advice = EVEN_SAMPLES if step[index - 1] == 0 else wraps if bits else _BACKWARDS
         raise DataError(
             f"{recording.name}: {recording.place(index)}, column time: time {verb}: "
             f"expected more than {raw[index - 1]:.15g} {unit}, found {raw[index]:.15g} {unit}; {advice}"

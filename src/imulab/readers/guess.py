@@ -22,6 +22,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Struct, field
+from msgspec.structs import replace
 
 from imulab.columns import KINDS, triad
 from imulab.errors import ReadError, file_name, first_of, quoted, readable
@@ -34,7 +35,7 @@ from imulab.readers.labelled import LabelledLines, pairs
 from imulab.readers.shipped import advice
 from imulab.readers.text import is_native
 from imulab.readers.titles import Title, is_number, is_units_row, read_title
-from imulab.recording import Array, Layout
+from imulab.recording import Array, Layout, bits_of_wrap
 from imulab.units import STANDARD_GRAVITY, parse_unit
 
 HEAD = 1 << 20
@@ -56,8 +57,10 @@ _TURNING = 20  # tenths of a second that may show a turn
 _AGREE = 0.9  # least correlation of the turns that rates and accelerometers show
 _TIME_OF_DAY = re.compile(r"\d?\d:\d\d:\d\d(?:\.\d+)?$")
 _DAY_AND_MONTH = re.compile(r"(\d\d?)[./-](\d\d?)[./-]\d{4} +\d?\d:\d\d")
+_ARROW = re.compile(r"[ \t]*(\d?\d:\d\d:\d\d(?:[.:]\d+)?) -> ?")
 _EITHER = "either"
 _DATES = {"day first": '"iso", day_first = true', "month first": '"iso", day_first = false'}
+_RATE = "--sample-rate HZ"
 _BY_HAND = "; a layout can be written by hand: imulab show --formats ends with an example"
 _NO_GRAVITY = {"linear", "free", "user", "without", "nog"}
 _EXAMPLES = {"accel": "m/s^2", "gyro": "deg/s", "mag": "uT"}
@@ -190,11 +193,33 @@ def guess_of_head(
     if _is_native(titles) and (sample_rate is None or "time" in titles):
         raise GuessError(f"{name}: titles with units, as imulab writes them; it needs no layout")
     try:
-        table = _labelled_table(lines) or guess_table(lines, name, prefix=prefix, encoding=encoding)
-        return layout_of_table(table, name, units=units, sample_rate=sample_rate)
+        bare, stamps = _without_arrows(lines)
+        table = _labelled_table(lines) or guess_table(bare, name, prefix=prefix, encoding=encoding)
+        try:
+            return layout_of_table(table, name, units=units, sample_rate=sample_rate)
+        except GuessError as error:
+            if not stamps or not stamps[table.above] or table.labelled or table.prefix or error.needs != _RATE:
+                raise
+            return layout_of_table(_with_stamps(table, stamps), name, units=units)
     except GuessError as error:
         known = advice(head)
         raise GuessError(f"{error}; {known}" if known else str(error), error.needs) from None
+
+
+def _without_arrows(lines: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return lines without the times that a serial monitor puts before them, and these times; none in other files."""
+    found = [_ARROW.match(line) for line in lines]
+    if sum(match is not None for match in found) <= len(lines) / 2:
+        return list(lines), []
+    bare = [line[match.end() :] if match else line for line, match in zip(lines, found, strict=True)]
+    return bare, [match[1] if match else "" for match in found]
+
+
+def _with_stamps(table: _Table, stamps: Sequence[str]) -> _Table:
+    """Return a table whose first column are a serial monitor's times, which the reader takes as the first field."""
+    rows = [[stamp, *row] for stamp, row in zip(stamps[len(stamps) - len(table.rows) :], table.rows, strict=True)]
+    units = ["", *table.units] if table.units else []
+    return replace(table, titles=["time", *table.titles], rows=rows, units=units, stamped=True)
 
 
 def _is_native(titles: str) -> bool:
@@ -216,7 +241,7 @@ def advice_on_guess(head: bytes, name: str) -> str:
 
 
 class _Table(Struct):
-    """Rows of fields below a line of titles."""
+    """Rows of fields below a line of titles; `stamped`: the first are a serial monitor's times of day."""
 
     titles: list[str]
     rows: list[list[str]]
@@ -227,6 +252,7 @@ class _Table(Struct):
     encoding: str = "utf-8"
     above: int = 0
     labelled: bool = False
+    stamped: bool = False
     others: tuple[str, ...] = ()
 
     def numbers(self, column: int) -> Array:
@@ -461,7 +487,11 @@ def _text(
     table: _Table, chosen: Sequence[tuple[str, int, str, str]], left: Sequence[str], sample_rate: float | None
 ) -> str:
     """Return the text of a layout file; columns are named by title where that names one alone."""
-    numbered = bool(table.prefix) or any(table.titles.count(table.titles[place]) > 1 for _, place, _, _ in chosen)
+    numbered = (
+        bool(table.prefix)
+        or table.stamped
+        or any(table.titles.count(table.titles[place]) > 1 for _, place, _, _ in chosen)
+    )
     lines = ["# Guessed by imulab layout guess from titles. A comment at a column says what its title does not."]
     lines += [f"# Not taken: {first_of(left, 8)}"] if left else []
     lines += [f"# Lines of other kinds: {' '.join(table.others[:8])} (--prefix NAME)"] if table.others else []
@@ -477,11 +507,19 @@ def _text(
     lines.append("[columns]")
     for column, place, unit, reason in chosen:
         title = table.titles[place].strip()
+        bits = _bits(table.numbers(place)) if column == "time" else 0
         comments = [*([_toml(title)] if numbered else []), *([reason] if reason else [])]
         comment = f"  # {'; '.join(comments)}" if comments else ""
         origin, written = _toml(place if numbered else title), _DATES.get(unit) or _toml(unit)
-        lines.append(f"{column} = {{ from = {origin}, unit = {written} }}{comment}")
+        counter = f", bits = {bits}" if bits else ""
+        lines.append(f"{column} = {{ from = {origin}, unit = {written}{counter} }}{comment}")
     return "\n".join([*lines, ""])
+
+
+def _bits(numbers: Array) -> int:
+    """Return how many bits a counter has that begins again in the rows; 0 where none does."""
+    falls = np.flatnonzero(np.diff(numbers) < 0)
+    return bits_of_wrap(float(numbers[falls[0]]), float(numbers[falls[0] + 1])) if falls.size else 0
 
 
 def _toml(value: str | int) -> str:
@@ -751,11 +789,16 @@ def _clock(
             "states it",
             "--unit time=ms",
         )
-    others = [t.text.strip() for t in titles if t.sensor == "time"]
-    found = f", found {quoted(others[0])}, which does not rise" if others else ""
+    others = [(t.text.strip(), place) for place, t in enumerate(titles) if t.sensor == "time"]
+    found = ""
+    if others:
+        text, place = others[0]
+        value = next((row[place] for row in table.rows if place < len(row)), "")
+        why = "does not rise" if _is_value(value) else f"holds {quoted(value)}, no number and no date that is read"
+        found = f", found {quoted(text)}, which {why}"
     raise GuessError(
         f"{name}: no title of a time that rises{found}; --sample-rate HZ states how many rows there are in a second",
-        "--sample-rate HZ",
+        _RATE,
     )
 
 
@@ -773,6 +816,8 @@ def _date_unit(texts: Sequence[str]) -> str:
     if len(days) < len(texts):
         return ""
     first, second = (max(int(match[k]) for match in days) for k in (1, 2))
+    if first <= 12 and second <= 12 and all("." in text[:3] for text in texts):
+        return "day first"  # as in all countries that write dates with points
     return _EITHER if first <= 12 and second <= 12 else "day first" if first > 12 else "month first"
 
 
