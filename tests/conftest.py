@@ -32,6 +32,14 @@ for flags in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL"):
     os.environ.pop(flags, None)
 
 
+# Kills, ports, terminals, full disks and bounds of memory are tried as Linux has them.
+collect_ignore = [] if sys.platform == "linux" else [
+    "test_fleet_engine.py", "test_fleet_history.py", "test_fleet_run.py", "test_front_nonsense.py",
+    "test_live_late.py", "test_live_link.py", "test_live_page_guided.py", "test_live_process.py",
+    "test_live_terminal.py", "test_live_wrong.py", "test_readers_formats.py",
+]  # fmt: skip
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--reduced", action="store_true", help="fewer trials in the statistical tests, fewer seeds in all")
 
