@@ -32,9 +32,11 @@ def page_of(browser: Browser, folder: Path, *words: str) -> Iterator[Any]:
         assert process.stdout is not None
         page = browser.new_page(viewport=SIZE)
         page.goto(process.stdout.readline().strip())
-        yield page
-        page.close()
-        process.terminate()
+        try:
+            yield page
+        finally:
+            page.close()
+            process.terminate()
 
 
 def session(browser: Browser, folder: Path) -> None:
@@ -68,6 +70,24 @@ def workbench(browser: Browser, folder: Path) -> None:
         page.locator("svg.plot").first.wait_for()
         page.wait_for_timeout(1000)  # the last curves
         page.screenshot(path=FIGURES / "workbench.png")
+        page.get_by_role("button", name="Run", exact=True).click()
+        page.locator(".found .js-plotly-plot .point").first.wait_for()
+        page.wait_for_timeout(1000)
+        page.set_viewport_size(SIZE | {"height": 760})
+        page.screenshot(path=FIGURES / "workbench_result.png")
+    rec = il.read(folder / "sn43.csv")
+    sensors = [f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz"]
+    rows = zip(1000 * rec.time, *(rec.columns[name] for name in sensors), strict=True)
+    lines = [";".join(f"{value:.7g}" for value in row) for row in rows]
+    (folder / "logger.csv").write_text("\n".join(["t;p;q;r;u;v;w", *lines]) + "\n")
+    with page_of(browser, folder, "open", "logger.csv") as page:
+        page.locator(".assistant").wait_for()
+        page.get_by_label("column 2, p: what it is").select_option("accel_x")
+        page.get_by_label("column 2, p: its unit").select_option("m/s^2")
+        page.locator("svg.plot").first.wait_for()
+        page.wait_for_timeout(1500)
+        page.set_viewport_size(SIZE | {"height": 700})
+        page.screenshot(path=FIGURES / "workbench_columns.png")
 
 
 def main() -> None:

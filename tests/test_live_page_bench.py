@@ -586,6 +586,98 @@ def test_a_command_that_says_much_is_told_of_in_few_messages(tmp_path, monkeypat
     assert len(told) < 20
 
 
+def test_the_columns_of_a_file_are_told_and_their_layout_written(bench):
+    rows = "".join(f"{10 * k},0.01,0.02,{1 + k % 3 / 100},3,4,5\n" for k in range(50))
+    bench.ask("files/u.csv", ("t_ms,ax,ay,az,p,q,r\n" + rows).encode(), "PUT")
+    told = bench.ask("columns", {"file": "session/u.csv"}).json()
+    known = [(each["column"], each["unit"]) for each in told["columns"]]
+    assert known == [("time", "ms"), ("accel_x", "g"), ("accel_y", "g"), ("accel_z", "g"), ("", ""), ("", ""), ("", "")]
+    assert len(told["rows"]) == 6
+    stated = [[0, "time", "ms"], [3, "accel_z", "g"], [4, "gyro_x", "deg/s"]]
+    made = bench.ask("columns", {"file": "session/u.csv", "columns": stated}).json()
+    opened = bench.ask("open", {"file": "session/u.csv", "reading": {"layout": made["layout"]}}).json()
+    message = until(lambda: (o := bench.part._openings.known(opened["opening"]).about).get("done") and o)
+    assert message["head"]["units"] == {"accel_z": "g", "gyro_x": "deg/s"}
+    saved = bench.ask("columns", {"file": "session/u.csv", "columns": stated, "name": "mine"}).json()
+    assert saved["layout"] == "session/mine.toml"
+    assert il.read("session/u.csv", "session/mine.toml").columns["gyro_x"][0] == 3
+    assert (
+        next(each for each in bench.ask("files").json()["files"] if each["name"] == "session/mine.toml")["kind"]
+        == "layout"
+    )
+
+
+WHOLE = [[0, "time", "s"], [1, "accel_x", "g"]]
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({"file": "session/u.csv", "columns": [[1, "accel_x", ""]]}, "expected the unit of accel_x"),
+        ({"file": "session/u.csv", "columns": [[1, "accel_x", "g"]]}, "how many rows there are in a second"),
+        ({"file": "session/u.csv", "columns": [[1, "accel_x", "g"], [2, "accel_x", "g"]]}, "chosen for two columns"),
+        ({"file": "session/u.csv", "columns": [[9, "accel_x", "g"]]}, "column 10"),
+        ({"file": "session/u.csv", "columns": [[-1, "accel_x", "g"]]}, "column 0"),
+        ({"file": "session/u.csv", "columns": [[0, "time", "ms"]]}, "expected a column of a sensor"),
+        ({"file": "session/u.csv", "columns": [["0", "time", "ms"]]}, "expected [place, name, unit]"),
+        ({"file": "/etc/passwd"}, "not among the files"),
+        ({"file": "session/link.csv"}, "not among the files"),
+        ({"file": "session/b.bin"}, "binary data"),
+        ({"file": "session/u.csv", "columns": WHOLE, "name": "../out"}, "expected the name"),
+    ],
+)  # fmt: skip
+def test_columns_that_cannot_be_are_answered_by_a_sentence(bench, body, said):
+    bench.ask("files/u.csv", b"t,a,b\n0,1,2\n1,2,3\n2,3,4\n", "PUT")
+    bench.ask("files/b.bin", bytes(range(256)), "PUT")
+    Path("session/link.csv").symlink_to("/etc/passwd")
+    answer = bench.ask("columns", body)
+    assert answer.status == 400
+    assert said in answer.json()["error"]
+    assert not list(Path("session").glob("*.toml"))
+
+
+def test_what_to_see_first_of_a_job_is_in_its_record(bench):
+    il.write_csv(il.simulate_tumble(attitudes=18, hold="2 s", gravity=9.81), "session/rec.csv")
+    job = run(bench, "tumble fit", file="session/rec.csv", gravity="9.81", output=True)
+    found = bench.ask(f"results/{job.number}").json()
+    record = il.load("session/rec.json")
+    assert found["state"] == record.verdict.state
+    assert found["headline"] in job.text
+    assert "esidual" in found["figure"]["title"]
+    assert found["figure"]["data"]
+    assert all(len(fact) == 2 for fact in found["facts"])
+    shown = run(bench, "show", files=["session/rec.csv"])
+    assert bench.ask(f"results/{shown.number}").json() == bench.ask("results/77").json() == {}
+
+
+def test_files_in_a_folder_that_a_command_wrote_are_files_of_the_session(bench):
+    run(bench, "thermal simulate", output=True, temperatures="0,20", duration="1 min", attitudes="12")
+    entries = bench.ask("files").json()["files"]
+    (folder,) = (each["name"] for each in entries if each["kind"] == "folder")
+    inside = [each for each in entries if each["folder"] == folder]
+    assert [each["kind"] for each in inside] == ["recording"] * 2
+    (Path(folder) / "link.csv").symlink_to("/etc/passwd")
+    assert "link.csv" not in {each["short"] for each in bench.ask("files").json()["files"]}
+    for name in (f"{folder}/link.csv", f"{folder}/../../x.csv", f"{folder}/.hidden", f"{folder}//", "/etc/passwd"):
+        assert bench.ask("open", {"file": name}).status == 400
+    assert bench.ask("open", {"file": inside[0]["name"]}).status == 200
+    told = bench.ask(
+        "command",
+        {"command": "thermal fit", "values": {"files": [each["name"] for each in inside] * 2, "output": True}},
+    )
+    assert told.json()["outputs"] == [f"session/{Path(folder).name}.json"]
+
+
+def test_values_are_checked_before_they_are_run(bench):
+    il.write_csv(il.simulate_tumble(attitudes=12, hold="1 s", gravity=9.81), "session/rec.csv")
+    values = {"file": "session/rec.csv", "order": "7", "gravity": "9.81", "height": "520", "monte_carlo": "many"}
+    wrong = bench.ask("command", {"command": "tumble fit", "values": values}).json()["wrong"]
+    assert wrong.keys() == {"order", "gravity", "monte_carlo"}
+    assert wrong["gravity"].startswith("gravity together with")
+    good = {"file": "session/rec.csv", "order": "2", "latitude": "48.1", "height": "520"}
+    assert bench.ask("command", {"command": "tumble fit", "values": good}).json()["wrong"] == {}
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no process groups")
 def test_ctrl_c_twice_leaves_no_command_behind(tmp_path):
     il.write_csv(il.simulate_tumble(attitudes=24, gravity=9.81), tmp_path / "rec.csv")

@@ -12,7 +12,7 @@ import pytest
 
 import imulab as il
 from imulab.live.page import contents, curves
-from imulab.live.page.curves import BUCKET, Writer, view
+from imulab.live.page.curves import BUCKET, Writer, statistics, view
 from imulab.recording import Recording
 
 
@@ -175,3 +175,35 @@ def test_of_a_file_that_breaks_the_rows_before_are_shown(tmp_path, rows):
     assert heads[-1]["metadata"]["serial"] == "SIM-0001"
     assert "attitudes" in last
     assert sorted(path.suffix for path in (tmp_path / "curves").iterdir() if path.suffix == ".csv") == []
+
+
+def test_statistics_are_those_of_the_samples_of_the_range(tmp_path):
+    given = recording(20_000)
+    head = written(given, tmp_path)
+    time = given.columns["time"]
+    found = statistics(tmp_path, head, time[2000], time[9000])
+    for name in ("accel_x", "gyro_x"):
+        values = given.columns[name][2000:9001]
+        values = values[np.isfinite(values)]
+        assert found.mean[name] == pytest.approx(values.mean(), rel=1e-12)
+        assert found.sigma[name] == pytest.approx(values.std(ddof=1), rel=1e-12)
+    assert found.rows == 7001
+    assert "gyro_x" not in found.density  # it has gaps
+    empty = statistics(tmp_path, head, time[-1] + 1, time[-1] + 2)
+    assert (empty.rows, len(empty.frequencies)) == (0, 0)
+    assert np.isnan(empty.mean["accel_x"])
+
+
+def test_a_spectrum_has_the_level_of_white_noise_and_the_power_of_a_line(tmp_path):
+    rate, rows = 200.0, 40_000
+    rng = np.random.default_rng(3)
+    time = np.arange(rows) / rate
+    tone = 0.5 * np.sin(2 * np.pi * 20.0 * time)
+    columns = {"time": time, "accel_x": rng.normal(scale=0.1, size=rows), "accel_y": tone}
+    head = written(Recording(columns, {"time": "s", "accel_x": "g", "accel_y": "g"}), tmp_path)
+    found = statistics(tmp_path, head, None, None)
+    inner = (found.frequencies > 1) & (found.frequencies < 90)
+    assert found.density["accel_x"][inner].mean() == pytest.approx(2 * 0.1**2 / rate, rel=0.1)  # one-sided
+    peak = found.frequencies[np.argmax(found.density["accel_y"])]
+    assert peak == pytest.approx(20.0, rel=0.02)
+    assert np.isfinite(found.density["accel_y"]).all()

@@ -8,9 +8,11 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("starlette", reason="the page needs imulab[live]")
@@ -83,8 +85,12 @@ def drop(page: Any, name: str, text: str) -> None:
 
 def command(page: Any) -> str:
     """Return the command line of the form, once it is that of the form's values."""
-    page.wait_for_timeout(600)
+    page.locator(".form:not([data-asked])").wait_for()
     return page.locator(".form .command code").inner_text()
+
+
+def run(page: Any) -> None:
+    page.get_by_role("button", name="Run", exact=True).click()
 
 
 def test_from_the_drop_to_record_report_and_firmware(workbench, new_page, folder):
@@ -103,10 +109,15 @@ def test_from_the_drop_to_record_report_and_firmware(workbench, new_page, folder
         "imulab tumble fit 'imulab-files/unit 7.csv' --gravity 9.81 -o 'imulab-files/unit 7.json' "
         "--report 'imulab-files/unit 7.html'"
     )
-    page.get_by_role("button", name="Run").click()
-    page.locator(".job .chip.done").wait_for()
-    assert page.locator(".job .state.look").inner_text().startswith("look: ")  # 12 attitudes are few
+    run(page)
+    page.locator(".job .found").wait_for()
+    assert page.locator(".found .said.look").inner_text().startswith("Look first. After calibration")  # 12 are few
+    assert page.locator(".found dd").count() == 3
+    assert not page.locator(".settings").evaluate("each => each.open")  # the form has folded away
+    page.locator(".found .js-plotly-plot .point").first.wait_for()
+    page.get_by_text("All that it says").click()
     assert page.locator(".job .command code").inner_text() == typed
+    page.get_by_role("button", name="Show unit 7.html").click()
     report = page.frame_locator(".job iframe")
     report.get_by_role("heading", name="Tumble calibration").wait_for()
     report.locator(".js-plotly-plot").first.wait_for()
@@ -114,12 +125,12 @@ def test_from_the_drop_to_record_report_and_firmware(workbench, new_page, folder
     assert main([*shlex.split(typed)[1:4], "--gravity", "9.81", "-o", "own.json"], project=False) == 0
     assert unsealed(record) == unsealed(Path("own.json"))
     page.locator("[data-name='imulab-files/unit 7.json']").click()
-    page.get_by_role("button", name="Firmware (zip)").click()
+    page.locator(".file").get_by_role("button", name="Firmware (zip)").click()
     packed = saved(page, "Save unit 7-c.zip")
     assert "unit 7-c/imulab.h" in zipfile.ZipFile(packed).namelist()
     page.reload()
     page.locator(".job").nth(1).wait_for()  # what was done is still there
-    assert page.locator(".job strong").all_inner_texts() == ["export", "tumble fit"]
+    assert page.locator(".job > summary strong").all_inner_texts() == ["export", "tumble fit"]
 
 
 def test_zooming_fetches_what_the_range_holds(workbench, new_page):
@@ -154,7 +165,7 @@ def test_cancelling_ends_the_command_and_leaves_nothing(workbench, new_page, fol
     page.get_by_text("More options").click()
     page.get_by_label("monte carlo", exact=True).fill("900000")
     assert "--monte-carlo 900000" in command(page)
-    page.get_by_role("button", name="Run").click()
+    run(page)
     page.locator(".job .chip.running").wait_for()
     page.get_by_role("button", name="Cancel").click()
     page.locator(".job .chip.cancelled").wait_for()
@@ -164,10 +175,16 @@ def test_cancelling_ends_the_command_and_leaves_nothing(workbench, new_page, fol
 def test_what_is_refused_is_said_where_it_was_typed(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))
+    page.get_by_label("order", exact=True).fill("nonsense")
+    page.get_by_text("order 'nonsense': expected one of").wait_for()  # before it is run
     page.get_by_label("gravity", exact=True).fill("nonsense")
-    page.get_by_role("button", name="Run").click()
-    page.locator(".job .chip.refused").wait_for()
-    assert "--gravity 'nonsense'" in page.locator(".job .heard").inner_text()
+    page.get_by_text("gravity 'nonsense': expected").wait_for()
+    run(page)
+    page.wait_for_function("() => document.activeElement.getAttribute('aria-invalid') === 'true'")
+    assert page.locator(".job").count() == 0
+    page.get_by_label("order", exact=True).fill("2")
+    page.get_by_label("gravity", exact=True).fill("9.81")
+    page.wait_for_function("() => !document.querySelector('.wrong:not([hidden])')")
 
 
 def test_a_file_of_foreign_columns_asks_for_a_layout(workbench, new_page):
@@ -183,10 +200,13 @@ def test_a_file_of_foreign_columns_asks_for_a_layout(workbench, new_page):
     drop(page, "phone2.csv", "t,q\n0,1\n1,2\n2,3\n")
     page.locator("[data-name='imulab-files/phone2.csv']").click()
     page.get_by_role("heading", name="phone2.csv").wait_for()
-    page.locator(".file .refused").wait_for()  # and with it, the form of "How the file is read" is open
-    page.locator("#reading-layout").fill("imulab-files/mine.toml")
-    page.get_by_role("button", name="Read it so").click()
-    page.locator("svg.plot", has_text="accel [g]").wait_for()
+    page.locator(".assistant").wait_for()
+    page.get_by_text("How the file is read").click()
+    assert page.locator("#layout-list option").count() > 40
+    page.get_by_label("search the layouts").fill("mine")
+    page.get_by_label("layouts", exact=True).select_option("imulab-files/mine.toml")
+    page.get_by_role("button", name="Read it with this layout").click()
+    page.locator(".plotbox", has_text="accel [g]").wait_for()
     assert "--layout imulab-files/mine.toml" in command(page)
 
 
@@ -197,7 +217,7 @@ def test_a_file_that_breaks_shows_its_good_part(workbench, new_page):
     page.get_by_text("Read up to where it breaks: ").wait_for()
     page.locator("svg.plot").first.wait_for()
     rows = len(il.read("own.csv"))
-    assert f"{rows:,} samples".replace(",", " ") in page.locator(".file .message").inner_text()
+    assert f"{rows:,} samples".replace(",", " ") in page.locator(".file .message").first.inner_text()
     assert f"row {rows + 1} (" in page.locator(".file .refused").inner_text()
     drop(page, "none.csv", "time [s],accel_x [g]\n0,1\n1,2\nx,2\n")  # and closing it leaves no fault behind
     page.get_by_role("heading", name="none.csv").wait_for()
@@ -252,8 +272,11 @@ def test_nothing_of_a_files_text_is_executed(workbench, new_page, folder):
     page.locator("svg.plot").first.wait_for()
     page.get_by_text("What the file says of itself").click()
     assert EVIL in page.locator(".file pre").inner_text()
-    page.get_by_role("button", name="Run").click()
-    page.locator(".job .chip.done").wait_for()
+    page.get_by_text("Mean, standard deviation").click()
+    page.locator(".spectrum svg").wait_for()
+    run(page)
+    page.locator(".job .found").wait_for()
+    page.get_by_role("button", name=re.compile(r"Show .*html")).click()
     report = page.frame_locator(".job iframe")
     report.get_by_role("heading", name="Tumble calibration").wait_for()
     page.get_by_role("button", name=re.compile("Look at")).click()
@@ -275,7 +298,8 @@ def test_nothing_of_a_files_text_is_executed(workbench, new_page, folder):
 def test_a_report_cannot_reach_the_session(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))
-    page.get_by_role("button", name="Run").click()
+    run(page)
+    page.get_by_role("button", name="Show rec.html").click()
     page.locator(".job iframe").wait_for()
     page.frame_locator(".job iframe").get_by_role("heading", name="Tumble calibration").wait_for()
     frame = page.frames[-1]
@@ -313,6 +337,176 @@ def test_two_records_are_compared(folder, new_page):
     finally:
         running.close()
     assert not (folder / "imulab-files").exists()  # nothing was made
+
+
+def gyro_log(name: str) -> str:
+    """Write the gyroscopes of a recording alone, and return their text."""
+    tumble(name)
+    rec = il.read(name)
+    kept = {key: values for key, values in rec.columns.items() if key.startswith(("time", "gyro"))}
+    il.write_csv(replace(rec, columns=kept, units={key: rec.units[key] for key in kept}), name)
+    return Path(name).read_text()
+
+
+def offered(page: Any) -> list[str]:
+    page.locator(".formplace .form").wait_for()
+    return page.locator(".procedure > .cards .card").evaluate_all("all => all.map(each => each.dataset.path)")
+
+
+def test_only_what_a_file_is_for_is_offered_and_of_the_rest_it_is_said_why(workbench, new_page, folder):
+    page = new_page(workbench.address)
+    drop(page, "gyro.csv", gyro_log("own.csv"))
+    page.locator("svg.plot").first.wait_for()
+    paths = offered(page)
+    assert paths[0] == "rate fit"
+    assert not {"tumble fit", "tumble mag", "array calibrate", "warmup fit", "apply"}.intersection(paths)
+    page.get_by_text("Not with this").click()
+    card = page.locator("[data-path='tumble fit']")
+    assert card.is_disabled()
+    assert "There are no three accelerometers in it." in card.inner_text()
+    il.simulate_rate(rates="0,100,-100", hold="1 s").save("table")
+    for file in sorted(Path("table").iterdir(), reverse=True):
+        drop(page, file.name, file.read_text())
+    page.locator("[data-name$='.toml']").first.click()
+    page.get_by_text("The manifest of a rate test: it names").wait_for()
+    assert offered(page) == ["rate fit"]
+
+
+def test_a_channel_can_be_read_out_and_hidden_and_a_window_taken(workbench, new_page):
+    page = new_page(workbench.address)
+    drop(page, "rec.csv", tumble("own.csv"))
+    page.get_by_text("attitudes at rest").wait_for()
+    plot = page.locator("svg.plot").first
+    box = plot.bounding_box()
+    page.mouse.move(box["x"] + 0.5 * (box["width"] - 72) + 62, box["y"] + 60)
+    shown = page.locator(".plotbox .channel .value").all_inner_texts()
+    assert all(shown)  # of every plot, not only of the one under the pointer
+    rec = il.read("own.csv")
+    middle = np.searchsorted(rec.time, (rec.time[0] + rec.time[-1]) / 2)
+    near = rec.columns["gyro_x"][middle - 30 : middle + 30]
+    value = float(shown[list(rec.units).index("gyro_x") - 1].replace("−", "-"))
+    assert near.min() - 1e-3 <= value <= near.max() + 1e-3
+    page.get_by_role("button", name=re.compile("^accel_y")).click()
+    page.locator(".channel[aria-pressed='false']").wait_for()
+    assert page.locator("svg.plot").first.locator("path.curve").count() == 2
+    page.mouse.move(box["x"] + 200, box["y"] + 30)  # down: a range of values
+    page.mouse.down()
+    page.mouse.move(box["x"] + 205, box["y"] + 90, steps=4)
+    page.mouse.up()
+    before = plot.get_attribute("aria-label")
+    page.mouse.move(box["x"] + 200, box["y"] + 80)  # along: a range of time
+    page.mouse.down()
+    page.mouse.move(box["x"] + 400, box["y"] + 80, steps=4)
+    page.mouse.up()
+    page.get_by_role("button", name="Use this window").click()
+    assert re.search(r"--window [\d.]+:[\d.]+", command(page))
+    assert "from" in before
+    assert page.locator(".part").inner_text().startswith("Only ")
+
+
+def test_reload_and_back_lead_where_one_was(workbench, new_page):
+    page = new_page(workbench.address)
+    drop(page, "rec.csv", tumble("own.csv"))
+    page.get_by_text("attitudes at rest").wait_for()
+    page.get_by_label("gravity", exact=True).fill("9.81")
+    page.locator("[data-path='noise fit']").click()
+    page.get_by_text("Fit a model of the noise to logs at rest").first.wait_for()
+    page.go_back()
+    page.locator("[data-path='tumble fit'][aria-pressed='true']").wait_for()
+    assert page.get_by_label("gravity", exact=True).input_value() == "9.81"
+    drop(page, "gyro.csv", gyro_log("own.csv"))
+    page.get_by_role("heading", name="gyro.csv").wait_for()
+    page.locator("svg.plot").first.wait_for()
+    whole = page.locator(".plotbar .range").inner_text()
+    page.get_by_role("button", name="closer").click()
+    page.wait_for_function("text => document.querySelector('.plotbar .range').textContent !== text", arg=whole)
+    status = page.locator(".plotbar .range").inner_text()
+    assert "from=" in page.url
+    page.reload()
+    page.get_by_role("heading", name="gyro.csv").wait_for()
+    page.wait_for_function("text => document.querySelector('.plotbar .range')?.textContent === text", arg=status)
+    page.go_back()
+    page.get_by_role("heading", name="rec.csv").wait_for()
+    page.get_by_text("attitudes at rest").wait_for()
+    assert page.get_by_label("gravity", exact=True).input_value() == "9.81"
+    other = new_page(page.url)  # a second tab has the address alone
+    other.get_by_role("heading", name="rec.csv").wait_for()
+    assert other.locator(".list [data-name]").count() == 2
+
+
+def test_what_an_export_would_lose_is_a_choice(workbench, new_page, folder):
+    page = new_page(workbench.address)
+    drop(page, "rec.csv", tumble("own.csv"))
+    page.get_by_label("order", exact=True).fill("1")
+    run(page)
+    page.locator(".job .found").wait_for()
+    page.get_by_label("Write for another program").select_option("px4")
+    page.get_by_role("button", name="Write", exact=True).click()
+    page.get_by_role("button", name="Write it without that").click()
+    page.locator(".job").nth(2).wait_for()
+    page.locator(".job >> nth=0 >> .chip.done").wait_for()
+    assert list((folder / "imulab-files" / "rec-px4").iterdir())
+
+
+COUNT = "window.clicks = 0; addEventListener('click', each => { window.clicks += each.detail > 0; }, true)"
+
+
+@pytest.mark.slow
+def test_an_unknown_file_becomes_a_corrected_one_without_leaving_the_page(workbench, new_page, folder):
+    tumble("own.csv", unit="g")
+    rec = il.read("own.csv")
+    names = [f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz"]
+    rows = zip(rec.time, *(rec.columns[name] for name in names), strict=True)
+    lines = ["zeit;p;q;r;u;v;w", *(";".join(f"{value:.6f}" for value in row) for row in rows)]
+    page = new_page(workbench.address)
+    page.evaluate(COUNT)
+    drop(page, "foreign.csv", "\n".join(lines) + "\n")
+    page.locator(".assistant").wait_for()
+    for column, (what, unit) in {"2, p": ("accel_x", "g"), "5, u": ("gyro_x", "deg/s")}.items():
+        page.get_by_label(f"column {column}: what it is").select_option(what)
+        page.get_by_label(f"column {column}: its unit").select_option(unit)
+    page.locator(".plotbox", has_text="gyro [°/s]").wait_for()  # the preview
+    page.get_by_role("button", name="Save as layout").click()
+    page.locator(".assistant").wait_for(state="detached")
+    page.get_by_label("gravity", exact=True).fill("9.81")
+    run(page)
+    page.locator(".job .found").wait_for()
+    page.get_by_role("button", name="Correct a recording", exact=True).click()
+    run(page)
+    page.get_by_text("apply done").wait_for()
+    assert page.evaluate("window.clicks") == 4
+    layout = folder / "imulab-files" / "foreign.toml"
+    assert il.read("imulab-files/foreign.csv", str(layout)).units["gyro_z"] == "deg/s"
+    corrected = il.read("imulab-files/foreign-apply.csv")
+    still = corrected.columns["accel_x"][:100] ** 2 + corrected.columns["accel_y"][:100] ** 2
+    length = np.sqrt(still + corrected.columns["accel_z"][:100] ** 2).mean()
+    assert length == pytest.approx(9.81, abs=5e-3)  # 0.3 m/s^2 off before
+
+
+@pytest.mark.slow
+def test_24_power_cycles_become_a_table_in_few_clicks(folder, new_page):
+    words = ["warmup", "simulate", "--duration", "200 s", "--rate", "2 Hz", "-o", "imulab-files/cycles"]
+    Path("imulab-files").mkdir()
+    assert main(words, project=False) == 0
+    running = Workbench()
+    try:
+        page = new_page(running.address)
+        page.evaluate(COUNT)
+        page.locator("[data-name='imulab-files/cycles']").click()
+        page.get_by_role("heading", name="and 23 more").wait_for()
+        page.locator("[data-path='warmup fit'][aria-pressed='true']").wait_for()
+        run(page)
+        page.locator(".job .found, .job .chip.refused").first.wait_for()
+        assert page.locator(".job .found").count() == 1
+        assert page.evaluate("window.clicks") == 2
+        assert len(il.load("imulab-files/cycles.json").sources) == 24
+        page.get_by_role("button", name="Only this one").click()
+        page.get_by_role("button", name="Choose all 24 like this").click()
+        page.get_by_role("heading", name="and 23 more").wait_for()
+        page.reload()
+        page.get_by_role("heading", name="and 23 more").wait_for()
+    finally:
+        running.close()
 
 
 @pytest.mark.slow

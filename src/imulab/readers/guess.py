@@ -43,7 +43,7 @@ HEAD = 1 << 20
 _MOST_LABELLED = 20_000  # lines or records that are looked at
 _MOST_LINES = 300  # above the rows
 _FEWEST = 3  # rows that show a column's size
-_DELIMITERS = {",": '","', ";": '";"', "\t": '"\\t"', " ": '"whitespace"'}
+DELIMITERS = {",": '","', ";": '";"', "\t": '"\\t"', " ": '"whitespace"'}
 _LIKELY_RATES = 4.0, 4000.0  # Hz: a clock whose steps give a rate between these in one unit alone has that unit
 _GRAVITIES = {"m/s^2": STANDARD_GRAVITY, "g": 1.0, "mg": 1000.0}
 _NEAR = 0.25  # relative: a mean this near to g in some unit is a specific force
@@ -179,7 +179,7 @@ def guess_of_head(
     if kind.layout == "none":
         raise GuessError(f"{name}: a {kind.name} file says itself what its columns are; it needs no layout")
     if kind.module == "jsonfile":
-        return layout_of_table(_table_of_json(head, name), name, units=units, sample_rate=sample_rate)
+        return layout_of_table(table_of_json(head, name), name, units=units, sample_rate=sample_rate)
     if kind is not TEXT or b"\0" in head[:4096]:
         content = "binary data" if kind is TEXT else kind.name
         raise GuessError(f"{name}: a layout is guessed from the titles of text, found {content}")
@@ -215,7 +215,7 @@ def _without_arrows(lines: Sequence[str]) -> tuple[list[str], list[str]]:
     return bare, [match[1] if match else "" for match in found]
 
 
-def _with_stamps(table: _Table, stamps: Sequence[str]) -> _Table:
+def _with_stamps(table: Table, stamps: Sequence[str]) -> Table:
     """Return a table whose first column are a serial monitor's times, which the reader takes as the first field."""
     rows = [[stamp, *row] for stamp, row in zip(stamps[len(stamps) - len(table.rows) :], table.rows, strict=True)]
     units = ["", *table.units] if table.units else []
@@ -240,7 +240,7 @@ def advice_on_guess(head: bytes, name: str) -> str:
     return f"imulab layout guess {quote(name)}{needs} -o L.toml writes a layout for it (--layout L.toml)"
 
 
-class _Table(Struct):
+class Table(Struct):
     """Rows of fields below a line of titles; `stamped`: the first are a serial monitor's times of day."""
 
     titles: list[str]
@@ -254,13 +254,14 @@ class _Table(Struct):
     labelled: bool = False
     stamped: bool = False
     others: tuple[str, ...] = ()
+    titled: bool = True
 
     def numbers(self, column: int) -> Array:
         """Return the readings of a column, NaN where a field is no number."""
         return np.array([_number(row[column], self.decimal) if column < len(row) else np.nan for row in self.rows])
 
 
-def guess_table(lines: Sequence[str], name: str, *, prefix: str = "", encoding: str = "utf-8") -> _Table:
+def guess_table(lines: Sequence[str], name: str, *, prefix: str = "", encoding: str = "utf-8") -> Table:
     """Return the table in the first lines of a text file; of several alike, that of the sensor in the file's name.
 
     Raises
@@ -268,12 +269,12 @@ def guess_table(lines: Sequence[str], name: str, *, prefix: str = "", encoding: 
     GuessError
         No line names the axes of a sensor.
     """
-    best: tuple[int, _Table] | None = None
-    for delimiter in _DELIMITERS:
+    best: tuple[int, Table] | None = None
+    for delimiter in DELIMITERS:
         if delimiter == " " and best is not None:
             break
         for above, line in enumerate(lines[:_MOST_LINES]):
-            titles = _fields(line.lstrip("# ") if line.startswith("#") else line, delimiter)
+            titles = fields_of_line(line.lstrip("# ") if line.startswith("#") else line, delimiter)
             if len(titles) < 3 or sum(map(is_number, titles)) > len(titles) / 2:
                 continue
             if prefix and titles[0] != prefix and f"${titles[1]}" != prefix:
@@ -298,7 +299,7 @@ def _sensors_of_name(name: str) -> set[str]:
     return {sensor for sensor in _EXAMPLES for word in words if word.startswith(sensor[:3])}
 
 
-def _labelled_table(lines: Sequence[str]) -> _Table | None:
+def _labelled_table(lines: Sequence[str]) -> Table | None:
     """Return the table of numbers with a label each, ``Acceleration X: -2.76, Y: ..``; None for other text."""
     counts: dict[str, int] = {}
     units: dict[str, str] = {}
@@ -313,11 +314,11 @@ def _labelled_table(lines: Sequence[str]) -> _Table | None:
     for label in often:  # the unit of the last axis is that of all three
         units[label] = units[label] or next((units[o] for o in often if stems[o] == stems[label] and units[o]), "")
     rows = LabelledLines(often, "", "", skips=True).read("\n".join(lines[:_MOST_LABELLED]).encode()).decode().split()
-    table = _Table(often, [row.split(",") for row in rows], "", units=[units[label] for label in often], labelled=True)
+    table = Table(often, [row.split(",") for row in rows], "", units=[units[label] for label in often], labelled=True)
     return table if rows else None
 
 
-def _table_of_json(data: bytes, name: str) -> _Table:
+def table_of_json(data: bytes, name: str) -> Table:
     """Return the table of a JSON file: records, or arrays by key, in which triples may lie flat."""
     document = parsed_document(data, name)
     if isinstance(document, dict):
@@ -390,14 +391,14 @@ def _score(titles: Sequence[str], likely: set[str]) -> int:
     return 10 * len(whole) + (len(bare) == 3) + timed + _NAMED * len(likely.intersection(sensor for sensor, _ in whole))
 
 
-def _rows_below(titles: list[str], below: Sequence[str], delimiter: str, above: int) -> _Table | None:
+def _rows_below(titles: list[str], below: Sequence[str], delimiter: str, above: int) -> Table | None:
     """Return the table under titles: its units row, its rows, and the prefix that they have."""
     tag = titles[0] if not is_number(titles[0]) else ""
     tags = {tag: titles[1:], f"${titles[1]}": titles[2:]} if titles[0].startswith("$") else {tag: titles[1:]}
     units: list[str] = []
     rows: dict[str, list[list[str]]] = {}
     for line in below:
-        fields = _fields(line, delimiter)
+        fields = fields_of_line(line, delimiter)
         if not any(fields) or line.startswith("#"):
             continue
         if not rows and not units and (fields[0] in ("$UNIT", "UNIT") or is_units_row(fields)):
@@ -414,13 +415,13 @@ def _rows_below(titles: list[str], below: Sequence[str], delimiter: str, above: 
     titles = _tagged(titles)[-len(tags[prefix]) :] if prefix else titles
     joined = " ".join(field for row in mine[:50] for field in row)
     decimal = "," if delimiter != "," and re.search(r"\d,\d", joined) and not re.search(r"\d\.\d", joined) else "."
-    starts = [_fields(line, delimiter)[0] for line in below if not line.startswith(("#", "$UNIT"))]
+    starts = [fields_of_line(line, delimiter)[0] for line in below if not line.startswith(("#", "$UNIT"))]
     others = tuple(dict.fromkeys(s for s in starts if prefix and s and s != prefix and not is_number(s)))
-    return _Table(titles, mine, delimiter, decimal, units, prefix, above=above, others=others)
+    return Table(titles, mine, delimiter, decimal, units, prefix, above=above, others=others)
 
 
 def layout_of_table(
-    table: _Table,
+    table: Table,
     name: str,
     *,
     units: Mapping[str, str] | None = None,
@@ -479,29 +480,34 @@ def layout_of_table(
         chosen.append(("temperature", *warm))
     about = {column.partition("_")[0]: reason for column, _, _, reason in chosen if reason}
     return LayoutGuess(
-        _text(table, chosen, left, sample_rate), tuple(f"{sensor}: {reason}" for sensor, reason in about.items())
+        layout_text(table, chosen, left, sample_rate), tuple(f"{sensor}: {reason}" for sensor, reason in about.items())
     )
 
 
-def _text(
-    table: _Table, chosen: Sequence[tuple[str, int, str, str]], left: Sequence[str], sample_rate: float | None
+def layout_text(
+    table: Table,
+    chosen: Sequence[tuple[str, int, str, str]],
+    left: Sequence[str],
+    sample_rate: float | None,
+    said: str = "Guessed by imulab layout guess from titles. A comment at a column says what its title does not.",
 ) -> str:
     """Return the text of a layout file; columns are named by title where that names one alone."""
     numbered = (
         bool(table.prefix)
         or table.stamped
+        or not table.titled
         or any(table.titles.count(table.titles[place]) > 1 for _, place, _, _ in chosen)
     )
-    lines = ["# Guessed by imulab layout guess from titles. A comment at a column says what its title does not."]
+    lines = [f"# {said}"]
     lines += [f"# Not taken: {first_of(left, 8)}"] if left else []
     lines += [f"# Lines of other kinds: {' '.join(table.others[:8])} (--prefix NAME)"] if table.others else []
-    lines += [f"delimiter = {_DELIMITERS[table.delimiter]}"] if table.delimiter else []
+    lines += [f"delimiter = {DELIMITERS[table.delimiter]}"] if table.delimiter else []
     lines += ["labelled = true"] if table.labelled else []
     lines += ['decimal = ","'] if table.decimal == "," else []
     lines += [f"encoding = {_toml(table.encoding)}"] if table.encoding != "utf-8" else []
     lines += [f"prefix = {_toml(table.prefix)}"] if table.prefix else []
     if numbered and not table.prefix:
-        lines += ["header = true", *([f"skip_lines = {table.above}"] if table.above else [])]
+        lines += ["header = true"] * table.titled + [f"skip_lines = {table.above}"] * bool(table.above)
     if sample_rate is not None:
         lines.append(f'sample_rate = {{ value = {sample_rate:g}, unit = "Hz" }}')
     lines.append("[columns]")
@@ -530,7 +536,7 @@ def _toml(value: str | int) -> str:
 
 
 def _sensors(
-    titles: Sequence[Title], table: _Table, name: str, known: Mapping[str, str]
+    titles: Sequence[Title], table: Table, name: str, known: Mapping[str, str]
 ) -> tuple[dict[str, list[int]], list[str]]:
     """Return the columns of each sensor, and the titles that are not taken."""
     groups: dict[tuple[str, tuple[str, ...]], dict[int, int]] = {}
@@ -565,7 +571,7 @@ def _sensors(
     return sensors, left
 
 
-def _bare(title: Title, table: _Table, name: str, known: Mapping[str, str]) -> str:
+def _bare(title: Title, table: Table, name: str, known: Mapping[str, str]) -> str:
     """Return the sensor of a bare x, y or z: by its unit, by the units that were named, or by the file's name."""
     if title.unit == "1":
         return "mag"
@@ -577,7 +583,7 @@ def _bare(title: Title, table: _Table, name: str, known: Mapping[str, str]) -> s
 
 
 def _is_linear(
-    key: tuple[str, tuple[str, ...]], table: _Table, whole: Mapping[tuple[str, tuple[str, ...]], list[int]]
+    key: tuple[str, tuple[str, ...]], table: Table, whole: Mapping[tuple[str, tuple[str, ...]], list[int]]
 ) -> bool:
     """Return whether an acceleration that its title calls linear has no gravity in it."""
     if "linear" not in key[1]:
@@ -588,14 +594,14 @@ def _is_linear(
 # Units, from titles or else from the readings.
 
 
-def _length(table: _Table, places: Sequence[int]) -> float:
+def _length(table: Table, places: Sequence[int]) -> float:
     """Return the median length of three columns."""
     length = np.linalg.norm([table.numbers(place) for place in places], axis=0)
     length = length[np.isfinite(length)]
     return float(np.median(length)) if len(length) >= _FEWEST else np.nan
 
 
-def _is_whole(table: _Table, places: Sequence[int]) -> bool:
+def _is_whole(table: Table, places: Sequence[int]) -> bool:
     """Return whether all readings are whole numbers, and not just zeros and ones."""
     values = np.concatenate([table.numbers(place) for place in places])
     values = values[np.isfinite(values)]
@@ -606,7 +612,7 @@ def _unit(
     sensor: str,
     places: Sequence[int],
     titles: Sequence[Title],
-    table: _Table,
+    table: Table,
     titled: Mapping[str, str],
     known: Mapping[str, str],
 ) -> tuple[str, str]:
@@ -647,7 +653,7 @@ def _fits(sensor: str, title: Title) -> bool:
 
 
 def _supposed(
-    sensor: str, places: Sequence[int], titles: Sequence[Title], table: _Table, titled: Mapping[str, str]
+    sensor: str, places: Sequence[int], titles: Sequence[Title], table: Table, titled: Mapping[str, str]
 ) -> tuple[str, str]:
     """Return the unit that readings show, and why; nothing where they do not."""
     words, length = titles[places[0]].stem, _length(table, places)
@@ -682,7 +688,7 @@ def _step(times: Array, unit: str) -> float | None:
     return usual * parse_unit(unit).factor if np.isfinite(usual) else None
 
 
-def _rate_unit(table: _Table, accel: Sequence[int], gyro: Sequence[int], step: float) -> tuple[str, str]:
+def _rate_unit(table: Table, accel: Sequence[int], gyro: Sequence[int], step: float) -> tuple[str, str]:
     """Return the unit of rates in which they explain how gravity turns in the body, df/dt = -w x f.
 
     The factor of the rates is that of least squares over all rows, f and w smoothed over a tenth of a second.
@@ -723,7 +729,7 @@ def _increments(unit: str, rate: float | None, title: str, name: str) -> tuple[s
     return f"{unit}@{rate:g}Hz", f"increments per sample, by the clock {rate:g} of them a second"
 
 
-def _temperature(titles: Sequence[Title], table: _Table, known: Mapping[str, str]) -> tuple[int, str, str] | None:
+def _temperature(titles: Sequence[Title], table: Table, known: Mapping[str, str]) -> tuple[int, str, str] | None:
     """Return the column of the temperature, its unit, and why; None where there is none that is surely one."""
     places = [i for i, t in enumerate(titles) if t.sensor == "temperature" and np.isfinite(table.numbers(i)).any()]
     if len(places) != 1:
@@ -744,7 +750,7 @@ def _temperature(titles: Sequence[Title], table: _Table, known: Mapping[str, str
 
 def _clock(
     titles: Sequence[Title],
-    table: _Table,
+    table: Table,
     known: Mapping[str, str],
     sample_rate: float | None,
     seconds: float | None,
@@ -821,6 +827,13 @@ def _date_unit(texts: Sequence[str]) -> str:
     return _EITHER if first <= 12 and second <= 12 else "day first" if first > 12 else "month first"
 
 
+def likely_time_unit(step: float) -> str:
+    """Return the one unit of time in which steps give a likely rate; nothing where none does, or several do."""
+    rates = {unit: 1 / (parse_unit(unit).factor * step) for unit in ("s", "ms", "us", "ns")} if step > 0 else {}
+    likely = [unit for unit, rate in rates.items() if _LIKELY_RATES[0] <= rate < _LIKELY_RATES[1] and step != 1.0]
+    return likely[0] if len(likely) == 1 else ""
+
+
 def _time_unit(title: Title, values: Array, step: float, seconds: float | None) -> tuple[str, str]:
     """Return the unit of a clock, and why where its title does not say it."""
     if title.unit in ("s", "ms", "us", "ns"):
@@ -849,16 +862,17 @@ def _time_unit(title: Title, values: Array, step: float, seconds: float | None) 
 # Fields of lines.
 
 
-def table_of_records(records: Sequence[Mapping[str, float | None]]) -> _Table:
+def table_of_records(records: Sequence[Mapping[str, float | None]]) -> Table:
     """Return the table of records with the same keys, such as lines of JSON."""
-    return _Table(
+    return Table(
         list(records[0]),
         [["nan" if v is None else repr(v) for v in record.values()] for record in records],
         delimiter="",
     )
 
 
-def _fields(line: str, delimiter: str) -> list[str]:
+def fields_of_line(line: str, delimiter: str) -> list[str]:
+    """Return the fields of a line without blanks and quotes around them."""
     fields = line.split() if delimiter == " " else line.split(delimiter)
     return [field.strip().strip('"').strip() for field in fields]
 

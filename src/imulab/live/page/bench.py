@@ -2,7 +2,9 @@
 
 Addresses, below ``/api/workbench``: ``files`` (GET; PUT, GET and DELETE of one), ``zip`` (a folder), ``reports`` (one
 that a command of this session has drawn), ``forms``, ``open`` and ``curves`` of a recording, ``command`` (what a form
-would run), ``jobs`` (POST runs it, DELETE cancels it). Messages to pages: ``files``, ``opening``, ``job``.
+would run), ``jobs`` (POST runs it, DELETE cancels it), ``results`` (what to see first of one), ``statistics`` of a
+range, ``layouts`` that come with imulab, and ``columns`` of a file, as far as known, or the layout of those that were
+stated. Messages to pages: ``files``, ``opening``, ``job``.
 """
 
 from __future__ import annotations
@@ -10,11 +12,13 @@ from __future__ import annotations
 import json
 import math
 import os
+import subprocess
+import sys
 import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from shlex import join
 from typing import IO, Any, ClassVar
@@ -27,8 +31,10 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from imulab.errors import OptionError, quoted
+from imulab.files import WITHIN, write_text
 from imulab.live.page.files import FolderFiles, Opening, Openings
 from imulab.live.page.jobs import Form, Jobs, PageJob
+from imulab.live.page.results import result_of
 from imulab.live.page.server import Hub, Message, PagePart, receive_file, report_response, to_json
 from imulab.options import options_of
 from imulab.recording import Reading
@@ -39,6 +45,8 @@ _LONGEST = 1 << 20
 _READING = tuple(option.name for option in options_of(Reading))
 _HERE = "/api/workbench"
 _ANY = "application/octet-stream"
+_FEW = 2  # inputs that give an output the name of the last
+_PATIENCE = 20  # s for the columns of a file
 _PIECE = 1 << 20  # bytes sent in one piece
 
 
@@ -62,7 +70,7 @@ class Workbench(PagePart):
         self._jobs, self._openings = Jobs(self._tell_job), Openings(self._tell_opening)
         self._coming: set[str] = set()
         self._lists = count()
-        shown = to_json(list(forms.values()))
+        shown = to_json([form.shown for form in forms.values()])
         self.routes = [
             Route(f"{_HERE}/files", self._list),
             Route(f"{_HERE}/files/{{name:path}}", self._receive, methods=["PUT"]),
@@ -73,6 +81,10 @@ class Workbench(PagePart):
             Route(f"{_HERE}/forms", lambda request: Response(shown, media_type="application/json")),
             Route(f"{_HERE}/open", self._open, methods=["POST"]),
             Route(f"{_HERE}/curves", self._curves),
+            Route(f"{_HERE}/statistics", self._statistics),
+            Route(f"{_HERE}/layouts", self._layouts),
+            Route(f"{_HERE}/columns", self._columns, methods=["POST"]),
+            Route(f"{_HERE}/results/{{number:int}}", self._result),
             Route(f"{_HERE}/command", self._command, methods=["POST"]),
             Route(f"{_HERE}/jobs", self._run, methods=["POST"]),
             Route(f"{_HERE}/jobs/{{number:int}}", self._cancel, methods=["DELETE"]),
@@ -168,9 +180,42 @@ class Workbench(PagePart):
             raise OptionError(f"reading: expected texts for {' '.join(_READING)}")
         name = self._files.path(str(asked.get("file")))
         layout = reading.get("layout", "")
-        if set(layout) & {"/", "\\"} or Path(layout or "\0").exists():
+        if layout not in self._openings.previews and (set(layout) & {"/", "\\"} or Path(layout or "\0").exists()):
             reading = {**reading, "layout": self._files.path(layout)}
         return _json(_opening_message(self._openings.open(name, reading, self._files.readable)))
+
+    async def _columns(self, request: Request) -> Response:
+        """Return what is known of the columns of a file; or write the layout of columns that were stated.
+
+        With a ``name`` it is a file of the session, else one for a preview.
+        """
+        asked = await _object(request)
+        name, stated = self._files.path(str(asked.get("file"))), _stated(asked.get("columns"), asked.get("sample_rate"))
+        told = await run_in_threadpool(_columns_of, name, stated, self._files.readable)
+        if stated is None:
+            return _json(told)
+        if not (saved := asked.get("name")):
+            return _json({"layout": self._openings.new_layout(told["toml"]), **told})
+        path = self._files.unused(str(saved).removesuffix(".toml") + ".toml", self._coming)
+        write_text(path, told["toml"])
+        self._hub.tell(self._list_message())
+        return _json({"layout": path, **told})
+
+    async def _layouts(self, request: Request) -> Response:
+        from imulab.readers.shipped import shipped
+
+        return _json([{"name": each.name, "about": each.about, "sensors": each.sensors} for each in shipped()])
+
+    async def _result(self, request: Request) -> Response:
+        job = self._jobs.jobs.get(request.path_params["number"])
+        done = job is not None and job.state == "done"
+        return _json(await run_in_threadpool(result_of, job.outputs) if job and done else {})
+
+    async def _statistics(self, request: Request) -> Response:
+        query = request.query_params
+        start, stop, number = (_number(query.get(key), key) for key in ("from", "to", "opening"))
+        opening = self._openings.known(int(number or 0))
+        return _json(await run_in_threadpool(self._openings.statistics, opening, start, stop))
 
     async def _curves(self, request: Request) -> Response:
         query = request.query_params
@@ -194,10 +239,12 @@ class Workbench(PagePart):
 
         def output(name: str, ending: str) -> str:
             """Return a name from the last file, with the command's where the ending alone would not tell them apart."""
-            stem = inputs[-1].name.partition(".")[0] if inputs else form.path.replace(" ", "-")
+            stem = _stem(inputs, self._files.folder) if inputs else form.path.replace(" ", "-")
             done = str(values.get("to") or form.path.split()[-1])
             default_name = (
-                f"{stem}-{done}{ending}" if ending in ("", *(each.suffix for each in inputs)) else f"{stem}{ending}"
+                f"{stem}-{done}{ending}"
+                if inputs and ending in ("", *(each.suffix for each in inputs))
+                else f"{stem}{ending}"
             )
             outputs.append(
                 self._files.new(name, taken.union(outputs))
@@ -210,8 +257,9 @@ class Workbench(PagePart):
         return form, words, outputs
 
     async def _command(self, request: Request) -> Response:
-        _, words, outputs = self._fill_form(await _object(request))
-        return _json({"command": join(["imulab", *words]), "outputs": outputs})
+        asked = await _object(request)
+        form, words, outputs = self._fill_form(asked)
+        return _json({"command": join(["imulab", *words]), "outputs": outputs, "wrong": form.wrong(asked["values"])})
 
     async def _run(self, request: Request) -> Response:
         form, words, outputs = self._fill_form(await _object(request))
@@ -224,6 +272,46 @@ class Workbench(PagePart):
 
 def _listed(value: Any) -> list[str]:
     return [str(each) for each in (value if isinstance(value, list) else [value]) if each]
+
+
+def _stem(inputs: list[Path], folder: Path) -> str:
+    """Return the name that outputs have from their inputs: the last one's, or what many have in common."""
+    last = inputs[-1].name.partition(".")[0]
+    if len(inputs) <= _FEW:
+        return last
+    if len(folders := {each.parent for each in inputs}) == 1 and (common := folders.pop()).parent == folder:
+        return common.name
+    alike = takewhile(lambda letters: len(set(letters)) == 1, zip(*(each.name for each in inputs), strict=False))
+    return "".join(letters[0] for letters in alike).partition(".")[0].rstrip("0123456789_-+ ") or last
+
+
+def _stated(columns: Any, sample_rate: Any) -> dict[str, Any] | None:
+    """Return checked statements on columns, None where there are none."""
+    if columns is None:
+        return None
+    if not isinstance(columns, list) or not all(
+        isinstance(each, list) and list(map(type, each)) == [int, str, str] for each in columns
+    ):
+        raise OptionError("columns: expected [place, name, unit] for each")
+    return {"columns": columns, "sample_rate": str(sample_rate or "")[:100]}
+
+
+def _columns_of(name: str, stated: dict[str, Any] | None, within: list[str]) -> dict[str, Any]:
+    """Return what a process of its own says of the columns of a file."""
+    words = [sys.executable, "-P", "-m", "imulab.live.page.columns", name]
+    environment = {**os.environ, WITHIN: json.dumps([os.path.realpath(root) for root in within])}
+    try:
+        ran = subprocess.run(
+            [*words, json.dumps(stated)] if stated else words,
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, encoding="utf-8", env=environment,
+            timeout=_PATIENCE, check=False,
+        )  # fmt: skip
+        told: dict[str, Any] = json.loads(ran.stdout)
+    except (subprocess.TimeoutExpired, ValueError):
+        told = {"error": f"{name}: its columns cannot be told"}
+    if "error" in told:
+        raise OptionError(told["error"])
+    return told
 
 
 def _json(value: Any) -> Response:

@@ -21,6 +21,9 @@ _FINE = 2000 * BUCKET
 """Most rows of a view that is made of samples."""
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time longer than both is a gap, as for `find_attitudes`."""
+_MOST_ROWS = 1 << 22  # of a spectrum
+_FEWEST_ROWS = 64  # of a spectrum
+_BANDS = 240  # of a spectrum that is drawn
 _MOST_GAPS = 1000  # that are marked
 _NUMBER = np.dtype("<f8")
 
@@ -179,6 +182,66 @@ def view(folder: Path, head: Head, start: float | None, stop: float | None, widt
     at, until = place.of(edges[:-1]), place.of(edges[1:] - 1)
     wide = np.flatnonzero(at[1:] - until[:-1] > head.longest_step) + 1 if head.timed else np.empty(0, np.int64)
     return CurveView(edges, at, until, low, high, wide.tolist())
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Numbers of a range: its rows, and by channel mean, standard deviation, and one-sided spectral density.
+
+    Attributes
+    ----------
+    mean, sigma
+        By channel, in its unit, without rows that are no number; NaN where there are too few.
+    frequencies
+        Frequencies of the densities, Hz, shape (k,); empty where there is no time, or where rows are few.
+    density
+        By channel, unit^2/Hz, shape (k,).
+    """
+
+    rows: int
+    mean: dict[str, float]
+    sigma: dict[str, float]
+    frequencies: Array
+    density: dict[str, Array]
+
+
+def statistics(folder: Path, head: Head, start: float | None, stop: float | None) -> Statistics:
+    """Return mean, standard deviation and spectrum of a range of places, the ends of the recording where None.
+
+    The spectrum is Welch's, of Hann windows that overlap by half, of the middle `_MOST_ROWS` rows at most, as if they
+    came in even steps; densities are averaged over bands of equal ratio (P. D. Welch, IEEE Trans. AU-15 (1967) 70).
+    """
+    place = _Places(folder, head)
+    first = 0 if start is None else place.row(start, "left")
+    last = head.rows if stop is None else place.row(stop, "right")
+    rows = max(last - first, 0)
+    mean, sigma, density = dict[str, float](), dict[str, float](), dict[str, Array]()
+    inner = first + max(rows - _MOST_ROWS, 0) // 2
+    step = 0.0
+    if head.timed and rows > _FEWEST_ROWS:
+        ends = place.of(np.array([first, last - 1]))
+        step = float(ends[1] - ends[0]) / (rows - 1)
+    frequencies = np.empty(0)
+    for number, name in enumerate(head.units):
+        values = _values(_file(folder, number, "values"), head.rows)[first:last]
+        good = values[np.isfinite(values)]
+        mean[name] = float(good.mean()) if good.size else np.nan
+        sigma[name] = float(good.std(ddof=1)) if good.size > 1 else np.nan
+        if step > 0 and good.size == rows:
+            frequencies, density[name] = _spectrum(values[inner - first : inner - first + _MOST_ROWS], 1 / step)
+    return Statistics(rows, mean, sigma, frequencies, density)
+
+
+def _spectrum(values: Array, rate: float) -> tuple[Array, Array]:
+    """Return frequencies and densities, averaged over bands of equal ratio."""
+    from scipy.signal import welch  # takes 0.4 s to load, and is asked for rarely
+
+    length = min(len(values), max(256, 1 << int(np.log2(len(values) / 4))))
+    frequencies, density = welch(values, rate, nperseg=length)
+    edges = np.unique(np.geomspace(1, len(frequencies), _BANDS + 1).round().astype(int))
+    counts = np.diff(edges)
+    sums = [np.add.reduceat(each, edges[:-1]) / counts for each in (frequencies, density)]
+    return sums[0], sums[1]
 
 
 class _Places:

@@ -20,8 +20,8 @@ from typing import IO, Any
 from imulab.device.unit import is_blob
 from imulab.display import has_hidden
 from imulab.errors import ImulabError, OptionError, quoted
-from imulab.files import WITHIN
-from imulab.live.page.curves import CurveView, Head, view
+from imulab.files import WITHIN, load_toml
+from imulab.live.page.curves import CurveView, Head, Statistics, statistics, view
 from imulab.live.page.server import inside
 from imulab.records import is_json
 
@@ -33,15 +33,19 @@ _WINDOWS = sys.platform == "win32"
 _NO_WINDOWS_NAME = re.compile(
     r"(?i)^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin\$|conout\$) *(\.|$)|[<>\"|?*]|[. ]$"
 )
-_KINDS = {".html": "report", ".htm": "report", ".toml": "manifest", ".zip": "other", ".pdf": "other", ".png": "other"}
+_MOST_INSIDE = 500  # files of a folder that are listed
+_SHOWN_INSIDE = (".csv", ".parquet", ".toml", ".json")
+_PROCEDURE = re.compile(rb'"procedure":\s*"(\w+)"')
+_KINDS = {".html": "report", ".htm": "report", ".zip": "other", ".pdf": "other", ".png": "other"}
 
 
 @dataclass(frozen=True)
 class FileEntry:
     """One file: its path as on the command line, its name, its kind, bytes, and when it was changed, s.
 
-    The kind is ``recording``, ``record``, ``report``, ``manifest``, ``folder`` or ``other``; `in_folder` is whether it
-    lies in the session's folder.
+    The kind is ``recording``, ``record``, ``report``, ``layout``, ``rate`` or ``centrifuge`` (manifests of such tests),
+    ``settings``, ``folder`` or ``other``; `in_folder` is whether it lies in the session's folder, and `folder` the name
+    of the folder in it that holds it, empty where that is the session's; `procedure` is that of a record.
     """
 
     name: str
@@ -50,6 +54,8 @@ class FileEntry:
     size: int
     modified: float
     in_folder: bool = False
+    folder: str = ""
+    procedure: str = ""
 
 
 class FolderFiles:
@@ -73,7 +79,7 @@ class FolderFiles:
 
     def __init__(self, folder: Path, named: Sequence[str] = (), later: Sequence[str] = ()) -> None:
         self.folder = folder
-        self._kinds: dict[tuple[str, int, int], str] = {}
+        self._kinds: dict[tuple[str, int, int], tuple[str, str]] = {}
         for name in named:
             if not _plain(name):
                 raise OptionError(f"{quoted(name)}: expected a file name without control characters")
@@ -103,8 +109,26 @@ class FolderFiles:
         """Return the present files: those of the command line first, then by name."""
         there = self.folder.iterdir() if self.folder.is_dir() else ()  # another program may have removed it
         inside = sorted(str(path) for path in there if _plain(path.name) and path.name[0] != ".")
-        entries = (self._entry(name) for name in dict.fromkeys([*self._given, *inside]))
+        entries = [self._entry(name) for name in dict.fromkeys([*self._given, *inside])]
+        entries += [inner for each in entries if each and each.kind == "folder" for inner in self._inside(each.name)]
         return [entry for entry in entries if entry is not None]
+
+    def _inside(self, folder: str) -> list[FileEntry]:
+        """Return the recordings, records and manifests in a folder that a command has written, or that was named."""
+        try:
+            names = sorted(path.name for path in Path(folder).iterdir() if path.suffix.lower() in _SHOWN_INSIDE)
+        except OSError:
+            return []
+        plain = [name for name in names if _plain(name) and name[0] != "."][:_MOST_INSIDE]
+        paths = (str(Path(folder, name)) for name in plain)
+        entries = (self._entry(path, folder) for path in paths if self._holds(path))
+        return [each for each in entries if each and (each.kind != "recording" or not each.name.endswith(".json"))]
+
+    def _holds(self, name: str) -> bool:
+        """Return whether a path leads to what is in the session's folder, or in a folder of the command line."""
+        real = os.path.realpath(name)
+        roots = (os.path.realpath(root) for root in self.readable)
+        return any(real == root or real.startswith(os.path.join(root, "")) for root in roots)  # noqa: PTH118
 
     def path(self, name: str) -> str:
         """Return the path of a file of the session, relative to the working folder.
@@ -114,10 +138,13 @@ class FolderFiles:
         OptionError
             The session has no such file.
         """
-        short = name.removeprefix(f"{self.folder}{os.sep}")
-        if name not in self._given and (
-            short == name or short.startswith(".") or not inside(self.folder, short).exists()
-        ):
+        if name in self._given:
+            return name
+        parts = Path(name).parts
+        hidden = not _plain(name) or str(Path(name)) != name or any(part.startswith(".") for part in parts)
+        parents = {str(self.folder), *self._given}
+        below = not Path(name).is_absolute() and parents.intersection(str(each) for each in Path(name).parents)
+        if hidden or not below or not self._holds(name) or not Path(name).exists():
             raise OptionError(f"{quoted(name)}: not among the files of this session")
         return name
 
@@ -170,7 +197,7 @@ class FolderFiles:
             path = checked(self.folder, f"{stem}-{number}{dot}{rest}")
         return str(path)
 
-    def _entry(self, name: str) -> FileEntry | None:
+    def _entry(self, name: str, folder: str = "") -> FileEntry | None:
         path = Path(name)
         try:
             status = path.stat()
@@ -178,8 +205,10 @@ class FolderFiles:
             return None
         key = name, status.st_mtime_ns, status.st_size
         if key not in self._kinds:
-            self._kinds[key] = _kind(path)
-        return FileEntry(name, path.name, self._kinds[key], status.st_size, status.st_mtime, self.owns(name))
+            kind = _kind(path)
+            self._kinds[key] = kind, _procedure(path) if kind == "record" else ""
+        kind, procedure = self._kinds[key]
+        return FileEntry(name, path.name, kind, status.st_size, status.st_mtime, self.owns(name), folder, procedure)
 
     def end(self) -> bool:
         """Remove the folder if it is empty; return whether it still exists."""
@@ -218,13 +247,33 @@ def _plain(name: str) -> bool:
 
 def _kind(path: Path) -> str:
     if path.is_dir():
-        return "folder"
+        return "recording" if any(path.glob("*.mcap")) or any(path.glob("*.db3")) else "folder"
+    if path.suffix.lower() == ".toml":
+        return _kind_of_toml(path)
     if known := _KINDS.get(path.suffix.lower()):
         return known
     try:
         return "record" if is_json(str(path)) or is_blob(str(path)) else "recording"
     except ImulabError:
         return "other"
+
+
+def _procedure(path: Path) -> str:
+    with suppress(OSError), path.open("rb") as stream:
+        named = _PROCEDURE.search(stream.read(4096))
+        return named[1].decode() if named else ""
+    return ""
+
+
+def _kind_of_toml(path: Path) -> str:
+    try:
+        table = load_toml(path, path.name, "settings")
+    except ImulabError:
+        return "settings"
+    runs = table.get("run")
+    if isinstance(runs, list) and runs:
+        return "rate" if all(isinstance(run, dict) and "mounting" in run for run in runs) else "centrifuge"
+    return "layout" if isinstance(table.get("columns"), dict) else "settings"
 
 
 # Recordings that the page shows: each is read by its own process, and its curves can be viewed meanwhile.
@@ -292,6 +341,8 @@ class Openings:
         self._open: dict[str, Opening] = {}  # by file and options, the latest viewed last
         self._place, self._lock = _new_place()
         self._number = 0
+        self.previews: list[str] = []
+        """Layouts of this session that are not saved."""
 
     def open(self, name: str, reading: Mapping[str, str], within: Sequence[str]) -> Opening:
         """Return a file that is being read; reading starts if it has not, or if the file has changed.
@@ -324,7 +375,7 @@ class Openings:
         opening.process = subprocess.Popen(
             [sys.executable, "-P", "-m", "imulab.live.page.contents", name, str(folder), json.dumps(chosen)],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, encoding="utf-8",
-            env={**os.environ, WITHIN: json.dumps([os.path.realpath(root) for root in within])},
+            env={**os.environ, WITHIN: json.dumps([os.path.realpath(root) for root in (*within, *self.previews)])},
         )  # fmt: skip
         threading.Thread(target=self._listen, args=(opening,), daemon=True).start()
         return opening
@@ -342,13 +393,25 @@ class Openings:
                 return opening
         raise OptionError("this recording is not open any more: choose it again")
 
+    def new_layout(self, toml: str) -> str:
+        """Return the path of a new layout that only this session knows, for a preview."""
+        self._number += 1
+        path = self._place / f"layout-{self._number}.toml"
+        path.write_text(toml, encoding="utf-8")
+        self.previews.append(str(path))
+        return str(path)
+
+    def statistics(self, opening: Opening, start: float | None, stop: float | None) -> Statistics:
+        """Return the numbers of a range."""
+        return statistics(opening.folder, opening.head, start, stop)
+
     def view(self, opening: Opening, start: float | None, stop: float | None, width: int) -> CurveView:
         """Return the curves of a range; errors as for `view` of `curves`."""
         return view(opening.folder, opening.head, start, stop, width)
 
     def end(self) -> None:
         """Close all files, and remove their curves."""
-        for opening in self._open.values():
+        for opening in list(self._open.values()):
             _close(opening)
         shutil.rmtree(self._place, ignore_errors=True)
         if self._lock is not None:

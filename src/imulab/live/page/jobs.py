@@ -18,7 +18,7 @@ from pathlib import Path
 from time import time
 from typing import IO, Any
 
-from imulab.errors import OptionError, listed, quoted
+from imulab.errors import ImulabError, OptionError, listed, quoted
 from imulab.files import WITHIN
 from imulab.options import Option
 
@@ -82,6 +82,28 @@ class Form:
     summary: str
     help: str
     fields: tuple[FormField, ...]
+    options: Mapping[str, Option] = dataclass_field(default_factory=dict, repr=False)
+
+    @property
+    def shown(self) -> dict[str, Any]:
+        """What a page is told of it."""
+        return {key: getattr(self, key) for key in ("path", "summary", "help", "fields")}
+
+    def wrong(self, values: Mapping[str, Any]) -> dict[str, str]:
+        """Return a sentence for each text that its option does not take, by the names of fields."""
+        found: dict[str, str] = {}
+        for field in self.fields:
+            option, text = self.options.get(field.name), values.get(field.name)
+            if option is None or field.kind != "text" or not isinstance(text, str) or not text.strip():
+                continue
+            try:
+                option.value(text.strip(), option.name.replace("_", " "))
+            except ImulabError as error:
+                found[field.name] = str(error)
+        found |= _wrong_gravity(
+            {f.name: str(values.get(f.name) or "").strip() for f in self.fields if f.group == "gravity"}
+        )
+        return found
 
     def words(
         self, values: Mapping[str, Any], file: Callable[[str], str], output: Callable[[str, str], str]
@@ -113,6 +135,19 @@ class Form:
         return words
 
 
+def _wrong_gravity(typed: Mapping[str, str]) -> dict[str, str]:
+    """Return why gravity, latitude and height, as typed, state none, at the one that the sentence begins with."""
+    from imulab.gravity import gravity_option
+
+    gravity, latitude, height = (typed.get(name) or None for name in ("gravity", "latitude", "height"))
+    try:
+        gravity_option(gravity, latitude, height, "{}", beside=True)
+    except ImulabError as error:
+        text = str(error)
+        return {next((name for name in typed if text.startswith(name)), "gravity"): text}
+    return {}
+
+
 def forms(commands: Iterable[Any]) -> dict[str, Form]:
     """Return the forms of commands of the command line, by their paths."""
     return {command.path: _form(command) for command in commands}
@@ -125,7 +160,9 @@ def _form(command: Any) -> Form:
         for each in command.arguments
     ]
     options = [_field(option, drawn=drawn) for option in command.options]
-    return Form(command.path, command.summary.rstrip("."), " ".join(command.help.split()), (*arguments, *options))
+    known = {option.keyword: option for option in command.options}
+    text = " ".join(command.help.split())
+    return Form(command.path, command.summary.rstrip("."), text, (*arguments, *options), known)
 
 
 def _field(option: Option, *, drawn: bool) -> FormField:

@@ -1,14 +1,21 @@
-// The workbench: recordings are dropped here, seen, calibrated, and left as records.
+// The workbench: files, what is in one, what can be done with it, and what was done.
+//
+// What is shown stands in the address (bench/state.js): the file, those chosen with it, the procedure, the range.
 
 import { h, put, show } from "./dom.js";
+import { columnTable, layoutList } from "./bench/columns.js";
 import { form } from "./bench/form.js";
 import { card } from "./bench/job.js";
-import { address, ask, bytes, send } from "./bench/net.js";
+import { alike, fileList, kindOf } from "./bench/list.js";
+import { address, ask, send } from "./bench/net.js";
 import { plots } from "./bench/plot.js";
+import { inAddress, keep, recall, toAddress } from "./bench/state.js";
+import { likely, reason } from "./bench/suits.js";
+import { grouped, written } from "./bench/units.js";
 
 export const title = "Workbench";
-const READING = ["layout", "units", "topic", "instance", "window", "element"];
-const KINDS = { recording: "recording", record: "record", report: "report", manifest: "manifest or layout", folder: "folder", other: "file" };
+const NOTHING = new Set(["folder", "report", "other", "settings", "layout"]); // kinds of files that no command is for
+const READING = ["units", "topic", "instance", "window", "element", "damaged"];
 
 let page = null;
 let place = null;
@@ -17,11 +24,16 @@ let folder = "";
 let newest = -1;
 let clicks = 0;
 let forms = [];
+let shipped = [];
 let chosen = null;
+let others = []; // names of further files that are chosen
 let opening = null;
-let current = null;
+let current = null; // the form that is shown
+let procedure = null;
 let reading = {};
-let last = null;
+let range = [null, null];
+let offered = "";
+let filled = "";
 const cards = new Map();
 const ui = {};
 
@@ -31,16 +43,17 @@ export function mount(into, given) {
   ui.input = h("input", { type: "file", multiple: true, id: "bench-files", class: "unseen", onchange: () => { take([...ui.input.files]); ui.input.value = ""; } });
   ui.drop = h("label", { class: "drop", for: "bench-files" }, h("strong", {}, "Drop recordings or records here"), h("span", {}, "or choose files"));
   ui.coming = h("ul", { class: "coming", "aria-live": "polite" });
-  ui.list = h("ul", { class: "list" });
+  ui.list = fileList({ choose: name => { clicks += 1; pick(name); }, toggle, redraw: () => ui.list.draw(files, chosen?.name, others) });
   ui.where = h("p", { class: "where" });
   ui.try = h("p", { class: "try" }, "Nothing at hand? ", h("button", { type: "button", onclick: simulate }, "Simulate a recording"));
   ui.file = h("section", { class: "file", "aria-label": "The chosen file", hidden: true });
   ui.procedure = h("section", { class: "procedure", "aria-labelledby": "bench-what", hidden: true });
   ui.jobs = h("div", { class: "jobs", "aria-label": "Results", role: "region" });
+  ui.status = h("p", { class: "statusline", role: "status", hidden: true });
   place.append(ui.bench = h("div", { class: "bench nothing" },
     h("p", { class: "welcome" }, "See a recording of an inertial sensor, calibrate it, and take the record, the report and the firmware with you."),
-    h("div", { class: "side" }, h("div", { class: "droparea" }, ui.input, ui.drop), ui.coming, ui.try, h("nav", { "aria-label": "Files" }, ui.list), ui.where),
-    h("div", { class: "work" }, ui.file, ui.procedure, ui.jobs)));
+    h("div", { class: "side" }, h("div", { class: "droparea" }, ui.input, ui.drop), ui.coming, ui.try, ui.list.element, ui.where),
+    h("div", { class: "work" }, ui.file, ui.jobs, ui.procedure, ui.status)));
   for (const kind of ["dragover", "drop", "dragleave"]) {
     addEventListener(kind, event => {
       if (place.hidden || ![...(event.dataTransfer?.types || [])].includes("Files")) return;
@@ -49,7 +62,8 @@ export function mount(into, given) {
       if (kind === "drop") take([...event.dataTransfer.files]);
     });
   }
-  ask("forms").then(found => { forms = found; if (chosen) formed(); }).catch(fail);
+  addEventListener("popstate", follow);
+  Promise.all([ask("forms"), ask("layouts")]).then(found => { [forms, shipped] = found; if (chosen) formed(); }).catch(fail);
 }
 
 const fail = error => page.say(error.message, "bad");
@@ -67,65 +81,135 @@ export function shown() {
   ask("files").then(listed).catch(fail);
 }
 
-// What has come is shown, unless another file was clicked on meanwhile.
+// Files
+
+// What has come is shown, unless another file was clicked on meanwhile; of many, the first, and the others are chosen too.
 async function take(given) {
   const before = clicks;
+  const came = [];
   for (const file of given) {
     const part = h("progress", { max: 1, value: 0, "aria-label": `receiving ${file.name}` });
     const row = h("li", {}, file.name, part);
     ui.coming.append(row);
     try {
       const name = await send(file, gone => { part.value = gone; });
+      came.push(name);
       if (!files.some(each => each.name === name)) listed(await ask("files"));
-      if (clicks === before && chosen?.name !== name) choose(name);
+      if (clicks === before && came.length === 1) arrived(name);
     } catch (error) {
       fail(error);
     }
     row.remove();
   }
+  const first = files.find(each => each.name === came[0]);
+  if (clicks === before && came.length > 1 && first && chosen === first) {
+    pick(first.name, { others: came.slice(1).filter(name => files.find(each => each.name === name)?.kind === first.kind) });
+  }
+}
+
+// A layout that comes while a file cannot be read is meant for that file.
+function arrived(name) {
+  const entry = files.find(each => each.name === name);
+  if (entry?.kind === "layout" && chosen?.kind === "recording" && opening?.error) readSo({ ...reading, layout: name });
+  else if (chosen?.name !== name) pick(name);
 }
 
 function listed(message) {
   if (message.number < newest) return; // an answer that a later message has overtaken
   ({ files, folder, number: newest } = message);
-  const row = each => h("li", {}, h("button", {
-    type: "button", class: "entry", "aria-current": each.name === chosen?.name ? "true" : null, "data-name": each.name, onclick: () => { clicks += 1; choose(each.name); },
-  }, h("span", { class: "filename" }, each.short), h("span", { class: "kind" }, `${KINDS[each.kind]}${each.kind === "folder" ? "" : `, ${bytes(each.size)}`}`)));
-  const focused = document.activeElement?.dataset?.name;
-  ui.list.replaceChildren(...files.map(row));
-  if (focused) [...ui.list.querySelectorAll("button")].find(each => each.dataset.name === focused)?.focus();
+  const known = new Set(files.map(each => each.name));
+  others = others.filter(name => known.has(name));
+  ui.list.draw(files, chosen?.name, others);
   ui.bench.classList.toggle("nothing", !files.length && !cards.size);
   show(ui.try, !files.some(each => each.kind === "recording"));
   put(ui.where, files.length ? `What is dropped or made is kept in the folder ${folder}.` : "");
-  if (chosen && !files.some(each => each.name === chosen.name)) leave();
-  else if (!chosen && files.length && !place.hidden) choose((files.find(each => each.kind === "recording") || files[0]).name);
+  if (chosen && !known.has(chosen.name)) leave();
+  else if (chosen) chosen = files.find(each => each.name === chosen.name);
+  else if (files.length && !place.hidden) begin();
   current?.refresh();
+  if (chosen) offer();
+}
+
+// The first file that is shown: that of the address, or the first recording.
+function begin() {
+  const wanted = inAddress();
+  if (files.some(each => each.name === wanted.file)) choose(wanted.file, wanted);
+  else pick((files.find(each => each.kind === "recording") || files[0]).name, {}, false);
 }
 
 function leave() {
   chosen = null;
+  others = [];
   show(ui.file, false);
-  listed({ files, folder, number: newest });
+  ui.list.draw(files, null, []);
+  offer();
 }
 
-function choose(name) {
+// Back and forward.
+function follow() {
+  const wanted = inAddress();
+  if (!files.some(each => each.name === wanted.file)) return;
+  if (wanted.file === chosen?.name && wanted.others.join() === others.join()) {
+    ui.plots?.follow(wanted.range);
+    range = wanted.range;
+    if (wanted.procedure !== procedure) { procedure = wanted.procedure; keep("procedure", chosen.name, procedure); offered = ""; offer(); }
+  } else {
+    choose(wanted.file, wanted);
+  }
+}
+
+// A file that was asked for: a folder opens with all that is in it.
+function pick(name, more = {}, step = true) {
+  const entry = files.find(each => each.name === name);
+  const inside = entry?.kind === "folder" ? files.filter(each => each.folder === name) : [];
+  const manifest = inside.find(each => ["rate", "centrifuge"].includes(each.kind));
+  const first = manifest || inside.find(each => each.kind === "recording") || inside[0];
+  if (!first) choose(name, more);
+  else choose(first.name, { ...more, others: manifest ? [] : inside.filter(each => each.kind === first.kind && each !== first).map(each => each.name) });
+  if (chosen) say(step);
+}
+
+const say = step => toAddress({ file: chosen.name, others, procedure, range }, step);
+
+function toggle(names, on) {
+  others = others.filter(each => !names.includes(each));
+  if (on) others.push(...names.filter(each => each !== chosen.name));
+  others = files.map(each => each.name).filter(each => others.includes(each));
+  ui.list.draw(files, chosen.name, others);
+  ui.heading?.replaceWith(ui.heading = heading());
+  say(false);
+  offered = "";
+  offer();
+}
+
+function choose(name, more = {}) {
   chosen = files.find(each => each.name === name) || null;
   if (!chosen) return;
-  for (const each of ui.list.querySelectorAll("button")) {
-    if (each.dataset.name === name) each.setAttribute("aria-current", "true");
-    else each.removeAttribute("aria-current");
-  }
+  others = more.others || [];
+  procedure = "procedure" in more ? more.procedure : recall("procedure", name) || null;
+  range = more.range || [null, null];
+  reading = { ...recall("reading", name) };
+  ui.list.draw(files, name, others);
   opening = null;
-  reading = {};
+  offered = filled = "";
+  for (const each of ui.jobs.children) if (!(each.files || []).includes(name)) each.open = false;
   ({ recording: recording, record: record }[chosen.kind] || other)();
   show(ui.file, true);
   offer();
 }
 
-const heading = () => h("div", { class: "heading" }, h("h2", {}, chosen.short),
-  h("span", { class: "actions" },
-    h("a", { class: "button", href: address(chosen.kind === "folder" ? "zip" : "files", chosen.name), download: "" }, chosen.kind === "folder" ? "Save as zip" : "Save"),
-    chosen.in_folder && chosen.kind !== "folder" ? h("button", { type: "button", onclick: remove }, "Remove") : null));
+// The name, how many are chosen with it, and what can be done with the file itself.
+function heading() {
+  const same = chosen.kind === "recording" || chosen.kind === "record" ? alike(files, chosen).map(each => each.name) : [];
+  const left = same.filter(each => each !== chosen.name && !others.includes(each));
+  return h("div", { class: "heading" }, h("h2", {}, chosen.short, others.length ? h("span", { class: "count" }, ` and ${grouped(others.length)} more`) : null),
+    h("span", { class: "actions" },
+      left.length ? h("button", { type: "button", onclick: () => toggle(same, true) }, `Choose all ${grouped(same.length)} like this`) : null,
+      others.length ? h("button", { type: "button", onclick: () => toggle([...others], false) }, "Only this one") : null,
+      h("a", { class: "button", href: address(chosen.kind === "folder" ? "zip" : "files", chosen.name), download: "" }, chosen.kind === "folder" ? "Save as zip" : "Save"),
+      chosen.folder ? h("a", { class: "button", href: address("zip", chosen.folder), download: "" }, "Save the folder") : null,
+      chosen.in_folder && chosen.kind !== "folder" ? h("button", { type: "button", onclick: remove }, "Remove") : null));
+}
 
 function remove() {
   if (confirm(`Remove ${chosen.short} from the folder ${folder}?`)) {
@@ -136,35 +220,88 @@ function remove() {
 // What a file shows that is made of forms; a recording that is shown already stays as it is.
 function formed() {
   if (chosen.kind === "record") record();
-  else if (chosen.kind === "recording") ui.reading.replaceChildren(ui.reading.firstChild, readingForm());
+  else if (chosen.kind === "recording") drawReading();
+  offered = "";
   offer();
 }
+
+// A recording
 
 function recording() {
   ui.summary = h("p", { class: "message", role: "status" }, "reading…");
   ui.refused = h("p", { class: "refused", role: "alert", hidden: true });
-  ui.reading = h("details", { class: "more" }, h("summary", {}, "How the file is read"), readingForm());
+  ui.columns = h("div", {});
+  ui.reading = h("details", { class: "more reading" }, h("summary", {}, "How the file is read"), h("div", {}));
   ui.head = h("details", { class: "more" }, h("summary", {}, "What the file says of itself"));
   const area = h("div", {});
-  ui.file.replaceChildren(heading(), ui.summary, ui.refused, area, ui.head, ui.reading);
-  ui.plots = plots(area);
+  ui.file.replaceChildren(ui.heading = heading(), ui.summary, ui.refused, ui.columns, area, ui.head, ui.reading);
+  ui.plots = plots(area, {
+    begin: () => range,
+    ranged: wanted => { range = wanted; say(false); },
+    use: ends => {
+      const text = ends.map(each => written(each, 7).replace("−", "-")).join(":");
+      if (current?.set("window", text)) ui.form.scrollIntoView({ block: "start" });
+      else readSo({ ...reading, window: text });
+    },
+  });
+  drawReading();
   open();
 }
 
-// The same options of reading as every command has.
-function readingForm() {
+// Layouts, columns, and the same options of reading as every command has.
+function drawReading() {
+  const body = ui.reading.lastChild;
   const convert = forms.find(each => READING.every(name => each.fields.some(field => field.name === name)));
-  if (!convert) return h("p", {});
+  if (!convert) return;
   const inputs = convert.fields.filter(each => READING.includes(each.name)).map(each => {
-    const input = h("input", { type: "text", id: `reading-${each.name}`, placeholder: each.shows, value: reading[each.name] || null, spellcheck: "false", autocomplete: "off" });
+    const input = h("input", { type: "text", id: `reading-${each.name}`, value: reading[each.name] || null, spellcheck: "false", autocomplete: "off" });
     return { each, input, element: h("div", { class: "field" }, h("label", { for: input.id }, each.name), input, h("small", {}, each.help)) };
   });
-  return h("form", { onsubmit: event => {
-    event.preventDefault();
-    reading = Object.fromEntries(inputs.map(({ each, input }) => [each.name, input.value.trim()]).filter(([, text]) => text));
-    open();
-    offer();
-  } }, h("div", { class: "fields" }, inputs.map(each => each.element)), h("p", { class: "go" }, h("button", { type: "submit" }, "Read it so")));
+  const now = reading.layout ? files.find(each => each.name === reading.layout)?.short || reading.layout : "";
+  body.replaceChildren(
+    h("p", { class: "message" }, now ? `Read with the layout ${now}. ` : "Read as its format and its titles say. ",
+      now ? h("button", { type: "button", onclick: () => readSo({ ...reading, layout: "" }) }, "Read it without") : null, " ",
+      h("button", { type: "button", onclick: () => state(true) }, "Say what its columns are")),
+    layoutList(files.filter(each => each.kind === "layout"), shipped, reading.layout, name => readSo({ ...reading, layout: name })),
+    h("form", { onsubmit: event => {
+      event.preventDefault();
+      readSo({ layout: reading.layout || "", ...Object.fromEntries(inputs.map(({ each, input }) => [each.name, input.value.trim()])) });
+    } }, h("div", { class: "fields" }, inputs.map(each => each.element)), h("p", { class: "go" }, h("button", { type: "submit" }, "Read it so"))));
+}
+
+function readSo(wanted, only = false) {
+  reading = Object.fromEntries(Object.entries(wanted).filter(([, text]) => text));
+  range = [null, null];
+  if (!only) {
+    for (const name of [chosen.name, ...others]) keep("reading", name, reading);
+    ui.columns.replaceChildren();
+    drawReading();
+    offered = "";
+  }
+  open();
+  if (!only) offer();
+}
+
+// The table in which a person says what the columns are.
+async function state(asked) {
+  const file = chosen;
+  try {
+    const told = await ask("columns", { file: file.name });
+    if (chosen !== file && chosen?.name !== file.name) return;
+    const table = columnTable(file, told, {
+      preview: layout => readSo({ ...reading, layout }, true),
+      saved: layout => { readSo({ ...reading, layout }); ui.file.scrollIntoView({ block: "start" }); },
+    });
+    ui.columns.replaceChildren(table.element);
+    put(ui.summary, "This file does not say itself what is in it.");
+    show(ui.refused, false);
+    table.begin();
+    if (asked) ui.columns.scrollIntoView({ block: "nearest" });
+  } catch (error) {
+    if (chosen?.name !== file.name) return;
+    if (asked) { put(ui.refused, error.message); show(ui.refused, true); }
+    else ui.reading.open = true;
+  }
 }
 
 function open() {
@@ -177,14 +314,16 @@ function open() {
 
 function opened(message) {
   opening = message;
-  const head = message.head;
-  const error = message.error;
+  const { head, error } = message;
+  const stating = Boolean(ui.columns.firstChild);
+  const some = Boolean(head?.rows);
   put(ui.refused, error || "");
-  show(ui.refused, Boolean(error));
-  if (error && !head?.rows) {
+  show(ui.refused, Boolean(error) && (some || !stating));
+  if (error && !some) {
     put(ui.summary, "This file cannot be read as it is.");
-    ui.reading.open = true;
     ui.plots.close();
+    if (!stating) state(false);
+    offer();
     return;
   }
   put(ui.summary, head ? `${error ? "Read up to where it breaks: " : ""}${summary(message)}` : "reading…");
@@ -195,10 +334,11 @@ function opened(message) {
     ui.head.replaceChildren(ui.head.firstChild, ...(notes.length ? [h("ul", {}, notes.map(each => h("li", {}, each)))] : []), h("pre", {}, told.join("\n")));
   }
   ui.plots.open(message);
+  offer();
 }
 
 function summary({ head, done, attitudes }) {
-  const parts = [`${head.rows.toLocaleString("en").replaceAll(",", " ")} samples`];
+  const parts = [`${grouped(head.rows)} samples`];
   if (!done) return `reading… ${parts[0]} so far`;
   if (head.timed) {
     const seconds = head.last - head.first;
@@ -212,66 +352,159 @@ function summary({ head, done, attitudes }) {
   return parts.join(", ");
 }
 
-const start = (command, values) => ask("jobs", { command, values }).then(worked);
+// A record, and other files
 
-// A record: what it says, its report, firmware and other programs' files, and what changed since another.
+const start = (command, values) => ask("jobs", { command, values }).then(worked);
+const targets = () => (forms.find(each => each.path === "export")?.fields.find(each => each.name === "to")?.choices || []).filter(each => each !== "c");
+
 function record() {
   const name = chosen.name;
-  const targets = forms.find(each => each.path === "export")?.fields.find(each => each.name === "to")?.choices || [];
-  const others = files.filter(each => each.kind === "record" && each.name !== name);
+  const beside = files.filter(each => each.kind === "record" && each.name !== name);
   const act = (label, run, kind) => h("button", { type: "button", class: kind, onclick: () => run().catch(fail) }, label);
-  const pick = (label, words, run) => {
+  const pickOne = (label, words, run) => {
     const select = h("select", { "aria-label": label }, words.map(([value, text]) => h("option", { value }, text)));
     return h("span", { class: "pick" }, select, act(label, () => run(select.value)));
   };
-  ui.file.replaceChildren(heading(), h("p", { class: "message" }, "A calibration record. Take it to the unit, or look at what it holds:"),
+  ui.file.replaceChildren(ui.heading = heading(), h("p", { class: "message" }, `A calibration ${kindOf(chosen)}. Take it to the unit, or look at what it holds:`),
     h("div", { class: "actions wide" },
       act("Report", () => start("report", { file: name, output: true }), "main"),
       act("What it says", () => start("show", { files: [name] })),
       act("Firmware (zip)", () => start("export", { records: [name], to: "c", output: true })),
-      pick("Write for another program", targets.filter(each => each !== "c").map(each => [each, each]), to => start("export", { records: [name], to, output: true })),
-      others.length ? pick("Compare with it", others.map(each => [each.name, each.short]), to => start("show", { files: [to, name] })) : null));
+      pickOne("Write for another program", targets().map(each => [each, each]), to => start("export", { records: [name], to, output: true })),
+      beside.length ? pickOne("Compare with it", beside.map(each => [each.name, each.short]), to => start("show", { files: [to, name] })) : null));
 }
 
 function other() {
-  ui.file.replaceChildren(heading(), h("p", { class: "message" }, { report: "A report: save it to open it in the browser.", folder: "What a command has written, as a folder.", manifest: "A manifest or a layout: choose it in a form below." }[chosen.kind] || "A file that imulab does not read by itself."));
+  const says = {
+    report: "A report: save it to open it in the browser.", folder: "What a command has written, as a folder.",
+    rate: "The manifest of a rate test: it names the recordings, and what the table did.", centrifuge: "The manifest of a centrifuge test: it names the runs.",
+    layout: "A layout: choose it for a recording, under “How the file is read”.", settings: "Settings of a command: choose it in a form.",
+  };
+  ui.file.replaceChildren(ui.heading = heading(), h("p", { class: "message" }, says[chosen.kind] || "A file that imulab does not read by itself."));
 }
 
 function simulate() {
   start("tumble simulate", { output: "tumble.csv" }).catch(() => start("tumble simulate", { output: true }).catch(fail));
 }
 
-// What can be done, with a form for it.
-function offer() {
-  if (!forms.length || !chosen) { show(ui.procedure, false); return; }
-  const takes = (each, what) => each.fields.some(field => (!field.flag || field.required) && field.kind.startsWith("file") && what.test(field.shows));
-  const suits = each => chosen.kind === "record" ? takes(each, /RECORD|FILE \[/) : takes(each, /FILE|LOG|STILL|MANIFEST/);
-  const order = [...forms].sort((one, other) => rank(one) - rank(other));
-  const free = order.filter(each => each.fields.every(field => field.flag));
-  const groups = new Map([["With this file", order.filter(each => suits(each) && !free.includes(each))], ["Plan and simulate", free]]);
-  const known = [...groups.values()].flat();
-  const wanted = known.find(each => each.path === last) || known[0];
-  const select = h("select", { id: "bench-procedure", onchange: () => { last = select.value; fill(order.find(each => each.path === last)); } },
-    [...groups].map(([label, found]) => h("optgroup", { label }, found.map(each => h("option", { value: each.path, selected: each === wanted }, `${each.path}: ${each.summary.replace(/\.$/, "")}`)))));
-  ui.form = h("div", {});
-  ui.procedure.replaceChildren(h("h2", { id: "bench-what" }, "What to do"), h("div", { class: "field wide" }, h("label", { for: "bench-procedure" }, "procedure"), select), ui.form);
-  show(ui.procedure, true);
-  fill(wanted);
+// What can be done
+
+function facts() {
+  return {
+    kind: chosen.kind, procedure: chosen.procedure, count: 1 + others.length, known: Boolean(opening?.head?.rows),
+    columns: Object.keys(opening?.head?.units || {}), timed: Boolean(opening?.head?.timed), attitudes: opening?.attitudes ? opening.attitudes.length : null,
+    records: files.filter(each => each.kind === "record").map(each => each.procedure),
+  };
 }
 
-// Fits first, then what needs one file, then what needs a record too.
-const rank = each => (/ (fit|calibrate|reduce)$/.test(each.path) ? 0 : 1 + each.fields.filter(field => !field.flag || field.required).length);
+// Cards: those for this file, those that are not and why, and what needs no file.
+function offer() {
+  // Before it is known what a recording holds, nothing is offered; while it is read anew, what was offered stays.
+  const unread = chosen?.kind === "recording" && (ui.columns.firstChild || (opening ? opening.error && !opening.head?.rows : !filled));
+  if (!forms.length || !chosen || NOTHING.has(chosen.kind) || unread) {
+    show(ui.procedure, false);
+    current = null;
+    offered = filled = "";
+    return;
+  }
+  const known = facts();
+  const key = JSON.stringify([chosen.name, others, known, reading]);
+  if (key === offered) return; // what was typed stays
+  offered = key;
+  const taking = forms.filter(each => each.fields.some(field => !field.flag) && each.path !== "layout guess");
+  const found = taking.map(each => ({ each, why: reason(each.path, known) }));
+  const fits = found.filter(({ why }) => !why).map(({ each }) => each).sort((one, other) => likely(one.path, other.path, known));
+  const free = forms.filter(each => each.fields.every(field => field.flag));
+  const button = (each, why) => h("button", {
+    type: "button", class: "card", disabled: Boolean(why), "data-path": each.path, "aria-pressed": why ? null : "false", onclick: () => choosing(each),
+  }, h("strong", {}, each.path), h("span", {}, why ? `${why[0].toUpperCase()}${why.slice(1)}.` : `${each.summary}.`));
+  const more = (label, items) => (items.length ? h("details", { class: "more" }, h("summary", {}, `${label} (${items.length})`), h("div", { class: "cards" }, items)) : null);
+  const old = ui.form;
+  const opened_ = [...ui.procedure.querySelectorAll("details.more")].filter(each => each.open).map(each => each.querySelector("summary").textContent.split(" (")[0]);
+  ui.form = h("div", { class: "formplace" });
+  ui.procedure.replaceChildren(h("h2", { id: "bench-what" }, others.length ? `What to do with these ${grouped(1 + others.length)} files` : "What to do with it"),
+    h("div", { class: "cards" }, fits.map(each => button(each))), ui.form,
+    more("Not with this", found.filter(({ why }) => why).map(({ each, why }) => button(each, why))) || "",
+    more("Plan and simulate", free.map(each => button(each))) || "");
+  for (const each of ui.procedure.querySelectorAll(":scope > details")) each.open = opened_.includes(each.querySelector("summary").textContent.split(" (")[0]);
+  show(ui.procedure, true);
+  const wanted = [...fits, ...free].find(each => each.path === procedure) || (known.kind === "recording" || known.kind === "rate" || known.kind === "centrifuge" ? fits[0] : null);
+  const same = wanted && filled === formKey(wanted);
+  if (same) { ui.form.replaceWith(old); ui.form = old; press(wanted); current.refresh(); }
+  else if (wanted) fill(wanted);
+  else current = null;
+}
 
-// The chosen file and the latest record go where they fit.
-function fill(definition) {
-  const latest = kind => (chosen.kind === kind ? chosen : files.filter(each => each.kind === kind).sort((one, other) => other.modified - one.modified)[0])?.name;
-  const values = { ...reading };
+// The form of these files as they are read: while it is the same, what is typed and folded stays.
+const formKey = definition => JSON.stringify([definition.path, chosen.name, others, reading]);
+const press = definition => { for (const each of ui.procedure.querySelectorAll(".card:enabled")) each.setAttribute("aria-pressed", String(each.dataset.path === definition.path)); };
+
+function choosing(definition) {
+  procedure = definition.path;
+  keep("procedure", chosen.name, procedure);
+  say(true);
+  fill(definition);
+  ui.form.scrollIntoView({ block: "nearest" });
+}
+
+// The chosen files and the latest record go where they fit; what was typed for this file before stands again.
+function fill(definition, given = {}) {
+  press(definition);
+  filled = formKey(definition);
+  const suitable = each => reason(definition.path, { ...facts(), kind: "record", procedure: each.procedure }) === "";
+  const latest = kind => (chosen.kind === kind ? chosen : files.filter(each => each.kind === kind && (kind !== "record" || suitable(each))).sort((one, other_) => other_.modified - one.modified)[0])?.name;
+  const all = [chosen.name, ...others];
+  const key = `${chosen.name}|${definition.path}`;
+  const read = Object.fromEntries(Object.entries(reading).filter(([name]) => definition.fields.some(each => each.name === name)));
+  const values = { ...read, ...recall("values", key), ...given };
   for (const each of definition.fields.filter(found => (!found.flag || found.required) && found.kind.startsWith("file"))) {
-    const fitting = [/RECORD/.test(each.shows) ? latest("record") : null, /RECORD(\.\.\.)?$/.test(each.shows) ? null : chosen.kind === "record" && each.shows.includes("RECORD") ? latest("recording") : chosen.name].filter(Boolean);
+    if (values[each.name]) continue;
+    const fitting = [/RECORD/.test(each.shows) ? [latest("record")] : [], /RECORD(\.\.\.)?$/.test(each.shows) ? [] : chosen.kind === "record" && each.shows.includes("RECORD") ? [latest("recording")] : all].flat().filter(Boolean);
     values[each.name] = each.kind === "files" ? fitting : fitting[0];
   }
-  current = form(definition, { files: () => files, values, run: async given => { last = definition.path; await start(definition.path, given); } });
-  ui.form.replaceChildren(current.element);
+  current = form(definition, {
+    files: () => files, values, keep: typed => keep("values", key, typed),
+    run: async typed => { procedure = definition.path; keep("procedure", chosen.name, procedure); say(false); await start(definition.path, typed); },
+  });
+  ui.form.replaceChildren(h("details", { class: "settings", open: true }, h("summary", {}, h("strong", {}, definition.path)), current.element));
+}
+
+// What was done
+
+const actions = {
+  look: name => { clicks += 1; pick(name); ui.file.scrollIntoView({ block: "start" }); },
+  kind: name => files.find(each => each.name === name)?.kind,
+  targets,
+  can: path => forms.some(each => each.path === path),
+  export: (name, to, more) => start("export", { records: [name], to, output: true, ...more }).catch(fail),
+  again: job => {
+    const records = job.words.slice(1).filter(word => files.some(each => each.name === word));
+    start("export", { records, to: job.words[job.words.indexOf("--to") + 1], lossy: true, output: true }).catch(fail);
+  },
+  // The form of what a record is for, with the recording that is shown.
+  form: (path, name) => {
+    const definition = forms.find(each => each.path === path);
+    const recording_ = (chosen?.kind === "recording" ? chosen : files.find(each => each.kind === "recording"))?.name;
+    const records = definition.fields.filter(each => each.kind.startsWith("file") && !each.flag);
+    const given = Object.fromEntries(records.map(each => [each.name, each.kind === "files" ? (/RECORD/.test(each.shows) ? [name, ...(/FILE/.test(each.shows) && recording_ ? [recording_] : [])] : [recording_]) : /RECORD/.test(each.shows) ? name : recording_]));
+    procedure = path;
+    say(true);
+    fill(definition, given);
+    ui.form.scrollIntoView({ block: "start" });
+  },
+  told: (job, state_) => { if (latestJob?.number === job.number) tell(job, state_); },
+};
+let latestJob = null;
+
+// The line that stays in sight: what runs, or how the last one ended.
+function tell(job, state_ = "") {
+  latestJob = job;
+  const waiting = [...cards.values()].filter(each => each.open()).length;
+  const words = { waiting: "waits", running: "runs", done: state_ ? `done: ${state_}` : "done", refused: "was refused", cancelled: "was cancelled" }[job.state];
+  show(ui.status, true);
+  ui.status.className = `statusline ${job.state} ${state_}`;
+  ui.status.replaceChildren(h("span", {}, `${job.path} ${words}${waiting > 1 ? `; ${waiting} in all` : ""}`), " ",
+    h("button", { type: "button", onclick: () => { const found = cards.get(job.number); found.element.open = true; found.element.scrollIntoView({ block: "start" }); } }, job.ended === null ? "Show" : "Show the result"));
 }
 
 function worked(job) {
@@ -279,14 +512,20 @@ function worked(job) {
   if (known) {
     known.update(job);
   } else {
-    const found = card(job, { look: name => { choose(name); ui.file.scrollIntoView({ block: "start" }); }, kind: name => files.find(each => each.name === name)?.kind });
+    const found = card(job, actions);
     for (const each of ui.jobs.children) each.open = false;
     cards.set(job.number, found);
+    found.element.files = job.words;
     ui.jobs.prepend(found.element);
-    if (Date.now() / 1000 - job.began < 5) found.element.scrollIntoView({ block: "start" });
+    if (Date.now() / 1000 - job.began < 5) {
+      const settings = ui.form?.querySelector("details.settings");
+      if (settings && settings.querySelector("summary").textContent === job.path) settings.open = false;
+      found.element.scrollIntoView({ block: "start" });
+    }
   }
+  if (!latestJob || job.number >= latestJob.number) tell(job);
   if (job.ended !== null && !chosen) {
-    const made = job.outputs.find(name => files.some(each => each.name === name && each.kind === "recording"));
-    if (made) choose(made);
+    const made = job.outputs.find(name => files.some(each => each.name === name && ["recording", "folder"].includes(each.kind)));
+    if (made) pick(made);
   }
 }

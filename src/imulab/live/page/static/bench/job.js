@@ -3,11 +3,12 @@
 import { h, put, show } from "../dom.js";
 import { commandLine } from "./form.js";
 import { address, ask } from "./net.js";
+import { lossy, result } from "./result.js";
 
 const STATES = { waiting: "waiting", running: "running", done: "done", refused: "refused", cancelled: "cancelled" };
 const FAILED_TEST = /^fail\b/;
 
-// `act.look(name)` shows a file, `act.kind(name)` is its kind.
+// `act.look(name)` shows a file, `act.kind(name)` is its kind; what else `act` has is for `result`.
 export function card(job, act) {
   const state = h("span", { class: "chip" });
   const time = h("span", { class: "time" });
@@ -16,10 +17,13 @@ export function card(job, act) {
   const verdict = h("p", { class: "state", hidden: true });
   const made = h("div", { class: "made" });
   const frame = h("div", { class: "report" });
+  const first = h("div", {});
   const cancel = h("button", { type: "button", onclick: () => { cancel.disabled = true; ask(`jobs/${job.number}`, undefined, { method: "DELETE" }).catch(() => {}); } }, "Cancel");
   const element = h("details", { class: "job", open: true, id: `job-${job.number}` },
     h("summary", {}, h("strong", {}, job.path), state, time),
-    commandLine(job.command), h("p", { class: "go" }, cancel), verdict, said, made, text, frame);
+    h("p", { class: "go" }, cancel), first, verdict, made, frame,
+    h("details", { class: "more all", open: true }, h("summary", {}, "All that it says"), said, text, h("p", { class: "same" }, "The command that does the same:"), commandLine(job.command)));
+  const all = element.querySelector(".all");
   let now = null;
 
   function tick() {
@@ -58,22 +62,37 @@ export function card(job, act) {
       said.append(h("li", { class: /^(note|warning)/.test(own) ? own.split(":")[0] : now.status === 0 ? "" : "bad" }, own));
     }
     if (!ended) return;
-    const [first, ...rest] = now.text.split("\n");
-    const found = /^(good|look|bad|pass|fail)\b/.exec(first);
+    const [head, ...rest] = now.text.split("\n");
+    const found = /^(good|look|bad|pass|fail)\b/.exec(head);
     show(verdict, Boolean(found));
     if (found) {
-      put(verdict, first);
+      put(verdict, head);
       verdict.className = `state ${{ pass: "good", fail: "bad" }[found[1]] || found[1]}`;
     }
     put(text, found ? rest.join("\n").replace(/^\n+/, "") : now.text);
     show(text, Boolean(text.textContent.trim()));
     made.replaceChildren(...now.outputs.flatMap(buttons));
+    if (now.state === "refused" && now.words[0] === "export" && now.messages.some(each => /lossy/.test(each))) first.replaceChildren(lossy(now, act));
+    if (now.state === "done") see(found);
+  }
+
+  // The result of a record comes first; of a report alone, the report.
+  async function see(known) {
     const drawn = now.outputs.find(name => name.endsWith(".html"));
-    if (drawn && now.state === "done" && Date.now() / 1000 - now.ended < 20) report(drawn);
+    const json = now.outputs.some(name => name.endsWith(".json"));
+    const seen = json ? await ask(`results/${now.number}`).catch(() => ({})) : {};
+    if (seen.state) {
+      first.replaceChildren(result(seen, act));
+      show(verdict, false);
+      all.open = false;
+    } else if (drawn && Date.now() / 1000 - now.ended < 20) {
+      report(drawn);
+    }
+    act.told(now, seen.state || (known ? known[1] : ""));
   }
 
   show(text, false);
   update(job);
   tick();
-  return { element, update };
+  return { element, update, open: () => now.ended === null };
 }
