@@ -466,7 +466,7 @@ def test_lost_samples_stand_in_the_headline(live, new_page):
 
 
 def test_the_place_is_asked_for_where_gravity_is_not_stated(live, new_page, tmp_path):
-    lines = lines_of(il.simulate_tumble(attitudes=14, order=1, gravity=9.8073, hold="3 s", move="1 s", gyro=False))
+    lines = lines_of(il.simulate_tumble(attitudes=90, order=1, gravity=9.8073, hold="3 s", move="1 s", gyro=False))
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(20)
         words = ["--attitudes", "12", "--order", "1", "--save", "rec.csv", "-o", "rec.json"]

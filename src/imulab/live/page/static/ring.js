@@ -8,7 +8,7 @@ const SIGNS = { accepted: "✓", done: "✓", silent: "!", lost: "!", failed: "!
 export class Ring {
   constructor() {
     this.full = s("circle", { class: "full", r: R, transform: "rotate(-90)" });
-    this.text = s("text", { y: 10 });
+    this.text = s("text", { y: 8 });
     this.place = s("svg", { class: "ring", viewBox: "-50 -50 100 100", "aria-hidden": "true" },
       s("circle", { class: "round", r: R }), this.full, this.text);
   }

@@ -52,6 +52,7 @@ export function mount(into, given) {
   for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel"]) parts.live.addEventListener(kind, byHand);
   parts.place = placeForm();
   parts.sphere = spherePlace();
+  parts.marks = h("span", {}, " Ring: next. Cross: now.");
   parts.strip = new Strip();
   parts.facts = h("dl", { class: "facts" });
   parts.parameters = h("div", {});
@@ -60,7 +61,7 @@ export function mount(into, given) {
   result = new ResultArea(page);
   const beside = h("div", { class: "beside" }, parts.bodies,
     h("section", { class: "covered" }, h("h2", {}, "What is covered"), parts.sphere,
-        h("p", { class: "caption" }, "Shaded: within 22° of an attitude held. Ring: next. Cross: now.")));
+        h("p", { class: "caption" }, "Shaded: within 22° of an attitude held.", parts.marks)));
   const attitudes = h("section", {}, h("h2", {}, "Attitudes"), parts.attitudes);
   parts.known = h("section", {}, h("h2", {}, "Parameters"), parts.parameters);
   parts.later = [beside, attitudes];
@@ -104,7 +105,9 @@ function view(now) {
   progress(now, measuring);
   bodies(now, measuring);
   facts(now);
-  once("sphere", [now.attitudes, now.next, now.up?.map(each => each.toFixed(2))], () => drawSphere(parts.sphere, now));
+  const there = measuring ? now : { ...now, next: null, up: null };
+  once("sphere", [there.attitudes, there.next, there.up?.map(each => each.toFixed(2))], () => drawSphere(parts.sphere, there));
+  show(parts.marks, measuring);
   once("parameters", [now.parameters, now.targets], () =>
     parts.parameters.replaceChildren(targetList(now), parameterTable(now)));
   once("attitudes", [now.attitudes, measuring], () =>
@@ -215,7 +218,7 @@ function placeForm() {
       const texts = Object.entries(fields).map(([name, label]) => [name, label.querySelector("input").value.trim()]);
       page.send({ type: "place", ...Object.fromEntries(texts) });
     },
-  }, h("p", {}, "Where is this? Local gravity is not known, and every scale factor inherits up to 0.16 % from that."),
+  }, h("p", {}, "Where is this? Without local gravity, scale factors are known to 0.16 % at best."),
   h("span", { class: "fields" }, Object.values(fields), h("button", {}, "Use")));
 }
 
