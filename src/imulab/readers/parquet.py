@@ -11,6 +11,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from imulab.columns import kind_of, measured, parse_column_title
 from imulab.display import Note
 from imulab.errors import ReadError
@@ -20,6 +22,7 @@ from imulab.readers.formats import Budget, library
 from imulab.readers.layout import Readings
 from imulab.recording import CORRECTED_BY, Array, Layout, Recording
 
+_NUMPY = {"double": "f8", "float": "f4", "halffloat": "f2"}  # numpy's names of pyarrow's types that it does not know
 _BYTES = 8  # of a number in memory
 _NOT_OURS = ("ARROW:", "org.apache.")
 _OTHERS_JSON = ("pandas", "huggingface", "geo")  # metadata of other writers, whose text begins with a brace
@@ -117,4 +120,7 @@ def _floats(arrow: Any, column: Any, title: str, name: str) -> Array:
         raise ReadError(f"{name}: column {title}: expected numbers, found {kind}")
     if column.null_count or arrow.types.is_boolean(kind):
         column = column.cast(arrow.float64(), safe=False).fill_null(float("nan"))
-    return to_floats(column.to_numpy(zero_copy_only=False), f"{name}: column {title}")
+    # Its buffer, because pyarrow's own conversion imports pandas, which takes longer than most files.
+    dtype = np.dtype(_NUMPY.get(str(column.type), str(column.type)))
+    values = np.frombuffer(column.buffers()[1], dtype, len(column), column.offset * dtype.itemsize)
+    return to_floats(values, f"{name}: column {title}")
