@@ -601,6 +601,7 @@ class Checks:
         """Keep the gyros that have repeated one number so far."""
         if self.still is None or self.first is None:
             self.still, self.first = np.ones(flat.shape[1], dtype=bool), np.full(flat.shape[1], np.nan)
+        self.still &= ~(np.abs(flat[-1] - flat[0]) > 0)  # most gyros need no more than two readings
         for k in np.flatnonzero(self.still).tolist():
             column = flat[np.isfinite(flat[:, k]), k]
             if len(column):

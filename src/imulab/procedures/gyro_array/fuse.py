@@ -592,6 +592,10 @@ class Fuser:
     def _drop_zeros(self, readings: Array) -> None:
         """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to NaN."""
         flat = readings.reshape(len(readings), -1)
+        if not (flat[:, 0] == 0).any():
+            before = [] if self.before is None or len(flat) >= HISTORY else [self.before]
+            self.before = np.vstack([*before, flat[-HISTORY:]])[-HISTORY:]
+            return
         joined = flat if self.before is None else np.vstack([self.before, flat])
         zero = zero_rows(list(joined.T))[len(joined) - len(flat) :]
         self.before = joined[(joined != 0).any(axis=1)][-HISTORY:]
