@@ -384,7 +384,7 @@ class Runner:
             self._stream.cut()
             return [Event("again", "samples come again" if session.begun else "samples come", self.recorder.last)]
         waited = now - self._last_arrival
-        if source.ended or not (source.lost or waited >= _SILENT):
+        if source.ended or not (source.lost or before or waited >= _SILENT):
             return []
         silence = f"nothing has come from {source.name} for"
         if session.begun and source.comes_back and waited >= _GIVEN_UP:
@@ -395,10 +395,10 @@ class Runner:
         outlook = f"{why} {self.kept()}." if session.begun else f"{why} The session begins with the first sample."
         if session.begun and source.comes_back:
             outlook += f" In {max(_GIVEN_UP - waited, 0):.0f} s the record is made of what there is."
-        if source.lost:
+        if source.lost or (before is not None and before.state == "lost"):  # until samples come again
             at = f" at {len(session.guide.kept)} of {session.wanted}" if session.wanted else ""
             session.trouble = Trouble("lost", f"link lost{at}; reconnecting", outlook)
-            text = f"{session.trouble.advice}: {source.lost}"
+            text = f"{session.trouble.advice}: {why}"
         else:
             session.trouble = Trouble("silent", "no samples come: is the unit on, and does it send?", outlook)
             text = f"{silence} {_SILENT:.0f} s: is the unit on, and does it send?"
