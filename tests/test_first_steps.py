@@ -182,6 +182,21 @@ def test_a_recording_without_its_time_is_told_what_it_needs(recording):
         il.fit_tumble(il.find_attitudes(table), gravity=9.81)
 
 
+@pytest.mark.parametrize("command", ["noise fit", "allan", "rate turn"])
+def test_samples_without_a_time_are_told_how_to_state_their_rate(imulab, tmp_path, command):
+    (tmp_path / "g.csv").write_text(
+        "gyro_x [deg/s],gyro_y [deg/s],gyro_z [deg/s]\n" + "0.1,0.2,0.3\n0.2,0.3,0.4\n" * 500
+    )
+    guess = "imulab layout guess g.csv --sample-rate 100Hz -o L.toml"
+    done = imulab(*command.split(), "g.csv", *(["-o", "r.json"] if " " in command else []))
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "no column time; " in done.stderr
+    assert guess in done.stderr
+    assert guess in imulab("show", "g.csv").stdout
+    assert imulab(*guess.split()[1:]).returncode == 0
+    assert "rate 100 Hz" in imulab("show", "g.csv", "--layout", "L.toml").stdout
+
+
 def test_the_noise_of_a_unit_that_moves_is_warned_of(imulab, tmp_path, recording):
     il.write_csv(recording, tmp_path / "moving.csv")
     done = imulab("allan", "moving.csv")

@@ -181,7 +181,7 @@ class Recording:
                 ) from None
             advice = next((note for note in self.notes if "--layout" in note), None)
             advice = advice or "a layout says where columns of other names are (--layout; docs/recordings.md)"
-            hint = f"; {advice}" if foreign else ""
+            hint = f"; {advice}" if foreign else f"; {state_rate(self.name)}" if name == "time" else ""
             raise DataError(f"{self.name}: no column {name}; found {' '.join(self.columns)}{hint}") from None
 
     def si(self, name: str) -> Array:
@@ -478,6 +478,12 @@ def check_finite(recording: Recording, names: list[str]) -> None:
                 f"{recording.name}: {recording.place(index)}, column {name}: "
                 f"expected {expected}, found {values[index]}{more}{advice}"
             )
+
+
+def state_rate(name: str) -> str:
+    """Return what to do about samples without a time in a file of this name."""
+    guess = f"imulab layout guess {name} --sample-rate 100Hz -o L.toml writes one"
+    return f"state the rate of samples: sample_rate in a layout ({guess}; in Python rate=100)"
 
 
 EVEN_SAMPLES = "where samples are even, state sample_rate in a layout instead of this column (in Python rate=)"

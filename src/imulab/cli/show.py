@@ -163,6 +163,7 @@ def finish_check(
 _MOST_ROWS = 1 << 21  # whose times are held at once
 _LEAST_JITTER = 1e-6  # s: a smaller one is that of rounding
 _SHOWN = 0.1  # s: times are shown to this
+_MANY_ATTITUDES = 100  # rows of a table from which it may be a recording that lacks its time
 _SLOWEST = 0.5  # Hz: at a lower rate the unit of time is doubted
 
 
@@ -445,6 +446,7 @@ def _contents(blocks: Iterable[Recording]) -> _Contents:
 def describe_recording(blocks: Iterable[Recording]) -> str:
     """Return a recording in lines: samples, rate, gaps, duration, and each column's range."""
     from imulab.estimation.sampling import doubt_unit_of_time
+    from imulab.recording import state_rate
     from imulab.units import to_si
 
     contents = _contents(blocks)
@@ -459,6 +461,7 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
         lines += [*text, *([f"{doubt} --unit time=UNIT states it"] if doubt else [])]
     if "time" not in last:
         lines.append("no time column: a table of attitudes, a row each")
+        lines += [f"or else {state_rate(printable(last.name))}"] if contents.samples > _MANY_ATTITUDES else []
     steps = {clock: _SHOWN / to_si(1.0, last.units[clock]) for clock in last.clocks if clock in last}
     rows = [[name, last.units[name], *column.texts(steps.get(name))] for name, column in contents.columns.items()]
     lines += ["", *aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]

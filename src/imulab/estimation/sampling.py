@@ -11,7 +11,17 @@ from imulab.display import Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.clock import GAP, Clock, read_clock, same_rows
 from imulab.estimation.rows import median, quantile
-from imulab.recording import EVEN_SAMPLES, Array, Recording, by_clock, check_finite, check_time, joined, stored_as
+from imulab.recording import (
+    EVEN_SAMPLES,
+    Array,
+    Recording,
+    by_clock,
+    check_finite,
+    check_time,
+    joined,
+    state_rate,
+    stored_as,
+)
 from imulab.units import to_si
 
 WIDEST_GAP = 10.0
@@ -187,7 +197,10 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
         There is no time column, time does not rise, or there are fewer than 3 samples.
     """
     if "time" not in recording:
-        raise DataError(f"{recording.name}: no column time; expected one, the noise depends on the sampling rate")
+        raise DataError(
+            f"{recording.name}: no column time; expected one, the noise depends on the sampling rate; "
+            f"{state_rate(recording.name)}"
+        )
     time = check_time(recording)
     if len(time) < _FEWEST:
         raise DataError(f"{recording.name}: {len(time)} samples are too few; expected at least {_FEWEST}")

@@ -292,7 +292,7 @@ class SampleClock:
             There is no time column, or time stands still or runs backwards.
         """
         if "time" not in block:
-            raise DataError(f"{block.name}: no column time; found {' '.join(block.columns)}")
+            block.column("time")  # raises the message of a missing column
         time = check_time(block)
         if not len(time):
             return

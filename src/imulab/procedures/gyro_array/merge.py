@@ -177,7 +177,7 @@ def _axes(names: Sequence[str]) -> str:
 
 def _time(recording: Recording) -> Array:
     if "time" not in recording:
-        raise DataError(f"{recording.name}: no column time; found {' '.join(recording.columns)}")
+        recording.column("time")  # raises the message of a missing column
     time = check_time(recording)
     if len(time) < 2:
         raise DataError(f"{recording.name}: a single sample; expected a recording")

@@ -29,7 +29,7 @@ from imulab.estimation.rows import distinct, leave_out, median, medians, quantil
 from imulab.estimation.sampling import bridged, doubt_unit_of_time
 from imulab.procedures.result import OWN_CLOCKS, as_recording
 from imulab.readers.streams import one_clock
-from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time
+from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time, state_rate
 from imulab.units import conversion_factor
 
 # Attitudes: what segmentation hands to a tumble fit.
@@ -226,8 +226,7 @@ def attitude_table(
     if len(mean) > _LONG_TABLE and apart < _NEIGHBOURS:
         raise SegmentError(
             f"{recording.name}: {len(mean)} rows without a time that go over into each other: samples of a recording, "
-            "no attitudes; state their rate: sample_rate in a layout (imulab layout guess "
-            f"{recording.name} --sample-rate 100Hz -o L.toml writes one; in Python rate=100)"
+            f"no attitudes; {state_rate(recording.name)}"
         )
     covariance = stated_covariance(recording, names, unit)
     kept = np.sort(np.unique(mean, axis=0, return_index=True)[1])
