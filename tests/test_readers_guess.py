@@ -357,3 +357,12 @@ def test_dates_that_are_not_read_are_shown_and_points_have_the_day_first(tmp_pat
             ReadError, match=r"found 'Timestamp', which holds '11-Dec-2024 08:00:00.500', no number and"
         ):
             il.guess_layout(tmp_path / "f.csv")
+
+
+@pytest.mark.parametrize("depth", [900, 5000, 100_000])
+def test_json_that_nests_deeply_is_refused_in_a_line(imulab, tmp_path, depth):
+    (tmp_path / "deep.json").write_text('{"a":' * depth + "[1,2,3]" + "}" * depth)
+    for command in (("layout", "guess"), ("show",)):
+        done = imulab(*command, "deep.json")
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        assert "internal" not in done.stderr

@@ -30,7 +30,7 @@ from imulab.files import open_file
 from imulab.options import measure, parsed, text
 from imulab.quantities import parse_units
 from imulab.readers.formats import TEXT, is_packed, recognised, unpacked
-from imulab.readers.jsonfile import LARGEST, parsed_document
+from imulab.readers.jsonfile import DEEP, LARGEST, parsed_document
 from imulab.readers.labelled import LabelledLines, pairs
 from imulab.readers.shipped import advice
 from imulab.readers.text import is_native
@@ -320,7 +320,13 @@ def _labelled_table(lines: Sequence[str]) -> Table | None:
 
 def table_of_json(data: bytes, name: str) -> Table:
     """Return the table of a JSON file: records, or arrays by key, in which triples may lie flat."""
-    document = parsed_document(data, name)
+    try:
+        return _table_of_document(parsed_document(data, name), name)
+    except RecursionError:
+        raise GuessError(f"{name}: {DEEP}") from None
+
+
+def _table_of_document(document: Any, name: str) -> Table:
     if isinstance(document, dict):
         arrays = dict(_arrays_of(document))
         plain = {key: len(value) for key, value in arrays.items() if not isinstance(value[0], dict | list)}

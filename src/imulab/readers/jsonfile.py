@@ -25,6 +25,7 @@ from imulab.records.calibration import FORMAT
 
 LARGEST = 20_000_000
 """Bytes of a file: what they hold may take 35 times as many in memory."""
+DEEP = "nests arrays or objects hundreds of levels deep; expected records"
 _LISTED = 20  # keys that a message lists
 
 
@@ -61,7 +62,7 @@ def blocks(path: Path, name: str, layout: Layout | None, *, skip_damaged: bool =
                 f"{name}: not a calibration record; of a recording --layout says which key is what; found {keys}"
             )
     except RecursionError:
-        raise ReadError(f"{name}: nests arrays or objects hundreds of levels deep; expected records") from None
+        raise ReadError(f"{name}: {DEEP}") from None
     values = {}
     for column, (key, number) in origins(layout, name, "JSON").items():
         where = f"{name}: {layout.name} takes {column} from {key!r}"
