@@ -485,21 +485,26 @@ def test_an_unknown_file_becomes_a_corrected_one_without_leaving_the_page(workbe
 
 @pytest.mark.slow
 def test_24_power_cycles_become_a_table_in_few_clicks(folder, new_page):
-    words = ["warmup", "simulate", "--duration", "200 s", "--rate", "2 Hz", "-o", "imulab-files/cycles"]
-    Path("imulab-files").mkdir()
-    assert main(words, project=False) == 0
     running = Workbench()
     try:
         page = new_page(running.address)
+        page.get_by_text("Plan and simulate").click()
+        page.locator("[data-path='warmup simulate']").click()
+        page.get_by_text("More options").click()
+        page.get_by_label("duration", exact=True).fill("200 s")
+        page.get_by_label("rate", exact=True).fill("2 Hz")
+        run(page)
+        page.get_by_text("warmup simulate done").wait_for()  # the folder that it made opens by itself
+        page.get_by_role("heading", name="and 23 more").wait_for()
         page.evaluate(COUNT)
-        page.locator("[data-name='imulab-files/cycles']").click()
+        page.locator("[data-name='imulab-files/warmup-simulate'][aria-current]").click()
         page.get_by_role("heading", name="and 23 more").wait_for()
         page.locator("[data-path='warmup fit'][aria-pressed='true']").wait_for()
         run(page)
         page.locator(".job .found, .job .chip.refused").first.wait_for()
         assert page.locator(".job .found").count() == 1
         assert page.evaluate("window.clicks") == 2
-        assert len(il.load("imulab-files/cycles.json").sources) == 24
+        assert len(il.load("imulab-files/warmup-simulate.json").sources) == 24
         page.get_by_role("button", name="Only this one").click()
         page.get_by_role("button", name="Choose all 24 like this").click()
         page.get_by_role("heading", name="and 23 more").wait_for()

@@ -114,9 +114,9 @@ class Workbench(PagePart):
         return {"type": "files", "number": number, "folder": str(self._files.folder), "files": self._files.entries()}
 
     def _tell_job(self, job: PageJob) -> None:
-        self._hub.tell(_job_message(job))
-        if job.ended is not None:
+        if job.ended is not None:  # first what it made
             self._hub.tell(self._list_message())
+        self._hub.tell(_job_message(job))
 
     def _tell_opening(self, opening: Opening) -> None:
         self._hub.tell(_opening_message(opening))

@@ -63,7 +63,7 @@ export function mount(into, given) {
     });
   }
   addEventListener("popstate", follow);
-  Promise.all([ask("forms"), ask("layouts")]).then(found => { [forms, shipped] = found; if (chosen) formed(); }).catch(fail);
+  Promise.all([ask("forms"), ask("layouts")]).then(found => { [forms, shipped] = found; if (chosen) formed(); else offer(); }).catch(fail);
 }
 
 const fail = error => page.say(error.message, "bad");
@@ -127,14 +127,14 @@ function listed(message) {
   else if (chosen) chosen = files.find(each => each.name === chosen.name);
   else if (files.length && !place.hidden) begin();
   current?.refresh();
-  if (chosen) offer();
+  offer();
 }
 
 // The first file that is shown: that of the address, or the first recording.
 function begin() {
   const wanted = inAddress();
   if (files.some(each => each.name === wanted.file)) choose(wanted.file, wanted);
-  else pick((files.find(each => each.kind === "recording") || files[0]).name, {}, false);
+  else pick((files.find(each => each.kind === "recording" && !each.folder) || files.find(each => actions.holds(each.name)) || files[0]).name, {}, false);
 }
 
 function leave() {
@@ -231,7 +231,7 @@ function recording() {
   ui.summary = h("p", { class: "message", role: "status" }, "reading…");
   ui.refused = h("p", { class: "refused", role: "alert", hidden: true });
   ui.columns = h("div", {});
-  ui.reading = h("details", { class: "more reading" }, h("summary", {}, "How the file is read"), h("div", {}));
+  ui.reading = h("details", { class: "more howread" }, h("summary", {}, "How the file is read"), h("div", {}));
   ui.head = h("details", { class: "more" }, h("summary", {}, "What the file says of itself"));
   const area = h("div", {});
   ui.file.replaceChildren(ui.heading = heading(), ui.summary, ui.refused, ui.columns, area, ui.head, ui.reading);
@@ -331,7 +331,7 @@ function opened(message) {
   const told = Object.entries(message.metadata || {}).map(([key, value]) => `${key}: ${value}`);
   show(ui.head, notes.length + told.length > 0);
   if (message.done) {
-    ui.head.replaceChildren(ui.head.firstChild, ...(notes.length ? [h("ul", {}, notes.map(each => h("li", {}, each)))] : []), h("pre", {}, told.join("\n")));
+    ui.head.replaceChildren(ui.head.firstChild, ...(notes.length ? [h("ul", {}, notes.map(each => h("li", {}, each)))] : []), h("pre", { tabindex: 0, "aria-label": "metadata of the file" }, told.join("\n")));
   }
   ui.plots.open(message);
   offer();
@@ -401,17 +401,17 @@ function facts() {
 function offer() {
   // Before it is known what a recording holds, nothing is offered; while it is read anew, what was offered stays.
   const unread = chosen?.kind === "recording" && (ui.columns.firstChild || (opening ? opening.error && !opening.head?.rows : !filled));
-  if (!forms.length || !chosen || NOTHING.has(chosen.kind) || unread) {
+  if (!forms.length || unread || (chosen ? NOTHING.has(chosen.kind) : files.length)) {
     show(ui.procedure, false);
     current = null;
     offered = filled = "";
     return;
   }
-  const known = facts();
-  const key = JSON.stringify([chosen.name, others, known, reading]);
+  const known = chosen ? facts() : {}; // without any file, a test can be planned and simulated
+  const key = JSON.stringify([chosen?.name, others, known, reading]);
   if (key === offered) return; // what was typed stays
   offered = key;
-  const taking = forms.filter(each => each.fields.some(field => !field.flag) && each.path !== "layout guess");
+  const taking = !chosen ? [] : forms.filter(each => each.fields.some(field => !field.flag) && each.path !== "layout guess");
   const found = taking.map(each => ({ each, why: reason(each.path, known) }));
   const fits = found.filter(({ why }) => !why).map(({ each }) => each).sort((one, other) => likely(one.path, other.path, known));
   const free = forms.filter(each => each.fields.every(field => field.flag));
@@ -422,7 +422,7 @@ function offer() {
   const old = ui.form;
   const opened_ = [...ui.procedure.querySelectorAll("details.more")].filter(each => each.open).map(each => each.querySelector("summary").textContent.split(" (")[0]);
   ui.form = h("div", { class: "formplace" });
-  ui.procedure.replaceChildren(h("h2", { id: "bench-what" }, others.length ? `What to do with these ${grouped(1 + others.length)} files` : "What to do with it"),
+  ui.procedure.replaceChildren(h("h2", { id: "bench-what" }, !chosen ? "Or plan a test, and simulate it" : others.length ? `What to do with these ${grouped(1 + others.length)} files` : "What to do with it"),
     h("div", { class: "cards" }, fits.map(each => button(each))), ui.form,
     more("Not with this", found.filter(({ why }) => why).map(({ each, why }) => button(each, why))) || "",
     more("Plan and simulate", free.map(each => button(each))) || "");
@@ -436,15 +436,21 @@ function offer() {
 }
 
 // The form of these files as they are read: while it is the same, what is typed and folded stays.
-const formKey = definition => JSON.stringify([definition.path, chosen.name, others, reading]);
+const formKey = definition => JSON.stringify([definition.path, chosen?.name, others, reading]);
 const press = definition => { for (const each of ui.procedure.querySelectorAll(".card:enabled")) each.setAttribute("aria-pressed", String(each.dataset.path === definition.path)); };
 
 function choosing(definition) {
-  procedure = definition.path;
-  keep("procedure", chosen.name, procedure);
-  say(true);
+  noted(definition, true);
   fill(definition);
   ui.form.scrollIntoView({ block: "nearest" });
+}
+
+// Notes the procedure, in the address too, as a step or not.
+function noted(definition, step) {
+  procedure = definition.path;
+  if (!chosen) return;
+  keep("procedure", chosen.name, procedure);
+  say(step);
 }
 
 // The chosen files and the latest record go where they fit; what was typed for this file before stands again.
@@ -452,19 +458,19 @@ function fill(definition, given = {}) {
   press(definition);
   filled = formKey(definition);
   const suitable = each => reason(definition.path, { ...facts(), kind: "record", procedure: each.procedure }) === "";
-  const latest = kind => (chosen.kind === kind ? chosen : files.filter(each => each.kind === kind && (kind !== "record" || suitable(each))).sort((one, other_) => other_.modified - one.modified)[0])?.name;
-  const all = [chosen.name, ...others];
-  const key = `${chosen.name}|${definition.path}`;
+  const latest = kind => (chosen?.kind === kind ? chosen : files.filter(each => each.kind === kind && (kind !== "record" || suitable(each))).sort((one, other_) => other_.modified - one.modified)[0])?.name;
+  const all = chosen ? [chosen.name, ...others] : [];
+  const key = `${chosen?.name}|${definition.path}`;
   const read = Object.fromEntries(Object.entries(reading).filter(([name]) => definition.fields.some(each => each.name === name)));
   const values = { ...read, ...recall("values", key), ...given };
   for (const each of definition.fields.filter(found => (!found.flag || found.required) && found.kind.startsWith("file"))) {
     if (values[each.name]) continue;
-    const fitting = [/RECORD/.test(each.shows) ? [latest("record")] : [], /RECORD(\.\.\.)?$/.test(each.shows) ? [] : chosen.kind === "record" && each.shows.includes("RECORD") ? [latest("recording")] : all].flat().filter(Boolean);
+    const fitting = [/RECORD/.test(each.shows) ? [latest("record")] : [], /RECORD(\.\.\.)?$/.test(each.shows) ? [] : chosen?.kind === "record" && each.shows.includes("RECORD") ? [latest("recording")] : all].flat().filter(Boolean);
     values[each.name] = each.kind === "files" ? fitting : fitting[0];
   }
   current = form(definition, {
     files: () => files, values, keep: typed => keep("values", key, typed),
-    run: async typed => { procedure = definition.path; keep("procedure", chosen.name, procedure); say(false); await start(definition.path, typed); },
+    run: async typed => { noted(definition, false); await start(definition.path, typed); },
   });
   ui.form.replaceChildren(h("details", { class: "settings", open: true }, h("summary", {}, h("strong", {}, definition.path)), current.element));
 }
@@ -474,6 +480,7 @@ function fill(definition, given = {}) {
 const actions = {
   look: name => { clicks += 1; pick(name); ui.file.scrollIntoView({ block: "start" }); },
   kind: name => files.find(each => each.name === name)?.kind,
+  holds: name => files.some(each => each.folder === name),
   targets,
   can: path => forms.some(each => each.path === path),
   export: (name, to, more) => start("export", { records: [name], to, output: true, ...more }).catch(fail),

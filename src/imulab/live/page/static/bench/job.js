@@ -45,7 +45,7 @@ export function card(job, act) {
     const short = name.slice(Math.max(name.lastIndexOf("/"), name.lastIndexOf("\\")) + 1);
     const kind = act.kind(name) || (short.endsWith(".html") ? "report" : short.includes(".") ? "recording" : "folder");
     const save = (href, label) => h("a", { class: "button", href, download: "" }, label);
-    if (kind === "folder") return [save(address("zip", name), `Save ${short}.zip`)];
+    if (kind === "folder") return [...(act.holds(name) ? [h("button", { type: "button", class: "main", onclick: () => act.look(name) }, `Look at ${short}`)] : []), save(address("zip", name), `Save ${short}.zip`)];
     if (kind === "report") return [h("button", { type: "button", onclick: () => report(name) }, `Show ${short}`), save(address("files", name), `Save ${short}`)];
     return [save(address("files", name), `Save ${short}`), h("button", { type: "button", onclick: () => act.look(name) }, `Look at ${short}`)];
   }

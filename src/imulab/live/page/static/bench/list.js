@@ -41,6 +41,7 @@ export function fileList(act) {
     } }, opened ? "fold" : `list ${grouped(inner.length)}`);
     const item = row(each, chosen, others);
     if (!inner.length) return [item];
+    if (!opened && inner.some(one => one.name === chosen)) item.querySelector(".entry").setAttribute("aria-current", "true");
     put(item.querySelector(".kind"), `folder, ${grouped(inner.length)} ${inner.length === 1 ? "file" : "files"}`);
     if (inner.length >= MANY) item.append(more);
     return [item, ...(opened ? inner.map(one => row(one, chosen, others)) : [])];
