@@ -156,14 +156,28 @@ def guess_layout(
     'm/s^2'
     """
     name = os.fsencode(file_name(file)).decode("utf-8", "backslashreplace")
-    with readable(name), open_file(file) as stream:
+    with readable(name):
+        head = read_head(file, name)
+    return guess_of_head(head, name, units=units, sample_rate=sample_rate, prefix=prefix or "")
+
+
+def read_head(file: str | os.PathLike[str], name: str) -> bytes:
+    """Return the first bytes of a file, or of what is packed in it; of JSON, as much as may be read."""
+    with open_file(file) as stream:
         head = stream.read(HEAD)
-        packed = unpacked(Path(file), name) if is_packed(head) else nullcontext(Path(file))
+    packed = unpacked(Path(file), name) if is_packed(head) else nullcontext(Path(file))
     with packed as content, open_file(content) as stream:
         head = stream.read(HEAD)
-        if recognised(head[:1024]).module == "jsonfile":
-            head += stream.read(LARGEST)
-    return guess_of_head(head, name, units=units, sample_rate=sample_rate, prefix=prefix or "")
+        return head + stream.read(LARGEST) if recognised(head[:1024]).module == "jsonfile" else head
+
+
+def lines_of_head(head: bytes) -> tuple[list[str], str]:
+    """Return the whole lines of a text's first bytes, and their encoding."""
+    try:
+        text = head[: head.rfind(b"\n") + 1 if len(head) == HEAD else None].decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return head.decode("latin-1").splitlines(), "latin-1"
+    return text.splitlines(), "utf-8"
 
 
 def guess_of_head(
@@ -183,12 +197,7 @@ def guess_of_head(
     if kind is not TEXT or b"\0" in head[:4096]:
         content = "binary data" if kind is TEXT else kind.name
         raise GuessError(f"{name}: a layout is guessed from the titles of text, found {content}")
-    encoding = "utf-8"
-    try:
-        text = head[: head.rfind(b"\n") + 1 if len(head) == HEAD else None].decode("utf-8-sig")
-    except UnicodeDecodeError:
-        encoding, text = "latin-1", head.decode("latin-1")
-    lines = text.splitlines()
+    lines, encoding = lines_of_head(head)
     titles = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     if _is_native(titles) and (sample_rate is None or "time" in titles):
         raise GuessError(f"{name}: titles with units, as imulab writes them; it needs no layout")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,9 @@ from msgspec import Struct
 
 from imulab.columns import KINDS, kind_of, triad
 from imulab.errors import OptionError, ReadError, quoted
-from imulab.files import open_file
-from imulab.readers.formats import TEXT, is_packed, recognised, unpacked
+from imulab.readers.formats import TEXT, recognised
 from imulab.readers.guess import (
     DELIMITERS,
-    HEAD,
     GuessError,
     LayoutGuess,
     Table,
@@ -29,9 +26,10 @@ from imulab.readers.guess import (
     layout_of_table,
     layout_text,
     likely_time_unit,
+    lines_of_head,
+    read_head,
     table_of_json,
 )
-from imulab.readers.jsonfile import LARGEST
 from imulab.readers.titles import is_number, is_units_row, known_unit, read_title
 
 _MOST_LINES = 500  # of the head in which a table without known titles is looked for
@@ -58,23 +56,14 @@ def table_of_file(file: str | Path) -> Table:
         It holds no rows of numbers, or says itself what its columns are.
     """
     name = Path(file).name
-    with open_file(file) as stream:
-        head = stream.read(HEAD)
-    packed = unpacked(Path(file), name) if is_packed(head) else nullcontext(Path(file))
-    with packed as content, open_file(content) as stream:
-        head = stream.read(HEAD)
-        if recognised(head[:1024]).module == "jsonfile":
-            return table_of_json(head + stream.read(LARGEST), name)
+    head = read_head(file, name)
     kind = recognised(head[:1024])
+    if kind.module == "jsonfile":
+        return table_of_json(head, name)
     if kind is not TEXT or b"\0" in head[:4096]:
-        content_kind = "binary data" if kind is TEXT else f"a {kind.name} file"
-        raise ReadError(f"{name}: columns are stated for text, found {content_kind}")
-    encoding = "utf-8"
-    try:
-        text = head[: head.rfind(b"\n") + 1 if len(head) == HEAD else None].decode("utf-8-sig")
-    except UnicodeDecodeError:
-        encoding, text = "latin-1", head.decode("latin-1")
-    lines = text.splitlines()
+        content = "binary data" if kind is TEXT else f"a {kind.name} file"
+        raise ReadError(f"{name}: columns are stated for text, found {content}")
+    lines, encoding = lines_of_head(head)
     try:
         return guess_table(lines, name, encoding=encoding)
     except GuessError:
@@ -113,24 +102,24 @@ def _plain_table(lines: list[str], name: str, encoding: str) -> Table:
 def columns_of_table(table: Table, name: str) -> tuple[list[StatedColumn], str]:
     """Return what is known of each column, and what was taken from the readings, in a sentence."""
     names = {column: "" for sensor in ("accel", "gyro", "mag") for column in triad(sensor)}
-    found: list[StatedColumn] = []
+    columns: list[StatedColumn] = []
     for place, text in enumerate(table.titles):
         title = read_title(text, table.units[place] if place < len(table.units) else "")
         sensor, axis = title.sensor, title.axis
         column = f"{sensor}_{'xyz'[axis]}" if axis is not None and f"{sensor}_x" in names else sensor
-        if (column not in names and column not in ("time", "temperature")) or any(c.column == column for c in found):
+        if (column not in names and column not in ("time", "temperature")) or any(c.column == column for c in columns):
             column = ""
         unit = known_unit(title.unit) if title.unit else ""
-        found.append(StatedColumn(text.strip(), column, unit or title.unit))
-    found = _with_clock(found, table)
+        columns.append(StatedColumn(text.strip(), column, unit or title.unit))
+    columns = _with_clock(columns, table)
     guess, open_units = _guess(table, name)
     if guess is None:
-        return found, ""
+        return columns, ""
     for column, entry in guess.layout.columns.items():
         place = entry.origin if isinstance(entry.origin, int) else table.titles.index(entry.origin)
-        found = [StatedColumn(c.title, "" if c.column == column else c.column, c.unit) for c in found]
-        found[place] = StatedColumn(found[place].title, column, "" if kind_of(column) in open_units else entry.unit)
-    return found, "; ".join(guess.supposed)
+        columns = [StatedColumn(c.title, "" if c.column == column else c.column, c.unit) for c in columns]
+        columns[place] = StatedColumn(columns[place].title, column, "" if kind_of(column) in open_units else entry.unit)
+    return columns, "; ".join(guess.supposed)
 
 
 def _guess(table: Table, name: str) -> tuple[LayoutGuess | None, dict[str, str]]:
@@ -147,10 +136,10 @@ def _guess(table: Table, name: str) -> tuple[LayoutGuess | None, dict[str, str]]
     return None, {}
 
 
-def _with_clock(found: list[StatedColumn], table: Table) -> list[StatedColumn]:
+def _with_clock(columns: list[StatedColumn], table: Table) -> list[StatedColumn]:
     """Return the columns with the unit of the time by its steps, and the first that rises as the time if none is."""
-    titled = any(column.column == "time" for column in found)
-    for place, column in enumerate(found):
+    titled = any(column.column == "time" for column in columns)
+    for place, column in enumerate(columns):
         values = table.numbers(place)
         steps = np.diff(values)
         if (
@@ -161,9 +150,9 @@ def _with_clock(found: list[StatedColumn], table: Table) -> list[StatedColumn]:
         ):
             continue
         unit = likely_time_unit(float(np.median(steps)))
-        found[place] = StatedColumn(column.title, "time", unit, "rises in every row")
+        columns[place] = StatedColumn(column.title, "time", unit, "rises in every row")
         break
-    return found
+    return columns
 
 
 def layout_of_columns(table: Table, chosen: Mapping[int, tuple[str, str]], sample_rate: float | None, name: str) -> str:
