@@ -366,3 +366,10 @@ def test_json_that_nests_deeply_is_refused_in_a_line(imulab, tmp_path, depth):
         done = imulab(*command, "deep.json")
         assert (done.returncode, done.stderr.count("\n")) == (2, 1)
         assert "internal" not in done.stderr
+
+
+@pytest.mark.parametrize("rate", [0.0, -5.0, 1e-7, 1e10])
+def test_a_rate_that_no_sensor_has_is_refused(tmp_path, rate):
+    (tmp_path / "a.csv").write_text("a_x,a_y,a_z\n1,2,3\n2,3,4\n1,1,1\n", encoding="utf-8")
+    with pytest.raises(ReadError, match=r"a\.csv: sample_rate: expected a number of Hz from"):
+        il.guess_layout(tmp_path / "a.csv", units={"accel": "g"}, sample_rate=rate)

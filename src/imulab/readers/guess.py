@@ -32,6 +32,7 @@ from imulab.quantities import parse_units
 from imulab.readers.formats import TEXT, is_packed, recognised, unpacked
 from imulab.readers.jsonfile import DEEP, LARGEST, parsed_document
 from imulab.readers.labelled import LabelledLines, pairs
+from imulab.readers.layout import check_rate
 from imulab.readers.shipped import advice
 from imulab.readers.text import is_native
 from imulab.readers.titles import Title, is_number, is_units_row, read_title
@@ -477,7 +478,7 @@ def layout_of_table(
     if clock is not None:
         chosen.append(("time", *clock[:3]))
     if sample_rate is not None:
-        step = 1 / sample_rate
+        step = 1 / check_rate(sample_rate, f"{name}: sample_rate")
     titled = {sensor: titles[places[0]].unit for sensor, places in sensors.items()}
     for sensor, places in sensors.items():
         unit, reason = _unit(sensor, places, titles, table, titled, known)

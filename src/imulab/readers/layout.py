@@ -338,7 +338,11 @@ def _sample_rate(entry: Any, path: str) -> float | None:
     if isinstance(entry, int | float):
         entry = {"value": entry, "unit": "Hz"}
     value, symbol = value_and_unit(entry, place, '{ value = 100, unit = "Hz" }')
-    rate = to_si(value, unit_of(symbol, "frequency", place))
+    return check_rate(to_si(value, unit_of(symbol, "frequency", place)), place)
+
+
+def check_rate(rate: float, place: str) -> float:
+    """Return a sampling rate that sensors can have, Hz; raise a ReadError on any other, which was stated at `place`."""
     low, high = _RATES
     if not low <= rate <= high:
         raise ReadError(f"{place}: expected a number of Hz from {low:g} to {high:g}, found {rate:g}")
