@@ -513,8 +513,8 @@ def test_a_link_that_is_exchanged_between_check_and_opening_opens_nothing(tmp_pa
         assert stream.read() == b"inside"
     check, times = module.check_within, []
 
-    def exchanging(path: Any) -> str:
-        found = check(path)
+    def exchanging(path: Any, roots: Any = None) -> str:
+        found = check(path, roots)
         if not times:  # after the check, before the file is opened
             (tmp_path / "in/a").unlink()
             (tmp_path / "in/a").symlink_to(tmp_path / "secret")
@@ -524,6 +524,35 @@ def test_a_link_that_is_exchanged_between_check_and_opening_opens_nothing(tmp_pa
     monkeypatch.setattr(module, "check_within", exchanging)
     with pytest.raises(OptionError, match="lies elsewhere"):
         module.open_file(tmp_path / "in/a")
+
+
+def test_a_link_put_in_place_of_a_file_after_its_name_was_checked_is_neither_sent_nor_shown(
+    bench, tmp_path, monkeypatch
+):
+    """What the page downloads is opened as what a job reads is."""
+    (tmp_path / "secret").write_text("secret")
+    Path("session/race").write_text("inside")
+    assert bench.ask("files/session%2Frace").body == b"inside"
+    find = FolderFiles.path
+
+    def exchanging(files: FolderFiles, name: str) -> str:
+        found = find(files, name)
+        Path("session/race").unlink()
+        Path("session/race").symlink_to(tmp_path / "secret")
+        return found
+
+    monkeypatch.setattr(FolderFiles, "path", exchanging)
+    for place in ("files", "reports"):
+        Path("session/race").unlink()
+        Path("session/race").write_text("inside")
+        answer = bench.ask(f"{place}/session%2Frace")
+        assert answer.status == 400
+        assert b"secret" not in answer.body.replace(b"/secret", b"")
+    folder = Path("session/made")
+    folder.mkdir()
+    (folder / "a").write_text("inside")
+    with zipfile.ZipFile(bench_module._pack(folder, ["session"])) as archive:
+        assert archive.read("made/a") == b"inside"
 
 
 def test_every_file_that_a_name_of_the_input_leads_to_is_opened_by_the_shared_opener():

@@ -166,7 +166,7 @@ def test_a_bag_whose_messages_are_made_up_by_sqlite(tmp_path, hidden):
     assert "expected a plain table messages" in refused(path)
 
 
-@pytest.mark.parametrize("kind", ["rows", "chunk", "external", "virtual", "link"])
+@pytest.mark.parametrize("kind", ["rows", "chunk", "external", "virtual", "link", "link through a link"])
 def test_an_hdf5_file_that_holds_nothing(tmp_path, kind):
     h5py = pytest.importorskip("h5py")
     path = tmp_path / "a.h5"
@@ -181,10 +181,16 @@ def test_an_hdf5_file_that_holds_nothing(tmp_path, kind):
             made = h5py.VirtualLayout((10,), "f8")
             made[:] = h5py.VirtualSource("other.h5", "x", (10,))
             file.create_virtual_dataset("x", made)
-        else:
+        elif kind == "link":
             file["x"] = h5py.ExternalLink("other.h5", "x")
+        else:
+            with h5py.File(tmp_path / "other.h5", "w") as other:
+                other["group/y"] = np.ones(9)
+            file["e"] = h5py.ExternalLink("other.h5", "group")
+            file["x"] = h5py.SoftLink("/e/y")
     said = refused(path, "--layout", layout(tmp_path, 'accel_x = { from = "x", unit = "g" }'))
-    expected = {"external": "lie in other files", "virtual": "lie in other files", "link": "found none"}
+    expected = {"external": "lie in other files", "virtual": "lie in other files"}
+    expected |= {"link": "found none", "link through a link": "found none"}
     assert expected.get(kind, "unpacks to more than 67 MB") in said
 
 

@@ -8,7 +8,7 @@ import re
 import stat
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BufferedReader
@@ -134,8 +134,10 @@ def permit(path: Path) -> None:
     _permitted.append(os.path.realpath(path))
 
 
-def check_within(path: str | PathLike[str]) -> str:
+def check_within(path: str | PathLike[str], roots: Sequence[str] | None = None) -> str:
     """Return the real path of a file; refuse one elsewhere than where this process may read, if it is confined.
+
+    `roots`, folders and files, confine it whatever the process may read.
 
     Raises
     ------
@@ -143,18 +145,23 @@ def check_within(path: str | PathLike[str]) -> str:
         It lies elsewhere, perhaps through a link.
     """
     real = os.path.realpath(path)
-    if WITHIN not in os.environ:
-        return real
-    import json
+    if roots is not None:
+        roots = [os.path.realpath(root) for root in roots]
+    elif WITHIN in os.environ:
+        import json
 
-    roots = (*json.loads(os.environ[WITHIN]), _PACKAGE, *_permitted)
+        roots = (*json.loads(os.environ[WITHIN]), _PACKAGE, *_permitted)
+    else:
+        return real
     if not any(real == root or real.startswith(os.path.join(root, "")) for root in roots):  # noqa: PTH118
         raise OptionError(f"{path}: lies elsewhere; expected a file in the session's folder")
     return real
 
 
-def open_file(path: str | PathLike[str]) -> BufferedReader:
+def open_file(path: str | PathLike[str], roots: Sequence[str] | None = None) -> BufferedReader:
     """Return a file opened for reading. It is what its real path names, so that no link can change between the two.
+
+    `roots` are those of `check_within`.
 
     Raises
     ------
@@ -163,11 +170,11 @@ def open_file(path: str | PathLike[str]) -> BufferedReader:
     OptionError
         As for `check_within`.
     """
-    if WITHIN not in os.environ:
+    if roots is None and WITHIN not in os.environ:
         return Path(path).open("rb")
-    stream = Path(check_within(path)).open("rb")  # noqa: SIM115
+    stream = Path(check_within(path, roots)).open("rb")  # noqa: SIM115
     try:
-        if os.path.samestat(os.fstat(stream.fileno()), os.lstat(check_within(path))):
+        if os.path.samestat(os.fstat(stream.fileno()), os.lstat(check_within(path, roots))):
             return stream
         raise OptionError(f"{path}: was replaced while it was opened")
     except BaseException:

@@ -92,6 +92,8 @@ def _get(h5py: Any, file: Any, path: str) -> Any:
         if isinstance(item.get(part, getlink=True), h5py.ExternalLink):
             return None
         item = item.get(part)
+        if item is not None and item.file.filename != file.filename:
+            return None  # a soft link may lead through an external one
     return item
 
 

@@ -9,9 +9,11 @@ stated. Messages to pages: ``files``, ``opening``, ``job``.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -21,7 +23,7 @@ from dataclasses import asdict
 from itertools import count, takewhile
 from pathlib import Path
 from shlex import join
-from typing import IO, Any, ClassVar
+from typing import IO, Any, BinaryIO, ClassVar
 from urllib.parse import quote
 
 from starlette.background import BackgroundTask
@@ -31,7 +33,7 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from imulab.errors import OptionError, quoted
-from imulab.files import WITHIN, write_text
+from imulab.files import WITHIN, open_file, write_text
 from imulab.live.page.files import FolderFiles, Opening, Openings
 from imulab.live.page.jobs import Form, Jobs, PageJob
 from imulab.live.page.results import result_of
@@ -70,6 +72,7 @@ class Workbench(PagePart):
         self._jobs, self._openings = Jobs(self._tell_job), Openings(self._tell_opening)
         self._coming: set[str] = set()
         self._lists = count()
+        self._describing = asyncio.Semaphore(1)  # a process of its own tells the columns of a file
         shown = to_json([form.shown for form in forms.values()])
         self.routes = [
             Route(f"{_HERE}/files", self._list),
@@ -148,7 +151,7 @@ class Workbench(PagePart):
         name = self._files.path(request.path_params["name"])
         if Path(name).is_dir():
             raise OptionError(f"{name}: is a folder")
-        stream = Path(name).open("rb")  # noqa: SIM115 -- it is closed once it is sent
+        stream = self._opened(name)  # it is closed once it is sent
         size = os.fstat(stream.fileno()).st_size  # a recording that is still written grows meanwhile
         headers = {**_download_header(Path(name).name), "content-length": str(size)}
         return StreamingResponse(_pieces(stream, size), headers=headers, media_type=_ANY)
@@ -157,7 +160,7 @@ class Workbench(PagePart):
         name = self._files.path(request.path_params["name"])
         if not Path(name).is_dir():
             raise OptionError(f"{name}: expected a folder")
-        packed = await run_in_threadpool(_pack, Path(name))
+        packed = await run_in_threadpool(_pack, Path(name), self._files.readable)
         task = BackgroundTask(Path(packed).unlink, missing_ok=True)
         return FileResponse(
             packed, headers=_download_header(f"{Path(name).name}.zip"), media_type=_ANY, background=task
@@ -169,7 +172,15 @@ class Workbench(PagePart):
         drawn = {path for job in self._jobs.jobs.values() if job.state == "done" for path in job.outputs}
         if name not in drawn or not name.endswith(".html"):
             raise OptionError(f"{name}: no report of this session; save it to look at it")
-        return report_response(Path(name).read_text(encoding="utf-8"))
+        with self._opened(name) as stream:
+            return report_response(stream.read().decode("utf-8"))
+
+    def _opened(self, name: str) -> BinaryIO:
+        """Return an open file of the session; a link that was put in its place in the meantime leads nowhere."""
+        try:
+            return open_file(name, self._files.readable)
+        except OSError as error:
+            raise OptionError(f"{name}: cannot be read: {error.strerror}") from None
 
     async def _open(self, request: Request) -> Response:
         asked = await _object(request)
@@ -191,7 +202,8 @@ class Workbench(PagePart):
         """
         asked = await _object(request)
         name, stated = self._files.path(str(asked.get("file"))), _stated(asked.get("columns"), asked.get("sample_rate"))
-        told = await run_in_threadpool(_columns_of, name, stated, self._files.readable)
+        async with self._describing:
+            told = await run_in_threadpool(_columns_of, name, stated, self._files.readable)
         if stated is None:
             return _json(told)
         if not (saved := asked.get("name")):
@@ -368,11 +380,14 @@ def _pieces(stream: IO[bytes], size: int) -> Iterator[bytes]:
             yield piece
 
 
-def _pack(folder: Path) -> str:
-    """Return a new archive with the files of a folder."""
+def _pack(folder: Path, roots: list[str]) -> str:
+    """Return a new archive with the files of a folder, and of the session: no link leads elsewhere."""
     handle, name = tempfile.mkstemp(prefix="imulab-", suffix=".zip")
     with os.fdopen(handle, "wb") as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(folder.rglob("*")):
             if path.is_file() and not path.is_symlink():
-                archive.write(path, path.relative_to(folder.parent))
+                entry = zipfile.ZipInfo.from_file(path, path.relative_to(folder.parent))
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                with open_file(path, roots) as source, archive.open(entry, "w") as target:
+                    shutil.copyfileobj(source, target, 1 << 20)
     return name
