@@ -457,14 +457,15 @@ def test_an_unknown_file_becomes_a_corrected_one_without_leaving_the_page(workbe
     rec = il.read("own.csv")
     names = [f"{sensor}_{axis}" for sensor in ("accel", "gyro") for axis in "xyz"]
     rows = zip(rec.time, *(rec.columns[name] for name in names), strict=True)
-    lines = ["zeit;p;q;r;u;v;w", *(";".join(f"{value:.6f}" for value in row) for row in rows)]
+    lines = ["zeit;p;q;r;u (deg/s);v (deg/s);w (deg/s)", *(";".join(f"{value:.6f}" for value in row) for row in rows)]
     page = new_page(workbench.address)
     page.evaluate(COUNT)
     drop(page, "foreign.csv", "\n".join(lines) + "\n")
     page.locator(".assistant").wait_for()
-    for column, (what, unit) in {"2, p": ("accel_x", "g"), "5, u": ("gyro_x", "deg/s")}.items():
-        page.get_by_label(f"column {column}: what it is").select_option(what)
-        page.get_by_label(f"column {column}: its unit").select_option(unit)
+    page.get_by_label("column 2, p: what it is").select_option("accel_x")
+    page.get_by_label("column 2, p: its unit").select_option("g")
+    page.get_by_label("column 5, u (deg/s): what it is").select_option("gyro_x")
+    assert page.get_by_label("column 7, w (deg/s): its unit").input_value() == "deg/s"  # its title says it
     page.locator(".plotbox", has_text="gyro [°/s]").wait_for()  # the preview
     page.get_by_role("button", name="Save as layout").click()
     page.locator(".assistant").wait_for(state="detached")

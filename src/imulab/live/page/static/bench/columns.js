@@ -34,7 +34,7 @@ export function columnTable(file, told, act) {
   let asked = 0;
 
   const columns = told.columns.map((each, place) => {
-    const what = h("select", { "aria-label": `column ${place + 1}, ${each.title}: what it is`, onchange: () => { unit.replaceChildren(...options(UNITS[kind(what.value)] || [], triadUnit(what.value))); together(what.value); soon(); } },
+    const what = h("select", { "aria-label": `column ${place + 1}, ${each.title}: what it is`, onchange: () => { unit.replaceChildren(...options(UNITS[kind(what.value)] || [], unitOf(each.unit, what.value))); together(what.value); soon(); } },
       GROUPS.map(([title, found]) => {
         const made = found.map(([value, text]) => h("option", { value, selected: value === each.column }, text));
         return title ? h("optgroup", { label: title }, made) : made;
@@ -44,6 +44,8 @@ export function columnTable(file, told, act) {
   });
 
   const triadUnit = column => columns.find(each => column && each.what.value !== column && kind(each.what.value) === kind(column) && each.unit.value)?.unit.value || "";
+  // The unit of a title, where it is one of what the column was said to be; else that of the sensor's other axes.
+  const unitOf = (titled, column) => ((UNITS[kind(column)] || []).includes(titled) ? titled : triadUnit(column));
   // The three axes of a sensor have one unit.
   function spread(column, unit) {
     for (const each of columns) if (column.includes("_") && kind(each.what.value) === kind(column)) each.unit.value = unit;
