@@ -175,6 +175,7 @@ def test_cancelling_ends_the_command_and_leaves_nothing(workbench, new_page, fol
 def test_what_is_refused_is_said_where_it_was_typed(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))
+    page.get_by_text("12 attitudes at rest (shaded)").wait_for()  # until then the form may be made anew
     page.get_by_label("order", exact=True).fill("nonsense")
     page.get_by_text("order 'nonsense': expected one of").wait_for()  # before it is run
     page.get_by_label("gravity", exact=True).fill("nonsense")

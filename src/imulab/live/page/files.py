@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from imulab.device.unit import is_blob
 from imulab.display import has_hidden
@@ -317,14 +317,14 @@ class Opening:
         return Head(**{key: value for key, value in described.items() if key in _KNOWN})
 
 
-def _new_place() -> tuple[Path, IO[bytes] | None]:
+def _new_place() -> tuple[Path, int | None]:
     """Return a new folder for curves, and its lock, which shows that it is used; remove those of killed programs."""
     place = Path(tempfile.mkdtemp(prefix=_CURVES))
     if sys.platform == "win32":
         return place, None
     import fcntl
 
-    lock = (place / _LOCK).open("wb")
+    lock = os.open(place / _LOCK, os.O_WRONLY | os.O_CREAT, 0o600)  # held until the program ends, however it does
     fcntl.flock(lock, fcntl.LOCK_EX)
     for old in place.parent.glob(f"{_CURVES}*/{_LOCK}"):
         with suppress(OSError), old.open("rb") as held:  # another user's, or locked
@@ -415,7 +415,8 @@ class Openings:
             _close(opening)
         shutil.rmtree(self._place, ignore_errors=True)
         if self._lock is not None:
-            self._lock.close()
+            os.close(self._lock)
+            self._lock = None
 
     def _listen(self, opening: Opening) -> None:
         process = opening.process

@@ -3,7 +3,8 @@
 // An area is a module with `title`, `mount(place, page)`, which is called once, `hear(message)`, which gets every
 // message of the socket, and `kept()`, which says what stays when the program has ended; `shown()`, where it has one, is
 // called whenever it comes into sight. `page.send(message)` answers, `page.say(text, kind)` says something above all areas
-// (kind: "note" or "bad"; no text takes it away), and `page.forget()` takes a refusal away once its cause has gone.
+// (kind: "note" or "bad"; no text takes it away), and `page.forget()` takes a refusal away once its cause has gone:
+// that of a place stands until another is sent.
 
 import { h, put, show } from "./dom.js";
 import * as session from "./session.js";
@@ -16,10 +17,11 @@ const tabs = document.getElementById("tabs");
 const mounted = {};
 let socket = null;
 let ended = false;
-let refused = false;
+let sent = ""; // the type of the latest message
+let refused = ""; // that of the message whose refusal stands above the page
 
 function say(text, kind = "note") {
-  refused = false;
+  refused = "";
   const place = document.getElementById("said");
   if (place.textContent === text) return;
   place.replaceChildren(...(text ? [h("p", { class: `said ${kind}` }, text)] : []));
@@ -28,12 +30,13 @@ function say(text, kind = "note") {
 const page = {
   say,
   send(message) {
+    sent = message.type;
     if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
     else say(gone(), "bad");
   },
   // Says that the program ends by itself now, and why: that it is gone is then no news.
-  forget() {
-    if (refused) say("");
+  forget(type = "") {
+    if (refused && (type === refused || refused !== "place")) say("");
   },
   others: () => Object.keys(mounted),
   end(text, kind) {
@@ -96,7 +99,7 @@ function hear(message) {
     put(document.getElementById("where"), `version ${message.version}`);
   } else if (message.type === "refused") {
     say(message.text, "bad");
-    refused = true;
+    refused = sent || "page";
   }
   for (const name of Object.keys(mounted)) AREAS[name].hear(message);
 }

@@ -115,7 +115,7 @@ function view(now) {
   once("knocked", [now.attitudes.filter(each => each.aside), measuring], () => knocked(now, measuring));
   once("warnings", now.warnings, () =>
     parts.warnings.replaceChildren(...now.warnings.map(text => h("p", { class: "said look" }, sentence(text)))));
-  once("cause", [now.missing, now.attitudes.map(each => each.number)], page.forget);
+  once("cause", [now.missing, now.attitudes.map(each => each.number)], () => page.forget());
 }
 
 export function advice(now) {
@@ -214,7 +214,7 @@ function placeForm() {
     class: "said note place", hidden: true,
     onsubmit(event) {
       event.preventDefault();
-      page.forget();
+      page.forget("place");
       const texts = Object.entries(fields).map(([name, label]) => [name, label.querySelector("input").value.trim()]);
       page.send({ type: "place", ...Object.fromEntries(texts) });
     },
