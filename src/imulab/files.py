@@ -8,7 +8,7 @@ import re
 import stat
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BufferedReader
@@ -134,6 +134,20 @@ def permit(path: Path) -> None:
     _permitted.append(os.path.realpath(path))
 
 
+def lies_in(path: str | PathLike[str], roots: Iterable[str]) -> bool:
+    """Return whether a path leads, through whatever links, to one of these files or into one of these folders."""
+    real = os.path.realpath(path)
+    every = (os.path.realpath(root) for root in roots)
+    return any(real == root or real.startswith(os.path.join(root, "")) for root in every)  # noqa: PTH118
+
+
+def confined(roots: Iterable[str]) -> dict[str, str]:
+    """Return the environment of a process that may read, by names in its input, only these files and folders."""
+    import json
+
+    return {**os.environ, WITHIN: json.dumps([os.path.realpath(root) for root in roots])}
+
+
 def check_within(path: str | PathLike[str], roots: Sequence[str] | None = None) -> str:
     """Return the real path of a file; refuse one elsewhere than where this process may read, if it is confined.
 
@@ -145,15 +159,11 @@ def check_within(path: str | PathLike[str], roots: Sequence[str] | None = None) 
         It lies elsewhere, perhaps through a link.
     """
     real = os.path.realpath(path)
-    if roots is not None:
-        roots = [os.path.realpath(root) for root in roots]
-    elif WITHIN in os.environ:
+    if roots is None and WITHIN in os.environ:
         import json
 
         roots = (*json.loads(os.environ[WITHIN]), _PACKAGE, *_permitted)
-    else:
-        return real
-    if not any(real == root or real.startswith(os.path.join(root, "")) for root in roots):  # noqa: PTH118
+    if roots is not None and not lies_in(real, roots):
         raise OptionError(f"{path}: lies elsewhere; expected a file in the session's folder")
     return real
 

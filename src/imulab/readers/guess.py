@@ -218,11 +218,11 @@ def guess_of_head(
 
 def _without_arrows(lines: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return lines without the times that a serial monitor puts before them, and these times; none in other files."""
-    found = [_ARROW.match(line) for line in lines]
-    if sum(match is not None for match in found) <= len(lines) / 2:
+    arrows = [_ARROW.match(line) for line in lines]
+    if sum(match is not None for match in arrows) <= len(lines) / 2:
         return list(lines), []
-    bare = [line[match.end() :] if match else line for line, match in zip(lines, found, strict=True)]
-    return bare, [match[1] if match else "" for match in found]
+    bare = [line[match.end() :] if match else line for line, match in zip(lines, arrows, strict=True)]
+    return bare, [match[1] if match else "" for match in arrows]
 
 
 def _with_stamps(table: Table, stamps: Sequence[str]) -> Table:
@@ -505,7 +505,7 @@ def layout_text(
     chosen: Sequence[tuple[str, int, str, str]],
     left: Sequence[str],
     sample_rate: float | None,
-    said: str = "Guessed by imulab layout guess from titles. A comment at a column says what its title does not.",
+    heading: str = "Guessed by imulab layout guess from titles. A comment at a column says what its title does not.",
 ) -> str:
     """Return the text of a layout file; columns are named by title where that names one alone."""
     numbered = (
@@ -514,7 +514,7 @@ def layout_text(
         or not table.titled
         or any(table.titles.count(table.titles[place]) > 1 for _, place, _, _ in chosen)
     )
-    lines = [f"# {said}"]
+    lines = [f"# {heading}"]
     lines += [f"# Not taken: {first_of(left, 8)}"] if left else []
     lines += [f"# Lines of other kinds: {' '.join(table.others[:8])} (--prefix NAME)"] if table.others else []
     lines += [f"delimiter = {DELIMITERS[table.delimiter]}"] if table.delimiter else []

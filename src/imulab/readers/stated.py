@@ -183,4 +183,4 @@ def layout_of_columns(table: Table, chosen: Mapping[int, tuple[str, str]], sampl
     rows = [(column, places[column], chosen[places[column]][1], "") for column in order]
     left = [title for place, title in enumerate(table.titles) if place not in chosen and title.strip()]
     rate = None if "time" in places else sample_rate
-    return layout_text(table, rows, left, rate, said="The columns as stated on the page.")
+    return layout_text(table, rows, left, rate, heading="The columns as stated on the page.")

@@ -33,7 +33,7 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from imulab.errors import OptionError, quoted
-from imulab.files import WITHIN, open_file, write_text
+from imulab.files import confined, open_file, write_text
 from imulab.live.page.files import FolderFiles, Opening, Openings
 from imulab.live.page.jobs import Form, Jobs, PageJob
 from imulab.live.page.results import result_of
@@ -203,15 +203,15 @@ class Workbench(PagePart):
         asked = await _object(request)
         name, stated = self._files.path(str(asked.get("file"))), _stated(asked.get("columns"), asked.get("sample_rate"))
         async with self._describing:
-            told = await run_in_threadpool(_columns_of, name, stated, self._files.readable)
+            answer = await run_in_threadpool(_columns_of, name, stated, self._files.readable)
         if stated is None:
-            return _json(told)
+            return _json(answer)
         if not (saved := asked.get("name")):
-            return _json({"layout": self._openings.new_layout(told["toml"]), **told})
+            return _json({"layout": self._openings.new_layout(answer["toml"]), **answer})
         path = self._files.unused(str(saved).removesuffix(".toml") + ".toml", self._coming)
-        write_text(path, told["toml"])
+        write_text(path, answer["toml"])
         self._hub.tell(self._list_message())
-        return _json({"layout": path, **told})
+        return _json({"layout": path, **answer})
 
     async def _layouts(self, request: Request) -> Response:
         from imulab.readers.shipped import shipped
@@ -311,19 +311,18 @@ def _stated(columns: Any, sample_rate: Any) -> dict[str, Any] | None:
 def _columns_of(name: str, stated: dict[str, Any] | None, within: list[str]) -> dict[str, Any]:
     """Return what a process of its own says of the columns of a file."""
     words = [sys.executable, "-P", "-m", "imulab.live.page.columns", name]
-    environment = {**os.environ, WITHIN: json.dumps([os.path.realpath(root) for root in within])}
     try:
         ran = subprocess.run(
             [*words, json.dumps(stated)] if stated else words,
-            stdin=subprocess.DEVNULL, capture_output=True, text=True, encoding="utf-8", env=environment,
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, encoding="utf-8", env=confined(within),
             timeout=_PATIENCE, check=False,
         )  # fmt: skip
-        told: dict[str, Any] = json.loads(ran.stdout)
+        answer: dict[str, Any] = json.loads(ran.stdout)
     except (subprocess.TimeoutExpired, ValueError):
-        told = {"error": f"{name}: its columns cannot be told"}
-    if "error" in told:
-        raise OptionError(told["error"])
-    return told
+        answer = {"error": f"{name}: its columns cannot be told"}
+    if "error" in answer:
+        raise OptionError(answer["error"])
+    return answer
 
 
 def _json(value: Any) -> Response:

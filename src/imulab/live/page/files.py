@@ -20,7 +20,7 @@ from typing import Any
 from imulab.device.unit import is_blob
 from imulab.display import has_hidden
 from imulab.errors import ImulabError, OptionError, quoted
-from imulab.files import WITHIN, load_toml
+from imulab.files import confined, lies_in, load_toml
 from imulab.live.page.curves import CurveView, Head, Statistics, statistics, view
 from imulab.live.page.server import inside
 from imulab.records import is_json
@@ -126,9 +126,7 @@ class FolderFiles:
 
     def _holds(self, name: str) -> bool:
         """Return whether a path leads to what is in the session's folder, or in a folder of the command line."""
-        real = os.path.realpath(name)
-        roots = (os.path.realpath(root) for root in self.readable)
-        return any(real == root or real.startswith(os.path.join(root, "")) for root in roots)  # noqa: PTH118
+        return lies_in(name, self.readable)
 
     def path(self, name: str) -> str:
         """Return the path of a file of the session, relative to the working folder.
@@ -375,7 +373,7 @@ class Openings:
         opening.process = subprocess.Popen(
             [sys.executable, "-P", "-m", "imulab.live.page.contents", name, str(folder), json.dumps(chosen)],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, encoding="utf-8",
-            env={**os.environ, WITHIN: json.dumps([os.path.realpath(root) for root in (*within, *self.previews)])},
+            env=confined([*within, *self.previews]),
         )  # fmt: skip
         threading.Thread(target=self._listen, args=(opening,), daemon=True).start()
         return opening

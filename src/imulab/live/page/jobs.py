@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
@@ -19,7 +18,7 @@ from time import time
 from typing import IO, Any
 
 from imulab.errors import ImulabError, OptionError, listed, quoted
-from imulab.files import WITHIN
+from imulab.files import confined
 from imulab.options import Option
 
 # Forms, made from the definitions of the command line.
@@ -91,7 +90,7 @@ class Form:
 
     def wrong(self, values: Mapping[str, Any]) -> dict[str, str]:
         """Return a sentence for each text that its option does not take, by the names of fields."""
-        found: dict[str, str] = {}
+        refusals: dict[str, str] = {}
         for field in self.fields:
             option, text = self.options.get(field.name), values.get(field.name)
             if option is None or field.kind != "text" or not isinstance(text, str) or not text.strip():
@@ -99,11 +98,11 @@ class Form:
             try:
                 option.value(text.strip(), option.name.replace("_", " "))
             except ImulabError as error:
-                found[field.name] = str(error)
-        found |= _wrong_gravity(
+                refusals[field.name] = str(error)
+        refusals |= _wrong_gravity(
             {f.name: str(values.get(f.name) or "").strip() for f in self.fields if f.group == "gravity"}
         )
-        return found
+        return refusals
 
     def words(
         self, values: Mapping[str, Any], file: Callable[[str], str], output: Callable[[str, str], str]
@@ -437,7 +436,7 @@ def _signal(process: subprocess.Popen[str], number: int) -> None:
 
 def _start(job: PageJob) -> subprocess.Popen[str]:
     """Return the process of a command; raise OptionError where it cannot be started."""
-    confined = {} if job.within is None else {WITHIN: json.dumps(job.within)}
+    where = os.environ if job.within is None else confined(job.within)
     try:
         # -P: no imports from the working folder.
         return subprocess.Popen(
@@ -448,7 +447,7 @@ def _start(job: PageJob) -> subprocess.Popen[str]:
             text=True,
             encoding="utf-8",
             errors="replace",
-            env={**os.environ, "PYTHONUTF8": "1", "NO_COLOR": "1", **confined},
+            env={**where, "PYTHONUTF8": "1", "NO_COLOR": "1"},
             start_new_session=not _WINDOWS,
         )
     except (OSError, ValueError) as error:

@@ -45,7 +45,7 @@ def result_of(paths: list[str]) -> dict[str, Any]:
 
 def _drawn(figure: Figure) -> dict[str, Any]:
     """Return what Plotly draws. It makes no links of the texts, and no styles, which the page's policy forbids."""
-    said = {"title": figure.title, "caption": figure.message or figure.caption}
+    texts = {"title": figure.title, "caption": figure.message or figure.caption}
     drawn = {"data": figure.traces, "layout": figure.layout, "height": figure.height, "narrow": narrow(figure)}
-    safe: dict[str, Any] = json.loads(_BOLD.sub("", json_for_script({**said, **drawn})))
+    safe: dict[str, Any] = json.loads(_BOLD.sub("", json_for_script({**texts, **drawn})))
     return safe
