@@ -8,8 +8,10 @@ import signal
 import socket
 import subprocess
 import tempfile
+import threading
 import traceback
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,6 +151,7 @@ def server():
         return [first, *children(first)]
 
     def start() -> None:
+        (data / "postmaster.pid").unlink(missing_ok=True)  # a killed server that nobody has waited for counts as alive
         subprocess.run([*pg_ctl, "-o", options, "start"], **run_as)
 
     start()
@@ -241,10 +244,24 @@ def test_what_is_lost_during_a_run_leaves_each_calibration_in_the_history_once(f
 def test_two_runs_at_once_into_an_empty_history_lose_nothing(fleet, postgres, tmp_path):
     folders = [tmp_path / line for line in ("a", "b")]
     runs = [command("fleet", "run", fleet, "-o", f, "--workers", 1, "--history", postgres) for f in folders]
-    for process in runs:
-        out, error = process.communicate()
-        assert (process.returncode, error) == (0, ""), out
+    said = [process.communicate() for process in runs]
+    assert [(process.returncode, error) for process, (_, error) in zip(runs, said, strict=True)] == [(0, "")] * 2
     check_once(postgres, *folders)
+
+
+def test_the_tables_are_made_by_many_at_once(server, postgres):
+    """Each round begins without tables, and eight connections find none at the same moment."""
+    for _ in range(5):
+        server.tell("DROP TABLE IF EXISTS imulab_parameters, imulab_calibrations")
+        start = threading.Barrier(8)
+
+        def begin(start=start):
+            start.wait()
+            with open_history(postgres) as history:
+                return history.of(["SN000"])
+
+        with ThreadPoolExecutor(8) as pool:
+            assert [task.result() for task in [pool.submit(begin) for _ in range(8)]] == [{}] * 8
 
 
 def test_an_unreachable_postgresql_is_reported_without_its_password(tmp_path, capsys):

@@ -70,7 +70,10 @@ class History:
             sa.Column("standard_uncertainty", sa.Double),
             sa.Column("unit", sa.String(80), nullable=False),
         )
-        tables.create_all(engine)
+        try:
+            tables.create_all(engine)
+        except sa.exc.DatabaseError:  # a run that began at the same moment has made them: seen by a second look
+            tables.create_all(engine)
         with engine.connect() as connection:  # a table of this name that is another's is refused before the work
             for table in (self._calibrations, self._parameters):
                 connection.execute(sa.select(table).limit(0))
