@@ -1,6 +1,7 @@
 """Allan deviation against allantools, and coefficients against the noise that was put in."""
 
 import json
+import math
 import re
 from html import unescape
 
@@ -365,3 +366,13 @@ def test_a_report_takes_the_place_of_no_input(imulab, tmp_path, command, report,
     assert words in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["x.csv"]
+
+
+def test_a_coefficient_that_does_not_show_is_printed_below_its_interval(imulab, tmp_path):
+    still = tmp_path / "still.csv"
+    imulab("noise", "simulate", "--white", "0.3 deg/sqrt(h)", "--duration", "10 min", "-o", still)
+    walk = json.loads(imulab("allan", still, "--json").stdout)["columns"]["gyro_y"]["rate_random_walk"]
+    assert walk["value"] == 0
+    limit = walk["interval_95"][1] * 3600 * 180 / math.pi * 60
+    shown = re.search(r"gyro_y +rate random walk +< ([\d.]+) +deg/h/sqrt\(h\)\n", imulab("allan", still).stdout)
+    assert float(shown[1]) == pytest.approx(limit, rel=0.05)

@@ -301,10 +301,9 @@ def coefficients_table(rows: list[list[str]]) -> ReportTable:
     """Return the table of rows of coefficients."""
     return ReportTable(
         "Noise coefficients",
-        "Value and standard uncertainty u, of the model that fits the spectrum best; 0 ± u: it does not show. "
-        "Angle (velocity) random walk: the white noise of the rate (specific "
-        "force). Bias instability: the level of 1/f noise, below which no averaging helps. Rate (acceleration) "
-        "random walk: how the zero wanders.",
+        "Value and standard uncertainty u, of the model that fits the spectrum best; <: not seen, and with 95 % below "
+        "this. Angle (velocity) random walk: the white noise of the rate (specific force). Bias instability: the level "
+        "of 1/f noise, below which no averaging helps. Rate (acceleration) random walk: how the zero wanders.",
         ["column", "coefficient", "value", "u", "unit"],
         rows,
     )
@@ -326,6 +325,8 @@ def coefficient_rows(analysis: dict[str, Any]) -> list[list[str]]:
             texts = ("not determined", "")
             if column[key]["value"] is not None:
                 texts = format_uncertain(*(column[key][part] * factor for part in ("value", "standard_uncertainty")))
+                if column[key]["value"] == 0:
+                    texts = (f"< {plain_number(column[key]['interval_95'][1] * factor, 2)}", "")
             label = title
             if column["unit"] == "m/s^2":
                 label = title.replace("angle", "velocity").replace("rate", "acceleration")
