@@ -17,7 +17,9 @@ from imulab.cli import main
 REPOSITORY = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"<!-- tested -->\n+```(\w*)\n(.*?)```", re.DOTALL)
 PUBLIC = sorted(set(imulab.__all__) - {"__version__"})
-PAGES = sorted(page for page in (REPOSITORY / "docs").glob("*.md") if BLOCK.search(page.read_text(encoding="utf-8")))
+README = REPOSITORY / "README.md"
+FOLDER = sorted((REPOSITORY / "docs").glob("*.md"))
+PAGES = [page for page in (README, *FOLDER) if BLOCK.search(page.read_text(encoding="utf-8"))]
 
 
 @pytest.mark.slow
@@ -43,14 +45,32 @@ def test_what_a_page_shows_runs(page, tmp_path, monkeypatch, capsys):
 
 def test_five_lines_lead_from_a_data_frame_to_a_record_and_a_picture(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    ((language, text),) = BLOCK.findall((REPOSITORY / "README.md").read_text(encoding="utf-8"))
-    assert language == "python"
+    (text,) = (text for language, text in BLOCK.findall(README.read_text(encoding="utf-8")) if language == "python")
     assert len([line for line in text.splitlines() if line]) == 5
     imulab.simulate_tumble(gravity=9.81362).to_frame("pandas").to_csv("recording.csv", index=False)
     (tmp_path / "example.py").write_text(text, encoding="utf-8")
     runpy.run_path("example.py")
     assert len(imulab.load("sn42.json").parameters) >= 9
     assert "Residual |f| \u2212 g of each attitude" in (tmp_path / "residuals.html").read_text(encoding="utf-8")
+
+
+def test_the_sessions_and_the_fit_of_the_readme_end_in_good(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    commands = re.findall(r"^ *(imulab (?:live|tumble) .*)$", README.read_text(encoding="utf-8"), re.MULTILINE)
+    for command in commands:
+        assert main(shlex.split(command.replace("speed=5", "speed=0"))[1:]) == 0
+    records = [imulab.load(name) for name in ("sn42.json", "live.json")]
+    assert [record.verdict.state for record in records] == ["good", "good"]
+
+
+def test_the_quickstart_shows_what_its_fit_prints(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = (REPOSITORY / "docs" / "quickstart.md").read_text(encoding="utf-8")
+    simulate, fit = re.findall(r"^(imulab tumble .*)$", page, re.MULTILINE)
+    assert main(shlex.split(simulate)[1:]) == main(shlex.split(fit)[1:]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    shown = page[page.index("    good: ") : page.index("The simulated unit knows")].splitlines()
+    assert [line.strip() for line in shown if line.strip() not in (*map(str.strip, printed), "...")] == []
 
 
 @pytest.mark.parametrize("page", ["tumble", "gyro_array", "warmup", "centrifuge", "noise", "thermal", "rate"])

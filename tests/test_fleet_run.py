@@ -251,7 +251,7 @@ def test_a_parquet_manifest_that_is_cut_or_cannot_be_read_is_said(tmp_path, monk
     with pytest.raises(ReadError, match=r"m\.parquet: not a whole Parquet file"):
         load_fleet(str(tmp_path / "m.parquet"))
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ReadError, match=r"m\.parquet: Parquet needs pyarrow.*pip install 'imulab\[tables\]'"):
+    with pytest.raises(ReadError, match=r"m\.parquet: Parquet needs pyarrow.*pip install '\.\[tables\]'"):
         load_fleet(str(tmp_path / "m.parquet"))
 
 
@@ -474,7 +474,8 @@ def test_without_sqlalchemy_there_is_no_history_and_one_line_says_so(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert done.stderr == (
-        "imulab: warning: no history is kept: the history needs SQLAlchemy: pip install 'imulab[fleet]'\n"
+        "imulab: warning: no history is kept: the history needs SQLAlchemy: "
+        "pip install '.[fleet]' in imulab's source folder\n"
     )
 
 

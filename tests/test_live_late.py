@@ -176,7 +176,7 @@ def test_a_late_stream_in_a_full_screen_terminal(tmp_path):
 
 @pytest.mark.slow
 def test_a_late_stream_on_the_page(tmp_path, new_page):
-    pytest.importorskip("starlette", reason="the page needs imulab[live]")
+    pytest.importorskip("starlette", reason="the page needs the extra live")
     lines = lines_of(tumble("g", field="48 uT"))
     with (
         late_unit("tcp", lines, 1600) as (words, begin, _),

@@ -23,7 +23,7 @@ from urllib.parse import quote
 
 import pytest
 
-pytest.importorskip("starlette", reason="the page needs imulab[live]")
+pytest.importorskip("starlette", reason="the page needs the extra live")
 
 import imulab as il
 from imulab.cli import main

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("starlette", reason="the page needs imulab[live]")
+pytest.importorskip("starlette", reason="the page needs the extra live")
 
 import imulab as il
 from imulab.cli import main
@@ -353,7 +353,10 @@ def test_what_is_not_installed_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("imulab.live.page.find_spec", lambda name: None if name == "uvicorn" else name)
     assert main(["live", "simulate", "--save", "rec.csv", "--page"]) == 2
-    assert "the page needs uvicorn, which is not here: pip install 'imulab[live]'" in capsys.readouterr().err
+    assert (
+        "the page needs uvicorn, which is not here: pip install '.[live]' in imulab's source folder"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_link_that_is_lost_keeps_the_page_and_comes_back(live, new_page, tmp_path):

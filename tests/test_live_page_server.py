@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-pytest.importorskip("starlette", reason="the page needs imulab[live]")
+pytest.importorskip("starlette", reason="the page needs the extra live")
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse
 from starlette.routing import Route

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("starlette", reason="the page needs imulab[live]")
+pytest.importorskip("starlette", reason="the page needs the extra live")
 
 import imulab as il
 from imulab.cli import main

@@ -268,7 +268,11 @@ def test_a_figure_is_saved_as_a_picture(fit, chromium, tmp_path, kind, begin):
     ("name", "without", "words"),
     [
         ("x.gif", None, r"x.gif: expected a name that ends in .html, .png, .svg or .pdf"),
-        ("x.png", "kaleido", r"x.png: a picture needs kaleido: pip install 'imulab\[plots\]'; .html needs nothing"),
+        (
+            "x.png",
+            "kaleido",
+            r"x.png: a picture needs kaleido: pip install '\.\[plots\]' in imulab's source folder; .html needs nothing",
+        ),
     ],
 )
 def test_a_figure_that_cannot_be_saved_is_refused_in_a_line(fit, tmp_path, monkeypatch, name, without, words):

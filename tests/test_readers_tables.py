@@ -284,7 +284,7 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch, truth,
     else:
         return  # lz4 is needed for compressed chunks only; tested with the bags
     monkeypatch.setitem(sys.modules, kind.library, None)
-    install = rf"pip install 'imulab\[{kind.extra}\]'"
+    install = rf"pip install '\.\[{kind.extra}\]'"
     with pytest.raises(ReadError, match=f"needs {kind.library}, which is not here: {install}"):
         il.read(path, text)
     if kind.writes:

@@ -52,6 +52,11 @@ def meant(known: Iterable[str], word: object, alike: float = 0.6) -> str:
     return f"; did you mean {names[close[0]]!r}?" if close else ""
 
 
+def install(extra: str) -> str:
+    """Return how to install the packages of an extra, for a message; no index has imulab, its source folder has."""
+    return f"pip install '.[{extra}]' in imulab's source folder"
+
+
 def file_name(value: object) -> str | os.PathLike[str]:
     """Return the name of a file.
 

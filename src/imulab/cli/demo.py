@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from imulab.display import Verdict
-from imulab.errors import ImulabError, OptionError
+from imulab.errors import ImulabError, OptionError, install
 from imulab.files import write_text
 from imulab.procedures.registry import load
 from imulab.procedures.views import exhibits_of
@@ -122,7 +122,7 @@ make -C firmware test
 _LIVE = (
     "live in the browser, with a simulated unit and the workbench beside it:\n"
     "    imulab live simulate --follow --save live.csv --page     (without --page in the terminal)\n"
-    "    the page needs more packages: pip install 'imulab[live]'"
+    f"    the page needs more packages: {install('live')}"
 )
 
 

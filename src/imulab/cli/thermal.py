@@ -1,4 +1,4 @@
-"""Calibrate an accelerometer triad over temperature."""
+"""Calibrate accelerometers and gyroscopes over temperature."""
 
 from __future__ import annotations
 

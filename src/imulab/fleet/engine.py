@@ -24,7 +24,7 @@ from typing import Any, Protocol, TypeVar
 
 from imulab._version import VERSION
 from imulab.display import UNJUDGED, Note, Verdict
-from imulab.errors import ImulabError, OptionError, listed
+from imulab.errors import ImulabError, OptionError, install, listed
 from imulab.files import write_text
 from imulab.fleet import ENGINES
 from imulab.fleet.manifest import FleetUnit, UnitFiles
@@ -441,7 +441,7 @@ def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskE
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise OptionError("--engine dask needs Dask: pip install 'imulab[fleet]'") from None
+        raise OptionError(f"--engine dask needs Dask: {install('fleet')}") from None
     for name in ("asyncio", *logging.root.manager.loggerDict):
         if name.partition(".")[0] in ("asyncio", "distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # `_Watch` reports what a person must know

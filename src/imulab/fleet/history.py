@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, install
 from imulab.fleet.engine import Summary
 from imulab.fleet.manifest import masked, without_secrets
 from imulab.records.calibration import Parameter
@@ -167,7 +167,7 @@ def open_history(url: str, *, there: bool = False) -> Iterator[History]:
         import sqlalchemy as sa
         from sqlalchemy.exc import SQLAlchemyError
     except ImportError:
-        raise OptionError("the history needs SQLAlchemy: pip install 'imulab[fleet]'") from None
+        raise OptionError(f"the history needs SQLAlchemy: {install('fleet')}") from None
     expected = "expected a URL such as sqlite:///history.sqlite or postgresql://user@host/database"
     try:
         address = sa.make_url(url)
@@ -188,9 +188,7 @@ def open_history(url: str, *, there: bool = False) -> Iterator[History]:
         try:
             engine = sa.create_engine(address, connect_args={"timeout" if kind == "sqlite" else "connect_timeout": 20})
         except ImportError as error:
-            raise OptionError(
-                f"history {name}: its driver is missing ({error}): pip install 'imulab[postgres]'"
-            ) from None
+            raise OptionError(f"history {name}: its driver is missing ({error}): {install('postgres')}") from None
     try:
         with _in_one_line(name, url, opening=True):
             history = History(engine, name, url)

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from imulab.errors import ImulabError, OptionError, ReadError, listed, readable, several
+from imulab.errors import ImulabError, OptionError, ReadError, install, listed, readable, several
 from imulab.procedures.registry import PROCEDURES
 from imulab.readers.formats import library
 
@@ -104,7 +104,7 @@ def _fetched(address: str, name: str, folder: Path) -> Path:
     try:
         import fsspec
     except ImportError:
-        raise ReadError(f"{name}: a URL needs fsspec: pip install 'imulab[fleet]'") from None
+        raise ReadError(f"{name}: a URL needs fsspec: {install('fleet')}") from None
     target = folder / (re.sub(r"[^\w.-]", "_", address.rstrip("/").rpartition("/")[2]) or "file")
     try:
         system, path = fsspec.core.url_to_fs(address)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from imulab.columns import parse_column_title, triad
-from imulab.errors import OptionError, ReadError, UnitError, quoted
+from imulab.errors import OptionError, ReadError, UnitError, install, quoted
 from imulab.live.stamps import Counts
 from imulab.readers.opened import fits
 from imulab.recording import Array, Layout
@@ -476,5 +476,5 @@ def _dialect() -> ModuleType:
     try:
         from pymavlink.dialects.v20 import ardupilotmega  # the common messages, and those of the most autopilots
     except ImportError:
-        raise OptionError("MAVLink needs pymavlink, which is not here: pip install 'imulab[live]'") from None
+        raise OptionError(f"MAVLink needs pymavlink, which is not here: {install('live')}") from None
     return ardupilotmega  # type: ignore[no-any-return]

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from imulab.errors import OptionError, ReadError
+from imulab.errors import OptionError, ReadError, install
 from imulab.quantities import whole_number
 
 BAUD = 115_200  # of a serial port, where none is stated
@@ -78,7 +78,7 @@ def _pyserial() -> Any:
     try:
         import serial
     except ImportError:
-        raise OptionError("serial ports need pyserial, which is not here: pip install 'imulab[live]'") from None
+        raise OptionError(f"serial ports need pyserial, which is not here: {install('live')}") from None
     return serial
 
 

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from msgspec import Struct
 
-from imulab.errors import ReadError, first_of
+from imulab.errors import ReadError, first_of, install
 from imulab.files import open_file, permit
 
 # Unpacking within limits: a few kilobytes can unpack to terabytes.
@@ -259,14 +259,14 @@ def library(module: str, kind: str, extra: str, name: str) -> Any:
         return import_module(module)
     except ImportError:
         package = module.partition(".")[0]
-        raise ReadError(f"{name}: {kind} needs {package}, which is not here: pip install 'imulab[{extra}]'") from None
+        raise ReadError(f"{name}: {kind} needs {package}, which is not here: {install(extra)}") from None
 
 
 def table() -> tuple[list[str], list[list[str]]]:
     """Return titles and rows of the list of formats that can be read and written."""
     rows = []
     for kind in (TEXT, *FORMATS):
-        needs = f"pip install 'imulab[{kind.extra}]'" if kind.extra and not kind.available else ""
+        needs = install(kind.extra) if kind.extra and not kind.available else ""
         optional = kind.extra and kind.available
         rows.append(
             [

@@ -30,7 +30,7 @@ import numpy as np
 
 from imulab.columns import triad
 from imulab.display import Finding, Note
-from imulab.errors import OptionError, ReadError, listed
+from imulab.errors import OptionError, ReadError, install, listed
 from imulab.files import open_file
 from imulab.readers import logs
 from imulab.readers.formats import Budget, unpack
@@ -428,7 +428,7 @@ def _decoder(method: str, name: str) -> Callable[[], Any]:
                 from backports import zstd
             return cast("Callable[[], Any]", zstd.ZstdDecompressor)
     except ImportError:
-        raise ReadError(f"{name}: compressed with {method}; reading it needs pip install 'imulab[ros]'") from None
+        raise ReadError(f"{name}: compressed with {method}: {install('ros')}") from None
     raise ReadError(f"{name}: compressed with {method!r}; expected none, bz2, lz4 or zstd")
 
 

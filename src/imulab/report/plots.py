@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, overload
 from uuid import uuid4
 
-from imulab.errors import OptionError, file_name, listed, quoted
+from imulab.errors import OptionError, file_name, install, listed, quoted
 from imulab.files import replacing, write_text
 from imulab.report import json_for_script, render_page
 from imulab.report.traces import INK, Exhibits, Figure
@@ -176,7 +176,7 @@ def _picture(plot: Plot, kind: str, path: str | Path) -> bytes:
         import kaleido
         from kaleido.errors import ChromeNotFoundError
     except ImportError:
-        needed = "kaleido: pip install 'imulab[plots]'"
+        needed = f"kaleido: {install('plots')}"
         raise OptionError(f"{path}: a picture needs {needed}; .html needs nothing") from None
     figure = plot.to_dict()
     height, scale = figure["layout"]["height"], 2 if kind == "png" else 1

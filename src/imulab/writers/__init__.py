@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 import imulab.writers._digits as _digits
-from imulab.errors import DataError, OptionError, file_name, quoted
+from imulab.errors import DataError, OptionError, file_name, install, quoted
 from imulab.files import replacing
 from imulab.recording import CORRECTED_BY, Array, Recording
 
@@ -201,7 +201,7 @@ def _pyarrow() -> Any:
     try:
         import pyarrow
     except ImportError:
-        raise OptionError("writing Parquet needs pyarrow, which is not here: pip install 'imulab[tables]'") from None
+        raise OptionError(f"writing Parquet needs pyarrow, which is not here: {install('tables')}") from None
     return pyarrow
 
 

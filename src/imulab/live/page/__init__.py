@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, install
 
 _NEEDED = ("starlette", "uvicorn", "websockets")
 
@@ -19,4 +19,4 @@ def require_server() -> None:
     """
     missing = [name for name in _NEEDED if find_spec(name) is None]
     if missing:
-        raise OptionError(f"the page needs {' '.join(missing)}, which is not here: pip install 'imulab[live]'")
+        raise OptionError(f"the page needs {' '.join(missing)}, which is not here: {install('live')}")
