@@ -11,7 +11,7 @@ from imulab.options import GROUPS, Option
 
 HEAD = """# The command line, command by command
 
-Made from the commands themselves: the same text as `imulab COMMAND --help`. What all commands share (units, intervals,
+Made from the commands themselves: the same text as `imulab COMMAND --help-all`. What all commands share (units, intervals,
 exit status, project file) is [told once](index.md#the-command-line).
 """
 

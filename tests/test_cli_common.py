@@ -37,6 +37,29 @@ def test_a_group_alone_prints_its_help(capsys, group):
     assert err == ""
 
 
+def test_help_fits_on_a_screen_and_names_every_option(monkeypatch):
+    from imulab.cli.app import commands
+    from imulab.cli.help import command_help
+
+    monkeypatch.setenv("COLUMNS", "80")
+    for command in commands():
+        text = command_help(command)
+        assert len(text.splitlines()) <= 46, command.path
+        assert all(option.flags[-1] in text for option in command.options)
+
+
+def test_the_short_help_leaves_out_what_few_runs_need(capsys):
+    texts = []
+    for flag in ("--help", "--help-all"):
+        assert main(["tumble", "fit", flag]) == 0
+        texts.append(capsys.readouterr().out)
+    assert ["Changes of scale factors" in text for text in texts] == [False, True]
+    assert "explained by 'imulab tumble fit --help-all':" in texts[0]
+    assert "--nonlinearity --asymmetry" in texts[0]
+    assert main(["--help"]) == 0
+    assert "Calibrate accelerometers and gyroscopes over temperature." in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "end"),
     [

@@ -34,7 +34,7 @@ def test_every_word_offered_is_taken_and_others_are_refused_by_name(name, option
 
 @pytest.mark.parametrize("path", COMMANDS)
 def test_the_help_of_a_command_has_a_sentence_on_every_option(path, capsys):
-    assert main([*path.split(), "--help"], project=False) == 0
+    assert main([*path.split(), "--help-all"], project=False) == 0
     shown = " ".join(capsys.readouterr().out.split())
     for option in COMMANDS[path].options:
         assert option.help.endswith("."), option.keyword
@@ -99,7 +99,7 @@ def test_options_are_what_a_signature_and_its_docstring_say():
 
 
 def test_help_is_the_same_without_docstrings():
-    words = ["-m", "imulab", "thermal", "check", "--help"]
+    words = ["-m", "imulab", "thermal", "check", "--help-all"]
     shown = [subprocess.run([sys.executable, *how, *words], capture_output=True, text=True) for how in ([], ["-OO"])]
     assert shown[0].stdout == shown[1].stdout
     assert "How far a hold tips while it warms or cools." in " ".join(shown[1].stdout.split())

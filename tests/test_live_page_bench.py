@@ -61,7 +61,7 @@ def words(path: str, **values: Any) -> list[str]:
 
 @pytest.mark.parametrize("path", COMMANDS)
 def test_a_form_has_what_the_help_of_its_command_has(path, capsys):
-    assert main([*path.split(), "--help"], project=False) == 0
+    assert main([*path.split(), "--help-all"], project=False) == 0
     shown = " ".join(capsys.readouterr().out.split())
     form = FORMS[path]
     assert " ".join(form.help.split()[:5]) in shown

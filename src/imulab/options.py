@@ -105,8 +105,10 @@ Read = Callable[[str, str], Any]
 """The text of an option, and how messages call it, to its value; raises OptionError."""
 
 
-class Program(NamedTuple):
-    """Marks an option for programs only."""
+class Mark(NamedTuple):
+    """Marks an option."""
+
+    name: str
 
 
 class Group(NamedTuple):
@@ -134,7 +136,7 @@ class Reads(NamedTuple):
     help: str = ""
 
 
-PROGRAM = Program()
+PROGRAM, RARE = Mark("for programs only"), Mark("few runs need it: long help only names it")
 FURTHER_TRIADS = Group("further triads")
 READING = Group("reading")
 OUTPUT = Group("output")
@@ -204,6 +206,8 @@ class Option:
         ``switch``, ``either`` (on, off or neither), ``texts`` (any number of them) or ``text``.
     group
         Where help lists it.
+    rare
+        Whether few runs need it.
     """
 
     keyword: str
@@ -213,6 +217,7 @@ class Option:
     required: bool
     kind: str
     group: str
+    rare: bool = False
 
     @property
     def name(self) -> str:
@@ -320,7 +325,8 @@ def _option(owner: Any, name: str, kind: Any, default: Any) -> Option | None:
     group = next((each.name for each in markers if isinstance(each, Group)), GROUPS[0])
     reads = _by_type(kinds) if reads is None else reads
     shape = "either" if reads.off else "switch" if switch else "texts" if reads.repeated else "text"
-    return Option(name, owner, reads, _text(default), default is inspect.Parameter.empty, shape, group)
+    required = default is inspect.Parameter.empty
+    return Option(name, owner, reads, _text(default), required, shape, group, RARE in markers)
 
 
 def _by_type(kinds: Sequence[Any]) -> Reads:

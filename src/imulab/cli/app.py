@@ -12,7 +12,7 @@ from typing import Any
 
 from imulab import options
 from imulab._version import VERSION
-from imulab.cli.command import ALIKE, HELP, Command, values_of
+from imulab.cli.command import ALIKE, HELP, HELP_ALL, Command, values_of
 from imulab.errors import OptionError, listed, meant
 
 TITLE = "From recordings of inertial sensors to calibration records and reports."
@@ -22,7 +22,7 @@ EXAMPLES = """
     imulab tumble fit recording.csv --gravity 9.81362 -o sn42.json --report sn42.html
     imulab apply sn42.json flight.csv -o corrected.csv
 
-  'imulab COMMAND --help' says more; 'imulab demo' runs everything on simulated instruments."""
+  'imulab COMMAND --help' says more, '--help-all' all; 'imulab demo' runs everything on simulated instruments."""
 ROOT_OPTIONS = (
     ("--version", "Print the version."),
     ("--install-completion", "Install completion for the current shell."),
@@ -89,12 +89,12 @@ def run(words: Sequence[str]) -> int | None:
         command = find([group, *words])
     if not isinstance(command, Command):
         raise _no_command(words[0], group)
-    values = values_of(command, words[command.path.count(" ") :])
-    if values is not None:
-        return run_command(command, *values)
+    values, typed = values_of(command, words[command.path.count(" ") :])
+    if not typed & {HELP.keyword, HELP_ALL.keyword}:
+        return run_command(command, values, typed)
     from imulab.cli.help import command_help
 
-    print(command_help(command))
+    print(command_help(command, whole=HELP_ALL.keyword in typed))
     return None
 
 
@@ -108,7 +108,9 @@ def _no_command(word: str, group: str) -> OptionError:
 
 def _answered(group: str, words: list[str]) -> bool:
     """Consume the options of the root or of a group from the words, and print the answers to them."""
-    known = {flag: lambda: print(_group_help(group)) for flag in HELP.flags} | ({} if group else _ANSWERS)
+    known = {flag: lambda: print(_group_help(group)) for flag in (*HELP.flags, *HELP_ALL.flags)} | (
+        {} if group else _ANSWERS
+    )
     asked = [] if words else [*HELP.flags]
     while words and words[0].startswith("-") and words[0] != "-":
         word = words.pop(0)

@@ -57,11 +57,15 @@ def _common(
     """Declares the options that every command has."""
 
 
-def _help(*, help: Annotated[bool, option("", "Show this message and exit.", "-h", "--help"), COMMON] = False) -> None:  # noqa: A002
-    """Declares the option that is answered at once."""
+def _help(
+    *,
+    help: Annotated[bool, option("", "Show this message and exit.", "-h", "--help"), COMMON] = False,  # noqa: A002
+    help_all: Annotated[bool, option("", "Explain every option and exit."), COMMON] = False,
+) -> None:
+    """Declares the options that are answered at once."""
 
 
-(HELP,) = options_of(_help)
+HELP, HELP_ALL = options_of(_help)
 
 
 @dataclass(frozen=True)
@@ -125,15 +129,15 @@ class Command:
         return tuple(sorted(chosen, key=lambda each: each.rank))
 
 
-def values_of(command: Command, words: Sequence[str]) -> tuple[dict[str, Any], set[str]] | None:
-    """Return the values of a command's parameters, and which of them were typed; None if help is asked for.
+def values_of(command: Command, words: Sequence[str]) -> tuple[dict[str, Any], set[str]]:
+    """Return the values of a command's parameters, and which of them were typed; of help alone, where it is asked for.
 
     Raises
     ------
     OptionError
         The words are none of this command.
     """
-    known = {flag: each for each in (*command.options, HELP) for flag in each.flags}
+    known = {flag: each for each in (*command.options, HELP, HELP_ALL) for flag in each.flags}
     opposite = {each.opposite: each for each in command.options if each.opposite}
     typed: dict[str, Any] = {}
     rest: list[str] = []
@@ -177,8 +181,8 @@ def values_of(command: Command, words: Sequence[str]) -> tuple[dict[str, Any], s
                 take(each, f"-{letter}", word[index:] or None, left)
                 if each.takes_value:
                     break
-    if "help" in typed:
-        return None
+    if asked := typed.keys() & {HELP.keyword, HELP_ALL.keyword}:
+        return {}, asked
     values = dict(_given(command, rest, refuse))
     for each in command.options:
         if each.required and each.keyword not in typed:

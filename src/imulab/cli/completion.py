@@ -11,7 +11,7 @@ import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
-from imulab.cli.command import HELP, Command
+from imulab.cli.command import HELP, HELP_ALL, Command
 from imulab.errors import OptionError
 
 ASKED = "_IMULAB_COMPLETE"
@@ -190,7 +190,7 @@ def _complete_word(command: Command, words: list[str], incomplete: str) -> Itera
         flag, _, incomplete = incomplete.partition("=")
         words = [*words, flag]
     if incomplete.startswith("-") and "--" not in words:
-        for each in (*command.options, HELP):
+        for each in (*command.options, HELP, HELP_ALL):
             for flag in filter(None, (*each.flags, each.opposite)):
                 if flag.startswith(incomplete) and (each.kind == "texts" or not {*each.flags} & {*words}):
                     yield flag, each.help

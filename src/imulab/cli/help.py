@@ -7,25 +7,45 @@ import shutil
 from collections.abc import Iterable, Sequence
 from textwrap import TextWrapper
 
-from imulab.cli.command import HELP, Command
+from imulab.cli.command import HELP, HELP_ALL, Command
 from imulab.options import GROUPS, Option
 
 _WIDEST, _COLUMN = 100, 30  # characters of a line of help; of the column of options at most
+_SCREEN = 40  # lines
+_FOLDED = ("further triads", "reading", "all commands")
 _KEPT = "\xa0"  # a space where no line ends
 _TITLES = {GROUPS[0]: "Options", GROUPS[-1]: "Options of all commands"}
 
 
-def command_help(command: Command) -> str:
-    """Return the text of ``--help`` for a command: usage, description, and options in their groups."""
+def command_help(command: Command, *, whole: bool = False) -> str:
+    """Return the text of ``--help`` for a command: usage, description, and options in their groups.
+
+    Where that is more than a screen, options that few runs need are only named, unless the `whole` is asked for.
+    """
     usage = " ".join([f"Usage: imulab {command.path} [OPTIONS]", *(each.shows for each in command.arguments)])
-    lines = [*_wrapped(usage, " " * 7, first=""), "", *_paragraphs(command.help)]
     argument_rows = [(each.shows, f"{each.help}{' [required]' if each.required else ''}") for each in command.arguments]
-    rows = [(each.group, each.spelling, f"{each.help}{_remarks(each)}") for each in (*command.options, HELP)]
-    column = _column([term for term, _ in argument_rows] + [term for _, term, _ in rows])
-    lines += _list("Arguments", argument_rows, column)
-    for group in GROUPS:
-        lines += _list(_TITLES.get(group, group.capitalize()), [row[1:] for row in rows if row[0] == group], column)
-    return "\n".join(lines)
+    head = [*_wrapped(usage, " " * 7, first=""), "", *_paragraphs(command.help)]
+    options = (*command.options, HELP, HELP_ALL)
+
+    def lines(explained: Sequence[Option]) -> list[str]:
+        rows = [(each.group, each.spelling, f"{each.help}{_remarks(each)}") for each in explained]
+        column = _column([term for term, _ in argument_rows] + [term for _, term, _ in rows])
+        text = [*head, *_list("Arguments", argument_rows, column)]
+        for group in GROUPS:
+            text += _list(_TITLES.get(group, group.capitalize()), [row[1:] for row in rows if row[0] == group], column)
+        return text
+
+    everything = lines(options)
+    if whole or len(everything) <= _SCREEN:
+        return "\n".join(everything)
+    explained = [each for each in options if each.required or not (each.rare or each.group in _FOLDED)]
+    named: dict[str, list[str]] = {}
+    for each in options:
+        if each not in explained:
+            named.setdefault(each.group, []).append(each.flags[-1])
+    rows = [(_TITLES.get(group, group.capitalize()), " ".join(flags)) for group, flags in named.items()]
+    more = _list(f"More, explained by 'imulab {command.path} {HELP_ALL.flags[0]}'", rows, _COLUMN)
+    return "\n".join([*lines(explained), *more])
 
 
 def group_help(usage: str, text: str, options: Iterable[tuple[str, str]], commands: Iterable[tuple[str, str]]) -> str:

@@ -17,7 +17,7 @@ import imulab as il
 from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, reading, warn, whole_number
 from imulab.errors import ImulabError, OptionError
-from imulab.options import FLAG, OUTPUT
+from imulab.options import FLAG, OUTPUT, RARE
 
 if TYPE_CHECKING:
     from imulab.gravity import Gravity
@@ -33,12 +33,13 @@ if TYPE_CHECKING:
 
 FOLDER = "imulab-files"
 _NOT_OFFERED = ("live", "open", "demo", "fleet ")
-PagePort = Annotated[str | None, option("N", "Port of the page; a free one if not given.", "--port")]
+PagePort = Annotated[str | None, option("N", "Port of the page; a free one if not given.", "--port"), RARE]
 PageHost = Annotated[
     str | None,
     option("ADDRESS", "Address of this machine to listen at, for others; 0.0.0.0 or ::, all.", "--host"),
+    RARE,
 ]
-NoBrowser = Annotated[bool, option("", "Print the address of the page, and open no browser.", "--no-browser")]
+NoBrowser = Annotated[bool, option("", "Print the address of the page, and open no browser.", "--no-browser"), RARE]
 
 
 def port_number(text: str | None) -> int:

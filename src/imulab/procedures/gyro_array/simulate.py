@@ -13,7 +13,7 @@ from typing import Annotated, TypeAlias
 import numpy as np
 
 from imulab.errors import OptionError, listed
-from imulab.options import choice, measure, repeated, text
+from imulab.options import RARE, choice, measure, repeated, text
 from imulab.procedures.gyro_array import EXPERIMENTS, FAULTS, MOUNTINGS, UNITS
 from imulab.quantities import in_si, quantity, whole
 from imulab.recording import Array, Recording
@@ -61,14 +61,14 @@ def simulate_array(
     axes: int | str = 1,
     rate: Annotated[float | str | None, measure("frequency", "Hz")] = None,
     duration: Annotated[float | str | None, measure("time", "s")] = None,
-    white: Annotated[float | str, measure("rate", "deg/s")] = "0.05 deg/s",
-    spread: Annotated[tuple[float, float] | str, text("LOW,HIGH")] = "0.6,1.6",
-    gauss_markov: Annotated[float | str, measure("rate", "deg/s")] = "0.003 deg/s",
-    correlation_time: Annotated[float | str, measure("time", "s")] = "200 s",
-    walk: Annotated[float | str, measure("rate", "deg/s")] = "0.0002 deg/s",
-    turn_on: Annotated[float | str, measure("rate", "deg/s")] = "0.02 deg/s",
+    white: Annotated[float | str, measure("rate", "deg/s"), RARE] = "0.05 deg/s",
+    spread: Annotated[tuple[float, float] | str, text("LOW,HIGH"), RARE] = "0.6,1.6",
+    gauss_markov: Annotated[float | str, measure("rate", "deg/s"), RARE] = "0.003 deg/s",
+    correlation_time: Annotated[float | str, measure("time", "s"), RARE] = "200 s",
+    walk: Annotated[float | str, measure("rate", "deg/s"), RARE] = "0.0002 deg/s",
+    turn_on: Annotated[float | str, measure("rate", "deg/s"), RARE] = "0.02 deg/s",
     scale_spread: float | str = 0,
-    misalignment: Annotated[float | str, measure("angle", "deg")] = "0 deg",
+    misalignment: Annotated[float | str, measure("angle", "deg"), RARE] = "0 deg",
     mounting: Annotated[str, choice(MOUNTINGS)] = "same",
     fault: Faults = None,
     unit: Annotated[str, choice(UNITS)] = "deg/s",

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from imulab.errors import OptionError
 from imulab.estimation.least_squares import Observability
 from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
-from imulab.options import FURTHER_TRIADS, PROGRAM, choice, measure, parsed
+from imulab.options import FURTHER_TRIADS, PROGRAM, RARE, choice, measure, parsed
 from imulab.procedures import tumble
 from imulab.procedures.result import Record, Result, as_record
 from imulab.procedures.tumble import FURTHER, HEMISPHERES, LOSSES, METHODS, ORDERS
@@ -87,13 +87,13 @@ def fit_tumble(
     height: Height = None,
     method: Annotated[str, choice(METHODS)] = "norm",
     loss: Annotated[str, choice(LOSSES)] = "auto",
-    nonlinearity: Annotated[tuple[float, float] | str | None, parsed(tumble.nonlinearity, "20ug,20ug")] = None,
-    asymmetry: Annotated[float | str | None, measure("number", "ppm", "20ppm")] = None,
-    prior: Record | None = None,
-    ageing: Annotated[Sequence[float] | str, parsed(tumble.ageing, "100ug,100ppm[,50urad]")] = (),
-    monte_carlo: int | str | None = None,
-    cross: bool = False,
-    threshold: Annotated[Sequence[float] | str | None, parsed(tumble.threshold, "5ppm,2ug,3arcsec")] = None,
+    nonlinearity: Annotated[tuple[float, float] | str | None, parsed(tumble.nonlinearity, "20ug,20ug"), RARE] = None,
+    asymmetry: Annotated[float | str | None, measure("number", "ppm", "20ppm"), RARE] = None,
+    prior: Annotated[Record | None, RARE] = None,
+    ageing: Annotated[Sequence[float] | str, parsed(tumble.ageing, "100ug,100ppm[,50urad]"), RARE] = (),
+    monte_carlo: Annotated[int | str | None, RARE] = None,
+    cross: Annotated[bool, RARE] = False,
+    threshold: Annotated[Sequence[float] | str | None, parsed(tumble.threshold, "5ppm,2ug,3arcsec"), RARE] = None,
     with_: Annotated[str | Sequence[str], parsed(further_triads, "gyro,mag", FURTHER), FURTHER_TRIADS] = (),
     field: Annotated[float | str | None, measure("magnetic field", "uT", "48.2uT"), FURTHER_TRIADS] = None,
     hemisphere: Annotated[str | None, choice(HEMISPHERES), FURTHER_TRIADS] = None,

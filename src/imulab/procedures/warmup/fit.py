@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeAlias, Unpack
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
-from imulab.options import choice, measure, names_of_columns, parsed
+from imulab.options import RARE, choice, measure, names_of_columns, parsed
 from imulab.procedures.result import Result, as_blocks
 from imulab.procedures.warmup import BEYOND, EXITS, MODELS, POOLS, settling_size
 from imulab.procedures.warmup.cycles import Curves, Cycle, common_axes, find_power_cycle, make_curves, with_axes
@@ -82,16 +82,16 @@ def fit_warmup(
     *,
     model: Annotated[str, choice(("auto", *MODELS))] = "auto",
     temperatures: Temperatures = SOURCE_TEMPERATURES,
-    tolerance: Annotated[float | str, parsed(number, "K")] = TOLERANCE,
+    tolerance: Annotated[float | str, parsed(number, "K"), RARE] = TOLERANCE,
     settling_time: Annotated[float | str | None, measure("time", "s")] = None,
     settling_limit: Annotated[Mapping[str, float] | str, parsed(settling_size, "LIMIT")] = "5 %",
     exit: Annotated[str, choice(EXITS)] = "zero",  # noqa: A002
-    taper_time: Annotated[float | str, measure("time", "s")] = "60 s",
+    taper_time: Annotated[float | str, measure("time", "s"), RARE] = "60 s",
     pool: Annotated[str, choice(POOLS)] = "unit",
     axes: Annotated[str | Sequence[str] | None, parsed(names_of_columns, "A,A,...")] = None,
-    beyond: Annotated[str, choice(BEYOND)] = "zero",
-    latest_start: Annotated[float | str, measure("time", "s")] = "5 s",
-    temperature_column: bool = False,
+    beyond: Annotated[str, choice(BEYOND), RARE] = "zero",
+    latest_start: Annotated[float | str, measure("time", "s"), RARE] = "5 s",
+    temperature_column: Annotated[bool, RARE] = False,
     **reading: Unpack[Reading],
 ) -> WarmupFit:
     """Fit the curve of an output's zero after power-on, ``Z(t; T)``, to power cycles at several temperatures.

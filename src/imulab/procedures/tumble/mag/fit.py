@@ -23,7 +23,7 @@ from imulab.estimation.decisions import (
 from imulab.estimation.least_squares import coverage_factor, f_test
 from imulab.estimation.rows import rms
 from imulab.gravity import Height, Latitude, LocalGravity, at_place
-from imulab.options import choice, measure, parsed, repeated, text
+from imulab.options import RARE, choice, measure, parsed, repeated, text
 from imulab.procedures import tumble
 from imulab.procedures.result import Record, Result, as_record
 from imulab.procedures.tumble import HEMISPHERES, LOSSES, MAG_ORDERS
@@ -470,13 +470,13 @@ def fit_mag(
     field: Annotated[float | str | None, measure("magnetic field", "uT", "48.2uT")] = None,
     loss: Annotated[str, choice(LOSSES)] = "auto",
     mag_order: Annotated[int | str, choice(MAG_ORDERS)] = 1,
-    drop: Annotated[Sequence[int | str], repeated("N")] = (),
-    hemisphere: Annotated[str | None, choice(HEMISPHERES)] = None,
-    dip: Annotated[float | str | tuple[float, float] | None, parsed(tumble.dip, "67.2+-0.2", unit="deg")] = None,
+    drop: Annotated[Sequence[int | str], repeated("N"), RARE] = (),
+    hemisphere: Annotated[str | None, choice(HEMISPHERES), RARE] = None,
+    dip: Annotated[float | str | tuple[float, float] | None, parsed(tumble.dip, "67.2+-0.2", unit="deg"), RARE] = None,
     gravity: LocalGravity = None,
     latitude: Latitude = None,
     height: Height = None,
-    order: Annotated[int | str, text("auto|1..5", ("auto", "1", "2", "3", "4", "5"))] = "auto",
+    order: Annotated[int | str, text("auto|1..5", ("auto", "1", "2", "3", "4", "5")), RARE] = "auto",
     **reading: Unpack[Reading],
 ) -> MagFit:
     """Calibrate a magnetometer triad, in the accelerometers' frame, from the attitudes of a tumble test.
