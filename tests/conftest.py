@@ -76,7 +76,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 def some_of(quick: int, values: Sequence[Any]) -> list[Any]:
     """Values of a parameter that differ by chance alone: the first few are in every run, the others in the full one."""
-    return [*values[:quick], *(pytest.param(value, marks=pytest.mark.further) for value in values[quick:])]
+    tuples = (value if isinstance(value, tuple) else (value,) for value in values[quick:])
+    return [*values[:quick], *(pytest.param(*each, marks=pytest.mark.further) for each in tuples)]
 
 
 @pytest.fixture(scope="session")

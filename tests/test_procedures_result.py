@@ -219,6 +219,7 @@ def test_a_browser_draws_what_a_notebook_gets_without_a_network(fit, chromium, t
 
 
 @pytest.mark.parametrize("made", [tumble, warmup])
+@pytest.mark.slow
 def test_no_legend_lies_on_a_title(made, chromium, tmp_path):
     figures = [plot.to_dict() for plot in made().plot()]
     library = files("imulab.report").joinpath("vendor", "plotly-cartesian.min.js").read_text()
@@ -256,6 +257,7 @@ def test_a_figure_is_saved_as_a_page(fit, tmp_path):
 
 
 @pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("svg", b"<svg"), ("pdf", b"%PDF")])
+@pytest.mark.slow
 def test_a_figure_is_saved_as_a_picture(fit, chromium, tmp_path, kind, begin):
     pytest.importorskip("kaleido")
     path = tmp_path / f"sphere.{kind}"

@@ -127,6 +127,7 @@ def test_the_table_axis_is_found_from_a_sweep_too(accel, noise):
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.2])
+@pytest.mark.slow
 def test_a_sweep_states_the_error_of_its_axis_whatever_the_noise(accel, correlation, reduced):
     """Noise of the accelerometers alone, white or correlated over 0.2 s, in which it erred by 4 times its statement."""
     trials = 3 if reduced else 8

@@ -355,6 +355,7 @@ def test_a_record_of_another_unit_is_said_to_be(accel):
         assert il.fit_turns(turns, accel=record).calibration.verdict.state == "good"
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_misalignments(accel, reduced):
     trials = 12 if reduced else 40
     scores = []

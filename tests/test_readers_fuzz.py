@@ -113,6 +113,7 @@ KINDS = ["ulog", "dataflash", "bag", "mcap", "sqlite", "parquet", "mat", "h5", "
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
 def test_a_changed_file_is_read_or_refused(files, kind):
     folder, content = files
     path, layout = folder / f"changed.{kind}", {"h5": folder / "layout.toml", "mat": _layout(folder)}.get(kind)
@@ -136,6 +137,7 @@ FAULTS = ["tumble_one_still_1Hz.csv", "live_huge_time_steps_h30.csv", "plot_null
 
 
 @pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.slow
 def test_a_file_that_once_failed_is_read_or_refused_however_it_is_changed(real_data, tmp_path, name):
     content = (real_data / "faults" / name).read_bytes()
 
@@ -148,6 +150,7 @@ def test_a_file_that_once_failed_is_read_or_refused_however_it_is_changed(real_d
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2, 3])
+@pytest.mark.slow
 def test_the_walk_never_leaves_the_block(kind):
     heads = [b"\x05\0D\1\0abc", b"\xa3\x95\x80\x81\x09", b"\x05\x1a\0\0\0\0\0\0\0", b"\x10\0\0\0\x04\0\0\0op=\x02"]
 

@@ -95,6 +95,7 @@ def test_padding_may_stand_between_blocks(tmp_path):
         np.testing.assert_array_equal(again.column(name), values)
 
 
+@pytest.mark.slow
 def test_noise_is_that_of_the_samples_and_not_of_their_interpolation():
     """The gyroscopes' angle random walk was .68 deg/sqrt(h) where .34 is true, and the verdict good."""
     off = []
@@ -194,6 +195,7 @@ def test_files_whose_readings_share_stamps_are_joined(tmp_path):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.slow
 def test_gyroscopes_are_calibrated_by_all_their_samples(seed):
     """As on one clock at the full rate, within what a quarter of the accelerometers' samples may move them."""
     recording = il.simulate_tumble(gravity=G, rate=RATE, order=1, seed=seed)

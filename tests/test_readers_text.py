@@ -56,6 +56,7 @@ def test_every_double_reads_back_exactly(values):
 
 @FIXED
 @given(st.from_regex(r"[+-]?[0-9]{0,22}(\.[0-9]{0,22})?([eE][+-]?[0-9]{0,3})?", fullmatch=True))
+@pytest.mark.slow
 def test_a_decimal_is_rounded_or_refused_as_float_does(token):
     answer, found = parse([token, "0"])
     try:

@@ -169,6 +169,7 @@ def test_a_knocked_attitude_stands_at_the_edge_of_the_residuals_with_its_value(r
 
 
 @pytest.mark.parametrize(("widths", "dark"), [((390, 768, 1280), False), ((390,), True)])
+@pytest.mark.slow
 def test_nothing_overflows_sideways(record, chromium, tmp_path, widths, dark):
     side = {f"xaxis{k}": {"domain": d, "anchor": f"y{k}"} for k, d in (("", [0, 0.45]), ("2", [0.55, 1]))}
     side |= {"yaxis": {"domain": [0, 1]}, "yaxis2": {"domain": [0, 1], "anchor": "x2"}}

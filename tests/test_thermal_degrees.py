@@ -307,6 +307,7 @@ def test_what_elements_behind_the_thermometer_do_to_scale_factors_is_noted_with_
     assert 0 < held < noted
 
 
+@pytest.mark.slow
 def test_ramps_without_a_tumble_are_refused_with_what_is_missing():
     ramps = [each for each in il.simulate_thermal(ramps=2) if each.name.startswith("ramp")]
     with pytest.raises(il.ImulabError, match=r"a tumble beside the rest ramps.*would help") as refused:
@@ -368,6 +369,7 @@ def test_six_attitudes_at_each_temperature_leave_no_room_to_step_down(reduced):
     assert np.mean(held) > 0.92
 
 
+@pytest.mark.slow
 def test_scale_factors_told_at_one_temperature_are_said_to_be_taken_as_constant():
     """44 K from the tumble, 100 ppm/K are 4,400 ppm; a tumble at each of five temperatures tells them."""
     made = {each.name: each for each in il.simulate_thermal(ramps=2, gyro=True)}

@@ -133,6 +133,7 @@ def test_tumbles_at_five_temperatures():
     assert all(each.chi_square < 4 for each in fit.left_out)
 
 
+@pytest.mark.slow
 def test_three_rest_ramps_and_one_tumble_show_biases_and_scale_factors():
     recordings = il.simulate_thermal(ramps=3, turn_on=0.0)
     chosen = [r for r in recordings if r.name in ("tumble_25.csv", "ramp_1.csv", "ramp_2.csv", "ramp_3.csv")]
@@ -253,6 +254,7 @@ def test_a_thermometer_that_settles_is_not_stuck(made, settling):
     assert il.fit_thermal(given).calibration.fit["recordings"] == 5
 
 
+@pytest.mark.slow
 def test_a_reading_in_whole_kelvins_is_not_stuck(made):
     ramps = [r for r in il.simulate_thermal(ramps=3, turn_on=0.0) if r.name.startswith("ramp")]
     coarse = [r.with_columns({"temperature": np.round(r.column("temperature"))}, {}) for r in (*made, *ramps)]
@@ -316,6 +318,7 @@ def test_a_recording_and_a_part_of_it_are_refused(made):
         il.fit_thermal([*made, part])
 
 
+@pytest.mark.slow
 def test_a_knock_in_a_rest_ramp_is_named():
     recordings = il.simulate_thermal(ramps=3, turn_on=0.0)
     chosen = [r for r in recordings if r.name in ("tumble_25.csv", "ramp_1.csv", "ramp_2.csv", "ramp_3.csv")]

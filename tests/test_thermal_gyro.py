@@ -258,6 +258,7 @@ def test_turns_tell_scale_factors_over_temperature_and_biases_are_of_those(turne
     assert u == pytest.approx(50e-6 * record.value("gyro_scale_factor_x"), rel=0.05)
 
 
+@pytest.mark.slow
 def test_counts_get_their_scale_factor_from_the_turns(turned):
     _, _, made = turned
     nominal = il.fit_thermal(recordings(made), gravity=G, with_="gyro", degrees="3,2,1").calibration
@@ -508,6 +509,7 @@ def test_corrected_as_by_the_model_inverted_by_hand_spline(kinked):
     assert np.abs(found.triad("gyro") - expected).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_scale_factors_from_turns_follow_their_own_law_beside_the_spline():
     """Each piece between knots holds the whole law of the scale factor."""
     rng = np.random.default_rng(9)

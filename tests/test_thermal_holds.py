@@ -92,6 +92,7 @@ def bench(seed, **knocks):
     return (values[:3] - true) / G, u[:3] / G, record
 
 
+@pytest.mark.slow
 def test_knocks_that_tip_a_bench_for_good_are_in_the_uncertainties():
     """As errors that are new in each hold they make biases err by 4.6 times what is stated."""
     errors, u, records = zip(*(bench(seed, tipped=1e-4) for seed in range(3)), strict=True)
@@ -101,6 +102,7 @@ def test_knocks_that_tip_a_bench_for_good_are_in_the_uncertainties():
     assert all(isinstance(each, Note) for each in said)
 
 
+@pytest.mark.slow
 def test_shakes_every_20_s_are_left_out_of_a_rest_ramp_and_said():
     calm, shaken = bench(7), bench(7, knocked=1.0)
     assert np.abs(shaken[0]).max() < 100e-6

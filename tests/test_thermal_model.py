@@ -89,6 +89,7 @@ def test_a_temperature_left_out_is_predicted_as_by_a_spline_without_its_knot():
         assert each.rms == pytest.approx(float(np.sqrt(np.mean(error**2))), rel=0.02)  # excess differs a little
 
 
+@pytest.mark.slow
 def test_auto_takes_the_spline_at_a_kink_and_polynomials_of_a_cubic_law(kinked):
     triad, made, record = kinked
     assert len(record.model["knots"]) == 7
@@ -269,6 +270,7 @@ def worst(law, count, attitudes, trials, turn_on):
     return 1e6 * np.sqrt(np.mean(errors, axis=0))
 
 
+@pytest.mark.slow
 def test_a_stated_spline_is_that_of_the_gyroscopes_too(tmp_path):
     made = il.simulate_thermal(gyro=True, attitudes=10)
     record = il.fit_thermal(made, degrees="spline,2,1", with_="gyro").calibration

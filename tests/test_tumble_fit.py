@@ -113,6 +113,7 @@ def test_one_long_and_quiet_hold_does_not_stand_out_of_attitudes_that_scatter():
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.slow
 def test_noisy_fit_equals_the_reference_fit(order):
     rng = np.random.default_rng(20 + order)
     truth = reference.random_truth(rng, order)

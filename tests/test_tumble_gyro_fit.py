@@ -64,6 +64,7 @@ def test_turns_of_one_segment_equal_those_of_the_other_function():
 
 
 @pytest.mark.parametrize("fit_bias", [False, True])
+@pytest.mark.slow
 def test_the_truth_is_found_within_its_uncertainty(fit_bias, reduced):
     trials = 4 if reduced else 12
     scores = []
@@ -78,6 +79,7 @@ def test_the_truth_is_found_within_its_uncertainty(fit_bias, reduced):
     assert np.abs(scores).max() < 5
 
 
+@pytest.mark.slow
 def test_slow_beginnings_of_turns_do_not_bias_what_noisy_accelerometers_go_with():
     """At 4 mg of noise the accelerometers take a tenth of a second or more of a turn for rest."""
     scores = []
@@ -109,6 +111,7 @@ def test_twists_about_the_vertical_that_only_the_gyroscopes_feel_leave_the_bias_
     assert np.sqrt(np.diag(fit.covariance)).max() < 2 * sigma.max()
 
 
+@pytest.mark.slow
 def test_the_uncertainty_of_the_accelerometers_record_is_carried_along(reduced):
     """A record from a hasty test, and turns from a careful one: the frame of the gyroscopes is no better known."""
     trials = 8 if reduced else 20
@@ -321,6 +324,7 @@ HALF_SUMS = [(False, 0.00152), (True, 0.00124)]
 
 
 @pytest.mark.parametrize(("fit_bias", "half_sum"), HALF_SUMS)
+@pytest.mark.slow
 def test_the_published_xsens_figures_are_half_sums_without_g_sensitivity(xsens, fit_bias, half_sum):
     """What the published figures mean: the zero of the first 50 s, turns from hold to hold, half the sum of squares."""
     _, attitudes, recording, _ = xsens
@@ -335,6 +339,7 @@ def test_the_published_xsens_figures_are_half_sums_without_g_sensitivity(xsens, 
 
 
 @pytest.mark.parametrize(("fit_bias", "half_sum"), HALF_SUMS)
+@pytest.mark.slow
 def test_xsens_reaches_the_published_figures(xsens, fit_bias, half_sum):
     record, attitudes, recording, _ = xsens
     fit = fit_gyro_triad(record, attitudes, recording, fit_bias=fit_bias, sensitivity="no")
@@ -348,6 +353,7 @@ def test_xsens_reaches_the_published_figures(xsens, fit_bias, half_sum):
 
 
 @pytest.mark.parametrize(("fit_bias", "half_sum"), HALF_SUMS)
+@pytest.mark.slow
 def test_g_sensitivity_found_at_rest_explains_nine_tenths_of_the_xsens_residuals(xsens, fit_bias, half_sum):
     record, attitudes, recording, _ = xsens
     fit = fit_gyro_triad(record, attitudes, recording, fit_bias=fit_bias)

@@ -62,6 +62,7 @@ def test_the_clock_is_a_common_part_of_all_three_scale_factors():
     assert np.abs(scores(unit, default)).max() < 5
 
 
+@pytest.mark.slow
 def test_two_clocks_are_compared_and_their_difference_is_part_of_the_uncertainty(reduced):
     trials = 4 if reduced else 6
     found = []
@@ -146,6 +147,7 @@ def lost(count, *, stamped):
         (lost(12, stamped=True), r"4 turns left out, samples are missing during them: gaps of up to 0\.13 s", 1),
     ],
 )
+@pytest.mark.slow
 def test_turns_with_a_knock_or_with_lost_samples_are_named_and_do_not_count(change, words, turns):
     for seed in range(3):
         unit, record, attitudes, recording = campaign(seed, change=change)
@@ -172,6 +174,7 @@ def test_one_attitude_cut_out_of_the_recording_leaves_the_verdict_good():
     assert fit.calibration.verdict.state == "good"
 
 
+@pytest.mark.slow
 def test_nothing_is_set_aside_without_reason(reduced):
     trials = 8 if reduced else 16
     aside = sum(len(fit_gyro_triad(*campaign(seed)[1:]).aside) for seed in range(20, 20 + trials))
@@ -285,6 +288,7 @@ def polled(columns, accel, path):
     return {n: v[number] for n, v in columns.items()}, {n: v[number] for n, v in accel.items()}
 
 
+@pytest.mark.slow
 def test_stamps_that_jitter_are_evened_where_the_turns_say_that_the_samples_do_not(reduced):
     trials = 3 if reduced else 8
     plain, wrong = [], []

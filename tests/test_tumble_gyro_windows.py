@@ -66,6 +66,7 @@ def fitted(seed, hand):
 
 
 @pytest.mark.parametrize("name", HANDS)
+@pytest.mark.slow
 def test_a_hand_that_is_not_quiet_leaves_the_scale_factors_within_their_uncertainty(name):
     """With a threshold between rest and turn they were .2 % off under the tremor, and the verdict was good."""
     scores, sizes = [], []

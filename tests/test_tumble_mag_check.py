@@ -46,6 +46,7 @@ def moved(truth, by):
     return replace(truth, hard_iron=truth.hard_iron + np.diag(np.diag(truth.matrix)) @ by)
 
 
+@pytest.mark.slow
 def test_a_record_that_holds_fails_once_in_twenty_and_a_change_is_found(reduced):
     trials = 30 if reduced else 100
     both, alone, found = 0, 0, 0
@@ -223,6 +224,7 @@ def scattered(real_data):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_directions_scatter_as_the_document_says_in_and_out_of_the_sample(scattered):
     expected = np.array(list(SCATTER.values()))
     # Where the document has .62 the fit gives .70: 16 attitudes leave the accelerometers 4 degrees of freedom.

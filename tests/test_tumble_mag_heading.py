@@ -296,6 +296,7 @@ def test_a_fit_of_such_attitudes_is_as_certain_as_predicted(plan, reduced):
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(found), axis=0)), expected, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_the_plan_on_disk_is_planned_on_from(tmp_path, capsys):
     first, second = tmp_path / "first.csv", tmp_path / "second.csv"
     common = ["--order", "1", "--noise", "20ug", "--with", "mag"]

@@ -278,6 +278,7 @@ def test_gauss_and_milligauss_taken_for_microtesla_are_refused(factor, stated):
 
 
 @pytest.mark.parametrize("late", [0.0, 0.5, 1.0, 3.6])
+@pytest.mark.slow
 def test_a_magnetometer_on_another_clock_is_right_or_said(late):
     found = []
     for seed in range(2):

@@ -177,6 +177,7 @@ def test_nonlinearity_that_the_attitudes_do_not_show_is_assumed_to_be_zero_and_s
     assert "ppm of scale factor" in said[0]
 
 
+@pytest.mark.slow
 def test_known_spread_of_nonlinearity_narrows_the_intervals_and_still_covers(planned):
     tau, names, covered, ratio = 20e-6, [f"bias_{a}" for a in "xyz"] + [f"scale_factor_{a}" for a in "xyz"], [], []
     for seed in range(60):

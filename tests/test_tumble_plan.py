@@ -91,6 +91,7 @@ def test_the_prediction_is_the_cramer_rao_bound_of_a_nominal_sensor(order):
         assert value == pytest.approx(np.sqrt(variance) * in_g[name[1] if name[0] == "k" else name[0]], rel=1e-6), name
 
 
+@pytest.mark.slow
 def test_no_two_attitudes_have_the_same_axis_vertical():
     plan = plan_attitudes(order=1, attitudes=60)
     cosine = plan.directions @ plan.directions.T - 2 * np.eye(60)
@@ -105,6 +106,7 @@ def test_no_two_attitudes_have_the_same_axis_vertical():
         (2, 18, head_candidates(np.radians(5))),
     ],
 )
+@pytest.mark.slow
 def test_a_plan_with_distinct_verticals_has_no_axis_vertical_twice(order, attitudes, candidates):
     """Within 5 degrees, up or down; without the rule, or with z vertical before, plans differ as they must."""
     plan = plan_attitudes(order=order, attitudes=attitudes, candidates=candidates, distinct_verticals=True)
@@ -116,6 +118,7 @@ def test_a_plan_with_distinct_verticals_has_no_axis_vertical_twice(order, attitu
     assert np.trace(plan.covariance) < 1.3 * np.trace(free.covariance)
 
 
+@pytest.mark.slow
 def test_distinct_verticals_count_what_is_there_and_refuse_what_cannot_be():
     up = np.array([[0.0, 0.0, 1.0]])
     more = plan_attitudes(order=1, attitudes=12, already=up, distinct_verticals=True)
@@ -184,6 +187,7 @@ def separated(count):
     return np.array(apart[:count])
 
 
+@pytest.mark.slow
 def test_attitudes_are_put_down_twice_for_want_of_others():
     """24 candidates of which two are a degree apart, and candidates that have all been measured."""
     apart = separated(24)

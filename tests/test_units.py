@@ -76,6 +76,7 @@ def test_kelvin_becomes_degrees_celsius():
 
 @settings(derandomize=True, database=None, deadline=None, max_examples=100)
 @given(value=st.floats(1e-12, 1e6) | st.floats(-1e6, -1e-12) | st.just(0.0))
+@pytest.mark.slow
 def test_every_unit_comes_back_from_si(value):
     for symbol in (*ONE, "K"):
         back = from_si(to_si(value, symbol), symbol)

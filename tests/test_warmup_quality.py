@@ -54,6 +54,7 @@ def test_warnings_name_what_is_wrong_with_the_test():
 
 
 @pytest.mark.parametrize("late", [0.0, 10.0])
+@pytest.mark.slow
 def test_logs_that_all_begin_late_are_said_where_there_is_a_thermometer(late):
     def begun(on, name):
         made = cycle_of(lambda t: flat(t + late), on, name=name)
