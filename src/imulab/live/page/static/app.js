@@ -4,7 +4,7 @@
 // message of the socket, and `kept()`, which says what stays when the program has ended; `shown()`, where it has one, is
 // called whenever it comes into sight. `page.send(message)` answers, `page.say(text, kind)` says something above all areas
 // (kind: "note" or "bad"; no text takes it away), and `page.forget()` takes a refusal away once its cause has gone:
-// that of a place stands until another is sent.
+// that of a place stands until another is sent, every other one as long as it takes to read it.
 
 import { h, put, show } from "./dom.js";
 import * as session from "./session.js";
@@ -12,6 +12,7 @@ import * as workbench from "./workbench.js";
 
 const AREAS = { session, workbench };
 const AGAIN = 1000;
+const READ = 5000;
 const GONE = "The program has ended, or cannot be reached any more.";
 const tabs = document.getElementById("tabs");
 const mounted = {};
@@ -19,6 +20,7 @@ let socket = null;
 let ended = false;
 let sent = ""; // the type of the latest message
 let refused = ""; // that of the message whose refusal stands above the page
+let refusedAt = 0;
 
 function say(text, kind = "note") {
   refused = "";
@@ -34,11 +36,15 @@ const page = {
     if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
     else say(gone(), "bad");
   },
-  // Says that the program ends by itself now, and why: that it is gone is then no news.
   forget(type = "") {
-    if (refused && (type === refused || refused !== "place")) say("");
+    if (!refused || (type !== refused && refused === "place")) return;
+    const left = type === refused ? 0 : refusedAt + READ - performance.now();
+    const own = refusedAt;
+    if (left > 0) setTimeout(() => { if (refused && refusedAt === own) say(""); }, left);
+    else say("");
   },
   others: () => Object.keys(mounted),
+  // Says that the program ends by itself now, and why: that it is gone is then no news.
   end(text, kind) {
     ended = true;
     say(text, kind);
@@ -100,6 +106,7 @@ function hear(message) {
   } else if (message.type === "refused") {
     say(message.text, "bad");
     refused = sent || "page";
+    refusedAt = performance.now();
   }
   for (const name of Object.keys(mounted)) AREAS[name].hear(message);
 }
