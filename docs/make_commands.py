@@ -11,8 +11,8 @@ from imulab.options import GROUPS, Option
 
 HEAD = """# The command line, command by command
 
-Made from the commands themselves: the same text as `imulab COMMAND --help-all`. What all commands share (units, intervals,
-exit status, project file) is [told once](index.md#the-command-line).
+Made from the commands themselves: the same text as `imulab COMMAND --help-all`. What all commands share (units,
+intervals, exit status, project file) is [told once](index.md#the-command-line).
 """
 
 
