@@ -222,25 +222,33 @@ def test_a_wrong_token_and_another_page_get_nothing(live, new_page, elsewhere):
 
 
 def test_finishing_too_early_is_answered_and_the_session_goes_on(live, new_page):
-    running = live(f"{UNIT},speed=5", "--follow", *FIT, "--save", "rec.csv")
+    running = live(f"{UNIT},speed=25,hold=100 h", *FIT, "--save", "rec.csv")  # it stays as it lies until it is turned
     page = new_page(running.address)
     growing = page.evaluate("fetch('/api/session/recording').then(answer => answer.json())")
     assert growing == {"error": "the recording still grows, and there is no record yet: finish the session first"}
     assert page.locator("#session").get_attribute("role") == "tabpanel"
     finish = page.get_by_role("button", name="Finish now")
+    page.locator(".sphere .held").wait_for(state="attached")
     assert finish.is_disabled()
     assert re.fullmatch(r"needs at least \d (more )?attitudes?", page.inner_text("#missing"))
+    page.clock.install()
+    page.clock.pause_at(
+        "2099-01-01"
+    )  # how long the refusal stands is counted by this clock, not by the machine's speed
     page.evaluate(
         """() => new Promise(done => {
       const other = new WebSocket(location.href.replace("http", "ws") + "ws");
       other.onopen = () => { other.send('{"type": "finish"}'); done(); };
     })"""
     )
-    page.wait_for_selector(
-        "#said .bad:has-text('attitude')"
-    )  # a program may ask for it: refused, until another is held
-    page.wait_for_selector("#said .bad", state="detached")
-    page.locator(".sphere .held").nth(3).wait_for(state="attached")
+    refusal = page.locator("#said .bad:has-text('attitude')")
+    refusal.wait_for()  # a program may ask for it: refused
+    page.get_by_role("button", name="Turn it so").click()
+    page.locator(".sphere .held").nth(1).wait_for(state="attached")
+    page.clock.run_for(4900)
+    assert refusal.count() == 1  # it stands for 5 s, though another attitude is held at once
+    page.clock.run_for(200)
+    assert refusal.count() == 0
     running.process.send_signal(signal.SIGINT)
     page.wait_for_selector("#said .bad:has-text('The program has ended')")
     status, error = running.end()
