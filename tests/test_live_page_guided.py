@@ -137,12 +137,14 @@ def test_a_simulated_unit_is_turned_with_the_mouse_and_its_gyroscopes_are_calibr
     running = live(f"{UNIT},speed=10,gyro=1", "--attitudes", "14", *FIT, "--save", "rec.csv", "-o", "both.json")
     page = new_page(running.address)
     held = page.locator(".sphere .held")
-    for _ in range(60):  # what was wanted when it is clicked may just have been reached
-        page.get_by_role("button", name="Turn it so").click()
-        page.wait_for_timeout(700)
-        if held.count() >= 13:
-            break
-    assert held.count() >= 13
+    turn = page.get_by_role("button", name="Turn it so")
+    for count in range(1, 13):
+        held.nth(count - 1).wait_for(state="attached")
+        for _ in range(300):  # what was wanted when it is clicked may just have been reached
+            if held.count() > count:
+                break
+            turn.click()
+            page.wait_for_timeout(200)
     page.get_by_text("gyro_scale_factor_x").wait_for()
     figure = page.locator(".body.by-hand")
     box = figure.bounding_box()
@@ -420,8 +422,11 @@ def test_the_page_shows_readings_progress_and_cover_and_reads_out_what_to_do(liv
     page.get_by_role("button", name="Voice").click()
     page.wait_for_function("() => spoken.includes('Hold still.') && spoken.some(text => text.startsWith('Turn it: '))")
     assert page.evaluate("spoken.every((text, k) => text !== spoken[k - 1])")
-    page.wait_for_selector(".now[data-state='still'] .ring text:text-matches('^[1-9][.][0-9] s$')")
-    full, round_ = map(float, page.get_attribute(".ring .full", "stroke-dasharray").split())
+    shown = page.wait_for_function(  # a hold is soon over: both are read at once
+        r"""() => document.querySelector(".now[data-state='still'] .ring text")?.textContent.match(/^[1-9][.][0-9] s$/)
+            && document.querySelector(".ring .full").getAttribute("stroke-dasharray")"""
+    )
+    full, round_ = map(float, shown.json_value().split())
     assert 0 < full <= round_
     page.locator(".sphere .held").nth(2).wait_for(state="attached")
     covered = page.locator(".sphere .covered-part polygon").count()

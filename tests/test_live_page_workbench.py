@@ -83,6 +83,12 @@ def drop(page: Any, name: str, text: str) -> None:
     page.evaluate(DROP, [name, text])
 
 
+def read(page: Any) -> None:
+    """Wait until a recording of attitudes is read to its end, and its plots are of all its rows."""
+    page.get_by_text("attitudes at rest").wait_for()
+    page.locator(".plots[aria-busy='false'] svg.plot").first.wait_for()
+
+
 def command(page: Any) -> str:
     """Return the command line of the form, once it is that of the form's values."""
     page.locator(".form:not([data-asked])").wait_for()
@@ -136,8 +142,7 @@ def test_from_the_drop_to_record_report_and_firmware(workbench, new_page, folder
 def test_zooming_fetches_what_the_range_holds(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))
-    page.get_by_text("attitudes at rest").wait_for()
-    page.locator("svg.plot").first.wait_for()
+    read(page)
     status = page.locator(".plotbar .range")
     whole = status.inner_text()
     box = page.locator("svg.plot").first.bounding_box()
@@ -162,6 +167,7 @@ def test_zooming_fetches_what_the_range_holds(workbench, new_page):
 def test_cancelling_ends_the_command_and_leaves_nothing(workbench, new_page, folder):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))
+    read(page)
     page.get_by_text("More options").click()
     page.get_by_label("monte carlo", exact=True).fill("900000")
     assert "--monte-carlo 900000" in command(page)
@@ -175,7 +181,7 @@ def test_cancelling_ends_the_command_and_leaves_nothing(workbench, new_page, fol
 def test_what_is_refused_is_said_where_it_was_typed(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))
-    page.get_by_text("12 attitudes at rest (shaded)").wait_for()  # until then the form may be made anew
+    read(page)  # until then the form may be made anew
     page.get_by_label("order", exact=True).fill("nonsense")
     page.get_by_text("order 'nonsense': expected one of").wait_for()  # before it is run
     page.get_by_label("gravity", exact=True).fill("nonsense")
@@ -376,7 +382,7 @@ def test_only_what_a_file_is_for_is_offered_and_of_the_rest_it_is_said_why(workb
 def test_a_channel_can_be_read_out_and_hidden_and_a_window_taken(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))
-    page.get_by_text("attitudes at rest").wait_for()
+    read(page)
     plot = page.locator("svg.plot").first
     box = plot.bounding_box()
     page.mouse.move(box["x"] + 0.5 * (box["width"] - 72) + 62, box["y"] + 60)
@@ -408,7 +414,7 @@ def test_a_channel_can_be_read_out_and_hidden_and_a_window_taken(workbench, new_
 def test_reload_and_back_lead_where_one_was(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))
-    page.get_by_text("attitudes at rest").wait_for()
+    read(page)
     page.get_by_label("gravity", exact=True).fill("9.81")
     page.locator("[data-path='noise fit']").click()
     page.get_by_text("Fit a model of the noise to logs at rest").first.wait_for()
@@ -417,7 +423,7 @@ def test_reload_and_back_lead_where_one_was(workbench, new_page):
     assert page.get_by_label("gravity", exact=True).input_value() == "9.81"
     drop(page, "gyro.csv", gyro_log("own.csv"))
     page.get_by_role("heading", name="gyro.csv").wait_for()
-    page.locator("svg.plot").first.wait_for()
+    page.locator(".plots[aria-busy='false'] svg.plot").first.wait_for()
     whole = page.locator(".plotbar .range").inner_text()
     page.get_by_role("button", name="closer").click()
     page.wait_for_function("text => document.querySelector('.plotbar .range').textContent !== text", arg=whole)
@@ -438,6 +444,7 @@ def test_reload_and_back_lead_where_one_was(workbench, new_page):
 def test_what_an_export_would_lose_is_a_choice(workbench, new_page, folder):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))
+    read(page)
     page.get_by_label("order", exact=True).fill("1")
     run(page)
     page.locator(".job .found").wait_for()
@@ -470,6 +477,7 @@ def test_an_unknown_file_becomes_a_corrected_one_without_leaving_the_page(workbe
     page.locator(".plotbox", has_text="gyro [°/s]").wait_for()  # the preview
     page.get_by_role("button", name="Save as layout").click()
     page.locator(".assistant").wait_for(state="detached")
+    read(page)
     page.get_by_label("gravity", exact=True).fill("9.81")
     run(page)
     page.locator(".job .found").wait_for()
@@ -522,8 +530,7 @@ def test_every_control_has_a_name_and_fits_the_screen(workbench, new_page, width
     page = new_page(workbench.address)
     page.set_viewport_size({"width": width, "height": 800})
     drop(page, "rec.csv", tumble("own.csv"))
-    page.get_by_text("attitudes at rest").wait_for()
-    page.locator("svg.plot").first.wait_for()
+    read(page)
     page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
     controls = page.locator("#workbench :is(input, select, button, a, svg.plot):visible")
     nameless = controls.evaluate_all(

@@ -51,6 +51,7 @@ export function plots(place, act) {
   let known = null;
   let range = [null, null];
   let shown = null;
+  let rows = 0; // of the recording when `shown` was asked for
   let asked = null;
   let waiting = false;
   let drag = null;
@@ -94,13 +95,15 @@ export function plots(place, act) {
   async function fetch() {
     asked?.abort();
     const own = asked = new AbortController();
+    const { rows: ready } = known.head;
+    area.setAttribute("aria-busy", "true");
     const query = new URLSearchParams({ opening: known.opening, width: Math.round(area.clientWidth || 800) });
     if (range[0] !== null) { query.set("from", range[0]); query.set("to", range[1]); }
     const began = performance.now();
     try {
       const found = await ask(`curves?${query}`, undefined, { signal: own.signal });
       if (own !== asked || !known) return;
-      shown = found;
+      [shown, rows] = [found, ready];
       draw();
       area.dataset.took = Math.round(performance.now() - began);
     } catch (error) {
@@ -119,6 +122,7 @@ export function plots(place, act) {
     drawn = boxes.map(each => each.svg);
     area.replaceChildren(...boxes.map(each => each.element));
     drawn[focused]?.focus();
+    area.setAttribute("aria-busy", String(!known.done || rows !== head.rows));
     show(window_, range[0] !== null && head.timed);
     const unit = head.timed ? "s" : "";
     const digits = ticks(low, high, 8).digits + 1;
