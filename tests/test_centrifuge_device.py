@@ -161,6 +161,9 @@ def test_plan_simulate_reduce_apply_report(imulab, tmp_path):
     assert "u(K), %" in done.stdout
     assert "fewer than the 500 table periods" in done.stderr
     assert len(tomllib.loads((tmp_path / "plan.toml").read_text())["run"]) == 5
+    for step in ("Level arm and table", "at their zero positions", "Stop table and arm, save, power off"):
+        assert step in done.stdout
+        assert step in (tmp_path / "plan.toml").read_text()
     options = ["--duration", "60 s", "--static-duration", "10 s", "--rate", "20 Hz"]
     done = imulab("centrifuge", "simulate", "--plan", "plan.toml", "-o", "sim", *options)
     assert done.returncode == 0, done.stderr

@@ -67,6 +67,9 @@ def test_fourier_is_the_source_s_formulas(encoder):
         channels = {name: c[name] - rest[name].mean() for name in ("dtg_x", "dtg_y", "fog")}
         A, B, m, _ = reference.fourier(channels["dtg_x"] - channels["fog"], run.table_rate, 1 / 200)
         expected["x"].append(np.hypot(A, B) / force[index - 1])
+        line = record.sections["runs"][index]["x"]
+        turned = np.exp(1j * (c["table_angle"][0] - run.table_rate / 200)) if encoder else 1.0
+        assert line["A"] + 1j * line["B"] == pytest.approx((A + 1j * B) * turned, rel=1e-9)
         A_F, B_F, *_ = reference.fourier(channels["fog"], run.table_rate, 1 / 200)
         A, B, *_ = reference.fourier(channels["dtg_y"], run.table_rate, 1 / 200)
         expected["y"].append(np.hypot(A + B_F, B - A_F) / force[index - 1])
@@ -452,8 +455,9 @@ def test_fourier(rig, imulab):
                 sums = {}
                 for channel in (name, "fog"):
                     A, B, m, _ = reference.fourier(c[channel] - still[channel].mean(), arm - NET_BY_HAND, 1 / RATE)
-                    # The sums go with +w_s t from the first sample; chi starts at table_angle and goes with sense.
-                    sums[channel] = (A + 1j * sense * B) * np.exp(1j * c["table_angle"][0])
+                    # The sums go with +w_s t, one step at the first sample; chi is table_angle there.
+                    first = c["table_angle"][0] - sense * (arm - NET_BY_HAND) / RATE
+                    sums[channel] = (A + 1j * sense * B) * np.exp(1j * first)
                 pair.append((sums[name] - sums["fog"] * (1 if axis == "x" else 1j)) / (arm**2 * RADIUS))
                 assert record["runs"][1 + 2 * level + (1 - sense) // 2]["periods"] == m
             K.append(abs(np.mean(pair)))

@@ -85,7 +85,9 @@ def test_the_verdict_is_printed_first_where_the_rate_goes_to_a_file(imulab, run_
 @pytest.mark.parametrize(
     ("elements", "rate", "words"),
     [
-        (2, 100.0, ["method feedback with 2 gyros on each axis"]),
+        (2, 100.0, ["method feedback with 2 gyros on each axis: its source states it for more than 3, and no gyro"]),
+        (3, 100.0, ["method feedback with 3 gyros on each axis: its source states it for more than 3"]),
+        (4, 100.0, []),
         (6, 400.0, ["method feedback at 400 Hz: its source states it for 50 to 200 Hz"]),
         (6, 20.0, ["method feedback at 20 Hz"]),
         (6, 50.0, []),

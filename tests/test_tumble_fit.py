@@ -415,6 +415,64 @@ def test_the_threshold_decides_how_many_passes_are_made():
     assert default.options["threshold"] == pytest.approx(SOURCE, rel=1e-12)
 
 
+def test_the_preset_scale_factors_are_where_the_iteration_starts():
+    """As in the transcription of the source from the same start, in counts, whose zero is far from the middle."""
+    data = 8192 / G_LINEARISED * outputs_linearised(reference.random_attitudes(np.random.default_rng(1), 30), part=0.1)
+    attitudes = il.find_attitudes(table(data, "count", None))
+    how = {"order": 2, "gravity": G_LINEARISED, "method": "linearised", "threshold": tuple(1e3 * x for x in SOURCE)}
+    limits = (1e3 * SOURCE[0], 1e3 * SOURCE[1] / G_LINEARISED, 1e3 * SOURCE[2])
+    values = []
+    for preset in ((8192.0, 8192.0, 8192.0), (7900.0, 8300.0, 8100.0)):
+        start = {f"scale_factor_{axis}": each / G_LINEARISED for axis, each in zip("xyz", preset, strict=True)}
+        expected, passes = reference.linearised_passes(data, 2, G_LINEARISED, start, limits)
+        found = il.fit_tumble(attitudes, preset=preset, **how).calibration
+        assert found.fit["iterations"] == passes
+        for name, value in expected.items():
+            assert found.value(name) == pytest.approx(value, rel=1e-9, abs=1e-9 * natural(name)), name
+        values.append(found.value("k2_x"))
+    assert values[0] != pytest.approx(values[1], rel=1e-9)  # so loose a threshold leaves the start in the result
+    one = il.fit_tumble(attitudes, preset=8192, **how).calibration
+    text = il.fit_tumble(attitudes, preset="8192,8192,8192", **how).calibration
+    assert one.value("k2_x") == text.value("k2_x") == values[0]
+    assert text.options["preset"] == [8192.0] * 3
+    for preset, message in (("8192,1", "expected one scale factor or three"), (-1.0, "above 0"), ("0", "above 0")):
+        with pytest.raises(OptionError, match=message):
+            il.fit_tumble(attitudes, preset=preset, **how)
+    with pytest.raises(OptionError, match="preset needs method linearised, found method norm"):
+        il.fit_tumble(attitudes, preset=8192)
+
+
+def test_linearised_and_its_plan_have_the_order_of_the_source_unless_another_is_given():
+    data = outputs_linearised(reference.random_attitudes(np.random.default_rng(1), 30), part=0.1)
+    attitudes = il.find_attitudes(table(data, "m/s^2", None))
+    found = il.fit_tumble(attitudes, gravity=G_LINEARISED, method="linearised").calibration
+    assert found.model["order"] == found.options["order"] == 4
+    assert not any("nonlinearity, which the source" in each for each in found.warnings)
+    low = il.fit_tumble(attitudes, gravity=G_LINEARISED, method="linearised", order=1).calibration
+    assert any(each.startswith("order 1 has no nonlinearity, which the source") for each in low.warnings)
+    assert [il.plan_tumble(24, noise="20ug", method=m).order for m in ("norm", "linearised")] == [3, 4]
+
+
+def test_with_the_signs_that_are_printed_in_equation_4_the_iteration_diverges_and_with_all_minus_it_settles():
+    """The source's equations (4) and (16) as docs/tumble_method.md states them, transcribed here with its own alpha."""
+    data = outputs_linearised(reference.random_attitudes(np.random.default_rng(1), 30), part=1.0) / G_LINEARISED
+    ends = {}
+    for signs in ((-1, 1, 1), (-1, -1, -1)):
+        scale, bias, alpha = np.ones(3), np.zeros(3), np.zeros(3)
+        for _ in range(30):
+            x, y, z = a = (data / scale - bias).T
+            length = x**2 + (alpha[0] * x + y) ** 2 + (alpha[2] * x + alpha[1] * y + z) ** 2
+            products = np.array([x * y, y * z, z * x]) * np.array(signs)[:, None]
+            design = np.vstack([a, a**2, a**3, products]).T
+            d = np.linalg.lstsq(design, (length - 1) / 2, rcond=None)[0]
+            scale, bias, alpha = scale * (1 + d[3:6]), bias + d[:3], alpha + d[9:]
+            if not np.all(np.isfinite(d)) or np.abs(d).max() > 1:
+                break
+        ends[signs] = np.abs(np.r_[d[:6], d[9:]]).max()
+    assert ends[-1, 1, 1] > 1e-2
+    assert ends[-1, -1, -1] < 1e-9
+
+
 @pytest.mark.parametrize("alone", [0, 1, 2])
 def test_each_of_the_three_changes_counts(alone):
     data = outputs_linearised(reference.random_attitudes(np.random.default_rng(1), 30))

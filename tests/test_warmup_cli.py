@@ -102,6 +102,27 @@ def test_outside_the_table_nothing_is_written_and_one_line_says_why(chamber, tmp
         np.testing.assert_array_equal(after.column(name), before.column(name))
 
 
+def test_apply_warns_where_the_ordinary_compensation_does_not_come_first(chamber, tmp_path, capsys):
+    recording = il.simulate_tumble(order=1, gravity=9.81, attitudes=12, hold=2.0)
+    fit = il.fit_tumble(recording, order=1, gravity=9.81)
+    il.fit_gyro(fit.calibration, recording).save(tmp_path / "t.json")
+    (file, *_) = sorted(chamber.glob("cycle*.csv"))
+    orders = [("t.json", "w.json"), ("w.json", "t.json")]
+    (tmp_path / "w.json").write_bytes((chamber / "auto.json").read_bytes())
+    warned = []
+    for names in orders:
+        assert main(["apply", *(str(tmp_path / name) for name in names), str(file), "-o", str(tmp_path / "o.csv")]) == 0
+        warned.append("a warm-up record before that of the ordinary compensation" in capsys.readouterr().err)
+    assert warned == [False, True]
+
+
+def test_the_plan_names_the_fixture_and_its_axes(capsys, tmp_path):
+    assert main(["warmup", "plan", "-o", str(tmp_path / "plan.csv")]) == 0
+    where = "x, y and z of the unit point east, up and south"
+    assert where in capsys.readouterr().out
+    assert where in il.read(tmp_path / "plan.csv").metadata["fixture"]
+
+
 def test_apply_converts_units_and_keeps_nan_where_it_is(chamber, tmp_path):
     recording = il.read(chamber / "cycle_+0_1.csv")
     degrees = recording.column("gyro_x") / 3600

@@ -16,7 +16,7 @@ def fourier(residual, rate, step):
     period = 2 * np.pi / rate
     m = int(np.floor(len(residual) * step / period + 1e-9))
     N = round(m * period / step)
-    j = np.arange(N)
+    j = np.arange(1, N + 1)
     A = 2 / N * np.sum(residual[:N] * np.cos(j * rate * step))
     B = 2 / N * np.sum(residual[:N] * np.sin(j * rate * step))
     return A, B, m, N

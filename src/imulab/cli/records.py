@@ -139,6 +139,7 @@ def apply(
     By one or more of them, in the order given; CSV or Parquet to OUT, CSV to standard output.
     """
     from imulab.procedures.apply import add_heading, apply_blocks, loaded
+    from imulab.procedures.correction_order import order_warnings
     from imulab.procedures.registry import load_any
     from imulab.readers import read_blocks
     from imulab.readers.streams import on_clock_of
@@ -168,6 +169,8 @@ def apply(
                     latest_start=start,
                 )
             )
+    for message in order_warnings([part.kind for ready in chain for part, _ in ready.sections]):
+        warn(message)
     if options["heading"]:
         chain = add_heading(chain, records)
     blocks = with_notes(_say_resampled(on_clock_of(read_blocks(file, **how))), notes=False)

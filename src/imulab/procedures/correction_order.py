@@ -62,6 +62,17 @@ def check_order(kinds: Sequence[str]) -> None:
         )
 
 
+def order_warnings(kinds: Sequence[str]) -> list[str]:
+    """Return a warning where a warm-up table comes before the ordinary compensation, by kind in the order applied."""
+    after = set(kinds[list(kinds).index("warmup") :]) if "warmup" in kinds else set()
+    if not after & {"tumble", "gyro"}:
+        return []
+    return [
+        "a warm-up record before that of the ordinary compensation: its source subtracts the table from corrected "
+        "outputs; expected the warm-up record last, fitted to cycles that the other had corrected"
+    ]
+
+
 def check_after(
     sections: Iterable[tuple[str, Mapping[str, Any], Sequence[str]]], before: Iterable[Thermal] = ()
 ) -> None:

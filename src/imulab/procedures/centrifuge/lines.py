@@ -13,8 +13,8 @@ is not correlated for longer than a block.
 Sources: IEEE Std 1057 (four-parameter sine fit); Fishman, Management Science 24 (1978) 510 (batch means).
 
 Method ``fourier`` (CN102636185A, steps (a) to (e)): ``A = (2/N) sum D cos(j w_s t)``, ``B`` likewise with the sine,
-``N = m T / t`` rounded to the nearest sample; j counts samples from 0, t is the sampling period, T the table period, m
-the number of whole periods.
+``N = m T / t`` rounded to the nearest sample; j counts samples from 1, as printed, t is the sampling
+period, T the table period, m the number of whole periods.
 """
 
 from __future__ import annotations
@@ -550,6 +550,7 @@ class PeriodSums:
         self._edge: Array | None = None
         self._index = 0
         self._step = 0.0
+        self.turn = 0.0  # from one sample to the next, rad
         self._time = (0.0, 0.0)
 
     def watch(self, blocks: Iterable[CellSamples]) -> Iterator[CellSamples]:
@@ -560,6 +561,7 @@ class PeriodSums:
                     yield block
                     continue
                 self._step = sampling_period(block.time[:FIRST_LOOK])
+                self.turn = self._rate * self._step
                 self._time = (float(block.time[0]), 0.0)
             self._add(block)
             self._time = (self._time[0], float(block.time[-1]))
@@ -574,8 +576,7 @@ class PeriodSums:
     def _add(self, block: CellSamples) -> None:
         """Add cosine and sine times the channels and 1, period by period."""
         count = len(block.time)
-        j = np.arange(self._index, self._index + count)
-        phase = self._rate * self._step * j
+        phase = self.turn * np.arange(self._index + 1, self._index + 1 + count)
         values = np.vstack([block.channels, np.ones(count)])
         products = np.stack([np.cos(phase) * values, np.sin(phase) * values])
         samples = 2 * np.pi / abs(self._rate) / self._step

@@ -323,6 +323,18 @@ class Plan(PlannedTest):
         """Return warnings about the test, with what to do."""
         return self.warnings
 
+    def remarks(self) -> list[str]:
+        """Return what to do at the rig, in order."""
+        return [
+            "1. Level arm and table. Mount the gyroscope with X and Y horizontal and its spin axis on the table's",
+            "   axis, the fibre-optic gyroscope with its axis parallel to X.",
+            "2. Both axes of the rig at their zero positions, at rest. Power on; warm up for 10 min.",
+            f"3. Record the static run for {self.static_duration / 60:.3g} min.",
+            f"4. For each loaded run: set the arm's rate, then the table's; when both are steady, record for "
+            f"{self.duration / 60:.3g} min.",
+            "5. Stop table and arm, save, power off. Repeat from 2 for each power cycle.",
+        ]
+
     def save(self, path: str | Path) -> None:
         """Write the list of runs where the name ends in .csv, else the manifest.
 
@@ -333,11 +345,7 @@ class Plan(PlannedTest):
         """
         test = self.manifest
         if not str(path).lower().endswith(".csv"):
-            comments = [
-                f"{len(test.runs)} runs; warm up 10 min after each power-on, then the static record of "
-                f"{self.static_duration / 60:.0f} min,",
-                f"then the loaded runs of {self.duration / 60:.0f} min. Columns: time, dtg_x, dtg_y, fog, table_angle.",
-            ]
+            comments = [f"{len(test.runs)} runs. Columns: time, dtg_x, dtg_y, fog, table_angle.", *self.remarks()]
             write_text(path, manifest_text(test, comments))
             return
         lines = ["number,file,power_cycle,role,sense,arm_rate [deg/s],table_rate [deg/s],specific_force [g]"]

@@ -654,7 +654,8 @@ def _whole_periods(sums: PeriodSums, static: Array, cells: Cells, used: Cells, p
         raise DataError(f"{place}: less than one period of the table in the part used")
     if cells.series_angle is None:
         return result
-    return PeriodResult(result.line * np.exp(1j * cells.series_angle[0]), result.periods, result.samples)
+    begin = cells.series_angle[0] - sums.turn  # the first sample has the number 1
+    return PeriodResult(result.line * np.exp(1j * begin), result.periods, result.samples)
 
 
 def _spectrum(cells: Cells, rates: Rates) -> tuple[Array, Array]:

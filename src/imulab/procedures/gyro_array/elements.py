@@ -173,11 +173,11 @@ class ArrayCalibration:
 def feedback_notes(count: int, rate: float) -> list[str]:
     """Return notes on method `feedback` for this number of gyros on each axis and sampling rate, Hz."""
     notes: list[str] = []
-    if count < FEWEST_ROBUST:
+    if count <= FEWEST_ROBUST:
         notes.append(
             Note(
-                f"method feedback with {count} gyro{'s' * (count > 1)} on each axis: with fewer than {FEWEST_ROBUST} "
-                "no gyro stands out from the others, so that the weights mean little"
+                f"method feedback with {count} gyro{'s' * (count > 1)} on each axis: its source states it for more "
+                f"than {FEWEST_ROBUST}" + ", and no gyro stands out from so few" * (count < FEWEST_ROBUST)
             )
         )
     low, high = SOURCE_RATES

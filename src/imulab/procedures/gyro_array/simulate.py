@@ -87,7 +87,7 @@ def simulate_array(
     elements
         Gyros on each axis.
     axes
-        1 or 3.
+        1, or 3: x forward, y right, z down.
     rate
         Sampling rate; that of the experiment if not given. In Hz.
     duration

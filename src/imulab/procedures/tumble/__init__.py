@@ -6,9 +6,10 @@ And the options' words, and texts as a person writes them, to values in SI.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from imulab.errors import OptionError, listed
-from imulab.quantities import quantity, with_uncertainty
+from imulab.quantities import number, quantity, with_uncertainty
 from imulab.units import STANDARD_GRAVITY
 
 # The words that the options of a tumble test take.
@@ -18,6 +19,7 @@ HIGHEST_ORDER = 5  # of the polynomial of an output in the specific force
 FROM_DATA = ("auto", "blend")
 ORDERS = ("auto", *map(str, range(HIGHEST_ORDER + 1)), "blend")
 METHODS = ("norm", "linearised")
+SOURCE_ORDER = 4  # of the example of method linearised's source, whose e is the order here
 LOSSES = ("square", "huber", "auto")
 CRITERIA = ("A", "D")
 SENSITIVITIES = ("auto", "yes", "no")
@@ -70,6 +72,21 @@ def threshold(text: str, name: str) -> tuple[float, ...]:
     if not all(0 < value < math.inf for value in changes):
         raise OptionError(f"{name} {text!r}: expected three finite changes above 0")
     return changes
+
+
+def preset(given: Sequence[float] | float | str, name: str) -> tuple[float, ...]:
+    """Return the scale factors that method linearised starts from, output per g, one for all axes or three.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    parts = given.split(",") if isinstance(given, str) else [given] if isinstance(given, int | float) else given
+    values = tuple(number(part.strip(), name) if isinstance(part, str) else float(part) for part in parts)
+    if len(values) not in (1, 3) or not all(0 < value < math.inf for value in values):
+        raise OptionError(f"{name} {given!r}: expected one scale factor or three, above 0, in output per g")
+    return values
 
 
 def nonlinearity(text: str, name: str) -> tuple[float, float]:

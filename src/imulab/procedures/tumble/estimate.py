@@ -79,6 +79,7 @@ def check_options(
     asymmetry: float | None = None,
     cross: bool = False,
     threshold: Sequence[float] | None = None,
+    preset: Sequence[float] | None = None,
     further: Sequence[str] = (),
     field: float | None = None,
     hemisphere: str | None = None,
@@ -101,6 +102,8 @@ def check_options(
         raise OptionError("loss huber needs method norm, found method linearised")
     if threshold is not None:
         _check_threshold(threshold, method)
+    if preset is not None and method != "linearised":
+        raise OptionError(f"preset needs method linearised, found method {method}")
     if with_prior and (method != "norm" or loss == "huber"):
         raise OptionError(f"a prior needs method norm and loss square or auto, found method {method} and loss {loss}")
     if ageing and not with_prior:
@@ -365,11 +368,15 @@ def _scaled_ageing(ageing: Sequence[float], gravity: float) -> tuple[float | Non
     return (*known, *[None] * (len(GROUPS) - len(known)))
 
 
-def nominal_scaling(attitudes: Attitudes, gravity: float, method: str = "norm") -> Scaling:
+def nominal_scaling(
+    attitudes: Attitudes, gravity: float, method: str = "norm", preset: Sequence[float] | None = None
+) -> Scaling:
     """Nominal sensor: by its unit, for counts and volts from the span of each axis; a far zero by the outputs' sphere.
 
-    Method linearised starts where its source does.
+    Method linearised starts where its source does: at no bias, and at the `preset` scale factors, if there are any.
     """
+    if preset is not None:
+        return Scaling(np.zeros(3), np.broadcast_to(np.asarray(preset, float), 3).copy())
     unit = parse_unit(attitudes.unit)
     if unit.quantity == "acceleration":
         zero = far_zero(attitudes.mean) if method == "norm" else np.zeros(3)

@@ -94,6 +94,7 @@ def fit_tumble(
     monte_carlo: Annotated[int | str | None, RARE] = None,
     cross: Annotated[bool, RARE] = False,
     threshold: Annotated[Sequence[float] | str | None, parsed(tumble.threshold, "5ppm,2ug,3arcsec"), RARE] = None,
+    preset: Annotated[Sequence[float] | float | str | None, parsed(tumble.preset, "K[,K,K]"), RARE] = None,
     with_: Annotated[str | Sequence[str], parsed(further_triads, "gyro,mag", FURTHER), FURTHER_TRIADS] = (),
     field: Annotated[float | str | None, measure("magnetic field", "uT", "48.2uT"), FURTHER_TRIADS] = None,
     hemisphere: Annotated[str | None, choice(HEMISPHERES), FURTHER_TRIADS] = None,
@@ -113,9 +114,9 @@ def fit_tumble(
         A file, recording, data frame or arrays with columns ``accel_x``, ``_y``, ``_z``; the triad alone, shape (n, 3);
         or attitudes from `find_attitudes`. Without a time each row is an attitude.
     order
-        auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them. ``"auto"``
-        takes the order that predicts best among those that the attitudes can see, with an uncertainty that holds
-        whatever the order.
+        auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them. With method
+        linearised ``"auto"`` is 4, as in its source; else it takes the order that predicts best among those that the
+        attitudes can see, with an uncertainty that holds whatever the order.
     gravity
         Local gravity, as 9.81362 or 9.81362+-0.00002; else of the head. The standard uncertainty of such a text enters
         that of the scale factors; without one the recording's head has it, or it is standard gravity, with a warning.
@@ -155,6 +156,9 @@ def fit_tumble(
     threshold
         Changes of scale factors, biases and misalignments at which method linearised rests; the source's "5 ppm, 2 ug,
         3 arcsec" if not given. From one pass to the next, as numbers in 1, m/s^2 and rad.
+    preset
+        Scale factors that method linearised starts from, output per g, one for all axes or three; else nominal ones.
+        Where the outputs are counts or volts, nominal is half the span of each axis, with its middle as zero.
     with_
         Further triads on the same attitudes, in one record. ``"gyro"``, ``"mag"`` or both, ``"gyro,mag"``: the record
         is that of `fit_mag` and then `fit_gyro` on the record of the accelerometers. With ``"mag"`` needs method norm,
@@ -211,21 +215,20 @@ def fit_tumble(
     nonlinearity = tumble.nonlinearity(nonlinearity, "nonlinearity") if isinstance(nonlinearity, str) else nonlinearity
     ageing = tumble.ageing(ageing, "ageing") if isinstance(ageing, str) else ageing
     asymmetry = None if asymmetry is None else in_si(asymmetry, "asymmetry", "number", "ppm")
-    threshold = tumble.threshold(threshold, "threshold") if isinstance(threshold, str) else threshold
+    threshold, preset = _iteration(threshold, preset)
     monte_carlo = None if monte_carlo is None else whole(monte_carlo, "monte_carlo")
     further = further_triads(with_, "with_")
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
     check_options(
         order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing, cross=cross, dip=dip,
-        nonlinearity=nonlinearity, asymmetry=asymmetry, threshold=threshold, further=further, field=magnitude,
-        hemisphere=hemisphere,
+        nonlinearity=nonlinearity, asymmetry=asymmetry, threshold=threshold, preset=preset, further=further,
+        field=magnitude, hemisphere=hemisphere,
     )  # fmt: skip
     place = _stated_place(further, hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
     local = local_gravity(at_place(gravity, latitude, height, beside="gyro" in further), attitudes.recording)
-    scaling = _checked_scaling(attitudes, local.value, method)
-    known = None if prior is None else prior_record(as_record(prior, "fit_tumble: prior"), attitudes)
-    order = order if known is None else _prior_order(known, order, attitudes)
+    scaling = _checked_scaling(attitudes, local.value, method, preset)
+    known, order = _known_and_order(prior, order, method, attitudes)
     rest = _threshold(threshold, local.value) if method == "linearised" else None
     estimate = estimate_triad(
         attitudes, local, scaling, order, loss, rest, nonlinearity=nonlinearity, asymmetry=asymmetry, prior=known,
@@ -234,7 +237,7 @@ def fit_tumble(
     options = {
         "order": order, "method": method, "loss": loss, "gravity": local.value,
         "nonlinearity": nonlinearity and list(nonlinearity), "asymmetry": asymmetry, "monte_carlo": monte_carlo,
-        "cross": cross or None, "threshold": None if rest is None else rest.in_si(local.value),
+        "cross": cross or None, "threshold": rest and rest.in_si(local.value), "preset": preset and list(preset),
     }  # fmt: skip
     trials = None if monte_carlo is None else _propagated(estimate, monte_carlo, progress)
     record = make_record(estimate, local, scaling, {k: v for k, v in options.items() if v is not None}, trials)
@@ -245,10 +248,28 @@ def fit_tumble(
     )  # fmt: skip
 
 
-def _checked_scaling(attitudes: Attitudes, gravity: float, method: str) -> Scaling:
+def _iteration(
+    threshold: Sequence[float] | str | None, preset: Sequence[float] | float | str | None
+) -> tuple[Sequence[float] | None, tuple[float, ...] | None]:
+    """Return where method linearised rests and where it starts, as numbers."""
+    rest = tumble.threshold(threshold, "threshold") if isinstance(threshold, str) else threshold
+    return rest, None if preset is None else tumble.preset(preset, "preset")
+
+
+def _known_and_order(
+    prior: Record | None, order: int | str, method: str, attitudes: Attitudes
+) -> tuple[Calibration | None, int | str]:
+    """Return the prior's record, and the order: where it is auto that of the prior or of the method's source."""
+    if prior is not None:
+        known = prior_record(as_record(prior, "fit_tumble: prior"), attitudes)
+        return known, _prior_order(known, order, attitudes)
+    return None, tumble.SOURCE_ORDER if order == "auto" and method == "linearised" else order
+
+
+def _checked_scaling(attitudes: Attitudes, gravity: float, method: str, preset: Sequence[float] | None) -> Scaling:
     """Return the nominal sensor, once the attitudes can be those of an accelerometer triad."""
     check_attitudes(attitudes, gravity)
-    return nominal_scaling(attitudes, gravity, method)
+    return nominal_scaling(attitudes, gravity, method, preset)
 
 
 def _stated_place(

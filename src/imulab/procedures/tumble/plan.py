@@ -22,7 +22,7 @@ from imulab.estimation.least_squares import observability
 from imulab.options import choice, either, file, parsed, text
 from imulab.procedures.registry import load
 from imulab.procedures.result import PlannedAttitudes, amount, as_recording
-from imulab.procedures.tumble import CRITERIA, HIGHEST_ORDER, METHODS
+from imulab.procedures.tumble import CRITERIA, HIGHEST_ORDER, METHODS, SOURCE_ORDER
 from imulab.procedures.tumble.attitudes import find_attitudes
 from imulab.procedures.tumble.estimate import check_method
 from imulab.procedures.tumble.fit import fit_tumble
@@ -579,7 +579,7 @@ def plan_tumble(
     attitudes: Annotated[int | str, parsed(whole_number, "N")],
     *,
     noise: Annotated[float | Known | None, text("20ug|FILE")] = None,
-    order: int | str = 3,
+    order: int | str | None = None,
     criterion: Annotated[str, choice(CRITERIA)] = "A",
     from_: Annotated[Data, text("sphere|FILE", STARTS)] = "sphere",
     add: Annotated[Known | Plan | None, file()] = None,
@@ -601,8 +601,8 @@ def plan_tumble(
         Noise of ``|f|`` in one attitude, or a recording or record that has it. In m/s^2, or a text such as ``"20ug"``;
         or the file of either.
     order
-        Order of the model, 0 to 5; 3 shows what 2 would leave out. Attitudes for order 3 show what an order 2 would
-        silently leave in scale factors.
+        Order of the model, 0 to 5; 3, or with method linearised 4, if not given. Attitudes for order 3 show what an
+        order 2 would silently leave in scale factors.
     criterion
         A: least sum of variances; D: smallest confidence region.
     from_
@@ -639,7 +639,7 @@ def plan_tumble(
     >>> il.plan_tumble(16, noise="20ug", order=1, with_="mag").headings.facing(0)
     '+y to the east'
     """
-    number = whole(order, "order")
+    number = whole(SOURCE_ORDER if method == "linearised" else 3, "order") if order is None else whole(order, "order")
     check_method(method, number)
     if with_ not in (None, "mag"):
         raise OptionError(f"with_ {with_!r}: expected mag: only magnetometers ask for headings")

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 _NAMED = (
-    "order", "method", "loss", "threshold", "ageing", "nonlinearity", "asymmetry", "cross", "monte-carlo", "with_",
-    "field", "hemisphere", "latitude", "dip",
+    "order", "method", "loss", "threshold", "preset", "ageing", "nonlinearity", "asymmetry", "cross", "monte-carlo",
+    "with_", "field", "hemisphere", "latitude", "dip",
 )  # fmt: skip
 
 
@@ -55,6 +55,7 @@ def _fit(
         monte_carlo=values["monte_carlo"],
         cross=values["cross"],
         threshold=values["threshold"],
+        preset=values["preset"],
         with_=values["with"],
         field=values["field"],
         hemisphere=values["hemisphere"],
@@ -101,7 +102,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
             values["order"], values["method"], values["loss"],
             monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
             nonlinearity=values["nonlinearity"], asymmetry=values["asymmetry"], cross=values["cross"],
-            threshold=values["threshold"], further=values["with"], field=values["field"],
+            threshold=values["threshold"], preset=values["preset"], further=values["with"], field=values["field"],
             hemisphere=values["hemisphere"], dip=values["dip"],
         )  # fmt: skip
         if "mag" in values["with"]:

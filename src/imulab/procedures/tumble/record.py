@@ -182,12 +182,16 @@ def freedom_finding(attitudes: int, size: int, order: int) -> str | None:
     )
 
 
-def vertical_warnings(complete: FittedAttitudes, method: str) -> list[str]:
-    """Name the axes that are vertical, up or down, in more than one attitude, which the linearised's source forbids."""
+def source_warnings(complete: FittedAttitudes, method: str) -> list[str]:
+    """Say what of the test departs from the source of method linearised: no nonlinearity, or an axis vertical twice."""
     if method != "linearised":
         return []
-    vertical = near_vertical(forces(complete.problem, complete.solution)[0], CLOSEST)
+    order = complete.problem.order
     warnings: list[str] = []
+    if order < 2:
+        note = f"order {order} has no nonlinearity, which the source of method linearised fits (order 4 in its example)"
+        warnings.append(Note(note))
+    vertical = near_vertical(forces(complete.problem, complete.solution)[0], CLOSEST)
     for axis, column in zip(AXES, vertical.T, strict=True):
         which = np.flatnonzero(column).tolist()
         if len(which) > 1:
@@ -354,7 +358,7 @@ def make_record(
             *_scatter_warnings(problem, solution, chi_square, freedom, order_chosen=bool(estimate.orders)),
             *shake_warnings(problem.motion, solution),
             *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(estimate.orders)),
-            *vertical_warnings(complete, str(options["method"])),
+            *source_warnings(complete, str(options["method"])),
             *aside_warnings(complete, options),
             *assumption_notes(estimate.stated),
             *estimate.notes,

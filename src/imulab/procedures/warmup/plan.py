@@ -38,6 +38,10 @@ class PlanStep:
     cycle: int
 
 
+FIXTURE = "levelled, on a three-axis table in the chamber; x, y and z of the unit point east, up and south, and stay so"
+"""How the unit lies during the test, as in the source: the Earth's rate and gravity are constant on each axis."""
+
+
 @dataclass(frozen=True, repr=False)
 class WarmupPlan(PlannedTest):
     """A chamber programme.
@@ -107,6 +111,7 @@ class WarmupPlan(PlannedTest):
             f"{from_si(self.curve_uncertainty, 'deg/h'):.2g} deg/h from noise, and "
             f"{100 * self.repeatability_uncertainty:.2g} % of the curve from repeatability"
         ]
+        lines.append(f"fixture: {FIXTURE}")
         if self.proposal != self.temperatures:
             lines.append(f"better: --temperatures {','.join(f'{t:g}' for t in self.proposal)}")
         return lines
@@ -297,7 +302,8 @@ def programme(plan: WarmupPlan) -> Recording:
         },
         units={"start": "min", "duration": "min", "set_point": "degC"},
         metadata={
-            "programme": "ramp and soak with power 0; with power 1 switch the unit on and record from that instant"
+            "programme": "ramp and soak with power 0; with power 1 switch the unit on and record from that instant",
+            "fixture": FIXTURE,
         },
         name="warm-up plan",
     )
