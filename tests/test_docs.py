@@ -22,6 +22,11 @@ FOLDER = sorted((REPOSITORY / "docs").glob("*.md"))
 PAGES = [page for page in (README, *FOLDER) if BLOCK.search(page.read_text(encoding="utf-8"))]
 
 
+def _expanded(word: str) -> list[str]:
+    """Return the files that a pattern names, as a shell has it; the word where it is none."""
+    return sorted(str(path) for path in Path().glob(word)) if "*" in word else [word]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_what_a_page_shows_runs(page, tmp_path, monkeypatch, capsys):
@@ -32,7 +37,7 @@ def test_what_a_page_shows_runs(page, tmp_path, monkeypatch, capsys):
             runpy.run_path("example.py")
             continue
         for line in text.replace("\\\n", " ").splitlines():
-            words = shlex.split(line, comments=True)
+            words = [name for word in shlex.split(line, comments=True) for name in _expanded(word)]
             if not words:
                 continue
             assert words[0] in ("imulab", "make"), line
