@@ -80,12 +80,12 @@ def test_several_streams_one_behind_the_other_are_one():
 MAT_HEAD = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
 
 
-def mat_variable(size: int, letter: bytes = b"x") -> bytes:
+def mat_variable(size: int, letter: bytes = b"x", level: int = 1) -> bytes:
     """A variable of `size` zeros (MathWorks, MAT-File Format), compressed."""
     flags = struct.pack("<IIII", 6, 8, 6, 0)
     shape = struct.pack("<IIii", 5, 8, size, 1)
     name = struct.pack("<II", 1, 1) + letter + bytes(7)
-    packer = zlib.compressobj(1)
+    packer = zlib.compressobj(level)
     total = len(flags) + len(shape) + len(name) + 8 + 8 * size
     parts = [packer.compress(struct.pack("<II", 14, total) + flags + shape + name + struct.pack("<II", 9, 8 * size))]
     zeros = bytes(1 << 20)
@@ -100,7 +100,7 @@ def test_a_matlab_variable_of_zeros(tmp_path):
     said = refused(tmp_path / "bomb.mat", "--layout", layout(tmp_path, 'accel_x = { from = "x", unit = "g" }'))
     assert "bomb.mat: unpacks to more than" in said
     small = tmp_path / "small.mat"
-    small.write_bytes(MAT_HEAD + mat_variable(1 << 24))  # 128 MB in 130 kB
+    small.write_bytes(MAT_HEAD + mat_variable(1 << 24, level=9))  # 128 MB in 130 kB
     table = layout(tmp_path, 'accel_x = { from = "x", unit = "g" }')
     assert "unpacks to more than 67 MB" in refused(small, "--layout", table)
     done = subprocess.run(

@@ -16,6 +16,7 @@ Pratt, Journal of the American Statistical Association 56 (1961) 549.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -37,6 +38,8 @@ from imulab.recording import Array
 
 Model = Callable[[Array], tuple[Array, Array]]
 """Parameters (p,) -> residuals (n,), Jacobian (n, p)."""
+_DAMPING = 1e-6
+"""Damping of the first step, of scaled parameters: the starts are good, and a step hardly shorter than Gauss's."""
 
 _HUBER = 1.345
 """95 % efficiency for normal errors (Huber 1981)."""
@@ -77,7 +80,10 @@ class Fit(Struct, frozen=True):
 def least_squares(
     model: Model, start: Array, weights: Array, *, tolerance: float = 1e-10, max_evaluations: int = 100
 ) -> Fit:
-    """Return the minimum of ``sum_i w_i r_i(p)^2`` of one problem, a batch of one, by scipy's trust-region method.
+    """Return the minimum of ``sum_i w_i r_i(p)^2`` of one problem, a batch of one.
+
+    Levenberg-Marquardt with the damping of H. B. Nielsen (Damping parameter in Marquardt's method, IMM-REP-1999-05,
+    Technical University of Denmark), in parameters scaled by the columns of the Jacobian (Moré, LNM 630 (1978) 105).
 
     Parameters
     ----------
@@ -92,24 +98,36 @@ def least_squares(
     max_evaluations
         Evaluations of the residuals before the problem is given up as not converged.
     """
-    from scipy import optimize
-
     root = np.sqrt(weights)
-    solution, evaluations, converged = np.asarray(start), 1, False
-    if np.isfinite(root * model(start)[0]).all():
-        with np.errstate(all="ignore"):
-            minimum = optimize.least_squares(
-                lambda p: root * model(p)[0],
-                start,
-                lambda p: root[:, None] * model(p)[1],
-                x_scale="jac",
-                ftol=None,
-                xtol=tolerance,
-                gtol=None,
-                max_nfev=max_evaluations,
-            )
-        solution, evaluations, converged = minimum.x, int(minimum.nfev), bool(minimum.status > 0)
+    solution = np.array(start, dtype=np.float64)
+    size, evaluations, converged = len(solution), 1, False
     residuals, jacobian = model(solution)
+    cost = float(np.sum((root * residuals) ** 2))
+    damping, growth, scale = _DAMPING, 2.0, np.full(size, np.finfo(float).tiny)
+    with np.errstate(all="ignore"):
+        while np.isfinite(cost) and not converged and evaluations < max_evaluations:
+            weighted = root[:, None] * jacobian
+            scale = np.maximum(scale, np.linalg.norm(weighted, axis=0))
+            columns: Array = np.column_stack([weighted / scale, -root * residuals])
+            triangle: Array = np.asarray(np.linalg.qr(columns, mode="r"))[:size]
+            accepted = False
+            while not (accepted or converged) and evaluations < max_evaluations:
+                damped = np.vstack([triangle[:, :size], math.sqrt(damping) * np.eye(size)])
+                scaled = np.linalg.lstsq(damped, np.append(triangle[:, size], np.zeros(size)), rcond=None)[0]
+                step = scaled / scale
+                trial = model(solution + step)
+                evaluations += 1
+                new_cost = float(np.sum((root * trial[0]) ** 2))
+                predicted = float(scaled @ (damping * scaled + triangle[:, :size].T @ triangle[:, size]))
+                gain = (cost - new_cost) / max(predicted, 1e-300)
+                length = float(np.linalg.norm(step))
+                converged = length < tolerance * (tolerance + float(np.linalg.norm(solution)))
+                accepted = gain > 0
+                if accepted:
+                    solution, (residuals, jacobian), cost = solution + step, trial, new_cost
+                    damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
+                else:  # further along the gradient, or no number there
+                    damping, growth = damping * growth, 2 * growth
     return Fit(
         solution[None], residuals[None], jacobian[None], np.asarray(weights)[None], np.array([evaluations]),
         np.array([converged]),

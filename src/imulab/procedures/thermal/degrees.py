@@ -46,6 +46,7 @@ from imulab.procedures.thermal.solve import (
     row_covariance,
     solve,
     whitener,
+    whitener_of,
 )
 from imulab.recording import Array
 
@@ -159,7 +160,7 @@ def _remove_knot(jacobian: Array, laws: Laws, number: int) -> tuple[Array, tuple
     if not laws.knots:
         return jacobian, ()
     fewer = np.delete(laws.knots, number)
-    basis = np.insert(cardinal_spline(tuple(fewer.tolist()))(laws.knots), number, 0.0, axis=1)
+    basis = np.insert(cardinal_spline(tuple(fewer.tolist()))(np.array(laws.knots)), number, 0.0, axis=1)
     basis[number, number] = 1.0
     changed = jacobian.copy()
     for part in laws.parts[:3]:
@@ -668,14 +669,7 @@ def within_and_between(
         Degrees of freedom by Satterthwaite: the more of an offset's variance is noise, the more there are. This is
         wrong where power cycles move outputs by more than noise does, and their scatter came out small by chance.
     """
-    from scipy.linalg import solve_triangular
-
-    factor = np.linalg.cholesky(whole)
-
-    def white(columns: Array) -> Array:
-        whitened: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
-        return whitened
-
+    white = whitener_of(whole)
     turns = _orthonormal_basis(white(unknown))
     offsets = white(rows.offsets[0])
     offsets = _orthonormal_basis(offsets - turns @ (turns.T @ offsets))

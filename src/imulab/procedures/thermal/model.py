@@ -13,15 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial import Polynomial, chebyshev
 
 from imulab.recording import Array
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
 
 AXES = ("x", "y", "z")
 MISALIGNMENTS = tuple(f"gyro_misalignment_{a}{b}" for a in AXES for b in AXES if a != b)
@@ -166,7 +162,7 @@ class Laws:
         pieces = np.zeros((len(edges) - 1, self.degrees[group] + 1))
         for piece, (start, stop) in enumerate(pairwise(edges)):
             middle, half = 0.5 * (start + stop), 0.5 * (stop - start)
-            cubic = cardinal_spline(self.knots).c[::-1, piece] @ coefficients if is_spline else coefficients
+            cubic = cardinal_spline(self.knots).coefficients[:, piece] @ coefficients if is_spline else coefficients
             law = Polynomial(cubic)(Polynomial([middle - (start if is_spline else about), half])).coef
             pieces[piece, : len(law)] = law
         return pieces
@@ -210,12 +206,49 @@ class Laws:
         return law_names("", unit, self.degrees[group])[1]
 
 
-@lru_cache(maxsize=256)
-def cardinal_spline(knots: tuple[float, ...]) -> CubicSpline:
-    """Return the natural cubic splines that are 1 at one knot and 0 at all others."""
-    from scipy.interpolate import CubicSpline
+@dataclass(frozen=True)
+class CardinalSpline:
+    """The natural cubic splines that are 1 at one of n knots and 0 at all others.
 
-    return CubicSpline(knots, np.eye(len(knots)), bc_type="natural")
+    Attributes
+    ----------
+    knots
+        Ascending, shape (n,).
+    coefficients
+        Of powers 0 to 3 of the distance from a piece's first knot, by piece and spline, shape (4, n - 1, n).
+    """
+
+    knots: Array
+    coefficients: Array
+
+    def __call__(self, at: Array, derivative: int = 0) -> Array:
+        """Return the splines or their first derivatives, shape (m, n); the end pieces go on beyond the knots."""
+        piece = np.clip(np.searchsorted(self.knots, at, side="right") - 1, 0, len(self.knots) - 2)
+        x = (at - self.knots[piece])[:, None]
+        a, b, c, d = self.coefficients[:, piece]
+        values: Array = b + x * (2 * c + 3 * x * d) if derivative else a + x * (b + x * (c + x * d))
+        return values
+
+
+@lru_cache(maxsize=256)
+def cardinal_spline(knots: tuple[float, ...]) -> CardinalSpline:
+    """Return the splines of these knots, two at least.
+
+    The slopes s at the knots make the second derivative continuous, and 0 at both ends (de Boor, A Practical Guide to
+    Splines, ch. IV); scipy.interpolate, which has the same, takes as long to load as a fit takes.
+    """
+    at, value = np.array(knots), np.eye(len(knots))
+    step = np.diff(at)[:, None]
+    secant = np.diff(value, axis=0) / step
+    inverse = 1 / step[:, 0]
+    left, right = np.append(inverse, 0.0), np.insert(inverse, 0, 0.0)
+    equations = np.diag(2 * (left + right)) + np.diag(inverse, 1) + np.diag(inverse, -1)
+    bends = 3 * secant / step
+    slopes = np.linalg.solve(equations, np.pad(bends, ((0, 1), (0, 0))) + np.pad(bends, ((1, 0), (0, 0))))
+    excess = (slopes[:-1] + slopes[1:] - 2 * secant) / step
+    return CardinalSpline(
+        at, np.stack([value[:-1], slopes[:-1], (secant - slopes[:-1]) / step - excess, excess / step])
+    )
 
 
 def law_names(name: str, unit: str, degree: int) -> tuple[list[str], list[str]]:

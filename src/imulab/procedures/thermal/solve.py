@@ -224,15 +224,29 @@ def row_covariance(rows: Rows, excess: float, tau: Array) -> Array:
 
 def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
     """Return a function that multiplies by the inverse of the Cholesky factor of V."""
-    from scipy.linalg import solve_triangular
+    return whitener_of(row_covariance(rows, excess, tau))
 
-    factor = np.linalg.cholesky(row_covariance(rows, excess, tau))
+
+def whitener_of(covariance: Array) -> Callable[[Array], Array]:
+    """Return a function that multiplies by the inverse of a covariance's Cholesky factor.
+
+    It substitutes forward, block by block; scipy's solver of triangles takes as long to load as a fit takes.
+    """
+    factor = np.linalg.cholesky(covariance)
+    blocks = [slice(start, start + _BLOCK) for start in range(0, len(factor), _BLOCK)]
+    inverses = [np.linalg.inv(factor[block, block]) for block in blocks]
 
     def white(columns: Array) -> Array:
-        whitened: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
+        whitened = np.array(columns, dtype=np.float64)
+        for block, inverse in zip(blocks, inverses, strict=True):
+            before = slice(block.start)
+            whitened[block] = inverse @ (whitened[block] - factor[block, before] @ whitened[before])
         return whitened
 
     return white
+
+
+_BLOCK = 64  # rows that are substituted at once
 
 
 # The fit.
