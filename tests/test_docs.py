@@ -78,6 +78,13 @@ def test_the_quickstart_shows_what_its_fit_prints(tmp_path, monkeypatch, capsys)
     assert [line.strip() for line in shown if line.strip() not in (*map(str.strip, printed), "...")] == []
 
 
+def test_the_files_that_contributing_names_are_there():
+    page = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = re.findall(r"`((?:src|tests|docs|runtime)/[a-z_/.]+)`", page)
+    assert len(named) > 25
+    assert [name for name in named if not (REPOSITORY / name).exists()] == []
+
+
 @pytest.mark.parametrize("page", ["tumble", "gyro_array", "warmup", "centrifuge", "noise", "thermal", "rate"])
 def test_every_procedure_has_a_worked_example(page):
     assert page in [found.stem for found in PAGES]
