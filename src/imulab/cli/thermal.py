@@ -66,6 +66,7 @@ def fit(
 
     Recordings of one unit with a column temperature: full and partial tumbles at several temperatures, and
     recordings at rest in which the temperature drifts. Calibrates the accelerometer triad over temperature.
+    Rest ramps alone give the biases of gyroscopes over temperature.
     """
     from imulab.cli.show import finish
     from imulab.procedures.registry import run_task

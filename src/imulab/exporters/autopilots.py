@@ -110,15 +110,15 @@ _FORCES = STANDARD_GRAVITY * _CORNERS / np.linalg.norm(_CORNERS, axis=1)[:, None
 class OffsetLaw:
     """``(raw - offset(T)) * scale``, m/s^2: offsets as cubics of ``T - reference``, rows of powers, (4, 3).
 
-    `rest`: the same of the gyroscopes, rad/s, ``raw - rest(T)``, None without; `lost`: comments on what is left out;
-    `origin`: where the numbers come from.
+    Both are None of a record without accelerometers. `rest`: the same of the gyroscopes, rad/s, ``raw - rest(T)``, None
+    without; `lost`: comments on what is left out; `origin`: where the numbers come from.
     """
 
     low: float
     high: float
     reference: float
-    offset: Array
-    scale: Array
+    offset: Array | None
+    scale: Array | None
     rest: Array | None
     lost: list[str]
     origin: list[str]
@@ -145,6 +145,8 @@ def offset_law(
     if len(records) != 1:
         raise OptionError(f"{target}: a {over[0].procedure} record goes alone, found {len(records)} records")
     laws = procedure_of(over[0]).laws(over[0])
+    if laws is None:
+        return _law_of_rates(over[0], target, reference)
     if laws.unit != "m/s^2":
         raise OptionError(
             f"{target}: corrects outputs in m/s^2, but the record is for accelerometers with outputs in {laws.unit}"
@@ -175,6 +177,21 @@ def offset_law(
         lost,
         origin_of(over[0]),
     )
+
+
+def _law_of_rates(record: Calibration, target: str, reference: float | None) -> OffsetLaw:
+    """Return the offsets of a record of gyroscopes alone; accelerometers stay as they are."""
+    low, high = record.model["range"]
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    about = middle if reference is None else reference
+    temperature = middle + half * _NODES
+    rest, costs, follows = _rest(record, target, temperature, ((temperature - about) / half)[:, None] ** np.arange(4))
+    assert rest is not None
+    kept = "gyroscopes alone, from rest: scale factors are not told, and what the autopilot has of accelerometers stays"
+    return OffsetLaw(
+        low, high, about, None, None, rest / half ** np.arange(4.0)[:, None], [kept, *costs, *follows],
+        origin_of(record),
+    )  # fmt: skip
 
 
 def _rest(
@@ -238,6 +255,10 @@ _PX4_THERMAL = (
     "PX4 takes a new temperature only where it has moved by more than 1 K; TC_A_ENABLE needs a reboot",
 )
 _PX4_RATES = "gyroscopes: the same with TC_G, TC_G0 and CAL_GYRO0, rad/s, without SCALE"
+_PX4_RATES_ALONE = (
+    "corrected = raw - X1 d - X2 d^2 - X3 d^3 - OFF, rad/s, d = T - TREF, T in degC held within TMIN to TMAX",
+    "PX4 takes a new temperature only where it has moved by more than 1 K; TC_G_ENABLE needs a reboot",
+)
 
 
 def export_px4(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
@@ -256,8 +277,13 @@ def export_px4(records: Sequence[Calibration], folder: Path, options: ExportOpti
             folder,
             law.origin,
             _px4_thermal_rows(law, options),
-            [*_PX4_THERMAL, *([] if law.rest is None else [_PX4_RATES]), *law.lost],
+            [
+                *(_PX4_RATES_ALONE if law.offset is None else _PX4_THERMAL),
+                *([] if law.rest is None or law.offset is None else [_PX4_RATES]),
+                *law.lost,
+            ],
             options,
+            "CAL_GYRO0_ID" if law.offset is None else "CAL_ACC0_ID",
         )
     held = corrections(records, "px4", options, _check_px4)
     device = str(options.device_id)
@@ -275,12 +301,12 @@ def export_px4(records: Sequence[Calibration], folder: Path, options: ExportOpti
 
 
 def _px4_thermal_rows(law: OffsetLaw, options: ExportOptions) -> list[tuple[str, float | str]]:
-    _check_px4(law.offset[0], law.scale)
-    device = str(options.device_id)
-    rows = _over_temperature("A", law, law.offset, device)
-    rows.append(("CAL_ACC0_ID", device))
-    rows += [(f"CAL_ACC0_{a}OFF", v) for a, v in zip("XYZ", law.offset[0], strict=True)]
-    rows += [(f"CAL_ACC0_{a}SCALE", v) for a, v in zip("XYZ", law.scale, strict=True)]
+    device, rows = str(options.device_id), list[tuple[str, float | str]]()
+    if law.offset is not None and law.scale is not None:
+        _check_px4(law.offset[0], law.scale)
+        rows = [*_over_temperature("A", law, law.offset, device), ("CAL_ACC0_ID", device)]
+        rows += [(f"CAL_ACC0_{a}OFF", v) for a, v in zip("XYZ", law.offset[0], strict=True)]
+        rows += [(f"CAL_ACC0_{a}SCALE", v) for a, v in zip("XYZ", law.scale, strict=True)]
     if law.rest is None:
         return rows
     rows += [*_over_temperature("G", law, law.rest, device), ("CAL_GYRO0_ID", device)]
@@ -309,15 +335,17 @@ def _write_px4(
     values: Sequence[tuple[str, float | str]],
     remarks: Sequence[str],
     options: ExportOptions,
+    key: str = "CAL_ACC0_ID",
 ) -> list[Path]:
-    """Write rows of name and value, texts as whole numbers, after comments on what they are."""
+    """Write rows of name and value, texts as whole numbers, after comments on what they are.
+
+    `key` is the parameter by which PX4 knows the sensor.
+    """
     rows = [
         (name, value, _INT32) if isinstance(value, str) else (name, single_precision(value), _FLOAT)
         for name, value in values
     ]
-    unknown = (
-        "device id 0: not known; PX4 ignores the calibration until CAL_ACC0_ID is that of the sensor (--device-id)"
-    )
+    unknown = f"device id 0: not known; PX4 ignores the calibration until {key} is that of the sensor (--device-id)"
     comments = [
         "PX4 parameters, " + origin[0],
         origin[1],
@@ -346,6 +374,12 @@ _ARDUPILOT_THERMAL = (
     " T in degC held within TMIN to TMAX",
     "ArduPilot's logs are corrected outputs: record the test with INS_TCAL1_ENABLE 0",
 )
+_ARDUPILOT_RATES_ALONE = (
+    "corrected = raw - P(T) + P(CALTEMP) - OFFS, rad/s, P = 1e-6 (GYR1 t + GYR2 t^2 + GYR3 t^3), t = T - 35, T in degC "
+    "held within TMIN to TMAX; ArduPilot measures OFFS again at each start unless INS_GYR_CAL is 0",
+    "ENABLE 1 turns on the laws of accelerometers too, which are 0 unless set: ACC1 to ACC3",
+    _ARDUPILOT_THERMAL[1],
+)
 _ARDUPILOT_RATES = (
     "gyroscopes: the same with GYR, GYR1_CALTEMP and GYROFFS, rad/s, without SCAL; ArduPilot measures GYROFFS again at "
     "each start unless INS_GYR_CAL is 0"
@@ -366,7 +400,11 @@ def export_ardupilot(records: Sequence[Calibration], folder: Path, options: Expo
             folder,
             law.origin,
             _ardupilot_thermal_rows(law),
-            [*_ARDUPILOT_THERMAL, *([] if law.rest is None else [_ARDUPILOT_RATES]), *law.lost],
+            [
+                *(_ARDUPILOT_RATES_ALONE if law.offset is None else _ARDUPILOT_THERMAL),
+                *([] if law.rest is None or law.offset is None else [_ARDUPILOT_RATES]),
+                *law.lost,
+            ],
         )
     held = corrections(records, "ardupilot", options, _check_ardupilot)
     rows: list[tuple[str, float]] = [(f"INS_ACCOFFS_{a}", v) for a, v in zip("XYZ", held.offset, strict=True)]
@@ -390,13 +428,13 @@ def export_ardupilot(records: Sequence[Calibration], folder: Path, options: Expo
 
 def _ardupilot_thermal_rows(law: OffsetLaw) -> list[tuple[str, float]]:
     caltemp = 0.5 * (law.low + law.high)
-    offset = (caltemp - law.reference) ** np.arange(4.0) @ law.offset
-    _check_ardupilot(offset, law.scale)
     rows = [("INS_TCAL1_ENABLE", 1.0), ("INS_TCAL1_TMIN", law.low), ("INS_TCAL1_TMAX", law.high)]
-    rows += _coefficients("ACC", law.offset)
-    rows.append(("INS_ACC1_CALTEMP", caltemp))
-    rows += [(f"INS_ACCOFFS_{a}", v) for a, v in zip("XYZ", offset, strict=True)]
-    rows += [(f"INS_ACCSCAL_{a}", v) for a, v in zip("XYZ", law.scale, strict=True)]
+    if law.offset is not None and law.scale is not None:
+        offset = (caltemp - law.reference) ** np.arange(4.0) @ law.offset
+        _check_ardupilot(offset, law.scale)
+        rows += [*_coefficients("ACC", law.offset), ("INS_ACC1_CALTEMP", caltemp)]
+        rows += [(f"INS_ACCOFFS_{a}", v) for a, v in zip("XYZ", offset, strict=True)]
+        rows += [(f"INS_ACCSCAL_{a}", v) for a, v in zip("XYZ", law.scale, strict=True)]
     if law.rest is None:
         return rows
     rows += _coefficients("GYR", law.rest)

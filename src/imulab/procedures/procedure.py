@@ -292,8 +292,8 @@ class Procedure:
 
         return NOT_FITTED
 
-    def laws(self, record: Calibration) -> AccelerometerLaws:
-        """Return the laws of the accelerometers over temperature."""
+    def laws(self, record: Calibration) -> AccelerometerLaws | None:
+        """Return the laws of the accelerometers over temperature, None for a record without."""
         raise NotImplementedError
 
     def gyro_laws(self, record: Calibration) -> GyroscopeLaws | None:

@@ -34,7 +34,7 @@ from imulab.procedures.thermal.gyro import RatesAtRest, leave_out_turns, lineari
 from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepare_recordings
 from imulab.procedures.thermal.model import AXES, Laws, forces
 from imulab.procedures.thermal.record import laws_in_g, names_and_units, predict_gyro_scale
-from imulab.procedures.thermal.schema import thermal_of
+from imulab.procedures.thermal.schema import refuse_ramp, thermal_of
 from imulab.procedures.thermal.solve import ThermalProblem, linearise, row_covariance
 from imulab.quantities import in_si
 from imulab.recording import Array, Data, Reading, Recording
@@ -457,6 +457,7 @@ def check_thermal(
     held = as_record(record, "check_thermal")
     if held.procedure != "thermal":
         raise RecordError(f"a {held.procedure} record cannot be checked over temperature; expected a thermal record")
+    refuse_ramp(held, "thermal check")
     largest = None if limit is None else in_si(limit, "limit", "acceleration", "mg")
     if largest is not None and not largest > 0:
         raise OptionError(f"limit {largest:g} m/s^2: expected more than 0")

@@ -115,7 +115,7 @@ def number_temperatures(temperature: Array) -> NDArray[np.int64]:
 def judge_observability(solution: ThermalSolution) -> Observability:
     """Return rank and condition of laws and directions of unmoved holds; lag and loops are judged elsewhere."""
     rows = solution.rows
-    fitted = np.s_[solution.laws.size : len(solution.coefficients)]
+    fitted = np.s_[min(solution.laws.size, len(solution.coefficients)) : len(solution.coefficients)]
     return observability(np.delete(rows.jacobian, fitted, axis=1), 1 / (np.diag(rows.noise) + solution.excess**2))
 
 

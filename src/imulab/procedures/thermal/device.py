@@ -18,7 +18,15 @@ from imulab.display import Note
 from imulab.errors import DataError, RecordError
 from imulab.procedures.procedure import OnLine
 from imulab.procedures.thermal.model import AXES, GROUPS, MISALIGNMENTS, SENSITIVITIES, Laws
-from imulab.procedures.thermal.schema import ThermalGyroModel, ThermalModel, thermal_of
+from imulab.procedures.thermal.schema import (
+    RampModel,
+    ThermalGyroModel,
+    ThermalModel,
+    gyros_of,
+    is_ramp,
+    refuse_ramp,
+    thermal_of,
+)
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, output_to_si
@@ -40,7 +48,7 @@ def read_gyro_laws(record: Calibration) -> Array:
     RecordError
         The record lacks a coefficient, has one in another unit, or a scale factor is 0 within the range.
     """
-    model = thermal_of(record).model
+    model = gyros_of(record).model
     gyro = model.gyro
     assert gyro is not None
     laws, about = model.gyro_laws, model.reference_temperature.value
@@ -87,7 +95,7 @@ def _sensitivity(record: Calibration) -> Array:
 
 def gyroscope_laws(record: Calibration) -> GyroscopeLaws | None:
     """Return the gyroscopes' laws for exporters, None where there are none; errors as for `read_gyro_laws`."""
-    model = thermal_of(record).model
+    model = gyros_of(record).model
     if model.gyro is None:
         return None
     laws = read_gyro_laws(record)
@@ -99,7 +107,7 @@ def gyroscope_laws(record: Calibration) -> GyroscopeLaws | None:
 
 def make_gyro_table(record: Calibration, columns: Mapping[str, Any]) -> DeviceTable:
     """Return the table of the gyroscopes; errors as for `read_gyro_laws`."""
-    model = thermal_of(record).model
+    model = gyros_of(record).model
     assert model.gyro is not None
     laws = read_gyro_laws(record)
     fields = [
@@ -158,14 +166,20 @@ def read_laws(record: Calibration) -> Array:
     return coefficients
 
 
-def accelerometer_laws(record: Calibration) -> AccelerometerLaws:
-    """Return the accelerometers' laws for exporters; errors as for `read_laws`."""
+def accelerometer_laws(record: Calibration) -> AccelerometerLaws | None:
+    """Return the accelerometers' laws for exporters, None of rest ramps; errors as for `read_laws`."""
+    if is_ramp(record):
+        return None
     model = thermal_of(record).model
     return AccelerometerLaws(model.laws.edges, read_laws(record), model.output_unit)
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     """Return the tables of a thermal record; errors as for `read_laws`."""
+    column = str(record.options.get("temperature_column") or "temperature")
+    known = {"temperature": column, "range": list(gyros_of(record).model.range)}
+    if is_ramp(record):
+        return (make_gyro_table(record, known),)
     model, laws = thermal_of(record).model, read_laws(record)
     fields = (
         Field("pieces", whole(len(laws))),
@@ -173,8 +187,6 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
         Field("knot", model.laws.edges, pointed=True),
         Field("coefficient", laws, pointed=True),
     )
-    column = str(record.options.get("temperature_column") or "temperature")
-    known = {"temperature": column, "range": list(model.range)}
     table = DeviceTable("thermal", fields, {"output_unit": model.output_unit, **known})
     return (table,) if model.gyro is None else (table, make_gyro_table(record, known))
 
@@ -296,13 +308,16 @@ def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Cal
     RecordError
         Their ranges of temperature have less than 1 K in common.
     """
-    models = [thermal_of(record).model for record in (first, second)]
+    models = [_model_of(record) for record in (first, second)]
     low, high = max(model.range[0] for model in models), min(model.range[1] for model in models)
     if high - low < _LEAST:
         ranges = " and ".join(f"{model.range[0]:.1f} to {model.range[1]:.1f} degC" for model in models)
         raise RecordError(f"cannot compare laws over {ranges}; expected ranges that share {_LEAST:g} K or more")
     both = all(model.gyro is not None for model in models)
-    kinds = [_list_laws(model, both) for model in models]
+    whole_ones = all(isinstance(model, ThermalModel) for model in models)
+    kinds = [_list_laws(model, both, accelerometers=whole_ones) for model in models]
+    if not kinds[0]:
+        raise RecordError("cannot compare a record of rest ramps with one without gyroscopes: they share no parameter")
     terms = [[laws.terms[group] for _, _, laws, group in each] for each in kinds]
     counts = [max(pair) for pair in zip(*terms, strict=True)]
     low, high = np.ceil(10 * low) / 10, np.floor(10 * high) / 10
@@ -313,7 +328,7 @@ def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Cal
 
 def on_line(record: Calibration) -> OnLine:
     """Return the values of a record's laws at the temperatures `ON_LINE` within its range."""
-    model = thermal_of(record).model
+    model = _model_of(record)
     about, laws = model.reference_temperature, _list_laws(model, model.gyro is not None)
     if model.gyro is not None and model.gyro.scale == "turns":
         laws.append(("gyro_scale_factor", AXES, model.gyro_laws, 1))
@@ -324,7 +339,8 @@ def on_line(record: Calibration) -> OnLine:
     named = tuple(f"{kind}_{axis}" for kind, axes, _, _ in laws for axis in axes)
     begun = tuple(f"{name}_" for name in named)  # powers, knots, and what a spline's value and slopes are at T0
     coefficients = frozenset(name for name in record.parameters if name in named or name.startswith(begun))
-    knots = *(model.knots or ()), *((model.gyro and model.gyro.knots) or ())
+    own_knots = model.knots if isinstance(model, ThermalModel) else None
+    knots = *(own_knots or ()), *((model.gyro and model.gyro.knots) or ())
     return OnLine(
         values.parameters,
         ("reference_temperature", about.unit),
@@ -335,18 +351,27 @@ def on_line(record: Calibration) -> OnLine:
     )
 
 
-def _list_laws(model: ThermalModel, gyroscopes: bool) -> list[Kind]:
+def _model_of(record: Calibration) -> RampModel:
+    """Return the model of a record, that of rest ramps without accelerometers."""
+    return gyros_of(record).model if is_ramp(record) else thermal_of(record).model
+
+
+def _list_laws(model: RampModel, gyroscopes: bool, *, accelerometers: bool = True) -> list[Kind]:
     """Return the kinds of parameters that follow the temperature."""
     kinds: list[Kind] = []
-    kinds += [(kind, axes, model.laws, group) for group, (kind, axes) in enumerate(GROUPS)]
+    if accelerometers and isinstance(model, ThermalModel):
+        kinds += [(kind, axes, model.laws, group) for group, (kind, axes) in enumerate(GROUPS)]
     return [*kinds, ("gyro_bias", AXES, model.gyro_laws, 0)] if gyroscopes else kinds
 
 
 def _evaluate_at(record: Calibration, laws: list[Kind], nodes: list[Array]) -> Calibration:
     """Return a record with the values of these laws at temperatures of each, degC, in place of coefficients."""
-    sections, names = thermal_of(record), record.covariance.names
-    fit, turn_on, freedom = sections.fit, sections.fit.between_recordings, record.fit.get("degrees_of_freedom")
-    scatters = {"bias": (turn_on.bias, turn_on.rank), "scale_factor": (turn_on.scale_factor, turn_on.rank)}
+    sections, names = gyros_of(record), record.covariance.names
+    fit, freedom = sections.fit, record.fit.get("degrees_of_freedom")
+    scatters = {}
+    if not is_ramp(record):
+        turn_on = thermal_of(record).fit.between_recordings
+        scatters = {"bias": (turn_on.bias, turn_on.rank), "scale_factor": (turn_on.scale_factor, turn_on.rank)}
     if fit.gyro is not None:
         scatters["gyro_bias"] = fit.gyro.between_recordings.bias, fit.gyro.between_recordings.rank
     rows, values, labels, units = [], [], [], []
@@ -395,6 +420,7 @@ def at_temperature(record: Calibration, temperature: float | None, name: str) ->
         The recording has no temperature, or one outside the record's range; or the record does not know the scatter
         between power cycles.
     """
+    refuse_ramp(record, "a prior of accelerometers")
     thermal = thermal_of(record)
     between = thermal.fit.between_recordings
     temperature = _check_in_range(record, temperature, name)
@@ -440,15 +466,15 @@ def gyros_at_temperature(record: Calibration, temperature: float | None, name: s
     RecordError
         The recording has no temperature, or one outside the record's range; or the record holds no scale factors.
     """
-    gyro = thermal_of(record).model.gyro
+    gyro = gyros_of(record).model.gyro
     if gyro is None or gyro.scale == "nominal":
         raise RecordError(
             "prior: a thermal record without scale factors of gyroscopes; expected one of thermal fit --with gyro from "
             "tumbles whose turns tell them"
         )
     at = np.array([_check_in_range(record, temperature, name)])
-    about = thermal_of(record).model.reference_temperature.value
-    low, high = thermal_of(record).model.range
+    about = gyros_of(record).model.reference_temperature.value
+    low, high = gyros_of(record).model.range
     laws = Laws(low, high, (gyro.degrees.scale_factor, 0, 0))
     labels = [f"gyro_scale_factor_{axis}" for axis in AXES]
     plain = [*MISALIGNMENTS, *(SENSITIVITIES if gyro.g_sensitivity else ())]
@@ -482,7 +508,7 @@ def gyros_at_temperature(record: Calibration, temperature: float | None, name: s
 
 def _check_in_range(record: Calibration, temperature: float | None, name: str) -> float:
     """Return the temperature of a recording if it has one within the record's range; else raise RecordError."""
-    low, high = thermal_of(record).model.range
+    low, high = gyros_of(record).model.range
     if temperature is None:
         raise RecordError(
             f"{name}: no column temperature; a thermal record is a prior at the temperature of the recording"

@@ -17,7 +17,15 @@ from imulab.procedures.thermal.record import (
     predict_gyro_scale,
     predict_parameters,
 )
-from imulab.procedures.thermal.schema import DegreesTried, LeftOutTemperature, ThermalRecord, thermal_of
+from imulab.procedures.thermal.schema import (
+    DegreesTried,
+    LeftOutTemperature,
+    RampRecord,
+    ThermalRecord,
+    gyros_of,
+    is_ramp,
+    thermal_of,
+)
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.parameters import ReadingUnit, parameters_table, reading_unit, rows_of, small_text, small_unit
@@ -162,7 +170,7 @@ def _alone_points(
 
 def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[str, str]], list[Figure]]:
     """Return the facts and figures of the gyroscopes of a record over temperatures, degC."""
-    thermal = thermal_of(record)
+    thermal = gyros_of(record)
     fit, data = thermal.fit.gyro, thermal.data.gyro
     assert fit is not None
     assert data is not None
@@ -206,7 +214,7 @@ def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[s
 
 def _steady_means(record: Calibration) -> Alone | None:
     """Return the mean bias of each recording that stayed at its temperature, deg/s; None where there are none."""
-    data = thermal_of(record).data.gyro
+    data = gyros_of(record).data.gyro
     assert data is not None
     steady = np.array(data.rate) == 0
     names, index = np.unique(np.array(data.recording)[steady], return_inverse=True)
@@ -255,6 +263,8 @@ _READ = (
 
 def exhibits(record: Calibration) -> Exhibits:
     """Return the figures and tables of a record."""
+    if is_ramp(record):
+        return _ramp_exhibits(record, gyros_of(record))
     thermal = thermal_of(record)
     low, high = thermal.model.range
     temperature = np.linspace(low, high, _POINTS)
@@ -292,6 +302,21 @@ def exhibits(record: Calibration) -> Exhibits:
     return Exhibits(headline, facts, items)
 
 
+def _ramp_exhibits(record: Calibration, ramp: RampRecord) -> Exhibits:
+    """Return the figures and tables of a record of rest ramps."""
+    low, high = ramp.model.range
+    temperature = np.linspace(low, high, _POINTS)
+    u, laws = predict_gyro_bias(record, temperature)[1], ramp.model.gyro_laws
+    kind = f"a spline with {len(laws.knots)} knots" if laws.knots else f"degree {laws.degrees[0]}"
+    headline = (
+        f"{low:.0f} to {high:.0f} degC at rest, biases of gyroscopes of {kind}, known to "
+        f"{small_text(float(u.max()), 'rad/s', 2)} or better; scale factors are not told."
+    )
+    facts, items = gyro_exhibits(record, temperature)
+    facts.append(("not told", "scale factors, misalignments, g-sensitivities; accelerometers"))
+    return Exhibits(headline, facts, [_coefficients_table(record), *items])
+
+
 def _lag_and_loop_facts(thermal: ThermalRecord) -> list[tuple[str, str]]:
     """Return lag and loops as facts, where they are observable."""
     fit, facts = thermal.fit, []
@@ -316,8 +341,11 @@ def _left_out_text(rows: Sequence[LeftOutTemperature], unit: str) -> str:
 def _coefficients_table(record: Calibration) -> ReportTable:
     """Return the coefficients of all laws."""
     reference = record.model["reference_temperature"]["value"]
-    model = thermal_of(record).model
-    splines = [("bias_x", model.knots), ("gyro_bias_x", None if model.gyro is None else model.gyro.knots)]
+    model = gyros_of(record).model
+    splines = [
+        ("bias_x", None if is_ramp(record) else thermal_of(record).model.knots),
+        ("gyro_bias_x", None if model.gyro is None else model.gyro.knots),
+    ]
     at_knots = [
         f" Of a spline, {name}_at_1 ... are the values at {', '.join(f'{knot:.4g}' for knot in knots)} degC."
         for name, knots in splines

@@ -44,6 +44,7 @@ from imulab.procedures.thermal.holds import (
     read_sides,
 )
 from imulab.procedures.thermal.model import GROUPS, Laws, forces
+from imulab.procedures.thermal.ramp import are_rest_ramps, fit_ramps
 from imulab.procedures.thermal.record import make_record, with_gyroscopes
 from imulab.procedures.thermal.solve import ThermalProblem, ThermalSolution
 from imulab.quantities import in_si
@@ -104,6 +105,7 @@ def fit_thermal(
 
     Minimises ``sum_p w_p (|f(M_p, T_p)| - g)^2`` over the holds of all recordings, each parameter a polynomial of the
     temperature; holds in which the temperature drifts and nothing is moved add that they share one direction.
+    Recordings of gyroscopes at rest, without accelerometers or too few for these, give the gyroscopes' biases alone.
 
     Parameters
     ----------
@@ -152,11 +154,12 @@ def fit_thermal(
     >>> fit.calibration.model["degrees"]["bias"]
     3
     """
-    items = _as_list(data)
     further = parse_further(with_, "with_")
     wanted, spline = parse_laws(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
     settling = None if settle is None else in_si(settle, "settle", "time", "s")
-    as_read = [as_recording(item, reading, fit_thermal, clock=OWN_CLOCKS) for item in items]
+    as_read = [as_recording(item, reading, fit_thermal, clock=OWN_CLOCKS) for item in _as_list(data)]
+    if prior is None and are_rest_ramps(as_read):
+        return _fit_ramps(as_read, wanted, spline, gyro_turn_on_scatter, settling, temperature_column, latitude)
     recordings = prepare_recordings([one_clock(each, "accel") for each in as_read], temperature_column, settling)
     gyroscopes = _gyroscopes(as_read, recordings, temperature_column, settling) if further else recordings
     earth = at_latitude(latitude) if further else None
@@ -195,6 +198,30 @@ def fit_thermal(
     if further:
         record = _with_gyroscopes(record, holds, problem, choice.solution, scale, wanted, spline, rates, name, earth)
     return ThermalFit(record, choice.view, tuple(choice.steps), tuple(choice.left_out))
+
+
+def _fit_ramps(
+    as_read: Sequence[Recording],
+    wanted: str | Degrees,
+    spline: bool,
+    turn_on_scatter: float | str | None,
+    settling: float | None,
+    temperature_column: str | None,
+    latitude: Latitude,
+) -> ThermalFit:
+    """Return the fit of recordings at rest, which tell the gyroscopes' biases alone."""
+    recordings = [own_clock(each, "gyro") for each in as_read]
+    recordings = prepare_recordings(recordings, temperature_column, settling, sensor="gyro")
+    earth, tau = at_latitude(latitude), _read_gyro_scatter(turn_on_scatter, ("gyro",))
+    options = {
+        "degrees": wanted if isinstance(wanted, str) else ["spline" if spline else wanted[0]],
+        "latitude": None if earth is None else earth.latitude,
+        "gyro_turn_on_scatter": tau,
+        "temperature_column": temperature_column,
+        "settle": settling,
+    }
+    record, view = fit_ramps(recordings, wanted, spline, tau, _drop_unstated(options), earth)
+    return ThermalFit(record, view, (), ())
 
 
 def _gyroscopes(

@@ -142,6 +142,8 @@ class RatesAtRest:
         Notes on samples and holds that were left out.
     earth
         The Earth's rate, where the latitude is known.
+    slow
+        Covariance of the means by slow noise on each axis, (rad/s)^2, shape (3, n, n); None where it is not known.
     """
 
     mean: Array
@@ -158,6 +160,7 @@ class RatesAtRest:
     size: Array
     notes: tuple[str, ...]
     earth: EarthRate | None = None
+    slow: Array | None = None
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -168,6 +171,7 @@ class RatesAtRest:
             self.mean[kept], self.covariance[kept], self.force[kept], self.temperature[kept], self.rate[kept],
             self.step[kept], self.shared[kept], self.recording[kept], self.attitude[kept], self.index[kept],
             self.unit, self.size, self.notes, self.earth,
+            None if self.slow is None else self.slow[:, kept][:, :, kept],
         )  # fmt: skip
 
 
@@ -543,6 +547,8 @@ def linearise_rates(held: RatesAtRest, laws: Laws, coefficients: Array, free: tu
     jacobian = np.hstack([jacobian, drift.reshape(3 * n, 4)[:, list(free)]])
     noise = np.zeros((n, 3, n, 3))
     noise[range(n), :, range(n), :] = held.covariance
+    if held.slow is not None:
+        noise[:, range(3), :, range(3)] += held.slow
     number = np.where(held.shared, held.recording, int(held.recording.max()) + 1 + np.arange(n))
     heat = _columns_by_row(number) * (slope * held.step[:, None]).ravel()[:, None]
     known, earth = model_earth_rate(held.force, held.attitude, held.earth)

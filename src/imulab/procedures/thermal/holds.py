@@ -214,7 +214,7 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
         attitudes.append(at_rest)
         cuts += stretches
         owner += [number] * len(stretches)
-        steps += [_reading_uncertainty(temperature)] * len(stretches)
+        steps += [reading_uncertainty(temperature)] * len(stretches)
     recording = np.array(owner)
     attitude = np.array([cut.attitude for cut in cuts])
     group, shared = np.full(len(cuts), -1), np.ones(len(cuts), dtype=np.bool_)
@@ -357,7 +357,7 @@ def pool_covariance(cuts: Sequence[Cut]) -> Array:
     return shrunk
 
 
-def _reading_uncertainty(temperature: Array) -> float:
+def reading_uncertainty(temperature: Array) -> float:
     """Return the standard uncertainty of a thermometer by the step of its readings, K: step / sqrt(12)."""
     values = np.unique(np.round(temperature, 6))
     digits = next((k for k in range(6) if np.array_equal(np.round(values, k), values)), 6)
@@ -400,7 +400,12 @@ _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
 def prepare_recordings(
-    recordings: Sequence[Recording], column: str | None, settle: float | None, *, span: float = LEAST_SPAN
+    recordings: Sequence[Recording],
+    column: str | None,
+    settle: float | None,
+    *,
+    span: float = LEAST_SPAN,
+    sensor: str = "accel",
 ) -> list[Recording]:
     """Return recordings with a column temperature that spans `span` K, without their settling time.
 
@@ -412,7 +417,7 @@ def prepare_recordings(
         The settling time is less than 0.
     """
     with_temperature = [_choose_temperature(recording, column) for recording in recordings]
-    _check_together(with_temperature)
+    _check_together(with_temperature, sensor)
     for recording in with_temperature:
         _check_temperature(recording)
     with_temperature = _note_constant(with_temperature)
@@ -426,7 +431,7 @@ def prepare_recordings(
         )
         raise DataError(
             f"{where}: column temperature: spans {high - low:.1f} K ({low:.1f} to {high:.1f} degC); expected at least "
-            f"{span:g} K: imulab tumble fit calibrates at one temperature"
+            f"{span:g} K: imulab {'tumble' if sensor == 'accel' else 'noise'} fit is for one temperature"
         )
     return [_skip_settling(recording, settle) for recording in with_temperature]
 
@@ -468,20 +473,20 @@ def _use_temperature(recording: Recording, column: str) -> Recording:
     return recording.with_columns({"temperature": recording.column(column)}, {"temperature": recording.units[column]})
 
 
-def _check_together(recordings: Sequence[Recording]) -> None:
+def _check_together(recordings: Sequence[Recording], sensor: str) -> None:
     """Refuse recordings of two units, with outputs in two units, or with rows that another has too."""
     first = recordings[0]
     if apart := different_units(*((r.name, r.metadata) for r in recordings), keys=("serial", "element")):
         raise DataError(f"{apart}; expected recordings of one unit")
     earlier: list[tuple[str, NDArray[np.uint64]]] = []
     for recording in recordings:
-        unit, other = first.triad_unit("accel"), recording.triad_unit("accel")
+        unit, other = first.triad_unit(sensor), recording.triad_unit(sensor)
         if unit != other:
             raise DataError(
-                f"{recording.name}: columns accel_x accel_y accel_z are in {other}, but in {unit} in {first.name}; "
+                f"{recording.name}: columns {' '.join(triad(sensor))} are in {other}, but in {unit} in {first.name}; "
                 "expected one unit"
             )
-        row_marks = np.sort(_hash_rows(recording))
+        row_marks = np.sort(_hash_rows(recording, sensor))
         for before, marks in earlier:
             if np.array_equal(row_marks, marks):
                 raise DataError(f"{recording.name}: the same recording as {before}, which would count twice")
@@ -502,10 +507,10 @@ def _shared_rows(marks: NDArray[np.uint64], other: NDArray[np.uint64]) -> float:
     return float((other[np.searchsorted(other, few).clip(max=len(other) - 1)] == few).mean())
 
 
-def _hash_rows(recording: Recording) -> NDArray[np.uint64]:
+def _hash_rows(recording: Recording, sensor: str) -> NDArray[np.uint64]:
     """Return a hash of each row of outputs, shape (n,)."""
     hashes = np.zeros(len(recording), dtype=np.uint64)
-    for name in triad("accel"):
+    for name in triad(sensor):
         bits = np.ascontiguousarray(recording.column(name), dtype=np.float64).view(np.uint64)
         hashes = (hashes ^ bits ^ (bits >> np.uint64(29))) * _MIX
         hashes ^= hashes >> np.uint64(32)

@@ -142,7 +142,7 @@ class ThermalProcedure(Procedure):
 
         return tables_of(record)
 
-    def laws(self, record: Calibration) -> AccelerometerLaws:
+    def laws(self, record: Calibration) -> AccelerometerLaws | None:
         from imulab.procedures.thermal.device import accelerometer_laws
 
         return accelerometer_laws(record)

@@ -48,6 +48,7 @@ from imulab.procedures.thermal.schema import (
     ThermalModel,
     ThermalSummary,
     TurnOn,
+    gyros_of,
     thermal_of,
 )
 from imulab.procedures.thermal.solve import (
@@ -402,9 +403,10 @@ def with_gyroscopes(
 ) -> Calibration:
     """Return the record with the gyroscopes' laws, taken as independent of the accelerometers' ones."""
     gyros = gyros if turned is None else rescale_gyroscopes(gyros, turned)
+    gravity = record.model["gravity"]["value"] if gyros.sensitivity else 1.0  # rest ramps have neither
     laws = gyros.solution.laws
     names, units = names_and_units(laws, sensitivity=gyros.sensitivity)
-    matrix, n = _gyro_to_si(gyros, record.model["gravity"]["value"]), gyros.count
+    matrix, n = _gyro_to_si(gyros, gravity), gyros.count
     coefficients, covariance = gyros.solution.coefficients[:n], gyros.solution.covariance[:n, :n]
     freedom = [gyros.solution.degrees_of_freedom(row) for row in matrix]
     if turned is not None:
@@ -609,7 +611,7 @@ def predict_gyro_bias(record: Calibration, temperature: Array) -> tuple[Array, A
 
 def _predict_gyro(record: Calibration, group: int, kind: str, temperature: Array) -> tuple[Array, Array]:
     """Return one kind of parameters over temperature and their standard uncertainties, SI, shapes (3, n)."""
-    model = thermal_of(record).model
+    model = gyros_of(record).model
     laws = model.gyro_laws
     functions = laws.recorded(group, temperature, model.reference_temperature.value)
     by_axis = [evaluate_law(record, laws.named(group, f"{kind}_{axis}"), functions) for axis in AXES]

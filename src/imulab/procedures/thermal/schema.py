@@ -50,23 +50,12 @@ class ThermalGyroModel(Part):
     scale: Literal["nominal", "turns"]
 
 
-class ThermalModel(Part):
-    """``model``; the range of temperature and the knots of the bias in degC, None where it is a polynomial."""
+class RampModel(Part):
+    """``model`` of rest ramps, and what the whole model has of gyroscopes; the range of temperature in degC."""
 
-    order: int
-    degrees: LawDegrees
-    knots: list[float] | None = None
     range: Annotated[list[float], 2]
     reference_temperature: Quantity
-    gravity: StatedGravity
-    output_unit: str
-    gauge: str
     gyro: ThermalGyroModel | None = None
-
-    @property
-    def laws(self) -> Laws:
-        """The laws of the accelerometers."""
-        return Laws(self.range[0], self.range[1], self.degrees.each, tuple(self.knots or ()))
 
     @property
     def gyro_laws(self) -> Laws:
@@ -74,6 +63,22 @@ class ThermalModel(Part):
         assert self.gyro is not None
         degrees = self.gyro.degrees.bias, self.gyro.degrees.scale_factor, 0
         return Laws(self.range[0], self.range[1], degrees, tuple(self.gyro.knots or ()))
+
+
+class ThermalModel(RampModel):
+    """``model``; the knots of the bias in degC, None where it is a polynomial."""
+
+    order: int
+    degrees: LawDegrees
+    knots: list[float] | None = None
+    gravity: StatedGravity
+    output_unit: str
+    gauge: str
+
+    @property
+    def laws(self) -> Laws:
+        """The laws of the accelerometers."""
+        return Laws(self.range[0], self.range[1], self.degrees.each, tuple(self.knots or ()))
 
 
 class LeftOutTemperature(Part):
@@ -154,7 +159,17 @@ class ThermalGyroSummary(Part):
     turns: GyroTurns | None = None
 
 
-class ThermalSummary(Part):
+class RampSummary(Part):
+    """``fit`` of rest ramps, and what the whole model has of gyroscopes.
+
+    `not_told` lists the parameters that such a test cannot show, of a whole test None.
+    """
+
+    not_told: list[str] | None = None
+    gyro: ThermalGyroSummary | None = None
+
+
+class ThermalSummary(RampSummary):
     """``fit``."""
 
     recordings: int
@@ -172,7 +187,6 @@ class ThermalSummary(Part):
     loop_x: TestedEffect | None = null()
     loop_y: TestedEffect | None = null()
     loop_z: TestedEffect | None = null()
-    gyro: ThermalGyroSummary | None = None
 
 
 class HoldResiduals(Part):
@@ -213,12 +227,25 @@ class OwnCalibrations(Part):
     standard_uncertainty: PerCalibration[Nine[float]]
 
 
-class ThermalEvidence(Part):
+class RampEvidence(Part):
+    """``data`` of rest ramps, and what the whole model has of gyroscopes."""
+
+    gyro: GyroHoldResiduals | None = None
+
+
+class ThermalEvidence(RampEvidence):
     """``data``."""
 
     holds: HoldResiduals
     calibrations: OwnCalibrations | None = None
-    gyro: GyroHoldResiduals | None = None
+
+
+class RampRecord(Part):
+    """What records of rest ramps, without accelerometers, and whole thermal records have in common."""
+
+    model: RampModel
+    fit: RampSummary
+    data: RampEvidence
 
 
 class ThermalRecord(Part):
@@ -231,16 +258,17 @@ class ThermalRecord(Part):
 
 def check(record: Calibration) -> None:
     """Check the sections of a record as it is read from its file; raises RecordError."""
-    thermal = part(record, ThermalRecord)
+    thermal = gyros_of(record) if is_ramp(record) else thermal_of(record)
     low, high = thermal.model.range
     if not low < high:
         raise RecordError(f"model.range: expected two temperatures in rising order, found {low:g} and {high:g}")
-    _check_knots(thermal.model, thermal.model, "model")
+    if isinstance(thermal.model, ThermalModel):
+        _check_knots(thermal.model, thermal.model, "model")
     if thermal.model.gyro is not None:
         _check_knots(thermal.model, thermal.model.gyro, "model.gyro")
 
 
-def _check_knots(model: ThermalModel, triad: ThermalModel | ThermalGyroModel, where: str) -> None:
+def _check_knots(model: RampModel, triad: ThermalModel | ThermalGyroModel, where: str) -> None:
     """Refuse knots of a triad's biases that are no temperatures in rising order over the range."""
     (low, high), knots = model.range, triad.knots
     if knots is None:
@@ -257,3 +285,22 @@ def _check_knots(model: ThermalModel, triad: ThermalModel | ThermalGyroModel, wh
 def thermal_of(record: Calibration) -> ThermalRecord:
     """Return the sections of a record; raises RecordError for a wrong part, for a missing one when it is asked for."""
     return part(record, ThermalRecord)
+
+
+def gyros_of(record: Calibration) -> RampRecord:
+    """Return the sections of a record as far as they are of gyroscopes; errors as for `thermal_of`."""
+    return part(record, RampRecord)
+
+
+def is_ramp(record: Calibration) -> bool:
+    """Return whether a record is of rest ramps, which tell the gyroscopes' biases alone."""
+    return gyros_of(record).fit.not_told is not None
+
+
+def refuse_ramp(record: Calibration, purpose: str) -> None:
+    """Raise RecordError for a record of rest ramps, which is not enough for a purpose, such as ``a prior``."""
+    if is_ramp(record):
+        raise RecordError(
+            f"the thermal record is of rest ramps, which tell no scale factors and no accelerometers: it is not enough "
+            f"for {purpose}; expected one of tumbles over temperature"
+        )

@@ -1,0 +1,211 @@
+"""Rest ramps: the biases of gyroscopes over temperature without a turn, from the fit to what a unit and autopilots do.
+
+The simulator is `tests.reference.rest_ramp`, which shares nothing with the fit.
+"""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.reference.rest_ramp import Ramp
+
+import imulab as il
+from imulab.errors import DataError, RecordError
+
+AXES = "xyz"
+
+
+def recorded(ramp: Ramp, unit: str = "deg/s", **metadata: str) -> il.Recording:
+    columns = {"time": ramp.time, **{f"gyro_{a}": ramp.output[:, k] for k, a in enumerate(AXES)}}
+    columns["temperature"] = ramp.reading
+    units = {"time": "s", **{f"gyro_{a}": unit for a in AXES}, "temperature": "degC"}
+    return il.Recording(columns=columns, units=units, metadata=metadata, name="ramp.csv")
+
+
+@cache
+def fitted(seed: int = 3) -> il.ThermalFit:
+    return il.fit_thermal(recorded(Ramp(seed)))
+
+
+def laws(record: il.Calibration, temperature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the laws of a record by powers of T - T0, deg/s, and their uncertainties, shapes (n, 3)."""
+    offset = temperature - record.model["reference_temperature"]["value"]
+    values, spread = [], []
+    for axis in AXES:
+        names = [n for n in record.covariance.names if n.startswith(f"gyro_bias_{axis}")]
+        powers = np.vander(offset, len(names), increasing=True)
+        values.append(powers @ [record.value(n) for n in names])
+        spread.append(np.sqrt(np.einsum("ni,ij,nj->n", powers, record.cov(*names), powers)))
+    return np.degrees(np.array(values).T), np.degrees(np.array(spread).T)
+
+
+def shares(seeds: range, **form: object) -> tuple[float, float]:
+    """Return in which share intervals hold the biases over temperature, and in which a lag is found."""
+    inside, lags = [], []
+    for seed in seeds:
+        ramp = Ramp(seed, **form)  # type: ignore[arg-type]
+        record = il.fit_thermal(recorded(ramp), degrees="3,0,0").calibration
+        at = np.linspace(*record.model["range"], 9)
+        values, u = laws(record, at)
+        inside.append(np.abs(values - ramp.bias(at)) < 1.96 * u)
+        lag = record.fit["gyro"]["lag"]
+        lags.append(lag is not None and lag["fitted"])
+    return float(np.mean(inside)), float(np.mean(lags))
+
+
+def test_record_names_what_is_told_and_what_is_not() -> None:
+    record = fitted().calibration
+    assert record.procedure == "thermal"
+    assert {f"gyro_bias_{a}" for a in AXES} <= set(record.parameters)
+    assert all(name.startswith("gyro_bias") for name in record.parameters)
+    assert record.parameters["gyro_bias_x_t1"].unit == "rad/s/K"
+    assert {"gyro_scale_factor_x", "bias_z", "scale_factor_y", "gyro_g_sensitivity_xx"} <= set(record.fit["not_told"])
+    assert any("scale factors" in w and "not told" in w for w in record.warnings)
+
+
+def test_f18_within_uncertainty() -> None:
+    rng = np.random.default_rng(111)
+    time = np.arange(9000) / 10
+    read = 12 + 35 * (1 - np.exp(-time / 400))
+    d = read - 25
+    law = np.array([0.3, -0.5, 0.1]) + np.outer(d, [0.02, -0.011, 0.03]) + np.outer(d**2, [2e-4, 0, -1e-4])
+    columns = {"time": time, "temperature": read}
+    columns |= dict(zip(("gyro_x", "gyro_y", "gyro_z"), (law + 0.07 * rng.standard_normal((9000, 3))).T, strict=True))
+    units = {"time": "s", "temperature": "degC", **{f"gyro_{a}": "deg/s" for a in AXES}}
+    record = il.fit_thermal(il.Recording(columns=columns, units=units, metadata={}, name="f18")).calibration
+    values, u = laws(record, np.array([25.0, 24.9, 25.1]))
+    assert (np.abs(values[0] - [0.3, -0.5, 0.1]) < 2 * u[0]).all()
+    assert u.max() < 0.006  # the Earth's rate, 0.0024 deg/s on an axis, and little more
+    assert np.abs((values[2] - values[1]) / 0.2 - [0.02, -0.011, 0.03]).max() < 1e-3
+
+
+def test_correction_by_record_blob_and_c_agree(tmp_path: Path) -> None:
+    ramp = Ramp(3)
+    record = fitted().calibration
+    (blob,) = il.export("blob", record, tmp_path)
+    by_record, by_blob = (il.apply(each, recorded(ramp)) for each in (record, str(blob)))
+    values, _ = laws(record, np.clip(ramp.reading, *record.model["range"]))
+    for k, axis in enumerate(AXES):
+        got = by_record.column(f"gyro_{axis}")
+        np.testing.assert_allclose(got, ramp.output[:, k] - values[:, k], atol=1e-9)
+        np.testing.assert_allclose(by_blob.column(f"gyro_{axis}"), got, atol=2e-5)  # single precision
+
+
+def test_autopilots_get_the_gyroscopes_alone(tmp_path: Path) -> None:
+    record = fitted().calibration
+    at = np.linspace(*record.model["range"], 7)
+    values, _ = laws(record, at)
+    (px4,) = il.export("px4", record, tmp_path)
+    rows = dict(line.split("\t")[2:4] for line in px4.read_text().splitlines() if not line.startswith("#"))
+    assert not any("ACC" in name or "TC_A" in name for name in rows)
+    powers = np.vander(at - float(rows["TC_G0_TREF"]), 4, increasing=True)
+    for k, axis in enumerate("XYZ"):
+        held = [float(rows[f"CAL_GYRO0_{axis}OFF"]), *(float(rows[f"TC_G0_X{p}_{k}"]) for p in (1, 2, 3))]
+        np.testing.assert_allclose(np.degrees(powers @ held), values[:, k], atol=2e-6)
+    (ardupilot,) = il.export("ardupilot", record, tmp_path)
+    rows = dict(line.split(",") for line in ardupilot.read_text().splitlines() if not line.startswith("#"))
+    assert not any("ACC" in name for name in rows)
+    powers = np.vander(at - 35.0, 4, increasing=True)[:, 1:]
+    about = np.vander([float(rows["INS_GYR1_CALTEMP"]) - 35.0], 4, increasing=True)[:, 1:]
+    for k, axis in enumerate("XYZ"):
+        held = 1e-6 * np.array([float(rows[f"INS_TCAL1_GYR{p}_{axis}"]) for p in (1, 2, 3)])
+        whole = (powers - about) @ held + float(rows[f"INS_GYROFFS_{axis}"])
+        np.testing.assert_allclose(np.degrees(whole), values[:, k], atol=2e-6)
+
+
+def test_record_is_read_shown_and_compared(tmp_path: Path) -> None:
+    record = fitted().calibration
+    record.save(tmp_path / "r.json")
+    again = il.load(tmp_path / "r.json")
+    assert again.parameters == record.parameters
+    il.write_report(again, tmp_path / "r.html")
+    assert "not told" in (tmp_path / "r.html").read_text()
+    other = fitted(4).calibration
+    assert il.compare_records(record, other) is not None
+
+
+def test_accelerometers_beside_do_not_matter() -> None:
+    (made,) = il.simulate_thermal([0, 40], attitudes=0, ramps=1, gyro=True, duration="20 min")
+    record = il.fit_thermal(made).calibration
+    alone = replace(
+        made,
+        columns={n: v for n, v in made.columns.items() if "accel" not in n},
+        units={n: v for n, v in made.units.items() if "accel" not in n},
+    )
+    assert record.parameters == il.fit_thermal(alone).calibration.parameters
+
+
+def test_lag_of_a_ramp_up_and_down_is_named() -> None:
+    record = il.fit_thermal(recorded(Ramp(1, back=True, lag=60.0)), degrees="3,0,0").calibration
+    assert record.fit["gyro"]["lag"]["value"] == pytest.approx(60.0, abs=15.0)
+    assert any("those of" in w and "s before" in w for w in record.warnings)
+
+
+def test_one_way_says_what_a_lag_would_cost() -> None:
+    assert any("usual lag of 20 s" in w for w in fitted().calibration.warnings)
+
+
+def test_gap_is_noted_and_bridged() -> None:
+    recording = recorded(Ramp(3))
+    kept = (recording.si("time") < 300) | (recording.si("time") > 500)
+    holed = replace(recording, columns={n: v[kept] for n, v in recording.columns.items()})
+    record = il.fit_thermal(holed).calibration
+    assert any("gaps" in w and "too few samples" in w for w in record.warnings)
+    at = np.linspace(*record.model["range"], 5)
+    values, u = laws(record, at)
+    assert (np.abs(values - Ramp(3).bias(at)) < 4 * u).all()
+
+
+def test_refusals_by_name() -> None:
+    ramp = Ramp(3)
+    turned = Ramp(3)
+    turned.output = turned.output + 40 * np.sin(turned.time / 7)[:, None]
+    with pytest.raises(DataError, match="at rest"):
+        il.fit_thermal(recorded(turned))
+    without = recorded(ramp)
+    without = replace(without, columns={n: v for n, v in without.columns.items() if n != "temperature"},
+                      units={n: v for n, v in without.units.items() if n != "temperature"})  # fmt: skip
+    with pytest.raises(DataError, match="no column temperature"):
+        il.fit_thermal(without)
+    narrow = Ramp(3)
+    narrow.reading = 20 + 0.1 * narrow.reading
+    with pytest.raises(DataError, match="expected at least 10 K: imulab noise fit"):
+        il.fit_thermal(recorded(narrow))
+    with pytest.raises(DataError, match="are in count, and a unit at rest does not tell its scale"):
+        il.fit_thermal(recorded(ramp, "count"))
+    loud = il.fit_thermal(recorded(ramp, "rad/s")) if np.degrees(np.abs(ramp.output).max()) < 60 else None
+    assert loud is None or loud.calibration.verdict.state == "bad"
+
+
+def test_no_prior_and_no_check_by_a_record_of_rest_ramps() -> None:
+    record = fitted().calibration
+    tumble = il.simulate_tumble()
+    with pytest.raises(RecordError, match="rest ramps"):
+        il.fit_tumble(tumble, prior=record)
+    with pytest.raises(RecordError, match="rest ramps"):
+        il.check_thermal(record, recorded(Ramp(3)))
+
+
+def test_intervals_hold_one_way(reduced: bool) -> None:
+    share, _ = shares(range(6 if reduced else 100))
+    assert (0.8 if reduced else 0.92) < share <= 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("form", "found"),
+    [
+        ({}, None),
+        ({"back": True}, (0.0, 0.02)),
+        ({"back": True, "lag": 20.0}, (0.2, 1.0)),
+        ({"back": True, "loop": 0.05}, None),
+    ],
+)
+def test_intervals_hold_in_a_thousand(
+    form: dict[str, object], found: tuple[float, float] | None, reduced: bool
+) -> None:
+    share, lag = shares(range(40 if reduced else 250), **form)
+    assert (0.90 if reduced else 0.93) <= share <= (0.995 if reduced else 0.97)
+    assert found is None or found[0] <= lag <= found[1]
