@@ -499,3 +499,43 @@ def test_the_restricted_likelihood_is_that_of_what_the_design_cannot_change():
     ]
     logs = restricted_log_likelihood(matrices, design, values)
     np.testing.assert_allclose(np.diff(logs), np.diff(expected), rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_one_problem_is_solved_as_by_scipy_from_a_start_that_is_far_too(seed):
+    """Exponentials with noise: from far away the plain Gauss-Newton step goes astray."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 4.0, 60)
+    truth = np.array([2.0, 0.7, -1.0, 3.0]) * rng.uniform(0.7, 1.3, 4)
+    weights = rng.uniform(0.5, 2.0, len(t)) / 0.02**2
+    weights[::7] = 0.0
+
+    def model(p):
+        first, second = np.exp(-p[1] * t), np.exp(-p[3] * t)
+        jacobian = np.column_stack([first, -t * p[0] * first, second, -t * p[2] * second])
+        return p[0] * first + p[2] * second - measured, jacobian
+
+    measured = 0.0
+    measured = model(truth)[0] + 0.02 * rng.standard_normal(len(t))
+    root = np.sqrt(weights)
+    start = truth * np.array([0.3, 2.0, 3.0, 0.6])
+    expected = optimize.least_squares(lambda p: root * model(p)[0], start, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    fit = least_squares(model, start, weights)
+    assert fit.converged[0]
+    cost = float(np.sum(weights * model(fit.parameters[0])[0] ** 2))
+    assert cost <= 2 * expected.cost * (1 + 1e-9)
+    pairs = (sorted(p.reshape(2, 2).tolist(), key=lambda pair: pair[1]) for p in (fit.parameters[0], expected.x))
+    np.testing.assert_allclose(*pairs, rtol=1e-5)  # either exponential may come first
+
+
+def test_a_problem_that_leads_out_of_its_domain_or_nowhere_is_not_called_solved():
+    def leaves(p):
+        return np.array([np.log(p[0]) + 20.0, 0.0]), np.array([[1 / p[0]], [0.0]])
+
+    fit = least_squares(leaves, np.array([5.0]), np.ones(2))
+    assert fit.converged[0]
+    assert fit.parameters[0, 0] == pytest.approx(np.exp(-20.0), rel=1e-6)
+    assert not least_squares(lambda p: (np.full(2, np.nan), np.ones((2, 1))), np.zeros(1), np.ones(2)).converged[0]
+    far = least_squares(leaves, np.array([5.0]), np.ones(2), max_evaluations=3)
+    assert not far.converged[0]
+    assert far.iterations[0] == 3

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import imulab as il
 from imulab.cli import main
 from imulab.procedures.thermal.degrees import choose_laws, number_temperatures, predict_left_out, split_temperatures
-from imulab.procedures.thermal.model import Laws
+from imulab.procedures.thermal.model import Laws, cardinal_spline
 from imulab.procedures.thermal.record import predict_parameters
 from imulab.procedures.thermal.solve import solve
 from reference import thermal as reference
@@ -300,3 +301,15 @@ def test_auto_on_rough_laws_and_kinks(reduced):
         if count >= 7:
             _, spline, auto = worst("kink", count, attitudes, trials, turn_on)
             assert auto <= 1.3 * spline
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 9])
+def test_cardinal_splines_are_scipys_natural_ones_beyond_the_knots_too(count):
+    rng = np.random.default_rng(count)
+    knots = np.cumsum(rng.uniform(4.0, 20.0, count)) - 40
+    expected = CubicSpline(knots, np.eye(count), bc_type="natural")
+    at = np.concatenate([knots, rng.uniform(knots[0] - 10, knots[-1] + 10, 60)])
+    spline = cardinal_spline(tuple(knots.tolist()))
+    for derivative in (0, 1):
+        np.testing.assert_allclose(spline(at, derivative), expected(at, derivative), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(spline.coefficients, expected.c[::-1], rtol=1e-11, atol=1e-14)

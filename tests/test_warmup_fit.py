@@ -4,13 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import minimize
 from scipy.stats import binom
 
 import imulab as il
 from imulab import simulate_power_cycle
 from imulab.errors import DataError
 from imulab.procedures.warmup.cycles import find_power_cycle, make_curves
-from imulab.procedures.warmup.model import coefficient_covariance, evaluate, solve, statistics
+from imulab.procedures.warmup.model import (
+    _nelder_mead,
+    _pchip_slopes,
+    coefficient_covariance,
+    evaluate,
+    solve,
+    statistics,
+)
 from imulab.procedures.warmup.simulate import warmup_truth
 from imulab.recording import Recording
 from reference import warmup as reference
@@ -336,3 +345,27 @@ def test_intervals_of_the_curve_cover(reduced, slow_noise):
     apart = total // len(times)
     fewest, most = binom.interval(1 - 1e-4, apart, 0.95)
     assert fewest / apart <= inside / total <= most / apart
+
+
+@pytest.mark.parametrize("count", [3, 5, 8])
+def test_slopes_at_knots_are_those_of_scipys_monotone_cubics(count):
+    rng = np.random.default_rng(count)
+    for _ in range(50):
+        knots = np.cumsum(rng.uniform(0.5, 9.0, count))
+        values = np.round(rng.standard_normal((count, 3, 2)), 1)  # rounded, so that neighbours are alike at times
+        expected = PchipInterpolator(knots, values, axis=0).derivative()(knots)
+        np.testing.assert_allclose(_pchip_slopes(knots, values), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_simplex_goes_where_scipys_goes(count):
+    rng = np.random.default_rng(count)
+
+    def valley(p):
+        return float((100 * (p[1:] - p[:-1] ** 2) ** 2).sum() + ((1 - p) ** 2).sum())
+
+    for _ in range(10):
+        simplex = rng.standard_normal((count + 1, count))
+        options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-9, "maxiter": 200}
+        expected = minimize(valley, simplex[0], method="Nelder-Mead", options=options).x
+        np.testing.assert_allclose(_nelder_mead(valley, simplex.copy(), 1e-3, 1e-9), expected, rtol=1e-9)

@@ -13,8 +13,9 @@ Source: start-up zero error compensation of MEMS inertial instruments (patent re
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -305,6 +306,7 @@ _CLOSEST = 1.6
 """Least factor between neighbouring time constants: the data do not separate closer ones."""
 SCALE_LIMIT = 3.0
 """Longest time scale that is tried, in units of T_M."""
+_MOST_SIMPLEXES = 200
 _PASSES = 3  # times that cycles are carried to their knot along the slopes of the amplitudes
 _WORST_CONDITION = 1e8  # beyond it exponentials are the same function
 _SHRINK = 2.0
@@ -497,13 +499,27 @@ def amplitude_slopes(knots: Array, amplitudes: Array, constants: Sequence[float]
 
 
 def _pchip_slopes(knots: Array, values: Array) -> Array:
-    if len(knots) == 2:
-        secant = (values[1] - values[0]) / (knots[1] - knots[0])
-        return np.stack([secant, secant])
-    from scipy.interpolate import PchipInterpolator
+    """Return the slopes at knots (k,) of the monotone cubics through values (k, ...) (PCHIP), shape of the values.
 
-    slopes: Array = PchipInterpolator(knots, values, axis=0).derivative()(knots)
-    return slopes
+    A weighted harmonic mean of the secants beside a knot, 0 where they have two signs (F. N. Fritsch and J. Butland,
+    SIAM J. Sci. Stat. Comput. 5 (1984) 300); at the ends a parabola's slope, kept monotone (C. Moler, Numerical
+    Computing with MATLAB, 3.6).
+    """
+    step = np.diff(knots).reshape(-1, *[1] * (values.ndim - 1))
+    secant = np.diff(values, axis=0) / step
+    if len(knots) == 2:
+        return np.concatenate([secant, secant])
+    left, right = 2 * step[1:] + step[:-1], step[1:] + 2 * step[:-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = (left + right) / (left / secant[:-1] + right / secant[1:])
+    inner = np.where(secant[:-1] * secant[1:] > 0, mean, 0.0)
+    ends = []
+    for near, far in ((0, 1), (-1, -2)):
+        own, other = secant[near], secant[far]
+        slope = ((2 * step[near] + step[far]) * own - step[near] * other) / (step[near] + step[far])
+        beyond = (np.sign(own) != np.sign(other)) & (np.abs(slope) > 3 * np.abs(own))
+        ends.append(np.where(np.sign(slope) != np.sign(own), 0.0, np.where(beyond, 3 * own, slope))[None])
+    return np.concatenate([ends[0], inner, ends[1]])
 
 
 def find_scales(
@@ -514,8 +530,6 @@ def find_scales(
     Each temperature and axis has its own coefficients; axes are weighted by their size and noise. Nelder-Mead in the
     logarithms, over at most 3 numbers.
     """
-    from scipy.optimize import minimize
-
     member = (curves.group[:, None] == np.arange(len(curves.temperatures))).astype(np.float64) * weights[:, None]
     member = member[:, member.any(axis=0)]
     size = (weights @ statistics(curves, "knot-cubic", ()).square) / max(
@@ -547,14 +561,41 @@ def find_scales(
         step, tolerance = 0.4, 1e-3
     else:
         first, step, tolerance = np.log(np.array(start)), 0.1, 3e-3
-    simplex = np.vstack([first, first + step * np.eye(count)])
-    minimum = minimize(
-        cost,
-        first,
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": tolerance, "fatol": 1e-9 * abs(cost(first)), "maxiter": 200},
-    )
-    return tuple(np.exp(np.sort(minimum.x)).tolist())
+    best = _nelder_mead(cost, np.vstack([first, first + step * np.eye(count)]), tolerance, 1e-9 * abs(cost(first)))
+    return tuple(np.exp(np.sort(best)).tolist())
+
+
+def _nelder_mead(cost: Callable[[Array], float], simplex: Array, near: float, alike: float) -> Array:
+    """Return the minimum that a simplex (n + 1, n) closes in on, to `near` in place and `alike` in cost.
+
+    J. C. Lagarias et al., SIAM J. Optim. 9 (1998) 112, as scipy has it, which takes as long to load as the fit takes.
+    """
+    costs = np.array([cost(corner) for corner in simplex])
+    for _ in range(_MOST_SIMPLEXES):
+        order = np.argsort(costs)
+        simplex, costs = simplex[order], costs[order]
+        if np.abs(simplex[1:] - simplex[0]).max() <= near and np.abs(costs[1:] - costs[0]).max() <= alike:
+            break
+        middle = simplex[:-1].mean(axis=0)
+
+        def along(share: float, middle: Array = middle, worst: Array = simplex[-1]) -> tuple[float, Array]:
+            place = middle + share * (middle - worst)
+            return cost(place), place
+
+        tried = along(1.0)
+        if tried[0] < costs[0]:
+            tried = min(tried, along(2.0), key=itemgetter(0))
+        elif tried[0] >= costs[-2]:
+            outside = tried[0] < costs[-1]
+            nearer = along(0.5 if outside else -0.5)
+            worse = nearer[0] > tried[0] if outside else nearer[0] >= costs[-1]
+            if worse:
+                simplex = simplex[0] + 0.5 * (simplex - simplex[0])
+                costs = np.array([costs[0], *(cost(corner) for corner in simplex[1:])])
+                continue
+            tried = nearer
+        costs[-1], simplex[-1] = tried
+    return np.asarray(simplex[np.argmin(costs)])
 
 
 def coefficients_of(curves: Curves, table: WarmupTable) -> Array:
