@@ -19,7 +19,7 @@ def flicker(count: int, rng: np.random.Generator) -> np.ndarray:
 class Ramp:
     """One unit and one recording; sizes in deg/s are drawn over decades, as sensors differ by these."""
 
-    def __init__(self, seed: int, *, back: bool = False, lag: float = 0.0, loop: float = 0.0) -> None:
+    def __init__(self, seed: int, *, back: bool = False, lag: float = 0.0, loop: float = 0.0, noise: int = 0) -> None:
         rng = np.random.default_rng(seed)
         count = int(RATE * LENGTH)
         self.time = np.arange(count) / RATE
@@ -30,6 +30,8 @@ class Ramp:
         self.low, self.high = self.temperature.min(), self.temperature.max()
         self.law = rng.standard_normal((4, 3)) * np.array([[1.0], [0.02], [2e-4], [2e-6]])
         white, slow, walk = 0.07, np.exp(rng.uniform(*np.log([5e-4, 2e-2]))), np.exp(rng.uniform(*np.log([2e-5, 1e-3])))
+        if noise:  # the same unit, another run
+            rng = np.random.default_rng([seed, noise])
         before = self.temperature - lag * np.gradient(self.temperature, self.time)
         way = np.sign(np.gradient(self.temperature, self.time))
         place = (2 * self.temperature - self.low - self.high) / (self.high - self.low)

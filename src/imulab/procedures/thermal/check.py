@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.display import Finding, Note
-from imulab.errors import DataError, OptionError, RecordError, UnitError
+from imulab.display import Note
+from imulab.errors import OptionError, RecordError, UnitError
 from imulab.estimation.decisions import THERMAL_CHECK
-from imulab.gravity import EarthRate, Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
+from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
 from imulab.options import FURTHER_TRIADS, measure, text
 from imulab.procedures.result import (
     Record,
@@ -28,152 +27,21 @@ from imulab.procedures.result import (
     probability_fact,
     probability_text,
 )
+from imulab.procedures.thermal.check_gyro import GyroCheck, check_gyros, gyro_figure, select_in_range, warn_known
+from imulab.procedures.thermal.check_ramp import RampCheck, check_ramp
 from imulab.procedures.thermal.degrees import within_and_between
-from imulab.procedures.thermal.figures import axis_groups
-from imulab.procedures.thermal.gyro import RatesAtRest, leave_out_turns, linearise_rates, note_turns, rates_at_rest
 from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepare_recordings
 from imulab.procedures.thermal.model import AXES, Laws, forces
-from imulab.procedures.thermal.record import laws_in_g, names_and_units, predict_gyro_scale
-from imulab.procedures.thermal.schema import refuse_ramp, thermal_of
+from imulab.procedures.thermal.record import laws_in_g
+from imulab.procedures.thermal.schema import is_ramp, thermal_of
 from imulab.procedures.thermal.solve import ThermalProblem, linearise, row_covariance
 from imulab.quantities import in_si
 from imulab.recording import Array, Data, Reading, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.sections import StatedGravity, entries
 from imulab.report.parameters import micro_g, text_in
-from imulab.report.traces import Exhibits, Figure, figure_axis, points, table, within_and_beyond
-from imulab.units import conversion_factor, from_si, parse_unit, to_si
-
-# The gyroscopes: their outputs at rest under the record's laws.
-
-
-_UNSAID = (
-    "the record does not say how far the gyroscopes' biases move from one power cycle to the next, so an offset that a "
-    "whole recording has in common is not tested: state --gyro-turn-on-scatter"
-)
-
-
-@dataclass(frozen=True)
-class GyroCheck:
-    """How well the gyroscopes' laws still hold.
-
-    Attributes
-    ----------
-    holds
-        Index of each tested hold among those of the check, shape (n,).
-    residuals, standard_uncertainty
-        Law less output of each hold and axis, rad/s, shape (n, 3).
-    within, between
-        Probabilities as in `ThermalCheck`.
-    """
-
-    holds: NDArray[np.int64]
-    residuals: Array
-    standard_uncertainty: Array
-    within: float | None
-    between: float | None
-
-    @property
-    def worst(self) -> tuple[int, int]:
-        """Index of the tested hold, and axis, whose output is farthest off."""
-        row, axis = np.unravel_index(int(np.argmax(np.abs(self.residuals))), self.residuals.shape)
-        return int(row), int(axis)
-
-
-def check_gyros(
-    record: Calibration,
-    holds: Holds,
-    force: Array,
-    turn_on_scatter: float | str | None,
-    earth: EarthRate | None = None,
-) -> tuple[GyroCheck | None, list[str]]:
-    """Return the test of the outputs at rest under specific forces in g, shape (n, 3), and its notes.
-
-    None where the record or the recordings have no gyroscopes.
-
-    Raises
-    ------
-    UnitError
-        The gyroscopes are in another unit than those of the record.
-    OptionError
-        The scatter is below 0.
-    """
-    model = thermal_of(record).model
-    if model.gyro is None:
-        return None, []
-    lacking = [recording.name for recording in holds.recordings if any(name not in recording for name in triad("gyro"))]
-    if lacking or any(recording.time is None for recording in holds.recordings):
-        which = (
-            lacking[0] if lacking else next(recording.name for recording in holds.recordings if recording.time is None)
-        )
-        return None, [
-            Note(f"{which}: no columns gyro_x gyro_y gyro_z over time, so the record's gyroscopes are not tested")
-        ]
-    tau, rank = _gyro_scatter(record, turn_on_scatter)
-    fit = thermal_of(record).fit.gyro
-    assert fit is not None
-    # Without a latitude the record's g-sensitivities hold the vertical part, which must not be subtracted twice.
-    known = earth if fit.latitude is not None or not model.gyro.g_sensitivity else None
-    laws = model.gyro_laws
-    try:
-        held, aside = leave_out_turns(replace(_rates_by_record(record, holds, force), earth=known), laws)
-    except DataError as error:  # faulty gyroscopes do not keep accelerometers from being tested
-        return None, [Finding(f"gyroscopes not tested: {error}", "check the columns gyro_x gyro_y gyro_z")]
-    names, _ = names_and_units(laws, sensitivity=model.gyro.g_sensitivity)
-    size = 3 * laws.terms[0]
-    factor = np.eye(len(names)) / model.gravity.value
-    factor[:size, :size] = laws.to_powers()[:size, :size]
-    inverse = np.linalg.inv(factor)
-    coefficients = inverse @ np.array([record.value(name) for name in names])
-    covariance = inverse @ record.cov(*names) @ inverse.T
-    rows = linearise_rates(held, laws, coefficients, ())
-    excess = fit.excess.value**2
-    noise = row_covariance(rows, excess, np.zeros(2))
-    whole = row_covariance(rows, excess, np.array([tau or 0.0, 0.0])) + rows.jacobian @ covariance @ rows.jacobian.T
-    within, between = within_and_between(rows, whole, noise, np.zeros((len(whole), 0)), rank, by_share=False)
-    residual, u = (each.reshape(-1, 3) for each in (rows.residual, np.sqrt(np.diag(whole))))
-    notes = [*held.notes, *note_turns(holds, aside), *([_UNSAID] if tau is None else [])]
-    return GyroCheck(held.index, residual, u, within, between), notes
-
-
-def _rates_by_record(record: Calibration, holds: Holds, force: Array) -> RatesAtRest:
-    """Return the rates at rest by the record's scale factors at each temperature."""
-    gyro = thermal_of(record).model.gyro
-    assert gyro is not None
-    of_rate = parse_unit(gyro.output_unit).quantity == "rate"
-    for recording in holds.recordings:
-        unit = recording.triad_unit("gyro")
-        if unit != gyro.output_unit and not (of_rate and parse_unit(unit).quantity == "rate"):
-            raise UnitError(
-                f"{recording.name}: columns gyro_x gyro_y gyro_z are in {unit}, but the record calibrates outputs in "
-                f"{gyro.output_unit}"
-            )
-    if gyro.scale == "nominal":
-        return rates_at_rest(holds, force, np.ones(3))
-    middle = np.array([record.model["reference_temperature"]["value"]])
-    nominal = predict_gyro_scale(record, middle)[0][:, 0]
-    size = to_si(nominal, gyro.output_unit) if of_rate else nominal
-    held = rates_at_rest(holds, force, size)
-    part = (nominal[:, None] / predict_gyro_scale(record, held.temperature)[0]).T
-    covariance = held.covariance * part[:, :, None] * part[:, None, :]
-    return replace(held, mean=held.mean * part, covariance=covariance)
-
-
-def _gyro_scatter(record: Calibration, stated: float | str | None) -> tuple[float | None, int | None]:
-    """Return the scatter of biases between power cycles, rad/s, and the rank of its estimate; None where unknown."""
-    if stated is not None:
-        tau = in_si(stated, "gyro_turn_on_scatter", "rate", "deg/s")
-        if not 0 <= tau < np.inf:
-            raise OptionError(f"gyro_turn_on_scatter {stated!r}: expected 0 or more")
-        return tau, 0
-    fit = thermal_of(record).fit.gyro
-    assert fit is not None
-    between = fit.between_recordings
-    if between.from_ == "unknown":
-        return None, None
-    least = 0.0 if between.resolution is None else between.resolution.value
-    return float(np.hypot(between.bias.value, least)), between.rank
-
+from imulab.report.traces import Exhibits, figure_axis, points, table, within_and_beyond
+from imulab.units import conversion_factor, from_si
 
 # The result.
 
@@ -360,23 +228,7 @@ class ThermalCheck(RecordCheck):
         )
         facts = [*((name, probability_fact(p)) for name, p in tests.items())]
         facts.append(("largest |f| − g", f"{_micro_text(self.residuals[self.worst])} µg"))
-        return self.exhibits_with(facts, [figure, *([_gyro_figure(self, gyro)] if gyro else []), holds])
-
-
-def _gyro_figure(check: ThermalCheck, gyro: GyroCheck) -> Figure:
-    """Return law less output of each hold and axis over temperature."""
-    residual, reach = from_si(gyro.residuals, "deg/h"), _BEYOND_RANGE * from_si(gyro.standard_uncertainty, "deg/h")
-    return points(
-        "The gyroscopes at rest under the record, over temperature",
-        "Bars: twice the standard uncertainty, from laws, power cycle, temperature, Earth's rate and noise.",
-        ("temperature, degC", np.repeat(check.holds.temperature[gyro.holds], len(AXES))),
-        (figure_axis("law less output, deg/h", zeroline=True), residual.ravel()),
-        reach.ravel(),
-        axis_groups(len(residual)),
-        size=7,
-        message=f"{int((np.abs(residual) > reach).sum())} of {residual.size} outputs lie beyond twice the standard "
-        "uncertainty.",
-    )
+        return self.exhibits_with(facts, [figure, *([gyro_figure(self.holds, gyro)] if gyro else []), holds])
 
 
 def _micro_text(value: float, sign: str = "+") -> str:
@@ -386,9 +238,6 @@ def _micro_text(value: float, sign: str = "+") -> str:
 
 
 # The test.
-
-
-_BEYOND = 1.0  # K outside the record's range, up to which its laws are taken to hold
 
 
 def check_thermal(
@@ -405,7 +254,7 @@ def check_thermal(
     settle: Annotated[float | str | None, measure("time", "s")] = None,
     temperature_column: Annotated[str | None, text("NAME")] = None,
     **reading: Unpack[Reading],
-) -> ThermalCheck:
+) -> ThermalCheck | RampCheck:
     """Test whether new recordings contradict a record over temperature, without refitting.
 
     ``r' V^-1 r`` with r the residuals ``|f| - g`` under the record and V the covariance from noise, laws, temperature
@@ -457,15 +306,13 @@ def check_thermal(
     held = as_record(record, "check_thermal")
     if held.procedure != "thermal":
         raise RecordError(f"a {held.procedure} record cannot be checked over temperature; expected a thermal record")
-    refuse_ramp(held, "thermal check")
+    if is_ramp(held):
+        items = [as_recording(item, reading, check_thermal, clock="gyro") for item in _as_list(data)]
+        return check_ramp(held, items, gyro_turn_on_scatter, settle, temperature_column)
     largest = None if limit is None else in_si(limit, "limit", "acceleration", "mg")
     if largest is not None and not largest > 0:
         raise OptionError(f"limit {largest:g} m/s^2: expected more than 0")
-    single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
-    listed: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
-    recordings = [as_recording(item, reading, check_thermal, clock="accel") for item in listed]
-    if not recordings:
-        raise OptionError("check_thermal: data: expected one recording or more, found none")
+    recordings = [as_recording(item, reading, check_thermal, clock="accel") for item in _as_list(data)]
     column = temperature_column or held.options.get("temperature_column")
     recordings = prepare_recordings(
         [_convert_outputs(held, item) for item in recordings],
@@ -478,7 +325,7 @@ def check_thermal(
         raise OptionError("gyro_turn_on_scatter: the record holds no gyroscopes (thermal fit --with gyro)")
     earth = at_latitude(latitude) if has_gyroscopes else None
     local = _choose_gravity(held, at_place(gravity, latitude, height, beside=earth is not None), recordings[0])
-    holds, notes = _select_in_range(held, find_holds(recordings))
+    holds, notes = select_in_range(held, find_holds(recordings))
     unit = thermal_of(held).model.output_unit
     check_holds(holds, local.value, conversion_factor(unit, "m/s^2") if unit in ("m/s^2", "g", "mg") else None)
     leaning, tau = _tilt_and_scatter(tilt, turn_on_scatter, held, local.value)
@@ -491,8 +338,17 @@ def check_thermal(
         )
     gyro, gyro_notes = check_gyros(held, holds, force, gyro_turn_on_scatter, earth)
     notes += gyro_notes
-    notes += [*([local.note] if local.note else []), *_warn_known(held, recordings)]
+    notes += [*([local.note] if local.note else []), *warn_known(held, recordings)]
     return ThermalCheck(holds, *tested, local, largest, tuple(notes), gyro)
+
+
+def _as_list(data: Data | Sequence[Data]) -> list[Any]:
+    """Return the recordings as a list."""
+    single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
+    listed: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
+    if not listed:
+        raise OptionError("check_thermal: data: expected one recording or more, found none")
+    return listed
 
 
 def _convert_outputs(record: Calibration, recording: Recording) -> Recording:
@@ -537,51 +393,6 @@ def _tilt_and_scatter(
     if not 0 <= tau < np.inf:
         raise OptionError(f"turn_on_scatter {turn_on_scatter!r}: expected 0 or more")
     return leaning, tau
-
-
-def _select_in_range(record: Calibration, holds: Holds) -> tuple[Holds, list[str]]:
-    """Return the holds within the record's range of temperature, and a note on the others.
-
-    Raises
-    ------
-    DataError
-        None is.
-    """
-    low, high = record.model["range"]
-    kept = (holds.temperature >= low - _BEYOND) & (holds.temperature <= high + _BEYOND)
-    out = holds.temperature[~kept]
-    if not out.size:
-        return holds, []
-    where = f"{out.min():.1f} to {out.max():.1f} degC" if np.ptp(out) > 0.1 else f"{out.mean():.1f} degC"
-    if not kept.any():
-        raise DataError(
-            f"{holds.recordings[0].name}: all holds are at {where}, outside the {low:.1f} to {high:.1f} degC of the "
-            "record, which says nothing there"
-        )
-    columns = ("mean", "covariance", "temperature", "rate", "step", "shared", "recording", "group", "start", "stop")
-    chosen = {name: getattr(holds, name)[kept] for name in columns}
-    group = chosen["group"]
-    chosen["wander"] = holds.wander[np.ix_(kept, kept)]
-    chosen["group"] = np.where(group >= 0, np.searchsorted(np.unique(group[group >= 0]), group), -1)
-    note = Finding(
-        f"{(~kept).sum()} of {len(kept)} holds are at {where}, outside the {low:.1f} to {high:.1f} degC of the record, "
-        "which says nothing there: not tested",
-        "record holds within the range of the record",
-    )
-    return replace(holds, **chosen), [note]
-
-
-def _warn_known(record: Calibration, recordings: Sequence[Recording]) -> list[str]:
-    """Return a warning for each recording from which the record was made."""
-    sources = {source.sha256 for source in record.sources}
-    return [
-        Finding(
-            f"{each.name}: the record was made from this recording, which says nothing of whether it still holds",
-            "check with a fresh recording",
-        )
-        for each in recordings
-        if each.source is not None and each.source.sha256 in sources
-    ]
 
 
 def _run_tests(

@@ -107,7 +107,7 @@ def fit_ramps(
     up = np.tile([0.0, 0.0, 1.0], (len(holds), 1))  # the Earth's rate from anywhere is the same from all directions
     held = rates_at_rest(holds, up, np.ones(3))
     _check_rest(holds, len(held), name)
-    held = replace(held, earth=earth, slow=_slow_noise(holds, held.mean, held.index))
+    held = replace(held, earth=earth, slow=slow_noise(holds, held.mean, held.index))
     low, high = float(holds.temperature.min()), float(holds.temperature.max())
     # A single recording has no power cycle beside it, whose offset could look like a bend of the law.
     known = 0.0 if tau is None and len(recordings) == 1 else tau
@@ -198,7 +198,7 @@ def _average_temperature(recording: Recording, start: float, stop: float) -> tup
     return float(read.mean()), float(np.polyfit(here - here.mean(), read, 1)[0])
 
 
-def _slow_noise(holds: Holds, mean: Array, index: NDArray[np.int64]) -> Array:
+def slow_noise(holds: Holds, mean: Array, index: NDArray[np.int64]) -> Array:
     """Return the covariance of the parts' means by slow noise on each axis, shape (3, n, n); recordings share none."""
     slow = np.zeros((3, len(index), len(index)))
     number, middle = holds.recording[index], 0.5 * (holds.start + holds.stop)[index]
