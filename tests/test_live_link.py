@@ -83,7 +83,7 @@ class Watched:
         end = time.monotonic() + seconds
         while not case():
             assert time.monotonic() < end, (self.session.view(), self.events)
-            self.events += self.runner.step(0.02)
+            self.events += self.runner.step_or_ask(0.02)
 
     def hold(self, more: int) -> None:
         """Take so many attitudes more."""
@@ -290,3 +290,49 @@ def test_after_half_a_minute_a_record_is_made_of_what_there_is(enough, lines, tm
     assert (tmp_path / "rec.json").exists() == enough
     if not enough:
         assert "rec.csv keeps 3 attitudes: --resume goes on with it" in process.text
+
+
+def test_a_server_where_nobody_listens_yet_is_waited_for(lines, tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    watched = Watched(f"tcp:127.0.0.1:{port}", tmp_path)
+    why = f"nobody listens at tcp:127.0.0.1:{port} yet, trying again"
+    watched.until(watched.state("absent"))
+    assert watched.session.view().advice == why
+    assert watched.runner.kept() == "no sample came, so nothing is kept"
+    time.sleep(0.6)  # longer than silence is passed over in silence
+    watched.events += watched.runner.step(0.02)
+    assert [event.text for event in watched.events] == [why]  # it is said once
+    with socket.create_server(("127.0.0.1", port)) as server:
+        server.settimeout(20)
+        link = server.accept()[0]
+        sender = Sender(link.sendall, lines)
+        watched.hold(2)
+        sender.stop()
+        link.close()
+    watched.runner.close()
+
+
+@pytest.mark.parametrize("titles", [b"ms;p;q;r\n", b""], ids=["titles sent once", "none"])
+def test_the_guess_of_an_unknown_stream_is_taken_and_the_session_goes_on(recording, titles, tmp_path):
+    time_, force = recording.si("time"), recording.triad("accel")
+    rows = [b"%d;%.4f;%.4f;%.4f\n" % (1e3 * t, *f) for t, f in zip(time_, force / 9.81, strict=True)]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(20)
+        watched = Watched(f"tcp:127.0.0.1:{server.getsockname()[1]}", tmp_path)
+        link = server.accept()[0]
+        sender = Sender(link.sendall, [titles, *rows])
+        watched.until(lambda: watched.runner.asked)
+        assert watched.session.view().state == "unknown"
+        assert watched.events[-1].text.startswith(f"{watched.session.source}: unknown format")
+        watched.until(lambda: sender.sent > 2000)  # one looks at it for a while
+        watched.events += watched.runner.take_guess()
+        assert watched.session.view().samples > 500  # those before the question
+        watched.hold(3)
+        sender.stop()
+        link.close()
+    watched.runner.close()
+    kept = il.read(watched.path)
+    assert kept.units["accel_x"] == "g"
+    assert kept.si("time")[-1] - kept.si("time")[0] > 20

@@ -279,6 +279,26 @@ def test_nothing_of_a_stream_is_executed(live, new_page, tmp_path):
     assert "taken" not in page.title()
 
 
+def test_the_guess_of_an_unknown_stream_is_one_click(live, new_page):
+    recording = il.simulate_tumble(attitudes=40, order=1, gravity=9.81, hold="3 s", move="1 s", gyro=False)
+    values = zip(recording.si("time"), recording.triad("accel"), strict=True)
+    rows = [b"%d;%.4f;%.4f;%.4f\n" % (1e3 * time, *force) for time, force in values]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(20)
+        running = live(f"tcp:127.0.0.1:{server.getsockname()[1]}", "--attitudes", "12", *FIT, "--save", "rec.csv")
+        page = new_page(running.address)
+        link = server.accept()[0]
+        sender = Sender(link.sendall, [b"ms;p;q;r\n", *rows])  # titles that come once: another start would miss them
+        page.locator(".advice:text-is('Unknown format: look at the guess, and take it.')").wait_for()
+        assert "[columns]" in page.get_by_label("Layout").inner_text()
+        page.get_by_role("button", name="Read it so").click()
+        page.get_by_label("Layout").wait_for(state="detached")
+        page.get_by_role("button", name="Make the record").click()
+        page.wait_for_selector(".result")
+        sender.stop()
+        link.close()
+
+
 def test_an_unknown_stream_shows_its_lines_and_a_guess(live, new_page, tmp_path):
     rows = "".join(f"{10 * k},{k % 3},{4 - k % 3},{1000 + k % 5}\\n" for k in range(400))
     sender = subprocess.Popen(

@@ -149,7 +149,7 @@ def test_a_recording_that_is_there_is_not_overwritten(tmp_path, monkeypatch, cap
         (["simulate", "--save", "rec.csv", "--attitudes", "3"], "expected 4 to 200"),
         (["simulate", "--save", "rec.csv", "--attitudes", "9", "--target", "bias 1 mg"], "one or the other"),
         (["simulate", "--save", "rec.csv", "--order", "7"], "--order '7'"),
-        (["tcp:127.0.0.1:9", "--save", "rec.csv"], "nobody listens"),
+        (["tcp:no.such.host.invalid:9", "--save", "rec.csv"], "no machine of this name"),
         (["replay:none.csv", "--save", "rec.csv", "--plain"], "none.csv: no such file"),
         (["udp:5005", "--save", "rec.csv", "--layout", "none.toml"], "no such layout"),
     ],

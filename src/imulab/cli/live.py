@@ -394,8 +394,13 @@ def _draw_view(runner: Runner, *, typed: bool) -> None:
     with keys(wanted=typed) as usable, Live(auto_refresh=False, transient=True) as screen:
         drawn = 0.0
         while not runner.ended and not (runner.session.enough and not usable):
-            events = runner.step(_WAIT)
+            events = runner.step_or_ask(_WAIT) if usable else runner.step(_WAIT)
+            if (asked := runner.asked) is not None and asked.guess is not None and events:
+                for line in (*asked.lines, *asked.guess.toml.splitlines()):
+                    screen.console.print(f"  {line}", markup=False, highlight=False)
             key = pressed(usable)
+            if key == "g":
+                events += runner.take_guess()
             if key == "q":
                 break
             if key == "u":

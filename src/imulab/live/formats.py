@@ -310,6 +310,13 @@ class LineStream:
             if clock is not None:
                 clock.cut()
 
+    def begin_with(self, layout: Layout) -> list[Recording]:
+        """Return the recordings of an unknown stream's beginning, read so; what came since then is left out."""
+        self._layout = layout
+        blocks = self._begin()
+        self.cut()
+        return blocks
+
     @property
     def over(self) -> str:
         """Reason why nothing more of the stream can be read; empty while it can."""

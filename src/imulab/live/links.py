@@ -23,6 +23,10 @@ GONE = (OSError, TypeError, ValueError)
 """What reading a link raises once it is lost: the last two are pyserial's, of a port that is gone."""
 
 
+class AbsentError(ReadError):
+    """Nobody is at the other end of a link yet; who is expected there may come."""
+
+
 @dataclass(frozen=True)
 class Link:
     """An open link.
@@ -166,6 +170,9 @@ def tcp_link(rest: str) -> LinkKind:
     def opened() -> Link:
         try:
             server = _Server(address)
+        except (ConnectionRefusedError, TimeoutError) as error:
+            why = "nobody listens at" if isinstance(error, ConnectionRefusedError) else "no answer from"
+            raise AbsentError(f"{why} {name} yet, trying again") from None
         except OSError as error:
             raise ReadError(f"{name}: {_why_no_address(error)}") from None
         return Link(server.read, server.write, server.close)
@@ -240,10 +247,6 @@ def _why_no_address(error: OSError) -> str:
         return "the port is busy: another program listens there"
     if error.errno in (errno.EACCES, errno.EPERM):
         return "not permitted: ports below 1024 belong to the administrator; expected another"
-    if isinstance(error, ConnectionRefusedError):
-        return "nobody listens there: is the unit on, and is the port right?"
-    if isinstance(error, TimeoutError):
-        return f"no answer within {_OPENING:.0f} s: is the address right, and on the same network?"
     if isinstance(error, socket.gaierror):
         return "no machine of this name"
     return f"cannot be opened: {reason(error)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from io import BytesIO
@@ -14,11 +15,12 @@ import numpy as np
 from imulab.errors import OptionError, ReadError
 from imulab.files import replacing
 from imulab.gravity import Gravity
-from imulab.live.formats import LineStream
+from imulab.live.formats import LineStream, UnknownFormatError
 from imulab.live.session import Event, Session
 from imulab.live.sources import LiveSource
 from imulab.live.view import FurtherFits, Trouble, further_triads
 from imulab.readers import read_blocks
+from imulab.readers.layout import layout_of
 from imulab.recording import Array, Layout, Recording
 from imulab.units import from_si
 from imulab.writers import decimal_rows, write_csv_to
@@ -210,7 +212,13 @@ _BEFORE, _BEHIND = 1.0, 0.6
 
 
 class Runner:
-    """Passes samples from the source to the session and the recording."""
+    """Passes samples from the source to the session and the recording.
+
+    Attributes
+    ----------
+    asked
+        The refusal of an unknown stream whose layout was guessed, while `take_guess` may answer it.
+    """
 
     def __init__(
         self,
@@ -224,6 +232,7 @@ class Runner:
         self._stream = LineStream(source.name, layout, polled=source.polled, units=units)
         self._last_arrival = source.now()
         self._given_up = False
+        self.asked: UnknownFormatError | None = None
         self._further: FurtherFits | None = None
         self._fit_due = False
         session.source = source.name
@@ -273,6 +282,10 @@ class Runner:
             The stream is not one of an accelerometer triad.
         """
         arrived, now = self.source.get(wait), self.source.now()
+        if self.asked is not None:
+            if self.source.ended:
+                raise self.asked
+            return []
         self._stream.counts.unread_share = self.source.unread_share
         events = self._check_link(any(len(piece.data) for piece in arrived), now)
         for piece in arrived:
@@ -296,9 +309,32 @@ class Runner:
             self.source.turn_to(self.session.next)
         return events
 
+    def step_or_ask(self, wait: float) -> list[Event]:
+        """Do as `step`; of an unknown stream whose layout was guessed, wait for `take_guess`, and errors at its end."""
+        try:
+            return self.step(wait)
+        except UnknownFormatError as error:
+            if error.guess is None or self.source.ended:
+                raise
+            self.asked = error
+            advice = "unknown format: look at the guess, and take it"
+            self.session.trouble = Trouble("unknown", advice, "The session begins as soon as it is taken.")
+            return [Event("unknown", str(error).partition("; --layout")[0], self.recorder.last)]
+
+    def take_guess(self) -> list[Event]:
+        """Read an unknown stream by the layout that was guessed, from its beginning on; return what happened."""
+        if self.asked is None or self.asked.guess is None:
+            return []
+        layout = layout_of(tomllib.loads(self.asked.guess.toml), "the guess")
+        self.asked = self.session.trouble = None
+        self._last_arrival = self.source.now()
+        return self._take(self._stream.begin_with(layout), self._last_arrival)
+
     def kept(self) -> str:
         """Return a sentence on what the recording keeps of a session that ends before its record."""
         count = len(self.session.guide.kept)
+        if not self.recorder.rows:
+            return "no sample came, so nothing is kept"
         return f"{self.recorder.path} keeps {count} attitude{'s' * (count != 1)}: --resume goes on with it"
 
     def drop(self, number: int | None = None) -> list[Event]:
@@ -384,7 +420,13 @@ class Runner:
             self._stream.cut()
             return [Event("again", "samples come again" if session.begun else "samples come", self.recorder.last)]
         waited = now - self._last_arrival
+        if source.absent:
+            session.trouble = Trouble("absent", source.absent, "The session begins with the first sample.")
+            return [Event("absent", source.absent, self.recorder.last)] if before is None else []
         if source.ended or not (source.lost or before or waited >= _SILENT):
+            return []
+        if before is not None and before.state == "absent":  # it has come
+            self._last_arrival, session.trouble = now, None
             return []
         silence = f"nothing has come from {source.name} for"
         if session.begun and source.comes_back and waited >= _GIVEN_UP:

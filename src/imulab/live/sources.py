@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import OptionError, ReadError, listed
-from imulab.live.links import CHUNK, GONE, Link, LinkKind, reason, serial_link, tcp_link, udp_link
+from imulab.live.links import CHUNK, GONE, AbsentError, Link, LinkKind, reason, serial_link, tcp_link, udp_link
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.quantities import number, quantity, whole_number
 from imulab.recording import Array, Recording
@@ -226,6 +226,8 @@ class LiveSource:
         Whether nothing more will come.
     lost
         Why the link is lost, while it is; the reason of an unexpected end.
+    absent
+        Why there has been no link yet, where nobody is at its other end; empty otherwise.
     comes_back
         Whether a lost link is opened again.
     unread_share
@@ -236,6 +238,7 @@ class LiveSource:
 
     polled = by_hand = comes_back = False
     unread_share = 0.0
+    absent = ""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -266,6 +269,7 @@ class LiveSource:
 class Linked(LiveSource):
     """A unit at a link, which a thread reads and opens again where it is lost, and standard input.
 
+    A server where nobody listens yet is waited for.
     What waits to be handed on is bounded. Beyond that a sender that can be held back (a pipe, TCP) has to wait; bytes
     of any other are lost, and counted. No bytes, with a time, are handed on where a link is open again.
     """
@@ -273,7 +277,11 @@ class Linked(LiveSource):
     def __init__(self, kind: LinkKind, *, comes_back: bool = True) -> None:
         super().__init__(kind.name)
         self.polled, self.comes_back = kind.polled, comes_back
-        self._kind, self._link = kind, kind.open()
+        self._kind = kind
+        try:
+            self._link = kind.open()
+        except AbsentError as error:
+            self._link, self.absent = Link(lambda: b""), str(error)
         self._changed = threading.Condition()
         self._pieces: deque[Arrived] = deque()
         self._queued = self._taken = self._unread = 0
@@ -283,6 +291,8 @@ class Linked(LiveSource):
         self._thread.start()
 
     def _run(self) -> None:
+        if self.absent:
+            self._open_again()
         while not self._stop.is_set():
             try:
                 data = self._link.read()
@@ -307,7 +317,7 @@ class Linked(LiveSource):
             self._link.close()
         while not self._stop.wait(_AGAIN):
             with suppress(ReadError, OSError):
-                self._link, self.lost = self._kind.open(), ""
+                self._link, self.lost, self.absent = self._kind.open(), "", ""
                 self._put(Arrived(b"", time.monotonic()), 0)
                 return True
         return False

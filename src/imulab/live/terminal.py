@@ -18,7 +18,7 @@ from imulab.units import STANDARD_GRAVITY
 
 _COLOURS = {
     "waiting": "white", "moving": "yellow", "settling": "yellow", "still": "cyan", "accepted": "green",
-    "silent": "red", "lost": "red",
+    "absent": "yellow", "unknown": "yellow", "silent": "red", "lost": "red",
 }  # fmt: skip
 _ROWS, _COLUMNS = 9, 37  # of the sphere on the terminal
 _MILLI = 1e3  # to mg
@@ -183,6 +183,8 @@ def _keys(view: View, *, by_hand: bool) -> Text:
     named = (aside or [held.number for held in view.attitudes])[-1:]
     drop = f"u: drop attitude {named[0]}   " if named else ""
     turn = "n xyz XYZ: turn   " if by_hand else ""
+    if view.state == "unknown":
+        return Text("g: read it as guessed   Ctrl-C: stop", style="dim")
     return Text(f"{turn}{drop}q: finish, write record   Ctrl-C: stop", style="dim")
 
 

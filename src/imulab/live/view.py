@@ -58,7 +58,7 @@ class KnownUnit:
 
 @dataclass(frozen=True)
 class Trouble:
-    """Why no samples come: a state, ``silent`` or ``lost``, what to do, and what will happen, in words."""
+    """Why no samples come: a state, ``absent``, ``silent`` or ``lost``, what to do, and what will happen, in words."""
 
     state: str
     advice: str
@@ -74,7 +74,8 @@ class View:
     source, format
         Name of the stream's source, and its format.
     state
-        ``waiting``, ``moving``, ``settling``, ``still`` or ``accepted``; ``silent`` or ``lost`` while no samples come.
+        ``waiting``, ``moving``, ``settling``, ``still`` or ``accepted``; ``absent``, ``silent`` or ``lost`` while
+        no samples come.
     advice
         What to do now, in one sentence.
     outlook

@@ -14,12 +14,15 @@ Messages to the page, beside those of `parts`:
     `parameters` as above, `files` (`kind`, `name`, `href`) and `command`, which makes the same record.
 ``corrected``
     After that, ten times a second: `length`, `raw` and `gravity`, m/s², of the reading now.
+``unknown``
+    The stream has no known format: its first `lines`, and a layout, `guess`, that ``guess`` takes; none once it is.
 ``failed``
     The session has ended: `text` says why, `missing` what a record would need where that is the reason, `kept` what the
     recording keeps; `lines` are the first of an unknown stream, `guess` a layout for it.
 
 Messages from the page: ``drop`` (`attitude`: its number), ``turn`` (`up`: the direction of the body that a simulated
-unit is to have upward), ``place`` (`latitude` and `height`, or `gravity`, as texts), ``finish`` and ``quit``.
+unit is to have upward), ``place`` (`latitude` and `height`, or `gravity`, as texts), ``guess`` (read an unknown
+stream so), ``finish`` and ``quit``.
 """
 
 from __future__ import annotations
@@ -100,6 +103,7 @@ class GuidedPart(PagePart):
         self._place = place
         self._asked: SimpleQueue[Message] = SimpleQueue()
         self._view: Message = {}
+        self._unknown: Message = {}
         self._done: Message = {}
         self._failed: Message = {}
         self._events: deque[Message] = deque(maxlen=_EVENTS)
@@ -111,6 +115,7 @@ class GuidedPart(PagePart):
             "drop": self._drop,
             "turn": self._turn,
             "place": self._take_place,
+            "guess": self._asked.put,
             "finish": self._asked.put,
             "quit": lambda _: self._hub.stop(),
         }
@@ -123,7 +128,8 @@ class GuidedPart(PagePart):
 
     def greet(self) -> Iterable[Message]:
         """Yield the view, the latest events, and the end of the session if it has ended."""
-        return [message for message in (self._view, *tuple(self._events), self._done, self._failed) if message]
+        told = (self._view, *tuple(self._events), self._unknown, self._done, self._failed)
+        return [message for message in told if message]
 
     def end(self) -> None:
         """End the session; the recording is kept."""
@@ -173,7 +179,7 @@ class GuidedPart(PagePart):
         runner, last_shown = self._runner, 0.0
         self._phase, self._finish = "measuring", False
         while not (self._stop.is_set() or self._finish or runner.ended):
-            events = [*self._do_requests(), *runner.step(_WAIT)]
+            events = [*self._do_requests(), *runner.step_or_ask(_WAIT)]
             for event in events:
                 self._publish(event)
             if events or monotonic() - last_shown > _EVERY:
@@ -209,6 +215,10 @@ class GuidedPart(PagePart):
                 try:
                     if message["type"] == "turn":
                         self._runner.turn(message["up"])
+                    elif message["type"] == "guess":
+                        events += self._runner.take_guess()
+                        self._unknown = {}
+                        self._tell({"type": "unknown"})
                     elif message["type"] == "place":
                         events += self._runner.state_gravity(self._place(message["texts"]))
                     else:
@@ -222,6 +232,9 @@ class GuidedPart(PagePart):
         if event.kind != "state":
             self._events.append({"type": "event", **asdict(event)})
             self._tell(self._events[-1])
+        if event.kind == "unknown" and (error := self._runner.asked) is not None and error.guess is not None:
+            self._unknown = {"type": "unknown", "lines": list(error.lines), "guess": error.guess.toml}
+            self._tell(self._unknown)
 
     def _show(self) -> None:
         self._view = {

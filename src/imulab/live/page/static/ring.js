@@ -3,7 +3,7 @@
 import { put, s } from "./dom.js";
 
 const R = 42, ROUND = 2 * Math.PI * R;
-const SIGNS = { accepted: "✓", done: "✓", silent: "!", lost: "!", failed: "!", computing: "…", settling: "…" };
+const SIGNS = { accepted: "✓", done: "✓", silent: "!", lost: "!", failed: "!", computing: "…", settling: "…", absent: "…", unknown: "?" };
 
 export class Ring {
   constructor() {

@@ -38,6 +38,7 @@ export function mount(into, given) {
     h("div", { class: "say" }, parts.advice, parts.outlook, parts.enough),
     parts.toward = h("div", { class: "toward" }, parts.progress, parts.count, parts.loss,
       h("span", { class: "actions" }, parts.missing, soundButton(), voiceButton(() => parts.advice.textContent), parts.finish)));
+  parts.unknown = h("div", {});
   parts.knocked = h("div", { role: "alert" });
   parts.warnings = h("div", { role: "alert" });
   parts.next = bodyPlace("Next attitude");
@@ -65,7 +66,7 @@ export function mount(into, given) {
   const attitudes = h("section", {}, h("h2", {}, "Attitudes"), parts.attitudes);
   parts.known = h("section", {}, h("h2", {}, "Parameters"), parts.parameters);
   parts.later = [beside, attitudes];
-  place.append(parts.now, parts.knocked, parts.warnings, parts.place, result.place, beside, parts.strip.place, parts.facts, parts.known, attitudes,
+  place.append(parts.now, parts.unknown, parts.knocked, parts.warnings, parts.place, result.place, beside, parts.strip.place, parts.facts, parts.known, attitudes,
     h("details", {}, h("summary", {}, "What happened"), parts.log));
 }
 
@@ -78,6 +79,7 @@ export function hear(message) {
     result.done(message);
   }
   else if (message.type === "corrected") result.corrected(message);
+  else if (message.type === "unknown") parts.unknown.replaceChildren(...(message.guess ? [guess(message)] : []));
   else if (message.type === "failed") failed(message);
 }
 
@@ -261,18 +263,23 @@ function happened(event) {
 
 const pre = (label, text) => h("pre", { tabindex: 0, role: "region", "aria-label": label }, text);
 
+// The guess of an unknown stream's columns, which one click takes.
+const guess = ({ lines, guess: text }) => h("section", { class: "said note" },
+  h("p", {}, "This stream does not say what its columns are. A guess: ", h("button", { class: "main", onclick: () => page.send({ type: "guess" }) }, "Read it so")),
+  h("p", {}, "Its first lines:"), pre("Lines of the stream", lines.join("\n")), h("p", {}, "The guess:"), pre("Layout", text), savedLayout(text));
+const savedLayout = text => h("p", {}, "To change it, save it, and start again with it as the layout: ",
+  h("a", { class: "button", href: URL.createObjectURL(new Blob([text], { type: "application/toml" })), download: "layout.toml" }, "Save layout.toml"));
+
 // The session has ended: what it knew stays on the page.
 function failed(message) {
   page.end(sentence(message.missing ? `For a record it needs ${message.missing}` : message.text), "bad");
+  parts.unknown.replaceChildren();
   const below = [];
   if (message.kept) below.push(h("p", {}, `${message.kept}.`));
   if (message.missing) below.push(h("details", {}, h("summary", {}, "The reason in full"), h("p", {}, message.text)));
   if (message.lines.length) below.push(h("p", {}, "The first lines of the stream:"), pre("Lines of the stream", message.lines.join("\n")));
   if (message.guess) {
-    const file = new Blob([message.guess], { type: "application/toml" });
-    below.push(h("p", {}, "A guess of its columns; check it, save it as layout.toml, and add --layout layout.toml: ",
-      h("a", { class: "button", href: URL.createObjectURL(file), download: "layout.toml" }, "Save layout.toml")),
-      pre("Layout", message.guess));
+    below.push(h("p", {}, "A guess of its columns:"), pre("Layout", message.guess), savedLayout(message.guess));
   }
   if (below.length) parts.knocked.replaceChildren(h("section", {}, below));
   for (const part of [parts.toward, parts.outlook]) show(part, false);
