@@ -3,17 +3,14 @@
 import ast
 import math
 import re
-from functools import cache
-from pathlib import Path
 
 import pytest
 from scipy.stats import chi2, norm
 
-import imulab
 from imulab.estimation import decisions
 from imulab.estimation.decisions import MOST_FALSE_ALARMS, NINE_AXES, all_decisions, false_alarms
+from test_imports import source_modules
 
-SOURCE = Path(imulab.__file__).parent
 LEVEL = re.compile(r"(CHANCE|LEVEL|SIGNIFICANT|INSIGNIFICANT|PROBABILITY|FALSE_ALARM|UNLIKELY)$")
 NO_PROBABILITY = {
     "SAME_LEVEL",  # of arm rates, relative
@@ -22,9 +19,8 @@ NO_PROBABILITY = {
 USUAL_LEVELS = (0.05, 0.01, 0.005, 0.003, 0.001)
 
 
-@cache
 def modules():
-    return [(path, ast.parse(path.read_text())) for path in SOURCE.rglob("*.py") if path != Path(decisions.__file__)]
+    return [(name, tree) for name, tree in source_modules().items() if name != decisions.__name__]
 
 
 def test_each_decision_is_made_somewhere():
@@ -56,8 +52,8 @@ def numbers(tree):
 
 def test_no_other_module_has_a_level():
     elsewhere = [
-        f"{path.relative_to(SOURCE)}: {name}"
-        for path, tree in modules()
+        f"{module}: {name}"
+        for module, tree in modules()
         for name, _ in numbers(tree)
         if LEVEL.search(name) and name not in NO_PROBABILITY
     ]
@@ -79,13 +75,13 @@ def is_probability(node):
 
 def test_no_p_value_is_held_against_a_number_of_a_module():
     wrong = []
-    for path, tree in modules():
+    for module, tree in modules():
         own = {name for name, value in numbers(tree) if 0 < value < 1}
         for node in ast.walk(tree):
             if not isinstance(node, ast.Compare) or not any(map(is_probability, [node.left, *node.comparators])):
                 continue
             wrong += [
-                f"{path.relative_to(SOURCE)}:{node.lineno}: {ast.unparse(node)}"
+                f"{module}:{node.lineno}: {ast.unparse(node)}"
                 for side in [node.left, *node.comparators]
                 if (isinstance(side, ast.Name) and side.id in own)
                 or (isinstance(side, ast.Constant) and side.value in USUAL_LEVELS)

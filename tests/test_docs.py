@@ -90,7 +90,9 @@ def test_every_procedure_has_a_worked_example(page):
     assert page in [found.stem for found in PAGES]
 
 
-@pytest.mark.parametrize("name", PUBLIC)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "check_noise")) for name in PUBLIC]
+)
 def test_the_example_of_a_public_name_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (example,) = doctest.DocTestFinder(recurse=False).find(getattr(imulab, name), name)

@@ -235,8 +235,15 @@ def worst(line):
     return float(line.split("worst ")[1].split()[0])
 
 
-@pytest.mark.parametrize("name", ["gcc", "clang"])
-@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize(
+    ("name", "real"),
+    [
+        ("gcc", "double"),
+        ("clang", "float"),
+        pytest.param("gcc", "float", marks=pytest.mark.slow),
+        pytest.param("clang", "double", marks=pytest.mark.slow),
+    ],
+)
 def test_the_exported_self_test_passes(name, real, exported, tmp_path):
     if shutil.which(name) is None:
         pytest.skip(f"no {name} on this machine")

@@ -173,7 +173,7 @@ def test_every_target_is_tried():
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
-@pytest.mark.parametrize("name", ["block comment", "line ends"])
+@pytest.mark.parametrize("name", ["block comment", pytest.param("line ends", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("target", ["c", "fusion", "kalibr"])
 def test_a_hostile_unit_or_name_of_a_model_is_refused_or_says_nothing(target, name, plain, tmp_path):
     tried = 0

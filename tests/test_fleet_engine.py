@@ -60,6 +60,7 @@ def check_complete(folder, reference, untouched):
 # ---- processes of this machine -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_finished_by_the_next(fleet, reference, tmp_path):
     folder = tmp_path / "out"
     process = command("fleet", "run", fleet, "-o", folder, "--workers", 2)

@@ -217,7 +217,9 @@ def begun(fleet, folder, url):
     return process
 
 
-@pytest.mark.parametrize("lost", ["server", "connection", pytest.param("worker", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "lost", ["connection", *(pytest.param(lost, marks=pytest.mark.slow) for lost in ("server", "worker"))]
+)
 def test_what_is_lost_during_a_run_leaves_each_calibration_in_the_history_once(fleet, server, postgres, tmp_path, lost):
     folder = tmp_path / "out"
     process = begun(fleet, folder, postgres)

@@ -75,6 +75,7 @@ def line(tmp_path_factory):
     return folder, rows
 
 
+@pytest.mark.slow
 def test_each_record_is_the_single_commands_to_the_last_bit(line, monkeypatch):
     folder, rows = line
     monkeypatch.chdir(folder)

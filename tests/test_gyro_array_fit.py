@@ -344,6 +344,7 @@ def test_latency_is_found_to_a_fraction_of_a_sample_and_said(axes, reduced):
     assert np.sqrt(np.mean(np.square(scores))) < 1.6
 
 
+@pytest.mark.slow
 def test_scale_factors_are_right_in_spite_of_latency(reduced):
     trials = 8 if reduced else 25
     inside, errors = [], []

@@ -1,6 +1,7 @@
 """The rooms of the package: which module imports which, read from the source without importing any."""
 
 import ast
+import gc
 import graphlib
 from functools import cache
 from pathlib import Path
@@ -29,10 +30,15 @@ KNOWN_NAMES = {
 @cache
 def source_modules() -> dict[str, ast.Module]:
     found = {}
+    gc.disable()  # it would go through millions of nodes again and again, which holds up parsing more than twice
     for path in sorted((SOURCE / "imulab").rglob("*.py")):
         name = ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__")
         found[name] = ast.parse(path.read_text(encoding="utf-8"))
+    gc.enable()
     return found
+
+
+NAMING = (ast.Constant, ast.Import, ast.ImportFrom)
 
 
 def _imported(node: ast.AST) -> set[str]:
@@ -56,7 +62,7 @@ def arrows() -> dict[str, set[str]]:
     The face of the package hands names on, and is in nobody's way.
     """
     return {
-        name: set().union(*map(_imported, ast.walk(tree))) - {name}
+        name: set().union(*(_imported(node) for node in ast.walk(tree) if isinstance(node, NAMING))) - {name}
         for name, tree in source_modules().items()
         if name != "imulab"
     }

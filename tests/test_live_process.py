@@ -177,6 +177,7 @@ def test_the_magnetometers_follow_too_or_are_left_out_with_the_reason(tmp_path, 
     assert ("the magnetometers are not calibrated: rec.csv: column mag_x" in process.text) == dead
 
 
+@pytest.mark.slow
 def test_the_view_has_gyroscopes_and_magnetometers_while_the_session_lasts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     recording = tumble(18, gyro=True, field="48 uT")

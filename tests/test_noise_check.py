@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import binom
 
 import imulab as il
+from conftest import some_of
 from imulab.cli import main
 from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.estimation.noise.agreement import agreement
@@ -74,7 +75,9 @@ def drawn(rng, count, logs, size):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "logs"), [(10_000_000, 1), (1_000_000, 10)])
-@pytest.mark.parametrize(("change", "passes"), [(0.006, True), (0.009, True), (-0.009, True), (0.012, False)])
+@pytest.mark.parametrize(
+    ("change", "passes"), some_of(3, [(0.009, True), (-0.009, True), (0.012, False), (0.006, True)])
+)
 def test_long_and_many_logs_keep_to_the_tolerance(count, logs, change, passes):
     """u(N)/N of 1e7 samples is 0.02 %: less than 1 % always passes, and 1.2 % is found."""
     rng = np.random.default_rng(logs)
