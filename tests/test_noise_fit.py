@@ -333,6 +333,13 @@ def test_a_ramp_is_a_parameter():
     assert abs(found.value - 1e-4 * DEGREE) < 4 * found.standard_uncertainty
 
 
+def test_several_steps_of_a_column_are_one_sentence():
+    record = il.fit_noise(columns_of(lambda t, _: 0.03 * (t > 200) - 0.02 * (t > 400)), columns=["gyro_x"]).calibration
+    assert len(record.fit["columns"]["gyro_x"]["steps"]) == 2
+    (sentence,) = [each for each in record.warnings if "the level changes by" in each]
+    assert "2 steps, 200 to 400 s: the level changes by up to 108 deg/h" in sentence
+
+
 def test_spikes_lines_and_steps_are_counted_and_said():
     t = 0.01 * np.arange(COUNT)
     x = samples(5, white=0.005) + 0.02 * np.sin(2 * np.pi * 31 * t) + 0.03 * (t > 300)

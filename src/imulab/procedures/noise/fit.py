@@ -250,8 +250,12 @@ def _describe_column(column: ColumnModel) -> list[str]:
         messages.append(Note(_describe_lines(column)))
     for low, high, factor in analysis.allowance.off[:_MOST_NAMED]:
         messages.append(Note(f"from {low:.3g} to {high:.3g} Hz the spectrum, left out, is {factor:.2g} of the model"))
-    for step in column.steps:
-        text = f"the level changes by {_sized(step.size, column.unit)} at {step.time:.4g} s"
+    if column.steps:
+        times, sizes = sorted(step.time for step in column.steps), [step.size for step in column.steps]
+        text = f"the level changes by {_sized(sizes[0], column.unit)} at {times[0]:.4g} s"
+        if len(times) > 1:
+            largest = _sized(max(map(abs, sizes)), column.unit)
+            text = f"{len(times)} steps, {times[0]:.4g} to {times[-1]:.4g} s: the level changes by up to {largest}"
         messages.append(Finding(f"{text}, which slow noise does not make; take it out by --steps remove"))
     messages += [each for drift in column.drifts if (each := _drift_sentence(drift, column)) is not None]
     choice, shortest = analysis.choice, analysis.limits[0]
