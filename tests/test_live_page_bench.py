@@ -551,7 +551,7 @@ def test_a_link_put_in_place_of_a_file_after_its_name_was_checked_is_neither_sen
     folder = Path("session/made")
     folder.mkdir()
     (folder / "a").write_text("inside")
-    with zipfile.ZipFile(bench_module._pack(folder, ["session"])) as archive:
+    with zipfile.ZipFile(bench_module._pack(folder, ["session"], tmp_path)) as archive:
         assert archive.read("made/a") == b"inside"
 
 

@@ -160,7 +160,7 @@ class Workbench(PagePart):
         name = self._files.path(request.path_params["name"])
         if not Path(name).is_dir():
             raise OptionError(f"{name}: expected a folder")
-        packed = await run_in_threadpool(_pack, Path(name), self._files.readable)
+        packed = await run_in_threadpool(_pack, Path(name), self._files.readable, self._openings.place)
         task = BackgroundTask(Path(packed).unlink, missing_ok=True)
         return FileResponse(
             packed, headers=_download_header(f"{Path(name).name}.zip"), media_type=_ANY, background=task
@@ -379,9 +379,9 @@ def _pieces(stream: IO[bytes], size: int) -> Iterator[bytes]:
             yield piece
 
 
-def _pack(folder: Path, roots: list[str]) -> str:
-    """Return a new archive with the files of a folder, and of the session: no link leads elsewhere."""
-    handle, name = tempfile.mkstemp(prefix="imulab-", suffix=".zip")
+def _pack(folder: Path, roots: list[str], place: Path) -> str:
+    """Return a new archive in `place` with the files of a folder, and of the session: no link leads elsewhere."""
+    handle, name = tempfile.mkstemp(suffix=".zip", dir=place)
     with os.fdopen(handle, "wb") as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(folder.rglob("*")):
             if path.is_file() and not path.is_symlink():

@@ -337,7 +337,8 @@ class Openings:
     def __init__(self, tell: Callable[[Opening], object]) -> None:
         self._tell = tell
         self._open: dict[str, Opening] = {}  # by file and options, the latest viewed last
-        self._place, self._lock = _new_place()
+        self.place, self._lock = _new_place()
+        """Folder of what is temporary; that of a killed program goes at the next start."""
         self._number = 0
         self.previews: list[str] = []
         """Layouts of this session that are not saved."""
@@ -367,7 +368,7 @@ class Openings:
         while len(self._open) >= _MOST:
             _close(self._open.pop(next(iter(self._open))))
         self._number += 1
-        folder = self._place / str(self._number)
+        folder = self.place / str(self._number)
         folder.mkdir()
         opening = self._open[key] = Opening(self._number, name, chosen, stamp, folder)
         opening.process = subprocess.Popen(
@@ -394,7 +395,7 @@ class Openings:
     def new_layout(self, toml: str) -> str:
         """Return the path of a new layout that only this session knows, for a preview."""
         self._number += 1
-        path = self._place / f"layout-{self._number}.toml"
+        path = self.place / f"layout-{self._number}.toml"
         path.write_text(toml, encoding="utf-8")
         self.previews.append(str(path))
         return str(path)
@@ -411,7 +412,7 @@ class Openings:
         """Close all files, and remove their curves."""
         for opening in list(self._open.values()):
             _close(opening)
-        shutil.rmtree(self._place, ignore_errors=True)
+        shutil.rmtree(self.place, ignore_errors=True)
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None

@@ -140,7 +140,8 @@ function begin() {
 function leave() {
   chosen = null;
   others = [];
-  show(ui.file, false);
+  ui.file.replaceChildren(h("p", { class: "message" }, "Choose a file in the list, or drop another one."));
+  show(ui.file, files.length > 0);
   ui.list.draw(files, null, []);
   offer();
 }
