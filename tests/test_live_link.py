@@ -79,7 +79,7 @@ class Watched:
         self.events: list = []
         self.runner = Runner.open(lambda: open_source(source), self.session, str(self.path), None, resume=False)
 
-    def until(self, case: Callable[[], object], seconds: float = 15.0) -> None:
+    def until(self, case: Callable[[], object], seconds: float = 60.0) -> None:
         end = time.monotonic() + seconds
         while not case():
             assert time.monotonic() < end, (self.session.view(), self.events)
