@@ -12,7 +12,7 @@ import pytest
 from tests.reference.rest_ramp import Ramp
 
 import imulab as il
-from imulab.errors import DataError, RecordError
+from imulab.errors import DataError, OptionError, RecordError
 
 AXES = "xyz"
 
@@ -135,6 +135,17 @@ def test_accelerometers_beside_do_not_matter() -> None:
         units={n: v for n, v in made.units.items() if "accel" not in n},
     )
     assert record.parameters == il.fit_thermal(alone).calibration.parameters
+
+
+def test_latitude_takes_the_vertical_part_of_the_earths_rate_off_where_up_is_known() -> None:
+    (made,) = il.simulate_thermal([0, 40], attitudes=0, ramps=1, gyro=True, duration="20 min")
+    without, record = il.fit_thermal(made).calibration, il.fit_thermal(made, latitude="90 deg").calibration
+    up = np.array([made.column(f"accel_{a}").mean() for a in AXES])
+    up /= np.linalg.norm(up)
+    less = [without.value(f"gyro_bias_{a}") - record.value(f"gyro_bias_{a}") for a in AXES]
+    np.testing.assert_allclose(less, 7.292115e-5 * up, atol=3e-6)
+    with pytest.raises(OptionError, match="no accelerometers"):
+        il.fit_thermal(recorded(Ramp(3)), latitude="48 deg")
 
 
 def test_lag_of_a_ramp_up_and_down_is_named() -> None:

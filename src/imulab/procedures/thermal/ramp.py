@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.display import UNJUDGED, Finding, Note
-from imulab.errors import DataError
+from imulab.errors import DataError, OptionError
 from imulab.estimation.least_squares import Observability
 from imulab.estimation.noise.readings import doubtful_units
 from imulab.estimation.rows import leave_out
@@ -104,7 +104,7 @@ def fit_ramps(
             "a rate such as deg/s: state it (--unit gyro=deg/s), or record a tumble beside it"
         )
     holds, notes = find_parts(recordings)
-    up = np.tile([0.0, 0.0, 1.0], (len(holds), 1))  # the Earth's rate from anywhere is the same from all directions
+    up = _upward(recordings, earth)[holds.recording]
     held = rates_at_rest(holds, up, np.ones(3))
     _check_rest(holds, len(held), name)
     held = replace(held, earth=earth, slow=slow_noise(holds, held.mean, held.index))
@@ -136,6 +136,25 @@ def fit_ramps(
     record = with_gyroscopes(record, holds, gyros, None, name)
     record = replace(record, warnings=(*record.warnings, *_say_untold(gyros, name)), verdict=UNJUDGED)
     return record, judge_observability(gyros.solution)
+
+
+def _upward(recordings: Sequence[Recording], earth: EarthRate | None) -> Array:
+    """Return the direction up of each recording, shape (m, 3), which matters where the latitude is stated.
+
+    Raises
+    ------
+    OptionError
+        A latitude is stated, and a recording has no accelerometers.
+    """
+    if earth is None:  # an unknown rate of the Earth is as likely from any direction
+        return np.tile([0.0, 0.0, 1.0], (len(recordings), 1))
+    for each in recordings:
+        if not set(triad("accel")) <= set(each.columns):
+            raise OptionError(
+                f"latitude: {each.name} has no accelerometers, which tell how the Earth's rate lies: leave it out"
+            )
+    force = np.array([np.nanmean(each.triad("accel"), axis=0) for each in recordings])
+    return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True), dtype=np.float64)
 
 
 def find_parts(recordings: Sequence[Recording]) -> tuple[Holds, list[Note]]:
