@@ -21,6 +21,7 @@ from types import SimpleNamespace
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import pytest
 
 pytest.importorskip("starlette", reason="the page needs the extra live")
@@ -311,6 +312,19 @@ def run(bench: SimpleNamespace, path: str, **values: Any) -> Any:
     job = bench.ask("jobs", {"command": path, "values": values}).json()
     assert "error" not in job, job
     return until(lambda: (found := bench.part._jobs.jobs[job["number"]]).ended and found)
+
+
+def test_a_unit_that_is_never_turned_and_a_column_without_numbers_are_told(bench):
+    cycle = il.simulate_power_cycle(20.0, seed=1, sample_rate=20.0)
+    still = cycle.with_columns({"mag_x": np.full(len(cycle), np.nan)}, {"mag_x": "uT"})
+    for name, recording in (("cycle.csv", still), ("turned.csv", il.simulate_tumble(attitudes=8, gravity=9.81))):
+        il.write_csv(recording, name)
+        sent = bench.ask(f"files/{name}", Path(name).read_bytes(), "PUT").json()["name"]
+        bench.ask("open", {"file": sent, "reading": {}})
+        about = until(lambda sent=sent: "attitudes" in (found := bench.ask("open", {"file": sent}).json()) and found)
+        assert about["turned"] == (name == "turned.csv")
+        said = "mag_x: no number in any row, nothing is drawn of it"
+        assert (said in about["notes"]) == (name == "cycle.csv")
 
 
 def test_from_the_recording_to_the_firmware(bench, tmp_path):

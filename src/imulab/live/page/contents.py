@@ -7,6 +7,7 @@ or large file costs the server nothing, and can be given up at any time.
 from __future__ import annotations
 
 import json
+import math
 import re
 import sys
 from collections.abc import Iterator, Mapping
@@ -29,6 +30,7 @@ from imulab.readers.formats import is_packed
 from imulab.recording import Array, Reading, Recording
 
 _EVERY = 0.15  # s between two messages of progress
+_TURNED = math.radians(5.0)  # an attitude that lies so far from the first is another one
 
 
 def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[str, Any]]:
@@ -47,7 +49,8 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
     ------
     dict
         ``head``: the fields of `Head`, with ``metadata`` and ``notes``, again and again, the last with ``done``; then
-        ``attitudes``: begin and end of each, s, or ``unknown``: why there are none. Of a file that breaks, ``error``
+        ``attitudes``: begin and end of each, s, or ``unknown``: why there are none, and ``turned``: whether they lie
+        another way than the first. Of a file that breaks, ``error``
         says where, and the others are of the rows before.
 
     Raises
@@ -58,10 +61,12 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
     options = read_options(options_of(Reading), reading, "--{}")
     writer, notes, last_sent, metadata = Writer(folder), dict[str, None](), 0.0, dict[str, str]()
     broken: dict[str, str] = {}
+    told: set[str] = set()
     try:
         for block in _blocks(file, options):
             writer.add(block)
             notes |= dict.fromkeys(block.notes)
+            told |= {name for name, values in block.columns.items() if name not in told and np.isfinite(values).any()}
             metadata = dict(block.metadata)
             if monotonic() - last_sent > _EVERY:
                 last_sent = monotonic()
@@ -72,6 +77,8 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
             raise
         broken = {"error": str(error)}
     writer.head.usual = usual_step(folder, writer.head)
+    empty = [] if broken else [name for name in writer.head.units if name not in told]
+    notes |= {f"{name}: no number in any row, nothing is drawn of it": None for name in empty}
     yield {"head": asdict(writer.head), "metadata": metadata, "notes": list(notes), **broken, "done": True}
     yield attitudes(folder, writer.head, Path(file).name)
 
@@ -129,7 +136,9 @@ def attitudes(folder: Path, head: Head, name: str) -> dict[str, Any]:
         known = find_attitudes(Recording(columns, units, name=name))
     except ImulabError as error:
         return {"attitudes": [], "unknown": str(error)}
-    return {"attitudes": [list(ends) for ends in zip(known.start.tolist(), known.stop.tolist(), strict=True)]}
+    up = known.mean / np.maximum(np.linalg.norm(known.mean, axis=1, keepdims=True), 1e-300)
+    ends = zip(known.start.tolist(), known.stop.tolist(), strict=True)
+    return {"attitudes": [list(each) for each in ends], "turned": bool((up @ up[0] < math.cos(_TURNED)).any())}
 
 
 def _all(path: Path, count: int) -> Array:

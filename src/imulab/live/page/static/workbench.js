@@ -338,7 +338,7 @@ function opened(message) {
   offer();
 }
 
-function summary({ head, done, attitudes }) {
+function summary({ head, done, attitudes, turned }) {
   const parts = [`${grouped(head.rows)} samples`];
   if (!done) return `reading… ${parts[0]} so far`;
   if (head.timed) {
@@ -346,6 +346,7 @@ function summary({ head, done, attitudes }) {
     if (head.rows > 1 && head.usual > 0) parts.push(`${seconds.toPrecision(4)} s at ${Number((1 / head.usual).toPrecision(4))} Hz`);
     parts.push(head.gap_count ? `${head.gap_count} ${head.gap_count === 1 ? "gap" : "gaps"}` : "no gaps");
     if (attitudes === undefined) parts.push("looking for attitudes…");
+    else if (attitudes.length > 1 && !turned) parts.push(`never turned, ${attitudes.length} stretches at rest (shaded)`);
     else if (attitudes.length) parts.push(`${attitudes.length} ${attitudes.length === 1 ? "attitude" : "attitudes"} at rest (shaded)`);
   } else {
     parts.push("no rising time: shown by row");
