@@ -96,7 +96,7 @@ def gyro(
     json: AsJson = False,
     **options: Any,
 ) -> None:
-    """Calibrate the gyroscope triad on top of that.
+    """Calibrate the gyroscope triad by the calibrated accelerometers.
 
     From the accelerometers' record and the turns between attitudes; writes one record with both triads.
     """

@@ -385,7 +385,7 @@ def exhibits(record: Calibration) -> Exhibits:
         ("order", str(model_of(record).order)),
         (f"rms, {len(used)} of {len(good)}" if bad else "rms of |f| − g", small_g(rms(used))),
         ("leave-one-out", small_g(left_out.value) if left_out else "not computed"),
-        ("worst u(scale factor)", f"{plain_number(worst, 2)} ppm" if worst is not None else "not stated"),
+        ("scale factors known to", f"{plain_number(worst, 2)} ppm" if worst is not None else "not stated"),
         ("condition number", plain_number(fit.condition_number, 3)),
     ]
     items: list[Figure | ReportTable] = [_residuals(record), parameters_table(record)]

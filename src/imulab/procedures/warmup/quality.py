@@ -549,8 +549,8 @@ def _warn_drifts(curves: Curves, chosen: Judged) -> list[str]:
                 Finding(
                     f"not settled: {kind} still drifts in the settled part of {int(share.any(axis=1).sum())} of "
                     f"{len(curves.cycles)} cycles, most in {curves.cycles[row].name} ({curves.axes[axis]}, "
-                    f"{small_text(curves.drift[row, axis], curves.units[axis])} from T_M to its end); Z is relative to "
-                    "the mean of that part",
+                    f"{small_text(curves.drift[row, axis], curves.units[axis])} from T_M to its end); the "
+                    "curve is counted from the mean of that part, which is not yet the settled zero",
                     "record longer, and state a later T_M (--settling-time)",
                 )
             )
