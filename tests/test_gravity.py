@@ -1,6 +1,7 @@
 """What is known of local gravity, and what is not: its value, its uncertainty, and what they do to a record."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 import imulab as il
 from conftest import table
 from imulab.errors import OptionError
-from imulab.gravity import ANOMALY, at_latitude, gravity_option, normal_gravity, stated_gravity
+from imulab.gravity import ANOMALY, at_latitude, field_at, gravity_option, normal_gravity, site, stated_gravity
 from imulab.procedures.views import compare_records
 from reference import tumble as reference
 
@@ -230,3 +231,52 @@ def test_the_earth_turns_eastward_a_full_turn_in_a_sidereal_day():
     assert (equator.vertical, equator.level) == pytest.approx((0.0, 2 * math.pi / sidereal_day), rel=1e-6)
     assert south.vertical == pytest.approx(-math.pi / sidereal_day, rel=1e-6)
     assert at_latitude(None) is None
+
+
+@pytest.mark.parametrize(
+    ("place", "total", "dip", "declination"),
+    [("80,0,0", 55000.1, 83.14, -1.28), ("0,120,0", 41104.9, -15.42, 0.16), ("-80,-120,0", 55120.6, -72.20, 69.36)],
+)
+def test_the_field_of_a_place_is_that_of_the_table_in_the_report_on_the_world_magnetic_model_of_2020(
+    place, total, dip, declination
+):
+    found = field_at(site(place), "2020-01-01")
+    assert found.model == "WMM-2020"
+    assert found.magnitude[0] == pytest.approx(total * 1e-9, abs=0.051e-9)
+    assert np.degrees([found.dip[0], found.declination[0]]) == pytest.approx([dip, declination], abs=0.0051)
+    level = math.sqrt(total**2 - (total * math.sin(math.radians(dip))) ** 2)
+    assert found.magnitude[1] == 148e-9  # of the report's error model
+    assert np.degrees([found.dip[1], found.declination[1]]) == pytest.approx(
+        [0.21, math.hypot(0.26, 5625 / level)], 1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("place", "part"),
+    [
+        ("151.2,-33.9", "are latitude and longitude exchanged? expected -33.9,151.2"),
+        ("200,10", "latitude 200 deg: expected -90 to 90"),
+        ("10,200", "longitude 200 deg: expected -180 to 180"),
+        ("48.1,11.6,20000", "height 20000 m: expected -500 to 10000"),
+        ("48.1", "expected latitude and longitude, deg, and perhaps the height, m: 48.1,11.6,520"),
+        ("48.1,north", "48.1,north"),
+    ],
+)
+def test_a_place_that_cannot_be_is_refused_by_name(place, part):
+    with pytest.raises(OptionError, match=r"^--place") as refused:
+        site(place, "--place")
+    assert part in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("date", "part"), [("2014-12-31", "2015 to 2029"), ("2030-01-01", "2015 to 2029"), ("yesterday", "2026-11-28")]
+)
+def test_a_day_that_no_model_covers_is_refused(date, part):
+    with pytest.raises(OptionError, match=part):
+        field_at(site("48.1,11.6"), date)
+
+
+def test_without_the_package_of_the_models_the_refusal_names_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygeomag", None)
+    with pytest.raises(OptionError, match=r"needs pygeomag, which is not here: pip install '\.\[place\]'"):
+        field_at(site("48.1,11.6"), "2026-11-28")

@@ -746,3 +746,42 @@ def test_one_command_for_all_triads_refuses_what_contradicts_the_place(given, sa
     assert said in error
     assert len([line for line in error.splitlines() if "note:" not in line]) == 1
     assert not out.exists()
+
+
+PLACE = ("--place", "48.1,11.6,520")
+
+
+def test_a_place_stands_for_gravity_field_and_dip_and_the_record_keeps_model_and_day(tmp_path):
+    # field, dip and declination of that place and day, as the form of the model's makers gives them: WMM-2025
+    _, _, (accel, mag) = simulated(3, dip=np.radians(64.39))
+    il.write(table(accel, mag), tmp_path / "t.csv")
+    where, day = ("tumble", "mag", str(tmp_path / "t.csv"), *PLACE), ("--date", "2026-11-28")
+    assert main([*where, *day, "--order", "1", "-o", str(tmp_path / "r.json")]) == 0
+    record = il.load(tmp_path / "r.json")
+    assert record.model["field"]["value"] == pytest.approx(48.8158e-6, abs=1e-9)
+    assert record.model["gravity"]["value"] == il.normal_gravity("48.1 deg", "520 m")
+    kept = record.model["place"]
+    assert (kept["model"], kept["date"], kept["height"]) == ("WMM-2025", "2026-11-28", 520)
+    assert np.degrees(kept["dip"]["value"]) == pytest.approx(64.393, abs=1e-3)
+    assert any("declination +4.38 ± 0.37 deg" in warning for warning in record.warnings)
+    stated = il.fit_mag(
+        str(tmp_path / "t.csv"), order=1, latitude="48.1 deg", height="520 m", field=48.81583023882008e-6
+    )
+    for name, parameter in stated.calibration.parameters.items():
+        assert record.parameters[name].value == pytest.approx(parameter.value, rel=1e-4, abs=1e-9)
+
+
+def test_the_dip_of_a_place_refuses_a_unit_of_the_other_hemisphere_and_what_contradicts_is_named(tmp_path, capsys):
+    _, _, (accel, mag) = simulated(3, dip=np.radians(64.39))
+    il.write(table(accel, mag), tmp_path / "t.csv")
+    where = ("tumble", "mag", str(tmp_path / "t.csv"), "--order", "1", "-o", str(tmp_path / "r.json"))
+    for more, part in (
+        (("--place", "-33.9,151.2", "--date", "2026-11-28"), "hemisphere"),
+        (PLACE, "has no date; expected the day of the test"),
+        (("--date", "2026-11-28"), "date without place: expected both"),
+        ((*PLACE, "--latitude", "48"), "--place together with --latitude"),
+        (("--place", "11.6"), "--place '11.6': expected latitude and longitude"),
+    ):
+        assert main([*where, *more]) == 2
+        assert part in capsys.readouterr().err.replace("\n", " ")
+        assert not (tmp_path / "r.json").exists()

@@ -1,9 +1,10 @@
-"""Local gravity, and the Earth's rate in a unit at rest.
+"""Local gravity, the magnetic field of a place, and the Earth's rate in a unit at rest.
 
 Gravity is as stated, normal gravity on and above the WGS 84 ellipsoid, or what a recording's head says.
 
 Source: NIMA TR8350.2 (World Geodetic System 1984), third edition, equations 4-1 (Somigliana) and 4-3
-(second-order free-air); constants from its tables 3.3 and 3.4.
+(second-order free-air); constants from its tables 3.3 and 3.4. The magnetic field is the World Magnetic Model's, by
+pygeomag.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
 from msgspec import Struct
 
 from imulab.display import Finding, Note
-from imulab.errors import OptionError, quoted
+from imulab.errors import OptionError, install, quoted
 from imulab.options import Group, text
-from imulab.quantities import in_si, quantity, with_uncertainty
+from imulab.quantities import in_si, number, quantity, with_uncertainty
 from imulab.units import STANDARD_GRAVITY, from_si
 
 if TYPE_CHECKING:
@@ -377,3 +378,108 @@ def at_latitude(latitude: float | str | None, name: str = "latitude") -> EarthRa
         It is no latitude.
     """
     return None if latitude is None else EarthRate(checked_latitude(in_si(latitude, name, "angle", "deg"), name))
+
+
+# The magnetic field of a place and date.
+
+
+_NANO, _KILO = 1e-9, 1e3
+_MODEL_YEARS = 2015, 2030
+"""First year, and the one after the last, of the models that pygeomag carries with their uncertainties."""
+
+
+class Site(Struct, frozen=True):
+    """A place: geodetic latitude and longitude, rad, and height, m; None where it is not stated."""
+
+    latitude: float
+    longitude: float
+    height: float | None = None
+
+
+class ModelField(Struct, frozen=True):
+    """Magnitude, T, dip and declination, rad, of the Earth's field by a model, each with its standard uncertainty.
+
+    `model` names it, ``WMM-2025``, and `date` the day. The dip is positive where the field points down, the declination
+    where it points east of true north.
+    """
+
+    magnitude: tuple[float, float]
+    dip: tuple[float, float]
+    declination: tuple[float, float]
+    model: str
+    date: str
+
+
+def site(text: str, name: str = "place") -> Site:
+    """Return the place of a text ``48.1,11.6`` or ``48.1,11.6,520``: latitude and longitude, deg, and height, m.
+
+    Raises
+    ------
+    OptionError
+        It is none; a latitude beyond 90 deg beside a longitude within is named as exchanged.
+    """
+    parts = text.split(",") if isinstance(text, str) else ()
+    if len(parts) not in (2, 3):
+        raise OptionError(
+            f"{name} {quoted(text)}: expected latitude and longitude, deg, and perhaps the height, m: 48.1,11.6,520"
+        )
+    latitude, longitude, *height = (number(part.strip(), f"{name} {quoted(text)}") for part in parts)
+    if 90 < abs(latitude) <= 180 and abs(longitude) <= 90:
+        raise OptionError(
+            f"{name} {quoted(text)}: latitude {latitude:g} deg is beyond 90: are latitude and longitude exchanged? "
+            f"expected {longitude:g},{latitude:g}"
+        )
+    if not abs(latitude) <= 90:
+        raise OptionError(f"{name} {quoted(text)}: latitude {latitude:g} deg: expected -90 to 90")
+    if not abs(longitude) <= 180:
+        raise OptionError(f"{name} {quoted(text)}: longitude {longitude:g} deg: expected -180 to 180")
+    if height and not -500 <= height[0] <= 10000:
+        raise OptionError(f"{name} {quoted(text)}: height {height[0]:g} m: expected -500 to 10000")
+    return Site(math.radians(latitude), math.radians(longitude), height[0] if height else None)
+
+
+def field_at(place: Site, date: str, name: str = "date") -> ModelField:
+    """Return the field of the World Magnetic Model at a place, on a day such as ``2026-11-28``.
+
+    The standard uncertainties are those of the model's error model, with the field of the crust; iron of a building is
+    in none of them.
+
+    Raises
+    ------
+    OptionError
+        The text is no date, the models do not cover it, or the package with the models is not installed.
+
+    Source: Chulliat et al., The US/UK World Magnetic Model for 2020-2025 (NOAA 2020), and that for 2025-2030.
+    """
+    from datetime import date as day_of
+
+    try:
+        day = day_of.fromisoformat(date.strip()[:10])
+    except ValueError:
+        raise OptionError(f"{name} {quoted(date)}: expected a day such as 2026-11-28") from None
+    first, end = _MODEL_YEARS
+    if not first <= day.year < end:
+        raise OptionError(f"{name} {day}: the World Magnetic Models here cover the years {first} to {end - 1}")
+    try:
+        from pygeomag import GeoMag
+    except ImportError:
+        raise OptionError(
+            f"the magnetic field of a place needs pygeomag, which is not here: {install('place')}"
+        ) from None
+    start = day_of(day.year, 1, 1).toordinal()
+    year = day.year + (day.toordinal() - start) / (day_of(day.year + 1, 1, 1).toordinal() - start)
+    model = GeoMag(base_year=day.year)
+    found = model.calculate(
+        glat=math.degrees(place.latitude),
+        glon=math.degrees(place.longitude),
+        alt=(place.height or 0.0) / _KILO,
+        time=year,
+    )
+    known = found.calculate_uncertainty()
+    return ModelField(
+        (_NANO * found.f, _NANO * known.f),
+        (math.radians(found.i), math.radians(known.i)),
+        (math.radians(found.d), math.radians(known.d)),
+        model.model,
+        str(day),
+    )

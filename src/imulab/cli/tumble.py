@@ -155,6 +155,7 @@ def mag(
     In the accelerometers' frame, from the same attitudes, into one record of both.
     """
     from imulab.cli.show import finish
+    from imulab.errors import OptionError
     from imulab.gravity import gravity_option
     from imulab.procedures.registry import load
     from imulab.procedures.tumble.mag.fit import fit_mag
@@ -164,6 +165,8 @@ def mag(
     check_outputs([output, report], [name for name in (file, accel, how["layout"]) if name])
     known = None if accel is None else load(accel)
     gravity, latitude, height = (options.pop(name) for name in ("gravity", "latitude", "height"))
+    if options["place"] is not None and latitude is not None:
+        raise OptionError("--place together with --latitude: expected one or the other")
     local = gravity_option(gravity, latitude, height, FLAG)
     place = call(parse_place, hemisphere=options.pop("hemisphere"), latitude=latitude, dip=options.pop("dip"))
     several = {name: tuple(options.pop(name) or ()) for name in ("same_direction", "drop")}

@@ -34,6 +34,19 @@ class GyroModel(Part):
     gyro_output_unit: str
 
 
+class MagPlace(Part):
+    """Place of a test in rad and m, and the field of a model there: its name, the day, magnitude, dip, declination."""
+
+    latitude: float
+    longitude: float
+    height: float | None = null()
+    model: str
+    date: str
+    field: Quantity
+    dip: Quantity
+    declination: Quantity
+
+
 class MagModel(Part):
     """What ``model`` adds of magnetometers: their law, and which output became which axis."""
 
@@ -41,6 +54,7 @@ class MagModel(Part):
     mag_output_unit: str
     mag_axes: str = "+x +y +z"
     field: Quantity | None = null()
+    place: MagPlace | None = None
 
 
 class OrderRow(Part):

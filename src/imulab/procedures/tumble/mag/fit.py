@@ -22,12 +22,12 @@ from imulab.estimation.decisions import (
 )
 from imulab.estimation.least_squares import coverage_factor, f_test
 from imulab.estimation.rows import rms
-from imulab.gravity import Height, Latitude, LocalGravity, at_place
-from imulab.options import RARE, choice, measure, parsed, repeated, text
+from imulab.gravity import Height, Latitude, LocalGravity, ModelField, Site, at_place, field_at, site
+from imulab.options import RARE, Group, choice, measure, parsed, repeated, text
 from imulab.procedures import tumble
 from imulab.procedures.result import Record, Result, as_record
 from imulab.procedures.tumble import HEMISPHERES, LOSSES, MAG_ORDERS
-from imulab.procedures.tumble.attitudes import TumbleData, as_attitudes
+from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.estimate import check_field
 from imulab.procedures.tumble.gyro.fit import with_gyro_of
 from imulab.procedures.tumble.mag.model import FEWEST, FieldMeans, count_extremes, mag_names
@@ -45,7 +45,15 @@ from imulab.procedures.tumble.mag.prepare import (
 from imulab.procedures.tumble.mag.solve import Joint, Place, Ready, parse_place, solve
 from imulab.procedures.tumble.model import gravity_slope, parameter_names, parameter_units
 from imulab.procedures.tumble.record import make_record, si_parameters
-from imulab.procedures.tumble.schema import FieldAgreement, Heading, MagFields, MagModel, MagSummary, OneSample
+from imulab.procedures.tumble.schema import (
+    FieldAgreement,
+    Heading,
+    MagFields,
+    MagModel,
+    MagPlace,
+    MagSummary,
+    OneSample,
+)
 from imulab.quantities import in_si
 from imulab.recording import Array, Reading
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -476,6 +484,8 @@ def fit_mag(
     gravity: LocalGravity = None,
     latitude: Latitude = None,
     height: Height = None,
+    place: Annotated[str | Site | None, parsed(site, "LAT,LON[,HEIGHT]", unit="deg, m"), Group("gravity")] = None,
+    date: Annotated[str | None, text("YYYY-MM-DD"), Group("gravity")] = None,
     order: Annotated[int | str, text("auto|1..5", ("auto", "1", "2", "3", "4", "5")), RARE] = "auto",
     **reading: Unpack[Reading],
 ) -> MagFit:
@@ -513,6 +523,11 @@ def fit_mag(
         Local gravity; else of the accelerometers' record, else of the head. As for `fit_tumble`.
     latitude, height
         As for `fit_tumble`.
+    place
+        Where the test was made: gives gravity, field and dip that are not stated otherwise. Field and dip are those of
+        the World Magnetic Model on the date; a text such as ``"48.1,11.6,520"``.
+    date
+        Day of the test, for the field of the place; else that in the head of the recording.
     order
         Order of the accelerometers' model, auto or 1 to 5.
     reading
@@ -543,8 +558,14 @@ def fit_mag(
     """
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
     _check_options(loss, mag_order, order, magnitude)
-    place = parse_place(hemisphere, latitude, dip)
+    stated = parse_place(hemisphere, latitude, dip)
+    where = _stated_site(place, date, latitude, height)
     attitudes = as_attitudes(data, reading, fit_mag)
+    found = None if where is None else _model_field(where, date, attitudes)
+    if where is not None and found is not None:
+        stated = parse_place(hemisphere, None, stated.dip or found.dip)
+        magnitude = found.magnitude[0] if magnitude is None else magnitude
+        latitude, height = (where.latitude, where.height) if gravity is None else (None, None)
     known = None if accel is None else as_record(accel, "fit_mag: accel")
     ready = prepare(
         attitudes,
@@ -568,18 +589,75 @@ def fit_mag(
             f"{', and does one axis point the same way in those of same-direction' if same_direction else ''}?"
         ) from None
     check_observability(what, np.delete(ready.kept, [one.index for one in aside]), name)
-    _check_result(joint, ready, place)
-    options = {
-        "loss": loss, "mag_order": mag_order if mag_order == "auto" else int(mag_order),
-        "field": magnitude, "hemisphere": place.hemisphere, "dip": place.dip and list(place.dip),
-        "drop": list(map(str, drop)),
-        "same_direction": [group if isinstance(group, str) else list(group) for group in same_direction],
-    }  # fmt: skip
-    set_options = {name: value for name, value in options.items() if value not in (None, [])}
+    _check_result(joint, ready, stated)
+    set_options = _stated_options(loss, mag_order, magnitude, stated, drop, same_direction)
     record = make_mag_record(ready, joint, what, aside, set_options)
+    if where is not None and found is not None:
+        record = _with_place(record, where, found)
     if known is not None and not ready.notes:
         record = with_gyro_of(record, known)
     return MagFit(record, joint, what, aside)
+
+
+def _stated_options(
+    loss: str,
+    mag_order: int | str,
+    field: float | None,
+    stated: Place,
+    drop: Sequence[int | str],
+    same_direction: Sequence[str | Sequence[int]],
+) -> dict[str, Any]:
+    """Return the options of a fit that say something, as the record keeps them."""
+    options = {
+        "loss": loss, "mag_order": mag_order if mag_order == "auto" else int(mag_order),
+        "field": field, "hemisphere": stated.hemisphere, "dip": stated.dip and list(stated.dip),
+        "drop": list(map(str, drop)),
+        "same_direction": [group if isinstance(group, str) else list(group) for group in same_direction],
+    }  # fmt: skip
+    return {name: value for name, value in options.items() if value not in (None, [])}
+
+
+def _stated_site(
+    place: str | Site | None, date: str | None, latitude: float | str | None, height: float | str | None
+) -> Site | None:
+    """Return the place of a test; refuse what contradicts it, and a date without one."""
+    if place is None:
+        if date is not None:
+            raise OptionError("date without place: expected both")
+        return None
+    if latitude is not None or height is not None:
+        raise OptionError("place together with latitude or height: expected one or the other")
+    return place if isinstance(place, Site) else site(place, "place")
+
+
+def _model_field(where: Site, date: str | None, attitudes: Attitudes) -> ModelField:
+    """Return the model's field on the stated day, else on that in the head of the recording."""
+    day = date or attitudes.recording.metadata.get("date")
+    if day is None:
+        raise OptionError(
+            f"place without date: the field changes with time, and the head of {attitudes.recording.name} has no date; "
+            "expected the day of the test, as 2026-11-28"
+        )
+    return field_at(where, day)
+
+
+def _with_place(record: Calibration, where: Site, found: ModelField) -> Calibration:
+    """Return a record with the place of the test, and the model whose field was used there."""
+
+    def known(pair: tuple[float, float], unit: str) -> Quantity:
+        return Quantity(value=pair[0], unit=unit, standard_uncertainty=pair[1])
+
+    place = MagPlace(
+        latitude=where.latitude, longitude=where.longitude, height=where.height, model=found.model, date=found.date,
+        field=known(found.magnitude, "T"), dip=known(found.dip, "rad"), declination=known(found.declination, "rad"),
+    )  # fmt: skip
+    note = Note(
+        f"mag: by {found.model} the field of the place has {1e6 * found.magnitude[0]:.2f} ± "
+        f"{1e6 * found.magnitude[1]:.2f} uT, dip {np.degrees(found.dip[0]):.2f} ± {np.degrees(found.dip[1]):.2f} deg, "
+        f"declination {np.degrees(found.declination[0]):+.2f} ± {np.degrees(found.declination[1]):.2f} deg; iron of a "
+        "building may change each by more"
+    )
+    return replace(record, model={**record.model, "place": entries(place)}, warnings=(*record.warnings, note))
 
 
 def _check_options(loss: str, mag_order: int | str, order: int | str, field: float | None) -> None:
