@@ -77,6 +77,7 @@ CALLS = {
     "fleet report": "done -o OUT.html",
     "fleet simulate": "--units 8 -o OUT",
     "layout guess": "foreign.csv -o OUT.toml",
+    "certificate": "tumble.json --lab lab.toml -o OUT.xml",
 }
 NONSENSE = (
     "",
@@ -166,6 +167,7 @@ def make_inputs(folder: Path) -> None:
         rows = [f"{0.01 * k:.2f},{0.1 * (k % period):.1f}" for k in range(200)]
         (folder / f"{name}.csv").write_text("\n".join(["time [s],gyro_z [deg/s]", *rows, ""]))
     readings = [f"{0.01 * k:.2f},{0.1 * (k % 7):.1f},0.2,9.8" for k in range(200)]
+    (folder / "lab.toml").write_bytes((Path(__file__).parent / "data" / "lab.toml").read_bytes())
     (folder / "foreign.csv").write_text("\n".join(["t,ax,ay,az", *readings, ""]))
     with contextlib.chdir(folder):
         for line in (*MADE, "fleet run fleet/first.csv -o done"):

@@ -22,6 +22,7 @@ FUNCTIONS = {
     "convert": il.write,
     "export": il.export,
     "layout guess": il.guess_layout,
+    "certificate": il.write_certificate,
     "allan": il.allan_deviation,
     "tumble plan": il.plan_tumble,
     "tumble simulate": il.simulate_tumble,

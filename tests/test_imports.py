@@ -11,7 +11,7 @@ import pytest
 SOURCE = Path(__file__).resolve().parents[1] / "src"
 ROOMS = [
     {"cli", "__main__"},
-    {"fleet", "live"},
+    {"fleet", "live", "certificate"},
     {"procedures", "readers", "exporters", "report", "writers"},
     {"estimation", "device", "records"},
 ]

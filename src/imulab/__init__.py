@@ -29,6 +29,7 @@ from imulab._version import VERSION as __version__  # noqa: N811
 from imulab.views import Views, hand_down
 
 if TYPE_CHECKING:
+    from imulab.certificate.issue import write_certificate as write_certificate
     from imulab.errors import ImulabError as ImulabError
     from imulab.fleet.report import write_fleet_report as write_fleet_report
     from imulab.fleet.run import fleet_status as fleet_status
@@ -160,6 +161,7 @@ _HOME = {
     "simulate_warmup": "procedures.warmup.simulate",
     "warmup_table": "procedures.warmup.spreadsheet",
     "write": "writers",
+    "write_certificate": "certificate.issue",
     "write_csv": "writers",
     "write_fleet_report": "fleet.report",
     "write_report": "procedures.views",

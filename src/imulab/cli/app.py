@@ -32,6 +32,7 @@ _WHERE = {
     **dict.fromkeys(("apply", "show", "report", "demo"), "records"),
     **{"convert": "records", "export": "records", "allan": "noise", "live": "live", "open": "live"},
     **{x: x for x in ("tumble", "array", "centrifuge", "warmup", "noise", "thermal", "rate", "fleet", "layout")},
+    "certificate": "certificate",
 }
 """Module of each first word of a command."""
 

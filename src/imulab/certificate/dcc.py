@@ -1,0 +1,305 @@
+"""A certificate as PTB's Digital Calibration Certificate, XML.
+
+Numbers are written by `repr`, so that every double is read back as it was. Prefixes stand before all names: a default
+namespace breaks digests of signatures. Source: PTB dcc.xsd 3.3.0, SI_Format.xsd 2.2.1 and dcc.sch, which wants methods,
+software and conditions inside a measurement result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from decimal import Decimal
+from typing import Any
+from xml.etree import ElementTree as ET
+
+from imulab.certificate.laboratory import Address, Condition, Equipment, Party
+from imulab.certificate.model import NORMAL, Certificate, Result
+from imulab.certificate.units import dsi_unit
+from imulab.estimation.distributions import chi_square_upper_quantile
+from imulab.records.calibration import Covariance
+
+SCHEMA = "3.3.0"
+"""Version of the schema that is written."""
+_SPACES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
+_XSI = "http://www.w3.org/2001/XMLSchema-instance"
+_COVERED = 0.95
+"""Probability of the ellipsoid of all parameters together, whose factor is the root of a quantile of chi-square."""
+_ISSUED_UNDER = "ISO/IEC 17025:2017"
+_STATEMENTS = (
+    ("7.8.2.1 l", "The results relate only to the item calibrated, in the condition described."),
+    ("7.8.2.1", "The certificate must not be reproduced except in full without the laboratory's written approval."),
+)
+
+
+def dcc_xml(certificate: Certificate) -> bytes:
+    """Return the certificate as XML, UTF-8, indented; the same certificate gives the same bytes."""
+    root = ET.Element(
+        "dcc:digitalCalibrationCertificate",
+        {
+            **{f"xmlns:{prefix}": space for prefix, space in _SPACES.items()},
+            "xmlns:xsi": _XSI,
+            "schemaVersion": SCHEMA,
+            "xsi:schemaLocation": f"{_SPACES['dcc']} https://ptb.de/dcc/v{SCHEMA}/dcc.xsd",
+        },
+    )
+    _administrative(root, certificate)
+    _measurement(_add(_add(root, "measurementResults"), "measurementResult"), certificate)
+    ET.indent(root)
+    text: str = ET.tostring(root, encoding="unicode")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()
+
+
+# Elements and texts.
+
+
+def _add(parent: ET.Element, name: str, text: str | None = None, **attributes: str) -> ET.Element:
+    """Return a new child, of the name space ``dcc`` where the name states none."""
+    child = ET.SubElement(parent, name if ":" in name else f"dcc:{name}", attributes)
+    child.text = text
+    return child
+
+
+def _words(parent: ET.Element, name: str, text: str) -> None:
+    """Add a text in the language of the certificate."""
+    _add(_add(parent, name), "content", text, lang="en")
+
+
+def _optional(parent: ET.Element, name: str, text: object | None) -> None:
+    if text is not None:
+        _add(parent, name, str(text))
+
+
+# The head: who, what, when.
+
+
+def _administrative(root: ET.Element, certificate: Certificate) -> None:
+    lab, head = certificate.lab, _add(root, "administrativeData")
+    _software(_add(head, "dccSoftware"), certificate.record.software)
+    core, identity = _add(head, "coreData"), lab.certificate
+    _add(core, "countryCodeISO3166_1", lab.laboratory.address.country)
+    for name in ("usedLangCodeISO639_1", "mandatoryLangCodeISO639_1"):
+        _add(core, name, identity.language)
+    _add(core, "uniqueIdentifier", identity.number)
+    if lab.customer.order is not None:
+        _identification(_add(core, "identifications"), "customer", lab.customer.order, "order")
+    _optional(core, "receiptDate", identity.received)
+    _add(core, "beginPerformanceDate", str(identity.performed[0]))
+    _add(core, "endPerformanceDate", str(identity.performed[1]))
+    _add(core, "performanceLocation", identity.location)
+    _add(core, "issueDate", str(identity.issued))
+    _item(_add(head, "items"), certificate)
+    laboratory = _add(head, "calibrationLaboratory")
+    _optional(laboratory, "calibrationLaboratoryCode", lab.laboratory.code)
+    _contact(_add(laboratory, "contact"), lab.laboratory)
+    persons = _add(head, "respPersons")
+    for person in lab.persons:
+        entry = _add(persons, "respPerson")
+        _words(_add(entry, "person"), "name", person.name)
+        _add(entry, "role", person.role)
+        if person.signs:
+            _add(entry, "mainSigner", "true")
+    _contact(_add(head, "customer"), lab.customer)
+    _statements(_add(head, "statements"), certificate)
+
+
+def _software(parent: ET.Element, software: str) -> None:
+    """Add a program; PTB's Schematron wants a letter before the numbers of a release."""
+    name, _, release = software.partition(" ")
+    entry = _add(parent, "software")
+    _words(entry, "name", name)
+    _add(entry, "release", f"v{release}")
+
+
+def _identification(parent: ET.Element, issuer: str, value: str, name: str) -> None:
+    entry = _add(parent, "identification")
+    _add(entry, "issuer", issuer)
+    _add(entry, "value", value)
+    _words(entry, "name", name)
+
+
+def _item(parent: ET.Element, certificate: Certificate) -> None:
+    stated, item = certificate.lab.item, _add(parent, "item")
+    _words(item, "name", stated.name)
+    _words(item, "description", f"Condition: {stated.condition}")
+    _words(_add(item, "manufacturer"), "name", stated.manufacturer)
+    _optional(item, "model", certificate.model)
+    _identification(_add(item, "identifications"), "manufacturer", certificate.serial, "serial number")
+
+
+def _contact(parent: ET.Element, party: Party) -> None:
+    _words(parent, "name", party.name)
+    _optional(parent, "eMail", party.email)
+    _location(_add(parent, "location"), party.address)
+
+
+def _location(parent: ET.Element, address: Address) -> None:
+    _add(parent, "street", address.street)
+    _optional(parent, "streetNo", address.number)
+    _add(parent, "postCode", address.postcode)
+    _add(parent, "city", address.city)
+    _add(parent, "countryCode", address.country)
+
+
+def _statements(parent: ET.Element, certificate: Certificate) -> None:
+    for clause, text in _STATEMENTS:
+        entry = _add(parent, "statement")
+        _add(entry, "norm", _ISSUED_UNDER)
+        _add(entry, "reference", clause)
+        _words(entry, "declaration", text)
+    entry = _add(parent, "statement")
+    _add(entry, "traceable", "true")
+    _add(entry, "norm", _ISSUED_UNDER)
+    _add(entry, "reference", "7.8.4.1 c")
+    _words(entry, "declaration", certificate.lab.traceability.statement)
+    remarks = list(certificate.record.verdict.reasons)
+    if certificate.lab.certificate.reviewed is not None:
+        remarks.append(f"Reviewed: {certificate.lab.certificate.reviewed}")
+    if certificate.left_out:
+        values = "1 value" if certificate.left_out == 1 else f"{certificate.left_out} values"
+        remarks.append(f"{values} without uncertainty are in the record, not in this certificate.")
+    for remark in remarks:
+        _words(_add(parent, "statement"), "declaration", remark)
+
+
+# The results.
+
+
+def _measurement(result: ET.Element, certificate: Certificate) -> None:
+    lab, record = certificate.lab, certificate.record
+    _words(result, "name", lab.method.name)
+    method = _add(_add(result, "usedMethods"), "usedMethod")
+    _words(method, "name", lab.method.name)
+    _words(
+        method,
+        "description",
+        f"Procedure {lab.method.procedure}; evaluated by the procedure {record.procedure}; "
+        f"deviations: {lab.method.deviations}",
+    )
+    for standard in lab.method.standards:
+        _add(method, "norm", standard)
+    _software(_add(result, "usedSoftware"), record.software)
+    if lab.equipment:
+        equipment = _add(result, "measuringEquipments")
+        for known in lab.equipment:
+            _equipment(_add(equipment, "measuringEquipment", refType="basic_normalUsed"), known)
+    conditions = ET.Element("dcc:influenceConditions")
+    for condition in lab.conditions:
+        _condition(_add(conditions, "influenceCondition"), condition)
+    for name, key in (("Gravity in the evaluation", "gravity"), ("Temperature of the item", "temperature")):
+        if isinstance(stated := record.model.get(key), Mapping):
+            _stated_condition(_add(conditions, "influenceCondition"), name, stated)
+    if len(conditions):
+        result.append(conditions)
+    entry = _add(_add(result, "results"), "result")
+    _words(entry, "name", "Parameters")
+    data = _add(entry, "data")
+    covered = [each.name for each in certificate.results if each.name in record.covariance.names]
+    for number, each in enumerate(certificate.results, start=1):
+        shared = {"id": f"parameter_{number}"} if each.name in covered else {}
+        _quantity(_add(data, "quantity", refType="basic_calibrationValue", **shared), each)
+    if covered:
+        _covariance(data, certificate.results, record.covariance, covered)
+    _provenance(_add(result, "measurementMetaData"), certificate)
+
+
+def _equipment(parent: ET.Element, standard: Equipment) -> None:
+    _words(parent, "name", standard.name)
+    known = standard.standard_uncertainty
+    size = "" if known is None else f", standard uncertainty {known.value!r} {known.unit}"
+    _words(parent, "description", f"Certificate {standard.certificate} of {standard.issuer}{size}")
+    _identification(_add(parent, "identifications"), "other", standard.certificate, "certificate")
+
+
+def _condition(parent: ET.Element, condition: Condition) -> None:
+    _words(parent, "name", condition.name)
+    quantity = _add(_add(parent, "data"), "quantity")
+    real = _add(quantity, "si:real")
+    _add(real, "si:value", repr(condition.value))
+    _add(real, "si:unit", dsi_unit(condition.unit)[0])
+    _expanded(real, condition.expanded_uncertainty, condition.coverage_factor, NORMAL[1], "normal")
+
+
+def _stated_condition(parent: ET.Element, name: str, stated: Mapping[str, Any]) -> None:
+    """Add a condition that the record states, with its uncertainty where it states one above 0."""
+    _words(parent, "name", name)
+    real = _add(_add(_add(parent, "data"), "quantity"), "si:real")
+    _add(real, "si:value", repr(float(stated["value"])))
+    _add(real, "si:unit", dsi_unit(stated["unit"])[0])
+    if uncertainty := stated.get("standard_uncertainty"):
+        _expanded(real, NORMAL[0] * uncertainty, *NORMAL)
+
+
+def _expanded(real: ET.Element, uncertainty: float, factor: float, probability: float, distribution: str) -> None:
+    expanded = _add(_add(real, "si:measurementUncertaintyUnivariate"), "si:expandedMU")
+    _add(expanded, "si:valueExpandedMU", repr(uncertainty))
+    _add(expanded, "si:coverageFactor", _plain(factor))
+    _add(expanded, "si:coverageProbability", _plain(probability))
+    _add(expanded, "si:distribution", distribution)
+
+
+def _plain(number: float) -> str:
+    """Return a number without an exponent, which coverage factors and probabilities must not have."""
+    return f"{Decimal(repr(number)):f}"
+
+
+def _quantity(quantity: ET.Element, result: Result) -> None:
+    _words(quantity, "name", result.name)
+    real = _add(quantity, "si:real")
+    _add(real, "si:label", result.name)
+    _add(real, "si:value", repr(result.value))
+    _add(real, "si:unit", result.dsi)
+    if result.interval is None:
+        _expanded(
+            real,
+            result.expanded_uncertainty,
+            result.coverage_factor,
+            result.probability,
+            result.distribution,
+        )
+    else:
+        covered = _add(_add(real, "si:measurementUncertaintyUnivariate"), "si:coverageIntervalMU")
+        _add(covered, "si:valueStandardMU", repr(result.standard_uncertainty))
+        _add(covered, "si:intervalMin", repr(result.interval[0]))
+        _add(covered, "si:intervalMax", repr(result.interval[1]))
+        _add(covered, "si:coverageProbability", _plain(result.probability))
+    if result.definition:
+        unit = _add(_add(quantity, "measurementMetaData"), "metaData")
+        _add(unit, "nonSIDefinition", result.definition)
+        _add(unit, "nonSIUnit", result.unit)
+
+
+def _covariance(data: ET.Element, results: tuple[Result, ...], covariance: Covariance, names: list[str]) -> None:
+    """Add the standard uncertainties and the covariance matrix, a column for each parameter."""
+    by_name = {result.name: (number, result) for number, result in enumerate(results, start=1)}
+    chosen = [by_name[name][1] for name in names]
+    references = " ".join(f"parameter_{by_name[name][0]}" for name in names)
+    quantity = _add(data, "quantity", refId=references)
+    _words(quantity, "name", "Covariance of the parameters")
+    values = _add(quantity, "si:realListXMLList")
+    _add(values, "si:labelXMLList", " ".join(names))
+    _add(values, "si:valueXMLList", " ".join(repr(result.value) for result in chosen))
+    _add(values, "si:unitXMLList", " ".join(result.dsi for result in chosen))
+    standard = _add(_add(values, "si:measurementUncertaintyUnivariateXMLList"), "si:standardMUXMLList")
+    _add(standard, "si:valueStandardMUXMLList", " ".join(repr(result.standard_uncertainty) for result in chosen))
+    region = _add(_add(values, "si:measurementUncertaintyMultivariateXMLList"), "si:ellipsoidalRegionMUXMLList")
+    matrix = _add(region, "si:covarianceMatrixXMLList")
+    for result, column in zip(chosen, covariance.block(names).tolist(), strict=True):
+        entries = _add(matrix, "si:columnXMLList")
+        for other, value in zip(chosen, column, strict=True):
+            entry = _add(entries, "si:covarianceXMLList")
+            _add(entry, "si:valueXMLList", repr(value))
+            _add(entry, "si:unitXMLList", dsi_unit(f"({result.unit})*({other.unit})")[0])
+    reach = math.sqrt(float(chi_square_upper_quantile(1 - _COVERED, len(names))))
+    _add(region, "si:coverageFactorXMLList", _plain(reach))
+    _add(region, "si:coverageProbabilityXMLList", _plain(_COVERED))
+
+
+def _provenance(parent: ET.Element, certificate: Certificate) -> None:
+    """Add the hashes of the record and of the recordings that it was made from."""
+    entries = [("record", certificate.sha256)]
+    entries += [(source.file, source.sha256) for source in certificate.record.sources]
+    for name, sha256 in entries:
+        entry = _add(parent, "metaData", refType="imulab_source")
+        _words(entry, "name", name)
+        _add(entry, "reference", f"sha256:{sha256}")

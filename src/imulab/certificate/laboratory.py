@@ -1,0 +1,179 @@
+"""What the laboratory states of a certificate: LAB.toml, its checks, and a commented one to start from.
+
+Nothing of it is invented: what the certificate needs and the file lacks is refused by its place.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import date
+from typing import Annotated, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from imulab.display import first_hidden
+from imulab.errors import ReadError
+from imulab.files import load_toml
+from imulab.quantities import LARGEST
+
+Text = Annotated[str, Meta(pattern=r"^\S+(\s+\S+)*$")]
+"""A text that the schema of certificates takes: not empty, without spaces at its ends."""
+Size = Annotated[float, Meta(gt=0, le=LARGEST)]
+Country = Annotated[str, Meta(pattern="^[A-Z]{2}$")]
+Location = Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"]
+
+
+class _Table(Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of the file; a key that it does not know may be misspelt, and is refused."""
+
+
+class Address(_Table, frozen=True, kw_only=True):
+    """Where a laboratory or a customer is; the country by ISO 3166-1."""
+
+    street: Text
+    number: Text | None = None
+    postcode: Text
+    city: Text
+    country: Country
+
+
+class Party(_Table, frozen=True, kw_only=True):
+    """The laboratory or the customer."""
+
+    name: Text
+    address: Address
+    email: Text | None = None
+    code: Text | None = None
+    order: Text | None = None
+
+
+class Person(_Table, frozen=True, kw_only=True):
+    """Who is responsible; who `signs` authorises the certificate."""
+
+    name: Text
+    role: Text
+    signs: bool = False
+
+
+class Identity(_Table, frozen=True, kw_only=True):
+    """The table ``certificate``: number, dates and place."""
+
+    number: Text
+    issued: date
+    performed: tuple[date, date]
+    location: Location
+    language: Literal["en"] = "en"
+    received: date | None = None
+    reviewed: Text | None = None
+
+
+class Item(_Table, frozen=True, kw_only=True):
+    """What was calibrated; model and serial must be those of the record."""
+
+    name: Text
+    manufacturer: Text
+    condition: Text
+    model: Text | None = None
+    serial: Text | None = None
+
+
+class Method(_Table, frozen=True, kw_only=True):
+    """How it was calibrated: the laboratory's procedure, and where it deviates."""
+
+    name: Text
+    procedure: Text
+    standards: list[Text] = []
+    deviations: Text
+
+
+class Traceability(_Table, frozen=True, kw_only=True):
+    """How the results are traceable to the SI."""
+
+    statement: Text
+
+
+class Stated(_Table, frozen=True, kw_only=True):
+    """A value with its unit."""
+
+    value: Size
+    unit: Text
+
+
+class Equipment(_Table, frozen=True, kw_only=True):
+    """A standard; the one of `quantity` gravity is compared with the gravity of the record."""
+
+    name: Text
+    certificate: Text
+    issuer: Text
+    quantity: Literal["gravity"] | None = None
+    standard_uncertainty: Stated | None = None
+
+
+class Condition(_Table, frozen=True, kw_only=True):
+    """A condition of the environment, with its expanded uncertainty."""
+
+    name: Text
+    value: Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+    unit: Text
+    expanded_uncertainty: Size
+    coverage_factor: Annotated[float, Meta(ge=1, le=LARGEST)] = 2.0
+
+
+class Laboratory(_Table, frozen=True, kw_only=True):
+    """LAB.toml as a whole."""
+
+    certificate: Identity
+    laboratory: Party
+    customer: Party
+    persons: list[Person]
+    item: Item
+    method: Method
+    traceability: Traceability
+    equipment: list[Equipment] = []
+    conditions: list[Condition] = []
+
+
+Kind = TypeVar("Kind")
+_UNKNOWN = re.compile("^Object contains unknown field `(.*)`$")
+_MISSING = re.compile("^Object missing required field `(.*)`$")
+
+
+def load_laboratory(path: str) -> Laboratory:
+    """Return the checked LAB.toml.
+
+    Raises
+    ------
+    ReadError
+        It cannot be read; a table or key is unknown, missing or of another kind; a text is empty, begins or ends with
+        a space, or has a control character; nobody signs; days are out of order.
+    """
+    table = load_toml(path, path, "laboratory")
+    if hidden := first_hidden(table):
+        raise ReadError(f"{path}: {hidden}: a control or bidirectional character; expected text alone")
+    try:
+        lab = msgspec.convert(table, Laboratory)
+    except msgspec.ValidationError as error:
+        raise ReadError(f"{path}: {_reason(str(error))}") from None
+    identity = lab.certificate
+    first, last = identity.performed
+    if not any(person.signs for person in lab.persons):
+        raise ReadError(f"{path}: persons: nobody signs; expected signs = true for who authorises the certificate")
+    if not first <= last <= identity.issued:
+        raise ReadError(f"{path}: certificate: performed {first} to {last}, issued {identity.issued}: out of order")
+    if identity.received is not None and identity.received > first:
+        raise ReadError(f"{path}: certificate: received {identity.received}, after the first day of work {first}")
+    return lab
+
+
+def _reason(message: str) -> str:
+    """Return the place of a mistake and what it is, from a message of msgspec's."""
+    what, _, where = message.partition(" - at `$")
+    place = where.rstrip("`").lstrip(".") or "the file"
+    if unknown := _UNKNOWN.match(what):
+        return f"{place}: unknown key {unknown[1]!r}"
+    if missing := _MISSING.match(what):
+        return f"{place}: expected {missing[1]}, which is missing"
+    if "matching regex" in what:
+        return f"{place}: expected a text that is not empty and has no space at its ends (a country: DE, two letters)"
+    return f"{place}: {what[0].lower()}{what[1:]}"

@@ -1,0 +1,144 @@
+"""What a certificate says, from a record and LAB.toml, with every refusal: one model for all that is written of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from imulab.certificate.laboratory import Equipment, Laboratory
+from imulab.certificate.units import dsi_unit
+from imulab.errors import OptionError, RecordError
+from imulab.files import unit_of
+from imulab.records.calibration import Calibration, Parameter
+from imulab.units import to_si
+
+NORMAL = (2.0, 0.9545, "normal")
+"""Coverage factor, probability and distribution where the record states no factor of its own."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """One parameter: its value and expanded uncertainty ``U = k u`` in its unit.
+
+    Attributes
+    ----------
+    unit, dsi, definition
+        Unit of the record, as the D-SI writes it, and the definition of what in it is not of the SI.
+    interval
+        The interval of 95 % where it is not that of U.
+    """
+
+    name: str
+    value: float
+    standard_uncertainty: float
+    coverage_factor: float
+    probability: float
+    distribution: str
+    unit: str
+    dsi: str
+    definition: str
+    interval: tuple[float, float] | None
+
+    @property
+    def expanded_uncertainty(self) -> float:
+        """Return U."""
+        return self.coverage_factor * self.standard_uncertainty
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """All that a certificate holds; `left_out` counts parameters without an uncertainty."""
+
+    lab: Laboratory
+    record: Calibration
+    sha256: str
+    serial: str
+    model: str | None
+    results: tuple[Result, ...]
+    left_out: int
+
+
+def make_certificate(record: Calibration, sha256: str, lab: Laboratory) -> Certificate:
+    """Return the certificate of a record whose seal was checked; `sha256` is its ``content_sha256``.
+
+    Raises
+    ------
+    RecordError
+        The record cannot have one: its verdict, no serial number, no parameter with an uncertainty, an uncertainty of
+        gravity below that of the laboratory's standard.
+    OptionError
+        LAB.toml says something else than the record.
+    UnitError
+        The D-SI has no name for a unit.
+    """
+    _check_verdict(record, lab)
+    serial = record.sensor.get("serial")
+    if not serial:
+        raise RecordError("the record names no serial number: fit again with --serial; a certificate is of one item")
+    for key, stated in (("serial", lab.item.serial), ("model", lab.item.model)):
+        if stated is not None and stated != record.sensor.get(key, stated):
+            raise OptionError(f"item.{key} {stated!r}: the record says {record.sensor[key]!r}")
+    for standard in lab.equipment:
+        if standard.quantity is not None:
+            _check_gravity(record, standard)
+    if len(record.model.get("serials", ())) > 1:
+        raise RecordError("the record is of several units; a certificate is of one item")
+    results = tuple(_results(record))
+    if not results:
+        raise RecordError("no parameter of the record has an uncertainty: there is nothing to certify")
+    for condition in lab.conditions:
+        dsi_unit(condition.unit)
+    model = record.sensor.get("model", lab.item.model)
+    return Certificate(lab, record, sha256, serial, model, results, len(record.parameters) - len(results))
+
+
+def _check_verdict(record: Calibration, lab: Laboratory) -> None:
+    state, reasons = record.verdict.state, "; ".join(record.verdict.reasons)
+    if state == "bad":
+        raise RecordError(f"the record's verdict is bad: {reasons}")
+    if state == "look" and lab.certificate.reviewed is None:
+        raise RecordError(
+            "the record's verdict is look; expected certificate.reviewed to say why it may be certified: " + reasons
+        )
+
+
+def _check_gravity(record: Calibration, standard: Equipment) -> None:
+    """Refuse a record whose gravity is stated better than that of the standard it is traced to."""
+    gravity = record.model.get("gravity")
+    if not isinstance(gravity, Mapping):
+        raise RecordError(f"{standard.name}: equipment of gravity, but the record is made without gravity")
+    if standard.standard_uncertainty is None:
+        raise OptionError(f"equipment {standard.name}: expected standard_uncertainty of gravity")
+    stated = gravity.get("standard_uncertainty")
+    unit = unit_of(standard.standard_uncertainty.unit, "acceleration", f"equipment {standard.name}")
+    least = to_si(standard.standard_uncertainty.value, unit)
+    if stated is None or stated < least * (1 - 1e-9):
+        found = "none" if stated is None else f"{stated:g} m/s^2"
+        raise RecordError(
+            f"uncertainty of gravity in the record: {found}, below {least:g} m/s^2 of {standard.name}; fit again with "
+            f"--gravity {gravity['value']!r}+-{least:g}"
+        )
+
+
+def _results(record: Calibration) -> list[Result]:
+    return [
+        _result(record, name, parameter, u)
+        for name, parameter in record.parameters.items()
+        if (u := parameter.standard_uncertainty) is not None and u > 0
+    ]
+
+
+def _result(record: Calibration, name: str, parameter: Parameter, u: float) -> Result:
+    factor = record.fit.get("coverage_factor_95")
+    if isinstance(factor, Mapping):
+        factor = factor.get(name)
+    k, probability, distribution = NORMAL
+    if isinstance(factor, int | float) and factor >= 1:
+        k, probability, distribution = float(factor), 0.95, "t"
+    dsi, definition = dsi_unit(parameter.unit)
+    interval = parameter.interval_95
+    if interval is not None:
+        probability = 0.95
+    return Result(
+        name, parameter.value, u, k, probability, distribution, parameter.unit, dsi, definition, interval
+    )  # fmt: skip

@@ -1,0 +1,249 @@
+"""Certificates: valid by PTB's schemas, every number of the record in them bit for bit, refusals write nothing."""
+
+import json
+import math
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from scipy.stats import chi2
+
+import imulab as il
+from imulab.certificate.dcc import dcc_xml
+from imulab.certificate.laboratory import load_laboratory
+from imulab.certificate.model import make_certificate
+from imulab.certificate.units import dsi_unit
+from imulab.cli import main
+from imulab.display import Verdict
+from imulab.errors import UnitError
+
+LAB = (Path(__file__).resolve().parent / "data" / "lab.toml").read_text(encoding="utf-8")
+STANDARD = """
+[[equipment]]
+name = "Local gravity value"
+quantity = "gravity"
+certificate = "GRAV-2024-017"
+issuer = "Example Institute"
+standard_uncertainty = { value = 1e-6, unit = "m/s^2" }
+"""
+REVIEWED = LAB.replace("location =", 'reviewed = "seen and understood"\nlocation =')
+WRITTEN = Path(__file__).resolve().parent / "data" / "written_by" / "0.2.0"
+NAMES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
+
+
+@pytest.fixture(scope="module")
+def sound(made_once):
+    """A folder with the good record of a tumble test, whose gravity is known to 1e-6 m/s^2."""
+    recording = il.simulate_tumble(gravity=9.81362)
+    return made_once(
+        "certified", lambda folder: il.fit_tumble(recording, gravity="9.81362+-0.000001").save(folder / "sound.json")
+    )
+
+
+@pytest.fixture
+def issue(tmp_path, monkeypatch, sound):
+    """A function that runs the command on a record and a LAB.toml, and returns its exit status."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(lab=LAB + STANDARD, record=sound / "sound.json", output="cert.xml"):
+        Path("lab.toml").write_text(lab, encoding="utf-8")
+        return main(["certificate", str(record), "--lab", "lab.toml", "-o", output])
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def schemas():
+    """PTB's schema by two libraries, from files alone."""
+    etree = pytest.importorskip("lxml.etree", reason="lxml checks certificates")
+    xmlschema = pytest.importorskip("xmlschema", reason="xmlschema checks certificates")
+    path = Path(os.environ.get("IMULAB_DATA", "")) / "dcc" / "dcc" / "v3.3.0.xsd"
+    if "IMULAB_DATA" not in os.environ or not path.exists():
+        pytest.skip("PTB's schemas are not here (IMULAB_DATA)")
+    first, second = etree.XMLSchema(etree.parse(path)), xmlschema.XMLSchema(str(path))
+
+    def mistakes(file):
+        tree = etree.parse(file)
+        first.validate(tree)
+        return [str(error) for error in first.error_log] + [error.reason for error in second.iter_errors(str(file))]
+
+    return mistakes
+
+
+def test_the_certificate_of_a_tumble_record_is_valid(issue, schemas):
+    assert issue() == 0
+    assert schemas("cert.xml") == []
+
+
+@pytest.mark.parametrize("name", ["nine_axes", "thermal", "rate", "warmup", "centrifuge", "array"])
+def test_certificates_of_other_procedures_are_valid(issue, schemas, name):
+    content = json.loads((WRITTEN / f"{name}.json").read_text(encoding="utf-8"))
+    assert issue(REVIEWED, WRITTEN / f"{name}.json") == 0
+    assert schemas("cert.xml") == []
+    known = [p["standard_uncertainty"] for p in content["parameters"].values() if p["standard_uncertainty"]]
+    assert len(_single("cert.xml")) == len(known)
+
+
+def test_schemas_see_a_changed_certificate(issue, schemas):
+    assert issue() == 0
+    text = Path("cert.xml").read_text(encoding="utf-8")
+    Path("cert.xml").write_text(text.replace("parameter_3 ", "parameter_99 "), encoding="utf-8")
+    assert any("parameter_99" in mistake for mistake in schemas("cert.xml"))
+
+
+def _single(path):
+    """The quantities of single parameters."""
+    return ElementTree.parse(path).findall(".//dcc:quantity[@refType='basic_calibrationValue']", NAMES)
+
+
+def _text(element, path):
+    return element.find(path, NAMES).text
+
+
+def test_every_number_comes_back_bit_for_bit(issue, sound):
+    assert issue() == 0
+    record = json.loads((sound / "sound.json").read_text(encoding="utf-8"))
+    factor, parameters = record["fit"]["coverage_factor_95"], record["parameters"]
+    assert [_text(each, "si:real/si:label") for each in _single("cert.xml")] == [*parameters]
+    for each, parameter in zip(_single("cert.xml"), parameters.values(), strict=True):
+        assert float(_text(each, "si:real/si:value")) == parameter["value"]
+        if "interval_95" in parameter:
+            ends = [float(_text(each, f".//si:interval{end}")) for end in ("Min", "Max")]
+            assert ends == parameter["interval_95"]
+            assert float(_text(each, ".//si:valueStandardMU")) == parameter["standard_uncertainty"]
+        else:
+            assert float(_text(each, ".//si:coverageFactor")) == factor
+            assert float(_text(each, ".//si:valueExpandedMU")) == factor * parameter["standard_uncertainty"]
+    together = ElementTree.parse("cert.xml").find(".//si:realListXMLList", NAMES)
+    assert _text(together, "si:labelXMLList").split() == record["covariance"]["names"]
+    known = [parameters[name]["standard_uncertainty"] for name in record["covariance"]["names"]]
+    assert [float(u) for u in _text(together, ".//si:valueStandardMUXMLList").split()] == known
+    columns = together.findall(".//si:columnXMLList", NAMES)
+    matrix = [[float(entry.text) for entry in column.findall(".//si:valueXMLList", NAMES)] for column in columns]
+    assert matrix == record["covariance"]["matrix"]
+    units = [entry.text for entry in together.findall(".//si:covarianceMatrixXMLList//si:unitXMLList", NAMES)]
+    assert units[0] == r"\metre\tothe{2}\second\tothe{-4}"
+
+
+def test_the_same_input_gives_the_same_bytes_without_a_clock(issue, sound):
+    assert issue() == 0
+    assert issue(output="again.xml") == 0
+    text = Path("cert.xml").read_bytes()
+    assert text == Path("again.xml").read_bytes()
+    sha256 = json.loads((sound / "sound.json").read_text(encoding="utf-8"))["content_sha256"]
+    assert f"sha256:{sha256}" in text.decode()
+    assert "Example Drones &lt;b&gt;Ltd&lt;/b&gt; &amp; S\u00f6hne" in text.decode()
+
+
+def test_parameters_without_uncertainty_are_counted(issue):
+    assert issue(REVIEWED, WRITTEN / "warmup.json") == 0
+    assert "7 values without uncertainty are in the record" in Path("cert.xml").read_text(encoding="utf-8")
+
+
+REFUSED = {
+    "nobody signs": (LAB.replace("signs = true", "signs = false"), "persons: nobody signs"),
+    "unknown key": (LAB.replace("role =", "rank ="), "persons[0]: unknown key 'rank'"),
+    "missing": (LAB.replace('condition = "as received"', ""), "item: expected condition, which is missing"),
+    "empty": (LAB.replace('"as received"', '""'), "item.condition: expected a text that is not empty"),
+    "space": (LAB.replace('"as received"', '" as received"'), "item.condition: expected a text that is not empty"),
+    "bell": (LAB.replace("as received", r"as\u0007received"), "item.condition: a control or bidirectional character"),
+    "country": (LAB.replace('"DE" }\n[customer]', '"Germany" }\n[customer]'), "laboratory.address.country: expected"),
+    "no day": (LAB.replace("2026-11-20", '"last week"'), "certificate.received: "),
+    "issued before": (LAB.replace("issued = 2026-11-27", "issued = 2026-11-23"), "out of order"),
+    "received after": (LAB.replace("received = 2026-11-20", "received = 2026-11-25"), "received 2026-11-25, after"),
+    "infinite": (LAB.replace("23.0", "inf"), "conditions[0].value: "),
+    "unit": (LAB.replace('"degC"', '"furlong"'), "unit furlong: the D-SI"),
+    "serial": (LAB.replace("condition =", 'serial = "SN-1"\ncondition ='), "item.serial 'SN-1': the record says"),
+    "gravity": (LAB + STANDARD.replace("1e-6", "1e-3"), "fit again with --gravity 9.81362+-0.001"),
+    "gravity's unit": (LAB + STANDARD.replace('"m/s^2"', '"deg"'), "expected a unit of acceleration"),
+    "no gravity": (LAB + STANDARD.replace("standard_unc", "#"), "expected standard_uncertainty of gravity"),
+    "not TOML": ("[certificate", "the laboratory file is not TOML"),
+}
+
+
+@pytest.mark.parametrize(("lab", "expected"), REFUSED.values(), ids=REFUSED)
+def test_what_is_wrong_is_refused_in_one_line_and_nothing_is_written(issue, capsys, lab, expected):
+    assert issue(lab) == 2
+    message = capsys.readouterr().err
+    assert expected in message
+    assert message.count("\n") == 1
+    assert not Path("cert.xml").exists()
+
+
+@pytest.mark.parametrize(
+    ("record", "expected"),
+    [
+        (WRITTEN / "tumble.json", "the record's verdict is look; expected certificate.reviewed"),
+        (WRITTEN / "noise.json", "the record names no serial number"),
+        (WRITTEN / "nobody.json", "No such file"),
+    ],
+    ids=["look", "no serial", "missing"],
+)
+def test_records_that_cannot_be_certified_are_refused(issue, capsys, record, expected):
+    assert issue(LAB, record) == 2
+    assert expected.lower() in capsys.readouterr().err.lower()
+    assert not Path("cert.xml").exists()
+
+
+def test_an_altered_or_bad_record_is_refused(issue, capsys, sound):
+    text = (sound / "sound.json").read_text(encoding="utf-8")
+    Path("altered.json").write_text(re.sub(r'"value": (-?)0\.', r'"value": \g<1>1.', text, count=1), encoding="utf-8")
+    assert issue(LAB, "altered.json") == 2
+    assert "altered" in capsys.readouterr().err
+    replace(il.load(sound / "sound.json"), verdict=Verdict("bad", ("no gravity",))).save("bad.json")
+    assert issue(REVIEWED, "bad.json") == 2
+    assert "verdict is bad: no gravity" in capsys.readouterr().err
+
+
+def test_an_output_that_is_an_input_or_no_certificate_is_refused(issue, capsys):
+    for output, expected in (("lab.toml", "would overwrite"), ("cert.html", "expected a name that ends with")):
+        Path("lab.toml").touch()
+        assert issue(output=output) == 2
+        assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [
+        ("m/s^2", r"\metre\second\tothe{-2}"),
+        ("m/s^2/(m/s^2)", r"\one"),
+        ("m/s^2/(m/s^2)/K", r"\kelvin\tothe{-1}"),
+        ("1/(m/s^2)", r"\metre\tothe{-1}\second\tothe{2}"),
+        ("rad/s/sqrt(Hz)", r"\radian\second\tothe{-1}\hertz\tothe{-0.5}"),
+        ("deg/s/(rad/s)", r"\degree\radian\tothe{-1}"),
+        ("uT/T", r"\micro\tesla\tesla\tothe{-1}"),
+        ("count/(m/s^2)", r"\metre\tothe{-1}\second\tothe{2}"),
+        ("1", r"\one"),
+    ],
+)
+def test_units_are_products_of_powers(unit, expected):
+    assert dsi_unit(unit)[0] == expected
+
+
+@pytest.mark.parametrize("unit", ["", "m/", "furlong", "m^", "(m", "m)", "2 m", "m s"])
+def test_units_without_a_name_are_refused(unit):
+    with pytest.raises(UnitError, match="the D-SI"):
+        dsi_unit(unit)
+
+
+@pytest.mark.filterwarnings("ignore")  # of the parser, on its own steps
+def test_units_of_written_records_are_known_to_ptbs_parser():
+    parser = pytest.importorskip("dsi_unit", reason="dsiunits checks units")
+    units = {
+        parameter["unit"]
+        for path in WRITTEN.glob("*.json")
+        for parameter in json.loads(path.read_text(encoding="utf-8")).get("parameters", {}).values()
+    }
+    assert len(units) > 10
+    assert [unit for unit in units if not parser.DsiUnit(dsi_unit(unit)[0]).valid] == []
+
+
+def test_the_region_of_all_parameters_holds_95_percent(sound, tmp_path):
+    (tmp_path / "lab.toml").write_text(LAB, encoding="utf-8")
+    made = make_certificate(il.load(sound / "sound.json"), "0" * 64, load_laboratory(str(tmp_path / "lab.toml")))
+    root = ElementTree.fromstring(dcc_xml(made))
+    factor = float(_text(root, ".//si:coverageFactorXMLList"))
+    assert math.isclose(chi2.cdf(factor**2, len(made.record.covariance.names)), 0.95, rel_tol=1e-12)
