@@ -304,26 +304,31 @@ def test_an_unknown_stream_shows_its_lines_and_a_guess(live, new_page, tmp_path)
     sender = subprocess.Popen(
         [
             sys.executable, "-c",
-            "import socket, time\n"
+            "import socket, sys, time\n"
             "s = socket.create_server(('127.0.0.1', 0)); print(s.getsockname()[1], flush=True)\n"
             f"c, _ = s.accept()\nfor line in '{rows}'.splitlines(True):\n"
-            "  c.sendall(line.encode()); time.sleep(0.01)\n",
+            "  c.sendall(line.encode()); time.sleep(0.01)\n"
+            "sys.stdin.readline()\n",  # it ends when the page has been seen
         ],
-        stdout=subprocess.PIPE, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
         port = sender.stdout.readline().strip()
         running = live(f"tcp:127.0.0.1:{port}", "--save", "rec.csv")
         page = new_page(running.address)
-        page.wait_for_selector("#said .bad:has-text('unknown format')")
+        page.get_by_role("button", name="Read it so").wait_for()
         assert "[columns]" in page.locator("pre").last.inner_text()
+        sender.communicate("\n")
+        page.wait_for_selector("#said .bad:has-text('unknown format')")
         status, error = running.end()
         assert status == 2
         assert "unknown format" in error
         assert not (tmp_path / "rec.csv").exists()
     finally:
         sender.kill()
-        sender.communicate()
+        sender.wait()
+        sender.stdin.close()
+        sender.stdout.close()
 
 
 def test_no_script_and_old_browsers_are_told(live, browser):
@@ -399,7 +404,7 @@ def test_a_link_that_is_lost_keeps_the_page_and_comes_back(live, new_page, tmp_p
         )
         page = new_page(running.address)
         first = server.accept()[0]
-        sender = Sender(first.sendall, lines)
+        sender = Sender(first.sendall, lines[: len(lines) // 3])  # however late the page is, much is left to send
         page.locator("section:has(> h2:text-is('Attitudes')) tbody tr").nth(2).wait_for()
         gone = sender.stop()
         first.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

@@ -232,6 +232,7 @@ class Runner:
         self._stream = LineStream(source.name, layout, polled=source.polled, units=units)
         self._last_arrival = source.now()
         self._given_up = False
+        self._reopened = False  # and no sample has come since
         self.asked: UnknownFormatError | None = None
         self._further: FurtherFits | None = None
         self._fit_due = False
@@ -289,6 +290,7 @@ class Runner:
         self._stream.counts.unread_share = self.source.unread_share
         events = self._check_link(any(len(piece.data) for piece in arrived), now)
         for piece in arrived:
+            self._reopened = not len(piece.data) and self.session.begun
             if not len(piece.data):  # the link is open again
                 self._stream.cut()
                 continue
@@ -423,7 +425,8 @@ class Runner:
         if source.absent:
             session.trouble = Trouble("absent", source.absent, "The session begins with the first sample.")
             return [Event("absent", source.absent, self.recorder.last)] if before is None else []
-        if source.ended or not (source.lost or before or waited >= _SILENT):
+        lost = source.lost or self._reopened
+        if source.ended or not (lost or before or waited >= _SILENT):
             return []
         if before is not None and before.state == "absent":  # it has come
             self._last_arrival, session.trouble = now, None
@@ -437,7 +440,7 @@ class Runner:
         outlook = f"{why} {self.kept()}." if session.begun else f"{why} The session begins with the first sample."
         if session.begun and source.comes_back:
             outlook += f" In {max(_GIVEN_UP - waited, 0):.0f} s the record is made of what there is."
-        if source.lost or (before is not None and before.state == "lost"):  # until samples come again
+        if lost or (before is not None and before.state == "lost"):  # until samples come again
             at = f" at {len(session.guide.kept)} of {session.wanted}" if session.wanted else ""
             session.trouble = Trouble("lost", f"link lost{at}; reconnecting", outlook)
             text = f"{session.trouble.advice}: {why}"
