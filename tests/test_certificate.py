@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, multivariate_normal, multivariate_t
 
 import imulab as il
 from imulab.certificate.dcc import dcc_xml
@@ -19,6 +20,7 @@ from imulab.certificate.units import dsi_unit
 from imulab.cli import main
 from imulab.display import Verdict
 from imulab.errors import UnitError
+from imulab.fleet.limits import Limits, decide, probability_of_all
 
 LAB = (Path(__file__).resolve().parent / "data" / "lab.toml").read_text(encoding="utf-8")
 STANDARD = """
@@ -48,9 +50,13 @@ def issue(tmp_path, monkeypatch, sound):
     """A function that runs the command on a record and a LAB.toml, and returns its exit status."""
     monkeypatch.chdir(tmp_path)
 
-    def run(lab=LAB + STANDARD, record=sound / "sound.json", output="cert.xml"):
+    def run(lab=LAB + STANDARD, record=sound / "sound.json", output="cert.xml", limits=None):
         Path("lab.toml").write_text(lab, encoding="utf-8")
-        return main(["certificate", str(record), "--lab", "lab.toml", "-o", output])
+        further = []
+        if limits is not None:
+            Path("limits.toml").write_text(limits, encoding="utf-8")
+            further = ["--limits", "limits.toml"]
+        return main(["certificate", str(record), "--lab", "lab.toml", *further, "-o", output])
 
     return run
 
@@ -247,3 +253,119 @@ def test_the_region_of_all_parameters_holds_95_percent(sound, tmp_path):
     root = ElementTree.fromstring(dcc_xml(made))
     factor = float(_text(root, ".//si:coverageFactorXMLList"))
     assert math.isclose(chi2.cdf(factor**2, len(made.record.covariance.names)), 0.95, rel_tol=1e-12)
+
+
+# Conformity.
+
+
+RULE = """
+[conformity]
+rule = "bands"
+agreed = "offer 2026-118"
+specification = "data sheet DS-0815, table 2"
+"""
+INFINITE = math.inf
+
+
+@pytest.mark.parametrize(
+    ("y", "u", "lower", "upper", "probability"),
+    [
+        (-5.47, 0.05, -INFINITE, -5.40, 0.919243),
+        (509.7, 8.6, 490, INFINITE, 0.989010),
+        (13.6, 1.8, 12.5, 16.3, 0.662630),
+        (8, 1, -INFINITE, 10, 0.977250),
+    ],
+)
+def test_probabilities_are_those_of_the_guide_to_conformity(y, u, lower, upper, probability):
+    """JCGM 106:2012, examples of clause 7: 0.92, 0.99, 0.66."""
+    assert decide(y, u, 2.0, Limits(lower, upper), "bands").probability == pytest.approx(probability, abs=5e-7)
+
+
+@pytest.mark.parametrize(
+    ("y", "bands", "guarded", "simple"),
+    [
+        (8.0, "pass", "pass", "pass"),
+        (8.01, "conditionalPass", "fail", "pass"),
+        (10.0, "conditionalPass", "fail", "pass"),
+        (10.01, "conditionalFail", "fail", "fail"),
+        (12.01, "fail", "fail", "fail"),
+    ],
+)
+def test_decisions_by_each_rule(y, bands, guarded, simple):
+    for rule, state in (("bands", bands), ("guarded", guarded), ("simple", simple)):
+        assert decide(y, 1.0, 2.0, Limits(-INFINITE, 10.0), rule).state == state
+
+
+@pytest.mark.parametrize("freedom", [None, 9.0])
+def test_the_probability_of_all_is_that_of_scipy(freedom):
+    rng = np.random.default_rng(5)
+    root = rng.standard_normal((7, 7))
+    covariance, mean = root @ root.T, rng.standard_normal(7)
+    u = np.sqrt(np.diag(covariance))
+    low, high = mean - rng.uniform(1, 3, 7) * u, mean + rng.uniform(1, 3, 7) * u
+    low[2] = -INFINITE
+    limits = [Limits(*ends) for ends in zip(low.tolist(), high.tolist(), strict=True)]
+    found = probability_of_all(mean.tolist(), covariance, limits, freedom)
+    if freedom is None:
+        expected = multivariate_normal.cdf(high, mean=mean, cov=covariance, lower_limit=low)
+    else:
+        expected = multivariate_t.cdf(high, loc=mean, shape=covariance, df=freedom, lower_limit=low)
+    assert found == pytest.approx(expected, abs=1.5e-3)
+    each = [decide(m, s, 2.0, ends, "simple", freedom).probability for m, s, ends in zip(mean, u, limits, strict=True)]
+    assert 1 - sum(1 - p for p in each) <= found <= min(each) + 5e-4
+
+
+def test_decisions_stand_in_a_valid_certificate(issue, schemas, sound):
+    values = {n: p["value"] for n, p in json.loads((sound / "sound.json").read_text())["parameters"].items()}
+    limits = (
+        '[tumble]\n"bias_*" = { lower = -0.5, upper = 0.5, unit = "m/s^2" }\n'
+        f'scale_factor_x = {{ upper = {values["scale_factor_x"] - 1e-9!r}, unit = "m/s^2/(m/s^2)" }}\n'
+        "[noise]\nnothing = 1\n"  # of another procedure: passed over
+    )
+    assert issue(LAB + STANDARD + RULE, limits=limits) == 0
+    assert schemas("cert.xml") == []
+    states = {
+        _text(each, "dcc:name/dcc:content"): each.findall(".//dcc:conformity", NAMES) for each in _single("cert.xml")
+    }
+    assert [state.text for state in states["bias_x"]] == ["pass"]
+    assert [state.text for state in states["scale_factor_x"]] == ["conditionalFail"]
+    assert states["misalignment_yx"] == []
+    tree = ElementTree.parse("cert.xml")
+    assert tree.findall(".//dcc:statement/dcc:conformity", NAMES)[0].text == "conditionalFail"
+    upper = tree.findall(".//dcc:quantity[@refType='basic_toleranceLimitUpper']//si:value", NAMES)
+    assert float(upper[-1].text) == values["scale_factor_x"] - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("rule", "limits", "message"),
+    [
+        ("", '[tumble]\nbias_x = { upper = 1, unit = "mg" }\n', "limits need a rule that the customer agreed to"),
+        (RULE, '[tumble]\nbias_x = { upper = 1, unit = "deg" }\n', "limits.toml: tumble: bias_x: unit 'deg': expected"),
+        (RULE, '[tumble]\nbais_x = { upper = 1, unit = "mg" }\n', "no parameter 'bais_x'"),
+        (RULE, "[noise]\nwhite = 1\n", "limits.toml: no limits of a parameter of this record"),
+        (RULE.replace("bands", "kind"), "[tumble]\n", "conformity.rule: "),
+    ],
+)
+def test_limits_that_cannot_be_decided_by_are_refused(issue, capsys, rule, limits, message):
+    assert issue(LAB + STANDARD + rule, limits=limits) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not Path("cert.xml").exists()
+
+
+def test_the_template_is_that_of_the_guide_and_makes_a_valid_certificate(issue, schemas, capsys):
+    assert main(["certificate", "--template"]) == 0
+    template = capsys.readouterr().out
+    guide = Path(__file__).resolve().parents[1] / "docs" / "certificate.md"
+    assert f"```toml\n{template}```" in guide.read_text(encoding="utf-8")
+    assert issue(template) == 0
+    assert schemas("cert.xml") == []
+    agreed = re.sub("(?m)^# ((.conformity|rule|agreed|specification).*)$", r"\1", template)
+    assert issue(agreed, output="decided.xml", limits='[tumble]\nbias_x = { upper = 50, unit = "mg" }\n') == 0
+    assert schemas("decided.xml") == []
+
+
+def test_what_is_missing_on_the_command_line_is_said(capsys):
+    assert main(["certificate", "r.json", "-o", "c.xml"]) == 2
+    assert capsys.readouterr().err == ("imulab: expected RECORD, --lab LAB.toml and -o CERT.xml, or --template alone\n")

@@ -14,20 +14,18 @@ from imulab.errors import ImulabError
 from imulab.fleet.engine import Summary
 from imulab.fleet.figures import staggered, summary_table
 from imulab.fleet.history import Past
+from imulab.fleet.limits import Limits, load_limits, to_parameter_unit
 from imulab.fleet.manifest import FleetManifest
 from imulab.fleet.report import fleet_exhibits
 from imulab.fleet.run import FleetState, run_fleet
 from imulab.fleet.statistics import (
-    Limits,
     capability,
     change_limit,
     changes_since,
     days_of,
     line_drift,
     line_statistics,
-    load_limits,
     outlier_limit,
-    to_parameter_unit,
 )
 from imulab.records.calibration import Parameter
 from imulab.report.parameters import reading_unit

@@ -11,7 +11,8 @@ import pytest
 SOURCE = Path(__file__).resolve().parents[1] / "src"
 ROOMS = [
     {"cli", "__main__"},
-    {"fleet", "live", "certificate"},
+    {"certificate"},
+    {"fleet", "live"},
     {"procedures", "readers", "exporters", "report", "writers"},
     {"estimation", "device", "records"},
 ]

@@ -17,6 +17,7 @@ from imulab.certificate.laboratory import Address, Condition, Equipment, Party
 from imulab.certificate.model import NORMAL, Certificate, Result
 from imulab.certificate.units import dsi_unit
 from imulab.estimation.distributions import chi_square_upper_quantile
+from imulab.fleet.limits import Decision, Limits
 from imulab.records.calibration import Covariance
 
 SCHEMA = "3.3.0"
@@ -26,6 +27,12 @@ _XSI = "http://www.w3.org/2001/XMLSchema-instance"
 _COVERED = 0.95
 """Probability of the ellipsoid of all parameters together, whose factor is the root of a quantile of chi-square."""
 _ISSUED_UNDER = "ISO/IEC 17025:2017"
+_RULES = {
+    "simple": "a value passes within its limits",
+    "guarded": "a value passes within its limits less its expanded uncertainty",
+    "bands": "a value passes within its limits less its expanded uncertainty, passes on condition within its limits, "
+    "fails on condition beyond them by at most its expanded uncertainty",
+}
 _STATEMENTS = (
     ("7.8.2.1 l", "The results relate only to the item calibrated, in the condition described."),
     ("7.8.2.1", "The certificate must not be reproduced except in full without the laboratory's written approval."),
@@ -158,8 +165,23 @@ def _statements(parent: ET.Element, certificate: Certificate) -> None:
     if certificate.left_out:
         values = "1 value" if certificate.left_out == 1 else f"{certificate.left_out} values"
         remarks.append(f"{values} without uncertainty are in the record, not in this certificate.")
+    bands = {each.name: each.decision.acceptance for each in certificate.results if each.decision is not None}
+    if hopeless := [name for name, band in bands.items() if band.lower > band.upper]:
+        remarks.append(f"{', '.join(hopeless)}: the uncertainty is more than half of the tolerance, no value can pass.")
     for remark in remarks:
         _words(_add(parent, "statement"), "declaration", remark)
+    agreed = certificate.lab.conformity
+    if agreed is not None and certificate.state is not None:
+        entry = _add(parent, "statement")
+        _add(entry, "norm", _ISSUED_UNDER)
+        _add(entry, "reference", "7.8.6")
+        _words(
+            entry,
+            "declaration",
+            f"Conformity with {agreed.specification}, decided by the rule {agreed.rule} ({_RULES[agreed.rule]}), as "
+            f"agreed: {agreed.agreed}. Probability that all values conform: {certificate.all_conform:.3f}.",
+        )
+        _add(entry, "conformity", certificate.state)
 
 
 # The results.
@@ -263,10 +285,28 @@ def _quantity(quantity: ET.Element, result: Result) -> None:
         _add(covered, "si:intervalMin", repr(result.interval[0]))
         _add(covered, "si:intervalMax", repr(result.interval[1]))
         _add(covered, "si:coverageProbability", _plain(result.probability))
-    if result.definition:
-        unit = _add(_add(quantity, "measurementMetaData"), "metaData")
-        _add(unit, "nonSIDefinition", result.definition)
-        _add(unit, "nonSIUnit", result.unit)
+    if result.definition or result.decision is not None:
+        told = _add(quantity, "measurementMetaData")
+        if result.definition:
+            unit = _add(told, "metaData")
+            _add(unit, "nonSIDefinition", result.definition)
+            _add(unit, "nonSIUnit", result.unit)
+        if result.decision is not None and result.limits is not None:
+            _conformity(_add(told, "metaData", refType="basic_conformity"), result, result.decision, result.limits)
+
+
+def _conformity(parent: ET.Element, result: Result, decision: Decision, limits: Limits) -> None:
+    """Add a decision with its probability, the limits, and those within which a value passes."""
+    _words(parent, "declaration", f"Probability of conformity: {decision.probability:.4f}")
+    _add(parent, "conformity", decision.state)
+    data = _add(parent, "data")
+    for kind, ends in (("tolerance", limits), ("acceptance", decision.acceptance)):
+        for end, value in (("Lower", ends.lower), ("Upper", ends.upper)):
+            if math.isfinite(value):
+                quantity = _add(data, "quantity", refType=f"basic_{kind}Limit{end}")
+                real = _add(quantity, "si:real")
+                _add(real, "si:value", repr(value))
+                _add(real, "si:unit", result.dsi)
 
 
 def _covariance(data: ET.Element, results: tuple[Result, ...], covariance: Covariance, names: list[str]) -> None:

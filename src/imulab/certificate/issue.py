@@ -19,7 +19,7 @@ from imulab.procedures.result import Record, as_record
 
 
 @checked
-def write_certificate(record: Record, path: str | Path, *, lab: str | Path) -> None:
+def write_certificate(record: Record, path: str | Path, *, lab: str | Path, limits: str | Path | None = None) -> None:
     """Write the Digital Calibration Certificate of a record, PTB's DCC 3.3.0, whole or not at all.
 
     Values, uncertainties and covariances are the record's, bit for bit; persons and places are those of the laboratory.
@@ -32,6 +32,9 @@ def write_certificate(record: Record, path: str | Path, *, lab: str | Path) -> N
         XML file to write.
     lab
         TOML file of the laboratory; the guide on certificates lists its keys.
+    limits
+        TOML file of limits, as of a fleet's report: whether each parameter conforms, by the rule in `lab`. None if not
+        given.
 
     Raises
     ------
@@ -61,7 +64,7 @@ def write_certificate(record: Record, path: str | Path, *, lab: str | Path) -> N
         name, calibration = "", as_record(record, "write_certificate")
         sha256 = calibration.sealed()[0]
     try:
-        text = dcc_xml(make_certificate(calibration, sha256, stated))
+        text = dcc_xml(make_certificate(calibration, sha256, stated, None if limits is None else str(limits)))
     except ImulabError as error:
         raise type(error)(f"{name}{error}") from None
     with replacing(path) as stream:

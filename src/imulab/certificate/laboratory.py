@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from datetime import date
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -15,6 +15,7 @@ from msgspec import Meta, Struct
 from imulab.display import first_hidden
 from imulab.errors import ReadError
 from imulab.files import load_toml
+from imulab.fleet.limits import Rule
 from imulab.quantities import LARGEST
 
 Text = Annotated[str, Meta(pattern=r"^\S+(\s+\S+)*$")]
@@ -120,6 +121,14 @@ class Condition(_Table, frozen=True, kw_only=True):
     coverage_factor: Annotated[float, Meta(ge=1, le=LARGEST)] = 2.0
 
 
+class Conformity(_Table, frozen=True, kw_only=True):
+    """By which rule it is decided whether values conform, where the customer agreed to it, and to what (7.1.3)."""
+
+    rule: Rule
+    agreed: Text
+    specification: Text
+
+
 class Laboratory(_Table, frozen=True, kw_only=True):
     """LAB.toml as a whole."""
 
@@ -132,9 +141,58 @@ class Laboratory(_Table, frozen=True, kw_only=True):
     traceability: Traceability
     equipment: list[Equipment] = []
     conditions: list[Condition] = []
+    conformity: Conformity | None = None
 
 
-Kind = TypeVar("Kind")
+TEMPLATE = """\
+[certificate]
+number = "EX-2026-0042"                  # unique in the laboratory
+issued = 2026-11-27
+performed = [2026-11-24, 2026-11-24]     # first and last day of the measurement
+location = "laboratory"                  # or customer, laboratoryBranch, customerBranch, other
+# received = 2026-11-20
+# reviewed = "why a record whose verdict is look may be certified"
+[laboratory]
+name = "Example Inertial Laboratory"
+address = { street = "Plumb Line", number = "1", postcode = "12345", city = "Exampletown", country = "DE" }
+# code, email
+[customer]
+name = "Example Drones Ltd"
+address = { street = "Propeller Road", number = "2", postcode = "54321", city = "Hovertown", country = "DE" }
+# order, email
+[[persons]]
+name = "A. Example"
+role = "Head of laboratory"
+signs = true                             # at least one person signs
+[item]
+name = "Accelerometer triad"
+manufacturer = "Example Sensors AG"
+condition = "as received, not adjusted"
+# model and serial, which must be those of the record
+[method]
+name = "Multi-position tumble calibration in the local gravity field"
+procedure = "QP-ACC-01, issue 3"
+standards = ["IEEE Std 1293-2018"]
+deviations = "none"
+[traceability]
+statement = "Gravity is traceable to the SI by the measurement named below."
+[[equipment]]
+name = "Local gravity value"
+quantity = "gravity"
+certificate = "GRAV-2024-017"
+issuer = "Example National Metrology Institute"
+standard_uncertainty = { value = 1e-6, unit = "m/s^2" }
+[[conditions]]
+name = "Ambient temperature"
+value = 23.0
+unit = "degC"
+expanded_uncertainty = 0.5
+# [conformity]                           # only where limits are given
+# rule = "guarded"                       # or simple, bands
+# agreed = "offer 2026-118 of 2026-11-02"
+# specification = "data sheet DS-0815 rev. C, table 2"
+"""
+"""A LAB.toml to start from."""
 _UNKNOWN = re.compile("^Object contains unknown field `(.*)`$")
 _MISSING = re.compile("^Object missing required field `(.*)`$")
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from imulab.certificate.laboratory import Equipment, Laboratory
 from imulab.certificate.units import dsi_unit
 from imulab.errors import OptionError, RecordError
 from imulab.files import unit_of
+from imulab.fleet.limits import Decision, Limits, decide, load_limits, probability_of_all, worst
 from imulab.records.calibration import Calibration, Parameter
 from imulab.units import to_si
 
@@ -26,6 +29,8 @@ class Result:
         Unit of the record, as the D-SI writes it, and the definition of what in it is not of the SI.
     interval
         The interval of 95 % where it is not that of U.
+    limits, decision
+        Its limits, and whether it conforms; None without limits.
     """
 
     name: str
@@ -38,6 +43,8 @@ class Result:
     dsi: str
     definition: str
     interval: tuple[float, float] | None
+    limits: Limits | None = None
+    decision: Decision | None = None
 
     @property
     def expanded_uncertainty(self) -> float:
@@ -47,7 +54,11 @@ class Result:
 
 @dataclass(frozen=True)
 class Certificate:
-    """All that a certificate holds; `left_out` counts parameters without an uncertainty."""
+    """All that a certificate holds.
+
+    `left_out` counts parameters without an uncertainty; `all_conform` is the probability that all values that have
+    limits lie within them, None without limits.
+    """
 
     lab: Laboratory
     record: Calibration
@@ -56,10 +67,19 @@ class Certificate:
     model: str | None
     results: tuple[Result, ...]
     left_out: int
+    all_conform: float | None = None
+
+    @property
+    def state(self) -> str | None:
+        """The worst of all decisions; None without limits."""
+        states = [result.decision.state for result in self.results if result.decision is not None]
+        return worst(states) if states else None
 
 
-def make_certificate(record: Calibration, sha256: str, lab: Laboratory) -> Certificate:
+def make_certificate(record: Calibration, sha256: str, lab: Laboratory, limits: str | None = None) -> Certificate:
     """Return the certificate of a record whose seal was checked; `sha256` is its ``content_sha256``.
+
+    `limits` is a TOML file of limits.
 
     Raises
     ------
@@ -89,7 +109,42 @@ def make_certificate(record: Calibration, sha256: str, lab: Laboratory) -> Certi
     for condition in lab.conditions:
         dsi_unit(condition.unit)
     model = record.sensor.get("model", lab.item.model)
-    return Certificate(lab, record, sha256, serial, model, results, len(record.parameters) - len(results))
+    together = None
+    if limits is not None:
+        results, together = _decide(record, results, lab, limits)
+    return Certificate(lab, record, sha256, serial, model, results, len(record.parameters) - len(results), together)
+
+
+def _decide(
+    record: Calibration, results: tuple[Result, ...], lab: Laboratory, limits: str
+) -> tuple[tuple[Result, ...], float]:
+    """Return the results with their decisions, and the probability that all conform."""
+    if lab.conformity is None:
+        raise OptionError(
+            f"{limits}: limits need a rule that the customer agreed to; expected [conformity] in LAB.toml with rule, "
+            "agreed, specification"
+        )
+    units = {(record.procedure, name): parameter.unit for name, parameter in record.parameters.items()}
+    known = {name: each for (_, name), each in load_limits(limits, units, only=record.procedure).items()}
+    freedom = record.fit.get("effective_degrees_of_freedom")
+    decided: list[Result] = []
+    for result in results:
+        if (ends := known.pop(result.name, None)) is None:
+            decided.append(result)
+            continue
+        u, k = result.standard_uncertainty, result.coverage_factor
+        decision = decide(result.value, u, k, ends, lab.conformity.rule, freedom)
+        decided.append(replace(result, limits=ends, decision=decision))
+    if known:
+        raise OptionError(f"{limits}: {', '.join(sorted(known))}: no uncertainty in the record, nothing can be decided")
+    judged = [result for result in decided if result.limits is not None]
+    if not judged:
+        raise OptionError(f"{limits}: no limits of a parameter of this record")
+    covariance = np.diag([result.standard_uncertainty**2 for result in judged])
+    rows = [row for row, result in enumerate(judged) if result.name in record.covariance.names]
+    covariance[np.ix_(rows, rows)] = record.covariance.block([judged[row].name for row in rows])
+    ends = [result.limits for result in judged if result.limits is not None]
+    return tuple(decided), probability_of_all([result.value for result in judged], covariance, ends, freedom)
 
 
 def _check_verdict(record: Calibration, lab: Laboratory) -> None:

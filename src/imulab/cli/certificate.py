@@ -5,24 +5,38 @@ from __future__ import annotations
 from typing import Annotated
 
 import imulab as il
-from imulab.cli.command import Command, option
-from imulab.cli.options import RecordFile, check_outputs
+from imulab.cli.command import Argument, Command, option
+from imulab.cli.options import check_outputs
+from imulab.errors import OptionError
 from imulab.options import OUTPUT
 
 
 def certificate(
-    record: RecordFile,
+    record: Annotated[str | None, Argument("RECORD", "Calibration record.")] = None,
     *,
-    lab: Annotated[str, option("LAB.toml", "Who issues it: laboratory, customer, persons, method, traceability.")],
-    output: Annotated[str, option("CERT.xml", "Certificate to write.", "-o", "--output"), OUTPUT],
+    lab: Annotated[
+        str | None, option("LAB.toml", "Who issues it: laboratory, customer, persons, method, traceability.")
+    ] = None,
+    limits: Annotated[
+        str | None, option("LIMITS.toml", "Limits of parameters: whether each conforms, by the rule in LAB.toml.")
+    ] = None,
+    output: Annotated[str | None, option("CERT.xml", "Certificate to write.", "-o", "--output"), OUTPUT] = None,
+    template: Annotated[bool, option("", "Print a LAB.toml to start from, and nothing else."), OUTPUT] = False,
 ) -> None:
     """Write a Digital Calibration Certificate.
 
     PTB's DCC 3.3.0 for other programs: values, uncertainties and covariances from the record, persons and places from
     LAB.toml. What is missing is refused, and nothing is written then.
     """
-    check_outputs([output], [record, lab])
-    il.write_certificate(record, output, lab=lab)
+    if template:
+        from imulab.certificate.laboratory import TEMPLATE
+
+        print(TEMPLATE, end="")
+        return
+    if record is None or lab is None or output is None:
+        raise OptionError("expected RECORD, --lab LAB.toml and -o CERT.xml, or --template alone")
+    check_outputs([output], [each for each in (record, lab, limits) if each])
+    il.write_certificate(record, output, lab=lab, limits=limits)
     print(f"certificate: {output}")
 
 

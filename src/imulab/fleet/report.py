@@ -15,6 +15,7 @@ from imulab.files import write_text
 from imulab.fleet import figures
 from imulab.fleet.engine import Summary
 from imulab.fleet.history import History, open_history
+from imulab.fleet.limits import load_limits
 from imulab.fleet.run import HISTORY, FleetState, default_history, fleet_status, own_files, read_by, refuse_overwriting
 from imulab.fleet.statistics import (
     FEWEST_FOR_OUTLIERS,
@@ -23,7 +24,6 @@ from imulab.fleet.statistics import (
     change_limit,
     changes_since,
     line_statistics,
-    load_limits,
     not_compared,
     parameter_units,
 )

@@ -1,9 +1,4 @@
-"""Statistics of a line: spread of a parameter over the units, outliers, drift, and capability within limits.
-
-[tumble]
-"bias_*" = { lower = -20, upper = 20, unit = "mg" }
-misalignment_yx = { upper = 3, unit = "mrad" }
-"""
+"""Statistics of a line: spread of a parameter over the units, outliers, drift, and capability within limits."""
 
 from __future__ import annotations
 
@@ -12,115 +7,19 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from fnmatch import fnmatchcase
 from itertools import zip_longest
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.estimation.decisions import FLEET_CHANGE, FLEET_DRIFT
 from imulab.estimation.distributions import normal_quantile, t_cdf, t_quantile
-from imulab.files import check_keys, load_toml, number_of
 from imulab.fleet.engine import Summary
 from imulab.fleet.history import Past, sources_of
+from imulab.fleet.limits import Limits
 from imulab.procedures.procedure import OnLine
-from imulab.procedures.registry import PROCEDURES
 from imulab.recording import Array
 from imulab.records.calibration import Parameter
-from imulab.report.parameters import reading_unit
-from imulab.units import conversion_factor
-
-# Limits of parameters, from a TOML file.
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Lower and upper limit of a parameter in its unit; either may be infinite."""
-
-    lower: float
-    upper: float
-
-
-def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[str, str], Limits]:
-    """Return limits from a file; a later line overrides an earlier one, so that a name may follow a pattern.
-
-    Parameters
-    ----------
-    path
-        TOML file: a table for each procedure, a line for each parameter or pattern (``"bias_*"``).
-    units
-        Procedure and parameter to unit, of every parameter there is.
-
-    Raises
-    ------
-    ReadError
-        The file cannot be read, names a procedure or parameter that is not there, or has a limit that cannot be.
-    UnitError
-        A unit is not one of the parameter's.
-    """
-    table = load_toml(path, str(path), "limits")
-    limits: dict[tuple[str, str], Limits] = {}
-    for procedure, entries in table.items():
-        if procedure not in PROCEDURES:
-            raise ReadError(
-                f"{path}: unknown procedure {quoted(procedure)}; known procedures: {listed(PROCEDURES, procedure)}"
-            )
-        if not isinstance(entries, dict):
-            raise ReadError(f'{path}: {procedure}: expected lines such as bias_x = {{ upper = 20, unit = "mg" }}')
-        known = [name for owner, name in units if owner == procedure]
-        for pattern, entry in entries.items():
-            names = [name for name in known if fnmatchcase(name, pattern)]
-            if not names:
-                shown = listed(known, pattern) or "none, there is no record of this procedure"
-                raise ReadError(f"{path}: {procedure}: no parameter {quoted(pattern)}; parameters: {shown}")
-            for name in names:
-                key = procedure, name
-                limits[key] = _limits(entry, name, units[key], f"{path}: {procedure}: {pattern}")
-    return limits
-
-
-def _limits(entry: Any, name: str, unit: str, place: str) -> Limits:
-    ends = {"lower": -math.inf, "upper": math.inf}
-    if not isinstance(entry, dict):
-        raise ReadError(f'{place}: expected {{ lower = -20, upper = 20, unit = "{unit}" }}, found {quoted(entry)}')
-    check_keys(entry, (*ends, "unit"), place)
-    if "unit" not in entry or not ends.keys() & entry.keys():
-        raise ReadError(f"{place}: expected a unit, and lower or upper or both")
-    for end in ends.keys() & entry.keys():
-        value = number_of(entry[end], f"{place}: {end}")
-        try:
-            ends[end] = to_parameter_unit(value, str(entry["unit"]), unit, name)
-        except UnitError as error:
-            raise UnitError(f"{place}: {error}") from None
-    if not ends["lower"] < ends["upper"]:
-        raise ReadError(f"{place}: lower {entry['lower']} is not below upper {entry['upper']}")
-    return Limits(ends["lower"], ends["upper"])
-
-
-def to_parameter_unit(value: float, unit: str, target: str, name: str = "") -> float:
-    """Return a value in a parameter's unit; `unit` is that, one of its quantity, or its reading unit.
-
-    Raises
-    ------
-    UnitError
-        It is none of these.
-    """
-    read = reading_unit(target, name)
-    if unit == target:
-        return value
-    if unit in (read.symbol, read.of_difference, read.symbol.replace("µ", "u")):
-        return (value - read.offset) / read.factor
-    try:
-        return value * conversion_factor(unit, target)
-    except UnitError:
-        also = "" if read.symbol == target else f" or {read.of_difference}"
-        raise UnitError(f"unit {unit!r}: expected {target}{also}") from None
-
-
-# Spread, outliers, drift and capability.
-
 
 _MAD_TO_SIGMA = 1.482602218505602  # unrounded, as these numbers are shown in full
 # Sqrt(pi / 2): mean distance from the median to standard deviation of normal values
