@@ -143,8 +143,8 @@ def _decide(
     covariance = np.diag([result.standard_uncertainty**2 for result in judged])
     rows = [row for row, result in enumerate(judged) if result.name in record.covariance.names]
     covariance[np.ix_(rows, rows)] = record.covariance.block([judged[row].name for row in rows])
-    ends = [result.limits for result in judged if result.limits is not None]
-    return tuple(decided), probability_of_all([result.value for result in judged], covariance, ends, freedom)
+    within = [result.limits for result in judged if result.limits is not None]
+    return tuple(decided), probability_of_all([result.value for result in judged], covariance, within, freedom)
 
 
 def _check_verdict(record: Calibration, lab: Laboratory) -> None:
