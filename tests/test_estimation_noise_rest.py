@@ -234,7 +234,7 @@ def test_a_large_file_that_has_to_be_looked_at_as_a_whole_is_not_in_memory(tmp_p
     assert large.warnings == small.warnings
     assert large.sources == small.sources
     assert len(held) == 2
-    assert all(isinstance(values, np.memmap) for values in held)
+    assert all(isinstance(values.base, np.memmap) for values in held)
 
 
 def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, capsys):

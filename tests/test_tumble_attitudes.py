@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -12,13 +13,14 @@ from scipy.stats import chi2
 
 import imulab as il
 from conftest import some_of
+from imulab.cli import main
 from imulab.errors import DataError, ImulabError, SegmentError, UnitError
 from imulab.procedures.tumble import _segment
 from imulab.procedures.tumble import attitudes as held
 from imulab.procedures.tumble import attitudes as segment
 from imulab.procedures.tumble.attitudes import find_attitudes
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian
-from imulab.recording import Recording
+from imulab.recording import Recording, on_disk
 from reference import segment as reference_loops
 from reference import tumble as reference
 from reference.tumble import random_attitudes
@@ -814,3 +816,39 @@ def test_tables_of_many_attitudes_are_taken_and_those_like_samples_doubted(rows,
     attitudes = il.find_attitudes(up + 0.01 * rng.standard_normal(up.shape), unit="m/s^2")
     assert len(attitudes) == rows
     assert any("no time column" in note for note in attitudes.notes) == doubted
+
+
+def test_a_large_file_gives_the_record_of_a_small_one_without_its_columns_in_memory(tmp_path, monkeypatch):
+    file, records = tmp_path / "log.csv", [tmp_path / "small.json", tmp_path / "large.json"]
+    il.write_csv(il.simulate_tumble(order=1, attitudes=24, gravity=9.81), file)
+    assert main(["tumble", "fit", str(file), "--gravity", "9.81", "-o", str(records[0])]) == 0
+    monkeypatch.setattr("imulab.recording.LARGE", 0)
+    mapped = []
+
+    def watched(recording, **how):
+        mapped.extend(isinstance(values.base, np.memmap) for values in recording.columns.values())
+        return find_attitudes(recording, **how)
+
+    monkeypatch.setattr(held, "find_attitudes", watched)
+    assert main(["tumble", "fit", str(file), "--gravity", "9.81", "-o", str(records[1])]) == 0
+    small, large = map(il.Calibration.load, records)
+    assert mapped
+    assert all(mapped)
+    assert large.parameters == small.parameters
+    assert (large.sources, large.warnings) == (small.sources, small.warnings)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells what a process has in memory")
+def test_memory_of_a_column_on_disk_is_given_back_when_another_is_asked_for():
+    def mapped():
+        status = Path("/proc/self/status").read_text()
+        return 1024 * int(status.partition("RssFile:")[2].split()[0])
+
+    n = 1 << 19
+    block = Recording({"time": np.arange(n, dtype=np.float64), "gyro_x": np.ones(n)}, {"time": "s", "gyro_x": "deg/s"})
+    recording = on_disk(iter([block]))
+    before = mapped()
+    assert recording.column("time").sum() == n * (n - 1) / 2
+    assert mapped() - before > 7 * n
+    assert recording.si("gyro_x").sum() == pytest.approx(np.radians(n))
+    assert mapped() - before < 7 * n

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import math
+import mmap
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -186,7 +187,11 @@ class Recording:
 
     def si(self, name: str) -> Array:
         """Return the samples of a column in SI (counts and volts as they are), shape (n,)."""
-        return to_si(self.column(name), self.units[name])
+        values = self.column(name)
+        converted = to_si(values, self.units[name])
+        if converted is not values:
+            release(values)
+        return converted
 
     @property
     def time(self) -> Array | None:
@@ -555,16 +560,37 @@ def on_disk(blocks: Iterator[Recording]) -> Recording:
         if (following := next(blocks, None)) is None:
             break
         block = following
-    columns = {name: _mapped(stream) for name, stream in files.items()}
+    columns = _OnDisk((name, _mapped(stream)) for name, stream in files.items())
     return packed(replace(head, columns=columns, units=first.units, notes=tuple(notes)))
+
+
+class _OnDisk(dict[str, Array]):
+    """Columns in temporary files: the memory that held the others is given back where one is asked for."""
+
+    def __getitem__(self, name: str) -> Array:
+        release(*(values for other, values in self.items() if other != name))
+        return super().__getitem__(name)
+
+
+def release(*columns: Array) -> None:
+    """Give back the memory that holds columns of temporary files; what is used again is read again."""
+    for values in columns:
+        base = _map_of(values)
+        if base is not None and hasattr(mmap, "MADV_DONTNEED"):
+            base.madvise(mmap.MADV_DONTNEED)
+
+
+def _map_of(values: Array) -> mmap.mmap | None:
+    """Return the map of the temporary file in which values lie, None for values in memory."""
+    base: Any = values
+    while base is not None and not isinstance(base, mmap.mmap):
+        base = getattr(base, "base", None)
+    return base
 
 
 def stored_as(values: Array, like: Array) -> Array:
     """Return values, shape (n,), in a temporary file if `like` is in one; else unchanged."""
-    base: Any = like
-    while base is not None and not isinstance(base, np.memmap):
-        base = getattr(base, "base", None)
-    if base is None:
+    if _map_of(like) is None:
         return values
     file = _file()
     _write(file, values, "recording")
@@ -590,7 +616,7 @@ def _write(file: IO[bytes], values: Array, name: str) -> None:
 
 def _mapped(file: IO[bytes]) -> Array:
     with file:
-        return np.memmap(file, np.float64, "r") if file.tell() else np.empty(0)
+        return np.asarray(np.memmap(file, np.float64, "r")) if file.tell() else np.empty(0)
 
 
 # Power cycles: temperature at power-on, and time that counts from power-on.

@@ -192,9 +192,9 @@ def with_notes(
 
 def read_recording(file: str, **how: Any) -> Recording:
     """Return a recording as a whole; a warning that it was cut is part of the line of a refusal, if there is one."""
-    from imulab.readers import read
+    from imulab.readers import read_mapped
 
-    recording = read(file, **how)
+    recording = read_mapped(file, **how)
     list(with_notes([recording], notes=False, tell=hold))
     return recording
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.rows import median, medians, quantile
+from imulab.estimation.rows import median, medians, quantile, standard_deviation
 from imulab.recording import Array, Recording
 
 Rows = NDArray[np.int64]
@@ -216,7 +216,7 @@ def _replaced(time: Array, kept: NDArray[np.bool_]) -> bool:
 def _unique_stamps(time: Array, step: Array, *, lossy: bool) -> Clock:
     widest = float(step.max())
     if widest <= GAP * step.min():  # no gap, whatever the usual step is
-        return Clock(len(step) / float(time[-1] - time[0]), float(step.std()), widest=widest)
+        return Clock(len(step) / float(time[-1] - time[0]), standard_deviation(step), widest=widest)
     usual, coarse = _usual(time, step, lossy=lossy)
     usual, rows, missing = _find_gaps(np.arange(len(time)), time, usual, coarse=coarse)
     regular = np.ones(len(step), dtype=bool)

@@ -194,6 +194,7 @@ def _noises(
             notes.append(_step_line(recording, name, step))
         if not isinstance(taus, str) or taus != "octave":
             noises[name] = replace(noises[name], curve=allan_deviation(samples, rate, taus))
+        del samples  # before the next is made
     return noises, notes + [prefixed(recording.name, line) for line in noise_lines(noises)]
 
 
@@ -220,12 +221,13 @@ def _check_squares(recording: Recording, names: list[str]) -> None:
     """Refuse samples whose squares overflow in double precision."""
     for name in names:
         values = recording.si(name)
-        index = int(max(np.argmax(values), np.argmin(values), key=lambda k: abs(values[k])))
+        index = int(np.argmax(values) if values.max() >= -values.min() else np.argmin(values))
         if abs(values[index]) > _LARGEST:
             raise DataError(
                 f"{recording.name}: {recording.place(index)}, column {name}: expected a reading, found "
                 f"{recording.column(name)[index]:.6g}, which is too large to be squared"
             )
+        del values  # before the next is made
 
 
 def _listed(values: Array | None) -> list[float | None] | None:
@@ -246,7 +248,9 @@ def columns_noise(
         As for `allan_deviation`; fewer than 50 samples.
     """
     curves, why, stretches = [], [], []
-    for samples, reason in zip(columns, moved or repeat("")):  # noqa: B905
+    reasons = iter(moved or repeat(""))
+    for samples in columns:
+        reason = next(reasons)
         curves.append(allan_deviation(samples, rate))
         if len(samples) < FEWEST:
             raise DataError(
@@ -351,6 +355,7 @@ def moved_columns(recording: Recording, names: list[str], rate: float) -> dict[s
         noise = deviation_of_steps(samples) / math.sqrt(2 * size)
         if reach > most_reach(quantity, noise):
             moved[name] = reach
+        del samples  # before the next is made
     reasons: dict[str, str] = {}
     for quantity, (_, unit) in _STILL.items():
         reaches = {n: r for n, r in moved.items() if parse_unit(recording.units[n]).quantity == quantity}

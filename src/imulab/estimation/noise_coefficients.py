@@ -20,7 +20,7 @@ from imulab.estimation.noise.analysis import Analysis, average, intervals_of
 from imulab.estimation.noise.spectrum import frequencies
 from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, bias_square, letters
 from imulab.estimation.rows import NORMAL_95, distinct
-from imulab.recording import Array
+from imulab.recording import Array, release
 
 # Allan deviation.
 
@@ -87,11 +87,13 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
         raise OptionError(f"sampling rate {rate:g}: expected a positive number of Hz")
     integral = np.empty(len(data) + 1)
     integral[0] = 0.0
-    centred = data - data[0]  # a constant becomes exactly 0
+    centred = np.subtract(data, data[0], out=integral[1:])  # a constant becomes exactly 0
+    release(data)
     mean = centred.mean()
     if not math.isfinite(mean):
         raise DataError("Allan deviation: expected finite samples")
-    np.cumsum(np.subtract(centred, mean, out=centred), out=integral[1:])
+    centred -= mean
+    np.add.accumulate(centred, out=centred)
     integral *= 1 / rate
     counts = _averages(len(integral), rate, taus)
     squares = np.array([_square(integral, m) for m in counts.tolist()])

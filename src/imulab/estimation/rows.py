@@ -9,7 +9,8 @@ else looks at the samples. They are bridged by straight lines, so that all rows 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from imulab.columns import kind_of
 from imulab.display import Finding, Note
 from imulab.errors import DataError
-from imulab.recording import Array, Recording, stored_as
+from imulab.recording import Array, Recording, release, stored_as
 
 # Medians, quantiles, distinct values, root mean squares.
 
@@ -81,6 +82,19 @@ def distinct(values: NDArray[Any]) -> NDArray[Any]:
     """
     ordered = np.sort(values, axis=None)
     return np.asarray(ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]])
+
+
+def standard_deviation(values: Array) -> float:
+    """Return the standard deviation of values, shape (n,), without a copy of them.
+
+    Examples
+    --------
+    >>> standard_deviation(np.array([1.0, 3.0]))
+    1.0
+    """
+    mean = float(values.mean())
+    parts = (values[start : start + _AT_ONCE] - mean for start in range(0, len(values), _AT_ONCE))
+    return math.sqrt(math.fsum(float(np.einsum("i,i", part, part)) for part in parts) / len(values))
 
 
 def rms(values: ArrayLike) -> float:
@@ -149,9 +163,9 @@ def find_step(samples: Array) -> Step | None:
 
 def deviation_of_steps(samples: Array) -> float:
     """Return the standard deviation of the differences between neighbouring samples, shape (n,), n >= 2."""
-    step = np.diff(samples)
-    square = float(np.einsum("i,i", step, step)) / len(step)  # std would copy a long log twice
-    return float(np.sqrt(max(square - float(step.mean()) ** 2, 0.0)))
+    square = math.fsum(float(np.einsum("i,i", steps, steps)) for _, steps in _steps(samples)) / (len(samples) - 1)
+    mean = float(samples[-1] - samples[0]) / (len(samples) - 1)
+    return math.sqrt(max(square - mean**2, 0.0))
 
 
 def _jumps(means: Array, place: int) -> bool:
@@ -202,6 +216,7 @@ _FAR_ZERO = 5.0  # usual steps around a single zero
 _BESIDE = 4  # samples on both sides
 _QUIET = 4.0  # a part rests while its steps are below this many times those of the quietest fifth
 _AROUND = 64  # samples whose differences show the noise
+_AT_ONCE = 1 << 16  # samples that are looked at together, in whole parts of 64: their steps stay in the cache
 HISTORY, _FEW_ZEROS = 50, 0.02
 """A row of zeros is no reading of a gyroscope whose last 50 rows hold at most this share of zeros."""
 _LONGEST_ZERO = 20  # rows of a dropout; longer zeros are a gyroscope at rest without noise
@@ -314,7 +329,7 @@ def zero_rows(values: Sequence[Array], never_zero: bool = False) -> NDArray[np.b
     never_zero
         Whether no row of zeros can be a reading, as of accelerometers.
     """
-    zero = np.array([column == 0 for column in values])
+    zero = np.array([_released(column == 0, column) for column in values])
     every = np.asarray(zero.all(axis=0))
     if never_zero or len(values) < 2 or not every.any():
         return every if len(values) > 1 else np.zeros_like(every)
@@ -327,9 +342,15 @@ def zero_rows(values: Sequence[Array], never_zero: bool = False) -> NDArray[np.b
     return zeros
 
 
+def _released(rows: NDArray[np.bool_], column: Array) -> NDArray[np.bool_]:
+    """Return what was found in a column, whose memory is given back if it lies in a temporary file."""
+    release(column)
+    return rows
+
+
 def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
     """Return the rows that repeat the row before in all columns, where the sensor itself does not repeat readings."""
-    same = [np.concatenate([[False], column[1:] == column[:-1]]) for column in values]
+    same = [_released(np.concatenate([[False], column[1:] == column[:-1]]), column) for column in values]
     every = np.logical_and.reduce(same)
     count, n = int(np.count_nonzero(every)), len(every)
     by_chance = n * float(np.prod([np.count_nonzero(each) / n for each in same]))
@@ -344,12 +365,19 @@ def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
 def far_rows(values: Sequence[Array], known: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the rows with a sample far from both neighbours, and those with such a zero, without the `known`."""
     far = np.zeros((2, len(known)), dtype=np.bool_)
-    good = np.flatnonzero(~known)
-    if len(good) >= 2 * _AROUND:
-        part = good if len(good) < len(known) else slice(None)
+    part = np.flatnonzero(~known) if known.any() else slice(None)
+    if len(known) - np.count_nonzero(known) >= 2 * _AROUND:
         for column in values:
             far[:, part] |= _far_samples(column[part])
+            release(column)
     return far[0] & ~far[1], far[1]
+
+
+def _steps(x: Array) -> Iterator[tuple[int, Array]]:
+    """Yield the sizes of the steps from sample to sample in blocks of whole parts, and where each block begins."""
+    for first in range(0, len(x) - 1, _AT_ONCE):
+        steps = np.diff(x[first : first + _AT_ONCE + 1])
+        yield first, np.abs(steps, out=steps)
 
 
 def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -358,15 +386,16 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     Far samples are looked for at rest only, since a motion has knocks; single zeros between values of one sign
     anywhere.
     """
-    steps = np.diff(x)
-    np.abs(steps, out=steps)
     far, alone = np.zeros((2, len(x)), dtype=np.bool_)
-    count = len(steps) // _AROUND
-    parts = steps[: count * _AROUND].reshape(count, _AROUND)
-    local = np.partition(parts[:, : _AROUND // 2], _UPPER, axis=1)[:, _UPPER]
+    count = (len(x) - 1) // _AROUND
+    local = np.empty(count)
+    resolution = np.inf
+    for first, steps in _steps(x):
+        parts = steps[: len(steps) // _AROUND * _AROUND].reshape(-1, _AROUND)
+        local[first // _AROUND :][: len(parts)] = np.partition(parts[:, : _AROUND // 2], _UPPER, axis=1)[:, _UPPER]
+        resolution = min(resolution, float(np.min(steps, where=steps > 0, initial=np.inf)))
     # Next to a motion there is no rest: the largest of a part's steps and its neighbours' counts.
     wide = np.maximum(local, np.maximum(np.append(local[1:], 0.0), np.concatenate([[0.0], local[:-1]])))
-    resolution = float(np.min(steps, where=steps > 0, initial=np.inf))
     if resolution == np.inf:
         return far, alone
     moving = wide > _QUIET * max(quantile(local, 0.2), resolution)
@@ -377,9 +406,12 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         return np.minimum(samples // _AROUND, count - 1)
 
     # A sample far from its surroundings is a large step away from them, or from the sample before.
-    suspect = np.flatnonzero(parts > limits[:, None])
-    rest = np.flatnonzero(steps[count * _AROUND :] > limits[-1]) + count * _AROUND
-    suspect = np.concatenate([suspect, rest])
+    far_steps = []
+    for first, steps in _steps(x):
+        its = limits[first // _AROUND :][: -(-len(steps) // _AROUND)]
+        its = np.append(its, limits[-1:]) if len(its) * _AROUND < len(steps) else its
+        far_steps.append(np.flatnonzero(steps > np.repeat(its, _AROUND)[: len(steps)]) + first)
+    suspect = np.concatenate(far_steps)
     suspect = suspect[~moving[part(suspect)]]
     index = distinct(np.minimum(suspect[:, None] + np.arange(3), len(x) - 1))
     middle = np.clip(index, _BESIDE, len(x) - 1 - _BESIDE)

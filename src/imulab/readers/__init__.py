@@ -12,7 +12,7 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from time import perf_counter
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -25,7 +25,7 @@ from imulab.readers.formats import FORMATS, TEXT, is_packed, recognised, unpacke
 from imulab.readers.layout import IfNeeded, load_layout, spread_packets
 from imulab.readers.selection import Selection
 from imulab.readers.text import TextFile, without_stray_times
-from imulab.recording import Array, Layout, Recording, Source, Window, packed
+from imulab.recording import Array, Layout, Recording, Source, Window, is_large, on_disk, packed
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
@@ -96,15 +96,31 @@ def read(
     ('deg/s', '9.81 m/s^2', 'tumble.csv')
     """
     selection = Selection(topic, instance, window, element, units, damaged, serial)
+    return _read(file, layout, selection, name, in_memory=True)
+
+
+def read_mapped(
+    file: str | Path, layout: str | Path | Layout | None = None, *, name: str | None = None, **part: Any
+) -> Recording:
+    """Return what `read` returns; the columns of a large file lie in temporary files and cannot be written to."""
+    return _read(file, layout, Selection(**part), name, in_memory=not is_large(file))
+
+
+def _read(
+    file: str | Path, layout: str | Path | Layout | None, selection: Selection, name: str | None, *, in_memory: bool
+) -> Recording:
     name, known = name or _name(file), _layout(layout)
-    hashed = _Hash()
+    hashed = _Hash(in_memory)
     blocks = _log_reading(selection.of(_blocks(file, name, known, selection, hashed), name))
+    if not in_memory:
+        recording = on_disk(blocks)
+        return replace(recording, source=Source(name, hashed.of(file)))
     first, parts, notes = _gather(blocks)
-    source, units = Source(name, hashed.of(file)), first.units
+    source, stated = Source(name, hashed.of(file)), first.units
     first = replace(first, columns={})
     # The parts of a column are freed as soon as they are joined, so that a large file is not in memory twice.
     joined = {key: _join([part.pop(key) for part in parts]) for key in list(parts[0])}
-    return packed(replace(first, columns=joined, units=units, source=source, notes=notes))
+    return packed(replace(first, columns=joined, units=stated, source=source, notes=notes))
 
 
 def _gather(blocks: Iterator[Recording]) -> tuple[Recording, list[dict[str, Array]], tuple[str, ...]]:
@@ -188,7 +204,8 @@ def _join(parts: list[Array]) -> Array:
 class _Hash:
     """SHA-256 of a source: updated while text is read, computed afterwards for other formats."""
 
-    def __init__(self) -> None:
+    def __init__(self, in_memory: bool) -> None:
+        self.in_memory = in_memory
         self.text: TextFile | None = None
 
     def of(self, file: str | Path) -> str:
@@ -278,7 +295,7 @@ def _text_blocks(
             selection.units,
             skip_damaged=selection.damaged == "skip",
             hashed=hashed is not None,
-            whole=hashed is not None,
+            whole=hashed is not None and hashed.in_memory,
         )
         if hashed is not None:
             hashed.text = text

@@ -111,7 +111,7 @@ def no_gravity(force: float, unit: str) -> str:
 
 
 def _first(recording: Recording, name: str) -> Array:
-    return np.asarray(recording.si(name), dtype=np.float64)[:_MOST_SAMPLES]
+    return to_si(np.asarray(recording.column(name)[:_MOST_SAMPLES], dtype=np.float64), recording.units[name])
 
 
 def _step(samples: Array) -> float:

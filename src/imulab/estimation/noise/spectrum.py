@@ -152,9 +152,12 @@ def cosine_coefficients(samples: Array) -> Array:
     >>> [f"{c:.4f}" for c in cosine_coefficients(np.array([2.0, 0.0, 0.0, -1.0]))]
     ['1.9598', '0.5000', '0.8118']
     """
-    centred, n = samples - samples.mean(), len(samples)
+    n = len(samples)
     # The Fourier transform of the even samples, then the odd ones backwards, turned, is the cosine transform.
-    turned = np.fft.rfft(np.concatenate([centred[::2], centred[1::2][::-1]]))
+    ordered = np.concatenate([samples[::2], samples[1::2][::-1]])
+    ordered -= samples.mean()
+    turned = np.fft.rfft(ordered)
+    del ordered
     # Each angle is the sum of a coarse and a fine one, which needs a thousandth of the exponentials.
     fine, coarse = np.arange(_FINE), _FINE * np.arange(len(turned) // _FINE + 1)
     turn = np.multiply.outer(np.exp(-0.5j * np.pi / n * coarse), np.exp(-0.5j * np.pi / n * fine))
@@ -183,7 +186,7 @@ class Accumulator:
 
     def __init__(self, interval: float, despike: bool = True) -> None:
         self._interval, self._despike = interval, despike
-        self._waiting: list[Array] = []
+        self._waiting = np.empty(0)
         self._held = self._spikes = self._stretches = 0
         self._squares = np.empty(0)
         self._knocks: list[NDArray[np.int64]] = []
@@ -191,14 +194,20 @@ class Accumulator:
 
     def add(self, samples: Array) -> None:
         """Take the next samples, finite, shape (k,)."""
-        held = self._held + len(samples)
-        if held > WHOLE or (self._stretches and held >= STRETCH):
-            samples = np.concatenate([*self._waiting, samples]) if self._held else samples
-            stop = held // STRETCH * STRETCH
+        if self._stretches or self._held + len(samples) > WHOLE:
+            held = self._waiting[: self._held]
+            stop = len(held) // STRETCH * STRETCH
+            for start in range(0, stop, STRETCH):
+                self._transform(held[start : start + STRETCH])
+            samples = np.concatenate([held[stop:], samples]) if stop < len(held) else samples
+            self._waiting, self._held = np.empty(STRETCH), 0
+            stop = len(samples) // STRETCH * STRETCH
             for start in range(0, stop, STRETCH):
                 self._transform(samples[start : start + STRETCH])
-            samples, self._waiting, self._held = samples[stop:], [], 0
-        self._waiting.append(np.array(samples, dtype=np.float64))
+            samples = samples[stop:]
+        elif not len(self._waiting):
+            self._waiting = np.empty(WHOLE)  # at once: many small arrays would leave holes in the memory
+        self._waiting[self._held : self._held + len(samples)] = samples
         self._held += len(samples)
 
     def stretch(self, interval: float | None = None) -> Stretch:
@@ -211,7 +220,7 @@ class Accumulator:
         """
         self._interval = interval or self._interval
         held = self._all()
-        self._waiting = []
+        self._waiting = np.empty(0)
         if not self._stretches:
             return self._whole(held)
         if len(held):
@@ -227,7 +236,7 @@ class Accumulator:
         return cosine_coefficients(held[: smooth_count(len(held))])[:SLOW]
 
     def _all(self) -> Array:
-        return self._waiting[0] if len(self._waiting) == 1 else np.concatenate([*self._waiting, np.empty(0)])
+        return self._waiting[: self._held]
 
     def _cleaned(self, samples: Array) -> Array:
         if not self._despike:

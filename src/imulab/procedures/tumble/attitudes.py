@@ -13,7 +13,7 @@ Source: Tedaldi, Pretto, Menegatti, ICRA 2014 (threshold sweep).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, Unpack
 
@@ -29,7 +29,7 @@ from imulab.estimation.rows import distinct, leave_out, median, medians, quantil
 from imulab.estimation.sampling import bridged, doubt_unit_of_time
 from imulab.procedures.result import OWN_CLOCKS, as_recording
 from imulab.readers.streams import one_clock
-from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time, state_rate
+from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time, release, state_rate
 from imulab.units import conversion_factor
 
 # Attitudes: what segmentation hands to a tumble fit.
@@ -371,12 +371,14 @@ _BATCHES = 10
 
 
 class HeldStill(Struct, frozen=True):
-    """The samples of all holds, one after the other, in blocks as long as a hand's tremor.
+    """The holds in blocks as long as a hand's tremor, one after the other.
 
-    `start` and `stop` are the stretches in blocks, `attitude` says whose each is; `centre` is an attitude's mean.
+    `columns` hold all samples; `first` is that of each stretch. `start` and `stop` are the stretches in blocks,
+    `attitude` says whose each is; `centre` is an attitude's mean.
     """
 
-    samples: tuple[Array, Array, Array]
+    columns: tuple[Array, ...]
+    first: NDArray[np.int64]
     mean: Array
     scatter: Array
     length: int
@@ -392,15 +394,24 @@ class HeldStill(Struct, frozen=True):
         usual = math.ceil(_TREMOR_SECONDS / step - 0.01)
         length = min(max(SMALLEST_BLOCK, usual), int((end - begin).min()) // 2)
         size = (end - begin) // length
-        index = np.concatenate([np.arange(a, a + n * length) for a, n in zip(begin, size, strict=True)])
-        x, y, z = (np.ascontiguousarray(recording.column(name)[index], dtype=np.float64) for name in names)
+        columns = tuple(np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)
         stop = np.cumsum(size)
         mean, scatter, unused = np.empty((stop[-1], 3)), np.empty((stop[-1], 3)), np.empty(stop[-1])
-        _segment.blocks(x, y, z, x, length, mean, scatter, unused)
+        for (x, y, z), part in _stretches(columns, begin, stop - size, stop, length):
+            _segment.blocks(x, y, z, x, length, mean[part], scatter[part], unused[part])
         first = np.unique(attitude, return_index=True)[1]
         total = np.add.reduceat(size, first)[:, None]
         centre = np.add.reduceat(mean, (stop - size)[first]) / total
-        return cls((x, y, z), mean, scatter, length, stop - size, stop, attitude, centre)
+        return cls(columns, begin, mean, scatter, length, stop - size, stop, attitude, centre)
+
+
+def _stretches(
+    columns: tuple[Array, ...], first: NDArray[np.int64], start: NDArray[np.int64], stop: NDArray[np.int64], length: int
+) -> Iterator[tuple[list[Array], slice]]:
+    """Yield the samples of each stretch, and which blocks they are; memory of temporary files is given back behind."""
+    for begin, a, b in zip(first.tolist(), start.tolist(), stop.tolist(), strict=True):
+        yield [column[begin : begin + (b - a) * length] for column in columns], slice(a, b)
+        release(*columns)
 
 
 def _statistics(held: HeldStill) -> tuple[Array, Array, Array]:
@@ -435,10 +446,13 @@ def _shrink_covariance(covariance: Array, freedom: Array, share: Array) -> Array
 def _motion(held: HeldStill, moments: Array, freedom: Array, share: Array) -> Motion:
     """How the attitudes moved: ``D = cov(x_k) - C_w / B + [mean(e e') - C_w / 2B] / 12``, B samples in a block."""
     count, size = len(held.centre), held.stop - held.start
-    sums = np.empty((3, count, 3, 3))
-    _segment.motion(
-        *held.samples, held.length, held.mean, held.start, held.stop, held.attitude, held.centre, *sums
-    )  # fmt: skip
+    sums, its = np.zeros((3, count, 3, 3)), np.empty((3, 1, 3, 3))
+    stretches = _stretches(held.columns, held.first, held.start, held.stop, held.length)
+    zero = np.zeros(1, dtype=np.int64)
+    for number, ((x, y, z), part) in zip(held.attitude.tolist(), stretches, strict=True):
+        blocks, centre = held.mean[part], held.centre[number : number + 1]
+        _segment.motion(x, y, z, held.length, blocks, zero, zero + len(blocks), zero, centre, *its)
+        sums[:, number] += its[:, 0]
     terms = size * held.length - 1, size, np.maximum(size - 2, 0)
     numbers = np.array([np.bincount(held.attitude, each, count) for each in terms])
     difference, spread, slope = sums / np.maximum(numbers, 1)[:, :, None, None]
@@ -509,6 +523,7 @@ _SAME_ATTITUDE = 2e-3
 """Pieces of one hold whose means differ by less than this fraction of g (rad) are one attitude: averaging them
 shortens the vector by less than 0.5 ug."""
 _TRACE_POINTS = 2000  # of the drawing of the scatter over time
+_AT_ONCE = 1 << 20  # samples of which blocks are formed at once
 _A_PART = 2000  # samples by which the resolution of an output is told
 
 
@@ -712,14 +727,21 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
 def _form_blocks(recording: Recording, names: list[str], time: Array, window: float) -> _Blocks:
     steps = np.diff(time)
     # The mean, not the median: stamps come in bursts, rates change, samples get lost; long pauses are left out.
-    usual = steps[steps <= quantile(steps, 0.99)] if steps.size else np.ones(1)
-    step = float(usual.mean())
+    release(time)
+    step = float(np.mean(steps, where=steps <= quantile(steps, 0.99))) if steps.size else 1.0
+    del steps
     seconds = min(_BLOCK_SECONDS, window / 3, len(time) * step)  # no block is longer than the recording
     length = max(SMALLEST_BLOCK, round(seconds / step))
     count = len(time) // length
     mean, scatter, longest = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
-    x, y, z = (np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)
-    _segment.blocks(x, y, z, np.ascontiguousarray(time), length, mean, scatter, longest)
+    columns = [*(recording.column(name) for name in names), time]
+    x, y, z, t = (np.ascontiguousarray(column, dtype=np.float64) for column in columns)
+    at_once = max(1, _AT_ONCE // length)
+    for first in range(0, count, at_once):
+        part = slice(first, min(first + at_once, count))
+        its = slice(part.start * length, part.stop * length + 1)  # and the sample that the last step leads to
+        _segment.blocks(x[its], y[its], z[its], t[its], length, mean[part], scatter[part], longest[part])
+        release(*columns)
     return _Blocks(mean, scatter, length, length * step, longest > max(_GAP_SECONDS, _GAP_STEPS * step))
 
 
