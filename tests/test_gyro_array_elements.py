@@ -87,7 +87,7 @@ def test_what_happens_at_rest_is_no_motion(fault):
         readings[:, :, 2] += 2.0 * rng.standard_normal((8000, 3))
     else:
         readings[7990:] += 3.0
-    found = find_rest(DEG * readings, 100.0, [["a"] * 6] * 3, "s.csv")
+    found = find_rest((DEG * readings).__getitem__, len(readings), 100.0, [["a"] * 6] * 3, "s.csv")
     assert (found.start, found.stop) == ((0, 7900) if fault == "knock" else (0, 8000))
 
 

@@ -8,6 +8,7 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError, ObservabilityError, RecordError, UnitError
+from imulab.procedures.gyro_array import elements, fit
 from imulab.procedures.gyro_array.alignment import align, nominal_orientation
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
@@ -167,6 +168,17 @@ def test_the_covariance_is_that_of_the_noise():
     np.testing.assert_allclose(np.diag(covariance), 1.49 / 5, rtol=0.06)
     limit = np.degrees(found["limit"][0]["value"])
     assert limit == pytest.approx(np.sqrt((1 / 3 + 0.49) / 5), rel=0.05)
+
+
+def test_a_long_recording_is_looked_at_in_parts_with_the_same_result(monkeypatch):
+    still, moving, _, _ = array_of(2, 3)
+    whole = calibrate_array(still, moving, averaging_time=0.7).calibration
+    for module in (fit, elements):
+        monkeypatch.setattr(module, "ROWS_AT_ONCE", 700)
+    parts = calibrate_array(still, moving, averaging_time=0.7).calibration
+    assert parts.warnings == whole.warnings
+    covariance, found = (np.array(each.sections["correlation"]["covariance"]) for each in (whole, parts))
+    np.testing.assert_allclose(found, covariance, rtol=0, atol=1e-13 * covariance.max())
 
 
 def test_the_record_survives_saving_and_draws_its_report(tmp_path):

@@ -51,10 +51,10 @@ def medians(values: NDArray[Any], axis: int = -1) -> Array:
     >>> medians(np.array([[4.0, 1.0, 2.0], [7.0, 9.0, 8.0]])).tolist()
     [2.0, 8.0]
     """
-    count = values.shape[axis]
-    pair = [(count - 1) // 2, count // 2]
-    low, high = np.moveaxis(np.partition(values, pair, axis), axis, 0)[pair]
-    return np.where(np.isnan(values.max(axis)), np.nan, (low + high) / 2)
+    middle = values.shape[axis] // 2
+    parted = np.moveaxis(np.partition(values, middle, axis), axis, 0)  # for one place, three times as fast as for two
+    low = parted[middle] if values.shape[axis] % 2 else parted[:middle].max(0)
+    return np.where(np.isnan(values.max(axis)), np.nan, (low + parted[middle]) / 2)
 
 
 def quantile(values: NDArray[Any], share: float) -> float:
@@ -67,9 +67,9 @@ def quantile(values: NDArray[Any], share: float) -> float:
     """
     place = share * (values.size - 1)
     below = int(place)
-    pair = [below, min(below + 1, values.size - 1)]
-    low, high = np.partition(values, pair, axis=None)[pair]
-    return float(low + (place - below) * (high - low))
+    parted = np.partition(values, below, axis=None)
+    low, above = parted[below], parted[below + 1 :]
+    return float(low + (place - below) * (above.min() - low)) if above.size else float(low)
 
 
 def distinct(values: NDArray[Any]) -> NDArray[Any]:

@@ -28,7 +28,7 @@ from imulab.estimation.decisions import ELEMENT_BENDS, READINGS_LATE
 from imulab.estimation.least_squares import coverage_factor
 from imulab.estimation.noise_coefficients import DeviationCurve
 from imulab.procedures.gyro_array.elements import Elements
-from imulab.recording import Array
+from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.mean_noise import mean_uncertainties
 
@@ -52,10 +52,8 @@ class AtRest:
     rate: float
 
 
-def at_rest(
-    readings: Array, rate: float, elements: Elements, record: Calibration | None, head: Mapping[str, str]
-) -> tuple[AtRest, list[str]]:
-    """Return biases and noise of readings at rest, shape (m, axes, n), rad/s, at a rate, Hz, and notes.
+def at_rest(still: Recording, rate: float, elements: Elements, record: Calibration | None) -> tuple[AtRest, list[str]]:
+    """Return biases and noise of the elements in a recording at rest, at a rate, Hz, and notes.
 
     The uncertainty of a bias is that of a mean over the duration t, averaged over noise models:
     ``u^2 = N^2/t + (2 ln 2/pi) B^2 + K^2 t/3 + ...`` (`terms.mean_terms`).
@@ -65,20 +63,20 @@ def at_rest(
     RecordError
         The record is no noise record, or lacks an element.
     """
-    n, duration = elements.count, len(readings) / rate
-    columns = [readings[:, a, i] for a in range(len(elements.axes)) for i in range(n)]
-    each = columns_noise(columns, rate, candidates=_CANDIDATES)
+    n, duration = elements.count, len(still) / rate
+    names = [name for row in elements.names for name in row]
+    bias = [float(still.si(name).mean()) for name in names]
+    each = columns_noise(map(still.si, names), rate, candidates=_CANDIDATES)
     notes: list[str] = []
     if record is None:
         spread = np.array([gyro.mean_uncertainty(duration) for gyro in each])
     else:
-        names = [name for row in elements.names for name in row]
-        spread, notes = mean_uncertainties(record, names, duration, "rad/s", head)
+        spread, notes = mean_uncertainties(record, names, duration, "rad/s", still.metadata)
     noise = tuple(tuple(each[k : k + n]) for k in range(0, len(each), n))
     curves = tuple(tuple(gyro.curve for gyro in row) for row in noise)
     white = np.array([[curve.deviation[0] for curve in row] for row in curves])
     spread = spread.reshape(len(elements.axes), n)
-    return AtRest(readings.mean(axis=0), curves, noise, white, spread, duration, rate), notes
+    return AtRest(np.reshape(bias, spread.shape), curves, noise, white, spread, duration, rate), notes
 
 
 def unseen(noises: Mapping[str, ColumnNoise], rest: AtRest) -> list[str]:

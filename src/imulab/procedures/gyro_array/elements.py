@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -62,12 +62,12 @@ class Elements:
         """Return the names of the fused columns: ``rate``, or ``rate_x rate_y rate_z``."""
         return [f"rate_{axis}" if axis else "rate" for axis in self.axes]
 
-    def readings(self, recording: Recording) -> Array:
-        """Return the readings as logged, shape (m, axes, n), C-contiguous."""
-        out = np.empty((len(recording), len(self.axes), self.count))
+    def readings(self, recording: Recording, rows: slice = slice(None)) -> Array:
+        """Return the readings as logged, of all rows or some, shape (m, axes, n), C-contiguous."""
+        out = np.empty((len(range(len(recording))[rows]), len(self.axes), self.count))
         for a, row in enumerate(self.names):
             for i, name in enumerate(row):
-                out[:, a, i] = recording.columns[name]
+                out[:, a, i] = recording.columns[name][rows]
         return out
 
     def truth(self, recording: Recording) -> Array | None:
@@ -822,6 +822,8 @@ _ALIKE = 1.25  # between quartiles of the elements: a common part of more unlike
 _STEADY, _STEADY_SPREAD = math.radians(5.0), 0.1
 _LARGEST_ZERO = math.radians(100.0)
 _MOST_SAMPLES = 20_000  # samples in which a fast motion is looked for
+ROWS_AT_ONCE = 1 << 16
+"""Rows of an array that are looked at together: those of a long log do not fit in memory as one array."""
 
 
 @dataclass(frozen=True)
@@ -833,7 +835,9 @@ class ArrayRest:
     moved: str = ""
 
 
-def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name: str) -> ArrayRest:
+def find_rest(
+    readings: Callable[[slice], Array], count: int, rate: float, names: Sequence[Sequence[str]], name: str
+) -> ArrayRest:
     """Return the longest stretch in which an array is at rest.
 
     A window of a second is quiet where the standard deviation of every gyro is at most 3 times that of its quietest
@@ -843,7 +847,9 @@ def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name
     Parameters
     ----------
     readings
-        Shape (m, axes, n), rad/s.
+        Returns those of some rows, shape (m, axes, n), rad/s.
+    count
+        Number of rows.
     rate
         Sampling rate, Hz.
     names
@@ -856,12 +862,10 @@ def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name
     DataError
         No stretch of five windows is quiet, or the quiet one moves.
     """
-    count, axes, n = readings.shape
     size = max(_SMALLEST_WINDOW, min(round(_WINDOW * rate), count // _FEWEST_WINDOWS))
-    windows = readings[: count // size * size].reshape(-1, size, axes, n)
-    spread, mean = windows.std(axis=1), windows.mean(axis=1)
+    spread, mean = _window_statistics(readings, count // size, size)
     usual = np.quantile(spread, _QUIETEST, axis=0)
-    steps = np.array([[resolution(readings[:, a, i]) for i in range(n)] for a in range(axes)])
+    steps = np.apply_along_axis(resolution, 0, readings(slice(_MOST_SAMPLES)))
     usual = np.maximum(usual, _STEP_NOISE * steps)
     loud = spread > _QUIET_FACTOR * usual
     calm = ~loud.any(axis=(1, 2))
@@ -879,11 +883,23 @@ def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name
             f"{name}: no stretch of {_SHORTEST * size / rate:.3g} s at rest: "
             f"{_restless_message(restless, spread, mean - centre, names, size / rate)}; expected a recording at rest"
         )
-    start, stop = first * size, count if last == len(windows) else last * size
-    _refuse_motion(readings[start:stop], mean[first:last], usual, size, names, name)
+    start, stop = first * size, count if last == len(mean) else last * size
+    _refuse_motion(readings(slice(start, min(stop, start + _MOST_SAMPLES))), mean[first:last], usual, size, names, name)
     if (start, stop) == (0, count):
         return ArrayRest(0, count)
     return ArrayRest(start, stop, _restless_message(restless, spread, mean - centre, names, size / rate))
+
+
+def _window_statistics(readings: Callable[[slice], Array], count: int, size: int) -> tuple[Array, Array]:
+    """Return standard deviation and mean of so many windows of `size` rows, shapes (count, axes, n)."""
+    spread, mean = [], []
+    at_once = max(1, ROWS_AT_ONCE // size)
+    for first in range(0, count, at_once):
+        part = readings(slice(first * size, min(first + at_once, count) * size))
+        windows = part.reshape(-1, size, *part.shape[1:])
+        mean.append(windows.mean(axis=1))
+        spread.append(windows.std(axis=1))
+    return np.concatenate(spread), np.concatenate(mean)
 
 
 def common_motion(off: Array, noise: Array) -> tuple[float, float]:
@@ -918,15 +934,15 @@ def common_motion(off: Array, noise: Array) -> tuple[float, float]:
 def _refuse_motion(
     readings: Array, mean: Array, usual: Array, size: int, names: Sequence[Sequence[str]], name: str
 ) -> None:
-    """Refuse a quiet stretch whose elements move together, or that turns steadily."""
+    """Refuse a quiet stretch whose elements move together, or that turns steadily; `readings` are its first."""
     slow = common_motion(mean - mean.mean(axis=0), usual / math.sqrt(size))
-    part = readings[: min(len(readings), _MOST_SAMPLES) // size * size]
+    part = readings[: len(readings) // size * size]
     blocks = part.reshape(-1, size, *part.shape[1:])
     fast = common_motion((blocks - blocks.mean(axis=1, keepdims=True)).reshape(part.shape), usual)
     moves, ratio = max(slow, fast, key=lambda pair: pair[1])
     if ratio > _TOGETHER:
         raise DataError(_motion_message(name, moves, ratio))
-    steady = readings.mean(axis=0)
+    steady = mean.mean(axis=0)
     rates = np.sqrt((steady**2).sum(axis=0))
     low, middle, high = np.quantile(rates, [0.0, 0.5, 1.0])
     if len(rates) > 2 and middle > _STEADY and high - low < _STEADY_SPREAD * middle:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,7 @@ from imulab.procedures.gyro_array.alignment import (
     unseen,
 )
 from imulab.procedures.gyro_array.elements import (
+    ROWS_AT_ONCE,
     Checks,
     Elements,
     feedback_notes,
@@ -113,21 +116,20 @@ def calibrate_array(
     warnings += [prefixed(still.name, note) for note in left_out.notes()]
     still, cut = _still_part(left_out, elements)
     warnings += cut
-    _check_readings(still, elements)
+    if cut or left_out.kinds:
+        _check_readings(still, elements)
     rate, timing = sampling_rate(still)
-    rest, notes = at_rest(_readings_si(still, elements), rate, elements, noise, still.metadata)
+    rest, notes = at_rest(still, rate, elements, noise)
     warnings += [*(prefixed(still.name, line) for line in notes), *timing]
     aligned = None
     if moving is not None:
         aligned, more = _align_in_motion(moving, elements, rest)
         warnings += more
-    readings = _readings_si(still, elements) - rest.bias
     checks = Checks(elements.names)
-    checks.watch(readings)
+    for rows in _blocks_of_rows(len(still)):
+        checks.watch(_readings_si(still, elements, rows) - rest.bias)
     warnings += [prefixed(still.name, line) for line in checks.units()]
-    if aligned is not None:
-        readings = np.einsum("iab,mbi->mai", np.linalg.inv(aligned.sensing), readings)
-    covariance, used, count = _allan_covariance(readings, rest.rate, averaging_time)
+    covariance, used, count = _allan_covariance(still, elements, rest, aligned, averaging_time)
     if used < averaging_time * 0.999:
         warnings.append(
             Note(
@@ -150,13 +152,15 @@ def calibrate_array(
 
 
 def _bridge_rows(recording: Recording, elements: Elements) -> LeftOut:
-    names = [name for row in elements.names for name in row]
-    check_finite(recording, names)
-    return leave_out(recording, names)
+    return leave_out(recording, [name for row in elements.names for name in row])
 
 
-def _readings_si(recording: Recording, elements: Elements) -> Array:
-    readings = elements.readings(recording)
+def _blocks_of_rows(count: int) -> Iterator[slice]:
+    return (slice(start, min(start + ROWS_AT_ONCE, count)) for start in range(0, count, ROWS_AT_ONCE))
+
+
+def _readings_si(recording: Recording, elements: Elements, rows: slice = slice(None)) -> Array:
+    readings = elements.readings(recording, rows)
     for axis, unit in enumerate(elements.units):
         readings[:, axis] = to_si(readings[:, axis], unit)
     return readings
@@ -167,11 +171,12 @@ def _check_readings(recording: Recording, elements: Elements) -> None:
     names = [name for row in elements.names for name in row]
     check_finite(recording, names)
     for name in names:
-        values = recording.columns[name]
+        values = recording.column(name)
         if len(values) and np.ptp(values) == 0:
             raise DataError(f"{recording.name}: column {name}: all samples are {values[0]:g}: a dead gyro")
     checks = Checks(elements.names)
-    checks.watch(elements.readings(recording))
+    for rows in _blocks_of_rows(len(recording)):
+        checks.watch(elements.readings(recording, rows))
     for line in checks.doubled():
         raise DataError(f"{recording.name}: {line}")
 
@@ -182,7 +187,7 @@ def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[
     if len(still) < _FEWEST_SAMPLES:
         raise DataError(f"{still.name}: {len(still)} samples at rest are too few; expected {_FEWEST_SAMPLES} or more")
     rate, _ = sampling_rate(still)
-    rest = find_rest(_readings_si(still, elements), rate, elements.names, still.name)
+    rest = find_rest(partial(_readings_si, still, elements), len(still), rate, elements.names, still.name)
     left_out.check(rest.start, rest.stop, "the recording at rest")
     if not rest.moved:
         return still, []
@@ -259,17 +264,25 @@ def _clipped_rows(readings: Array) -> np.ndarray:
     return rows
 
 
-def _allan_covariance(readings: Array, rate: float, averaging_time: float) -> tuple[Array, float, int]:
+def _allan_covariance(
+    still: Recording, elements: Elements, rest: AtRest, aligned: Alignment | None, averaging_time: float
+) -> tuple[Array, float, int]:
     """Return the Allan covariance of each axis, (axes, n, n), the averaging time used, and its degrees of freedom."""
-    m, axes, n = readings.shape
+    n, m, rate = elements.count, len(still), rest.rate
     size = max(1, min(round(averaging_time * rate), m // (_FEWEST_DIFFERENCES * n + 1)))
-    total = np.concatenate([np.zeros((1, axes, n)), np.cumsum(readings, axis=0)])
     starts = np.arange(0, m - 2 * size + 1, max(1, size // _OVERLAP))
-    first, middle, last = total[starts], total[starts + size], total[starts + 2 * size]
-    difference = (last - 2 * middle + first) / size
+    covariance = np.zeros((len(elements.axes), n, n))
+    for part in np.array_split(starts, -(-m // max(ROWS_AT_ONCE, 4 * size))):
+        readings = _readings_si(still, elements, slice(part[0], part[-1] + 2 * size)) - rest.bias
+        if aligned is not None:
+            readings = np.einsum("iab,mbi->mai", np.linalg.inv(aligned.sensing), readings)
+        total = np.concatenate([np.zeros((1, *readings.shape[1:])), np.cumsum(readings, axis=0)])
+        its = part - part[0]
+        difference = (total[its + 2 * size] - 2 * total[its + size] + total[its]) / size
+        covariance += np.einsum("kai,kaj->aij", difference, difference)
     # Equivalent number of independent differences for white noise: NIST SP 1065, table 5.
     freedom = max(2, round(1.5 * m / size))
-    return np.einsum("kai,kaj->aij", difference, difference) / (2 * len(difference)), size / rate, freedom
+    return covariance / (2 * len(starts)), size / rate, freedom
 
 
 def _with_unit(value: Any, uncertainty: Any, unit: str) -> dict[str, Any]:
@@ -394,7 +407,7 @@ def _correlation(
         "averaging_time": {"value": averaging_time, "unit": "s"},
         "axes": list(elements.axes),
         "matrix": correlation.tolist(),
-        "standard_uncertainty": ((1 - correlation**2) / math.sqrt(differences)).tolist(),
+        "standard_uncertainty": (np.maximum(1 - correlation**2, 0.0) / math.sqrt(differences)).tolist(),
         "covariance": covariance.tolist(),
         "unit": "(rad/s)^2",
         "weights": [weights.tolist() for weights, _ in fixed],
