@@ -184,7 +184,9 @@ def outcome(words: list[str]) -> tuple[int | str, str]:
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
-        signal.alarm(SECONDS)
+        # Of processor time, since the tests share the machine; a call that only waits has longer.
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+        signal.alarm(4 * SECONDS)
         # What this process holds already, which in a whole run of tests is much, and so much more.
         held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         most = held + (GIGABYTES << 30)

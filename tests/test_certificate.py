@@ -359,6 +359,8 @@ def test_the_template_is_that_of_the_guide_and_makes_a_valid_certificate(issue, 
     template = capsys.readouterr().out
     guide = Path(__file__).resolve().parents[1] / "docs" / "certificate.md"
     assert f"```toml\n{template}```" in guide.read_text(encoding="utf-8")
+    assert main(["certificate", "--template", "-o", "start.toml"]) == 0
+    assert Path("start.toml").read_text(encoding="utf-8") == template
     assert issue(template) == 0
     assert schemas("cert.xml") == []
     agreed = re.sub("(?m)^# ((.conformity|rule|agreed|specification).*)$", r"\1", template)

@@ -17,7 +17,7 @@ from imulab.certificate.laboratory import Address, Condition, Equipment, Party
 from imulab.certificate.model import NORMAL, Certificate, Result
 from imulab.certificate.units import dsi_unit
 from imulab.estimation.distributions import chi_square_upper_quantile
-from imulab.fleet.limits import Decision, Limits
+from imulab.fleet.limits import Conformity, Limits
 from imulab.records.calibration import Covariance
 
 SCHEMA = "3.3.0"
@@ -295,7 +295,7 @@ def _quantity(quantity: ET.Element, result: Result) -> None:
             _conformity(_add(told, "metaData", refType="basic_conformity"), result, result.decision, result.limits)
 
 
-def _conformity(parent: ET.Element, result: Result, decision: Decision, limits: Limits) -> None:
+def _conformity(parent: ET.Element, result: Result, decision: Conformity, limits: Limits) -> None:
     """Add a decision with its probability, the limits, and those within which a value passes."""
     _words(parent, "declaration", f"Probability of conformity: {decision.probability:.4f}")
     _add(parent, "conformity", decision.state)

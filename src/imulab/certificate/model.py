@@ -11,7 +11,7 @@ from imulab.certificate.laboratory import Equipment, Laboratory
 from imulab.certificate.units import dsi_unit
 from imulab.errors import OptionError, RecordError
 from imulab.files import unit_of
-from imulab.fleet.limits import Decision, Limits, decide, load_limits, probability_of_all, worst
+from imulab.fleet.limits import Conformity, Limits, decide, load_limits, probability_of_all, worst
 from imulab.records.calibration import Calibration, Parameter
 from imulab.units import to_si
 
@@ -44,7 +44,7 @@ class Result:
     definition: str
     interval: tuple[float, float] | None
     limits: Limits | None = None
-    decision: Decision | None = None
+    decision: Conformity | None = None
 
     @property
     def expanded_uncertainty(self) -> float:

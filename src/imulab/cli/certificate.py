@@ -8,6 +8,7 @@ import imulab as il
 from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import check_outputs
 from imulab.errors import OptionError
+from imulab.files import replacing
 from imulab.options import OUTPUT
 
 
@@ -21,7 +22,9 @@ def certificate(
         str | None, option("LIMITS.toml", "Limits of parameters: whether each conforms, by the rule in LAB.toml.")
     ] = None,
     output: Annotated[str | None, option("CERT.xml", "Certificate to write.", "-o", "--output"), OUTPUT] = None,
-    template: Annotated[bool, option("", "Print a LAB.toml to start from, and nothing else."), OUTPUT] = False,
+    template: Annotated[
+        bool, option("", "Print a LAB.toml to start from, or write it to the output, and nothing else."), OUTPUT
+    ] = False,
 ) -> None:
     """Write a Digital Calibration Certificate.
 
@@ -31,7 +34,13 @@ def certificate(
     if template:
         from imulab.certificate.laboratory import TEMPLATE
 
-        print(TEMPLATE, end="")
+        if output is None:
+            print(TEMPLATE, end="")
+            return
+        check_outputs([output], [])
+        with replacing(output) as stream:
+            stream.write(TEMPLATE.encode())
+        print(f"template: {output}")
         return
     if record is None or lab is None or output is None:
         raise OptionError("expected RECORD, --lab LAB.toml and -o CERT.xml, or --template alone")

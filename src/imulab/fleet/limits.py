@@ -126,7 +126,7 @@ def to_parameter_unit(value: float, unit: str, target: str, name: str = "") -> f
 
 
 @dataclass(frozen=True)
-class Decision:
+class Conformity:
     """Whether a value conforms.
 
     Attributes
@@ -146,7 +146,7 @@ class Decision:
 
 def decide(
     value: float, uncertainty: float, factor: float, limits: Limits, rule: Rule, freedom: float | None = None
-) -> Decision:
+) -> Conformity:
     """Return the decision on a value with its standard uncertainty; an end that equals its limit passes.
 
     ``simple`` passes within the limits, ``guarded`` within the limits less ``U = k u``. ``bands`` says in between
@@ -174,7 +174,7 @@ def decide(
     state = next((state for ends, state in states if ends.lower <= value <= ends.upper), "fail")
     ends = (np.array([limits.lower, limits.upper]) - value) / uncertainty
     low, high = normal_cdf(ends) if freedom is None else t_cdf(ends, freedom)
-    return Decision(state, float(high - low), acceptance)
+    return Conformity(state, float(high - low), acceptance)
 
 
 def probability_of_all(

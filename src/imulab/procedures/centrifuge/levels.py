@@ -465,7 +465,7 @@ _LEAST = 3e-4
 """Gravity terms at the net rate, on a base that is not level, look like a mismatch of up to this size."""
 
 
-class Measured:
+class MeasuredRuns:
     """Arrays over runs, X axis: signed rates, forces, lines of FOG and residual, and variances of a component."""
 
     def __init__(self, runs: list[LoadedRun], lines: dict[int, RunLine]) -> None:
@@ -504,7 +504,7 @@ def _pairs(values: Complex) -> Array:
     return np.concatenate([values.real, values.imag])
 
 
-def tilted(test: Measured) -> tuple[Array, Array, bool]:
+def tilted(test: MeasuredRuns) -> tuple[Array, Array, bool]:
     """Return values, covariance, and whether tau is known, of ``-w_t (delta + kappa a) exp(i w_s tau)`` for the FOG."""
     with_flexure, with_delay = test.levels >= 2, test.levels >= 3
     parameters = np.zeros(5)
@@ -539,7 +539,7 @@ class Mismatch:
     freedom: int
 
 
-def mismatch(test: Measured, axis: int = 0, delay: float = 0.0) -> Mismatch | None:
+def mismatch(test: MeasuredRuns, axis: int = 0, delay: float = 0.0) -> Mismatch | None:
     """Return scale mismatch and azimuth of an axis against the FOG by the Earth's rate; None where that does not show.
 
     `delay` is that of the FOG against the axis, s.
@@ -595,7 +595,7 @@ class Delays:
         return self.fog - self.axis
 
 
-def delays(test: Measured) -> Delays | None:
+def delays(test: MeasuredRuns) -> Delays | None:
     """Return the delays that the lines show by turning with the table rate; None without encoder or three levels.
 
     The FOG's from its own lines, ``-w_t (delta + kappa a) exp(i w_s tau)``; that of X from the rest of X without them,
@@ -612,7 +612,7 @@ def delays(test: Measured) -> Delays | None:
     )
 
 
-def _axis_delay(test: Measured, tau: float) -> tuple[float, float]:
+def _axis_delay(test: MeasuredRuns, tau: float) -> tuple[float, float]:
     """Return the delay of X and its uncertainty for a delay of the FOG, s."""
     axis_delay = u = 0.0
     sense = np.array([run.run.sense for run in test.runs])

@@ -23,7 +23,7 @@ from imulab.procedures.centrifuge import CURVES
 from imulab.procedures.centrifuge.levels import (
     Level,
     Levels,
-    Measured,
+    MeasuredRuns,
     Repeatability,
     RunLine,
     as_vector,
@@ -210,7 +210,7 @@ def find_corrections(runs: Sequence[LoadedRun], lines: dict[int, RunLine], *, co
     correct
         Whether errors are corrected; otherwise all of them are uncertainty (method ``fourier``).
     """
-    test = Measured([run for run in runs if run.index in lines], lines)
+    test = MeasuredRuns([run for run in runs if run.index in lines], lines)
     axes = len(test.runs[0].channels) - 1
     late, shown = _correct_delay(test, lines, axes, correct=correct)
     turn: Complex = np.exp(-1j * test.table * late)
@@ -241,7 +241,7 @@ class _Finding:
 
 
 def _correct_delay(
-    test: Measured, lines: dict[int, RunLine], axes: int, *, correct: bool
+    test: MeasuredRuns, lines: dict[int, RunLine], axes: int, *, correct: bool
 ) -> tuple[float, list[_Finding]]:
     """Return by how much the FOG's line is turned back, s, and the delays that the test shows."""
     delay = delays(test)
@@ -292,7 +292,7 @@ def _correct_delay(
 
 
 def _correct_mismatch(
-    test: Measured, axis: int, axes: int, late: float, *, correct: bool
+    test: MeasuredRuns, axis: int, axes: int, late: float, *, correct: bool
 ) -> tuple[Complex, list[_Finding]]:
     """Return, by run, the term to add to the factor of the FOG's line in an axis, and the mismatch found."""
     change = np.zeros(len(test.runs), dtype=np.complex128)

@@ -20,7 +20,7 @@ import numpy as np
 from imulab.errors import OptionError, quoted
 from imulab.files import write_text
 from imulab.options import measure, text
-from imulab.procedures.centrifuge.levels import Measured, RunLine, arm_rate_off, delays, mismatch, tilted, weighted
+from imulab.procedures.centrifuge.levels import MeasuredRuns, RunLine, arm_rate_off, delays, mismatch, tilted, weighted
 from imulab.procedures.centrifuge.manifest import Manifest, make_manifest, manifest_text
 from imulab.procedures.centrifuge.run import LoadedRun
 from imulab.procedures.result import PlannedTest, amount
@@ -75,7 +75,7 @@ def error_budget(
 
     `runs` and `lines` are those before any correction; `corrected` names the errors that are corrected.
     """
-    test = Measured([run for run in runs if run.index in lines], lines)
+    test = MeasuredRuns([run for run in runs if run.index in lines], lines)
     entries = [
         *_tilt(test), _flexure(test), *_scale_mismatch(test), *_delays(test), _table_rate(test),
         _arm_rate(test, manifest), _radius(test, manifest),
@@ -91,7 +91,7 @@ def _corrected_entry(entry: BudgetEntry) -> BudgetEntry:
     return replace(entry, effect=entry.effect * share, removed=entry.effect, basis=f"{entry.basis}; corrected")
 
 
-def _tilt(test: Measured) -> list[BudgetEntry]:
+def _tilt(test: MeasuredRuns) -> list[BudgetEntry]:
     if not test.encoder:
         size = np.abs(test.fog / test.arm)
         variance = test.fog_variance / test.arm**2
@@ -115,7 +115,7 @@ def _tilt(test: Measured) -> list[BudgetEntry]:
     return entries
 
 
-def _flexure(test: Measured) -> BudgetEntry:
+def _flexure(test: MeasuredRuns) -> BudgetEntry:
     """Return differential flexure: the part of the lines that changes sign with the sense of rotation."""
     reach = float(np.abs(test.arm).max()) / test.K
     senses = np.sign(test.arm)
@@ -139,7 +139,7 @@ def _flexure(test: Measured) -> BudgetEntry:
     )  # fmt: skip
 
 
-def _scale_mismatch(test: Measured) -> list[BudgetEntry]:
+def _scale_mismatch(test: MeasuredRuns) -> list[BudgetEntry]:
     """Return scale mismatch and azimuth of X against the FOG, by the Earth's rate."""
     measured = mismatch(test)
     if measured is None:
@@ -157,7 +157,7 @@ def _scale_mismatch(test: Measured) -> list[BudgetEntry]:
     return entries
 
 
-def _delays(test: Measured) -> list[BudgetEntry]:
+def _delays(test: MeasuredRuns) -> list[BudgetEntry]:
     """Return the delays of FOG and X against the encoder, by the turning of their lines with the table rate."""
     per_second = float(np.abs(test.table).max()) * test.fog_share
     measured = delays(test)
@@ -173,7 +173,7 @@ def _delays(test: Measured) -> list[BudgetEntry]:
     ]  # fmt: skip
 
 
-def _table_rate(test: Measured) -> BudgetEntry:
+def _table_rate(test: MeasuredRuns) -> BudgetEntry:
     origins = {run.rates.origin for run in test.runs}
     if "manifest" in origins:
         return BudgetEntry(
@@ -194,7 +194,7 @@ def _table_rate(test: Measured) -> BudgetEntry:
     )  # fmt: skip
 
 
-def _arm_rate(test: Measured, manifest: Manifest) -> BudgetEntry:
+def _arm_rate(test: MeasuredRuns, manifest: Manifest) -> BudgetEntry:
     """Return the error of the arm rate: table rate plus net rate as measured, against the manifest's."""
     runs = [run for run in test.runs if run.rates.net_rate is not None and run.rates.origin != "manifest"]
     stated = manifest.rate_uncertainty / float(np.abs(test.arm).max())
@@ -210,7 +210,7 @@ def _arm_rate(test: Measured, manifest: Manifest) -> BudgetEntry:
     )  # fmt: skip
 
 
-def _radius(test: Measured, manifest: Manifest) -> BudgetEntry:
+def _radius(test: MeasuredRuns, manifest: Manifest) -> BudgetEntry:
     relative = manifest.radius_uncertainty / manifest.radius
     return BudgetEntry(
         "radius",
