@@ -24,7 +24,7 @@ from imulab.procedures.thermal.holds import find_holds
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.record import predict_parameters
 from imulab.procedures.thermal.simulate import thermal_truth
-from imulab.procedures.thermal.solve import ThermalProblem, conclude, solve
+from imulab.procedures.thermal.solve import Rows, ThermalProblem, conclude, solve, whitener
 from reference import thermal as reference
 
 G = reference.G
@@ -70,6 +70,28 @@ def test_exact_data_give_the_laws_to_twelve_digits():
     triad = reference.Triad(rng)
     found = solve(problem(rng, triad, (-20, 0, 25, 45, 60), 12, noise=0.0, stated=1e-8), LAWS, tau=0.0)
     assert np.abs(LAWS.design(AT) @ found.coefficients - truth(triad)).max() < 1e-12
+
+
+@pytest.mark.parametrize("shared", [0, 1, 3])
+def test_rows_are_whitened_as_by_the_factor_of_their_whole_covariance(shared):
+    rng = np.random.default_rng(shared)
+    recording = rng.permutation(np.repeat([0, 2, 3, 5], [70, 20, 9, 3]))  # 5: the prior; in no order
+    n = len(recording)
+    own = (recording[:, None] == recording) * (lambda a: a @ a.T)(rng.standard_normal((n, 2 * n)))
+    which = np.unique(recording, return_inverse=True)[1]
+    one = np.eye(4)[which]
+    bias, scale = (np.kron(one, np.ones(3)) * rng.standard_normal((n, 12)) for _ in range(2))
+    errors = np.hstack([one * rng.standard_normal((n, 1)), rng.standard_normal((n, shared))])
+    owner = np.where(recording == 5, -1, np.arange(n))
+    rows = Rows(
+        rng.standard_normal(n), rng.standard_normal((n, 4)), own, (bias, scale), errors, np.zeros((n, 4)),
+        owner, owner >= 0, recording,
+    )  # fmt: skip
+    whole = own + errors @ errors.T + np.diag(0.3 * (owner >= 0)) + 4 * bias @ bias.T + 0.25 * scale @ scale.T
+    white = whitener(rows, 0.3, np.array([2.0, 0.5]))
+    factor = np.linalg.cholesky(whole)
+    for columns in (rows.residual, rows.jacobian):
+        np.testing.assert_allclose(white(columns), np.linalg.solve(factor, columns), rtol=1e-10, atol=1e-12)
 
 
 def errors(trials, temperatures, count, turn_on):

@@ -145,8 +145,8 @@ def split_temperatures(solution: ThermalSolution, cluster: NDArray[np.int64]) ->
     for number in range(1, int(cluster.max(initial=0))):
         jacobian, missing = _remove_knot(rows.jacobian, solution.laws, number)
         train, test = at != number, (at == number) & rows.magnitude
-        white = whitener(select_rows(rows, train), solution.excess**2, solution.scatter.tau)
-        test_weight = row_covariance(select_rows(rows, test), solution.excess**2, solution.scatter.tau)
+        white = whitener(rows.part(train), solution.excess**2, solution.scatter.tau)
+        test_weight = row_covariance(rows.part(test), solution.excess**2, solution.scatter.tau)
         rest = white(jacobian[train]), white(target[train])
         parts.append(Split(number, jacobian[test], target[test], test_weight, *rest, missing))
     return parts
@@ -189,21 +189,6 @@ def predict_left_out(splits: Sequence[Split], kept: NDArray[np.bool_]) -> list[L
         chi_square = float(error @ np.linalg.solve(scatter, error)) / len(error)
         errors.append(LeftOutCluster(split.number, len(error), float(np.sqrt(np.mean(error**2))), chi_square))
     return errors
-
-
-def select_rows(rows: Rows, which: NDArray[np.bool_]) -> Rows:
-    """Return some of the rows, with every column."""
-    return replace(
-        rows,
-        residual=rows.residual[which],
-        jacobian=rows.jacobian[which],
-        noise=rows.noise[np.ix_(which, which)],
-        offsets=(rows.offsets[0][which], rows.offsets[1][which]),
-        errors=rows.errors[which],
-        drift=rows.drift[which],
-        owner=rows.owner[which],
-        magnitude=rows.magnitude[which],
-    )
 
 
 def choose_laws(
@@ -799,7 +784,7 @@ def _warn_offset(holds: Holds, problem: ThermalProblem, solution: ThermalSolutio
     for number in numbers[attitudes >= _ATTITUDES].tolist():
         if not problem.shared[problem.recording == number].all():
             continue
-        others = select_rows(rows, whose != number)
+        others = rows.part(whose != number)
         excess, freedom = fit_excess(others, solution.excess**2)
         scatter, white = fit_turn_on_scatter(others, excess), whitener(others, excess, np.zeros(2))
         of_recording = np.s_[3 * number : 3 * number + 3]

@@ -561,6 +561,7 @@ def linearise_rates(held: RatesAtRest, laws: Laws, coefficients: Array, free: tu
         drift=drift.reshape(3 * n, 4),
         owner=np.repeat(np.arange(n), 3),
         magnitude=np.ones(3 * n, dtype=np.bool_),
+        recording=np.repeat(held.recording, 3),
     )
 
 

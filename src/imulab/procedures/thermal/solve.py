@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +74,8 @@ class Rows:
 
     `offsets` are the derivatives by offsets of bias and of scale factor in each power cycle, (N, 3 R) each; `errors`
     the derivatives by errors of the temperature, of unit variance; `drift` those by lag and loops, (N, 4), fitted or
-    not; `owner` is the hold of each row, -1 for a prior; `magnitude` marks rows that are magnitudes.
+    not; `owner` is the hold of each row, -1 for a prior; `magnitude` marks rows that are magnitudes; `recording` is the
+    number of each row's recording, that of a prior its own: but for `errors`, noise of two recordings is uncorrelated.
     """
 
     residual: Array
@@ -84,6 +86,15 @@ class Rows:
     drift: Array
     owner: NDArray[np.int64]
     magnitude: NDArray[np.bool_]
+    recording: NDArray[np.int64]
+
+    def part(self, which: NDArray[Any]) -> Rows:
+        """Return some of the rows, with every column."""
+        return Rows(
+            self.residual[which], self.jacobian[which], self.noise[np.ix_(which, which)],
+            (self.offsets[0][which], self.offsets[1][which]), self.errors[which], self.drift[which],
+            self.owner[which], self.magnitude[which], self.recording[which],
+        )  # fmt: skip
 
 
 def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directions: Array) -> Rows:
@@ -107,7 +118,9 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directio
     full = np.einsum("nai,nij,nbj->nab", basis, noise, basis)
     full[:, 1, 1] += problem.tilt**2
     full[:, 2, 2] += problem.tilt**2
-    row_noise = np.where(owner[:, None] == owner, full[owner[:, None], kind[:, None], kind[None, :]], 0.0)
+    first, second = np.nonzero(owner[:, None] == owner)
+    row_noise = np.zeros((len(rows), len(rows)))
+    row_noise[first, second] = full[owner[first], kind[first], kind[second]]
     if problem.wander is not None and problem.wander.any():
         tipped = np.where((kind[:, None] == kind) & (kind > 0), problem.wander[owner[:, None], owner], 0.0)
         row_noise = row_noise + tipped
@@ -125,8 +138,9 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directio
     by_drift = np.einsum("Nj,Njk->Nk", felt, drift[owner])
     jacobian = np.hstack([jacobian, by_drift[:, list(problem.free)], turns])
     linearised = Rows(
-        residual, jacobian, row_noise, (offsets[0], offsets[1]), errors, by_drift, owner.astype(np.int64), ~side
-    )
+        residual, jacobian, row_noise, (offsets[0], offsets[1]), errors, by_drift, owner.astype(np.int64), ~side,
+        problem.recording[owner],
+    )  # fmt: skip
     return (
         linearised
         if problem.known is None
@@ -209,22 +223,59 @@ def _add_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coeffi
         np.vstack([rows.drift, np.zeros((9, 4))]),
         np.append(rows.owner, np.full(9, -1)),
         np.append(rows.magnitude, np.zeros(9, dtype=np.bool_)),
+        np.append(rows.recording, np.full(9, rows.recording.max(initial=-1) + 1)),
     )
 
 
 def row_covariance(rows: Rows, excess: float, tau: Array) -> Array:
     """Return V, shape (N, N)."""
-    whole = rows.noise + rows.errors @ rows.errors.T
-    whole[np.diag_indices(len(whole))] += np.where(rows.owner >= 0, excess, 0.0)
+    every = np.arange(len(rows.residual))
+    return _covariance_of(rows, every, np.arange(rows.errors.shape[1]), excess, tau)
+
+
+def _covariance_of(rows: Rows, which: NDArray[np.int64], felt: NDArray[np.int64], excess: float, tau: Array) -> Array:
+    """Return V of some of the rows by noise, offsets, and some columns of `errors`."""
+    errors = rows.errors[np.ix_(which, felt)]
+    whole: Array = rows.noise[np.ix_(which, which)] + errors @ errors.T
+    whole[np.diag_indices(len(whole))] += np.where(rows.owner[which] >= 0, excess, 0.0)
     for size, offsets in zip(tau, rows.offsets, strict=True):
         if size > 0:
-            whole += size**2 * offsets @ offsets.T
+            columns = offsets[which]
+            whole += size**2 * columns @ columns.T
     return whole
 
 
 def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
-    """Return a function that multiplies by the inverse of the Cholesky factor of V."""
-    return whitener_of(row_covariance(rows, excess, tau))
+    """Return a function that multiplies by the inverse of the Cholesky factor of V.
+
+    V has a block for each recording, whose factors are small, beside ``c c'`` of each column that several recordings
+    share. What this adds, once whitened, has the factor of ``1 + c c'``: row i less ``c_i`` times the mean of the
+    unknown as told by the rows before, over the root of its variance.
+    """
+    members = [np.flatnonzero(rows.recording == number) for number in np.unique(rows.recording)]
+    felt = np.array([rows.errors[which].any(axis=0) for which in members])
+    shared = felt.sum(axis=0) > 1
+    blocks = [
+        whitener_of(_covariance_of(rows, which, np.flatnonzero(its), excess, tau))
+        for which, its in zip(members, felt & ~shared, strict=True)
+    ]
+    common: list[Array] = []
+
+    def white(columns: Array) -> Array:
+        whitened: Array = np.empty(np.shape(columns))
+        for which, block in zip(members, blocks, strict=True):
+            whitened[which] = block(columns[which])
+        whitened = whitened.reshape(len(whitened), -1)
+        for loading in common:
+            known = 1 + np.append(0.0, np.cumsum(loading**2))
+            told = np.cumsum(loading[:, None] * whitened, axis=0)
+            whitened[1:] -= (loading[1:] / known[1:-1])[:, None] * told[:-1]
+            whitened *= np.sqrt(known[:-1] / known[1:])[:, None]
+        return whitened.reshape(np.shape(columns))
+
+    for column in rows.errors[:, shared].T:
+        common += [white(column)]  # by all before
+    return white
 
 
 def whitener_of(covariance: Array) -> Callable[[Array], Array]:
