@@ -15,6 +15,7 @@ from msgspec import Struct
 
 from imulab.columns import KINDS, kind_of, triad
 from imulab.errors import OptionError, ReadError, quoted
+from imulab.estimation.rows import median
 from imulab.readers.formats import TEXT, recognised
 from imulab.readers.guess import (
     DELIMITERS,
@@ -149,7 +150,7 @@ def _with_clock(columns: list[StatedColumn], table: Table) -> list[StatedColumn]
             or not (np.isfinite(steps).all() and steps.min() > 0)
         ):
             continue
-        unit = likely_time_unit(float(np.median(steps)))
+        unit = likely_time_unit(median(steps))
         columns[place] = StatedColumn(column.title, "time", unit, "rises in every row")
         break
     return columns

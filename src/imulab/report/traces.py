@@ -247,7 +247,7 @@ def band(x: Array, low: Array, high: Array, colour: str, digits: int = 7, **more
 def rounded(values: Any, digits: int = 7) -> list[float | None]:
     """Return values for a figure, which needs no more than seven digits; what is not finite leaves a gap."""
     numbers = np.asarray(values, dtype=np.float64)
-    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in numbers.tolist()]
+    return [float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in numbers.tolist()]
 
 
 def correlation_map(matrix: Array, names: Sequence[str], **more: Any) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from imulab.estimation.noise.likelihood import (
 )
 from imulab.estimation.noise.spectrum import Spectrum, Stretch, binned, variances_of_coefficients
 from imulab.estimation.noise.terms import NAMES, Bins, letters, prepare, terms
+from imulab.estimation.rows import median
 from imulab.recording import Array
 
 # Drift with a covariate, time or temperature, separated from slow noise by least squares under the noise model.
@@ -159,7 +160,7 @@ def _without_hidden(stretch: Stretch, rows: Array) -> Stretch:
         return stretch
     spectrum = stretch.spectra[0]
     counts = (spectrum.freedom > 0) & (spectrum.last <= len(stretch.slow))
-    noise = float(np.median(spectrum.power[counts])) if counts.any() else 0.0
+    noise = median(spectrum.power[counts]) if counts.any() else 0.0
     moved = np.zeros(len(stretch.slow))
     moved[: rows.shape[1]] = (rows**2).sum(axis=0)
     hidden = np.flatnonzero(moved > _HIDES * noise)

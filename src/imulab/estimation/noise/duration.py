@@ -10,6 +10,7 @@ import numpy as np
 from imulab.estimation.noise.likelihood import Flags, fit, information, profile, time_limits, within
 from imulab.estimation.noise.spectrum import Spectrum, bins
 from imulab.estimation.noise.terms import prepare
+from imulab.estimation.rows import medians
 from imulab.recording import Array
 
 LONGEST = 1e9
@@ -102,7 +103,7 @@ def visible(
     power = frame.variances(values[None]) * np.random.default_rng(1).chisquare(used) / used
     best = fit(frame, model[None], limits, power, freedom)
     every = np.broadcast_to(model, best.values.shape)
-    return np.asarray(np.median(profile(frame, best.values, every, limits, power, freedom)[1], axis=0))
+    return medians(profile(frame, best.values, every, limits, power, freedom)[1], 0)
 
 
 def _empty(interval: float, length: float, highest: float | None, ripple: float = 0.0) -> Spectrum:

@@ -32,6 +32,7 @@ from imulab.estimation.decisions import (
 )
 from imulab.estimation.distributions import chi_square_tail, f_tail
 from imulab.estimation.least_squares import Observability, chi_square_probability, observability
+from imulab.estimation.rows import median
 from imulab.procedures.thermal import APART, DEGREES, LEAST_KNOTS
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import AXES, GROUPS, Laws, cardinal_spline
@@ -722,7 +723,7 @@ def warn_disagreement(holds: Holds, problem: ThermalProblem, solution: ThermalSo
     ]
     rows = solution.rows
     messages: list[str] = []
-    noise = float(np.median(np.sqrt(np.diag(rows.noise)[rows.magnitude])))
+    noise = median(np.sqrt(np.diag(rows.noise)[rows.magnitude]))
     scattered = solution.excess > max(_SCATTERS, _NOISE * noise)
     apart = _name_outlier(holds, problem, solution.laws) if differ or scattered else ""
     if differ and (apart or not solution.scatter.bound):  # a bound contains bends of the law

@@ -28,7 +28,7 @@ from imulab.display import Bad, Finding, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, SegmentError, UnitError
 from imulab.estimation.decisions import BIAS_FOLLOWS_GRAVITY, SCALE_LAW_SCATTERS, SCALE_OFF_UNIT, TURNED_IN_HOLD
 from imulab.estimation.least_squares import chi_square_probability
-from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
+from imulab.estimation.rows import MAD_TO_SIGMA, leave_out, median, medians
 from imulab.gravity import EARTH, EarthRate
 from imulab.procedures.thermal import DEGREES, FOLLOWED, LEAST_KNOTS, STRETCHES, TURNED
 from imulab.procedures.thermal.degrees import (
@@ -240,11 +240,11 @@ def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
     if not averages:
         raise DataError(f"{holds.recordings[0].name}: columns gyro_x gyro_y gyro_z: they turn in every hold")
     mean = np.array([cut.mean for cut in averages])
-    if np.abs(np.median(mean, axis=0)).max() > _LARGEST:
-        worst = int(np.argmax(np.abs(np.median(mean, axis=0))))
+    if np.abs(medians(mean, 0)).max() > _LARGEST:
+        worst = int(np.argmax(np.abs(medians(mean, 0))))
         raise DataError(
             f"{holds.recordings[0].name}: column {_COLUMNS[worst]}: "
-            f"{np.degrees(np.median(mean[:, worst])):.3g} deg/s at rest; expected a bias below "
+            f"{np.degrees(median(mean[:, worst])):.3g} deg/s at rest; expected a bias below "
             f"{np.degrees(_LARGEST):.0f} deg/s: is the unit {unit} wrong?"
         )
     alone = holds.group < 0
@@ -271,13 +271,13 @@ def _average_still(
     if (np.ptp(output[rest], axis=0) == 0).any():
         name = _COLUMNS[int(np.argmin(np.ptp(output[rest], axis=0)))]
         raise DataError(f"{recording.name}: column {name}: the same output in every sample at rest: a dead axis")
-    median = [np.median(output[piece], axis=0) for piece in pieces]
-    spread = [np.median(np.abs(output[piece] - m), axis=0) for piece, m in zip(pieces, median, strict=True)]
+    middle = [medians(output[piece], 0) for piece in pieces]
+    spread = [medians(np.abs(output[piece] - m), 0) for piece, m in zip(pieces, middle, strict=True)]
     steps = [np.diff(np.unique(column)) for column in output[rest].T]
-    sigma = np.maximum(MAD_TO_SIGMA * np.median(spread, axis=0), [step.min() for step in steps])
+    sigma = np.maximum(MAD_TO_SIGMA * medians(np.array(spread), 0), [step.min() for step in steps])
     cuts: list[Cut | None] = []
     notes: list[str] = []
-    for index, piece, m in zip(members.tolist(), pieces, median, strict=True):
+    for index, piece, m in zip(members.tolist(), pieces, middle, strict=True):
         still = between_turns((np.abs(output[piece] - m) <= STILL_SIGMAS * sigma).all(axis=1))
         if still.sum() < max(_QUIET_PART * len(still), _FEWEST):
             notes.append(
@@ -591,7 +591,7 @@ def leave_out_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray
         root = np.repeat(np.sqrt(weight), 3)
         coefficients = np.linalg.lstsq(columns * root[:, None], held.mean.ravel() * root, rcond=1e-9)[0]
         left = (held.mean.ravel() - columns @ coefficients).reshape(n, 3)
-        sigma = MAD_TO_SIGMA * float(np.median(np.abs(left))) + 1e-12
+        sigma = MAD_TO_SIGMA * median(np.abs(left)) + 1e-12
         far = np.abs(left).max(axis=1) / sigma
         weight = 1 / (1 + (far / 2) ** 2)
     many = np.bincount(held.recording)[held.recording] >= _TELL
@@ -751,7 +751,7 @@ def scale_from_turns(
         temperature = _mean_temperatures(holds, number, attitudes)
         across, moved = _covariance_of_directions(problem, solution, attitudes, reading, temperature)
         estimate = estimate_turns(solved, across, solved.rest.zero_uncertainty)
-        step = float(np.median(np.diff(stamps.time)))
+        step = median(np.diff(stamps.time))
         notes += [prefixed(holds.recordings[number].name, note) for note in estimate.notes(step)]
         turned.append(_evaluate_turns(estimate, moved, float(temperature.mean())))
     if not turned:

@@ -24,7 +24,7 @@ from imulab.display import Bad, Finding, Note, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import DIRECTION_WANDERS
 from imulab.estimation.noise.readings import no_gravity
-from imulab.estimation.rows import MAD_TO_SIGMA, leave_out
+from imulab.estimation.rows import MAD_TO_SIGMA, leave_out, median, medians, quantile
 from imulab.procedures.thermal import LEAST_SPAN, SETTLE
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, TIME_DOUBTED, Attitudes, find_attitudes
 from imulab.recording import Array, Recording, check_finite
@@ -65,9 +65,9 @@ def _exclude_knocks(outputs: Array, time: Array) -> NDArray[np.bool_]:
     mean, scatter = blocks.mean(axis=1), blocks.var(axis=1)
     padded = np.pad(mean, ((_BESIDE, _BESIDE), (0, 0)), "reflect")
     beside = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
-    off = np.abs(mean - np.median(beside, axis=-1))
-    usual = np.maximum(np.median(scatter, axis=0), np.finfo(float).tiny)
-    far = _OFF * np.maximum(MAD_TO_SIGMA * np.median(off, axis=0), np.sqrt(usual / size))
+    off = np.abs(mean - medians(beside, -1))
+    usual = np.maximum(medians(scatter, 0), np.finfo(float).tiny)
+    far = _OFF * np.maximum(MAD_TO_SIGMA * medians(off, 0), np.sqrt(usual / size))
     bad = ((scatter / usual).mean(axis=1) > _SHAKEN) | (off > far).any(axis=1)
     bad = np.convolve(bad, np.ones(3), "same") > 0.5
     still = np.append(np.repeat(~bad, size), np.full(len(time) - count * size, not bad[-1]))
@@ -96,7 +96,7 @@ def fit_wander(direction: Array, temperature: Array, time: Array) -> float:
     sizes, modes = np.linalg.eigh(free.T @ np.minimum(begun[:, None], begun) @ free)
     squares = ((modes.T @ free.T @ direction @ across.T) ** 2).sum(axis=1)
     # Variances c (1 + r s) of two components each; c takes its most likely value at every ratio r.
-    unit = float(np.median(sizes))
+    unit = median(sizes)
     relative = 1 + _RATIOS[:, None] * np.maximum(sizes, 0.0) / unit
     level = (squares / relative).mean(axis=1) / 2
     likelihood = -2 * (len(sizes) * np.log(level) + np.log(relative).sum(axis=1))
@@ -348,7 +348,7 @@ def pool_covariance(cuts: Sequence[Cut]) -> Array:
     length = np.array([max(cut.stop - cut.start, 1e-9) for cut in cuts])
     density = covariance * length[:, None, None]
     level = np.trace(density, axis1=1, axis2=2)
-    usual = level <= 3 * np.median(level)
+    usual = level <= 3 * median(level)
     common = np.einsum("n,nij->ij", freedom[usual], density[usual]) / freedom[usual].sum()
     common += 1e-3 * np.trace(common) * np.eye(3)
     weights = freedom[:, None, None]
@@ -552,9 +552,9 @@ def _check_stuck(recording: Recording, values: Array) -> None:
     runs, changes = np.diff(edges), np.abs(np.diff(values[edges[:-1]]))
     longest = int(np.argmax(runs))
     # Readings with steps larger than their noise rest at one value wherever the temperature is steady.
-    if not changes.size or np.median(changes) < _STEPS * changes.min():
+    if not changes.size or median(changes) < _STEPS * changes.min():
         return
-    if len(runs) < _READINGS or runs[longest] < max(_STUCK, _SHORT * np.quantile(np.delete(runs, longest), 0.95)):
+    if len(runs) < _READINGS or runs[longest] < max(_STUCK, _SHORT * quantile(np.delete(runs, longest), 0.95)):
         return
     first, last = int(edges[longest]), int(edges[longest + 1]) - 1
     if _settles(values[:first], values[first]):
@@ -640,7 +640,7 @@ def check_holds(holds: Holds, gravity: float, nominal: float | None) -> list[str
                 f"{length[far[0]]:.4g} m/s^2, expected {gravity:.4g} m/s^2: is the unit wrong? {reason}"
             )
     doubts: list[str] = []
-    if nominal is not None and (reason := no_gravity(float(np.median(length)), holds.unit)):
+    if nominal is not None and (reason := no_gravity(median(length), holds.unit)):
         doubts.append(
             Bad(
                 f"{holds.recordings[0].name}: columns accel_x accel_y accel_z: {reason}",

@@ -22,7 +22,7 @@ from imulab.display import UNJUDGED, Finding, Note
 from imulab.errors import DataError, OptionError
 from imulab.estimation.least_squares import Observability
 from imulab.estimation.noise.readings import doubtful_units
-from imulab.estimation.rows import leave_out
+from imulab.estimation.rows import leave_out, median
 from imulab.gravity import EARTH, EarthRate
 from imulab.procedures.thermal.degrees import Degrees, judge_observability
 from imulab.procedures.thermal.gyro import ThermalGyroscopes, check_gyroscopes, fit_gyroscopes, rates_at_rest
@@ -165,7 +165,7 @@ def find_parts(recordings: Sequence[Recording]) -> tuple[Holds, list[Note]]:
         time = recording.si("time")
         bounds = np.linspace(time[0], time[-1], _count_parts(recording) + 1)
         inside = np.histogram(time, bounds)[0]
-        kept = np.flatnonzero(inside >= max(_FEWEST, 0.3 * np.median(inside)))
+        kept = np.flatnonzero(inside >= max(_FEWEST, 0.3 * median(inside)))
         if len(kept) < len(inside):
             lost = np.setdiff1d(np.arange(len(inside)), kept)
             notes.append(
@@ -289,6 +289,6 @@ def _say_untold(gyros: ThermalGyroscopes, name: str) -> list[str]:
         f"gyro: {name}: {gyros.drift.reason}: a usual lag of {_LAG:g} s shifts biases by up to "
         f"{text_in(float(shift.max()), 'deg/s')} deg/s, where their uncertainty is {text_in(float(u.max()), 'deg/s')}"
     )
-    fails = float(np.median((shift / u).max(axis=1))) > _FAILS
+    fails = median((shift / u).max(axis=1)) > _FAILS
     action = "let the temperature change more slowly, or record the way back too"
     return [*notes, Finding(text, action) if fails else Note(text)]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imulab.estimation.rows import median
 from imulab.recording import Array
 
 _RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 13)])
@@ -65,7 +66,7 @@ def fit_slow_noise(mean: Array, terms: Array, time: Array) -> Array:
 def _slow_covariances(time: Array) -> tuple[Array, Array]:
     """Return the covariances of 1/f noise and of a random walk at these times, shapes (n, n)."""
     apart, begun = np.abs(time[:, None] - time), time - time[0] + (time[1] - time[0]) / 2
-    step, length = float(np.median(np.diff(time))), 2 * float(time[-1] - time[0])
+    step, length = median(np.diff(time)), 2 * float(time[-1] - time[0])
     constants = step * 2.0 ** np.arange(np.ceil(np.log2(length / step)) + 1)
     flicker = np.exp(-apart[:, :, None] / constants).sum(axis=2)
     return flicker, np.minimum(begun[:, None], begun)

@@ -252,6 +252,8 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
     share. What this adds, once whitened, has the factor of ``1 + c c'``: row i less ``c_i`` times the mean of the
     unknown as told by the rows before, over the root of its variance.
     """
+    if len(rows.residual) <= _FEW:
+        return whitener_of(row_covariance(rows, excess, tau))
     members = [np.flatnonzero(rows.recording == number) for number in np.unique(rows.recording)]
     felt = np.array([rows.errors[which].any(axis=0) for which in members])
     shared = felt.sum(axis=0) > 1
@@ -297,7 +299,7 @@ def whitener_of(covariance: Array) -> Callable[[Array], Array]:
     return white
 
 
-_BLOCK = 64  # rows that are substituted at once
+_FEW, _BLOCK = 200, 64  # rows that are factored whole in less time, and that are substituted at once
 
 
 # The fit.

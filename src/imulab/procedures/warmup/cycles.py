@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, UnitError
+from imulab.estimation.rows import median, medians, quantile
 from imulab.estimation.sampling import mend_blocks
 from imulab.recording import (
     LATEST_START,
@@ -603,7 +604,7 @@ def make_curves(
         wide = merge(bins, edges)
         where = np.searchsorted(edges, wide.start + _NEARLY, side="right") - 1
         nodes[i, where], shares[i, where] = wide.nodes, wide.shares
-        seconds[i, where] = wide.count / np.median(bins.count)
+        seconds[i, where] = wide.count / median(bins.count)
         mean[i, where] = wide.mean - reference[i]
     curves = Curves(
         cycles=tuple(cycles),
@@ -657,10 +658,10 @@ def quiet_levels(cycles: Sequence[Cycle]) -> list[Array]:
     sample rate are mostly quieter, it is theirs (a cycle may move throughout).
     """
     quietest = np.array([_quietest(cycle.bins.variance) for cycle in cycles])
-    rate = np.array([np.median(cycle.bins.count) for cycle in cycles])
+    rate = np.array([median(cycle.bins.count) for cycle in cycles])
     levels = []
     for level, mine in zip(quietest, rate, strict=True):
-        usual = np.median(quietest[np.abs(rate / mine - 1) < 0.1], axis=0)
+        usual = medians(quietest[np.abs(rate / mine - 1) < 0.1], 0)
         levels.append(np.where(usual > 0, np.minimum(level, usual), level))
     return levels
 
@@ -669,7 +670,7 @@ def _quietest(variance: Array) -> Array:
     """Return the smallest running median over 1 min, or over a quarter of a log shorter than 4 min."""
     width = max(min(_QUIET, len(variance) // 4), 1)
     windows = np.lib.stride_tricks.sliding_window_view(variance, width, axis=0)[:: max(width // 6, 1)]
-    return np.asarray(np.median(windows, axis=-1).min(axis=0))
+    return medians(windows, -1).min(axis=0)
 
 
 def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
@@ -685,12 +686,12 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
     away = np.square(bins.mean - _running_medians(bins.mean))
     # Noise from neighbouring bins, because within a bin of few samples the variance is poorly known.
     steps = np.diff(bins.mean, axis=0)
-    usual = np.median(np.abs(steps - np.median(steps, axis=0)), axis=0) if len(steps) else np.inf
+    usual = medians(np.abs(steps - medians(steps, 0)), 0) if len(steps) else np.inf
     alone = _APART**2 * np.maximum(quiet / bins.count[:, None], (1.05 * usual) ** 2)
     moved = np.zeros(len(bins), dtype=np.bool_)
     while not moved.all():
         # The curve's range is taken from bins at rest: in motion a larger range would hide the motion.
-        spread = np.subtract(*np.quantile(bins.mean[~moved], [0.95, 0.05], axis=0))
+        spread = np.array([quantile(axis, 0.95) - quantile(axis, 0.05) for axis in bins.mean[~moved].T])
         moved_now = (excess > noise + (_MOVED_RANGE * spread) ** 2).any(axis=1) & (bins.count > 2)
         moved_now |= (away > alone + (_APART_RANGE * spread) ** 2).any(axis=1)
         if not (moved_now & ~moved).any():
@@ -708,9 +709,9 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
 def _running_medians(values: Array) -> Array:
     """Return the median of each row and the three on either side, which two bad rows do not change."""
     if len(values) <= 3:
-        return np.asarray(np.median(values, axis=0, keepdims=True))
+        return medians(values, 0)[None]
     padded = np.pad(values, ((3, 3), (0, 0)), mode="reflect", reflect_type="odd")
-    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 7, axis=0), axis=-1))
+    return medians(np.lib.stride_tricks.sliding_window_view(padded, 7, axis=0), -1)
 
 
 def _white_noise(still: Sequence[CycleBins]) -> Array:
@@ -731,7 +732,7 @@ def _settled_mean(late: CycleBins, bins: CycleBins, noise: Array) -> tuple[Array
     """Return mean and length of the settled part, s, and its change from start to end with standard uncertainty."""
     weight = late.count / late.count.sum()
     mean = weight @ late.mean
-    seconds = float(late.count.sum() / np.median(bins.count))
+    seconds = float(late.count.sum() / median(bins.count))
     time = (late.shares * late.nodes).sum(axis=1)
     time = time - weight @ time
     spread = float(weight @ time**2)
@@ -765,7 +766,7 @@ def _choose_settling_time(
     total, weight = np.zeros((count, len(edges) - 1, len(axes))), np.zeros((count, len(edges) - 1, 1))
     for bins, k in zip(wide, group, strict=True):
         where = np.searchsorted(edges, bins.start + _NEARLY, side="right") - 1
-        share = (bins.count / np.median(bins.count / (bins.stop - bins.start)))[:, None]
+        share = (bins.count / median(bins.count / (bins.stop - bins.start)))[:, None]
         settled = bins.where(bins.start >= 0.75 * shortest)
         level = np.average(settled.mean, axis=0, weights=settled.count) if len(settled) else bins.mean[-1]
         total[k, where] += share * (bins.mean - level)

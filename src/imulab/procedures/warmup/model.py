@@ -350,16 +350,21 @@ class Statistics:
 
 def statistics(curves: Curves, model: str, scales: Sequence[float]) -> Statistics:
     """Return the sums of all cycles for the basis of a model."""
-    values = basis(model, curves.nodes, curves.settling_time, scales)
-    average = np.einsum("cbn,cbnp->cbp", curves.shares, values)
-    weighted = average * curves.seconds[:, :, None]
+    average = _averages(model, curves.nodes, curves.shares, curves.settling_time, scales)
+    weighted = (average * curves.seconds[:, :, None]).swapaxes(1, 2)
     return Statistics(
-        normal=np.einsum("cbp,cbq->cpq", weighted, average),
-        moment=np.einsum("cbp,cba->cpa", weighted, curves.mean),
+        normal=weighted @ average,
+        moment=weighted @ curves.mean,
         square=np.einsum("cb,cba->ca", curves.seconds, curves.mean**2),
         weight=curves.seconds.sum(axis=1),
-        total=weighted.sum(axis=1),
+        total=weighted.sum(axis=2),
     )
+
+
+def _averages(model: str, nodes: Array, shares: Array, settling_time: float, scales: Sequence[float]) -> Array:
+    """Return the mean of each basis function over each bin, shape (c, b, p)."""
+    average: Array = np.einsum("cbn,cbnp->cbp", shares, basis(model, nodes, settling_time, scales))
+    return average
 
 
 def hats(curves: Curves, knots: Index) -> Array:
@@ -530,13 +535,14 @@ def find_scales(
     Each temperature and axis has its own coefficients; axes are weighted by their size and noise. Nelder-Mead in the
     logarithms, over at most 3 numbers.
     """
-    member = (curves.group[:, None] == np.arange(len(curves.temperatures))).astype(np.float64) * weights[:, None]
-    member = member[:, member.any(axis=0)]
-    size = (weights @ statistics(curves, "knot-cubic", ()).square) / max(
-        float(weights @ curves.seconds.sum(axis=1)), 1e-9
-    )
+    sums = statistics(curves, "knot-cubic", ())
+    size = (weights @ sums.square) / max(float(weights @ sums.weight), 1e-9)
     scale = curves.noise / 100 + 1e-4 * size
     scale = np.where(scale > 0, scale, 1.0)
+    square = weights @ sums.square
+    used = weights > 0
+    nodes, shares, mean, seconds = (x[used] for x in (curves.nodes, curves.shares, curves.mean, curves.seconds))
+    member = (np.unique(curves.group[used])[:, None] == curves.group[used]) * weights[used]
     end = curves.settling_time
     low, high = np.log(0.5), np.log(SCALE_LIMIT * end)
 
@@ -546,14 +552,14 @@ def find_scales(
         outside += np.maximum(np.log(_CLOSEST) - np.diff(logs), 0).sum()
         if outside > 0:
             return 1e300 * (1 + float(outside))
-        sums = statistics(curves, model, np.exp(logs).tolist())
-        normal = np.einsum("ck,cpq->kpq", member, sums.normal)
-        moment = np.einsum("ck,cpa->kpa", member, sums.moment)
+        average = _averages(model, nodes, shares, end, np.exp(logs).tolist())
+        weighted = (average * seconds[:, :, None]).swapaxes(1, 2)
+        moment = np.tensordot(member, weighted @ mean, 1)
         try:
-            best = np.linalg.solve(normal, moment)
+            best = np.linalg.solve(np.tensordot(member, weighted @ average, 1), moment)
         except np.linalg.LinAlgError:
             return 1e300
-        left = np.einsum("ck,ca->a", member, sums.square) - np.einsum("kpa,kpa->a", best, moment)
+        left = square - (best * moment).sum(axis=(0, 1))
         return float((left / scale).sum())
 
     if start is None:

@@ -18,6 +18,7 @@ from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, first_of
 from imulab.estimation.decisions import STILL_DRIFTS
 from imulab.estimation.noise.readings import no_gravity
+from imulab.estimation.rows import median, medians
 from imulab.procedures.correction_order import parse_thermals
 from imulab.procedures.warmup.cycles import SETTLED, Curves, Cycle
 from imulab.procedures.warmup.model import (
@@ -519,7 +520,7 @@ def _warn_gravity(curves: Curves) -> list[str]:
     if len(places) < 3:
         return []
     unit = curves.cycles[0].file_units[places[0]]
-    reason = no_gravity(float(np.median(np.linalg.norm(curves.reference[:, places], axis=1))), unit)
+    reason = no_gravity(median(np.linalg.norm(curves.reference[:, places], axis=1)), unit)
     action = "correct the unit in the titles of accel_x accel_y accel_z, or state it: --unit accel=UNIT"
     return [Bad(f"accel_x .. accel_z: {reason}; is their unit, {unit}, right?", action)] if reason else []
 
@@ -601,7 +602,7 @@ def _warn_odd_cycles(curves: Curves) -> list[str]:
     several = np.bincount(curves.group)[curves.group] > 1
     if several.sum() < _MOST_NAMED + 1:
         return []
-    usual = np.median(apart[several], axis=0)
+    usual = medians(apart[several], 0)
     limit = _ODD * np.maximum(usual, np.sqrt(curves.expected_noise().mean(axis=0)))
     odd = (apart > limit + _ROUNDING * np.abs(curves.reference).max(axis=0)) & several[:, None]
     if not odd.any():
