@@ -54,6 +54,8 @@ FUNCTIONS = {
     "rate simulate": il.simulate_rate,
     "rate fit": il.fit_rate,
     "rate turn": il.fit_turns,
+    "magnetometer simulate": il.simulate_magnetometer,
+    "magnetometer fit": il.fit_magnetometer,
     "fleet run": il.run_fleet,
     "fleet status": il.fleet_status,
     "fleet report": il.write_fleet_report,
@@ -238,6 +240,10 @@ MADE = {
         lambda out: il.simulate_rate(
             [50 * DEGREE, 100 * DEGREE], faces="+z", hold=2, noise=0.01 * DEGREE, loop=1e-5
         ).save(out),
+    ),
+    "magnetometer simulate": (
+        ["--turn", "level", "--duration", "20 s", "--noise", "0.2uT", "-o", "one.csv"],
+        lambda out: il.write(il.simulate_magnetometer(turn="level", duration=20.0, noise="0.2 uT"), out),
     ),
     "warmup table": (
         ["warm.json", "--per-second", "-o", "one.csv"],

@@ -85,7 +85,9 @@ def test_the_files_that_contributing_names_are_there():
     assert [name for name in named if not (REPOSITORY / name).exists()] == []
 
 
-@pytest.mark.parametrize("page", ["tumble", "gyro_array", "warmup", "centrifuge", "noise", "thermal", "rate"])
+@pytest.mark.parametrize(
+    "page", ["tumble", "gyro_array", "warmup", "centrifuge", "noise", "thermal", "rate", "magnetometer_alone"]
+)
 def test_every_procedure_has_a_worked_example(page):
     assert page in [found.stem for found in PAGES]
 

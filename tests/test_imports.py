@@ -103,9 +103,9 @@ def test_no_circles():
 SHARED = {
     f"imulab.procedures.tumble.{name}"
     for name in ("attitudes", "plan", *(f"gyro.{part}" for part in ("rest", "solve", "turns", "estimate")))
-} | {"imulab.procedures.thermal.device"}
+} | {"imulab.procedures.thermal.device", "imulab.procedures.magnetometer.fit"}
 """Attitudes at rest, plans of them and the turns between them: over temperature they are those of the tumble test; and
-what laws over temperature know of such a test."""
+what laws over temperature know of such a test; and magnetometers without accelerometers."""
 
 
 def test_procedures_do_not_import_each_other():

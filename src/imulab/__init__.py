@@ -50,6 +50,9 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.public import fuse as fuse
     from imulab.procedures.gyro_array.public import merge_array as merge_array
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
+    from imulab.procedures.magnetometer.fit import MagnetometerFit as MagnetometerFit
+    from imulab.procedures.magnetometer.fit import fit_magnetometer as fit_magnetometer
+    from imulab.procedures.magnetometer.simulate import simulate_magnetometer as simulate_magnetometer
     from imulab.procedures.noise.allan import allan_deviation as allan_deviation
     from imulab.procedures.noise.check import check_noise as check_noise
     from imulab.procedures.noise.fit import NoiseFit as NoiseFit
@@ -115,6 +118,9 @@ _HOME = {
     "CentrifugeFit": "procedures.centrifuge.fit",
     "ImulabError": "errors",
     "Recording": "recording",
+    "MagnetometerFit": "procedures.magnetometer.fit",
+    "fit_magnetometer": "procedures.magnetometer.fit",
+    "simulate_magnetometer": "procedures.magnetometer.simulate",
     "MagFit": "procedures.tumble.mag.fit",
     "RateFit": "procedures.rate.fit",
     "TurnsFit": "procedures.rate.turns",

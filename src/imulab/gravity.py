@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
 from msgspec import Struct
 
 from imulab.display import Finding, Note
-from imulab.errors import OptionError, install, quoted
+from imulab.errors import DataError, OptionError, install, quoted
 from imulab.options import Group, text
 from imulab.quantities import in_si, number, quantity, with_uncertainty
-from imulab.units import STANDARD_GRAVITY, from_si
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
 if TYPE_CHECKING:
     from imulab.recording import Recording
@@ -384,6 +384,8 @@ def at_latitude(latitude: float | str | None, name: str = "latitude") -> EarthRa
 
 
 _NANO, _KILO = 1e-9, 1e3
+_FIELDS = (5e-6, 2e-4)
+"""Magnitudes that the field can have near the Earth's surface, T: from a quarter of the least to thrice the most."""
 _MODEL_YEARS = 2015, 2030
 """First year, and the one after the last, of the models that pygeomag carries with their uncertainties."""
 
@@ -483,3 +485,58 @@ def field_at(place: Site, date: str, name: str = "date") -> ModelField:
         model.model,
         str(day),
     )
+
+
+def stated_site(
+    place: str | Site | None, date: str | None, latitude: float | str | None, height: float | str | None
+) -> Site | None:
+    """Return the place of a test; refuse what contradicts it, and a date without one."""
+    if place is None:
+        if date is not None:
+            raise OptionError("date without place: expected both")
+        return None
+    if latitude is not None or height is not None:
+        raise OptionError("place together with latitude or height: expected one or the other")
+    return place if isinstance(place, Site) else site(place, "place")
+
+
+def field_of_test(where: Site, date: str | None, recording: Recording) -> ModelField:
+    """Return the model's field on the stated day, else on that in the head of the recording."""
+    day = date or recording.metadata.get("date")
+    if day is None:
+        raise OptionError(
+            f"place without date: the field changes with time, and the head of {recording.name} has no date; "
+            "expected the day of the test, as 2026-11-28"
+        )
+    return field_at(where, day)
+
+
+def field_note(found: ModelField) -> Note:
+    """Return what a record says of a model's field."""
+    return Note(
+        f"mag: by {found.model} the field of the place has {1e6 * found.magnitude[0]:.2f} ± "
+        f"{1e6 * found.magnitude[1]:.2f} uT, dip {math.degrees(found.dip[0]):.2f} ± {math.degrees(found.dip[1]):.2f} "
+        f"deg, declination {math.degrees(found.declination[0]):+.2f} ± {math.degrees(found.declination[1]):.2f} deg; "
+        "iron of a building may change each by more"
+    )
+
+
+def check_field_magnitude(length: float, unit: str, name: str, field: float | None) -> None:
+    """Refuse a unit in which the magnitude of the outputs, `length`, cannot be that of the field, T.
+
+    Raises
+    ------
+    DataError
+        The unit is one of field, and the magnitude is off by a factor of 2 of what was stated, or nowhere on Earth.
+    """
+    known = parse_unit(unit)
+    if known.quantity != "magnetic field":
+        return
+    tesla = length * known.factor
+    low, high = (field / 2, 2 * field) if field is not None else _FIELDS
+    if not low <= tesla <= high:
+        expected = f"{1e6 * field:.4g} uT" if field is not None else "25 to 65 uT on Earth"
+        raise DataError(
+            f"{name}: columns mag_x mag_y mag_z: the field turns through {length:.4g} {unit} ({1e6 * tesla:.4g} uT), "
+            f"expected {expected}: is the unit wrong?"
+        )

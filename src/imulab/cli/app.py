@@ -31,7 +31,21 @@ ROOT_OPTIONS = (
 _WHERE = {
     **dict.fromkeys(("apply", "show", "report", "demo"), "records"),
     **{"convert": "records", "export": "records", "allan": "noise", "live": "live", "open": "live"},
-    **{x: x for x in ("tumble", "array", "centrifuge", "warmup", "noise", "thermal", "rate", "fleet", "layout")},
+    **{
+        x: x
+        for x in (
+            "tumble",
+            "array",
+            "centrifuge",
+            "warmup",
+            "noise",
+            "thermal",
+            "rate",
+            "magnetometer",
+            "fleet",
+            "layout",
+        )
+    },
     "certificate": "certificate",
 }
 """Module of each first word of a command."""

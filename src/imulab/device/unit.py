@@ -197,6 +197,24 @@ def correct_gyroscopes(
     return recording.with_columns({name: from_si(corrected[name], symbol) for name, symbol in kept.items()}, kept)
 
 
+def correct_magnetometers(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+    """Return the recording with mag_* as the field in the body frame: uT, or parts of the local field (unit 1).
+
+    Raises
+    ------
+    UnitError
+        The columns' unit cannot be converted to the record's.
+    DataError
+        The recording has no magnetometer triad.
+    """
+    field, _ = unit.mag(outputs_of(recording, "mag", str(columns["output_unit"])))
+    known = "uT" if columns["field_unit"] == "T" else "1"
+    return recording.with_columns(
+        {name: from_si(values, known) for name, values in zip(triad("mag"), field, strict=True)},
+        dict.fromkeys(triad("mag"), known),
+    )
+
+
 # ---- gyro array ----------------------------------------------------------------------------------------------------
 
 
@@ -366,6 +384,15 @@ def golden_gyroscopes(table: DeviceTable, rng: np.random.Generator) -> dict[str,
     output[1, 2] = np.nan
     rate, _ = DeviceUnit.of(table).gyro(list(output.T), list(force.T))
     return {"": VECTORS, "scale": 5.0, "output": output, "force": force, "rate": np.column_stack(rate)}
+
+
+def golden_magnetometers(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
+    """Return outputs of fields up to twice the local one, and those fields."""
+    size = 1e-4 if table.columns["field_unit"] == "T" else 2.0
+    output = (rng.uniform(-size, size, (VECTORS, 3)) + field_of(table, "bias")) / field_of(table, "gain")
+    output[1, 0] = np.nan
+    field, _ = DeviceUnit.of(table).mag(list(output.T))
+    return {"": VECTORS, "scale": size, "output": output, "field": np.column_stack(field)}
 
 
 # Blobs: the tables of one unit as the bytes that its firmware loads, read back on the desk.

@@ -152,6 +152,12 @@ ACCELEROMETERS_CONTRADICT_RECORD = Decision(
     1e-3, "verdict", {"tumble mag": 1}, "the attitudes contradict the accelerometers' record, which is not used"
 )
 
+# Magnetometer alone
+FIELD_ALONE_STEP = Decision(1e-3, "verdict", {"magnetometer": 1}, "|m| is another from some time on")
+READINGS_SET_ASIDE = Decision(
+    5.7e-7, "verdict", {"magnetometer": 8000}, "readings, or their means over windows, lie off all others", limit=5.0
+)
+
 # Thermal
 THERMAL_POWER = Decision(
     0.01, "model", {"thermal": 9}, "the highest power of the temperature in a law is needed (Wald)"
@@ -303,6 +309,7 @@ MOST_FALSE_ALARMS: Mapping[tuple[str, ...], float] = {
     ("tumble",): 0.03,
     NINE_AXES: 0.04,
     ("thermal", "thermal gyro"): 0.04,
+    ("magnetometer",): 0.04,
     ("rate",): 0.04,
     ("noise",): 0.04,
     ("gyro_array",): 0.04,

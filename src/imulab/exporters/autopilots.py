@@ -30,10 +30,12 @@ from imulab.exporters.matrices import FieldCorrection, ardupilot_rows, px4_rows,
 from imulab.exporters.model import (
     AXES,
     NEGLIGIBLE,
+    ROTATION_NOT_TOLD,
     UnitModel,
     accel_terms,
     gyro_terms,
     held_accelerometers,
+    magnetometers_alone,
     one_unit,
     origin_of,
     refuse_raw,
@@ -261,6 +263,9 @@ _PX4_RATES_ALONE = (
 )
 
 
+_PX4_MAG = "magnetometers: corrected = ROT (K (raw - OFF)), gauss, K of SCALE and ODIAG"
+
+
 def export_px4(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
     """Write ``imulab.params``.
 
@@ -271,6 +276,13 @@ def export_px4(records: Sequence[Calibration], folder: Path, options: ExportOpti
     """
     if options.device_id > _LARGEST_ID:
         raise OptionError(f"px4: device id {options.device_id}; expected at most {_LARGEST_ID}")
+    alone = magnetometers_alone(records, "px4")
+    if alone is not None:
+        held_mag, lost = symmetric(alone[1], "px4", options, turned=True)
+        rows = px4_rows(held_mag, options, turned=False)
+        return _write_px4(
+            folder, origin_of(alone[0]), rows, [_PX4_MAG, ROTATION_NOT_TOLD, *lost], options, "CAL_MAG0_ID"
+        )
     law = offset_law(records, "px4", options)
     if law is not None:
         return _write_px4(
@@ -296,7 +308,7 @@ def export_px4(records: Sequence[Calibration], folder: Path, options: ExportOpti
     comments = ["corrected = (raw - OFF) * SCALE, m/s^2; gyroscopes: raw - OFF, rad/s; single precision"]
     if held.mag is not None:
         values += px4_rows(held.mag, options)
-        comments += ["magnetometers: corrected = ROT (K (raw - OFF)), gauss, K of SCALE and ODIAG"]
+        comments += [_PX4_MAG]
     return _write_px4(folder, held.unit.origin, values, [*comments, *held.lost], options)
 
 
@@ -386,6 +398,10 @@ _ARDUPILOT_RATES = (
 )
 
 
+_AFTER_ORIENT = "of outputs after COMPASS_ORIENT, as ArduPilot logs them; the orientation is not told, and not written"
+_ARDUPILOT_MAG = "magnetometers: corrected = K (raw + OFS) after ORIENT, mgauss; for 4.2 and later"
+
+
 def export_ardupilot(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
     """Write ``imulab.param``.
 
@@ -394,6 +410,11 @@ def export_ardupilot(records: Sequence[Calibration], folder: Path, options: Expo
     OptionError
         ArduPilot cannot hold the record.
     """
+    alone = magnetometers_alone(records, "ardupilot")
+    if alone is not None:
+        held_mag, lost = symmetric(alone[1], "ardupilot", options, turned=True)
+        of_mag = ardupilot_rows(held_mag, options, turned=False)
+        return _save_ardupilot(folder, origin_of(alone[0]), of_mag, [_ARDUPILOT_MAG, _AFTER_ORIENT, *lost])
     law = offset_law(records, "ardupilot", options, _REFERENCE)
     if law is not None:
         return _save_ardupilot(
@@ -416,11 +437,7 @@ def export_ardupilot(records: Sequence[Calibration], folder: Path, options: Expo
     comments = [
         "for Copter 3.4, Plane 3.5 and later: corrected = (raw - OFFS) * SCAL, m/s^2; older versions scale first",
         "gyroscopes: raw - OFFS, rad/s; ArduPilot measures these again at each start unless INS_GYR_CAL is 0",
-        *(
-            ["magnetometers: corrected = K (raw + OFS) after ORIENT, mgauss; for 4.2 and later"]
-            if held.mag is not None
-            else []
-        ),
+        *([_ARDUPILOT_MAG] if held.mag is not None else []),
         *held.lost,
     ]
     return _save_ardupilot(folder, held.unit.origin, rows, comments)

@@ -31,12 +31,14 @@ from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import (
     AXES,
-    UnitModel,
+    ROTATION_NOT_TOLD,
     accel_terms,
     gyro_terms,
     held_accelerometers,
     inverse_gain,
+    magnetometers_alone,
     one_unit,
+    origin_of,
     settle_losses,
     single_precision,
     write_one,
@@ -170,8 +172,8 @@ def euler(rotation: Array) -> tuple[float, float, float]:
     return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
 
 
-def px4_rows(mag: FieldCorrection, options: ExportOptions) -> list[tuple[str, float | str]]:
-    """Return PX4's parameters: ``Rot (K (M - OFF))``, gauss, K symmetric.
+def px4_rows(mag: FieldCorrection, options: ExportOptions, *, turned: bool = True) -> list[tuple[str, float | str]]:
+    """Return PX4's parameters: ``Rot (K (M - OFF))``, gauss, K symmetric; without Rot where it is not `turned`.
 
     Raises
     ------
@@ -189,14 +191,18 @@ def px4_rows(mag: FieldCorrection, options: ExportOptions) -> list[tuple[str, fl
     rows += [(f"CAL_MAG0_{a}SCALE", float(matrix[i, i])) for i, a in enumerate("XYZ")]
     pairs = (("X", 0, 1), ("Y", 0, 2), ("Z", 1, 2))
     rows += [(f"CAL_MAG0_{a}ODIAG", float(matrix[i, j])) for a, i, j in pairs]
+    if not turned:
+        return rows
     if options.mag_mount == "internal":
         return [*rows, ("CAL_MAG0_ROT", "-1")]
     angles = zip(("ROLL", "PITCH", "YAW"), euler(q), strict=True)
     return [*rows, ("CAL_MAG0_ROT", "100"), *((f"CAL_MAG0_{name}", angle) for name, angle in angles)]
 
 
-def ardupilot_rows(mag: FieldCorrection, options: ExportOptions) -> list[tuple[str, float]]:
+def ardupilot_rows(mag: FieldCorrection, options: ExportOptions, *, turned: bool = True) -> list[tuple[str, float]]:
     """Return ArduPilot's parameters: ``K (M + OFS)`` after COMPASS_ORIENT, mgauss, K symmetric.
+
+    Without the orientation where it is not `turned`.
 
     Raises
     ------
@@ -219,7 +225,7 @@ def ardupilot_rows(mag: FieldCorrection, options: ExportOptions) -> list[tuple[s
     rows += [(f"COMPASS_DIA_{a}", float(matrix[i, i])) for i, a in enumerate("XYZ")]
     rows += [(f"COMPASS_ODI_{a}", float(off[i])) for i, a in enumerate("XYZ")]
     rows.append(("COMPASS_SCALE", 0.0))
-    if not external:
+    if not (external and turned):
         return rows
     angles = zip(("ROLL", "PITCH", "YAW"), euler(q), strict=True)
     rows += [("COMPASS_EXTERNAL", 1.0), ("COMPASS_ORIENT", 101.0), ("CUST_ROT_ENABLE", 1.0)]
@@ -240,6 +246,9 @@ def export_fusion(records: Sequence[Calibration], folder: Path, options: ExportO
     OptionError
         Fusion cannot hold the record.
     """
+    alone = magnetometers_alone(records, "fusion")
+    if alone is not None:
+        return _write_fusion(folder, origin_of(alone[0]), _magnetic(alone[1]), [_FUSION_MAG, ROTATION_NOT_TOLD])
     unit = one_unit(records, "fusion")
     accel, error, how = held_accelerometers(unit, inverse_gain, misalignment=True)
     gyro = unit.gyro
@@ -258,16 +267,26 @@ def export_fusion(records: Sequence[Calibration], folder: Path, options: ExportO
         lost += settle_magnetometers(quadratic_loss(largest_quadratic(unit.mag)), "fusion", options)
         lines += _magnetic(unit.mag)
     comments = [
-        "x-io Fusion, " + unit.origin[0],
-        unit.origin[1],
-        "include it behind Fusion.h: for FusionModelInertial and FusionModelMagnetic, or before 1.3",
-        "FusionCalibrationInertial and FusionCalibrationMagnetic",
         "calibrated = Misalignment (Sensitivity . (raw - Offset))",
-        *(["magnetometers: calibrated = softIronMatrix (raw - hardIronOffset)"] if unit.mag is not None else []),
+        *([_FUSION_MAG] if unit.mag is not None else []),
         "no axes are turned: the results are in the record's axes",
         *lost,
     ]
-    head = [*c_comment(*comments), "#ifndef IMULAB_FUSION_H", "#define IMULAB_FUSION_H", ""]
+    return _write_fusion(folder, unit.origin, lines, comments)
+
+
+_FUSION_MAG = "magnetometers: calibrated = softIronMatrix (raw - hardIronOffset)"
+
+
+def _write_fusion(folder: Path, origin: Sequence[str], lines: Sequence[str], comments: Sequence[str]) -> list[Path]:
+    """Write the header, with the comments and constants in it."""
+    first = [
+        "x-io Fusion, " + origin[0],
+        origin[1],
+        "include it behind Fusion.h: for FusionModelInertial and FusionModelMagnetic, or before 1.3",
+        "FusionCalibrationInertial and FusionCalibrationMagnetic",
+    ]
+    head = [*c_comment(*first, *comments), "#ifndef IMULAB_FUSION_H", "#define IMULAB_FUSION_H", ""]
     return write_one(folder, "imulab_fusion.h", [*head, *lines, "#endif"])
 
 
@@ -329,6 +348,11 @@ def export_ros(records: Sequence[Calibration], folder: Path, options: ExportOpti
     OptionError
         imu_calib cannot hold the record.
     """
+    alone = magnetometers_alone(records, "ros")
+    if alone is not None:
+        of_mag, more = _magnetometers(alone[1], options)
+        comments = ["ROS, " + origin_of(alone[0])[0], origin_of(alone[0])[1], ROTATION_NOT_TOLD, *more]
+        return write_one(folder, "imu_calib.yaml", [*hash_comments(comments), *of_mag])
     unit = one_unit(records, "ros")
     gyro = unit.gyro
     accel, error, how = held_accelerometers(unit, inverse_gain, misalignment=True)
@@ -341,7 +365,7 @@ def export_ros(records: Sequence[Calibration], folder: Path, options: ExportOpti
         how=how,
         options=options,
     )
-    of_mag, more = _magnetometers(unit, options)
+    of_mag, more = ([], []) if unit.mag is None else _magnetometers(unit.mag, options)
     comments = [
         "ROS imu_calib, " + unit.origin[0],
         unit.origin[1],
@@ -356,15 +380,13 @@ def export_ros(records: Sequence[Calibration], folder: Path, options: ExportOpti
     return write_one(folder, "imu_calib.yaml", lines + of_mag)
 
 
-def _magnetometers(unit: UnitModel, options: ExportOptions) -> tuple[list[str], list[str]]:
-    """Return the keys of magnetometer_pipeline, and comments on them, none where the unit has no magnetometers."""
-    if unit.mag is None:
-        return [], []
-    if not in_field(unit.mag):
-        comment = f"its file has no place for magnetometers with outputs in {unit.mag.unit}: theirs are left out"
+def _magnetometers(magnetometers: Magnetometers, options: ExportOptions) -> tuple[list[str], list[str]]:
+    """Return the keys of magnetometer_pipeline, and comments on them."""
+    if not in_field(magnetometers):
+        comment = f"its file has no place for magnetometers with outputs in {magnetometers.unit}: theirs are left out"
         options.tell(f"ros: {comment}")
         return [], [comment]
-    mag = field_correction(unit.mag, "ros")
+    mag = field_correction(magnetometers, "ros")
     lost = settle_magnetometers(quadratic_loss(mag.quadratic), "ros", options)
     bias = mag.in_unit("T")
     lines = [f"initial_mag_bias_{axis}: {yaml_number(value)}" for axis, value in zip(AXES, bias, strict=True)]
@@ -386,16 +408,22 @@ def export_motioncal(records: Sequence[Calibration], folder: Path, options: Expo
     OptionError
         The record has no magnetometers, or ones that a symmetric matrix cannot correct.
     """
-    unit = one_unit(records, "motioncal")
-    if unit.mag is None:
+    alone = magnetometers_alone(records, "motioncal")
+    if alone is None:
+        unit = one_unit(records, "motioncal")
+        record, magnetometers = unit.record, unit.mag
+    else:
+        record, magnetometers = alone
+    if magnetometers is None:
         raise OptionError("motioncal: holds magnetometers only, and the record has none (imulab tumble mag)")
-    mag, lost = symmetric(unit.mag, "motioncal", options, turned=False)
+    origin = origin_of(record)
+    mag, lost = symmetric(magnetometers, "motioncal", options, turned=False)
     matrix = mag.rotation.T @ mag.matrix
     matrix = (matrix + matrix.T) / 2
     offset, field = mag.in_unit("uT"), mag.magnitude * conversion_factor(mag.unit, "uT")
     comments = [
-        "MotionCal and Adafruit_Sensor_Calibration, " + unit.origin[0],
-        unit.origin[1],
+        "MotionCal and Adafruit_Sensor_Calibration, " + origin[0],
+        origin[1],
         "corrected = invW (raw - V), uT: V is the hard iron, invW the soft iron (symmetric), B the field's magnitude",
         "no axes are turned: raw must be in the axes of the record's magnetometer outputs",
         *lost,

@@ -76,6 +76,26 @@ def one_unit(records: Sequence[Calibration], target: str) -> UnitModel:
     return UnitModel(record, triads.accel, triads.gyro, triads.mag)
 
 
+def magnetometers_alone(records: Sequence[Calibration], target: str) -> tuple[Calibration, Magnetometers] | None:
+    """Return the one record and its magnetometers where it holds them alone, else None.
+
+    Raises
+    ------
+    RecordError
+        The record lacks a parameter, or is of a level turn.
+    """
+    if len(records) != 1:
+        return None
+    try:
+        mag = procedure_of(records[0]).magnetometers(records[0])
+    except RecordError as error:
+        raise RecordError(f"{target}: {error}") from None
+    return None if mag is None else (records[0], mag)
+
+
+ROTATION_NOT_TOLD = "how the magnetometers are turned against the body is not told, and not written: set it by hand"
+
+
 def refuse_raw(unit: UnitModel, target: str) -> None:
     """Refuse a record of outputs in counts or volts.
 

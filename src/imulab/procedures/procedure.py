@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from imulab.device.unit import DeviceUnit
     from imulab.recording import Recording, Source
     from imulab.records.calibration import Calibration, Parameter
-    from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, LinearFit, Triads
+    from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, LinearFit, Magnetometers, Triads
     from imulab.report.parameters import Row
     from imulab.report.traces import Exhibits
 
@@ -285,6 +285,10 @@ class Procedure:
     def triads(self, record: Calibration) -> Triads:
         """Return accelerometers, gyroscopes and magnetometers as matrices."""
         raise NotImplementedError
+
+    def magnetometers(self, record: Calibration) -> Magnetometers | None:
+        """Return the magnetometers of a record that holds them alone, None for one that does not."""
+        return None
 
     def linear_fit(self, record: Calibration, *, misalignment: bool) -> LinearFit:
         """Return the accelerometers fitted anew without nonlinearity (and misalignment), for programs without."""

@@ -15,6 +15,7 @@ from imulab.files import open_file
 from imulab.options import FLAG
 from imulab.procedures.centrifuge.procedure import CentrifugeProcedure
 from imulab.procedures.gyro_array.procedure import GyroArrayProcedure
+from imulab.procedures.magnetometer.procedure import MagnetometerProcedure
 from imulab.procedures.noise.procedure import NoiseProcedure
 from imulab.procedures.procedure import Files, Procedure, Section
 from imulab.procedures.rate.procedure import RateProcedure
@@ -36,6 +37,7 @@ PROCEDURES: dict[str, Procedure] = {
         NoiseProcedure(),
         ThermalProcedure(),
         RateProcedure(),
+        MagnetometerProcedure(),
     )
 }
 """The procedures by their names on the command line and in manifests of fleets."""

@@ -36,7 +36,7 @@ from imulab.errors import RecordError, quoted
 from imulab.quantities import LARGEST
 
 if TYPE_CHECKING:
-    from imulab.gravity import Gravity
+    from imulab.gravity import Gravity, ModelField, Site
     from imulab.records.calibration import Calibration
 
 P = TypeVar("P", bound="Part")
@@ -178,6 +178,32 @@ class StatedGravity(Part):
             standard_uncertainty=gravity.standard_uncertainty,
             from_=gravity.origin,
         )
+
+
+class FieldPlace(Part):
+    """Place of a test in rad and m, and the field of a model there: its name, the day, magnitude, dip, declination."""
+
+    latitude: float
+    longitude: float
+    height: float | None = null()
+    model: str
+    date: str
+    field: Quantity
+    dip: Quantity
+    declination: Quantity
+
+    @classmethod
+    def of(cls, where: Site, found: ModelField) -> FieldPlace:
+        """Return the place of a test, with a model's field there."""
+
+        def known(pair: tuple[float, float], unit: str) -> Quantity:
+            return Quantity(value=pair[0], unit=unit, standard_uncertainty=pair[1])
+
+        return cls(
+            latitude=where.latitude, longitude=where.longitude, height=where.height, model=found.model, date=found.date,
+            field=known(found.magnitude, "T"), dip=known(found.dip, "rad"),
+            declination=known(found.declination, "rad"),
+        )  # fmt: skip
 
 
 class Length(Part):

@@ -156,22 +156,12 @@ def golden_accelerometers(table: DeviceTable, rng: np.random.Generator) -> dict[
     return {"": VECTORS, "scale": 2 * STANDARD_GRAVITY, "output": output, "force": np.column_stack(force)}
 
 
-def golden_magnetometers(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
-    """Return outputs of fields up to twice the local one, and those fields."""
-    size = 1e-4 if table.columns["field_unit"] == "T" else 2.0
-    output = (rng.uniform(-size, size, (VECTORS, 3)) + field_of(table, "bias")) / field_of(table, "gain")
-    output[1, 0] = np.nan
-    field, _ = DeviceUnit.of(table).mag(list(output.T))
-    return {"": VECTORS, "scale": size, "output": output, "field": np.column_stack(field)}
-
-
 # A tumble record applied: raw triads to specific force and body rate, by the C core.
 
 
 _LARGEST_FORCE = 2.0  # g: outputs at rest or in a hand hardly exceed it; more is a wrong unit or another record
 _ACCEL = triad("accel")
 _GYRO = triad("gyro")
-_MAG = triad("mag")
 
 
 def apply_tumble(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
@@ -188,23 +178,6 @@ def apply_tumble(unit: DeviceUnit, columns: Mapping[str, Any], recording: Record
     """
     force, _ = unit.tumble(outputs_of(recording, "accel", str(columns["output_unit"])))
     return recording.with_columns(dict(zip(_ACCEL, force, strict=True)), dict.fromkeys(_ACCEL, "m/s^2"))
-
-
-def apply_mag(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-    """Return the recording with mag_* as the field in the body frame: uT, or parts of the local field (unit 1).
-
-    Raises
-    ------
-    UnitError
-        The columns' unit cannot be converted to the record's.
-    DataError
-        The recording has no magnetometer triad.
-    """
-    field, _ = unit.mag(outputs_of(recording, "mag", str(columns["output_unit"])))
-    known = "uT" if columns["field_unit"] == "T" else "1"
-    return recording.with_columns(
-        {name: from_si(values, known) for name, values in zip(_MAG, field, strict=True)}, dict.fromkeys(_MAG, known)
-    )
 
 
 def specific_force(record: Calibration, output: Array) -> Array:

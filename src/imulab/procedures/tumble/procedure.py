@@ -171,14 +171,14 @@ class MagnetometerSection(Section):
     triad = "mag"
 
     def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
-        from imulab.procedures.tumble.device import golden_magnetometers
+        from imulab.device.unit import golden_magnetometers
 
         return golden_magnetometers(table, random)
 
     def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-        from imulab.procedures.tumble.device import apply_mag
+        from imulab.device.unit import correct_magnetometers
 
-        return apply_mag(unit, columns, recording)
+        return correct_magnetometers(unit, columns, recording)
 
 
 class TumbleProcedure(Procedure):

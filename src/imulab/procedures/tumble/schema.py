@@ -7,7 +7,19 @@ from typing import Annotated, TypeVar
 
 from imulab.errors import RecordError
 from imulab.records.calibration import Calibration
-from imulab.records.sections import Length, Measured, Part, Quantity, Size, StatedGravity, field, holds, null, part
+from imulab.records.sections import (
+    FieldPlace,
+    Length,
+    Measured,
+    Part,
+    Quantity,
+    Size,
+    StatedGravity,
+    field,
+    holds,
+    null,
+    part,
+)
 
 T = TypeVar("T")
 PerAttitude = Annotated[list[T], "attitudes"]
@@ -34,19 +46,6 @@ class GyroModel(Part):
     gyro_output_unit: str
 
 
-class MagPlace(Part):
-    """Place of a test in rad and m, and the field of a model there: its name, the day, magnitude, dip, declination."""
-
-    latitude: float
-    longitude: float
-    height: float | None = null()
-    model: str
-    date: str
-    field: Quantity
-    dip: Quantity
-    declination: Quantity
-
-
 class MagModel(Part):
     """What ``model`` adds of magnetometers: their law, and which output became which axis."""
 
@@ -54,7 +53,7 @@ class MagModel(Part):
     mag_output_unit: str
     mag_axes: str = "+x +y +z"
     field: Quantity | None = null()
-    place: MagPlace | None = None
+    place: FieldPlace | None = None
 
 
 class OrderRow(Part):

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.columns import triad
 from imulab.display import UNJUDGED, Bad, Finding, Note
 from imulab.errors import DataError, OptionError, listed, quoted
 from imulab.estimation.decisions import (
@@ -22,10 +23,22 @@ from imulab.estimation.decisions import (
 )
 from imulab.estimation.least_squares import coverage_factor, f_test
 from imulab.estimation.rows import rms
-from imulab.gravity import Height, Latitude, LocalGravity, ModelField, Site, at_place, field_at, site
+from imulab.gravity import (
+    Height,
+    Latitude,
+    LocalGravity,
+    ModelField,
+    Site,
+    at_place,
+    field_note,
+    field_of_test,
+    site,
+    stated_site,
+)
 from imulab.options import RARE, Group, choice, measure, parsed, repeated, text
 from imulab.procedures import tumble
-from imulab.procedures.result import Record, Result, as_record
+from imulab.procedures.magnetometer.fit import MagnetometerFit, fit_readings
+from imulab.procedures.result import OWN_CLOCKS, Record, Result, as_record, as_recording
 from imulab.procedures.tumble import HEMISPHERES, LOSSES, MAG_ORDERS
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.estimate import check_field
@@ -50,14 +63,13 @@ from imulab.procedures.tumble.schema import (
     Heading,
     MagFields,
     MagModel,
-    MagPlace,
     MagSummary,
     OneSample,
 )
 from imulab.quantities import in_si
 from imulab.recording import Array, Reading
 from imulab.records.calibration import Calibration, Covariance, Parameter
-from imulab.records.sections import Length, Quantity, entries
+from imulab.records.sections import FieldPlace, Length, Quantity, entries
 from imulab.units import parse_unit
 
 # The record.
@@ -488,8 +500,10 @@ def fit_mag(
     date: Annotated[str | None, text("YYYY-MM-DD"), Group("gravity")] = None,
     order: Annotated[int | str, text("auto|1..5", ("auto", "1", "2", "3", "4", "5")), RARE] = "auto",
     **reading: Unpack[Reading],
-) -> MagFit:
+) -> MagFit | MagnetometerFit:
     """Calibrate a magnetometer triad, in the accelerometers' frame, from the attitudes of a tumble test.
+
+    Of data without accelerometers, waved or turned level, see `fit_magnetometer`, which is what they get.
 
     ``|m| = F`` and ``m.f = -|m| |f| sin(dip)`` in every attitude, ``M = S (A + b)``, ``A = s (+ k2 s^2)``, ``s = T m``:
     hard iron b, soft iron, scale and mounting in S and T. Both triads are fitted together.
@@ -559,9 +573,18 @@ def fit_mag(
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
     _check_options(loss, mag_order, order, magnitude)
     stated = parse_place(hemisphere, latitude, dip)
-    where = _stated_site(place, date, latitude, height)
+    where = stated_site(place, date, latitude, height)
+    if not isinstance(data, Attitudes):
+        recording = as_recording(data, reading, fit_mag, clock=OWN_CLOCKS)
+        data, reading = recording, Reading()
+        if not any(name in recording for name in triad("accel")) and all(name in recording for name in triad("mag")):
+            _refuse_alone(
+                recording.name, mag_order, accel=accel, same_direction=same_direction, drop=drop, gravity=gravity,
+                latitude=latitude, height=height, hemisphere=hemisphere, dip=dip,
+            )  # fmt: skip
+            return fit_readings(recording, magnitude, where, date)
     attitudes = as_attitudes(data, reading, fit_mag)
-    found = None if where is None else _model_field(where, date, attitudes)
+    found = None if where is None else field_of_test(where, date, attitudes.recording)
     if where is not None and found is not None:
         stated = parse_place(hemisphere, None, stated.dip or found.dip)
         magnitude = found.magnitude[0] if magnitude is None else magnitude
@@ -576,19 +599,8 @@ def fit_mag(
         same_direction=same_direction,
         drop=drop,
     )
-    name = attitudes.recording.name
-    try:
-        with np.errstate(all="ignore"):  # a diverging fit ends in LinAlgError
-            joint, aside = _solve_pair(ready, loss, str(mag_order))
-            what = judge_observability(joint.pair, joint.theta)
-        if same_direction and not what.enough:  # it was enough at the start of the fit
-            raise np.linalg.LinAlgError
-    except np.linalg.LinAlgError:
-        raise DataError(
-            f"{name}: the fit of both triads finds no solution: are both of the same attitudes, by one clock"
-            f"{', and does one axis point the same way in those of same-direction' if same_direction else ''}?"
-        ) from None
-    check_observability(what, np.delete(ready.kept, [one.index for one in aside]), name)
+    joint, aside, what = _solve_observed(ready, loss, str(mag_order), held=bool(same_direction))
+    check_observability(what, np.delete(ready.kept, [one.index for one in aside]), attitudes.recording.name)
     _check_result(joint, ready, stated)
     set_options = _stated_options(loss, mag_order, magnitude, stated, drop, same_direction)
     record = make_mag_record(ready, joint, what, aside, set_options)
@@ -597,6 +609,32 @@ def fit_mag(
     if known is not None and not ready.notes:
         record = with_gyro_of(record, known)
     return MagFit(record, joint, what, aside)
+
+
+def _refuse_alone(name: str, mag_order: int | str, **options: Any) -> None:
+    """Refuse options that need accelerometers."""
+    stated = [key for key, value in options.items() if value is not None and value != ()]
+    if stated or str(mag_order) != "1":
+        option = stated[0] if stated else "mag_order"
+        raise OptionError(f"{option} needs accelerometers, and {name} has magnetometers alone: leave it out")
+
+
+def _solve_observed(
+    ready: Ready, loss: str, mag_order: str, *, held: bool
+) -> tuple[Joint, tuple[Disturbed, ...], MagObservability]:
+    """Return the fit, the attitudes that it leaves out, and how well they tell the magnetometers' parameters."""
+    try:
+        with np.errstate(all="ignore"):  # a diverging fit ends in LinAlgError
+            joint, aside = _solve_pair(ready, loss, mag_order)
+            what = judge_observability(joint.pair, joint.theta)
+        if held and not what.enough:  # it was enough at the start of the fit
+            raise np.linalg.LinAlgError
+    except np.linalg.LinAlgError:
+        raise DataError(
+            f"{ready.estimate.attitudes.recording.name}: the fit of both triads finds no solution: are both of the "
+            f"same attitudes, by one clock{', and does one axis point the same way in those of same-direction' * held}?"
+        ) from None
+    return joint, aside, what
 
 
 def _stated_options(
@@ -617,47 +655,10 @@ def _stated_options(
     return {name: value for name, value in options.items() if value not in (None, [])}
 
 
-def _stated_site(
-    place: str | Site | None, date: str | None, latitude: float | str | None, height: float | str | None
-) -> Site | None:
-    """Return the place of a test; refuse what contradicts it, and a date without one."""
-    if place is None:
-        if date is not None:
-            raise OptionError("date without place: expected both")
-        return None
-    if latitude is not None or height is not None:
-        raise OptionError("place together with latitude or height: expected one or the other")
-    return place if isinstance(place, Site) else site(place, "place")
-
-
-def _model_field(where: Site, date: str | None, attitudes: Attitudes) -> ModelField:
-    """Return the model's field on the stated day, else on that in the head of the recording."""
-    day = date or attitudes.recording.metadata.get("date")
-    if day is None:
-        raise OptionError(
-            f"place without date: the field changes with time, and the head of {attitudes.recording.name} has no date; "
-            "expected the day of the test, as 2026-11-28"
-        )
-    return field_at(where, day)
-
-
 def _with_place(record: Calibration, where: Site, found: ModelField) -> Calibration:
     """Return a record with the place of the test, and the model whose field was used there."""
-
-    def known(pair: tuple[float, float], unit: str) -> Quantity:
-        return Quantity(value=pair[0], unit=unit, standard_uncertainty=pair[1])
-
-    place = MagPlace(
-        latitude=where.latitude, longitude=where.longitude, height=where.height, model=found.model, date=found.date,
-        field=known(found.magnitude, "T"), dip=known(found.dip, "rad"), declination=known(found.declination, "rad"),
-    )  # fmt: skip
-    note = Note(
-        f"mag: by {found.model} the field of the place has {1e6 * found.magnitude[0]:.2f} ± "
-        f"{1e6 * found.magnitude[1]:.2f} uT, dip {np.degrees(found.dip[0]):.2f} ± {np.degrees(found.dip[1]):.2f} deg, "
-        f"declination {np.degrees(found.declination[0]):+.2f} ± {np.degrees(found.declination[1]):.2f} deg; iron of a "
-        "building may change each by more"
-    )
-    return replace(record, model={**record.model, "place": entries(place)}, warnings=(*record.warnings, note))
+    place = entries(FieldPlace.of(where, found))
+    return replace(record, model={**record.model, "place": place}, warnings=(*record.warnings, field_note(found)))
 
 
 def _check_options(loss: str, mag_order: int | str, order: int | str, field: float | None) -> None:

@@ -212,8 +212,6 @@ _FLAT = 0.05  # of the largest spread: outputs that spread less across a plane l
 _MAGNET_NEAR = 4.5
 """Distance from the middle of the outputs over its median, from which a magnet was near; up to 4.1 without, where axes
 differ in scale by a factor of 2."""
-_FIELDS = (5e-6, 2e-4)
-"""Magnitudes that the field can have near the Earth's surface, T: from a quarter of the least to thrice the most."""
 
 
 @dataclass(frozen=True)
@@ -473,25 +471,4 @@ def _check_far(mean: Array, labels: Sequence[str], kept: NDArray[np.intp], name:
         raise DataError(
             f"{name}: {labels[worst]}: the outputs of mag_x mag_y mag_z lie {distance[worst]:.1f} times as far from "
             f"the middle of all as usual: was a magnet near? leave the attitude out with --drop {kept[worst] + 1}"
-        )
-
-
-def check_magnitude(length: float, unit: str, name: str, field: float | None) -> None:
-    """Refuse a unit in which the magnitude of the outputs, `length`, cannot be that of the field, T.
-
-    Raises
-    ------
-    DataError
-        The unit is one of field, and the magnitude is off by a factor of 2 of what was stated, or nowhere on Earth.
-    """
-    known = parse_unit(unit)
-    if known.quantity != "magnetic field":
-        return
-    tesla = length * known.factor
-    low, high = (field / 2, 2 * field) if field is not None else _FIELDS
-    if not low <= tesla <= high:
-        expected = f"{1e6 * field:.4g} uT" if field is not None else "25 to 65 uT on Earth"
-        raise DataError(
-            f"{name}: columns mag_x mag_y mag_z: the field turns through {length:.4g} {unit} ({1e6 * tesla:.4g} uT), "
-            f"expected {expected}: is the unit wrong?"
         )

@@ -13,7 +13,7 @@ from imulab.errors import DataError, ObservabilityError, OptionError, RecordErro
 from imulab.estimation.decisions import ACCELEROMETERS_CONTRADICT_RECORD
 from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import chi_square_probability
-from imulab.gravity import Gravity, local_gravity
+from imulab.gravity import Gravity, check_field_magnitude, local_gravity
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_attitudes, check_prior, made_from
 from imulab.procedures.tumble.estimate import estimate_triad, nominal_scaling
@@ -22,7 +22,6 @@ from imulab.procedures.tumble.mag.model import (
     FEWEST,
     MAGNETOMETERS,
     FieldMeans,
-    check_magnitude,
     field_means,
     invert_triad,
 )
@@ -296,7 +295,7 @@ def prepare(
     force = invert_triad(theta, estimate.problem.reading[0], ACCELEROMETERS).vector
     begin = find_start(means.mean[kept], force / np.linalg.norm(force, axis=1)[:, None])
     mag, first = scale_magnetometers(begin, field)
-    check_magnitude(mag.size, means.unit, name, field)
+    check_field_magnitude(mag.size, means.unit, name, field)
     pair, start = _make_pair(estimate, means, kept, mag, prior), np.concatenate([first, [begin.dip], theta])
     if groups:
         places = [np.flatnonzero(np.isin(kept, group)).tolist() for group in groups]

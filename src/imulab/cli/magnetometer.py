@@ -1,0 +1,46 @@
+"""Calibrate a magnetometer triad alone."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import imulab as il
+from imulab.cli.command import Command, option
+from imulab.cli.options import AsJson, GivenFiles, OutputFile, RecordingFile, ReportFile, call, check_outputs
+from imulab.options import OUTPUT
+
+
+def simulate(
+    *, output: Annotated[str, option("OUT", "Recording to write.", "-o", "--output"), OUTPUT], **options: Any
+) -> None:
+    """Simulate a magnetometer that is waved or turned level.
+
+    With its truth in the head of the file.
+    """
+    from imulab.writers import check_writable, write
+
+    check_writable(output)
+    recording = call(il.simulate_magnetometer, **options)
+    write(recording, output)
+    print(f"{output}: {len(recording)} readings, serial {recording.metadata['serial']}")
+
+
+def fit(
+    file: RecordingFile, *, output: OutputFile = None, report: ReportFile = None, json: AsJson = False, **options: Any
+) -> None:
+    """Calibrate a magnetometer triad alone.
+
+    From readings waved through all directions, or of a level turn. Hard and soft iron in the body's gauge: how the
+    magnetometers are turned against the body is not told.
+    """
+    from imulab.cli.show import finish
+    from imulab.procedures.registry import run_task
+
+    check_outputs([output, report], [name for name in (file, options["layout"]) if name])
+    finish(run_task("magnetometer", [file], options, GivenFiles()), output, report, json=json)
+
+
+COMMANDS = (
+    Command("magnetometer simulate", simulate, lambda: [il.simulate_magnetometer]),
+    Command("magnetometer fit", fit, lambda: [il.fit_magnetometer]),
+)

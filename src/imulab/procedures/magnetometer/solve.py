@@ -1,0 +1,364 @@
+"""The fit of an ellipsoid, or of an ellipse in the plane of a level turn, to outputs of magnetometers.
+
+The field has one magnitude, whatever way the unit points: ``M = D m + h``, ``|m| = 1``, D symmetric, in as many axes as
+were turned, d = 3 or 2. With ``m = W (M - h)``, ``W = D^-1``, ``u = m / |m|`` and ``v = W u`` one reading says
+
+    r = |m| - 1 - sigma^2 (tr W^2 - v'v) / 2,    var r = sigma^2 v'v,
+    dr/dh_i = -v_i,   dr/dD_ii = -v_i u_i,   dr/dD_ij = -(v_i u_j + v_j u_i)
+
+for noise of one standard deviation sigma on each output. The term with sigma^2 is the lengthening of |m| by the noise
+across it. The derivatives are taken at u, not at m, since m has the noise of r: with m, D would be too large by
+sigma^2. What u has of it, ``E[du r] = sigma^2 q``, ``q = (1 - u u') W v``, is taken off:
+
+    sum_k  w dr/dtheta r - sigma^2 (w d(dr/dtheta)/du q - 2 w^2 v'W q dr/dtheta) = 0,    w = 1 / v'v
+
+has no bias of second order, and reaches the Cramer-Rao bound, in which the direction of each reading is unknown.
+
+Readings in a row can have errors in common. With B blocks of consecutive readings, scores ``s_b = sum q_k r_k`` of
+orthonormal columns q, and ``G_b = sum q_k q_k'``,
+
+    f = sum_b |s_b|^2 / (sigma^2 (p - sum_b tr G_b^2))
+
+is how many times larger the covariance is than with independent errors; it is 1 on the average where they are.
+
+Sources: Vasconcelos et al., IEEE Trans. Aerosp. Electron. Syst. 47 (2011) 1293; Al-Sharadqah and Chernov, Electron. J.
+Statist. 3 (2009) 886 (bias of geometric fits).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.estimation.decisions import READINGS_SET_ASIDE
+from imulab.estimation.rows import MAD_TO_SIGMA, median
+from imulab.recording import Array
+
+BLOCKS = 30
+"""Blocks of consecutive readings, by which errors in common are seen."""
+_LEAST_IN_BLOCKS = 8  # readings in a block; fewer readings in all are taken as independent
+_STEPS, _CLOSE = 60, 1e-10
+_FARTHEST = 1e3  # largest parameter of a fit, where the readings spread by about 1
+_HUBER = 2.0  # robust standard deviations, from which a reading pulls by its sign alone
+_DAMPING = 1e-3
+
+
+def pairs(dimension: int) -> list[tuple[int, int]]:
+    """Return the places (i, j), i <= j, of the free elements of D."""
+    return [(i, j) for i in range(dimension) for j in range(i, dimension)]
+
+
+def unpack(theta: Array, dimension: int) -> tuple[Array, Array]:
+    """Return hard iron h, shape (d,), and soft iron D, shape (d, d), of parameters."""
+    soft: Array = np.zeros((dimension, dimension))
+    for value, (i, j) in zip(theta[dimension:].tolist(), pairs(dimension), strict=True):
+        soft[i, j] = soft[j, i] = value
+    return theta[:dimension], soft
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A fitted ellipsoid or ellipse, in units in which the field has length 1.
+
+    Attributes
+    ----------
+    theta
+        Hard iron, then the free elements of D, shape (p,).
+    residual, jacobian
+        r over |v|, and its derivatives, of the readings that were fitted, shapes (n,) and (n, p).
+    sigma
+        Standard deviation of one output.
+    inflation
+        Factor f of the covariance by errors that readings in a row have in common.
+    converged
+        Whether the fit came to rest.
+    """
+
+    theta: Array
+    residual: Array
+    jacobian: Array
+    sigma: float
+    inflation: float
+    converged: bool
+
+    @property
+    def dimension(self) -> int:
+        """Number of axes that were turned."""
+        return 3 if len(self.theta) == 9 else 2
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of theta, shape (p, p)."""
+        size = np.linalg.norm(self.jacobian, axis=0)
+        scaled = self.jacobian / size
+        matrix: Array = self.inflation * self.sigma**2 * np.linalg.inv(scaled.T @ scaled) / np.outer(size, size)
+        return matrix
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of sigma."""
+        return max(len(self.residual) / self.inflation - len(self.theta), 1.0)
+
+    @property
+    def gain(self) -> float:
+        """Output per field, the geometric mean over the axes."""
+        return float(np.abs(np.linalg.det(unpack(self.theta, self.dimension)[1])) ** (1 / self.dimension))
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the derivatives, columns scaled to length 1."""
+        values = np.linalg.svd(self.jacobian / np.linalg.norm(self.jacobian, axis=0), compute_uv=False)
+        return float(values[0] / max(values[-1], 1e-300))
+
+
+def evaluate(theta: Array, outputs: Array, sigma: float = 0.0) -> tuple[Array, Array, Array]:
+    """Return r, shape (n,), its derivatives, shape (n, p), and |v|, shape (n,), for outputs of shape (n, d)."""
+    length, u, v, inverse = _directions(theta, outputs)
+    square = (v**2).sum(axis=1)
+    lengthening = sigma**2 * (float(np.trace(inverse @ inverse)) - square) / 2
+    return length - 1 - lengthening, np.hstack([-v, -_products(v, u)]), np.sqrt(square)
+
+
+def _directions(theta: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:
+    """Return |m|, shape (n,), u and v, shape (n, d), and W."""
+    hard, soft = unpack(theta, outputs.shape[1])
+    inverse = np.asarray(np.linalg.inv(soft), dtype=np.float64)
+    field = (outputs - hard) @ inverse
+    length = np.sqrt((field**2).sum(axis=1))
+    u = field / length[:, None]
+    return length, u, u @ inverse, inverse
+
+
+def _products(v: Array, u: Array) -> Array:
+    """Return ``v_i u_i`` and ``v_i u_j + v_j u_i`` at the places of D, shape (n, p - d)."""
+    return np.column_stack(
+        [v[:, i] * u[:, j] + (v[:, j] * u[:, i] if i != j else 0.0) for i, j in pairs(v.shape[1])]
+    )  # fmt: skip
+
+
+def _noise_score(theta: Array, outputs: Array) -> Array:
+    """Return what the noise of u adds to the sum of scores, over sigma^2, shape (p,)."""
+    _, u, v, inverse = _directions(theta, outputs)
+    weight = 1 / (v**2).sum(axis=1)
+    back = v @ inverse
+    q = back - u * (u * back).sum(axis=1)[:, None]
+    dv = q @ inverse
+    change = -np.hstack([dv, _products(dv, u) + _products(v, q)])
+    jacobian = -np.hstack([v, _products(v, u)])
+    score: Array = weight @ change - 2 * (weight**2 * (v * dv).sum(axis=1)) @ jacobian
+    return score
+
+
+def direction_rows(theta: Array, directions: Array) -> tuple[Array, Array]:
+    """Return the derivatives of the corrected field by theta: of its length, (n, p), and across it, (n, d, p).
+
+    Of fields of length 1 in given directions, shape (n, d). A rotation of all of them, which the outputs do not tell,
+    is taken off.
+    """
+    d = directions.shape[1]
+    inverse = np.linalg.inv(unpack(theta, d)[1])
+    eye = np.eye(d)
+    columns = [-np.tile(inverse[:, i], (len(directions), 1)) for i in range(d)]
+    columns += [
+        -(np.outer(directions[:, j], inverse[:, i]) + (np.outer(directions[:, i], inverse[:, j]) if i != j else 0.0))
+        for i, j in pairs(d)
+    ]
+    change = np.stack(columns, axis=2)
+    along = np.einsum("ni,nip->np", directions, change)
+    across = change - directions[:, :, None] * along[:, None, :]
+    turns = [np.outer(eye[i], eye[j]) - np.outer(eye[j], eye[i]) for i in range(d) for j in range(i)]
+    for turn in turns:  # orthogonal to one another over directions that are spread evenly
+        moved = directions @ turn.T
+        moved /= np.sqrt((moved**2).sum())
+        across -= moved[:, :, None] * np.einsum("ni,nip->p", moved, across)
+    return along, across
+
+
+def fit_surface(outputs: Array) -> Surface:
+    """Return the ellipsoid or ellipse through outputs, shape (n, d), n above the number of parameters.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The outputs determine none.
+    """
+    d = outputs.shape[1]
+    centre, size = fit_sphere(outputs)
+    theta = np.concatenate([np.zeros(d), [1.0 if i == j else 0.0 for i, j in pairs(d)]])
+    scaled = (outputs - centre) / size
+    theta = _approach(scaled, theta)
+    sigma = _scatter(*evaluate(theta, scaled)[::2], len(theta))
+    rest = False
+    for _ in range(_STEPS):
+        r, jacobian, weight = evaluate(theta, scaled, sigma)
+        whitened, rows = r / weight, jacobian / weight[:, None]
+        step = np.linalg.solve(rows.T @ rows, sigma**2 * _noise_score(theta, scaled) - rows.T @ whitened)
+        theta = theta + step
+        if not np.abs(theta).max() < _FARTHEST:
+            raise np.linalg.LinAlgError
+        sigma = _scatter(*evaluate(theta, scaled, sigma)[::2], len(theta))
+        if rest := float(np.abs(step).max()) < _CLOSE:
+            break
+    hard, soft = unpack(theta, d)
+    if np.linalg.eigvalsh(soft).min() <= 0:
+        raise np.linalg.LinAlgError
+    r, jacobian, weight = evaluate(theta, scaled, sigma)
+    whitened, rows = r / weight, jacobian / weight[:, None]
+    whole = np.concatenate([centre + size * hard, size * theta[d:]])
+    # In outputs: r has no unit, so that the derivatives by h and D are those over the size.
+    return Surface(whole, whitened * size, rows, size * sigma, _inflation(whitened, rows, sigma), rest)
+
+
+def fit_sphere(points: Array) -> tuple[Array, float]:
+    """Return centre and radius of the sphere or circle through points (n, d), by algebraic least squares."""
+    middle = points.mean(axis=0)
+    spread = float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean()))
+    if not spread:
+        raise np.linalg.LinAlgError
+    scaled = (points - middle) / spread
+    design = np.column_stack([2 * scaled, np.ones(len(points))])
+    found = np.linalg.lstsq(design, (scaled**2).sum(axis=1))[0]
+    radius = float(np.sqrt(max(found[-1] + float(found[:-1] @ found[:-1]), 1e-6)))
+    return middle + spread * found[:-1], spread * radius
+
+
+def _approach(outputs: Array, theta: Array) -> Array:
+    """Return parameters near the least of Huber's loss of the residuals, by damped Gauss-Newton steps."""
+    damping = _DAMPING
+    r, jacobian, weight = evaluate(theta, outputs)
+    for _ in range(_STEPS):
+        x, rows = r / weight, jacobian / weight[:, None]
+        limit = _HUBER * max(MAD_TO_SIGMA * median(np.abs(x)), 1e-12)
+        root = np.sqrt(np.minimum(1.0, limit / np.maximum(np.abs(x), 1e-300)))
+        normal = (rows * root[:, None]).T @ (rows * root[:, None])
+        gradient = rows.T @ (root**2 * x)
+        cost = _huber(x, limit)
+        while True:
+            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            try:
+                next_r, next_jacobian, next_weight = evaluate(theta + step, outputs)
+                better = _huber(next_r / weight, limit) <= cost * (1 + 1e-12)
+            except np.linalg.LinAlgError:
+                better = False
+            if better or damping > 1e6:
+                break
+            damping *= 10
+        if not better:
+            break
+        theta, r, jacobian, weight = theta + step, next_r, next_jacobian, next_weight
+        damping = max(damping / 10, 1e-12)
+        if float(np.abs(step).max()) < 1e-6:
+            break
+    return theta
+
+
+def _huber(x: Array, limit: float) -> float:
+    size = np.abs(x)
+    return float(np.sum(np.where(size <= limit, x**2 / 2, limit * (size - limit / 2))))
+
+
+def _scatter(r: Array, weight: Array, size: int) -> float:
+    """Return sigma by the residuals."""
+    return float(np.sqrt(((r / weight) ** 2).sum() / max(len(r) - size, 1)))
+
+
+def _inflation(whitened: Array, rows: Array, sigma: float) -> float:
+    """Return by how much errors in common of readings in a row increase the covariance, 1 or more."""
+    count = min(BLOCKS, len(whitened) // _LEAST_IN_BLOCKS)
+    if count < BLOCKS // 2 or not sigma:
+        return 1.0
+    q = np.linalg.qr(rows / np.linalg.norm(rows, axis=0))[0]
+    edges = np.linspace(0, len(whitened), count + 1).astype(np.intp)[:-1]
+    scores = np.add.reduceat(q * whitened[:, None], edges, axis=0)
+    shares = np.add.reduceat(q[:, :, None] * q[:, None, :], edges, axis=0)
+    free = q.shape[1] - float((shares**2).sum())
+    return float(np.maximum(1.0, (scores**2).sum() / (sigma**2 * max(free, 1.0))))
+
+
+# What the parameters leave open of the corrected field, and directions without readings.
+
+
+_DIRECTIONS = 400  # over which uncertainties are averaged
+
+
+def uncertainties(surface: Surface) -> tuple[float, float, float]:
+    """Return standard uncertainties of the corrected field: of |m|, rms and largest over all directions; of direction.
+
+    As parts of the field, and in rad. A rotation of all directions, which is not told, is not in the last.
+    """
+    along, across = direction_rows(surface.theta, even_directions(surface.dimension))
+    covariance = surface.covariance
+    magnitude = np.maximum(np.einsum("np,pq,nq->n", along, covariance, along), 0.0)
+    direction = np.maximum(np.einsum("nip,pq,niq->n", across, covariance, across), 0.0)
+    return float(np.sqrt(magnitude.mean())), float(np.sqrt(magnitude.max())), float(np.sqrt(direction.mean()))
+
+
+def even_directions(dimension: int) -> Array:
+    """Return directions spread evenly over the sphere (a spiral) or the circle, shape (400, d)."""
+    k = np.arange(_DIRECTIONS) + 0.5
+    if dimension == 2:
+        angle = 2 * np.pi * k / _DIRECTIONS
+        return np.column_stack([np.cos(angle), np.sin(angle)])
+    up = 1 - 2 * k / _DIRECTIONS
+    angle = np.pi * (1 + np.sqrt(5)) * k
+    level = np.sqrt(1 - up**2)
+    return np.column_stack([level * np.cos(angle), level * np.sin(angle), up])
+
+
+def widest_gap(field: Array) -> tuple[float, Array]:
+    """Return the angle, rad, of the direction farthest from all readings, shape (n, d), and that direction."""
+    unit = field / np.linalg.norm(field, axis=1)[:, None]
+    every = even_directions(field.shape[1])
+    near = (every @ unit[:: max(1, len(unit) // 4000)].T).max(axis=1)
+    worst = int(np.argmin(near))
+    return float(np.arccos(np.clip(near[worst], -1, 1))), every[worst]
+
+
+# Readings that do not belong to the others.
+
+_WINDOWS = (1, 4, 16, 64)
+_LEAST_WINDOWS = 24  # windows of one length that tell what is usual
+_ROUNDS = 8
+
+
+def find_disturbed(outputs: Array, least: int) -> tuple[Surface, NDArray[np.bool_]]:
+    """Return the fit without readings that were disturbed, and which these are, shape (n,).
+
+    Means of residuals over 1, 4, 16 and 64 readings are held against their own usual scatter, that of the median, so
+    that errors that all readings have in common set none aside. `least` readings are kept.
+    """
+    aside = np.zeros(len(outputs), dtype=np.bool_)
+    surface = fit_surface(outputs)
+    for _ in range(_ROUNDS):
+        r, _, weight = evaluate(surface.theta, outputs)
+        marked = _mark_far(r / weight, aside)
+        if (marked == aside).all() or len(outputs) - int(marked.sum()) < least:
+            break
+        aside = marked
+        surface = fit_surface(outputs[~aside])
+    return surface, aside
+
+
+def _mark_far(x: Array, aside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the readings in windows whose mean residual is far from 0; a window's mean is of those not yet far."""
+    far, single = np.zeros(len(x), dtype=np.bool_), 0.0
+    for width in _WINDOWS:
+        count = len(x) // width
+        if count < _LEAST_WINDOWS:
+            break
+        near = (~far[: count * width]).reshape(count, width)
+        left = near.sum(axis=1)
+        means = (x[: count * width].reshape(count, width) * near).sum(axis=1) / np.maximum(left, 1)
+        kept = means[~aside[: count * width].reshape(count, width).any(axis=1)]
+        if len(kept) < _LEAST_WINDOWS // 2:
+            break
+        usual = MAD_TO_SIGMA * median(np.abs(kept))
+        single = usual if width == 1 else single  # a median of few windows is uncertain: not below white noise
+        limit = READINGS_SET_ASIDE.limit * max(usual, single / np.sqrt(width), 1e-12)
+        bad = np.abs(means) * np.sqrt(left / width) > limit
+        if width > 1:
+            bad |= np.append(bad[1:], False) | np.append(False, bad[:-1])  # a disturbance comes and goes
+        far[: count * width] |= np.repeat(bad, width)
+    return far

@@ -1,0 +1,354 @@
+"""A magnetometer alone, waved or turned level: at the bound, what is told and what is not, and what disturbs it."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from tests.reference.field_alone import Sensor, circle, sphere
+
+import imulab as il
+from imulab.cli import main
+from imulab.device.unit import DeviceUnit
+from imulab.errors import DataError, ObservabilityError, OptionError, RecordError
+from imulab.procedures.magnetometer.device import tables_of
+from imulab.procedures.magnetometer.solve import evaluate, find_disturbed, fit_surface
+
+NOISE = 0.4  # uT
+NAMES = [f"mag_bias_{a}" for a in "xyz"] + [f"mag_soft_{a}" for a in ("xx", "xy", "xz", "yy", "yz", "zz")]
+
+
+def recorded(outputs, unit="uT", rate=20.0, **more):
+    """Return outputs as a recording over time."""
+    columns = {"time": np.arange(len(outputs)) / rate}
+    columns |= {f"mag_{axis}": outputs[:, k] for k, axis in enumerate("xyz")}
+    return il.Recording(columns | more, dict.fromkeys(columns | more, unit) | {"time": "s"}, {"serial": "SN7"})
+
+
+def waved(seed, count=600, noise=NOISE):
+    rng = np.random.default_rng(seed)
+    sensor = Sensor(seed)
+    return sensor, sensor.outputs(sphere(count, rng), noise, rng)
+
+
+def levelled(seed, count=400, turns=2.0, noise=0.2, tilt=0.0):
+    """Return a sensor turned about z, whose z column is the steady vertical field and its own offset."""
+    rng = np.random.default_rng(seed)
+    sensor = Sensor(seed, axes=2, field=20.0)
+    upright = 43.0 + noise * rng.standard_normal(count)
+    return sensor, np.column_stack([sensor.outputs(circle(count, turns), noise, rng), upright])
+
+
+@pytest.mark.parametrize("axes", [3, 2])
+def test_derivatives_are_those_of_the_residual(axes):
+    rng = np.random.default_rng(1)
+    sensor = Sensor(1, axes=axes, field=1.0)
+    outputs = sensor.outputs(sphere(20, rng) if axes == 3 else circle(20, 0.9), 0.0, rng)
+    r, jacobian, weight = evaluate(sensor.theta, outputs)
+    assert np.abs(r).max() < 1e-14
+    for k in range(len(sensor.theta)):
+        step = np.zeros(len(sensor.theta))
+        step[k] = 1e-6
+        slope = (evaluate(sensor.theta + step, outputs)[0] - evaluate(sensor.theta - step, outputs)[0]) / 2e-6
+        np.testing.assert_allclose(jacobian[:, k], slope, atol=1e-8)
+    np.testing.assert_allclose(weight, np.linalg.norm(jacobian[:, :axes], axis=1))
+
+
+@pytest.mark.parametrize("axes", [3, 2])
+def test_errors_are_at_the_bound_and_intervals_hold(axes, reduced):
+    """Over simulated recordings of one sensor: errors over the Cramer-Rao bound, stated uncertainty, coverage, bias."""
+    trials, count, noise = (80 if reduced else 2000), 400, 0.6
+    sensor = Sensor(5, axes=axes)
+    errors, stated, inside = [], [], []
+    directions = sphere(count, np.random.default_rng(1)) if axes == 3 else circle(count, 2)
+    for seed in range(trials):
+        rng = np.random.default_rng([seed, axes])
+        surface = fit_surface(sensor.outputs(directions, noise, rng))
+        scale = np.concatenate([np.ones(axes), np.full(len(sensor.theta) - axes, 1 / sensor.field)])
+        errors.append(scale * surface.theta - sensor.theta)
+        stated.append(scale * np.sqrt(np.diag(surface.covariance)))
+        inside.append(np.abs(errors[-1]) < 1.966 * stated[-1])
+    bound = np.sqrt(np.diag(sensor.bound(directions, noise)))
+    ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / bound
+    slack = 3 / np.sqrt(2 * trials)
+    assert ratio.mean() == pytest.approx(1, abs=0.03 + slack / np.sqrt(len(bound)))
+    assert ratio.max() < 1.04 + slack
+    assert np.mean(stated, axis=0) / bound == pytest.approx(1, abs=0.06)
+    assert 0.93 < np.mean(inside) < 0.97
+    bias = np.mean(errors, axis=0) / bound
+    assert np.abs(bias).max() < 0.04 + 3.3 / np.sqrt(trials)
+
+
+def test_large_noise_lengthens_nothing():
+    """With 5 % of noise an uncorrected magnitude would be too long by 0.25 %, tenfold the uncertainty."""
+    rng = np.random.default_rng(3)
+    sensor = Sensor(3)
+    surface = fit_surface(sensor.outputs(sphere(60_000, rng), 0.05 * sensor.field, rng))
+    assert surface.theta[3:] / sensor.field == pytest.approx(sensor.theta[3:], abs=8e-4)
+
+
+def test_waved_gives_nine_parameters_and_says_that_the_rotation_is_not_told():
+    sensor, outputs = waved(7)
+    record = il.fit_mag(recorded(outputs), field="48 uT").calibration
+    assert list(record.parameters) == NAMES
+    assert record.model["gauge"] == "body, rotation not told"
+    assert record.fit["not_told"] == ["rotation"]
+    assert record.verdict.state == "good"
+    truth = sensor.theta * np.array([1e-6] * 3 + [1.0] * 6)
+    for name, value in zip(NAMES, truth, strict=True):
+        parameter = record.parameters[name]
+        assert abs(parameter.value - value) < 4 * parameter.standard_uncertainty, name
+        assert parameter.unit == ("T" if "bias" in name else "1")
+    corrected = il.apply(record, recorded(outputs))
+    length = np.linalg.norm(corrected.triad("mag"), axis=1)
+    assert length.mean() == pytest.approx(48, rel=1e-3)
+    assert length.std() == pytest.approx(NOISE, rel=0.15)
+
+
+def test_a_level_turn_gives_an_ellipse_and_says_what_it_does_not():
+    sensor, outputs = levelled(8)
+    fit = il.fit_magnetometer(recorded(outputs))
+    record = fit.calibration
+    assert list(record.parameters) == ["mag_bias_x", "mag_bias_y", "mag_soft_xx", "mag_soft_xy", "mag_soft_yy"]
+    assert record.model["turned"] == "level"
+    assert record.fit["not_told"] == ["rotation", "mag_bias_z", "mag_soft_xz", "mag_soft_yz", "mag_soft_zz"]
+    assert 1e6 * record.value("mag_bias_x") == pytest.approx(sensor.hard[0], abs=0.06)
+    ratio = record.value("mag_soft_xx") / record.value("mag_soft_yy")
+    assert ratio == pytest.approx(sensor.soft[0, 0] / sensor.soft[1, 1], abs=4e-3)
+    corrected = il.apply(record, recorded(outputs))
+    level = np.hypot(corrected.column("mag_x"), corrected.column("mag_y"))
+    assert level.std() / level.mean() < 0.013
+    np.testing.assert_allclose(corrected.column("mag_z"), outputs[:, 2])
+    assert record.verdict.state == "good"
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mgauss", 10.0), ("nT", 1000.0), ("gauss", 0.01), ("mT", 1e-3)])
+def test_units_of_field_give_the_same(unit, factor):
+    _, outputs = waved(2)
+    expected = il.fit_magnetometer(recorded(outputs)).calibration
+    record = il.fit_magnetometer(recorded(factor * outputs, unit)).calibration
+    for name in NAMES:
+        assert record.value(name) == pytest.approx(expected.value(name), rel=1e-8)
+
+
+def test_counts_are_in_units_of_the_field_or_per_tesla():
+    sensor, outputs = waved(2)
+    alone = il.fit_magnetometer(recorded(15 * outputs, "count"))
+    stated = il.fit_magnetometer(recorded(15 * outputs, "count"), field="48uT")
+    assert alone.calibration.parameters["mag_soft_xx"].unit == "count"
+    assert stated.calibration.parameters["mag_soft_xx"].unit == "count/T"
+    assert stated.calibration.value("mag_soft_xx") == pytest.approx(15e6 * sensor.soft[0, 0], rel=2e-3)
+    for fit, size in ((alone, 1.0), (stated, 48.0)):
+        length = np.linalg.norm(fit.apply(recorded(15 * outputs, "count")).triad("mag"), axis=1)
+        assert length.mean() == pytest.approx(size, rel=1e-3)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("uT", 1000.0), ("gauss", 1.0), ("nT", 1.0)])
+def test_a_wrong_unit_is_refused(unit, factor):
+    _, outputs = waved(4)
+    with pytest.raises(DataError, match="is the unit wrong"):
+        il.fit_magnetometer(recorded(factor * outputs, unit))
+
+
+def test_the_core_computes_it_and_a_blob_keeps_it(tmp_path, monkeypatch):
+    _, outputs = waved(6)
+    record = il.fit_magnetometer(recorded(outputs), field="48uT").calibration
+    (table,) = tables_of(record)
+    field, _ = DeviceUnit.of(table).mag(list(outputs.T))
+    soft = np.array([[record.value(f"mag_soft_{min(a, b)}{max(a, b)}") for b in "xyz"] for a in "xyz"])
+    hard = 1e6 * np.array([record.value(f"mag_bias_{a}") for a in "xyz"])
+    np.testing.assert_allclose(1e6 * np.column_stack(field), np.linalg.solve(soft, (outputs - hard).T).T, rtol=1e-12)
+    monkeypatch.chdir(tmp_path)
+    record.save("r.json")
+    il.write_csv(recorded(outputs), "w.csv")
+    assert il.load("r.json") == record
+    assert main(["export", "--to", "blob", "r.json", "-o", "."]) == 0
+    assert main(["apply", "unit.blob", "w.csv", "-o", "by_blob.csv"]) == 0
+    expected = il.apply(record, recorded(outputs)).triad("mag")
+    np.testing.assert_allclose(il.read("by_blob.csv").triad("mag"), expected, atol=2e-5)
+
+
+def test_the_field_of_a_place_is_used_whole_or_its_level_part():
+    pytest.importorskip("pygeomag")
+    where = {"place": "48.1,11.6,520", "date": "2026-11-28"}
+    _, outputs = waved(7)
+    record = il.fit_magnetometer(recorded(outputs), **where).calibration
+    place = record.model["place"]
+    assert record.model["field"]["value"] == place["field"]["value"]
+    _, outputs = levelled(8)
+    record = il.fit_magnetometer(recorded(outputs), **where).calibration
+    level = place["field"]["value"] * np.cos(place["dip"]["value"])
+    assert record.model["field"]["value"] == pytest.approx(level)
+    with pytest.raises(OptionError, match="level part of the field only"):
+        il.fit_magnetometer(recorded(outputs), field="20uT")
+
+
+# Too few directions.
+
+
+def test_half_a_level_turn_is_refused_by_name():
+    _, outputs = levelled(3, turns=0.35)
+    with pytest.raises(ObservabilityError, match=r"in one plane, across axis z.*leaves out 2\d\d of 360 deg"):
+        il.fit_magnetometer(recorded(outputs))
+
+
+def test_readings_about_one_direction_are_refused_by_name():
+    rng = np.random.default_rng(1)
+    directions = sphere(4000, rng)
+    outputs = Sensor(1).outputs(directions[directions[:, 2] > 0.75], NOISE, rng)
+    with pytest.raises(ObservabilityError, match=r"do not determine hard and soft iron: .*none is within"):
+        il.fit_magnetometer(recorded(outputs))
+
+
+def test_half_a_sphere_is_fitted_and_looked_at():
+    rng = np.random.default_rng(1)
+    directions = sphere(1200, rng)
+    sensor = Sensor(1)
+    outputs = sensor.outputs(directions[directions[:, 2] > 0.2], 0.4, rng)
+    record = il.fit_magnetometer(recorded(outputs)).calibration
+    assert record.verdict.state == "look"
+    assert "leave out directions" in record.verdict.reasons[0]
+    off = abs(1e6 * record.value("mag_bias_z") - sensor.hard[2])
+    assert off < 4e6 * record.parameters["mag_bias_z"].standard_uncertainty
+
+
+def test_a_turn_oblique_to_all_axes_is_refused():
+    angle = np.linspace(0, 12, 300)
+    across = np.linalg.svd(np.ones((1, 3)))[2][1:]
+    outputs = 30 * np.column_stack([np.cos(angle), np.sin(angle)]) @ across + 15
+    outputs += 0.1 * np.random.default_rng(1).standard_normal(outputs.shape)
+    with pytest.raises(ObservabilityError, match="oblique to all axes"):
+        il.fit_magnetometer(recorded(outputs))
+
+
+# What disturbs it.
+
+
+def test_steel_that_passes_is_set_aside_by_its_time():
+    clean = il.fit_magnetometer(recorded(waved(9, 1200)[1])).calibration
+    _, outputs = waved(9, 1200)
+    bump = 10 * np.exp(-(((np.arange(1200) - 500) / 15) ** 2))
+    record = il.fit_magnetometer(recorded(outputs + bump[:, None] * np.array([1.0, 0.4, -0.7]))).calibration
+    assert record.verdict.state == "look"
+    (reason,) = record.verdict.reasons
+    assert "was steel or a magnet near" in reason
+    assert re.search(r"\(24\.\d to 2[56]\.\d s\): \|m\| is up to 3\d % high", reason)
+    for name in NAMES:
+        u = clean.parameters[name].standard_uncertainty
+        assert abs(record.value(name) - clean.value(name)) < 2 * u, name
+
+
+def test_single_spikes_are_a_note():
+    _, outputs = waved(9, 3000)
+    outputs[1500] += 40
+    record = il.fit_magnetometer(recorded(outputs)).calibration
+    assert record.verdict.state == "good"
+    assert any("1 of 3000 readings set aside" in text for text in record.warnings)
+
+
+def test_a_field_that_changes_is_seen():
+    _, outputs = waved(5, 2000)
+    sensor = Sensor(5)
+    outputs[1200:] = sensor.hard + 1.01 * (outputs[1200:] - sensor.hard)
+    record = il.fit_magnetometer(recorded(outputs)).calibration
+    assert any(text.startswith("mag: from 60.") and "% higher" in text for text in record.verdict.reasons)
+
+
+def test_repeated_rows_count_once():
+    _, outputs = waved(5)
+    once = il.fit_magnetometer(recorded(outputs)).calibration
+    four = il.fit_magnetometer(recorded(np.repeat(outputs, 4, axis=0), rate=80.0)).calibration
+    for name in NAMES:
+        assert four.parameters[name].standard_uncertainty == pytest.approx(
+            once.parameters[name].standard_uncertainty, rel=1e-9
+        )
+    assert any("1800 rows that repeat" in text for text in four.warnings)
+
+
+def test_errors_in_common_widen_the_uncertainties(reduced):
+    """An error that lasts for 20 readings is no independent one of each."""
+    sensor, _ = waved(5)
+    inside = []
+    for seed in range(15 if reduced else 60):
+        rng = np.random.default_rng(seed)
+        slow = np.repeat(rng.standard_normal((80, 3)), 25, axis=0)
+        walk = np.cumsum(0.15 * rng.standard_normal((2000, 3)), axis=0)  # a hand that turns slowly
+        directions = np.array([1.0, 0, 0]) + walk - walk.mean(axis=0)
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        surface = fit_surface(sensor.outputs(directions, 0.1, rng) + 0.5 * slow)
+        scale = np.concatenate([np.ones(3), np.full(6, 1 / sensor.field)])
+        error = scale * surface.theta - sensor.theta
+        inside.append(np.abs(error) < 2.0 * scale * np.sqrt(np.diag(surface.covariance)))
+    assert np.mean(inside) > (0.85 if reduced else 0.90)
+    assert surface.inflation > 5
+
+
+def test_no_reading_of_clean_recordings_is_set_aside():
+    assert sum(int(find_disturbed(waved(seed, 800)[1], 12)[1].sum()) for seed in range(40)) <= 1
+
+
+def test_clipped_and_dead_axes_are_refused():
+    _, outputs = waved(5, 2000)
+    clipped = np.minimum(outputs, np.quantile(outputs, 0.9, axis=0))
+    with pytest.raises(DataError, match=r"mag_x: 200 of \d+ readings are .* saturated"):
+        il.fit_magnetometer(recorded(clipped))
+    outputs[:, 1] = 3.0
+    with pytest.raises(DataError, match=r"mag_y: .* a dead axis"):
+        il.fit_magnetometer(recorded(outputs))
+
+
+def test_clean_tests_are_good(reduced):
+    verdicts = [
+        il.fit_magnetometer(recorded(waved(seed, 500)[1])).calibration.verdict.state
+        for seed in range(25 if reduced else 300)
+    ]
+    assert np.mean([state != "good" for state in verdicts]) <= 0.04
+
+
+# The command, and what cannot be done with such a record.
+
+
+def test_the_command_of_both_names_writes_the_same_record(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["magnetometer", "simulate", "--duration", "20 s", "-o", "w.csv"]) == 0
+    assert main(["tumble", "mag", "w.csv", "--field", "48uT", "-o", "a.json", "--report", "a.html"]) == 0
+    assert main(["magnetometer", "fit", "w.csv", "--field", "48uT", "-o", "b.json"]) == 0
+    one, other = (json.loads((tmp_path / f"{name}.json").read_text()) for name in "ab")
+    assert one["parameters"] == other["parameters"]
+    truth = il.read("w.csv").metadata
+    for name in NAMES:
+        off = one["parameters"][name]["value"] - float(truth[f"truth_{name}"])
+        assert abs(off) < 4 * one["parameters"][name]["standard_uncertainty"], name
+    assert "is not told" in capsys.readouterr().out
+    page = (tmp_path / "a.html").read_text()
+    assert "What the magnitude is known to in each direction" in page
+
+
+@pytest.mark.parametrize("option", ["hemisphere", "dip", "accel"])
+def test_options_that_need_accelerometers_are_refused(option):
+    _, outputs = waved(2)
+    value = {"hemisphere": "north", "dip": "67 deg", "accel": "other.json"}[option]
+    with pytest.raises(OptionError, match=f"{option} needs accelerometers"):
+        il.fit_mag(recorded(outputs), **{option: value})
+
+
+def test_headings_are_refused_since_the_rotation_is_not_told():
+    _, outputs = waved(2)
+    record = il.fit_magnetometer(recorded(outputs)).calibration
+    with pytest.raises(RecordError, match="does not tell how they are turned"):
+        il.apply(record, recorded(outputs), heading=True)
+
+
+@pytest.mark.parametrize("target", ["px4", "ardupilot", "fusion", "ros", "motioncal"])
+def test_other_programs_hold_it(target, tmp_path):
+    sensor, outputs = waved(2)
+    record = il.fit_magnetometer(recorded(outputs), field="48uT").calibration
+    (file,) = il.export(target, record, tmp_path)
+    inverse = np.linalg.inv(sensor.soft)
+    text = file.read_text()
+    for value in (inverse[0, 0], inverse[0, 1]):
+        assert f"{value:.2f}" in text
+    assert "ROT" not in text.replace("ROT (K", "") or target != "px4"
+    _, outputs = levelled(2)
+    with pytest.raises(RecordError, match="level turn, and tells nothing of axis z"):
+        il.export(target, il.fit_magnetometer(recorded(outputs)).calibration, tmp_path)
