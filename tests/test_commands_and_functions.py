@@ -56,6 +56,7 @@ FUNCTIONS = {
     "rate turn": il.fit_turns,
     "magnetometer simulate": il.simulate_magnetometer,
     "magnetometer fit": il.fit_magnetometer,
+    "magnetometer check": il.check_magnetometer,
     "fleet run": il.run_fleet,
     "fleet status": il.fleet_status,
     "fleet report": il.write_fleet_report,

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from tests.reference.field_alone import Sensor, circle, sphere
+from tests.test_tumble_mag_check import SAP5, G, sap5_recording
 
 import imulab as il
 from imulab.cli import main
@@ -352,3 +353,16 @@ def test_other_programs_hold_it(target, tmp_path):
     _, outputs = levelled(2)
     with pytest.raises(RecordError, match="level turn, and tells nothing of axis z"):
         il.export(target, il.fit_magnetometer(recorded(outputs)).calibration, tmp_path)
+
+
+# Real instruments.
+
+
+@pytest.mark.parametrize("name", SAP5)
+def test_sap5_the_magnetometers_alone_fit_as_well_as_beside_the_accelerometers(real_data, name):
+    recording = sap5_recording(real_data / "sap5" / f"{name}.json")
+    both = il.fit_mag(recording, gravity=G, order=2).calibration.fit["mag"]["magnitude"]["rms"]
+    columns = {key: values for key, values in recording.columns.items() if key.startswith("mag")}
+    alone = il.fit_mag(il.Recording(columns, dict.fromkeys(columns, "count"))).calibration
+    assert 0.85 * both < alone.fit["rms"] < 1.05 * both  # |m| alone has no dip to agree with
+    assert alone.verdict.state == "good"

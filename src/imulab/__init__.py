@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.public import fuse as fuse
     from imulab.procedures.gyro_array.public import merge_array as merge_array
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
+    from imulab.procedures.magnetometer.check import check_magnetometer as check_magnetometer
     from imulab.procedures.magnetometer.fit import MagnetometerFit as MagnetometerFit
     from imulab.procedures.magnetometer.fit import fit_magnetometer as fit_magnetometer
     from imulab.procedures.magnetometer.simulate import simulate_magnetometer as simulate_magnetometer
@@ -119,6 +120,7 @@ _HOME = {
     "ImulabError": "errors",
     "Recording": "recording",
     "MagnetometerFit": "procedures.magnetometer.fit",
+    "check_magnetometer": "procedures.magnetometer.check",
     "fit_magnetometer": "procedures.magnetometer.fit",
     "simulate_magnetometer": "procedures.magnetometer.simulate",
     "MagFit": "procedures.tumble.mag.fit",

@@ -6,7 +6,18 @@ from typing import Annotated, Any
 
 import imulab as il
 from imulab.cli.command import Command, option
-from imulab.cli.options import AsJson, GivenFiles, OutputFile, RecordingFile, ReportFile, call, check_outputs
+from imulab.cli.options import (
+    AsJson,
+    GivenFiles,
+    OutputFile,
+    RecordFile,
+    RecordingFile,
+    ReportFile,
+    call,
+    check_outputs,
+    read_recording,
+    reading,
+)
 from imulab.options import OUTPUT
 
 
@@ -40,7 +51,30 @@ def fit(
     finish(run_task("magnetometer", [file], options, GivenFiles()), output, report, json=json)
 
 
+def check(
+    record: RecordFile, file: RecordingFile, *, report: ReportFile = None, json: AsJson = False, **options: Any
+) -> int:
+    """Hold new readings against a record.
+
+    Tests whether they still agree with it, without refitting; exit status 0: pass, 1: fail. A record that still holds
+    fails once in twenty tests.
+    """
+    from imulab.cli.show import finish_check, notes_on_data
+    from imulab.errors import RecordError
+    from imulab.procedures.registry import load
+
+    check_outputs([report], [name for name in (record, file, options["layout"]) if name])
+    held = load(record)
+    recording = read_recording(file, **reading(options))
+    try:
+        result = call(il.check_magnetometer, held, recording)
+    except RecordError as error:
+        raise RecordError(f"{record}: {error}") from None
+    return finish_check(result, held, record, [file], notes_on_data(held, [recording]), report, json=json)
+
+
 COMMANDS = (
     Command("magnetometer simulate", simulate, lambda: [il.simulate_magnetometer]),
     Command("magnetometer fit", fit, lambda: [il.fit_magnetometer]),
+    Command("magnetometer check", check, lambda: [il.check_magnetometer]),
 )

@@ -157,6 +157,7 @@ FIELD_ALONE_STEP = Decision(1e-3, "verdict", {"magnetometer": 1}, "|m| is anothe
 READINGS_SET_ASIDE = Decision(
     5.7e-7, "verdict", {"magnetometer": 8000}, "readings, or their means over windows, lie off all others", limit=5.0
 )
+MAGNETOMETER_CHECK = Decision(0.05, "check", {"magnetometer check": 1}, "the record of a magnetometer no longer holds")
 
 # Thermal
 THERMAL_POWER = Decision(
@@ -316,6 +317,7 @@ MOST_FALSE_ALARMS: Mapping[tuple[str, ...], float] = {
     ("centrifuge",): 0.04,
     ("warmup",): 0.04,
     ("tumble check",): 0.05,
+    ("magnetometer check",): 0.05,
     ("thermal check",): 0.05,
     ("noise check",): 0.05,
     ("compare",): 0.05,

@@ -6,8 +6,19 @@ body shows in no magnitude, and is not told; accelerometers beside them tell it 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 AXES = "xyz"
 GAUGE = "body, rotation not told"
 FEWEST = {3: 12, 2: 8}
 """Readings that a fit takes at least, by the number of axes that were turned."""
 ALL_WAYS, LEVEL = "all ways", "level"
+
+
+def name_columns(samples: NDArray[Any]) -> Mapping[str, Any]:
+    """Return the columns of an array without names."""
+    return {"mag": samples}

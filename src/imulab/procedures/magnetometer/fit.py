@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Unpack
+from typing import Annotated, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imulab.display import UNJUDGED
 from imulab.errors import ObservabilityError, OptionError
 from imulab.gravity import ModelField, Site, check_field_magnitude, field_note, field_of_test, site, stated_site
 from imulab.options import Group, measure, parsed, text
-from imulab.procedures.magnetometer import AXES, FEWEST
-from imulab.procedures.magnetometer.model import Readings, Turned, read_readings
+from imulab.procedures.magnetometer import AXES, FEWEST, name_columns
+from imulab.procedures.magnetometer.model import Readings, Turned, check_dead, read_readings
 from imulab.procedures.magnetometer.record import make_record
 from imulab.procedures.magnetometer.solve import find_disturbed, fit_sphere, uncertainties, widest_gap
 from imulab.procedures.result import Result, as_recording
@@ -110,11 +108,6 @@ def fit_magnetometer(
     return fit_readings(recording, magnitude, where, date)
 
 
-def name_columns(samples: NDArray[Any]) -> Mapping[str, Any]:
-    """Return the columns of an array without names."""
-    return {"mag": samples}
-
-
 def fit_readings(recording: Recording, field: float | None, where: Site | None, date: str | None) -> MagnetometerFit:
     """Calibrate a magnetometer triad; arguments in SI, else as for `fit_magnetometer`."""
     found = None if where is None else field_of_test(where, date, recording)
@@ -177,6 +170,7 @@ def _find_surface(readings: Readings) -> Turned:
     upright = int(np.argmax(normal))
     turned = _fit_level(readings, AXES[upright]) if spread[2] <= _FLAT * spread[1] else None
     if turned is None:
+        check_dead(output, readings.unit, name)
         raise ObservabilityError(
             f"{name}: the readings do not determine hard and soft iron: {why}; {_say_gap(output)}; turn the unit "
             "through all directions, each axis up and down"

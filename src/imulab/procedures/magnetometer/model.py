@@ -114,7 +114,7 @@ def read_readings(recording: Recording) -> Readings:
     Raises
     ------
     DataError
-        There are no magnetometers, or too few readings; an axis is dead or clipped.
+        There are no magnetometers, or too few readings; an axis is clipped.
     UnitError
         The columns have different units, or one of something else.
     """
@@ -151,20 +151,14 @@ def read_readings(recording: Recording) -> Readings:
 
 
 def _check_readings(output: Array, unit: str, name: str) -> None:
-    """Refuse too few readings, and a dead or clipped axis."""
+    """Refuse too few readings, and a clipped axis."""
     least = min(FEWEST.values())
     if len(output) < least:
         raise DataError(
             f"{name}: {len(output)} different readings of mag_x mag_y mag_z; expected {FEWEST[3]} or more in all "
             f"directions, or {least} or more of a level turn"
         )
-    span = np.ptp(output, axis=0)
     for axis, column in enumerate(triad("mag")):
-        if span[axis] <= _DEAD * span.max():
-            raise DataError(
-                f"{name}: column {column}: the output changes by {span[axis]:.3g} {unit}, other axes by "
-                f"{span.max():.3g} {unit}: a dead axis?"
-            )
         for end in (np.min, np.max):
             count, extreme = _count_at_end(output[:, axis], float(end(output[:, axis])))
             if count:
@@ -172,6 +166,23 @@ def _check_readings(output: Array, unit: str, name: str) -> None:
                     f"{name}: column {column}: {count} of {len(output)} readings are {extreme:.6g} {unit}, where they "
                     "end: the axis is saturated; expected a wider range, or less iron near"
                 )
+
+
+def check_dead(output: Array, unit: str, name: str) -> None:
+    """Refuse an axis whose output does not change, and a unit that was not turned.
+
+    Raises
+    ------
+    DataError
+        There is one.
+    """
+    span = np.ptp(output, axis=0)
+    for axis, column in enumerate(triad("mag")):
+        if span[axis] <= _DEAD * span.max():
+            raise DataError(
+                f"{name}: column {column}: the output changes by {span[axis]:.3g} {unit}, other axes by "
+                f"{span.max():.3g} {unit}: a dead axis?"
+            )
 
 
 def _count_at_end(values: Array, extreme: float) -> tuple[int, float]:

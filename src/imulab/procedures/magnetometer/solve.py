@@ -208,7 +208,7 @@ def fit_surface(outputs: Array) -> Surface:
     whitened, rows = r / weight, jacobian / weight[:, None]
     whole = np.concatenate([centre + size * hard, size * theta[d:]])
     # In outputs: r has no unit, so that the derivatives by h and D are those over the size.
-    return Surface(whole, whitened * size, rows, size * sigma, _inflation(whitened, rows, sigma), rest)
+    return Surface(whole, whitened * size, rows, size * sigma, find_inflation(whitened, orthonormal(rows), sigma), rest)
 
 
 def fit_sphere(points: Array) -> tuple[Array, float]:
@@ -264,12 +264,16 @@ def _scatter(r: Array, weight: Array, size: int) -> float:
     return float(np.sqrt(((r / weight) ** 2).sum() / max(len(r) - size, 1)))
 
 
-def _inflation(whitened: Array, rows: Array, sigma: float) -> float:
-    """Return by how much errors in common of readings in a row increase the covariance, 1 or more."""
+def orthonormal(rows: Array) -> Array:
+    """Return orthonormal columns that span those of a matrix."""
+    return np.linalg.qr(rows / np.linalg.norm(rows, axis=0))[0]
+
+
+def find_inflation(whitened: Array, q: Array, sigma: float) -> float:
+    """Return by how much errors in common of readings in a row increase the covariance, 1 or more; q is orthonormal."""
     count = min(BLOCKS, len(whitened) // _LEAST_IN_BLOCKS)
     if count < BLOCKS // 2 or not sigma:
         return 1.0
-    q = np.linalg.qr(rows / np.linalg.norm(rows, axis=0))[0]
     edges = np.linspace(0, len(whitened), count + 1).astype(np.intp)[:-1]
     scores = np.add.reduceat(q * whitened[:, None], edges, axis=0)
     shares = np.add.reduceat(q[:, :, None] * q[:, None, :], edges, axis=0)
@@ -333,7 +337,7 @@ def find_disturbed(outputs: Array, least: int) -> tuple[Surface, NDArray[np.bool
     surface = fit_surface(outputs)
     for _ in range(_ROUNDS):
         r, _, weight = evaluate(surface.theta, outputs)
-        marked = _mark_far(r / weight, aside)
+        marked = mark_far(r / weight, aside)
         if (marked == aside).all() or len(outputs) - int(marked.sum()) < least:
             break
         aside = marked
@@ -341,7 +345,7 @@ def find_disturbed(outputs: Array, least: int) -> tuple[Surface, NDArray[np.bool
     return surface, aside
 
 
-def _mark_far(x: Array, aside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def mark_far(x: Array, aside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the readings in windows whose mean residual is far from 0; a window's mean is of those not yet far."""
     far, single = np.zeros(len(x), dtype=np.bool_), 0.0
     for width in _WINDOWS:
