@@ -54,6 +54,7 @@ FUNCTIONS = {
     "rate simulate": il.simulate_rate,
     "rate fit": il.fit_rate,
     "rate turn": il.fit_turns,
+    "magnetometer plan": il.plan_magnetometer,
     "magnetometer simulate": il.simulate_magnetometer,
     "magnetometer fit": il.fit_magnetometer,
     "magnetometer check": il.check_magnetometer,

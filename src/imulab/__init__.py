@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from imulab.procedures.magnetometer.check import check_magnetometer as check_magnetometer
     from imulab.procedures.magnetometer.fit import MagnetometerFit as MagnetometerFit
     from imulab.procedures.magnetometer.fit import fit_magnetometer as fit_magnetometer
+    from imulab.procedures.magnetometer.plan import plan_magnetometer as plan_magnetometer
     from imulab.procedures.magnetometer.simulate import simulate_magnetometer as simulate_magnetometer
     from imulab.procedures.noise.allan import allan_deviation as allan_deviation
     from imulab.procedures.noise.check import check_noise as check_noise
@@ -122,6 +123,7 @@ _HOME = {
     "MagnetometerFit": "procedures.magnetometer.fit",
     "check_magnetometer": "procedures.magnetometer.check",
     "fit_magnetometer": "procedures.magnetometer.fit",
+    "plan_magnetometer": "procedures.magnetometer.plan",
     "simulate_magnetometer": "procedures.magnetometer.simulate",
     "MagFit": "procedures.tumble.mag.fit",
     "RateFit": "procedures.rate.fit",

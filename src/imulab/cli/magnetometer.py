@@ -21,6 +21,16 @@ from imulab.cli.options import (
 from imulab.options import OUTPUT
 
 
+def plan(*, json: AsJson = False, **options: Any) -> None:
+    """Say how many readings to take, and how far to tilt.
+
+    And what that will give.
+    """
+    from imulab.cli.show import finish_plan
+
+    finish_plan(call(il.plan_magnetometer, **options), None, json=json)
+
+
 def simulate(
     *, output: Annotated[str, option("OUT", "Recording to write.", "-o", "--output"), OUTPUT], **options: Any
 ) -> None:
@@ -74,6 +84,7 @@ def check(
 
 
 COMMANDS = (
+    Command("magnetometer plan", plan, lambda: [il.plan_magnetometer]),
     Command("magnetometer simulate", simulate, lambda: [il.simulate_magnetometer]),
     Command("magnetometer fit", fit, lambda: [il.fit_magnetometer]),
     Command("magnetometer check", check, lambda: [il.check_magnetometer]),

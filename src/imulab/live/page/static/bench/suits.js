@@ -20,6 +20,8 @@ const NEEDS = {
   "tumble fit": [holds("accel"), facts => (facts.timed && facts.attitudes === 0 ? "no attitude at rest was found in it" : "")],
   "tumble gyro": [holds("gyro"), timed],
   "tumble mag": [holds("mag")],
+  "magnetometer fit": [holds("mag")],
+  "magnetometer check": [holds("mag"), record("magnetometer")],
   "tumble check": [holds("accel"), record("tumble", "thermal")],
   "thermal fit": [warm, inertial],
   "thermal check": [warm, inertial, record("thermal")],
@@ -33,8 +35,8 @@ const NEEDS = {
   "array merge": [rates, several],
   apply: [record()],
 };
-const RECORDS = { report: [], export: [], "warmup table": ["warmup"], "tumble check": ["tumble", "thermal"], "thermal check": ["thermal"], "noise check": ["noise"], apply: [], show: [] };
-const ONE = new Set(["tumble fit", "tumble gyro", "tumble mag", "tumble check", "rate fit", "rate turn", "array calibrate", "array fuse", "array compare", "allan", "convert", "apply", "show"]);
+const RECORDS = { report: [], export: [], "warmup table": ["warmup"], "tumble check": ["tumble", "thermal"], "thermal check": ["thermal"], "noise check": ["noise"], "magnetometer check": ["magnetometer"], apply: [], show: [] };
+const ONE = new Set(["tumble fit", "tumble gyro", "tumble mag", "magnetometer fit", "magnetometer check", "tumble check", "rate fit", "rate turn", "array calibrate", "array fuse", "array compare", "allan", "convert", "apply", "show"]);
 const LATER = ["show", "convert", "layout guess"]; // what the page does by itself, or what is rarely wanted
 
 // The sentence that says why a procedure is not for what is chosen; none where it is. Nothing is known of a recording
@@ -61,6 +63,7 @@ export function likely(one, other, facts) {
   const rank = path => {
     if (LATER.includes(path)) return 90;
     if (path === "warmup fit" && facts.count > 1) return 0;
+    if (path === "magnetometer fit" && has(facts, "mag") && !has(facts, "accel")) return 0;
     if (path.startsWith("array") && some(facts, ELEMENTS)) return / calibrate$/.test(path) ? 1 : 5;
     const order = ["tumble fit", "rate fit", "centrifuge reduce", "thermal fit", "noise fit", "tumble mag", "rate turn", "tumble gyro", "allan", "tumble check", "apply", "thermal check", "noise check"];
     return order.includes(path) ? 10 + order.indexOf(path) : 50;
