@@ -342,3 +342,38 @@ def test_headings_that_cannot_be_are_refused(capsys):
     two_faces = np.tile([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], (8, 1))
     with pytest.raises(il.ImulabError, match="no headings of these 16 attitudes determine a magnetometer"):
         plan_headings(two_faces)
+
+
+def test_true_headings_are_magnetic_ones_turned_by_the_declination_of_the_place(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pygeomag")
+    monkeypatch.chdir(tmp_path)
+    il.write_csv(il.simulate_tumble(order=1, gravity=G, field="48.8 uT", dip="64.4 deg", seed=3), "r.csv")
+    place = ["--place", "48.1,11.6", "--date", "2026-11-28"]
+    assert main(["tumble", "mag", "r.csv", "--gravity", str(G), "--order", "1", *place, "-o", "r.json"]) == 0
+    for words, name in (
+        (["--heading"], "m.csv"),
+        (["--heading", "magnetic"], "n.csv"),
+        (["--heading", "true"], "t.csv"),
+    ):
+        assert main(["apply", "r.json", "r.csv", *words, "-o", name]) == 0
+    assert (tmp_path / "m.csv").read_bytes() == (tmp_path / "n.csv").read_bytes()
+    magnetic, true = il.read("m.csv"), il.read("t.csv")
+    declination = il.load("r.json").model["place"]["declination"]
+    turned = np.radians(true.column("heading") - magnetic.column("heading"))
+    np.testing.assert_allclose(wrapped(turned), declination["value"], atol=1e-9)
+    np.testing.assert_allclose(
+        true.column("std_heading"),
+        np.minimum(np.hypot(magnetic.column("std_heading"), np.degrees(declination["standard_uncertainty"])), 103.93),
+        rtol=1e-3,
+    )
+    assert true.metadata["heading"].startswith("from true north, declination +4.3")
+    capsys.readouterr()
+    assert main(["apply", "--heading", "r.json", "r.csv", "-o", "o.csv"]) == 0
+    assert main(["apply", "--heading=up", "r.json", "r.csv", "-o", "o.csv"]) == 2
+    assert "--heading 'up': expected one of no magnetic true" in capsys.readouterr().err
+
+
+def test_true_headings_of_a_record_without_a_place_are_refused():
+    truth, record = fitted(1)
+    with pytest.raises(RecordError, match="true headings need the declination of the place"):
+        il.apply(record, table(*exact_outputs(truth, attitudes(np.random.default_rng(2), 20))), heading="true")

@@ -121,7 +121,8 @@ class Reads(NamedTuple):
     """Reader of the text of an option, and its placeholder in help.
 
     `words` are offered to complete it; where there are no `other` ones, they are all that it takes. `unit` is that of a
-    bare number; `off` the option that says the opposite of a switch.
+    bare number; `off` the option that says the opposite of a switch; `bare` the word that counts
+    where none of the words follows the option.
     """
 
     read: Read | None = None
@@ -134,6 +135,7 @@ class Reads(NamedTuple):
     flags: tuple[str, ...] = ()
     off: str = ""
     help: str = ""
+    bare: str = ""
 
 
 PROGRAM, RARE = Mark("for programs only"), Mark("few runs need it: long help only names it")

@@ -149,7 +149,9 @@ def values_of(command: Command, words: Sequence[str]) -> tuple[dict[str, Any], s
         return refuse(f"No such option: {flag}", meant([*known, *opposite], flag, ALIKE))
 
     def take(each: Option, flag: str, value: str | None, left: list[str]) -> None:
-        if each.takes_value:
+        if value is None and each.reads.bare and (not left or left[0] not in each.words):
+            typed[each.keyword] = each.reads.bare
+        elif each.takes_value:
             if value is None and not left:
                 raise OptionError(f"Option '{flag}' requires an argument.")
             text = left.pop(0) if value is None else value

@@ -138,7 +138,7 @@ def apply(
 
     By one or more of them, in the order given; CSV or Parquet to OUT, CSV to standard output.
     """
-    from imulab.procedures.apply import add_heading, apply_blocks, loaded
+    from imulab.procedures.apply import add_heading, apply_blocks, heading_kind, loaded
     from imulab.procedures.correction_order import order_warnings
     from imulab.procedures.registry import load_any
     from imulab.readers import read_blocks
@@ -171,8 +171,8 @@ def apply(
             )
     for message in order_warnings([part.kind for ready in chain for part, _ in ready.sections]):
         warn(message)
-    if options["heading"]:
-        chain = add_heading(chain, records)
+    if kind := heading_kind(options["heading"], "--heading"):
+        chain = add_heading(chain, records, kind)
     blocks = with_notes(_say_resampled(on_clock_of(read_blocks(file, **how))), notes=False)
     if options["temperature_column"] and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)

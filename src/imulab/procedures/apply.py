@@ -14,9 +14,9 @@ from imulab.columns import KINDS, triad
 from imulab.device.tables import DeviceTable, Fusion
 from imulab.device.unit import Blob, DeviceUnit
 from imulab.display import SENTENCES, Note
-from imulab.errors import DataError, OptionError, RecordError
+from imulab.errors import DataError, OptionError, RecordError, listed
 from imulab.estimation.sampling import whole_where_shared
-from imulab.options import measure
+from imulab.options import choice, measure
 from imulab.procedures.correction_order import check_after, check_order, name_correction, parse_thermals
 from imulab.procedures.procedure import Procedure, Section
 from imulab.procedures.registry import joined_of, load_any, procedure_of, section
@@ -147,8 +147,18 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
     return Loaded(DeviceUnit.of(*tables), chain, called, (record.sealed()[0],), again)
 
 
-def add_heading(chain: Sequence[Loaded], records: Sequence[Calibration | Blob]) -> list[Loaded]:
-    """Return the chain, in which the last record with magnetometers adds magnetic heading and dip.
+HEADINGS = ("no", "magnetic", "true")
+
+
+def heading_kind(value: bool | str, name: str = "heading") -> str:
+    """Return ``magnetic`` or ``true``, empty for no heading; refuses other words."""
+    if isinstance(value, str) and value not in HEADINGS:
+        raise OptionError(f"{name} {value!r}: expected one of {listed(HEADINGS, value)}")
+    return {True: "magnetic", False: "", "no": ""}.get(value, str(value))
+
+
+def add_heading(chain: Sequence[Loaded], records: Sequence[Calibration | Blob], kind: str = "magnetic") -> list[Loaded]:
+    """Return the chain, in which the last record with magnetometers adds heading, of a `kind`, and dip.
 
     Raises
     ------
@@ -163,7 +173,9 @@ def add_heading(chain: Sequence[Loaded], records: Sequence[Calibration | Blob]) 
             why = why or f"{extended[index].name}: heading needs a record with magnetometers, found {kind}"
             continue
         try:
-            extended[index] = replace(extended[index], further=procedure_of(record).heading(record))
+            extended[index] = replace(
+                extended[index], further=procedure_of(record).heading(record, true=kind == "true")
+            )
         except RecordError as error:
             why = f"{extended[index].name}: {error}"
             continue
@@ -178,7 +190,7 @@ def apply(
     again: bool = False,
     latest_start: Annotated[float | str, measure("time", "s")] = "5 s",
     temperature_column: bool = False,
-    heading: bool = False,
+    heading: Annotated[bool | str, choice(HEADINGS, bare="magnetic")] = False,
     **reading: Unpack[Reading],
 ) -> Recording:
     """Return data corrected by a record; columns that it does not touch pass unchanged.
@@ -199,10 +211,10 @@ def apply(
     temperature_column
         Take a missing power-on temperature from the first row's column temperature (warm-up).
     heading
-        Add columns of magnetic heading and dip, deg, with uncertainties. Columns ``heading`` (of the body's x axis,
-        clockwise from magnetic north), ``std_heading``, ``dip`` and ``std_dip`` of a unit at rest, with standard
-        uncertainties by the record's covariance, the scatter of its attitudes, and the acceleration that shows where
-        ``|f|`` is off g by more than 1 %.
+        Add columns of magnetic or true heading and dip, deg, with uncertainties. Columns ``heading`` (of the body's x
+        axis, clockwise from magnetic north; with ``"true"`` from true north, by the declination of the record's place),
+        ``std_heading``, ``dip`` and ``std_dip`` of a unit at rest, with standard uncertainties by the record's
+        covariance, the scatter of its attitudes, and the acceleration that shows where ``|f|`` is off g by more than 1 %.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.
@@ -237,10 +249,10 @@ def apply(
         ready = record
     else:
         ready = loaded(record, name, again=again, latest_start=in_si(latest_start, "latest_start", "time", "s"))
-    if heading:
+    if kind := heading_kind(heading):
         if isinstance(record, Loaded):
             raise OptionError("heading: expected a record, found one that was loaded without")
-        (ready,) = add_heading([ready], [record])
+        (ready,) = add_heading([ready], [record], kind)
     before = {each.rpartition("sha256:")[2] for each in recording.corrected_by}
     if not ready.again and before.intersection(ready.holds):
         raise DataError(

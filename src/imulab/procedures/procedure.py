@@ -252,13 +252,13 @@ class Procedure:
         """Return how the unit is to fuse, by texts of method and memory, or as the record states for None."""
         raise NotImplementedError
 
-    def heading(self, record: Calibration) -> Callable[[Recording], Recording]:
-        """Return a function that adds magnetic heading and dip to a recording that the record corrected.
+    def heading(self, record: Calibration, *, true: bool = False) -> Callable[[Recording], Recording]:
+        """Return a function that adds magnetic or true heading and dip to a recording that the record corrected.
 
         Raises
         ------
         RecordError
-            It holds no magnetometers.
+            It holds no magnetometers, or true headings are asked of one without a place.
         """
         raise NotImplementedError
 

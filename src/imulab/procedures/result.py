@@ -88,7 +88,7 @@ class Result:
         return self.calibration.cov(*names)
 
     @checked
-    def apply(self, data: Data, *, again: bool = False, heading: bool = False, **reading: Unpack[Reading]) -> Any:
+    def apply(self, data: Data, *, again: bool = False, heading: bool | str = False, **reading: Unpack[Reading]) -> Any:
         """Return data corrected by the record, of a data frame a data frame; see `Calibration.apply`."""
         return self.calibration.apply(data, again=again, heading=heading, **reading)
 

@@ -267,7 +267,7 @@ def plots(record: Calibration, name: str | int | None) -> Plots | Plot:
 
 
 def apply_to(
-    record: Calibration, data: Any, reading: Mapping[str, Any] | Reading, *, again: bool, heading: bool
+    record: Calibration, data: Any, reading: Mapping[str, Any] | Reading, *, again: bool, heading: bool | str
 ) -> Any:
     """Return data corrected by a record: of a data frame a frame of the same library, of all else a recording."""
     from imulab.procedures.apply import apply

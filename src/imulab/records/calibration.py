@@ -415,7 +415,7 @@ class Calibration:
         return self.covariance.block(names) if names else self.covariance.array()
 
     @checked
-    def apply(self, data: Data, *, again: bool = False, heading: bool = False, **reading: Unpack[Reading]) -> Any:
+    def apply(self, data: Data, *, again: bool = False, heading: bool | str = False, **reading: Unpack[Reading]) -> Any:
         """Return data corrected by the record: a file, a recording, a data frame or arrays; see `imulab.apply`.
 
         Of a data frame this is a frame of the same library, with titles ``name [unit]``; of all else a `Recording`.

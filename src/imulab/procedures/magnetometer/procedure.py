@@ -98,7 +98,7 @@ class MagnetometerProcedure(Procedure):
 
         return tables_of(record)
 
-    def heading(self, record: Calibration) -> Callable[[Recording], Recording]:
+    def heading(self, record: Calibration, *, true: bool = False) -> Callable[[Recording], Recording]:
         raise RecordError(
             "the record is of magnetometers alone, and does not tell how they are turned against the accelerometers; "
             "headings need a record of tumble mag with accelerometers"

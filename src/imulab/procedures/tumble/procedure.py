@@ -218,10 +218,10 @@ class TumbleProcedure(Procedure):
 
         return tables_of(record)
 
-    def heading(self, record: Calibration) -> Callable[[Recording], Recording]:
+    def heading(self, record: Calibration, *, true: bool = False) -> Callable[[Recording], Recording]:
         from imulab.procedures.tumble.mag.heading import make_heading_function
 
-        return make_heading_function(record)
+        return make_heading_function(record, true=true)
 
     def beyond(self, record: Calibration, recording: Recording) -> tuple[int, float]:
         from imulab.procedures.tumble.device import beyond_test

@@ -196,15 +196,29 @@ def add_sample_noise(law: Law, record: Calibration) -> Law:
     )
 
 
-def make_heading_function(record: Calibration) -> Callable[[Recording], Recording]:
+def make_heading_function(record: Calibration, *, true: bool = False) -> Callable[[Recording], Recording]:
     """Return a function that adds heading, std_heading, dip and std_dip, deg, to a recording corrected by the record.
+
+    Headings are clockwise from magnetic north; `true` ones from true north, by the declination of the record's place.
 
     Raises
     ------
     RecordError
-        As for `read_law`.
+        As for `read_law`; true headings are asked of a record without a place.
     """
     of_means = read_law(record)
+    turn, known, metadata = 0.0, 0.0, {}
+    if true:
+        place = mag_model_of(record).place
+        if place is None:
+            raise RecordError(
+                "true headings need the declination of the place, which the record does not hold: state it in the fit "
+                "(tumble mag --place LAT,LON --date DAY)"
+            )
+        turn, known = place.declination.value, place.declination.standard_uncertainty or 0.0
+        metadata = {
+            "heading": f"from true north, declination {np.degrees(turn):+.2f} deg by {place.model}, {place.date}"
+        }
     of_each = add_sample_noise(of_means, record)
 
     def with_heading(recording: Recording) -> Recording:
@@ -216,12 +230,14 @@ def make_heading_function(record: Calibration) -> Callable[[Recording], Recordin
         # A table of attitudes has no time: its rows are means.
         angles = (of_each if "time" in recording else of_means).angles(force, field)
         columns = {
-            "heading": angles.heading, "std_heading": angles.heading_uncertainty,
+            "heading": (angles.heading + turn) % (2 * np.pi),
+            "std_heading": np.minimum(np.hypot(angles.heading_uncertainty, known), _UNKNOWN),
             "dip": angles.dip, "std_dip": angles.dip_uncertainty,
         }  # fmt: skip
-        return recording.with_columns(
+        added = recording.with_columns(
             {name: from_si(values, "deg") for name, values in columns.items()}, dict.fromkeys(columns, "deg")
         )
+        return replace(added, metadata={**added.metadata, **metadata}) if metadata else added
 
     return with_heading
 
