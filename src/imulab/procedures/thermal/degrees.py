@@ -255,6 +255,8 @@ def _find_missed_degrees(
     stated = solution.laws
     bias, scale, misalignment = (max(pair) for pair in zip(stated.degrees, highest.degrees, strict=True))
     larger = replace(stated, degrees=(bias, scale, misalignment))
+    if larger == stated:
+        return None
     try:
         higher, _ = _fit_highest(problem, larger, tau, name)
     except ObservabilityError:
@@ -787,10 +789,11 @@ def _warn_offset(holds: Holds, problem: ThermalProblem, solution: ThermalSolutio
             continue
         others = rows.part(whose != number)
         excess, freedom = fit_excess(others, solution.excess**2)
-        scatter, white = fit_turn_on_scatter(others, excess), whitener(others, excess, np.zeros(2))
+        scatter = fit_turn_on_scatter(others, excess)
         of_recording = np.s_[3 * number : 3 * number + 3]
         stretch, rank = max(float(scatter.tau[1]), _USUAL), freedom
         if stretch > _USUAL:  # determined by few recordings
+            white = whitener(others, excess, np.zeros(2))
             bias, scale = (white(columns) for columns in others.offsets)
             rank = float(len(offset_modes(np.hstack([white(others.jacobian), bias]), scale, white(others.residual))[0]))
         tests = [(1, np.array([_BENDS, stretch]), rank, _OFF_SCALE)]

@@ -278,7 +278,7 @@ def _average_still(
     cuts: list[Cut | None] = []
     notes: list[str] = []
     for index, piece, m in zip(members.tolist(), pieces, middle, strict=True):
-        still = between_turns((np.abs(output[piece] - m) <= STILL_SIGMAS * sigma).all(axis=1))
+        still = between_turns(np.all(np.abs(output[piece] - m) <= STILL_SIGMAS * sigma, axis=1))
         if still.sum() < max(_QUIET_PART * len(still), _FEWEST):
             notes.append(
                 Finding(

@@ -314,7 +314,7 @@ def _cut_recording(attitudes: Attitudes, outputs: Array, temperature: Array) -> 
     for attitude in np.unique(attitudes.pieces[:, 2]).tolist():
         samples = np.concatenate([np.arange(a, b) for a, b, number in attitudes.pieces.tolist() if number == attitude])
         time, read, output = whole[samples], temperature[samples], outputs[samples]
-        drift = abs(np.polyfit(time, read, 1)[0]) * (time[-1] - time[0])
+        drift = abs(_slope(time, read)) * (time[-1] - time[0])
         count = int(max(1, min(np.ceil(drift / _CUT), len(samples) // _FEWEST)))
         edges = np.linspace(0, len(samples), count + 1).astype(np.int64)
         cuts += [average_cut(output, read, time, a, b, attitude) for a, b in pairwise(edges.tolist())]
@@ -328,15 +328,22 @@ def average_cut(outputs: Array, temperature: Array, time: Array, first: int, las
     counts = np.diff(np.append(edges, last))[:, None]
     means = np.add.reduceat(outputs[first:last], edges - first) / counts
     at = np.add.reduceat(temperature[first:last], edges - first) / counts[:, 0]
-    functions = np.column_stack([np.ones(batches), at - at.mean()]) if np.ptp(at) > 0 else np.ones((batches, 1))
-    left = means - functions @ np.linalg.lstsq(functions, means, rcond=None)[0]
-    freedom = max(batches - functions.shape[1], 1)
+    left, heated, freedom = means - means.mean(axis=0), at - at.mean(), batches - 1
+    if np.ptp(at) > 0:
+        left -= np.outer(heated, heated @ left / (heated @ heated))
+        freedom -= 1
     middle = time[first:last]
-    rate = float(np.polyfit(middle - middle.mean(), temperature[first:last], 1)[0])
+    rate = _slope(middle, temperature[first:last])
     return Cut(
         outputs[first:last].mean(axis=0), left.T @ left / freedom / batches, float(freedom),
         float(temperature[first:last].mean()), rate, float(middle[0]), float(middle[-1]), int(attitude),
     )  # fmt: skip
+
+
+def _slope(time: Array, values: Array) -> float:
+    """Return the slope of the straight line through values over time, shape (n,)."""
+    centred = time - time.mean()
+    return float(centred @ (values - values.mean()) / (centred @ centred))
 
 
 def pool_covariance(cuts: Sequence[Cut]) -> Array:

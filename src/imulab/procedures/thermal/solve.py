@@ -431,6 +431,8 @@ def nominal(laws: Laws, zero: Array) -> Array:
 def _mean_directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
     """Return the mean direction of each unmoved group at these coefficients, shape (G, 3)."""
     count = int(problem.group.max(initial=-1)) + 1
+    if not count:
+        return np.empty((0, 3))
     force, _ = forces(evaluate_parameters(problem, laws, coefficients)[0], problem.reading)
     directions = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1)[:, None]

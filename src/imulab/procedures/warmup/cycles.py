@@ -670,7 +670,7 @@ def _quietest(variance: Array) -> Array:
     """Return the smallest running median over 1 min, or over a quarter of a log shorter than 4 min."""
     width = max(min(_QUIET, len(variance) // 4), 1)
     windows = np.lib.stride_tricks.sliding_window_view(variance, width, axis=0)[:: max(width // 6, 1)]
-    return medians(windows, -1).min(axis=0)
+    return np.asarray(medians(windows, -1).min(axis=0))
 
 
 def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
