@@ -454,6 +454,38 @@ def test_a_name_that_is_being_written_is_not_given_twice(bench):
     until(lambda: bench.part._jobs.jobs[job["number"]].ended)
 
 
+def test_a_file_that_is_dropped_again_replaces_the_older_and_its_results_say_so(bench):
+    def drop(seed: int) -> dict[str, Any]:
+        il.write_csv(il.simulate_tumble(attitudes=12, hold="3 s", gravity=9.81, seed=seed), "own.csv")
+        return bench.ask("files/own.csv", Path("own.csv").read_bytes(), "PUT").json()
+
+    name = drop(1)["name"]
+    fit = run(bench, "tumble fit", file=name, gravity="9.81", order="1", output="rec.json")
+    firmware = run(bench, "export", records=[fit.outputs[0]], to="c", output=True)
+    plan = run(bench, "tumble simulate", output="other.csv")
+    assert drop(1) == {"name": name, "replaced": False}  # the same again is no news
+    assert [job.replaced for job in (fit, firmware, plan)] == [[], [], []]
+    assert drop(2) == {"name": name, "replaced": True}
+    assert Path(name).read_bytes() == Path("own.csv").read_bytes()
+    assert [job.replaced for job in (fit, firmware, plan)] == [[name], [name], []]
+    assert run(bench, "tumble fit", file=name, gravity="9.81", order="1").replaced == []
+    own = bench.ask("files/rec.json", Path(fit.outputs[0]).read_bytes(), "PUT").json()
+    assert own == {"name": "session/rec-2.json", "replaced": False}  # what a command has made is not replaced
+    assert sorted(path.name for path in Path("session").iterdir() if path.name[0] == ".") == []
+
+
+def test_results_are_cleared_but_not_what_runs_nor_what_they_made(bench):
+    fit = run(bench, "tumble simulate", output="own.csv")
+    more = bench.ask("jobs", {"command": "tumble simulate", "values": {"output": "b.csv", "attitudes": "200"}}).json()
+    assert bench.ask("results", None, "DELETE").status == 200
+    assert fit.number not in bench.part._jobs.jobs
+    assert Path(fit.outputs[0]).is_file()
+    assert until(lambda: bench.part._jobs.jobs[more["number"]].ended)
+    assert run(bench, "tumble simulate", output="c.csv").number > more["number"]  # no number comes twice
+    bench.ask(f"results/{more['number']}", None, "DELETE")
+    assert more["number"] not in bench.part._jobs.jobs
+
+
 MANIFEST = """radius = {{ value = 2.0, unit = "m" }}
 rates = {{ unit = "deg/s" }}
 [[run]]

@@ -201,6 +201,29 @@ def test_what_is_refused_is_said_where_it_was_typed(workbench, new_page):
     page.wait_for_function("() => !document.querySelector('.wrong:not([hidden])')")
 
 
+def test_results_name_their_file_say_that_it_was_replaced_and_are_cleared(workbench, new_page):
+    page = new_page(workbench.address)
+    drop(page, "rec.csv", tumble("own.csv"))
+    read(page)
+    page.get_by_label("gravity", exact=True).fill("9.81")
+    command(page)
+    run(page)
+    page.locator(".job .found").wait_for()
+    title = page.locator(".job > summary").inner_text()
+    assert title.startswith("tumble fit of rec.csv")
+    assert re.search(r"\d\d:\d\d", title)
+    drop(page, "rec.csv", tumble("own.csv", seed=7))
+    page.get_by_text("rec.csv has been replaced by what came now").wait_for()
+    page.get_by_text("Made from an older rec.csv, which has been replaced since.").wait_for()
+    read(page)
+    assert page.locator(".entry .filename").all_inner_texts() == ["rec.csv", "rec.html", "rec.json"]
+    page.get_by_role("button", name="Clear the list of results").click()
+    page.wait_for_function("() => !document.querySelector('.job')")
+    page.reload()
+    page.locator(".entry").first.wait_for()
+    assert page.locator(".job").count() == 0
+
+
 def test_a_file_of_foreign_columns_asks_for_a_layout(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "phone.csv", "t;a\n1;x\n")

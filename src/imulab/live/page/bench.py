@@ -2,9 +2,9 @@
 
 Addresses, below ``/api/workbench``: ``files`` (GET; PUT, GET and DELETE of one), ``zip`` (a folder), ``reports`` (one
 that a command of this session has drawn), ``forms``, ``open`` and ``curves`` of a recording, ``command`` (what a form
-would run), ``jobs`` (POST runs it, DELETE cancels it), ``results`` (what to see first of one), ``statistics`` of a
-range, ``layouts`` that come with imulab, and ``columns`` of a file, as far as known, or the layout of those that were
-stated. Messages to pages: ``files``, ``opening``, ``job``.
+would run), ``jobs`` (POST runs it, DELETE cancels it), ``results`` (GET: what to see first of one; DELETE: forget it,
+or all that have ended), ``statistics`` of a range, ``layouts`` that come with imulab, and ``columns`` of a file, as far
+as known, or the layout of those that were stated. Messages to pages: ``files``, ``opening``, ``job``, ``cleared``.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
+from filecmp import cmp
 from itertools import count, takewhile
 from pathlib import Path
 from shlex import join
@@ -34,7 +35,7 @@ from starlette.routing import Route
 
 from imulab.errors import OptionError, quoted
 from imulab.files import confined, open_file, write_text
-from imulab.live.page.files import FolderFiles, Opening, Openings
+from imulab.live.page.files import FolderFiles, Opening, Openings, checked
 from imulab.live.page.jobs import Form, Jobs, PageJob
 from imulab.live.page.results import result_of
 from imulab.live.page.server import Hub, Message, PagePart, receive_file, report_response, to_json
@@ -71,6 +72,7 @@ class Workbench(PagePart):
         self._hub = Hub()
         self._jobs, self._openings = Jobs(self._tell_job), Openings(self._tell_opening)
         self._coming: set[str] = set()
+        self._dropped: set[str] = set()  # may be replaced: whoever dropped one has it
         self._lists = count()
         self._describing = asyncio.Semaphore(1)  # a process of its own tells the columns of a file
         shown = to_json([form.shown for form in forms.values()])
@@ -88,6 +90,8 @@ class Workbench(PagePart):
             Route(f"{_HERE}/layouts", self._layouts),
             Route(f"{_HERE}/columns", self._columns, methods=["POST"]),
             Route(f"{_HERE}/results/{{number:int}}", self._result),
+            Route(f"{_HERE}/results/{{number:int}}", self._clear, methods=["DELETE"]),
+            Route(f"{_HERE}/results", self._clear, methods=["DELETE"]),
             Route(f"{_HERE}/command", self._command, methods=["POST"]),
             Route(f"{_HERE}/jobs", self._run, methods=["POST"]),
             Route(f"{_HERE}/jobs/{{number:int}}", self._cancel, methods=["DELETE"]),
@@ -128,15 +132,28 @@ class Workbench(PagePart):
         return _json(self._list_message())
 
     async def _receive(self, request: Request) -> Response:
-        used = {path for job in self._jobs.jobs.values() for path in job.outputs}  # a report is one that was drawn
-        name = self._files.unused(request.path_params["name"], self._coming | used)
+        """Take a dropped file; it replaces one that was dropped before and that no command reads now."""
+        jobs = self._jobs.jobs.values()
+        used = {path for job in jobs for path in job.outputs}  # a report is one that was drawn
+        busy = self._coming | used | {path for job in jobs if job.is_open for path in job.inputs}
+        former = str(checked(self._files.folder, request.path_params["name"]))
+        replaces = former in self._dropped - busy and Path(former).is_file()
+        name = former if replaces else self._files.unused(request.path_params["name"], self._coming | used)
         self._coming.add(name)
+        place = Path(name).with_name(f".{Path(name).name}") if replaces else Path(name)
         try:
-            await receive_file(request, Path(name))
+            await receive_file(request, place)
+            replaces = replaces and not await run_in_threadpool(cmp, place, name, shallow=False)
+            if replaces:
+                place.replace(name)
+                self._jobs.mark_replaced(name)
         finally:
             self._coming.discard(name)
+            if place.name != Path(name).name:
+                place.unlink(missing_ok=True)
+        self._dropped.add(name)
         self._hub.tell(self._list_message())
-        return _json({"name": name})
+        return _json({"name": name, "replaced": replaces})
 
     async def _remove(self, request: Request) -> Response:
         name = self._files.path(request.path_params["name"])
@@ -144,6 +161,7 @@ class Workbench(PagePart):
         if not self._files.owns(name) or not path.is_file():
             raise OptionError(f"{name}: is not in the session's folder")
         path.unlink()
+        self._dropped.discard(name)
         self._hub.tell(self._list_message())
         return _json({})
 
@@ -223,6 +241,10 @@ class Workbench(PagePart):
         done = job is not None and job.state == "done"
         return _json(await run_in_threadpool(result_of, job.outputs) if job and done else {})
 
+    async def _clear(self, request: Request) -> Response:
+        self._hub.tell({"type": "cleared", "numbers": self._jobs.forget(request.path_params.get("number"))})
+        return _json({})
+
     async def _statistics(self, request: Request) -> Response:
         query = request.query_params
         start, stop, number = (_number(query.get(key), key) for key in ("from", "to", "opening"))
@@ -238,14 +260,15 @@ class Workbench(PagePart):
         )
         return _json({key: value for key, value in asdict(shown).items() if key != "rows"})
 
-    def _fill_form(self, asked: Mapping[str, Any]) -> tuple[Form, list[str], list[str]]:
-        """Return the form, the words and the outputs for the values of a page."""
+    def _fill_form(self, asked: Mapping[str, Any]) -> tuple[Form, list[str], list[str], list[str]]:
+        """Return the form, the words, the outputs and the files that go in, for the values of a page."""
         form = self._forms.get(str(asked.get("command")))
         values = asked.get("values")
         if form is None or not isinstance(values, dict):
             raise OptionError(f"command {quoted(asked.get('command'))}: not among those offered")
         inputs = [Path(each) for field in form.fields if not field.flag for each in _listed(values.get(field.name))]
         outputs: list[str] = []
+        used: list[str] = []
         running = {path for job in self._jobs.jobs.values() if job.is_open for path in job.outputs}
         taken = running | self._coming
 
@@ -265,17 +288,23 @@ class Workbench(PagePart):
             )
             return outputs[-1]
 
-        words = form.words(values, self._files.path, output)
-        return form, words, outputs
+        def file(name: str) -> str:
+            used.append(path := self._files.path(name))
+            return path
+
+        words = form.words(values, file, output)
+        return form, words, outputs, used
 
     async def _command(self, request: Request) -> Response:
         asked = await _object(request)
-        form, words, outputs = self._fill_form(asked)
+        form, words, outputs, _ = self._fill_form(asked)
         return _json({"command": join(["imulab", *words]), "outputs": outputs, "wrong": form.wrong(asked["values"])})
 
     async def _run(self, request: Request) -> Response:
-        form, words, outputs = self._fill_form(await _object(request))
-        return _json(_job_message(self._jobs.run(form.path, words, outputs, self._files.within(words))))
+        form, words, outputs, used = self._fill_form(await _object(request))
+        job = self._jobs.run(form.path, words, outputs, self._files.within(words), used)
+        self._dropped.difference_update(outputs)
+        return _json(_job_message(job))
 
     async def _cancel(self, request: Request) -> Response:
         await run_in_threadpool(self._jobs.cancel, request.path_params["number"])

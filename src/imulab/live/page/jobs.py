@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
+from itertools import count
 from pathlib import Path
 from time import time
 from typing import IO, Any
@@ -266,8 +267,10 @@ class PageJob:
         The command to type, quoted for a shell.
     words
         Its words without quotes, and without the program's name.
-    outputs
-        Paths of its outputs.
+    outputs, inputs
+        Paths of its outputs, and of the files that it was given.
+    replaced
+        Those files, at first or second hand, that have been replaced since.
     state
         ``waiting``, ``running``, ``done``, ``refused`` (exit status 2, or 1 of a test that failed), ``cancelled``.
     messages, text
@@ -290,6 +293,8 @@ class PageJob:
     began: float = dataclass_field(default_factory=time)
     ended: float | None = None
     within: list[str] | None = None
+    inputs: list[str] = dataclass_field(default_factory=list)
+    replaced: list[str] = dataclass_field(default_factory=list)
 
     @property
     def is_open(self) -> bool:
@@ -307,13 +312,19 @@ class Jobs:
         self._processes: dict[int, subprocess.Popen[str]] = {}
         self._watches: dict[int, threading.Thread] = {}
         self._due: set[int] = set()
+        self._numbers = count(1)
 
     def run(
-        self, path: str, words: Sequence[str], outputs: Sequence[str], within: Sequence[str] | None = None
+        self,
+        path: str,
+        words: Sequence[str],
+        outputs: Sequence[str],
+        within: Sequence[str] | None = None,
+        inputs: Sequence[str] = (),
     ) -> PageJob:
         """Start a command in the working folder, or let it wait while as many run as may; return its job.
 
-        `within` names the folders and files that it may read, None for all.
+        `within` names the folders and files that it may read, None for all; `inputs` are the files that it was given.
 
         Raises
         ------
@@ -322,9 +333,9 @@ class Jobs:
         """
         roots = None if within is None else [os.path.realpath(root) for root in within]
         with self._lock:
-            number = len(self.jobs) + 1
+            number = next(self._numbers)
             command = shlex.join(["imulab", *words])
-            job = PageJob(number, path, command, list(words), list(outputs), within=roots)
+            job = PageJob(number, path, command, list(words), list(outputs), within=roots, inputs=list(inputs))
             if len(self._processes) < self._most:
                 self._begin(job)
             self.jobs[number] = job
@@ -366,6 +377,23 @@ class Jobs:
         except subprocess.TimeoutExpired:
             _signal(process, signal.SIGTERM if _WINDOWS else signal.SIGKILL)
         self._watches[number].join(_GRACE)
+
+    def forget(self, number: int | None = None) -> list[int]:
+        """Forget what has ended, or one of it; return the numbers. What it made stays."""
+        with self._lock:
+            ended = [each for each, job in self.jobs.items() if not job.is_open and number in (None, each)]
+            for each in ended:
+                del self.jobs[each]
+        return ended
+
+    def mark_replaced(self, name: str) -> None:
+        """Note in each job that has used a file, or what another made of it, that the file has been replaced."""
+        former = {name}
+        for job in list(self.jobs.values()):  # in the order in which they were asked for
+            if former.intersection(job.inputs) or any(_mentions(each, name) for each in job.inputs):
+                job.replaced = list(dict.fromkeys([*job.replaced, name]))
+                former.update(job.outputs)
+                self._tell(job)
 
     def end(self) -> None:
         """End all commands, those that wait first."""
@@ -410,6 +438,13 @@ class Jobs:
         self._due.discard(job.number)
         if job.ended is None:
             self._tell(job)
+
+
+def _mentions(manifest: str, name: str) -> bool:
+    """Return whether a manifest of a test names a file."""
+    with suppress(OSError, UnicodeDecodeError):
+        return manifest.endswith(".toml") and Path(name).name in Path(manifest).read_text(encoding="utf-8")
+    return False
 
 
 def _cores() -> int:

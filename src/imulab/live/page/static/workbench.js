@@ -5,7 +5,7 @@
 import { h, put, show } from "./dom.js";
 import { columnTable, layoutList } from "./bench/columns.js";
 import { form } from "./bench/form.js";
-import { card } from "./bench/job.js";
+import { card, from } from "./bench/job.js";
 import { alike, fileList, kindOf } from "./bench/list.js";
 import { address, ask, send } from "./bench/net.js";
 import { plots } from "./bench/plot.js";
@@ -49,11 +49,12 @@ export function mount(into, given) {
   ui.file = h("section", { class: "file", "aria-label": "The chosen file", hidden: true });
   ui.procedure = h("section", { class: "procedure", "aria-labelledby": "bench-what", hidden: true });
   ui.jobs = h("div", { class: "jobs", "aria-label": "Results", role: "region" });
+  ui.clear = h("p", { class: "clear", hidden: true }, h("button", { type: "button", onclick: () => ask("results", undefined, { method: "DELETE" }).catch(fail) }, "Clear the list of results"), " What they made stays.");
   ui.status = h("p", { class: "statusline", role: "status", hidden: true });
   place.append(ui.bench = h("div", { class: "bench nothing" },
     h("p", { class: "welcome" }, "See a recording of an inertial sensor, calibrate it, and take the record, the report and the firmware with you."),
     h("div", { class: "side" }, h("div", { class: "droparea" }, ui.input, ui.drop), ui.coming, ui.try, ui.list.element, ui.where),
-    h("div", { class: "work" }, ui.file, ui.jobs, ui.procedure, ui.status)));
+    h("div", { class: "work" }, ui.file, ui.jobs, ui.clear, ui.procedure, ui.status)));
   for (const kind of ["dragover", "drop", "dragleave"]) {
     addEventListener(kind, event => {
       if (place.hidden || ![...(event.dataTransfer?.types || [])].includes("Files")) return;
@@ -74,6 +75,7 @@ export function hear(message) {
   if (message.type === "files") listed(message);
   else if (message.type === "opening" && message.file === chosen?.name && JSON.stringify(message.reading) === JSON.stringify(reading)) opened(message);
   else if (message.type === "job") worked(message);
+  else if (message.type === "cleared") cleared(message.numbers);
 }
 
 // A file is not read before somebody looks, and a session beside this may have written others.
@@ -92,10 +94,11 @@ async function take(given) {
     const row = h("li", {}, file.name, part);
     ui.coming.append(row);
     try {
-      const name = await send(file, gone => { part.value = gone; });
+      const { name, replaced } = await send(file, gone => { part.value = gone; });
       came.push(name);
       if (!files.some(each => each.name === name)) listed(await ask("files"));
-      if (clicks === before && came.length === 1) arrived(name);
+      if (replaced) page.say(`${file.name} has been replaced by what came now; results of the older one say so.`);
+      if (clicks === before && came.length === 1) arrived(name, replaced);
     } catch (error) {
       fail(error);
     }
@@ -108,10 +111,11 @@ async function take(given) {
 }
 
 // A layout that comes while a file cannot be read is meant for that file.
-function arrived(name) {
+function arrived(name, replaced) {
   const entry = files.find(each => each.name === name);
   if (entry?.kind === "layout" && chosen?.kind === "recording" && opening?.error) readSo({ ...reading, layout: name });
   else if (chosen?.name !== name) pick(name);
+  else if (replaced) choose(name, { others, procedure });
 }
 
 function listed(message) {
@@ -512,8 +516,18 @@ function tell(job, state_ = "") {
   const words = { waiting: "waits", running: "runs", done: state_ ? `done: ${state_}` : "done", refused: "was refused", cancelled: "was cancelled" }[job.state];
   show(ui.status, true);
   ui.status.className = `statusline ${job.state} ${state_}`;
-  ui.status.replaceChildren(h("span", {}, `${job.path} ${words}${waiting > 1 ? `; ${waiting} in all` : ""}`), " ",
+  ui.status.replaceChildren(h("span", {}, `${job.path}${from(job)} ${words}${waiting > 1 ? `; ${waiting} in all` : ""}`), " ",
     h("button", { type: "button", onclick: () => { const found = cards.get(job.number); found.element.open = true; found.element.scrollIntoView({ block: "start" }); } }, job.ended === null ? "Show" : "Show the result"));
+}
+
+// Takes results off the list, here and on every page.
+function cleared(numbers) {
+  for (const number of numbers) {
+    cards.get(number)?.element.remove();
+    cards.delete(number);
+  }
+  if (numbers.includes(latestJob?.number)) { latestJob = null; show(ui.status, false); }
+  show(ui.clear, cards.size > 0);
 }
 
 function worked(job) {
@@ -526,6 +540,7 @@ function worked(job) {
     cards.set(job.number, found);
     found.element.files = job.words;
     ui.jobs.prepend(found.element);
+    show(ui.clear, true);
     if (Date.now() / 1000 - job.began < 5) {
       const settings = ui.form?.querySelector("details.settings");
       if (settings && settings.querySelector("summary").textContent === job.path) settings.open = false;

@@ -8,10 +8,20 @@ import { lossy, result } from "./result.js";
 const STATES = { waiting: "waiting", running: "running", done: "done", refused: "refused", cancelled: "cancelled" };
 const FAILED_TEST = /^fail\b/;
 
+const clock = seconds => new Date(seconds * 1000).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
+const bare = name => name.slice(Math.max(name.lastIndexOf("/"), name.lastIndexOf("\\")) + 1);
+
+// The files that a command was given, as one says them; of many, the first.
+export function from({ inputs }) {
+  const names = [...new Set(inputs)].map(bare);
+  return !names.length ? "" : ` of ${names.length > 2 ? `${names[0]} and ${names.length - 1} more` : names.join(" and ")}`;
+}
+
 // `act.look(name)` shows a file, `act.kind(name)` is its kind; what else `act` has is for `result`.
 export function card(job, act) {
   const state = h("span", { class: "chip" });
   const time = h("span", { class: "time" });
+  const stale = h("p", { class: "said look", hidden: true });
   const said = h("ul", { class: "heard", "aria-live": "polite" });
   const text = h("pre", { tabindex: 0, "aria-label": "result" });
   const verdict = h("p", { class: "state", hidden: true });
@@ -20,8 +30,8 @@ export function card(job, act) {
   const first = h("div", {});
   const cancel = h("button", { type: "button", onclick: () => { cancel.disabled = true; ask(`jobs/${job.number}`, undefined, { method: "DELETE" }).catch(() => {}); } }, "Cancel");
   const element = h("details", { class: "job", open: true, id: `job-${job.number}` },
-    h("summary", {}, h("strong", {}, job.path), state, time),
-    h("p", { class: "go" }, cancel), first, verdict, made, frame,
+    h("summary", {}, h("strong", {}, job.path), h("span", { class: "from" }, from(job)), state, h("span", { class: "time" }, `${clock(job.began)}, `), time),
+    stale, h("p", { class: "go" }, cancel), first, verdict, made, frame,
     h("details", { class: "more all", open: true }, h("summary", {}, "All that it says"), said, text, h("p", { class: "same" }, "The command that does the same:"), commandLine(job.command)));
   const all = element.querySelector(".all");
   let now = null;
@@ -42,7 +52,7 @@ export function card(job, act) {
   }
 
   function buttons(name) {
-    const short = name.slice(Math.max(name.lastIndexOf("/"), name.lastIndexOf("\\")) + 1);
+    const short = bare(name);
     const kind = act.kind(name) || (short.endsWith(".html") ? "report" : short.includes(".") ? "recording" : "folder");
     const save = (href, label) => h("a", { class: "button", href, download: "" }, label);
     if (kind === "folder") return [...(act.holds(name) ? [h("button", { type: "button", class: "main", onclick: () => act.look(name) }, `Look at ${short}`)] : []), save(address("zip", name), `Save ${short}.zip`)];
@@ -57,6 +67,8 @@ export function card(job, act) {
     put(state, failed ? "fail" : STATES[now.state]);
     state.className = `chip ${failed ? "refused" : now.state}`;
     show(cancel.parentElement, now.ended === null);
+    show(stale, now.replaced.length > 0);
+    put(stale, `Made from an older ${now.replaced.map(bare).join(" and ")}, which has been replaced since.`);
     for (const line of now.messages.slice(said.children.length)) {
       const own = line.replace(/^imulab: /, "");
       said.append(h("li", { class: /^(note|warning)/.test(own) ? own.split(":")[0] : now.status === 0 ? "" : "bad" }, own));

@@ -32,7 +32,7 @@ export function send(file, tell) {
     request.onload = () => {
       let answer = {};
       try { answer = JSON.parse(request.responseText); } catch { answer = { error: request.responseText }; }
-      if (request.status === 200) done(answer.name);
+      if (request.status === 200) done(answer);
       else failed(new Error(answer.error || `${file.name}: was not received`));
     };
     request.send(file);
