@@ -8,6 +8,7 @@ import pytest
 
 import imulab as il
 from conftest import table
+from imulab.cli import main
 from imulab.errors import OptionError
 from imulab.gravity import ANOMALY, at_latitude, field_at, gravity_option, normal_gravity, site, stated_gravity
 from imulab.procedures.views import compare_records
@@ -280,3 +281,36 @@ def test_without_the_package_of_the_models_the_refusal_names_its_extra(monkeypat
     monkeypatch.setitem(sys.modules, "pygeomag", None)
     with pytest.raises(OptionError, match=r"needs pygeomag, which is not here: pip install '\.\[place\]'"):
         field_at(site("48.1,11.6"), "2026-11-28")
+
+
+def test_a_place_stands_for_latitude_and_height(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    expected = normal_gravity(math.radians(48.1), 520.0)
+    tumble = il.simulate_tumble(attitudes=14, order=1, gravity=expected, hold="3 s", seed=2)
+    il.write_csv(tumble, "t.csv")
+    assert main(["tumble", "fit", "t.csv", "--order", "1", "--place", "48.1,11.6,520", "-o", "r.json"]) == 0
+    record = il.load("r.json")
+    assert record.model["gravity"]["value"] == pytest.approx(expected, rel=1e-12)
+    assert record.model["gravity"]["standard_uncertainty"] == pytest.approx(ANOMALY)
+    same = il.fit_tumble(tumble, order=1, place="48.1,11.6,520").calibration
+    assert same.model["gravity"]["value"] == record.model["gravity"]["value"]
+    assert main(["tumble", "check", "r.json", "t.csv", "--place", "48.1,11.6,520"]) == 0
+    stated = il.fit_tumble(tumble, order=1, place="48.1,11.6,520", gravity=9.81, with_="gyro").calibration
+    assert stated.model["gravity"]["value"] == 9.81
+    assert stated.fit["gyro"]["latitude"] == pytest.approx(math.radians(48.1))
+    warm = il.simulate_thermal([0, 30], attitudes=14, ramps=0, seed=1)
+    thermal = il.fit_thermal(warm, degrees="1,0,0", place="48.1,11.6,520").calibration
+    assert thermal.model["gravity"]["value"] == pytest.approx(expected, rel=1e-12)
+    assert il.check_thermal(thermal, warm[0], place="48.1,11.6,520").gravity.value == pytest.approx(expected)
+    capsys.readouterr()
+    for command in (["tumble", "fit", "t.csv"], ["tumble", "check", "r.json", "t.csv"], ["thermal", "fit", "t.csv"]):
+        assert main([*command, "--place", "48.1,11.6", "--latitude", "48.1"]) == 2
+        assert "--place together with --latitude or --height" in capsys.readouterr().err
+
+
+def test_a_place_that_is_typed_wins_over_the_gravity_of_the_project_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "imulab.toml").write_text('gravity = "9.7"\n')
+    il.write_csv(il.simulate_tumble(attitudes=14, order=1, gravity=9.80739, hold="3 s", seed=2), "t.csv")
+    assert main(["tumble", "fit", "t.csv", "--order", "1", "--place", "48.1,11.6", "-o", "r.json"]) == 0
+    assert il.load("r.json").model["gravity"]["value"] == pytest.approx(normal_gravity(math.radians(48.1)))

@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, install, quoted
-from imulab.options import Group, text
+from imulab.options import Group, parsed, text
 from imulab.quantities import in_si, number, quantity, with_uncertainty
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
@@ -141,7 +141,12 @@ def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
 
 
 def gravity_option(
-    gravity: str | None, latitude: str | None, height: str | None, label: str, *, beside: bool = False
+    gravity: str | None,
+    latitude: float | str | None,
+    height: float | str | None,
+    label: str,
+    *,
+    beside: bool = False,
 ) -> Gravity | None:
     """Return the gravity that options state, or None; `label` makes the name of an option in messages (``"--{}"``).
 
@@ -485,6 +490,32 @@ def field_at(place: Site, date: str, name: str = "date") -> ModelField:
         model.model,
         str(day),
     )
+
+
+StatedSite: TypeAlias = Annotated[str | Site | None, parsed(site, "LAT,LON[,HEIGHT]", unit="deg, m"), _GROUP]
+
+
+def of_place(
+    place: str | Site | None,
+    gravity: object,
+    latitude: float | str | None,
+    height: float | str | None = None,
+    label: str = "{}",
+) -> tuple[float | str | None, float | str | None]:
+    """Return latitude and height: those of a stated place, else as stated; no height beside a stated gravity.
+
+    Raises
+    ------
+    OptionError
+        Latitude or height are stated beside the place.
+    """
+    if place is None:
+        return latitude, height
+    if latitude is not None or height is not None:
+        names = [label.format(name) for name in ("place", "latitude", "height")]
+        raise OptionError(f"{names[0]} together with {names[1]} or {names[2]}: expected one or the other")
+    where = place if isinstance(place, Site) else site(place, label.format("place"))
+    return where.latitude, None if gravity is not None else where.height
 
 
 def stated_site(

@@ -100,7 +100,7 @@ def additions(settings: Mapping[str, str], typed: Mapping[str, object], files: S
     their columns are; else it is for those that do not.
     """
     added = {key: text for key, text in settings.items() if key in typed and typed[key] is None}
-    if any(typed.get(key) is not None for key in _GRAVITY):
+    if any(typed.get(key) is not None for key in (*_GRAVITY, "place")):
         added = {key: text for key, text in added.items() if key not in _GRAVITY}
     if "layout" in added and files and all(map(_describes_itself, files)):
         del added["layout"]

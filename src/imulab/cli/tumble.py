@@ -187,14 +187,15 @@ def check(
     """
     from imulab.cli.show import finish_check, notes_on_data
     from imulab.errors import RecordError
-    from imulab.gravity import gravity_option
+    from imulab.gravity import gravity_option, of_place
     from imulab.procedures.registry import load
     from imulab.procedures.tumble.attitudes import find_attitudes
     from imulab.procedures.tumble.check import check_tumble
 
     check_outputs([report], [name for name in (record, file, options["layout"]) if name])
     held = load(record)
-    local = gravity_option(options["gravity"], options["latitude"], options["height"], FLAG)
+    latitude, height = of_place(options["place"], options["gravity"], options["latitude"], options["height"], FLAG)
+    local = gravity_option(options["gravity"], latitude, height, FLAG, beside=options["place"] is not None)
     limit = options["limit"]
     largest = None if limit is None else quantity(limit, "--limit", "acceleration", "mg")
     attitudes = find_attitudes(read_recording(file, **reading(options)))

@@ -214,7 +214,8 @@ def apply(
         Add columns of magnetic or true heading and dip, deg, with uncertainties. Columns ``heading`` (of the body's x
         axis, clockwise from magnetic north; with ``"true"`` from true north, by the declination of the record's place),
         ``std_heading``, ``dip`` and ``std_dip`` of a unit at rest, with standard uncertainties by the record's
-        covariance, the scatter of its attitudes, and the acceleration that shows where ``|f|`` is off g by more than 1 %.
+        covariance, the scatter of its attitudes, and the acceleration that shows where ``|f|`` is off g by more than
+        1 %.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.

@@ -137,11 +137,11 @@ class Form:
 
 def _wrong_gravity(typed: Mapping[str, str]) -> dict[str, str]:
     """Return why gravity, latitude and height, as typed, state none, at the one that the sentence begins with."""
-    from imulab.gravity import gravity_option
+    from imulab.gravity import gravity_option, of_place
 
-    gravity, latitude, height = (typed.get(name) or None for name in ("gravity", "latitude", "height"))
+    gravity, latitude, height, place = (typed.get(name) or None for name in ("gravity", "latitude", "height", "place"))
     try:
-        gravity_option(gravity, latitude, height, "{}", beside=True)
+        gravity_option(gravity, *of_place(place, gravity, latitude, height), "{}", beside=True)
     except ImulabError as error:
         text = str(error)
         return {next((name for name in typed if text.startswith(name)), "gravity"): text}

@@ -16,7 +16,17 @@ from imulab.columns import triad
 from imulab.display import Note
 from imulab.errors import OptionError, RecordError, UnitError
 from imulab.estimation.decisions import THERMAL_CHECK
-from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
+from imulab.gravity import (
+    Gravity,
+    Height,
+    Latitude,
+    LocalGravity,
+    StatedSite,
+    at_latitude,
+    at_place,
+    local_gravity,
+    of_place,
+)
 from imulab.options import FURTHER_TRIADS, measure, text
 from imulab.procedures.result import (
     Record,
@@ -248,6 +258,7 @@ def check_thermal(
     gravity: LocalGravity = None,
     latitude: Latitude = None,
     height: Height = None,
+    place: StatedSite = None,
     tilt: Annotated[float | str, measure("angle", "mrad")] = "0.2 mrad",
     turn_on_scatter: Annotated[float | str | None, measure("acceleration", "mg", "SIZE")] = None,
     gyro_turn_on_scatter: Annotated[float | str | None, measure("rate", "deg/s", "SIZE"), FURTHER_TRIADS] = None,
@@ -272,7 +283,7 @@ def check_thermal(
         Largest ``| |f| - g |`` that passes, beside the test. In m/s^2, or a text such as ``"2 mg"``.
     gravity
         Local gravity where they were measured; else of the first head, else of the record. As for `fit_tumble`.
-    latitude, height
+    latitude, height, place
         As for `fit_tumble`.
     tilt
         As for `fit_thermal`.
@@ -304,6 +315,7 @@ def check_thermal(
     (12,)
     """
     held = as_record(record, "check_thermal")
+    latitude, height = of_place(place, gravity, latitude, height)
     if held.procedure != "thermal":
         raise RecordError(f"a {held.procedure} record cannot be checked over temperature; expected a thermal record")
     if is_ramp(held):
@@ -324,7 +336,8 @@ def check_thermal(
     if gyro_turn_on_scatter is not None and not has_gyroscopes:
         raise OptionError("gyro_turn_on_scatter: the record holds no gyroscopes (thermal fit --with gyro)")
     earth = at_latitude(latitude) if has_gyroscopes else None
-    local = _choose_gravity(held, at_place(gravity, latitude, height, beside=earth is not None), recordings[0])
+    beside = earth is not None or place is not None
+    local = _choose_gravity(held, at_place(gravity, latitude, height, beside=beside), recordings[0])
     holds, notes = select_in_range(held, find_holds(recordings))
     unit = thermal_of(held).model.output_unit
     check_holds(holds, local.value, conversion_factor(unit, "m/s^2") if unit in ("m/s^2", "g", "mg") else None)

@@ -15,7 +15,17 @@ import numpy as np
 from imulab.display import UNJUDGED
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import Observability
-from imulab.gravity import EarthRate, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
+from imulab.gravity import (
+    EarthRate,
+    Height,
+    Latitude,
+    LocalGravity,
+    StatedSite,
+    at_latitude,
+    at_place,
+    local_gravity,
+    of_place,
+)
 from imulab.options import FURTHER_TRIADS, measure, parsed, text
 from imulab.procedures.result import OWN_CLOCKS, Record, Result, as_record, as_recording
 from imulab.procedures.thermal import check_degrees, parse_further, parse_laws
@@ -92,6 +102,7 @@ def fit_thermal(
     gravity: LocalGravity = None,
     latitude: Latitude = None,
     height: Height = None,
+    place: StatedSite = None,
     prior: Record | None = None,
     with_: Annotated[str | Sequence[str], parsed(parse_further, "gyro", ("gyro",)), FURTHER_TRIADS] = (),
     tilt: Annotated[float | str, measure("angle", "mrad")] = "0.2 mrad",
@@ -115,7 +126,7 @@ def fit_thermal(
         Of the laws of bias, scale factor and misalignment, 3,2,1, or spline,2,1; auto: from there down, or a spline.
         ``"spline,2,1"``: biases are natural cubic splines with a knot at each temperature; ``"auto"``: from 3,2,1 down,
         as data allow, or the spline where it predicts as well.
-    gravity, latitude, height
+    gravity, latitude, height, place
         As for `fit_tumble`.
     prior
         Tumble record of this unit at a known temperature: counts as one recording. A record of order 1, or its file.
@@ -157,13 +168,14 @@ def fit_thermal(
     further = parse_further(with_, "with_")
     wanted, spline = parse_laws(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
     settling = None if settle is None else in_si(settle, "settle", "time", "s")
+    latitude, height = of_place(place, gravity, latitude, height)
     as_read = [as_recording(item, reading, fit_thermal, clock=OWN_CLOCKS) for item in _as_list(data)]
     if prior is None and are_rest_ramps(as_read):
         return _fit_ramps(as_read, wanted, spline, gyro_turn_on_scatter, settling, temperature_column, latitude)
     recordings = prepare_recordings([one_clock(each, "accel") for each in as_read], temperature_column, settling)
     gyroscopes = _gyroscopes(as_read, recordings, temperature_column, settling) if further else recordings
     earth = at_latitude(latitude) if further else None
-    local = local_gravity(at_place(gravity, latitude, height, beside=earth is not None), recordings[0])
+    local = local_gravity(at_place(gravity, latitude, height, beside=bool(earth or place)), recordings[0])
     holds = replace(find_holds(recordings), gyroscopes=tuple(gyroscopes))
     nominal = conversion_factor(holds.unit, "m/s^2") if parse_unit(holds.unit).quantity == "acceleration" else None
     doubts = check_holds(holds, local.value, nominal)
@@ -183,15 +195,11 @@ def fit_thermal(
     covered, hidden = cover_hidden(problem, choice.solution, drift, name)
     options = {
         "degrees": wanted if isinstance(wanted, str) else ["spline", *wanted[1:]] if spline else list(wanted),
-        "gravity": local.value,
-        "tilt": leaning,
-        "with": list(further) or None,
+        "gravity": local.value, "tilt": leaning, "with": list(further) or None,
         "latitude": None if earth is None else earth.latitude,
         "turn_on_scatter": None if scatter is None else scatter * local.value,
-        "gyro_turn_on_scatter": rates,
-        "temperature_column": temperature_column,
-        "settle": settling,
-    }
+        "gyro_turn_on_scatter": rates, "temperature_column": temperature_column, "settle": settling,
+    }  # fmt: skip
     choice = replace(choice, solution=covered)
     record = make_record(holds, problem, choice, drift, local, scale, _drop_unstated(options), name)
     record = replace(record, warnings=(*doubts, *record.warnings, *hidden), verdict=UNJUDGED)

@@ -41,12 +41,15 @@ def _function() -> Callable[..., ThermalFit]:
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    from imulab.gravity import at_latitude, gravity_option
+    from imulab.gravity import at_latitude, gravity_option, of_place
 
     values = read_options(TASK.options, texts, label)
     values["with"] = values["with"] or ()
-    earth = at_latitude(values["latitude"], label.format("latitude")) if values["with"] else None
-    gravity = gravity_option(values["gravity"], values["latitude"], values["height"], label, beside=earth is not None)
+    place = values["place"]
+    latitude, height = of_place(place, values["gravity"], values["latitude"], values["height"], label)
+    earth = at_latitude(latitude, label.format("latitude")) if values["with"] else None
+    beside = earth is not None or place is not None
+    gravity = gravity_option(values["gravity"], latitude, height, label, beside=beside)
     fit = {name: values[name] for name in _OF_THE_FIT}
     fit |= {"gravity": gravity, "with_": values["with"], "latitude": None if earth is None else earth.latitude}
     return {**values, "fit": fit, "part": part_of(values)}

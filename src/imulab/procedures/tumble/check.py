@@ -17,7 +17,7 @@ from imulab.estimation.decisions import ATTITUDES_DISTURBED, TUMBLE_CHECK
 from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import median
-from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_place, local_gravity
+from imulab.gravity import Gravity, Height, Latitude, LocalGravity, StatedSite, at_place, local_gravity, of_place
 from imulab.options import measure
 from imulab.procedures.result import Record, RecordCheck, as_record, columns_as_rows, probability_fact, probability_text
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
@@ -354,6 +354,7 @@ def check_tumble(
     gravity: LocalGravity = None,
     latitude: Latitude = None,
     height: Height = None,
+    place: StatedSite = None,
     **reading: Unpack[Reading],
 ) -> Check:
     """Test whether fresh attitudes contradict an existing record, without refitting.
@@ -374,7 +375,7 @@ def check_tumble(
         Largest ``| |f| - g |`` that passes, beside the test. In m/s^2, or a text such as ``"2 mg"``.
     gravity
         Local gravity where they were measured; else of the file's head, else of the record. As for `fit_tumble`.
-    latitude, height
+    latitude, height, place
         As for `fit_tumble`.
     reading
         How arrays and files are to be understood, as for `fit_tumble`.
@@ -411,7 +412,8 @@ def check_tumble(
     if limit is None and not record.covariance.names:
         raise RecordError("the record states no uncertainties to test against; expected a fixed limit (--limit 1mg)")
     check_uncorrected(record, attitudes.recording)
-    local = _gravity(record, at_place(gravity, latitude, height), attitudes)
+    latitude, height = of_place(place, gravity, latitude, height)
+    local = _gravity(record, at_place(gravity, latitude, height, beside=place is not None), attitudes)
     attitudes = _convert_attitudes(record, attitudes)
     g, order = local.value, model_of(record).order
     scale = g * np.array([record.value(f"scale_factor_{axis}") for axis in "xyz"])

@@ -10,7 +10,17 @@ from numpy.typing import ArrayLike
 
 from imulab.errors import OptionError
 from imulab.estimation.least_squares import Observability
-from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_latitude, at_place, local_gravity
+from imulab.gravity import (
+    Gravity,
+    Height,
+    Latitude,
+    LocalGravity,
+    StatedSite,
+    at_latitude,
+    at_place,
+    local_gravity,
+    of_place,
+)
 from imulab.options import FURTHER_TRIADS, PROGRAM, RARE, choice, measure, parsed
 from imulab.procedures import tumble
 from imulab.procedures.result import Record, Result, as_record
@@ -85,6 +95,7 @@ def fit_tumble(
     gravity: LocalGravity = None,
     latitude: Latitude = None,
     height: Height = None,
+    place: StatedSite = None,
     method: Annotated[str, choice(METHODS)] = "norm",
     loss: Annotated[str, choice(LOSSES)] = "auto",
     nonlinearity: Annotated[tuple[float, float] | str | None, parsed(tumble.nonlinearity, "20ug,20ug"), RARE] = None,
@@ -126,6 +137,8 @@ def fit_tumble(
         ``"gyro"`` it is that of `fit_gyro` too, and may stand beside gravity.
     height
         Height above the ellipsoid, beside the latitude.
+    place
+        Latitude, longitude and height together, such as 48.1,11.6,520. Deg and m, in place of latitude and height.
     method
         norm: by the length of f; linearised: the published first-order iteration.
     loss
@@ -212,21 +225,20 @@ def fit_tumble(
     ['m/s^2', 'rad/s', 'T']
     """
     order = tumble.order(order, "order") if isinstance(order, str) else order
-    nonlinearity = tumble.nonlinearity(nonlinearity, "nonlinearity") if isinstance(nonlinearity, str) else nonlinearity
-    ageing = tumble.ageing(ageing, "ageing") if isinstance(ageing, str) else ageing
-    asymmetry = None if asymmetry is None else in_si(asymmetry, "asymmetry", "number", "ppm")
+    nonlinearity, ageing, asymmetry, magnitude = _as_numbers(nonlinearity, ageing, asymmetry, field)
     threshold, preset = _iteration(threshold, preset)
     monte_carlo = None if monte_carlo is None else whole(monte_carlo, "monte_carlo")
     further = further_triads(with_, "with_")
-    magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
     check_options(
         order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing, cross=cross, dip=dip,
         nonlinearity=nonlinearity, asymmetry=asymmetry, threshold=threshold, preset=preset, further=further,
         field=magnitude, hemisphere=hemisphere,
     )  # fmt: skip
-    place = _stated_place(further, hemisphere, latitude, dip)
+    latitude, height = of_place(place, gravity, latitude, height)
+    stated = _stated_place(further, hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
-    local = local_gravity(at_place(gravity, latitude, height, beside="gyro" in further), attitudes.recording)
+    beside = "gyro" in further or place is not None
+    local = local_gravity(at_place(gravity, latitude, height, beside=beside), attitudes.recording)
     scaling = _checked_scaling(attitudes, local.value, method, preset)
     known, order = _known_and_order(prior, order, method, attitudes)
     rest = _threshold(threshold, local.value) if method == "linearised" else None
@@ -242,10 +254,25 @@ def fit_tumble(
     trials = None if monte_carlo is None else _propagated(estimate, monte_carlo, progress)
     record = make_record(estimate, local, scaling, {k: v for k, v in options.items() if v is not None}, trials)
     return TumbleFit(
-        _with_further(with_assumed_alignment(record), further, attitudes, local, loss, magnitude, place, latitude),
+        _with_further(with_assumed_alignment(record), further, attitudes, local, loss, magnitude, stated, latitude),
         estimate.observability, estimate.orders, local.value * estimate.found.solution.deviations[0],
         estimate.found.solution.down_weights[0],
     )  # fmt: skip
+
+
+def _as_numbers(
+    nonlinearity: tuple[float, float] | str | None,
+    ageing: Sequence[float] | str,
+    asymmetry: float | str | None,
+    field: float | str | None,
+) -> tuple[tuple[float, float] | None, Sequence[float], float | None, float | None]:
+    """Return nonlinearity, ageing, asymmetry and field, which may be texts, as numbers."""
+    return (
+        tumble.nonlinearity(nonlinearity, "nonlinearity") if isinstance(nonlinearity, str) else nonlinearity,
+        tumble.ageing(ageing, "ageing") if isinstance(ageing, str) else ageing,
+        None if asymmetry is None else in_si(asymmetry, "asymmetry", "number", "ppm"),
+        None if field is None else in_si(field, "field", "magnetic field", "uT"),
+    )
 
 
 def _iteration(

@@ -60,7 +60,7 @@ def _fit(
         field=values["field"],
         hemisphere=values["hemisphere"],
         dip=values["dip"],
-        latitude=values["place"],
+        latitude=values["earth"],
         progress=progress,
     ).calibration
 
@@ -92,11 +92,13 @@ def _function() -> Callable[..., TumbleFit]:
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    from imulab.gravity import at_latitude, gravity_option
+    from imulab.gravity import at_latitude, gravity_option, of_place
     from imulab.procedures.tumble.estimate import check_options
 
     values = read_options(TASK.options, texts, label)
     values["ageing"], values["with"] = values["ageing"] or (), values["with"] or ()
+    place = values["place"]
+    latitude, height = of_place(place, values["gravity"], values["latitude"], values["height"], label)
     with labelled(label, _NAMED):
         check_options(
             values["order"], values["method"], values["loss"],
@@ -108,13 +110,11 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         if "mag" in values["with"]:
             from imulab.procedures.tumble.mag.solve import parse_place
 
-            place = parse_place(values["hemisphere"], values["latitude"], values["dip"])
-            values["hemisphere"] = place.hemisphere
-    earth = at_latitude(values["latitude"], label.format("latitude")) if "gyro" in values["with"] else None
-    values["place"] = None if earth is None else earth.latitude
-    values["gravity"] = gravity_option(
-        values["gravity"], values["latitude"], values["height"], label, beside="gyro" in values["with"]
-    )
+            values["hemisphere"] = parse_place(values["hemisphere"], latitude, values["dip"]).hemisphere
+    earth = at_latitude(latitude, label.format("latitude")) if "gyro" in values["with"] else None
+    values["earth"] = None if earth is None else earth.latitude
+    beside = earth is not None or place is not None
+    values["gravity"] = gravity_option(values["gravity"], latitude, height, label, beside=beside)
     return {**values, "part": part_of(values)}
 
 
