@@ -42,7 +42,7 @@ SCENARIOS = (
         "tumble",
         "What are the errors of this accelerometer triad, with gravity as the only reference?",
         """
-imulab tumble simulate --order 2 --gravity 9.81362 --knock 7 --seed 4 -o tumble.csv
+imulab tumble simulate --order 2 --gravity 9.81362 --knock 7 --seed 4 --rate "40 Hz" -o tumble.csv
 imulab tumble fit tumble.csv --gravity 9.81362 -o tumble.json --report tumble.html
 imulab apply tumble.json tumble.csv -o tumble_corrected.csv
 """,
@@ -53,7 +53,7 @@ imulab apply tumble.json tumble.csv -o tumble_corrected.csv
         "gyro array",
         "What does fusing six cheap gyroscopes really buy?",
         """
-imulab array simulate --experiment static --duration "400 s" -o array_still.csv
+imulab array simulate --experiment static --duration "160 s" -o array_still.csv
 imulab array simulate --experiment dynamic --session 1 -o array.csv
 imulab array simulate --experiment dynamic --session 1 --fault stuck:3:40:20 -o array_fault.csv
 imulab array calibrate array_still.csv -o array_calibration.json --report array_calibration.html
@@ -67,7 +67,7 @@ imulab array compare array.csv --calibration array_calibration.json -o array.jso
         "warm-up",
         "How large is the bias of the minutes after power-on, and what is left with a table in the unit?",
         """
-imulab warmup simulate -o warmup
+imulab warmup simulate --rate "1 Hz" -o warmup
 imulab warmup fit warmup/*.csv --model auto -o warmup.json --report warmup.html
 """,
         "warmup.json",
@@ -77,7 +77,7 @@ imulab warmup fit warmup/*.csv --model auto -o warmup.json --report warmup.html
         "centrifuge",
         "How does the g-sensitive drift of a flexible gyroscope change with g?",
         """
-imulab centrifuge simulate --levels 1,5,10,20 --duration "3 min" --both-senses -o centrifuge
+imulab centrifuge simulate --levels 1,5,10,20 --duration "3 min" --both-senses --rate "12 Hz" -o centrifuge
 imulab centrifuge reduce centrifuge/manifest.toml -o centrifuge.json --report centrifuge.html
 """,
         "centrifuge.json",
@@ -87,7 +87,7 @@ imulab centrifuge reduce centrifuge/manifest.toml -o centrifuge.json --report ce
         "noise",
         "What must a filter be told of the noise of this unit, and how sure is that?",
         """
-imulab noise simulate --white "0.3 deg/sqrt(h)" --flicker "12 deg/h" --walk "60 deg/h/sqrt(h)" --rate 50 -o rest.csv
+imulab noise simulate --white "0.3 deg/sqrt(h)" --flicker "12 deg/h" --walk "60 deg/h/sqrt(h)" --rate 5 -o rest.csv
 imulab noise fit rest.csv -o noise.json --report noise.html
 imulab noise plan --from noise.json --for walk=10%
 """,
@@ -98,7 +98,7 @@ imulab noise plan --from noise.json --for walk=10%
         "fleet",
         "Is the production line still making the same thing?",
         """
-imulab fleet simulate -o line
+imulab fleet simulate --rate "15 Hz" -o line
 imulab fleet run line/first.csv -o line/records --workers 1
 imulab fleet run line/second.csv -o line/records --workers 1
 imulab fleet report line/records --limits line/limits.toml -o fleet.html

@@ -356,7 +356,13 @@ LIMITS = """[tumble]
 """
 
 
-def simulate_fleet(folder: Folder, *, units: int | str = 12, seed: int | str = 1) -> tuple[Path, Path]:
+def simulate_fleet(
+    folder: Folder,
+    *,
+    units: int | str = 12,
+    rate: Annotated[float | str, measure("frequency", "Hz")] = "100 Hz",
+    seed: int | str = 1,
+) -> tuple[Path, Path]:
     """Write the recordings of a line's units, two manifests and limits; return the paths of the manifests.
 
     ``first.csv`` calibrates every unit, one a day; ``second.csv`` the same units half a year later. The zero of z
@@ -368,6 +374,8 @@ def simulate_fleet(folder: Folder, *, units: int | str = 12, seed: int | str = 1
         Made if it is not there.
     units
         Number of units, 8 or more. At most 2000.
+    rate
+        Sample rate.
     seed
         Seed of the random numbers.
 
@@ -410,7 +418,7 @@ def simulate_fleet(folder: Folder, *, units: int | str = 12, seed: int | str = 1
             moved = 5 * mg if name == "second" and number == _CHANGED else 0.0
             recording = simulate_tumble(
                 attitudes=16, truth=truth | {"bias_y": truth["bias_y"] + moved}, hold=3.0, move=1.0, gyro=False,
-                seed=int(rng.integers(1 << 31)),
+                rate=rate, seed=int(rng.integers(1 << 31)),
             )  # fmt: skip
             serial, date = f"LINE-{number + 1:04d}", (begin + timedelta(days=number)).isoformat()
             file = f"{name}_{number + 1:04d}.csv"
