@@ -52,7 +52,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the further seeds in the reduced run."""
+    """Leave out the further seeds in the reduced run. What drives a browser is among the long tests."""
+    for item in items:
+        if "browser" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
     if config.getoption("--reduced"):
         further = [item for item in items if item.get_closest_marker("further")]
         config.hook.pytest_deselected(items=further)

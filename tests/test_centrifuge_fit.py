@@ -224,6 +224,7 @@ def test_a_rate_taken_from_the_manifest_costs_what_its_uncertainty_may():
     assert record.parameters["x_K_2"].standard_uncertainty / K == pytest.approx(u, rel=0.05)
 
 
+@pytest.mark.slow
 def test_k_at_20_g_within_five_parts_in_ten_thousand():
     """zeta(20 g) = 1 %, angle random walk 0.01 and 0.005 deg/sqrt(h), two power cycles of 15 min."""
     truth = typical_truth(0.01)

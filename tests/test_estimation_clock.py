@@ -316,6 +316,7 @@ def test_a_long_file_is_read_in_parts_by_the_same_rule(imulab, tmp_path, monkeyp
     assert (parts["start"], parts["end"], parts["duration"]) == (whole["start"], whole["end"], whole["duration"])
 
 
+@pytest.mark.slow
 def test_a_replay_of_coarse_stamps_gives_what_the_file_gives(imulab, tmp_path):
     """A tumble test at 100 Hz with stamps of whole hundredths rounded to two readings each."""
     recording = il.simulate_tumble(gravity=9.81, attitudes=12)

@@ -483,6 +483,7 @@ def arduino(folder, rows):
     return np.array([line.split() for line in run(build / "sketch", input=text).splitlines()], dtype=float)
 
 
+@pytest.mark.slow
 def test_the_arduino_example_corrects_as_the_desk_does(tools, tmp_path):
     records = [madeup.tumble(2, gyro=True, sensitive=True), madeup.centrifuge(), madeup.warmup()]
     export("c", records, tmp_path)

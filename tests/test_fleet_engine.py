@@ -332,6 +332,7 @@ def test_a_process_that_ends_is_reported():
         list(engine.run(os._exit, [(3,)], 2))
 
 
+@pytest.mark.slow
 def test_a_folder_for_temporary_files_may_have_a_long_name(tmp_path):
     folder = tmp_path / ("x" * 120)
     folder.mkdir()

@@ -167,6 +167,7 @@ def postgres(server):
     return server.url
 
 
+@pytest.mark.slow
 def test_postgresql(tmp_path, postgres):
     manifest = make_fleet(tmp_path / "in", 3, order=1)
     check_history(manifest, tmp_path / "out", postgres)
@@ -243,6 +244,7 @@ def test_what_is_lost_during_a_run_leaves_each_calibration_in_the_history_once(f
     check_once(postgres, folder)
 
 
+@pytest.mark.slow
 def test_two_runs_at_once_into_an_empty_history_lose_nothing(fleet, postgres, tmp_path):
     folders = [tmp_path / line for line in ("a", "b")]
     runs = [command("fleet", "run", fleet, "-o", f, "--workers", 1, "--history", postgres) for f in folders]

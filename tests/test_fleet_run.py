@@ -42,6 +42,7 @@ def plain(path):
 # ---- parameters are the single command's ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_parameters_equal_the_single_commands_to_the_last_bit(imulab, imulab_process, tmp_path):
     manifest = make_fleet(tmp_path / "in", 3)
     il.write(il.simulate_tumble(attitudes=16, order=1, hold=2.0, seed=4), tmp_path / "in" / "long.csv")
@@ -63,6 +64,7 @@ def test_parameters_equal_the_single_commands_to_the_last_bit(imulab, imulab_pro
         assert many.sensor["serial"] == serial
 
 
+@pytest.mark.slow
 def test_arrays_and_centrifuge_tests_run_through_the_same_functions(imulab, tmp_path):
     assert (
         imulab("array", "simulate", "-o", "still.csv", "--experiment", "static", "--duration", "60 s").returncode == 0

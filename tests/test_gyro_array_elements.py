@@ -111,6 +111,7 @@ def test_elements_go_together_by_what_the_array_turns():
     assert common_motion(noise, np.full((3, 5), 0.01))[1] < 2
 
 
+@pytest.mark.slow
 def test_the_real_array_finds_its_own_rest(real_data):
     log = il.read(real_data / "mimu4444" / "exp_1.bin")  # as logged: rests and turns, every second element upside down
     record = calibrate_array(log, log).calibration

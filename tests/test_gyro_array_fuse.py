@@ -361,6 +361,7 @@ def test_the_real_array_reaches_its_split_half_figures(real_data, capsys):
     np.testing.assert_allclose(found["mean"], [0.197, 0.174, 0.103], atol=0.002)
 
 
+@pytest.mark.slow
 def test_a_jump_in_the_real_array_reaches_the_mean_and_not_robust(real_data):
     # Gyro 4 steps by -0.12 deg/s about z at 46 to 80 s. An eighth of it is 0.42 deg over the 28 s at rest.
     whole = il.read(real_data / "mimu4444" / "exp_1.bin")

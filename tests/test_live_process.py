@@ -122,6 +122,7 @@ def from_standard_input(folder: Path, lines: list[str]) -> subprocess.CompletedP
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_what_was_wrong_with_a_stream_is_said_and_left_out(tmp_path):
     recording = tumble(14)
     done = from_standard_input(tmp_path, rows_of(recording, 10))
@@ -134,6 +135,7 @@ def test_what_was_wrong_with_a_stream_is_said_and_left_out(tmp_path):
     np.testing.assert_array_equal(il.read(tmp_path / "rec.csv").time, np.delete(recording.time, 1700).round(4))
 
 
+@pytest.mark.slow
 def test_titles_that_become_others_end_a_session_that_can_be_gone_on_with(tmp_path):
     lines = rows_of(tumble(14), 0)
     lines.insert(4000, lines[0].replace("accel_x", "gyro_x"))

@@ -141,6 +141,7 @@ class Screen:
 WORDS = ["simulate:speed=20,order=1", "--follow", "--attitudes", "16", "--order", "1", "--save", "rec.csv"]
 
 
+@pytest.mark.slow
 def test_the_keys_drop_finish_and_show_that_it_works(tmp_path):
     screen = Screen([*WORDS, "-o", "rec.json"], tmp_path)
     try:

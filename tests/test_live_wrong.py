@@ -187,6 +187,7 @@ def test_an_unknown_format_shows_its_lines_and_offers_a_layout(tmp_path):
     assert not (tmp_path / "rec.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_stream_that_stops_is_said_and_what_came_is_kept(tmp_path):
     recording = tumble()
     with device(lines_of(recording)[:3200], 800) as unit:
@@ -200,6 +201,7 @@ def test_a_stream_that_stops_is_said_and_what_came_is_kept(tmp_path):
     same_as_sent(tmp_path, recording, unit)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_sentence_and_keeps_whole_lines(tmp_path):
     limit = 100_000
     recording = tumble()

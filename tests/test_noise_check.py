@@ -97,6 +97,7 @@ def simulated(seed=2, **more):
     return il.simulate_noise(**{**NOISE, "duration": "10 min", **more}, seed=seed)
 
 
+@pytest.mark.slow
 def test_an_unchanged_unit_passes(record):
     found = il.check_noise(record, simulated())
     assert found.passed
@@ -136,6 +137,7 @@ def test_noise_that_the_model_has_not_got_is_found(record):
     assert "noise from 3.1 to 6.2 Hz" in found.columns["gyro_x"].text()
 
 
+@pytest.mark.slow
 def test_several_logs_add_up_and_files_are_taken(record, tmp_path):
     for seed in (2, 3):
         il.write_csv(simulated(seed), tmp_path / f"{seed}.csv")

@@ -261,6 +261,7 @@ def test_vibration_is_no_change_of_level(disturbance):
     assert not any("level changes" in line for line in record.warnings)
 
 
+@pytest.mark.slow
 def test_a_small_step_is_named_and_not_only_a_random_walk():
     """.006 deg/s, 13 standard uncertainties: a model of white noise and walk took it for walk without a word."""
     record = il.fit_noise(columns_of(lambda t, _: np.where(t > 250, 0.006, 0.0))).calibration
@@ -469,6 +470,7 @@ def test_it_goes_through_commands_and_a_fleet(tmp_path, monkeypatch, capsys):
     ("scale", "words"),
     [(1 / 57.3, "no usual gyroscope has steps of"), (1.0, "")],
 )
+@pytest.mark.slow
 def test_a_doubted_unit_is_bad_and_survives_quiet(tmp_path, capsys, scale, words):
     """A bag in deg/s and g, read as rad/s and m/s^2, gives a filter noise that is 57 and 9.8 times off."""
     rng = np.random.default_rng(3)

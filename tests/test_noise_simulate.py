@@ -54,6 +54,7 @@ def test_a_log_has_the_allan_deviation_of_its_terms():
     assert abs(np.corrcoef(np.diff(log.si("gyro_x")), np.diff(log.si("gyro_y")))[0, 1]) < 0.01
 
 
+@pytest.mark.slow
 def test_a_record_is_simulated_and_found_again(tmp_path):
     first = il.fit_noise(il.simulate_noise(white="100 ug/sqrt(Hz)", walk="300 ug/sqrt(h)", duration="20 min"))
     first = replace(first.calibration, sensor={"serial": "A-7"})

@@ -285,6 +285,7 @@ def test_a_record_of_another_unit_is_said(case):
     assert any("|f| scatters by" in note and "is it of this unit?" in note for note in notes)
 
 
+@pytest.mark.slow
 def test_bad_input_is_named(case):
     recording, attitudes, record = case
     swapped = recording.with_columns({"gyro_x": recording.columns["gyro_y"], "gyro_y": recording.columns["gyro_x"]}, {})

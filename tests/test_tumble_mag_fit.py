@@ -643,6 +643,7 @@ def test_a_stated_dip_changes_nothing_but_what_is_said_of_it():
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.slow
 def test_a_dip_off_by_more_than_both_uncertainties_is_said_in_one_sentence(sign):
     found = fitted().parameters["dip"]
     own = found.standard_uncertainty
