@@ -204,6 +204,21 @@ FORGED = {
         lambda c: c["model"]["terms"].update(gyro_x="NXZ"),
         "model.terms.gyro_x: expected letters of",
     ),
+    "interval next to nothing": (
+        "noise.json",
+        lambda c: c["data"]["columns"]["gyro_x"]["spectra"][0].update(interval=1e-320),
+        "spectra[0].interval: expected a number above 0",
+    ),
+    "whole number of a list": (
+        "noise.json",
+        lambda c: c["fit"]["columns"]["gyro_x"]["candidates"][0]["values"].__setitem__(3, 2**70),
+        "candidates[0].values[3]: expected a whole number of at most 9.22337e+18",
+    ),
+    "whole number": (
+        "tumble.json",
+        lambda c: next(iter(c["fit"]["shared"].values())).update(bias_y=2**70),
+        "bias_y: expected a whole number of at most 9.22337e+18",
+    ),
     "term": (
         "noise.json",
         lambda c: c["parameters"].update(gyro_x_odd=c["parameters"].pop("gyro_x_walk")),
@@ -228,6 +243,12 @@ def test_what_a_record_may_hold_is_checked_where_it_is_read(case, inputs):
     with pytest.raises(ImulabError, match=r"^r\.json: ") as caught:
         loads(sealed(content), "r.json")
     assert words in str(caught.value)
+
+
+def test_what_no_number_describes_is_not_drawn(inputs, tmp_path):
+    content = json.loads((inputs / "spin.json").read_text())
+    place = ("parameters", "y_K_2", "value")
+    assert faults("spin.json", content, [(place, 0)], inputs, tmp_path) == []
 
 
 def test_every_record_that_imulab_makes_is_read(inputs):

@@ -33,7 +33,7 @@ from msgspec import NODEFAULT
 from msgspec import field as field
 
 from imulab.errors import RecordError, quoted
-from imulab.quantities import LARGEST
+from imulab.quantities import LARGEST, SMALLEST
 
 if TYPE_CHECKING:
     from imulab.gravity import Gravity, ModelField, Site
@@ -58,7 +58,7 @@ def _is_number(value: Any) -> bool:
     return type(value) is float or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-Positive = Annotated[float, PlainKind("a number above 0", lambda value: _is_number(value) and value > 0)]
+Positive = Annotated[float, PlainKind("a number above 0", lambda value: _is_number(value) and value >= SMALLEST)]
 Size = Annotated[float, PlainKind("a number of 0 or more", lambda value: _is_number(value) and value >= 0)]
 _PLAIN = {
     float: PlainKind("a number", _is_number),
@@ -243,6 +243,10 @@ def read(kind: type[T], value: Any, place: str = "") -> T:
     return result
 
 
+_WHOLE = 2**63 - 1
+"""Largest whole number that arrays hold."""
+
+
 def check_sizes(value: Any, where: Place = None) -> None:
     """Refuse numbers larger than any quantity.
 
@@ -258,7 +262,7 @@ def check_sizes(value: Any, where: Place = None) -> None:
                 check_sizes(item, (where, key))
     elif isinstance(value, list):
         try:
-            if not value or (min(value) >= -LARGEST and max(value) <= LARGEST):
+            if not value or (min(value) >= -_WHOLE and max(value) <= _WHOLE):
                 return
         except TypeError:  # there are texts, lists or None among them
             pass
@@ -266,6 +270,8 @@ def check_sizes(value: Any, where: Place = None) -> None:
             check_sizes(item, (where, index))
     elif _is_number(value) and not -LARGEST <= value <= LARGEST:
         raise _mistake(where, f"a number of at most {LARGEST:g}", value)
+    elif type(value) is int and not -_WHOLE <= value <= _WHOLE:
+        raise _mistake(where, f"a whole number of at most {_WHOLE:g}", value)
 
 
 @cache

@@ -149,7 +149,11 @@ def json_for_script(value: Any) -> Any:
     """Return JSON that cannot end the script element it stands in, and whose texts Plotly makes no links of."""
     from markupsafe import Markup
 
-    text = _LINK.sub("&lt;", json.dumps(value, ensure_ascii=False, allow_nan=False))
+    try:
+        text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    except ValueError:  # what is no number is not drawn
+        text = json.dumps(json.loads(json.dumps(value), parse_constant=lambda _: None), ensure_ascii=False)
+    text = _LINK.sub("&lt;", text)
     return Markup(text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
 
 
