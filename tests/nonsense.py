@@ -32,6 +32,8 @@ MADE = (
     "thermal fit hot/tumble*.csv --gravity 9.81 -o hot.json",
     "rate simulate --rates 50,100,200 --faces +z,-z --cycles 1 --hold 2s --rate 50 --seed 1 -o turned",
     "rate fit turned/test.toml -o rate.json",
+    "magnetometer simulate --duration 20s --seed 1 -o wave.csv",
+    "magnetometer fit wave.csv -o wave.json",
     "fleet simulate --units 8 --seed 1 -o fleet",
 )
 CALLS = {
@@ -72,6 +74,10 @@ CALLS = {
     "rate simulate": "--rates 50,100 --faces +z,-z --cycles 1 --hold 1s --rate 20 -o OUT",
     "rate fit": "turned/test.toml -o OUT.json",
     "rate turn": "turned/pz_1.csv --turns 2 -o OUT.json",
+    "magnetometer plan": "--turn level",
+    "magnetometer simulate": "--duration 5s -o OUT.csv",
+    "magnetometer fit": "wave.csv -o OUT.json",
+    "magnetometer check": "wave.json wave.csv",
     "fleet run": "fleet/first.csv --workers 1 -o OUT",
     "fleet status": "done",
     "fleet report": "done -o OUT.html",

@@ -298,6 +298,15 @@ def test_clipped_and_dead_axes_are_refused():
         il.fit_magnetometer(recorded(outputs))
 
 
+def test_readings_that_lie_on_no_ellipsoid_are_refused_with_their_scatter():
+    _, outputs = waved(3)
+    outputs[300:] += 40.0  # a magnet beside it
+    with pytest.raises(DataError, match=r"no ellipsoid fits the readings: \|m\| scatters by \d\d %"):
+        il.fit_magnetometer(recorded(outputs))
+    with pytest.raises(DataError, match="these are no readings"):
+        il.fit_magnetometer(recorded(1e200 * outputs, "count"))
+
+
 def test_clean_tests_are_good(reduced):
     verdicts = [
         il.fit_magnetometer(recorded(waved(seed, 500)[1])).calibration.verdict.state

@@ -8,7 +8,7 @@ from typing import Annotated, Unpack
 import numpy as np
 
 from imulab.display import UNJUDGED
-from imulab.errors import ObservabilityError, OptionError
+from imulab.errors import DataError, ObservabilityError, OptionError
 from imulab.gravity import ModelField, Site, check_field_magnitude, field_note, field_of_test, site, stated_site
 from imulab.options import Group, measure, parsed, text
 from imulab.procedures.magnetometer import AXES, FEWEST, name_columns
@@ -156,13 +156,14 @@ def _find_surface(readings: Readings) -> Turned:
     output, name = readings.output, readings.recording.name
     centred = output - output.mean(axis=0)
     _, spread, directions = np.linalg.svd(centred, full_matrices=False)
-    why = f"{len(output)} readings, fewer than {FEWEST[3]}"
+    why, scatter = f"{len(output)} readings, fewer than {FEWEST[3]}", 0.0
     if len(output) >= FEWEST[3]:
         try:
             surface, aside = find_disturbed(output, FEWEST[3])
             _, largest, _ = uncertainties(surface)
             if surface.converged and largest <= _WORST_MAGNITUDE and surface.condition <= _WORST_CONDITION:
                 return Turned(readings, surface, aside, AXES)
+            scatter = surface.sigma / surface.gain
             why = f"in some directions |m| is known to {100 * min(largest, 9.99):.2g} % only"
         except np.linalg.LinAlgError:
             why = "the readings lie on no ellipsoid"
@@ -171,6 +172,11 @@ def _find_surface(readings: Readings) -> Turned:
     turned = _fit_level(readings, AXES[upright]) if spread[2] <= _FLAT * spread[1] else None
     if turned is None:
         check_dead(output, readings.unit, name)
+        if scatter > _RAGGED:
+            raise DataError(
+                f"{name}: no ellipsoid fits the readings: |m| scatters by {100 * scatter:.0f} % of the field; was a "
+                "magnet or steel near for a part of them, or are mag_x mag_y mag_z not of one sensor?"
+            )
         raise ObservabilityError(
             f"{name}: the readings do not determine hard and soft iron: {why}; {_say_gap(output)}; turn the unit "
             "through all directions, each axis up and down"

@@ -20,6 +20,7 @@ _CLIPPED, _PILED, _NEXT = 0.01, 5.0, 5
 """An axis is clipped where this share of the readings, and so many times as many as at the next 5 values, are at one
 end."""
 _LEAST_PILED = 10
+_SPANS = 1e-30, 1e30  # of the outputs, in any unit; beyond them there are no squares
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,9 @@ def _check_readings(output: Array, unit: str, name: str) -> None:
             f"{name}: {len(output)} different readings of mag_x mag_y mag_z; expected {FEWEST[3]} or more in all "
             f"directions, or {least} or more of a level turn"
         )
+    span = float(np.ptp(output, axis=0).max())
+    if not _SPANS[0] < span < _SPANS[1]:
+        raise DataError(f"{name}: the outputs of mag_x mag_y mag_z span {span:.3g} {unit}: these are no readings")
     for axis, column in enumerate(triad("mag")):
         for end in (np.min, np.max):
             count, extreme = _count_at_end(output[:, axis], float(end(output[:, axis])))
