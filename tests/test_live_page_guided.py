@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ pytest.importorskip("starlette", reason="the page needs the extra live")
 
 import imulab as il
 from imulab.cli import main
+from imulab.report import noise_figures
 from liveports import lines_of
 from test_live_link import Sender
 
@@ -469,6 +471,15 @@ def test_the_page_shows_readings_progress_and_cover_and_reads_out_what_to_do(liv
     assert set(page.evaluate(same)) == {"rgb(31, 111, 139)"}  # that of x in reports, #1f6f8b
 
 
+def test_axes_have_the_colours_of_reports():
+    style = (resources.files("imulab") / "live/page/static/workbench.css").read_text()
+    drawn = (resources.files("imulab") / "report/draw.js").read_text()
+    light, dark = (re.findall(r"--c([012]): (#\w+);", line) for line in style.split("\n") if "--c0: #" in line)
+    night = dict(re.findall(r'"(#\w{6})": "(#\w{6})"', drawn))
+    assert [colour for _, colour in light] == list(noise_figures._CHANNEL_COLOURS[:3])
+    assert [colour for _, colour in dark] == [night[colour] for _, colour in light]
+
+
 @pytest.mark.parametrize("width", [768, 390])
 def test_every_button_is_inside_and_print_has_none(live, new_page, width):
     running = live(
@@ -487,6 +498,9 @@ def test_every_button_is_inside_and_print_has_none(live, new_page, width):
     page.wait_for_selector(".result")
     assert page.evaluate(outside, width) == []
     assert page.get_attribute(".now", "data-verdict") in ("good", "look")
+    cut = """() => [...document.querySelectorAll("[aria-label='Parameters']")].filter(each => each.offsetParent
+        && each.scrollWidth > each.clientWidth).length"""
+    assert page.evaluate(cut) == 0  # no "ppm of" of "ppm off nominal"
     page.emulate_media(media="print")
     shown = "[...document.querySelectorAll('button, a.button, input, select')].filter(each => each.offsetParent).length"
     assert page.evaluate(shown) == 0
@@ -517,10 +531,12 @@ def test_the_place_is_asked_for_where_gravity_is_not_stated(live, new_page, tmp_
         sender = Sender(link.sendall, lines)
         use = page.get_by_role("button", name="Use")
         use.click()
-        page.wait_for_selector("#said .bad:has-text('expected the latitude, or the gravity')")
+        page.wait_for_selector(".place .wrong:has-text('expected the latitude, or the gravity')")
         page.get_by_label("Latitude").fill("95")
         use.click()
-        page.wait_for_selector("#said .bad:has-text('latitude 95 deg: expected -90 to 90 deg')")
+        page.wait_for_selector(".place .wrong:has-text('latitude 95 deg: expected -90 to 90 deg')")
+        assert page.get_by_label("Latitude").get_attribute("aria-invalid") == "true"
+        assert page.locator("#said").inner_text() == ""
         page.get_by_label("Latitude").fill("48.1")
         page.get_by_label("height").fill("500")
         use.click()

@@ -480,6 +480,8 @@ def test_what_an_export_would_lose_is_a_choice(workbench, new_page, folder):
     page.locator(".job .found").wait_for()
     page.get_by_label("Write for another program").select_option("px4")
     page.get_by_role("button", name="Write", exact=True).click()
+    page.get_by_role("button", name="Write it without that").wait_for()
+    assert "--lossy" not in "".join(page.locator(".heard").all_text_contents())
     page.get_by_role("button", name="Write it without that").click()
     page.locator(".job").nth(2).wait_for()
     page.locator(".job >> nth=0 >> .chip.done").wait_for()

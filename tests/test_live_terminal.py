@@ -6,6 +6,7 @@ import fcntl
 import os
 import re
 import select
+import socket
 import struct
 import subprocess
 import sys
@@ -22,6 +23,7 @@ import imulab as il
 from imulab.live.guide import read_targets
 from imulab.live.session import Session
 from imulab.live.terminal import direction_of_key, draw
+from test_live_link import Sender
 
 
 def shown(session: Session, width: int, height: int) -> list[str]:
@@ -156,6 +158,26 @@ def test_the_keys_drop_finish_and_show_that_it_works(tmp_path):
     finally:
         screen.close()
     assert il.load(tmp_path / "rec.json").fit["attitudes"] >= 15
+
+
+def test_a_key_takes_the_guess_of_an_unknown_stream(tmp_path):
+    recording = il.simulate_tumble(attitudes=40, order=1, gravity=9.81, hold="3 s", move="1 s", gyro=False)
+    values = zip(recording.si("time"), recording.triad("accel"), strict=True)
+    rows = [b"%d;%.4f;%.4f;%.4f\n" % (1e3 * time, *force) for time, force in values]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(20)
+        words = [f"tcp:127.0.0.1:{server.getsockname()[1]}", "--order", "1", "--gravity", "9.81", "--save", "rec.csv"]
+        screen = Screen(words, tmp_path)
+        try:
+            link = server.accept()[0]
+            sender = Sender(link.sendall, [b"ms;p;q;r\n", *rows])
+            assert screen.shows("g: read it as guessed"), screen.text
+            screen.press("g")
+            assert screen.until("attitude 2 accepted"), screen.text
+            sender.stop()
+            link.close()
+        finally:
+            screen.close()
 
 
 def test_an_interrupt_keeps_the_recording_and_says_so(tmp_path):

@@ -6,7 +6,7 @@
 // (kind: "note" or "bad"; no text takes it away), and `page.forget()` takes a refusal away once its cause has gone:
 // that of a place stands until another is sent, every other one as long as it takes to read it.
 
-import { h, put, show } from "./dom.js";
+import { h, inWords, put, show } from "./dom.js";
 import * as session from "./session.js";
 import * as workbench from "./workbench.js";
 
@@ -26,7 +26,7 @@ function say(text, kind = "note") {
   refused = "";
   const place = document.getElementById("said");
   if (place.textContent === text) return;
-  place.replaceChildren(...(text ? [h("p", { class: `said ${kind}` }, text)] : []));
+  place.replaceChildren(...(text ? [h("p", { class: `said ${kind}` }, inWords(text))] : []));
 }
 
 const page = {
@@ -103,6 +103,8 @@ function hear(message) {
     say("");
     begin(message.areas);
     put(document.getElementById("where"), `version ${message.version}`);
+  } else if (message.type === "refused" && sent === "place") {
+    session.wrongPlace(inWords(message.text));
   } else if (message.type === "refused") {
     say(message.text, "bad");
     refused = sent || "page";

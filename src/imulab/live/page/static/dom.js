@@ -34,3 +34,7 @@ export function loadPlotly() {
   });
   return plotly;
 }
+
+// A sentence as the page says it: options by the labels of their fields, without the command line's signs. To resume
+// a session is for the terminal alone, and has no field.
+export const inWords = text => text.replace(/--(?!resume\b)([a-z][a-z-]*)/g, (_, name) => `“${name.replaceAll("-", " ")}”`).replace(/(^|\s)-o\b/g, "$1“output”").replace(/\bm\/s\^2\b/g, "m/s²");

@@ -1,6 +1,6 @@
 // The record, once it is made: what it says, its files, and the reading corrected by it.
 
-import { h, put } from "./dom.js";
+import { h, inWords, put } from "./dom.js";
 import { parameterTable } from "./tables.js";
 
 const HEADS = { good: "Good.", look: "Look first.", bad: "Stop." };
@@ -22,8 +22,8 @@ export class ResultArea {
     this.place.replaceChildren(h("section", { class: "result" },
       h("h2", {}, "The record"),
       h("div", { class: `said ${message.verdict}` }, h("strong", {}, `${HEADS[message.verdict]} `), message.headline,
-        message.reasons.length ? h("ul", {}, message.reasons.map(text => h("li", {}, text))) : null,
-        message.next.map(text => h("p", {}, h("b", {}, "next: "), text))),
+        message.reasons.length ? h("ul", {}, message.reasons.map(text => h("li", {}, inWords(text)))) : null,
+        message.next.map(text => h("p", {}, h("b", {}, "next: "), inWords(text)))),
       h("p", { class: "files" }, files, h("button", { onclick: () => this.quit() }, "End the session")),
       h("dl", { class: "facts" }, h("div", {}, h("dt", {}, "|f| now, corrected by the record"), this.length)),
       this.beside,

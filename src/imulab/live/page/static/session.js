@@ -1,7 +1,7 @@
 // The guided session: what to do now above all, then where one is, then what is known.
 
 import { bodyPlace, degreesBetween, dragged, drawBody, product, shortest, upright } from "./body.js";
-import { h, put, show } from "./dom.js";
+import { h, inWords, put, show } from "./dom.js";
 import { ResultArea } from "./result.js";
 import { Ring } from "./ring.js";
 import { beep, soundButton, speak, voiceButton } from "./sound.js";
@@ -86,7 +86,7 @@ export function hear(message) {
 export const kept = () => "The recording is kept: the terminal says how the session ended, and how to go on.";
 
 const duration = seconds => (seconds < 60 ? "" : `${Math.floor(seconds / 60)} min `) + `${Math.floor(seconds % 60)} s`;
-const sentence = text => text.charAt(0).toUpperCase() + text.slice(1) + (/[.?!]$/.test(text) ? "" : ".");
+const sentence = text => inWords(text.charAt(0).toUpperCase() + text.slice(1)) + (/[.?!]$/.test(text) ? "" : ".");
 
 function view(now) {
   const measuring = now.phase === "measuring";
@@ -208,15 +208,28 @@ function byHand(event) {
 // The direction that the drawn orientation has up.
 const lastUp = () => orientation[2];
 
+// A refusal of the place stands at the field that it names.
+export function wrongPlace(text) {
+  const inputs = [...parts.place.querySelectorAll("input")];
+  const named = inputs.find(each => text.startsWith(each.name)) || inputs[0];
+  for (const each of inputs) each.setAttribute("aria-invalid", String(Boolean(text) && each === named));
+  let said = parts.place.querySelector(".wrong");
+  if (!said) parts.place.append(said = h("p", { class: "wrong", id: "wrong-place", role: "alert" }));
+  named.setAttribute("aria-errormessage", said.id);
+  put(said, text.replace(/^place: /, ""));
+  show(said, Boolean(text));
+  if (text) named.focus();
+}
+
 // Asks for the place where nobody stated its gravity, which limits every scale factor.
 function placeForm() {
-  const field = (label, unit, hint) => h("label", {}, label, h("input", { inputmode: "decimal", size: 8, placeholder: hint, "aria-label": `${label}, ${unit}` }), unit);
-  const fields = { latitude: field("Latitude", "°", "48.14"), height: field("height", "m", "520"), gravity: field("or gravity", "m/s²", "9.80725") };
+  const field = (name, label, unit, hint) => h("label", {}, label, h("input", { name, inputmode: "decimal", size: 8, placeholder: hint, "aria-label": `${label}, ${unit}` }), unit);
+  const fields = { latitude: field("latitude", "Latitude", "°", "48.14"), height: field("height", "height", "m", "520"), gravity: field("gravity", "or gravity", "m/s²", "9.80725") };
   return h("form", {
     class: "said note place", hidden: true,
     onsubmit(event) {
       event.preventDefault();
-      page.forget("place");
+      wrongPlace("");
       const texts = Object.entries(fields).map(([name, label]) => [name, label.querySelector("input").value.trim()]);
       page.send({ type: "place", ...Object.fromEntries(texts) });
     },
@@ -256,7 +269,7 @@ function knocked(now, measuring) {
 const drop = number => page.send({ type: "drop", attitude: number });
 
 function happened(event) {
-  parts.log.prepend(h("li", {}, h("span", { class: "time" }, `${event.time.toFixed(1)} s`), ` ${event.text}`));
+  parts.log.prepend(h("li", {}, h("span", { class: "time" }, `${event.time.toFixed(1)} s`), ` ${inWords(event.text)}`));
   while (parts.log.children.length > LOG) parts.log.lastChild.remove();
   beep(event.kind);
 }

@@ -1,6 +1,6 @@
 // A form for a command, made from the command's own definition, with the command line that it makes.
 
-import { h, put, show } from "../dom.js";
+import { h, inWords, put, show } from "../dom.js";
 import { ask, copy } from "./net.js";
 
 const SOON = 200;
@@ -8,8 +8,6 @@ const FRONT = 3; // options of a model that stand in front
 const MANY = 4; // files from which a field tells their number first
 
 export const plain = flag => flag.replace(/^-+/, "").replaceAll("-", " ");
-// Help as the page says it: options by their names, without the command line's signs.
-export const inWords = text => text.replace(/--([a-z][a-z-]*)/g, (_, name) => `“${name.replaceAll("-", " ")}”`).replace(/(^|\s)-o\b/g, "$1“output”").replace(/\bm\/s\^2\b/g, "m/s²");
 
 // Examples, for values whose kind alone says little; they are no defaults.
 const EXAMPLES = {

@@ -1,6 +1,6 @@
 // What a command has said and made.
 
-import { h, put, show } from "../dom.js";
+import { h, inWords, put, show } from "../dom.js";
 import { commandLine } from "./form.js";
 import { address, ask } from "./net.js";
 import { lossy, result } from "./result.js";
@@ -71,7 +71,7 @@ export function card(job, act) {
     put(stale, `Made from an older ${now.replaced.map(bare).join(" and ")}, which has been replaced since.`);
     for (const line of now.messages.slice(said.children.length)) {
       const own = line.replace(/^imulab: /, "");
-      said.append(h("li", { class: /^(note|warning)/.test(own) ? own.split(":")[0] : now.status === 0 ? "" : "bad" }, own));
+      said.append(h("li", { class: /^(note|warning)/.test(own) ? own.split(":")[0] : now.status === 0 ? "" : "bad" }, inWords(own)));
     }
     if (!ended) return;
     const [head, ...rest] = now.text.split("\n");

@@ -1,7 +1,6 @@
 // The result of a fit as it is seen first: verdict, three numbers, the residuals, and what to do next.
 
-import { h, loadPlotly } from "../dom.js";
-import { inWords } from "./form.js";
+import { h, inWords, loadPlotly } from "../dom.js";
 
 const HEADS = { good: "Good", look: "Look first", bad: "Stop" };
 const FACTS = 3;
