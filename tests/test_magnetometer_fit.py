@@ -342,6 +342,22 @@ def test_options_that_need_accelerometers_are_refused(option):
         il.fit_mag(recorded(outputs), **{option: value})
 
 
+def test_a_unit_that_was_waved_beside_accelerometers_is_pointed_to_the_other_fit():
+    _, outputs = waved(2)
+    rng = np.random.default_rng(1)
+    accel = {f"accel_{a}": 9.81 * rng.standard_normal(600) for a in "xyz"}
+    both = recorded(outputs)
+    both = il.Recording(both.columns | accel, both.units | dict.fromkeys(accel, "m/s^2"))
+    with pytest.raises(il.ImulabError):
+        il.fit_mag(both, gravity=9.81)
+    table = {key: values[:5] for key, values in both.columns.items() if key != "time"}
+    few = il.Recording(table, {key: both.units[key] for key in table})
+    with pytest.raises(DataError, match="'imulab magnetometer fit' takes a unit that was waved by hand"):
+        il.fit_mag(few, gravity=9.81)
+    expected = il.fit_magnetometer(recorded(outputs)).calibration
+    assert il.fit_magnetometer(both).calibration.parameters == expected.parameters
+
+
 def test_headings_are_refused_since_the_rotation_is_not_told():
     _, outputs = waved(2)
     record = il.fit_magnetometer(recorded(outputs)).calibration

@@ -430,7 +430,7 @@ def _check_means(means: FieldMeans, name: str, names: list[str], tilt: str) -> N
     if n < FEWEST:
         raise DataError(
             f"{name}: {n} attitudes{tilt}; a magnetometer needs {FEWEST} or more, better 16, of several tilts and "
-            "headings"
+            "headings; 'imulab magnetometer fit' takes a unit that was waved by hand"
         )
     span = np.ptp(means.mean, axis=0)
     for axis, column in enumerate(names):
