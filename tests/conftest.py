@@ -272,3 +272,21 @@ def sap5_table(path: Path) -> np.ndarray:
     """Attitudes of a cave-survey instrument, g, shape (n, 3): a flat list with null and NaN in unused slots."""
     flat = [value for value in json.loads(path.read_text())["shots"]["grav"] if value is not None and value == value]
     return np.array(flat).reshape(-1, 3)
+
+
+@pytest.fixture(scope="session")
+def accessibility() -> Callable[[Any], list[str]]:
+    """A function that returns the violations that axe-core finds on a page, in light and in dark."""
+    module = pytest.importorskip("axe_playwright_python", reason="the tests of accessibility need axe-core")
+    script = (Path(module.__path__[0]) / "axe.min.js").read_text(encoding="utf-8")
+
+    def violations(page: Any) -> list[str]:
+        page.evaluate(script)
+        found = []
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            each = page.evaluate("axe.run(document, {iframes: false}).then(told => told.violations)")
+            found += [f"{scheme}: {rule['id']}: {node['html'][:200]}" for rule in each for node in rule["nodes"]]
+        return found
+
+    return violations

@@ -549,3 +549,17 @@ def test_the_place_is_asked_for_where_gravity_is_not_stated(live, new_page, tmp_
         link.close()
     record = il.load(tmp_path / "rec.json")
     assert record.model["gravity"]["value"] == pytest.approx(il.normal_gravity("48.1", "500 m"), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_axe_finds_nothing_from_the_first_sample_to_the_record(live, new_page, accessibility):
+    words = ["--follow", "--attitudes", "14", *FIT, "--save", "rec.csv", "-o", "r.json"]
+    page = new_page(live(f"{UNIT},speed=25,knock=3", *words).address)
+    page.locator(".said.bad button").wait_for()
+    page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
+    assert accessibility(page) == []
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.locator(".said.bad button").click()
+    page.get_by_role("button", name="Make the record").click()
+    page.wait_for_selector(".result")
+    assert accessibility(page) == []

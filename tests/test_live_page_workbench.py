@@ -575,3 +575,31 @@ def test_every_control_has_a_name_and_fits_the_screen(workbench, new_page, width
     for _ in range(3):  # the drop zone, then the file, by the keyboard alone
         page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.matches('button, input, a')")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 1280])
+def test_axe_finds_nothing_in_any_state(workbench, new_page, accessibility, width):
+    page = new_page(workbench.address)
+    page.set_viewport_size({"width": width, "height": 800})
+    page.locator(".drop").wait_for()
+    assert accessibility(page) == []
+    text = tumble("own.csv")
+    drop(page, "unknown.csv", "t;p;q;r\n" + text.partition("\n")[2].replace(",", ";"))
+    page.locator(".assistant").wait_for()
+    assert accessibility(page) == []
+    drop(page, "rec.csv", text)
+    read(page)
+    page.get_by_label("order", exact=True).fill("nonsense")
+    page.get_by_text("order 'nonsense': expected one of").wait_for()
+    page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
+    assert accessibility(page) == []
+    page.get_by_label("order", exact=True).fill("1")
+    command(page)
+    run(page)
+    page.locator(".found .js-plotly-plot .point").first.wait_for()
+    page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
+    assert accessibility(page) == []
+    drop(page, "rec.csv", tumble("own.csv", seed=7))
+    page.get_by_text("Made from an older rec.csv").wait_for()
+    assert accessibility(page) == []

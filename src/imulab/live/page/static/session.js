@@ -58,7 +58,7 @@ export function mount(into, given) {
   parts.facts = h("dl", { class: "facts" });
   parts.parameters = h("div", {});
   parts.attitudes = h("div", {});
-  parts.log = h("ol", { class: "log" });
+  parts.log = h("ol", { class: "log", tabindex: 0, "aria-label": "What happened" });
   result = new ResultArea(page);
   const beside = h("div", { class: "beside" }, parts.bodies,
     h("section", { class: "covered" }, h("h2", {}, "What is covered"), parts.sphere,
