@@ -209,6 +209,11 @@ FORGED = {
         lambda c: c["data"]["columns"]["gyro_x"]["spectra"][0].update(interval=1e-320),
         "spectra[0].interval: expected a number above 0",
     ),
+    "uncertainty next to nothing": (
+        "six.json",
+        lambda c: c["data"]["attitudes"]["standard_uncertainty"].__setitem__(2, 1e-320),
+        "attitudes.standard_uncertainty[2]: expected 0, or a number of 1e-100 or more",
+    ),
     "whole number of a list": (
         "noise.json",
         lambda c: c["fit"]["columns"]["gyro_x"]["candidates"][0]["values"].__setitem__(3, 2**70),

@@ -60,6 +60,10 @@ def _is_number(value: Any) -> bool:
 
 Positive = Annotated[float, PlainKind("a number above 0", lambda value: _is_number(value) and value >= SMALLEST)]
 Size = Annotated[float, PlainKind("a number of 0 or more", lambda value: _is_number(value) and value >= 0)]
+Uncertainty = Annotated[
+    float,
+    PlainKind("0, or a number of 1e-100 or more", lambda value: _is_number(value) and (not value or value >= SMALLEST)),
+]
 _PLAIN = {
     float: PlainKind("a number", _is_number),
     int: PlainKind("a whole number of 0 or more", lambda value: type(value) is int and 0 <= value < 2**53),

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeVar
 from imulab.errors import RecordError
 from imulab.procedures.thermal.model import Laws
 from imulab.records.calibration import Calibration
-from imulab.records.sections import Length, Measured, Part, Quantity, Size, StatedGravity, null, part
+from imulab.records.sections import Length, Measured, Part, Quantity, Size, StatedGravity, Uncertainty, null, part
 
 T = TypeVar("T")
 PerHold = Annotated[list[T], "holds"]
@@ -203,7 +203,7 @@ class HoldResiduals(Part):
     group: PerHold[int | None]
     mean: PerHold[Three[float]]
     residual: PerHold[float]
-    standard_uncertainty: PerHold[float]
+    standard_uncertainty: PerHold[Uncertainty]
 
 
 class GyroHoldResiduals(Part):

@@ -15,6 +15,7 @@ from imulab.records.sections import (
     Quantity,
     Size,
     StatedGravity,
+    Uncertainty,
     field,
     holds,
     null,
@@ -264,7 +265,7 @@ class HeldAttitudes(Part):
     force: PerAttitude[Three[float]]
     residual: PerAttitude[float]
     residual_before: PerAttitude[float]
-    standard_uncertainty: PerAttitude[float] | None
+    standard_uncertainty: PerAttitude[Uncertainty] | None
     lengthening: PerAttitude[float] | None = null()
     down_weight: PerAttitude[float]
 
