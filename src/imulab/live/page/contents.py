@@ -142,7 +142,7 @@ def attitudes(folder: Path, head: Head, name: str) -> dict[str, Any]:
 
 
 def _all(path: Path, count: int) -> Array:
-    return np.fromfile(path, "<f8", count)
+    return np.memmap(path, "<f8", "r", shape=(count,)) if count else np.empty(0)
 
 
 def main() -> int:
