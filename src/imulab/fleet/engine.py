@@ -202,6 +202,10 @@ def work(unit: FleetUnit, job: Job) -> Outcome:
         return outcome
 
 
+def _work_all(units: Sequence[FleetUnit], job: Job) -> list[Outcome]:
+    return [work(unit, job) for unit in units]
+
+
 def kept(unit: FleetUnit, base: str, store: Store) -> Outcome | None:
     """Return the outcome of a unit that has a record of its present files and options, else None."""
     with UnitFiles(base) as files:
@@ -291,7 +295,9 @@ def _one_line(text: str) -> str:
 _CONNECT = 10.0
 """Seconds to wait for a scheduler, and as many for its first worker: both must be over within 45 s."""
 _AHEAD = 3
-"""Units at the scheduler for each thread of the cluster, so that none waits for the driver."""
+"""Batches at the scheduler for each thread of the cluster, so that none waits for the driver."""
+_ROUNDS, _LARGEST_BATCH = 4, 8
+"""A task costs some 15 ms of processor time: few units come one by one, many in batches, some for each thread."""
 _LOST = 30.0
 """Seconds without scheduler, without workers, or with nothing left of what was submitted, before giving up."""
 
@@ -359,15 +365,17 @@ class DaskEngine:
             yield result
 
     def _outcomes(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
-        """Yield each outcome as it comes; the scheduler holds a few units for each thread."""
+        """Yield each outcome as it comes; the scheduler holds a few batches of units for each thread."""
         from distributed import as_completed
 
-        threads = sum(self._client.ncores().values())
-        waiting = (self._client.submit(work, unit, job, pure=False) for unit in units)
-        first = list(islice(waiting, _AHEAD * max(threads, 1)))
+        ahead = _AHEAD * max(sum(self._client.ncores().values()), 1)
+        size = min(max(len(units) // (_ROUNDS * ahead), 1), _LARGEST_BATCH)
+        batches = (units[start : start + size] for start in range(0, len(units), size))
+        waiting = (self._client.submit(_work_all, batch, job, pure=False) for batch in batches)
+        first = list(islice(waiting, ahead))
         running = as_completed(first, loop=self._client.loop, with_results=True)  # type: ignore[no-untyped-call]
-        for _, outcome in running:
-            yield outcome
+        for _, outcomes in running:
+            yield from outcomes
             running.update(list(islice(waiting, 1)))  # type: ignore[no-untyped-call]
 
     def run_alone(self, unit: FleetUnit, job: Job) -> Iterator[Outcome]:
@@ -439,6 +447,7 @@ def open_engine(kind: str, *, scheduler: str | None, workers: int | None) -> Ite
 
 def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskEngine:
     try:
+        from dask import config
         from distributed import Client, LocalCluster
     except ImportError:
         raise OptionError(f"--engine dask needs Dask: {install('fleet')}") from None
@@ -447,6 +456,7 @@ def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskE
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # `_Watch` reports what a person must know
     if scheduler is None:
         count = workers or available()
+        stack.enter_context(config.set({"distributed.worker.profile.enabled": False}))
         cluster = stack.enter_context(
             LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
