@@ -44,6 +44,8 @@ def certificate(
         return
     if record is None or lab is None or output is None:
         raise OptionError("expected RECORD, --lab LAB.toml and -o CERT.xml, or --template alone")
+    if output.endswith(".pdf"):
+        raise OptionError(f"{output}: expected a name that ends with .xml, in which programs read a certificate")
     check_outputs([output], [each for each in (record, lab, limits) if each])
     il.write_certificate(record, output, lab=lab, limits=limits)
     print(f"certificate: {output}")
