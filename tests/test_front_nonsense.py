@@ -250,10 +250,16 @@ def test_what_a_record_may_hold_is_checked_where_it_is_read(case, inputs):
     assert words in str(caught.value)
 
 
-def test_what_no_number_describes_is_not_drawn(inputs, tmp_path):
-    content = json.loads((inputs / "spin.json").read_text())
-    place = ("parameters", "y_K_2", "value")
-    assert faults("spin.json", content, [(place, 0)], inputs, tmp_path) == []
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("spin.json", ("parameters", "y_K_2", "value")),
+        ("six.json", ("data", "attitudes", "standard_uncertainty", 2)),
+    ],
+)
+def test_a_zero_that_is_divided_by_is_not_drawn_or_weighed(name, place, inputs, tmp_path):
+    content = json.loads((inputs / name).read_text())
+    assert faults(name, content, [(place, 0)], inputs, tmp_path) == []
 
 
 def test_every_record_that_imulab_makes_is_read(inputs):

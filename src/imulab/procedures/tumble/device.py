@@ -268,6 +268,8 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
     lengthening = np.array(held.lengthening or np.zeros(len(kept)))[kept] / g
     stated = held.standard_uncertainty
     noise_variance: Array = np.ones((1, n)) if stated is None else (np.array(stated)[kept] / g)[None] ** 2
+    if not noise_variance.all():  # an attitude without uncertainty cannot be weighed beside others
+        return None
 
     def model(parameters: Array) -> tuple[Array, Array]:
         theta = np.zeros((1, 9))
