@@ -31,7 +31,7 @@ from imulab.cli import main
 from imulab.cli.app import commands
 from imulab.errors import OptionError
 from imulab.live.page import bench as bench_module
-from imulab.live.page import server
+from imulab.live.page import results, server
 from imulab.live.page.bench import Workbench
 from imulab.live.page.files import FolderFiles, Openings, checked
 from imulab.live.page.jobs import Jobs, forms
@@ -472,6 +472,17 @@ def test_a_file_that_is_dropped_again_replaces_the_older_and_its_results_say_so(
     own = bench.ask("files/rec.json", Path(fit.outputs[0]).read_bytes(), "PUT").json()
     assert own == {"name": "session/rec-2.json", "replaced": False}  # what a command has made is not replaced
     assert sorted(path.name for path in Path("session").iterdir() if path.name[0] == ".") == []
+
+
+def test_a_result_is_bounded_in_what_is_read_and_what_is_drawn(tmp_path, monkeypatch):
+    record = tmp_path / "r.json"
+    il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81).save(record)
+    whole = results.result_of([str(record)])
+    assert whole["figure"]["data"]
+    monkeypatch.setattr(results, "_MOST_DRAWN", 1000)
+    assert results.result_of([str(record)]) == {**whole, "figure": None}
+    monkeypatch.setattr(results, "_MOST_READ", 1000)
+    assert results.result_of([str(record)]) == {}
 
 
 def test_results_are_cleared_but_not_what_runs_nor_what_they_made(bench):
