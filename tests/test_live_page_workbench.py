@@ -396,7 +396,7 @@ def test_only_what_a_file_is_for_is_offered_and_of_the_rest_it_is_said_why(workb
     page.locator("svg.plot").first.wait_for()
     paths = offered(page)
     assert paths[0] == "rate fit"
-    assert not {"tumble fit", "tumble mag", "array calibrate", "warmup fit", "apply"}.intersection(paths)
+    assert not {"tumble fit", "tumble mag", "array calibrate", "warmup fit", "apply", "certificate"} & set(paths)
     page.get_by_text("Not with this").click()
     card = page.locator("[data-path='tumble fit']")
     assert card.is_disabled()
@@ -407,6 +407,13 @@ def test_only_what_a_file_is_for_is_offered_and_of_the_rest_it_is_said_why(workb
     page.locator("[data-name$='.toml']").first.click()
     page.get_by_text("The manifest of a rate test: it names").wait_for()
     assert offered(page) == ["rate fit"]
+    il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81).save("unit.json")
+    drop(page, "unit.json", Path("unit.json").read_text())
+    page.locator("[data-name$='unit.json']").click()
+    page.locator("[data-path='certificate']:not([disabled])").wait_for()
+    cards = page.locator(".procedure > .cards .card").evaluate_all("all => all.map(each => each.dataset.path)")
+    assert {"certificate", "report", "export"} <= set(cards)
+    assert "noise fit" not in cards
 
 
 def test_a_channel_can_be_read_out_and_hidden_and_a_window_taken(workbench, new_page):

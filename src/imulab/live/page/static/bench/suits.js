@@ -35,7 +35,7 @@ const NEEDS = {
   "array merge": [rates, several],
   apply: [record()],
 };
-const RECORDS = { report: [], export: [], "warmup table": ["warmup"], "tumble check": ["tumble", "thermal"], "thermal check": ["thermal"], "noise check": ["noise"], "magnetometer check": ["magnetometer"], apply: [], show: [] };
+const RECORDS = { report: [], certificate: [], export: [], "warmup table": ["warmup"], "tumble check": ["tumble", "thermal"], "thermal check": ["thermal"], "noise check": ["noise"], "magnetometer check": ["magnetometer"], apply: [], show: [] };
 const ONE = new Set(["tumble fit", "tumble gyro", "tumble mag", "magnetometer fit", "magnetometer check", "tumble check", "rate fit", "rate turn", "array calibrate", "array fuse", "array compare", "allan", "convert", "apply", "show"]);
 const LATER = ["show", "convert", "layout guess"]; // what the page does by itself, or what is rarely wanted
 
