@@ -485,6 +485,18 @@ def test_a_result_is_bounded_in_what_is_read_and_what_is_drawn(tmp_path, monkeyp
     assert results.result_of([str(record)]) == {}
 
 
+def test_a_certificate_of_a_record_is_written_beside_it(bench):
+    fit = il.fit_tumble(il.simulate_tumble(order=1, gravity=9.81), order=1, gravity="9.81+-1e-5")
+    assert fit.calibration.verdict.state == "good"
+    fit.save("unit.json")
+    main(["certificate", "--template", "-o", "LAB.toml"])
+    record, lab = (
+        bench.ask(f"files/{name}", Path(name).read_bytes(), "PUT").json()["name"] for name in ("unit.json", "LAB.toml")
+    )
+    job = run(bench, "certificate", record=record, lab=lab, output="unit.xml")
+    assert Path(job.outputs[0]).read_bytes().startswith(b"<?xml")
+
+
 def test_results_are_cleared_but_not_what_runs_nor_what_they_made(bench):
     fit = run(bench, "tumble simulate", output="own.csv")
     more = bench.ask("jobs", {"command": "tumble simulate", "values": {"output": "b.csv", "attitudes": "200"}}).json()
