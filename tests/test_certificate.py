@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -62,12 +61,12 @@ def issue(tmp_path, monkeypatch, sound):
 
 
 @pytest.fixture(scope="module")
-def schemas():
+def schemas(real_data):
     """PTB's schema by two libraries, from files alone."""
     etree = pytest.importorskip("lxml.etree", reason="lxml checks certificates")
     xmlschema = pytest.importorskip("xmlschema", reason="xmlschema checks certificates")
-    path = Path(os.environ.get("IMULAB_DATA", "")) / "dcc" / "dcc" / "v3.3.0.xsd"
-    if "IMULAB_DATA" not in os.environ or not path.exists():
+    path = real_data / "dcc" / "dcc" / "v3.3.0.xsd"
+    if not path.exists():
         pytest.skip("PTB's schemas are not here (IMULAB_DATA)")
     first, second = etree.XMLSchema(etree.parse(path)), xmlschema.XMLSchema(str(path))
 

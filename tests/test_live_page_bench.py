@@ -331,7 +331,7 @@ def test_from_the_recording_to_the_firmware(bench, tmp_path):
     il.write_csv(il.simulate_tumble(attitudes=12, gravity=9.81), "rec.csv")
     name = bench.ask("files/rec.csv", Path("rec.csv").read_bytes(), "PUT").json()["name"]
     assert name == "session/rec.csv"
-    assert bench.ask("files/rec.csv", b"other", "PUT").json()["name"] == "session/rec-2.csv"
+    assert bench.ask("files/other.csv", b"other", "PUT").json()["name"] == "session/other.csv"
     bench.ask("open", {"file": name, "reading": {}})
     about = until(lambda: "attitudes" in (found := bench.ask("open", {"file": name}).json()) and found)
     assert len(about["attitudes"]) == 12
@@ -357,14 +357,14 @@ def test_from_the_recording_to_the_firmware(bench, tmp_path):
     assert sorted(names) == sorted(str(path.relative_to(tmp_path / "session")) for path in there)
     kinds = {entry["short"]: entry["kind"] for entry in bench.ask("files").json()["files"]}
     assert kinds == {
-        "rec-2.csv": "recording",
+        "other.csv": "recording",
         "rec-c": "folder",
         "rec.csv": "recording",
         "rec.html": "report",
         "rec.json": "record",
     }
-    assert bench.ask("files/session%2Frec-2.csv", None, "DELETE").status == 200
-    assert not Path("session/rec-2.csv").exists()
+    assert bench.ask("files/session%2Fother.csv", None, "DELETE").status == 200
+    assert not Path("session/other.csv").exists()
 
 
 @pytest.mark.parametrize(

@@ -466,9 +466,11 @@ def test_the_page_shows_readings_progress_and_cover_and_reads_out_what_to_do(liv
     ]  # nothing over a mark
     assert page.locator(".strip .band").count() == 3
     assert re.fullmatch(r"x −?\d+\.\d+", page.locator(".readings .values span").first.inner_text())
-    same = """() => [".sphere .axis-x", ".strip .axis-x", ".body .axis-x", ".readings .axis-x"].map(
-        each => getComputedStyle(document.querySelector(each)).color)"""
-    assert set(page.evaluate(same)) == {"rgb(31, 111, 139)"}  # that of x in reports, #1f6f8b
+    colour = "each => getComputedStyle(document.querySelector(each)).color"
+    curves = {page.evaluate(colour, place) for place in (".strip .band.axis-x", ".body .axis-x")}
+    assert curves == {"rgb(31, 111, 139)"}  # that of x in reports, #1f6f8b; small letters are darker
+    letters = {page.evaluate(colour, f"{place} .axis-x") for place in (".sphere", ".readings")}
+    assert letters == {"color(srgb 0.12451 0.373529 0.465686)"}
 
 
 def test_axes_have_the_colours_of_reports():

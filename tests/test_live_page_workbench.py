@@ -522,7 +522,7 @@ def test_an_unknown_file_becomes_a_corrected_one_without_leaving_the_page(workbe
     page.locator(".job .found").wait_for()
     page.get_by_role("button", name="Correct a recording", exact=True).click()
     run(page)
-    page.get_by_text("apply done").wait_for()
+    page.get_by_text(re.compile(r"^apply of foreign\.json.* done")).wait_for()
     assert page.evaluate("window.clicks") == 4
     layout = folder / "imulab-files" / "foreign.toml"
     assert il.read("imulab-files/foreign.csv", str(layout)).units["gyro_z"] == "deg/s"

@@ -459,7 +459,11 @@ def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskE
         stack.enter_context(config.set({"distributed.worker.profile.enabled": False}))
         cluster = stack.enter_context(
             LocalCluster(  # type: ignore[no-untyped-call]
-                n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+                n_workers=count,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL + 1,  # of the workers' processes too, which may outlive the scheduler
             )
         )
         scheduler = str(cluster.scheduler_address)

@@ -136,9 +136,9 @@ def fit_tumble(
         normal gravity, as a text (``"47.4 deg"``) or in rad; what a place differs by is part of the uncertainty. With
         ``"gyro"`` it is that of `fit_gyro` too, and may stand beside gravity.
     height
-        Height above the ellipsoid, beside the latitude.
+        Height above the ellipsoid, for gravity. Beside the latitude.
     place
-        Latitude, longitude and height together, such as 48.1,11.6,520. Deg and m, in place of latitude and height.
+        Where it is measured: 48.1,11.6,520. Latitude, longitude and height, deg and m, in place of latitude and height.
     method
         norm: by the length of f; linearised: the published first-order iteration.
     loss
