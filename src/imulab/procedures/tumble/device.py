@@ -258,18 +258,16 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
     if held is None:
         return None
     gravity = model_of(record).gravity
-    kept = np.array(held.down_weight) >= _KEPT
+    kept, stated = np.array(held.down_weight) >= _KEPT, held.standard_uncertainty
     n, g = int(kept.sum()), float(gravity.value)
-    if n <= len(free):
+    # An attitude without uncertainty cannot be weighed beside others.
+    if n <= len(free) or not all(stated or [1.0]):
         return None
     names = parameter_names(_LINEAR)
     nominal = np.array([record.value(name) for name in names[3:6]])
     reading = (np.array(held.mean)[kept] / (nominal * g))[None]
     lengthening = np.array(held.lengthening or np.zeros(len(kept)))[kept] / g
-    stated = held.standard_uncertainty
     noise_variance: Array = np.ones((1, n)) if stated is None else (np.array(stated)[kept] / g)[None] ** 2
-    if not noise_variance.all():  # an attitude without uncertainty cannot be weighed beside others
-        return None
 
     def model(parameters: Array) -> tuple[Array, Array]:
         theta = np.zeros((1, 9))
