@@ -2,15 +2,19 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import imulab as il
+import madeup
 from imulab.cli import main
 from imulab.errors import RecordError
+from imulab.procedures.apply import add_heading, loaded
 from imulab.procedures.tumble.mag.heading import plan_headings, read_law
 from imulab.procedures.tumble.plan import roll_pitch
+from imulab.procedures.tumble.procedure import TumbleProcedure
 from imulab.recording import Recording
 from reference import magnetometer as reference
 
@@ -371,6 +375,15 @@ def test_true_headings_are_magnetic_ones_turned_by_the_declination_of_the_place(
     assert main(["apply", "--heading", "r.json", "r.csv", "-o", "o.csv"]) == 0
     assert main(["apply", "--heading=up", "r.json", "r.csv", "-o", "o.csv"]) == 2
     assert "--heading 'up': expected one of no magnetic true" in capsys.readouterr().err
+
+
+def test_a_later_record_without_magnetometers_does_not_change_the_kind_of_heading(monkeypatch):
+    asked = []
+    monkeypatch.setattr(TumbleProcedure, "heading", lambda self, record, *, true=False: asked.append(true))
+    written = Path(__file__).parent / "data" / "written_by" / "0.2.0"
+    records = [madeup.tumble(), il.load(written / "warmup.json")]
+    add_heading([loaded(record) for record in records], records, "true")
+    assert asked == [True]
 
 
 def test_true_headings_of_a_record_without_a_place_are_refused():

@@ -169,8 +169,8 @@ def add_heading(chain: Sequence[Loaded], records: Sequence[Calibration | Blob], 
     for index in reversed(range(len(records))):
         record = records[index]
         if isinstance(record, Blob) or not procedure_of(record).has_heading:
-            kind = "a blob" if isinstance(record, Blob) else f"a {record.procedure} record"
-            why = why or f"{extended[index].name}: heading needs a record with magnetometers, found {kind}"
+            other = "a blob" if isinstance(record, Blob) else f"a {record.procedure} record"
+            why = why or f"{extended[index].name}: heading needs a record with magnetometers, found {other}"
             continue
         try:
             extended[index] = replace(

@@ -197,8 +197,8 @@ def check_magnetometer(
     moved, after = np.zeros(d), first
     for _ in range(_PASSES):  # |m| is not linear in a large change of hard iron
         there = theta + np.concatenate([moved, np.zeros(size - d)])
-        after, found = _test(there, output[used], covariance, theta, size - 1 - d, hard=True, summary=fit_of(held))
-        moved = moved + found[1:]
+        after, change = _test(there, output[used], covariance, theta, size - 1 - d, hard=True, summary=fit_of(held))
+        moved = moved + change[1:]
     magnitude = evaluate(theta, output)[0]
     notes = list(readings.notes)
     if not used.all():
@@ -221,8 +221,8 @@ def _find_used(theta: Array, output: Array) -> NDArray[np.bool_]:
     x, rows = _whitened(theta, output)
     aside = np.zeros(len(x), dtype=np.bool_)
     for _ in range(_PASSES):
-        found = np.linalg.lstsq(rows[~aside], x[~aside])[0]
-        aside = mark_far(x - rows @ found, aside)
+        coefficients = np.linalg.lstsq(rows[~aside], x[~aside])[0]
+        aside = mark_far(x - rows @ coefficients, aside)
         if (~aside).sum() < len(theta) + _SPARE:
             return np.ones(len(x), dtype=np.bool_)
     return ~aside
@@ -251,8 +251,8 @@ def _test(
     field = np.concatenate([np.zeros(d), theta[d:]])
     design = slopes @ np.column_stack([field, np.eye(len(theta))[:, :d]] if hard else [field])
     y, columns = np.linalg.solve(root, u.T @ x), np.linalg.solve(root, design)
-    found = np.linalg.lstsq(columns, y)[0]
-    value = float(((y - columns @ found) ** 2).sum())
+    coefficients = np.linalg.lstsq(columns, y)[0]
+    value = float(((y - columns @ coefficients) ** 2).sum())
     tested = max(freedom - int((~kept).sum()), 1)
     spare = min(nu / inflation, summary.degrees_of_freedom)
-    return float(f_tail(value / tested, float(tested), max(spare, 1.0))), -found
+    return float(f_tail(value / tested, float(tested), max(spare, 1.0))), -coefficients

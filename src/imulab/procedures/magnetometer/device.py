@@ -44,14 +44,14 @@ def matrices(record: Calibration) -> tuple[Array, Array]:
     """Return h, shape (3,), and D, shape (3, 3), as the record states them; of an axis without, 0 and the mean of D."""
     axes = model_of(record).axes
     theta = np.array([record.value(name) for name in parameter_names(axes)])
-    told = [AXES.index(axis) for axis in axes]
+    turned = [AXES.index(axis) for axis in axes]
     part_hard, part_soft = unpack(theta, len(axes))
     determinant = float(np.linalg.det(part_soft))
     if not determinant > 0:
         raise RecordError("the record's mag_soft is no matrix of an ellipsoid: its determinant is not above 0")
     hard, soft = np.zeros(3), determinant ** (1 / len(axes)) * np.eye(3)
-    hard[told] = part_hard
-    soft[np.ix_(told, told)] = part_soft
+    hard[turned] = part_hard
+    soft[np.ix_(turned, turned)] = part_soft
     return hard, soft
 
 

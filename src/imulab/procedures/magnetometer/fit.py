@@ -110,7 +110,7 @@ def fit_magnetometer(
 
 def fit_readings(recording: Recording, field: float | None, where: Site | None, date: str | None) -> MagnetometerFit:
     """Calibrate a magnetometer triad; arguments in SI, else as for `fit_magnetometer`."""
-    found = None if where is None else field_of_test(where, date, recording)
+    model_field = None if where is None else field_of_test(where, date, recording)
     readings = read_readings(recording)
     turned = _find_surface(readings)
     if turned.upright and field is not None:
@@ -119,8 +119,8 @@ def fit_readings(recording: Recording, field: float | None, where: Site | None, 
             "and date, or leave it out"
         )
     known, origin = field, "stated"
-    if found is not None and known is None:
-        known = float(found.magnitude[0] * (np.cos(found.dip[0]) if turned.upright else 1.0))
+    if model_field is not None and known is None:
+        known = float(model_field.magnitude[0] * (np.cos(model_field.dip[0]) if turned.upright else 1.0))
         origin = "place"
     if turned.upright is None or known is not None:
         check_field_magnitude(turned.surface.gain, readings.unit, recording.name, known)
@@ -130,8 +130,8 @@ def fit_readings(recording: Recording, field: float | None, where: Site | None, 
         "date": date,
     }
     record = make_record(turned, known, origin, {key: value for key, value in options.items() if value is not None})
-    if where is not None and found is not None:
-        record = _with_place(record, where, found)
+    if where is not None and model_field is not None:
+        record = _with_place(record, where, model_field)
     return MagnetometerFit(record, turned)
 
 

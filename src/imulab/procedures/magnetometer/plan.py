@@ -189,9 +189,9 @@ def plan_magnetometer(
         size, directions = size * math.cos(angle), even_directions(2)
     else:
         directions = _tilted(largest, angle)
-    one = _predict(directions, largest, size, spread)
+    single = _predict(directions, largest, size, spread)
     fewest = FEWEST[directions.shape[1]]
-    needed = max(math.ceil((one.direction / target) ** 2), fewest)
+    needed = max(math.ceil((single.direction / target) ** 2), fewest)
     if readings is None and needed > _MOST:
         raise OptionError(
             f"wanted {math.degrees(target):.3g} deg: that takes {needed:.2g} readings; expected a larger tilt, less "
@@ -206,16 +206,16 @@ def plan_magnetometer(
         for each in _TILTS
     )  # fmt: skip
     return MagnetometerPlan(
-        turn, _with_readings(one, count), tuple(_with_readings(one, each) for each in counts), tilts, target
+        turn, _with_readings(single, count), tuple(_with_readings(single, each) for each in counts), tilts, target
     )
 
 
-def _with_readings(one: Predicted, count: int) -> Predicted:
+def _with_readings(single: Predicted, count: int) -> Predicted:
     """Return what so many readings give, by what one gives."""
     root = math.sqrt(count)
     return replace(
-        one, readings=count, hard=one.hard / root, soft=one.soft / root, magnitude=one.magnitude / root,
-        direction=one.direction / root,
+        single, readings=count, hard=single.hard / root, soft=single.soft / root, magnitude=single.magnitude / root,
+        direction=single.direction / root,
     )  # fmt: skip
 
 

@@ -219,9 +219,9 @@ def fit_sphere(points: Array) -> tuple[Array, float]:
         raise np.linalg.LinAlgError
     scaled = (points - middle) / spread
     design = np.column_stack([2 * scaled, np.ones(len(points))])
-    found = np.linalg.lstsq(design, (scaled**2).sum(axis=1))[0]
-    radius = float(np.sqrt(max(found[-1] + float(found[:-1] @ found[:-1]), 1e-6)))
-    return middle + spread * found[:-1], spread * radius
+    sphere = np.linalg.lstsq(design, (scaled**2).sum(axis=1))[0]
+    radius = float(np.sqrt(max(sphere[-1] + float(sphere[:-1] @ sphere[:-1]), 1e-6)))
+    return middle + spread * sphere[:-1], spread * radius
 
 
 def _approach(outputs: Array, theta: Array) -> Array:
