@@ -65,6 +65,7 @@ def test_every_result_shows_itself_in_twelve_lines_and_as_a_table(made):
         lines = repr(shown).splitlines()
         assert len(lines) <= 12
         assert max(map(len, lines)) < 250
+    assert (result.parameters, result.verdict) == (record.parameters, record.verdict)
     assert record.sensor["serial"] in repr(result)
     assert record.verdict.state in repr(result)
     assert exhibits_of(record).headline in repr(record)

@@ -476,17 +476,17 @@ def field_at(place: Site, date: str, name: str = "date") -> ModelField:
     start = day_of(day.year, 1, 1).toordinal()
     year = day.year + (day.toordinal() - start) / (day_of(day.year + 1, 1, 1).toordinal() - start)
     model = GeoMag(base_year=day.year)
-    found = model.calculate(
+    field = model.calculate(
         glat=math.degrees(place.latitude),
         glon=math.degrees(place.longitude),
         alt=(place.height or 0.0) / _KILO,
         time=year,
     )
-    known = found.calculate_uncertainty()
+    known = field.calculate_uncertainty()
     return ModelField(
-        (_NANO * found.f, _NANO * known.f),
-        (math.radians(found.i), math.radians(known.i)),
-        (math.radians(found.d), math.radians(known.d)),
+        (_NANO * field.f, _NANO * known.f),
+        (math.radians(field.i), math.radians(known.i)),
+        (math.radians(field.d), math.radians(known.d)),
         model.model,
         str(day),
     )
@@ -542,12 +542,12 @@ def field_of_test(where: Site, date: str | None, recording: Recording) -> ModelF
     return field_at(where, day)
 
 
-def field_note(found: ModelField) -> Note:
+def field_note(field: ModelField) -> Note:
     """Return what a record says of a model's field."""
     return Note(
-        f"mag: by {found.model} the field of the place has {1e6 * found.magnitude[0]:.2f} ± "
-        f"{1e6 * found.magnitude[1]:.2f} uT, dip {math.degrees(found.dip[0]):.2f} ± {math.degrees(found.dip[1]):.2f} "
-        f"deg, declination {math.degrees(found.declination[0]):+.2f} ± {math.degrees(found.declination[1]):.2f} deg; "
+        f"mag: by {field.model} the field of the place has {1e6 * field.magnitude[0]:.2f} ± "
+        f"{1e6 * field.magnitude[1]:.2f} uT, dip {math.degrees(field.dip[0]):.2f} ± {math.degrees(field.dip[1]):.2f} "
+        f"deg, declination {math.degrees(field.declination[0]):+.2f} ± {math.degrees(field.declination[1]):.2f} deg; "
         "iron of a building may change each by more"
     )
 

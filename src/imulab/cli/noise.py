@@ -77,8 +77,8 @@ def describe(analysis: dict[str, Any]) -> str:
 
     sizes: dict[tuple[int, float], list[str]] = {}
     for name, column in analysis["columns"].items():
-        of = {**analysis, **column}
-        sizes.setdefault((of["samples"], of["sample_rate"]["value"]), []).append(name)
+        of_column = {**analysis, **column}
+        sizes.setdefault((of_column["samples"], of_column["sample_rate"]["value"]), []).append(name)
     texts = [f"{n} samples at {rate:.6g} Hz" for n, rate in sizes]
     if len(sizes) > 1:
         texts = [f"{text} ({' '.join(names)})" for text, names in zip(texts, sizes.values(), strict=True)]

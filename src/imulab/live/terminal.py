@@ -57,8 +57,8 @@ def draw(view: View, width: int = 80, height: int = 24, *, by_hand: bool = False
 def _advice(view: View, width: int) -> list[Text]:
     """Return what to do, in a bar across the screen, and the unit's present attitude."""
     style = f"bold reverse {_COLOURS[view.state]}"
-    of = f": {view.hold:.1f} of {view.hold_needed:.1f} s" if view.state == "still" and view.hold else ""
-    advice = f"{view.advice}{of}"
+    progress = f": {view.hold:.1f} of {view.hold_needed:.1f} s" if view.state == "still" and view.hold else ""
+    advice = f"{view.advice}{progress}"
     lines = [Text(f" {line}".ljust(width), style=style) for line in wrap(advice, width - 2) or [""]]
     lines += [Text(line) for line in wrap(view.outlook, width)]
     if view.up is not None:

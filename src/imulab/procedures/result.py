@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imulab._version import VERSION
 from imulab.arguments import check, checked, described, types_of, unknown_options
-from imulab.display import Bad, Note, Shown, aligned, verdict_of
+from imulab.display import Bad, Note, Shown, Verdict, aligned, verdict_of
 from imulab.errors import DataError, OptionError
 from imulab.estimation.sampling import mend_stamps
 from imulab.files import open_file, write_page
@@ -25,7 +25,7 @@ from imulab.readers import read, read_blocks
 from imulab.readers.selection import Selection
 from imulab.readers.streams import on_clock_of, one_clock
 from imulab.recording import Data, Reading, Recording, Sampling, Source, Window, joined
-from imulab.records.calibration import Calibration
+from imulab.records.calibration import Calibration, Parameter
 from imulab.report import render_page, render_plan
 from imulab.report.traces import Exhibits, Figure, ReportTable
 from imulab.writers import write_csv
@@ -54,6 +54,16 @@ class Result:
 
     def _repr_html_(self) -> str:
         return self.calibration._repr_html_()
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """The parameters of the record, by name."""
+        return self.calibration.parameters
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result may be used, with reasons and what to do next."""
+        return self.calibration.verdict
 
     @checked
     def save(self, path: str | Path) -> None:

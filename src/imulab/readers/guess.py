@@ -649,11 +649,11 @@ def _unit(
 
 def _unknown_unit(sensor: str, places: Sequence[int], titles: Sequence[Title], name: str) -> GuessError:
     stated = {titles[place].unit for place in places}
-    found = "" if stated == {""} else f", found {' '.join(sorted(unit or 'none' for unit in stated))}"
+    units = "" if stated == {""} else f", found {' '.join(sorted(unit or 'none' for unit in stated))}"
     example = f"--unit {sensor}={_EXAMPLES[sensor]}"
     return GuessError(
         f"{name}: column {quoted(titles[places[0]].text.strip())}: neither the title nor the readings say its "
-        f"unit{found}; {example} states it",
+        f"unit{units}; {example} states it",
         example,
     )
 

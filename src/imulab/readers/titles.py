@@ -244,12 +244,12 @@ def titles_of(line: str, delimiter: str) -> list[str]:
 
 def read_title(title: str, unit: str = "") -> Title:
     """Return what a title says; `unit` is that of a units row, which goes before the title's own."""
-    rest, own = _split_unit(title.strip().lstrip("#").strip())
+    rest, stated = _split_unit(title.strip().lstrip("#").strip())
     words = [word.lower() for word in _WORD.findall(rest)]
     axis, words = _axis(words)
-    if not (own or unit):
-        words, own = _unit_of_words(words)
-    symbol = known_unit(unit) or own
+    if not (stated or unit):
+        words, stated = _unit_of_words(words)
+    symbol = known_unit(unit) or stated
     if symbol == "g" and rest != title.strip() and title.rstrip().endswith(("(G)", "[G]")) and "mag" in title.lower():
         symbol = "gauss"
     gained = "d" in words and {"ang", "angle", "theta", "v", "vel", "velocity"}.intersection(words)

@@ -197,16 +197,16 @@ class FieldPlace(Part):
     declination: Quantity
 
     @classmethod
-    def of(cls, where: Site, found: ModelField) -> FieldPlace:
+    def of(cls, where: Site, field: ModelField) -> FieldPlace:
         """Return the place of a test, with a model's field there."""
 
         def known(pair: tuple[float, float], unit: str) -> Quantity:
             return Quantity(value=pair[0], unit=unit, standard_uncertainty=pair[1])
 
         return cls(
-            latitude=where.latitude, longitude=where.longitude, height=where.height, model=found.model, date=found.date,
-            field=known(found.magnitude, "T"), dip=known(found.dip, "rad"),
-            declination=known(found.declination, "rad"),
+            latitude=where.latitude, longitude=where.longitude, height=where.height, model=field.model, date=field.date,
+            field=known(field.magnitude, "T"), dip=known(field.dip, "rad"),
+            declination=known(field.declination, "rad"),
         )  # fmt: skip
 
 

@@ -188,7 +188,7 @@ def rows_of(record: Calibration) -> list[Row]:
     rows = []
     for name, parameter in record.parameters.items():
         read = reading_unit(parameter.unit, name)
-        u, given, interval = (
+        u, for_order, interval = (
             parameter.standard_uncertainty, parameter.standard_uncertainty_given_order, parameter.interval_95,
         )  # fmt: skip
         low_high = None if interval is None else sorted(read.of(end) for end in interval)
@@ -198,7 +198,7 @@ def rows_of(record: Calibration) -> list[Row]:
                 read.of(parameter.value),
                 None if u is None else u * abs(read.factor),
                 read.symbol,
-                None if given is None else given * abs(read.factor),
+                None if for_order is None else for_order * abs(read.factor),
                 None if low_high is None else (low_high[0], low_high[1]),
             )
         )

@@ -61,12 +61,14 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
     options = read_options(options_of(Reading), reading, "--{}")
     writer, notes, last_sent, metadata = Writer(folder), dict[str, None](), 0.0, dict[str, str]()
     broken: dict[str, str] = {}
-    told: set[str] = set()
+    with_numbers: set[str] = set()
     try:
         for block in _blocks(file, options):
             writer.add(block)
             notes |= dict.fromkeys(block.notes)
-            told |= {name for name, values in block.columns.items() if name not in told and np.isfinite(values).any()}
+            with_numbers |= {
+                name for name, values in block.columns.items() if name not in with_numbers and np.isfinite(values).any()
+            }
             metadata = dict(block.metadata)
             if monotonic() - last_sent > _EVERY:
                 last_sent = monotonic()
@@ -77,7 +79,7 @@ def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[
             raise
         broken = {"error": str(error)}
     writer.head.usual = usual_step(folder, writer.head)
-    empty = [] if broken else [name for name in writer.head.units if name not in told]
+    empty = [] if broken else [name for name in writer.head.units if name not in with_numbers]
     notes |= {f"{name}: no number in any row, nothing is drawn of it": None for name in empty}
     yield {"head": asdict(writer.head), "metadata": metadata, "notes": list(notes), **broken, "done": True}
     yield attitudes(folder, writer.head, Path(file).name)

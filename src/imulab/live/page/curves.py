@@ -185,7 +185,7 @@ def view(folder: Path, head: Head, start: float | None, stop: float | None, widt
 
 
 @dataclass(frozen=True)
-class Statistics:
+class RangeStatistics:
     """Numbers of a range: its rows, and by channel mean, standard deviation, and one-sided spectral density.
 
     Attributes
@@ -205,7 +205,7 @@ class Statistics:
     density: dict[str, Array]
 
 
-def statistics(folder: Path, head: Head, start: float | None, stop: float | None) -> Statistics:
+def statistics(folder: Path, head: Head, start: float | None, stop: float | None) -> RangeStatistics:
     """Return mean, standard deviation and spectrum of a range of places, the ends of the recording where None.
 
     The spectrum is Welch's, of Hann windows that overlap by half, of the middle `_MOST_ROWS` rows at most, as if they
@@ -229,7 +229,7 @@ def statistics(folder: Path, head: Head, start: float | None, stop: float | None
         sigma[name] = float(good.std(ddof=1)) if good.size > 1 else np.nan
         if step > 0 and good.size == rows:
             frequencies, density[name] = _spectrum(values[inner - first : inner - first + _MOST_ROWS], 1 / step)
-    return Statistics(rows, mean, sigma, frequencies, density)
+    return RangeStatistics(rows, mean, sigma, frequencies, density)
 
 
 def _spectrum(values: Array, rate: float) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ from imulab.device.unit import is_blob
 from imulab.display import has_hidden
 from imulab.errors import ImulabError, OptionError, quoted
 from imulab.files import confined, lies_in, load_toml
-from imulab.live.page.curves import CurveView, Head, Statistics, statistics, view
+from imulab.live.page.curves import CurveView, Head, RangeStatistics, statistics, view
 from imulab.live.page.server import inside
 from imulab.records import is_json
 
@@ -400,7 +400,7 @@ class Openings:
         self.previews.append(str(path))
         return str(path)
 
-    def statistics(self, opening: Opening, start: float | None, stop: float | None) -> Statistics:
+    def statistics(self, opening: Opening, start: float | None, stop: float | None) -> RangeStatistics:
         """Return the numbers of a range."""
         return statistics(opening.folder, opening.head, start, stop)
 

@@ -128,8 +128,8 @@ class GuidedPart(PagePart):
 
     def greet(self) -> Iterable[Message]:
         """Yield the view, the latest events, and the end of the session if it has ended."""
-        told = (self._view, *tuple(self._events), self._unknown, self._done, self._failed)
-        return [message for message in told if message]
+        messages = (self._view, *tuple(self._events), self._unknown, self._done, self._failed)
+        return [message for message in messages if message]
 
     def end(self) -> None:
         """End the session; the recording is kept."""

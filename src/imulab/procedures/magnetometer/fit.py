@@ -12,7 +12,7 @@ from imulab.errors import DataError, ObservabilityError, OptionError
 from imulab.gravity import ModelField, Site, check_field_magnitude, field_note, field_of_test, site, stated_site
 from imulab.options import Group, measure, parsed, text
 from imulab.procedures.magnetometer import AXES, FEWEST, name_columns
-from imulab.procedures.magnetometer.model import Readings, Turned, check_dead, read_readings
+from imulab.procedures.magnetometer.model import FittedTurn, MagReadings, check_dead, read_readings
 from imulab.procedures.magnetometer.record import make_record
 from imulab.procedures.magnetometer.solve import find_disturbed, fit_sphere, uncertainties, widest_gap
 from imulab.procedures.result import Result, as_recording
@@ -49,7 +49,7 @@ class MagnetometerFit(Result):
     """
 
     calibration: Calibration
-    turned: Turned
+    turned: FittedTurn
 
 
 def fit_magnetometer(
@@ -135,17 +135,17 @@ def fit_readings(recording: Recording, field: float | None, where: Site | None, 
     return MagnetometerFit(record, turned)
 
 
-def _with_place(record: Calibration, where: Site, found: ModelField) -> Calibration:
-    place = entries(FieldPlace.of(where, found))
+def _with_place(record: Calibration, where: Site, field: ModelField) -> Calibration:
+    place = entries(FieldPlace.of(where, field))
     return replace(
-        record, model={**record.model, "place": place}, warnings=(*record.warnings, field_note(found)), verdict=UNJUDGED
+        record, model={**record.model, "place": place}, warnings=(*record.warnings, field_note(field)), verdict=UNJUDGED
     )
 
 
 # All directions, or a level turn.
 
 
-def _find_surface(readings: Readings) -> Turned:
+def _find_surface(readings: MagReadings) -> FittedTurn:
     """Return the fit of all directions, or of a level turn.
 
     Raises
@@ -162,7 +162,7 @@ def _find_surface(readings: Readings) -> Turned:
             surface, aside = find_disturbed(output, FEWEST[3])
             _, largest, _ = uncertainties(surface)
             if surface.converged and largest <= _WORST_MAGNITUDE and surface.condition <= _WORST_CONDITION:
-                return Turned(readings, surface, aside, AXES)
+                return FittedTurn(readings, surface, aside, AXES)
             scatter = surface.sigma / surface.gain
             why = f"in some directions |m| is known to {100 * min(largest, 9.99):.2g} % only"
         except np.linalg.LinAlgError:
@@ -194,7 +194,7 @@ def _find_surface(readings: Readings) -> Turned:
     return turned
 
 
-def _fit_level(readings: Readings, upright: str) -> Turned | None:
+def _fit_level(readings: MagReadings, upright: str) -> FittedTurn | None:
     """Return the fit of a level turn about an axis, None where the readings are on no ellipse."""
     axes = AXES.replace(upright, "")
     output = readings.output[:, [AXES.index(axis) for axis in axes]]
@@ -202,7 +202,7 @@ def _fit_level(readings: Readings, upright: str) -> Turned | None:
         surface, aside = find_disturbed(output, FEWEST[2])
     except np.linalg.LinAlgError:
         return None
-    turned = Turned(readings, surface, aside, axes)
+    turned = FittedTurn(readings, surface, aside, axes)
     scatter = float(np.sqrt(np.mean(turned.residual[~aside] ** 2)))
     return turned if surface.converged and scatter < _RAGGED else None
 

@@ -24,7 +24,7 @@ _SPANS = 1e-30, 1e30  # of the outputs, in any unit; beyond them there are no sq
 
 
 @dataclass(frozen=True)
-class Readings:
+class MagReadings:
     """Outputs of a magnetometer triad in the order of time.
 
     Attributes
@@ -66,7 +66,7 @@ class Readings:
 
 
 @dataclass(frozen=True)
-class Turned:
+class FittedTurn:
     """Readings and the surface that was fitted to them: an ellipsoid, or the ellipse of a level turn.
 
     Attributes
@@ -81,7 +81,7 @@ class Turned:
         Axes that the surface holds.
     """
 
-    readings: Readings
+    readings: MagReadings
     surface: Surface
     aside: NDArray[np.bool_]
     axes: str
@@ -109,7 +109,7 @@ class Turned:
         return field
 
 
-def read_readings(recording: Recording) -> Readings:
+def read_readings(recording: Recording) -> MagReadings:
     """Return the readings of a recording; rows without numbers and repeats of the row before are left out.
 
     Raises
@@ -148,7 +148,7 @@ def read_readings(recording: Recording) -> Readings:
         )
     row = row[new]
     _check_readings(output[row], unit, recording.name)
-    return Readings(output[row], row, recording, unit, tuple(notes))
+    return MagReadings(output[row], row, recording, unit, tuple(notes))
 
 
 def _check_readings(output: Array, unit: str, name: str) -> None:

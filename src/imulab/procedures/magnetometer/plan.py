@@ -33,7 +33,7 @@ _FARTHEST = 180.0
 
 
 @dataclass(frozen=True)
-class Predicted:
+class PredictedTurn:
     """What some readings with some tilt give: standard uncertainties of hard iron, T, soft iron, |m| and direction.
 
     `magnitude` is that of |m| where it is largest, as a part of the field; `direction` is in rad.
@@ -69,9 +69,9 @@ class MagnetometerPlan(PlannedTest):
     """
 
     turn: str
-    chosen: Predicted
-    others: tuple[Predicted, ...]
-    tilts: tuple[Predicted, ...]
+    chosen: PredictedTurn
+    others: tuple[PredictedTurn, ...]
+    tilts: tuple[PredictedTurn, ...]
     wanted: float
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
@@ -109,7 +109,7 @@ class MagnetometerPlan(PlannedTest):
     def content(self) -> dict[str, Any]:
         """Return the plan for scripts, in SI."""
 
-        def row(each: Predicted) -> dict[str, Any]:
+        def row(each: PredictedTurn) -> dict[str, Any]:
             return {
                 "readings": each.readings, "tilt": amount(each.tilt, "rad"), "mag_bias": amount(each.hard, "T"),
                 "mag_soft": each.soft, "magnitude": each.magnitude, "direction": amount(each.direction, "rad"),
@@ -210,7 +210,7 @@ def plan_magnetometer(
     )
 
 
-def _with_readings(single: Predicted, count: int) -> Predicted:
+def _with_readings(single: PredictedTurn, count: int) -> PredictedTurn:
     """Return what so many readings give, by what one gives."""
     root = math.sqrt(count)
     return replace(
@@ -231,7 +231,7 @@ def _tilted(largest: float, dip: float) -> Array:
     return np.column_stack([np.cos(side) * x - np.sin(side) * y, np.sin(side) * x + np.cos(side) * y, z])
 
 
-def _predict(directions: Array, tilt: float, field: float, noise: float) -> Predicted:
+def _predict(directions: Array, tilt: float, field: float, noise: float) -> PredictedTurn:
     """Return what one reading of these directions gives on the average, of a sensor without soft iron."""
     d = directions.shape[1]
     theta = np.concatenate([np.zeros(d), [1.0 if i == j else 0.0 for i, j in pairs(d)]])
@@ -240,4 +240,4 @@ def _predict(directions: Array, tilt: float, field: float, noise: float) -> Pred
     spread = np.sqrt(np.diag(surface.covariance))
     soft = [k for k, name in enumerate(parameter_names("xyz"[:d])) if "soft" in name]
     _, magnitude, direction = uncertainties(surface)
-    return Predicted(1, tilt, field * float(spread[:d].max()), float(spread[soft].max()), magnitude, direction)
+    return PredictedTurn(1, tilt, field * float(spread[:d].max()), float(spread[soft].max()), magnitude, direction)

@@ -54,7 +54,7 @@ TASK = Task(
 )
 
 
-class MagnetometerSection(Section):
+class MagnetometerAloneSection(Section):
     """Bias and matrix of magnetometers."""
 
     kind = "mag"
@@ -81,7 +81,7 @@ class MagnetometerProcedure(Procedure):
     elsewhere = "{target} wants accelerometers too, and this record holds magnetometers alone"
     has_heading = True
     task = TASK
-    sections = (MagnetometerSection(),)
+    sections = (MagnetometerAloneSection(),)
 
     def check(self, record: Calibration) -> None:
         from imulab.procedures.magnetometer.schema import check

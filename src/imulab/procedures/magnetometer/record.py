@@ -13,7 +13,7 @@ from imulab.estimation.decisions import FIELD_ALONE_STEP
 from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.magnetometer import ALL_WAYS, GAUGE, LEVEL
-from imulab.procedures.magnetometer.model import Readings, Turned, not_told, parameter_names
+from imulab.procedures.magnetometer.model import FittedTurn, MagReadings, not_told, parameter_names
 from imulab.procedures.magnetometer.schema import FieldModel, FieldReadings, FieldSummary
 from imulab.procedures.magnetometer.solve import BLOCKS, uncertainties, widest_gap
 from imulab.recording import Array
@@ -36,7 +36,7 @@ _LEAST_IN_BLOCK = 8
 _LEAST_PART = 3  # blocks before and after a step
 
 
-def make_record(turned: Turned, known: float | None, origin: str, options: Mapping[str, Any]) -> Calibration:
+def make_record(turned: FittedTurn, known: float | None, origin: str, options: Mapping[str, Any]) -> Calibration:
     """Return the record; `known` is the field's magnitude, T, from `origin`, None for that of the outputs."""
     readings, surface = turned.readings, turned.surface
     unit = parse_unit(readings.unit)
@@ -77,7 +77,7 @@ def make_record(turned: Turned, known: float | None, origin: str, options: Mappi
     )  # fmt: skip
 
 
-def _make_parameters(turned: Turned, field: Quantity) -> tuple[dict[str, Parameter], Covariance]:
+def _make_parameters(turned: FittedTurn, field: Quantity) -> tuple[dict[str, Parameter], Covariance]:
     """Return hard iron, T or the unit of the outputs, and soft iron per `field`, with their covariance."""
     surface, unit = turned.surface, parse_unit(turned.readings.unit)
     in_field = unit.quantity == "magnetic field"
@@ -97,7 +97,7 @@ def _make_parameters(turned: Turned, field: Quantity) -> tuple[dict[str, Paramet
     return parameters, Covariance(tuple(names), tuple(map(tuple, matrix.tolist())))
 
 
-def _summarize(turned: Turned, residual: Array) -> FieldSummary:
+def _summarize(turned: FittedTurn, residual: Array) -> FieldSummary:
     """Return ``fit``."""
     surface, unit = turned.surface, parse_unit(turned.readings.unit)
     in_field = unit.quantity == "magnetic field"
@@ -120,7 +120,7 @@ def _summarize(turned: Turned, residual: Array) -> FieldSummary:
     )
 
 
-def _kept_readings(turned: Turned, residual: Array) -> FieldReadings:
+def _kept_readings(turned: FittedTurn, residual: Array) -> FieldReadings:
     """Return some readings, evenly over the recording, for figures."""
     some = np.unique(np.linspace(0, len(residual) - 1, min(len(residual), _KEPT)).astype(np.intp))
     time = turned.readings.time
@@ -179,7 +179,7 @@ def _notes_on_field(upright: str | None, known: float | None, origin: str, *, in
     return notes
 
 
-def _warn_disturbed(readings: Readings, r: Array, aside: NDArray[np.bool_]) -> list[str]:
+def _warn_disturbed(readings: MagReadings, r: Array, aside: NDArray[np.bool_]) -> list[str]:
     """Return a warning of readings that were set aside, with where they are and how large |m| was."""
     share = float(aside.mean())
     if not share:
@@ -226,7 +226,7 @@ def _warn_coverage(fit: FieldSummary, upright: str | None) -> list[str]:
     ]
 
 
-def _warn_step(readings: Readings, r: Array, aside: NDArray[np.bool_]) -> list[str]:
+def _warn_step(readings: MagReadings, r: Array, aside: NDArray[np.bool_]) -> list[str]:
     """Return a warning of a step of |m| at some time, by means of residuals over blocks of readings.
 
     The step that explains most is tested by F(1, B - 2) over the scatter of the B means, times the number of splits.

@@ -139,10 +139,10 @@ def cover_hidden(
         moved_by = [
             f"the {kinds} by {size * np.sqrt(variance):.2g} {unit}, of which their uncertainty holds "
             f"{size * part * np.sqrt(variance):.2g} {unit}"
-            for (kinds, size, unit), variance, part, own in zip(
+            for (kinds, size, unit), variance, part, variance_stated in zip(
                 _SHOWN_IN, variances.tolist(), held.tolist(), stated.tolist(), strict=True
             )
-            if variance > _SHOWN * own
+            if variance > _SHOWN * variance_stated
         ]
         if moved_by:
             text = f"{name}: {what}; it moves {', and '.join(moved_by)}"

@@ -200,12 +200,15 @@ def _own_calibrations(calibrations: list[OwnCalibration], holds: Holds, factor: 
     if not calibrations:
         return None
     each = np.append(factor, np.ones(3))
-    names = ["prior" if own.recording < 0 else holds.recordings[own.recording].name for own in calibrations]
+    names = [
+        "prior" if calibration.recording < 0 else holds.recordings[calibration.recording].name
+        for calibration in calibrations
+    ]
     return OwnCalibrations(
         recording=names,
-        temperature=[own.temperature for own in calibrations],
-        values=[(each * own.values).tolist() for own in calibrations],
-        standard_uncertainty=[(each * own.standard_uncertainty).tolist() for own in calibrations],
+        temperature=[calibration.temperature for calibration in calibrations],
+        values=[(each * calibration.values).tolist() for calibration in calibrations],
+        standard_uncertainty=[(each * calibration.standard_uncertainty).tolist() for calibration in calibrations],
     )
 
 

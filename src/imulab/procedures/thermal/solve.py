@@ -270,8 +270,8 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
         whitened = whitened.reshape(len(whitened), -1)
         for loading in common:
             known = 1 + np.append(0.0, np.cumsum(loading**2))
-            told = np.cumsum(loading[:, None] * whitened, axis=0)
-            whitened[1:] -= (loading[1:] / known[1:-1])[:, None] * told[:-1]
+            summed = np.cumsum(loading[:, None] * whitened, axis=0)
+            whitened[1:] -= (loading[1:] / known[1:-1])[:, None] * summed[:-1]
             whitened *= np.sqrt(known[:-1] / known[1:])[:, None]
         return whitened.reshape(np.shape(columns))
 

@@ -74,7 +74,7 @@ def threshold(text: str, name: str) -> tuple[float, ...]:
     return changes
 
 
-def preset(given: Sequence[float] | float | str, name: str) -> tuple[float, ...]:
+def preset(value: Sequence[float] | float | str, name: str) -> tuple[float, ...]:
     """Return the scale factors that method linearised starts from, output per g, one for all axes or three.
 
     Raises
@@ -82,10 +82,10 @@ def preset(given: Sequence[float] | float | str, name: str) -> tuple[float, ...]
     OptionError
         It is none.
     """
-    parts = given.split(",") if isinstance(given, str) else [given] if isinstance(given, int | float) else given
+    parts = value.split(",") if isinstance(value, str) else [value] if isinstance(value, int | float) else value
     values = tuple(number(part.strip(), name) if isinstance(part, str) else float(part) for part in parts)
     if len(values) not in (1, 3) or not all(0 < value < math.inf for value in values):
-        raise OptionError(f"{name} {given!r}: expected one scale factor or three, above 0, in output per g")
+        raise OptionError(f"{name} {value!r}: expected one scale factor or three, above 0, in output per g")
     return values
 
 

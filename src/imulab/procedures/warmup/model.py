@@ -520,10 +520,10 @@ def _pchip_slopes(knots: Array, values: Array) -> Array:
     inner = np.where(secant[:-1] * secant[1:] > 0, mean, 0.0)
     ends = []
     for near, far in ((0, 1), (-1, -2)):
-        own, other = secant[near], secant[far]
-        slope = ((2 * step[near] + step[far]) * own - step[near] * other) / (step[near] + step[far])
-        beyond = (np.sign(own) != np.sign(other)) & (np.abs(slope) > 3 * np.abs(own))
-        ends.append(np.where(np.sign(slope) != np.sign(own), 0.0, np.where(beyond, 3 * own, slope))[None])
+        nearest, other = secant[near], secant[far]
+        slope = ((2 * step[near] + step[far]) * nearest - step[near] * other) / (step[near] + step[far])
+        beyond = (np.sign(nearest) != np.sign(other)) & (np.abs(slope) > 3 * np.abs(nearest))
+        ends.append(np.where(np.sign(slope) != np.sign(nearest), 0.0, np.where(beyond, 3 * nearest, slope))[None])
     return np.concatenate([ends[0], inner, ends[1]])
 
 

@@ -37,7 +37,7 @@ from imulab.procedures.tumble.gyro.estimate import Nonlinearity, TurnEstimate, e
 from imulab.procedures.tumble.gyro.rest import clock_notes, direction_covariance, find_holds
 from imulab.procedures.tumble.gyro.solve import (
     CRYSTAL,
-    Clock,
+    ScaleClock,
     TurnProblem,
     TurnSolution,
     clock_of_scale,
@@ -134,7 +134,7 @@ class GyroFit:
     unit: str
     fit_bias: bool
     observability: Observability
-    clock: Clock
+    clock: ScaleClock
     nonlinearity: Nonlinearity | None
     between_samples: Array
     lost_samples: float
@@ -363,7 +363,7 @@ def _triad_of_estimate(
     unit: str,
     fit_bias: bool,
     conditioning: Observability,
-    clock: Clock,
+    clock: ScaleClock,
     notes: tuple[str, ...],
 ) -> GyroFit:
     """Turn scaled parameters into the triad."""
@@ -543,7 +543,7 @@ def _diagonal_blocks(first: Array, second: Array) -> Array:
     return joined
 
 
-def _clock_state(clock: Clock) -> ClockState:
+def _clock_state(clock: ScaleClock) -> ClockState:
     """Return what the record says of the clock."""
     other = clock.comparison
     if other is None:

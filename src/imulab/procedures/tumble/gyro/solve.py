@@ -90,7 +90,7 @@ class ClockComparison:
 
 
 @dataclass(frozen=True)
-class Clock:
+class ScaleClock:
     """Clock that the scale factors of the gyroscopes refer to.
 
     Attributes
@@ -138,7 +138,7 @@ class Clock:
         return []
 
 
-def clock_of_scale(comparison: ClockComparison | None, clock: float, triad: str, *, counted: bool) -> Clock:
+def clock_of_scale(comparison: ClockComparison | None, clock: float, triad: str, *, counted: bool) -> ScaleClock:
     """Return what is known of the clock that the scale factors are referred to.
 
     Parameters
@@ -156,7 +156,7 @@ def clock_of_scale(comparison: ClockComparison | None, clock: float, triad: str,
         more = comparison.rate_uncertainty**2
     elif comparison is not None:
         more = max(comparison.rate**2 - comparison.variance(clock), 0.0)
-    return Clock((clock**2 + more) ** 0.5, clock, triad, comparison, counted)
+    return ScaleClock((clock**2 + more) ** 0.5, clock, triad, comparison, counted)
 
 
 def is_counted(time: Array) -> bool:

@@ -584,10 +584,10 @@ def fit_mag(
             )  # fmt: skip
             return fit_readings(recording, magnitude, where, date)
     attitudes = as_attitudes(data, reading, fit_mag)
-    found = None if where is None else field_of_test(where, date, attitudes.recording)
-    if where is not None and found is not None:
-        stated = parse_place(hemisphere, None, stated.dip or found.dip)
-        magnitude = found.magnitude[0] if magnitude is None else magnitude
+    model_field = None if where is None else field_of_test(where, date, attitudes.recording)
+    if where is not None and model_field is not None:
+        stated = parse_place(hemisphere, None, stated.dip or model_field.dip)
+        magnitude = model_field.magnitude[0] if magnitude is None else magnitude
         latitude, height = (where.latitude, where.height) if gravity is None else (None, None)
     known = None if accel is None else as_record(accel, "fit_mag: accel")
     ready = prepare(
@@ -604,8 +604,8 @@ def fit_mag(
     _check_result(joint, ready, stated)
     set_options = _stated_options(loss, mag_order, magnitude, stated, drop, same_direction)
     record = make_mag_record(ready, joint, what, aside, set_options)
-    if where is not None and found is not None:
-        record = _with_place(record, where, found)
+    if where is not None and model_field is not None:
+        record = _with_place(record, where, model_field)
     if known is not None and not ready.notes:
         record = with_gyro_of(record, known)
     return MagFit(record, joint, what, aside)
@@ -655,10 +655,10 @@ def _stated_options(
     return {name: value for name, value in options.items() if value not in (None, [])}
 
 
-def _with_place(record: Calibration, where: Site, found: ModelField) -> Calibration:
+def _with_place(record: Calibration, where: Site, field: ModelField) -> Calibration:
     """Return a record with the place of the test, and the model whose field was used there."""
-    place = entries(FieldPlace.of(where, found))
-    return replace(record, model={**record.model, "place": place}, warnings=(*record.warnings, field_note(found)))
+    place = entries(FieldPlace.of(where, field))
+    return replace(record, model={**record.model, "place": place}, warnings=(*record.warnings, field_note(field)))
 
 
 def _check_options(loss: str, mag_order: int | str, order: int | str, field: float | None) -> None:
