@@ -78,6 +78,7 @@ def schemas(real_data):
     return mistakes
 
 
+@pytest.mark.slow
 def test_the_certificate_of_a_tumble_record_is_valid(issue, schemas):
     assert issue() == 0
     assert schemas("cert.xml") == []

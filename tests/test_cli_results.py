@@ -94,6 +94,7 @@ def test_a_recording_without_numbers_is_json_all_the_same(run):
     assert told["sample_rate"]["value"] is None
 
 
+@pytest.mark.slow
 def test_the_plan_of_a_tumble_as_json(run):
     asked = ["tumble", "plan", "--attitudes", "18", "--noise", "20ug"]
     status, out, err = run(*asked, "--json", "-o", "plan.csv")

@@ -74,6 +74,7 @@ def test_every_command_has_a_function():
     assert {*FUNCTIONS} | WITHOUT == {*COMMANDS}
 
 
+@pytest.mark.slow
 def test_what_a_program_wants_of_a_noise_fit_is_as_on_the_command_line(folder, capsys, monkeypatch):
     monkeypatch.chdir(folder)
     ran("noise", "fit", "log1.csv", "--for", "px4", "--rate", "100", "--step", "8 ms")
@@ -411,6 +412,7 @@ def test_a_record_is_checked_as_on_the_command_line(folder, capsys, monkeypatch)
     assert [each["standard_uncertainty"] for each in said["attitudes"]] == found.standard_uncertainty.tolist()
 
 
+@pytest.mark.slow
 def test_noise_is_checked_as_on_the_command_line(folder, capsys, monkeypatch):
     monkeypatch.chdir(folder)
     ran("noise", "check", "noise.json", "log2.csv", "--tolerance", "2 %", "--json")
@@ -420,6 +422,7 @@ def test_noise_is_checked_as_on_the_command_line(folder, capsys, monkeypatch):
     assert found.passed
 
 
+@pytest.mark.slow
 def test_the_noise_of_columns_is_told_as_on_the_command_line(folder, capsys, monkeypatch):
     monkeypatch.chdir(folder)
     ran("allan", "still.csv", "--taus", "dense", "--window", "3:25", "--json")

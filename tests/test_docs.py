@@ -59,6 +59,7 @@ def test_five_lines_lead_from_a_data_frame_to_a_record_and_a_picture(tmp_path, m
     assert "Residual |f| \u2212 g of each attitude" in (tmp_path / "residuals.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_sessions_and_the_fit_of_the_readme_end_in_good(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     commands = re.findall(r"^ *(imulab (?:live|tumble) .*)$", README.read_text(encoding="utf-8"), re.MULTILINE)

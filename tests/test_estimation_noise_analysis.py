@@ -500,6 +500,7 @@ def best_model(spectrum):
     return min(models, key=lambda model: fitted([spectrum], model)[2] + 4 * len(model))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("step", "least", "most"), [(60.0, 8, 10), (0.0, 0, 0)])
 def test_a_step_is_told_from_the_random_walk_that_a_model_takes_it_for(step, least, most, reduced):
     """400 s of N and 1/f noise, drawn in time, 60 deg/h beside 6.6 deg/h: the model fitted first has a walk."""

@@ -346,6 +346,7 @@ def test_the_fit_is_the_minimum_that_another_minimiser_finds(name):
         np.testing.assert_allclose(np.log(found.values[k, has]), other.x, atol=3e-3)
 
 
+@pytest.mark.slow
 def test_a_model_never_fits_worse_than_one_inside_it():
     models = np.array([terms(name) for name in ("N", "NK", "NB", "NG", "NBK", "NGK", "NGB", "NGG", "NGGK")])
     rng = np.random.default_rng(5)

@@ -212,6 +212,7 @@ def test_no_noise_has_knocks(sizes, step):
             assert not len(knocks_removed(step * np.round(x / step) if step else x)[1])
 
 
+@pytest.mark.slow
 def test_a_narrow_band_is_said_and_the_white_noise_less_certain(reduced):
     """A filter of 5 Hz of first order: N is 1.4 % too small on average."""
     trials = 6 if reduced else 12

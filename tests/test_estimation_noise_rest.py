@@ -113,6 +113,7 @@ def test_a_faulty_log_is_looked_at_as_a_whole(kind):
     assert long_rest(blocks_of(faulty(kind), 7001), ["gyro_x", "gyro_y"]) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plain", "moves"])
 def test_a_large_file_gives_the_record_of_a_small_one(tmp_path, monkeypatch, kind):
     file = tmp_path / "log.csv"
@@ -212,6 +213,7 @@ def test_the_curve_of_a_large_file_is_that_of_a_small_one_to_the_last_bit(tmp_pa
     assert outcomes() == small
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["zeros", "held"])
 def test_a_large_file_that_has_to_be_looked_at_as_a_whole_is_not_in_memory(tmp_path, monkeypatch, kind):
     file = tmp_path / "log.csv"

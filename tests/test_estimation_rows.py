@@ -293,6 +293,7 @@ def test_a_step_on_a_drift_is_found(reduced):
     assert found >= 0.8 * trials
 
 
+@pytest.mark.slow
 def test_a_step_is_found_where_it_is_and_as_large_as_it_is(reduced):
     trials = 20 if reduced else 50
     rng = np.random.default_rng(8)

@@ -111,6 +111,7 @@ def outputs_of(table, reach, rng, many, *, odd=True):
     return rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
 def test_tumble_to_the_last_bit(order, c_core, many):
     rng = np.random.default_rng(order)

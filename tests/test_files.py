@@ -100,6 +100,7 @@ def closed(tmp_path, command, *streams):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="file descriptors of POSIX")
 def test_closed_standard_streams(tmp_path, recording):
     lost = "imulab: standard output: cannot be written: Bad file descriptor\n"

@@ -143,6 +143,7 @@ def test_an_interrupt_of_the_terminal_ends_all_processes_without_a_word(fleet, r
     check_complete(folder, reference, before)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
 def test_no_process_of_a_run_hears_an_interrupt(fleet, tmp_path):
     """Held back before they start: one that is still starting would end with a traceback."""
@@ -245,6 +246,7 @@ def test_a_cluster_makes_the_same_records_whatever_dies(cluster, fleet, referenc
     check_complete(folder, reference, before)
 
 
+@pytest.mark.slow
 def test_workers_that_do_not_see_the_folder_send_their_records_back(fleet, reference, tmp_path):
     """A worker elsewhere: it is given no folder, as the driver does when its folder turns out to be another one."""
     from imulab.fleet.engine import DONE, LEFT, Job, work
@@ -288,6 +290,7 @@ def test_a_scheduler_without_workers_is_said(cluster, fleet, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "address", ["tcp://127.0.0.1:{port}", "nonsense", "what://ever:1", "tcp://no.such.host.invalid:1"]
 )
@@ -347,6 +350,7 @@ OF_THE_TRACKER = r"(?m)^.*UserWarning: resource_tracker: .*\n +warnings\.warn\(.
 """A warning of joblib's process that looks after semaphores, which on a busy machine outlives the one it serves."""
 
 
+@pytest.mark.slow
 def test_an_interrupt_does_not_wait_for_what_is_under_work(tmp_path):
     code = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -392,6 +396,7 @@ def test_one_call_has_a_process_of_its_own():
     assert found != os.getpid()
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_guard(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("from imulab.fleet import engine\nprint(sorted(engine.run(pow, [(2, 3), (2, 4)], 2)))\n")

@@ -176,6 +176,7 @@ def test_postgresql(tmp_path, postgres):
     assert "change since each unit" in (tmp_path / "r.html").read_text()
 
 
+@pytest.mark.slow
 def test_two_lines_write_into_one_history(tmp_path, postgres):
     """Folders of two lines, one unit on both: each calibration is there once."""
     rows = [{"serial": "BOTH", "procedure": "tumble", "file": "u.csv", "order": "1"}]

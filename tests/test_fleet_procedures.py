@@ -156,6 +156,7 @@ def test_a_fault_of_a_unit_with_gyroscopes_is_that_units(line, monkeypatch):
     assert not any("\n" in reason for reason in reasons.values())
 
 
+@pytest.mark.slow
 def test_the_report_shows_gyroscopes_in_the_units_that_people_read(line, monkeypatch):
     folder, rows = line
     monkeypatch.chdir(folder)
@@ -224,6 +225,7 @@ def test_several_recordings_of_each_unit_are_fitted_as_one_alone(folder):
     assert il.run_fleet("fleet.csv", "out", workers=1).kept == 2
 
 
+@pytest.mark.slow
 def test_units_are_compared_at_temperatures_that_they_share(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     il.simulate_thermal("-20,0,20,40,60", attitudes=10, seed=1).save("wide")

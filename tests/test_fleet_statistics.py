@@ -314,6 +314,7 @@ def line(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_report_says_what_is_there(line, capsys):
     arguments = [
         "fleet",
@@ -351,6 +352,7 @@ def test_without_history_and_limits_there_is_less_to_say(line):
     assert "smallest Cpk" not in page
 
 
+@pytest.mark.slow
 def test_the_figures_are_drawn(line, chromium, tmp_path):
     import subprocess
 

@@ -91,6 +91,7 @@ def test_a_known_nonsense_is_refused(line, there):
     assert not list(there.glob("OUT*"))
 
 
+@pytest.mark.slow
 def test_some_nonsense_ends_in_words(there):
     calls = nonsense.calls(there)
     assert len({path for path, _, _ in calls}) == len(nonsense.CALLS)
@@ -149,6 +150,7 @@ def mutations(content):
     return [(place, value) for place in places for value in (*VALUES, sealed, 1e99, -1e99, 1e-99, 2**53)]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("name", RECORDS)
 def test_some_forged_fields_are_refused_or_used(name, inputs, tmp_path):

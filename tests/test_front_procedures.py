@@ -27,6 +27,7 @@ def parameters(record):
     return {name: (p.value, p.standard_uncertainty) for name, p in record.parameters.items()}
 
 
+@pytest.mark.slow
 def test_an_array_is_calibrated_in_every_form_as_by_the_command(array, tmp_path):
     folder, still, readings = array
     assert main(["array", "calibrate", str(folder / "still.csv"), "-o", str(tmp_path / "cli.json"), "--json"]) == 0
@@ -112,6 +113,7 @@ def cycles(tmp_path_factory):
     return paths
 
 
+@pytest.mark.slow
 def test_power_cycles_are_fitted_in_every_form_as_by_the_command(cycles, tmp_path):
     output, options = tmp_path / "cli.json", {"temperatures": TEMPERATURES, "model": "exponential"}
     given = ["--temperatures", "-40,0,60", "--model", "exponential", "-o", str(output)]
@@ -123,6 +125,7 @@ def test_power_cycles_are_fitted_in_every_form_as_by_the_command(cycles, tmp_pat
         assert parameters(il.fit_warmup(form, **options).calibration) == expected
 
 
+@pytest.mark.slow
 def test_power_cycles_of_hours_are_averaged_as_they_are_read(tmp_path):
     peaks = []
     for duration in (500.0, 2000.0):
@@ -173,6 +176,7 @@ def test_a_manifest_that_cannot_be_is_refused_in_a_line(centrifuge):
         il.fit_centrifuge("no.toml")
 
 
+@pytest.mark.slow
 def test_the_gyroscopes_are_fitted_in_every_form_as_by_the_command(tmp_path):
     il.write_csv(il.simulate_tumble(order=1, gravity=9.81, seed=7), tmp_path / "rec.csv")
     recording = il.read(tmp_path / "rec.csv")

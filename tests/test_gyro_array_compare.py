@@ -408,6 +408,7 @@ def test_the_report_of_a_comparison_comes_from_its_record():
     json.dumps(record.to_dict(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_the_source_s_dynamic_experiment():
     rows = {(r.method, r.calibrated): r for r in run_experiment("dynamic", seeds=6)}
     assert len(rows) == 13

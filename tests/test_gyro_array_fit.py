@@ -213,6 +213,7 @@ def test_an_element_without_noise_coefficients_still_serves(tmp_path, axes):
         assert np.isfinite(fuse(moving, FuseOptions(method=method, calibration=again)).rate).all()
 
 
+@pytest.mark.slow
 def test_the_real_array_is_calibrated(real_data):
     recording = il.read(real_data / "mimu4444" / "exp_1.bin")
     quiet = (recording.time > 468.5) & (recording.time < 495.5)
@@ -338,6 +339,7 @@ def late_lines(record):
     return [line for line in record.warnings if "come later than" in line]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [1, 3])
 def test_latency_is_found_to_a_fraction_of_a_sample_and_said(axes, reduced):
     trials = 2 if reduced else 4

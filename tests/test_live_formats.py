@@ -159,6 +159,7 @@ def test_titles_of_a_layout_that_come_again_in_another_order_are_followed(tmp_pa
     assert (len(found), stream.counts.damaged) == (600, 0)
 
 
+@pytest.mark.slow
 def test_arrival_times_are_straightened(reduced):
     """Ten streams of 10 s: the rate of one scatters by .2 %, as late as its first and last samples happen to come."""
     trials = 4 if reduced else 10

@@ -156,6 +156,7 @@ def test_targets_are_read():
     np.testing.assert_allclose([bias.value, scale.value], [100e-6 * G, 200e-6])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "low"), [(1, True), (2, False), ("auto", False)])
 def test_an_order_that_is_too_low_for_the_target_is_said_and_is_no_last_attitude_for_ever(order, low):
     unit, _ = simulated_unit("order=2,noise=0.2mg,rate=50", follow=True)

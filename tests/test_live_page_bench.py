@@ -252,6 +252,7 @@ def test_a_module_in_the_working_folder_is_not_imported(tmp_path, monkeypatch):
     assert (job.state, Path("executed").exists()) == ("done", False)
 
 
+@pytest.mark.slow
 def test_cancelling_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     il.write_csv(il.simulate_tumble(attitudes=24, gravity=9.81), "rec.csv")
@@ -684,6 +685,7 @@ def test_a_command_that_says_much_is_told_of_in_few_messages(tmp_path, monkeypat
     assert len(told) < 20
 
 
+@pytest.mark.slow
 def test_the_columns_of_a_file_are_told_and_their_layout_written(bench):
     rows = "".join(f"{10 * k},0.01,0.02,{1 + k % 3 / 100},3,4,5\n" for k in range(50))
     bench.ask("files/u.csv", ("t_ms,ax,ay,az,p,q,r\n" + rows).encode(), "PUT")
@@ -776,6 +778,7 @@ def test_values_are_checked_before_they_are_run(bench):
     assert bench.ask("command", {"command": "tumble fit", "values": good}).json()["wrong"] == {}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no process groups")
 def test_ctrl_c_twice_leaves_no_command_behind(tmp_path):
     il.write_csv(il.simulate_tumble(attitudes=24, gravity=9.81), tmp_path / "rec.csv")
@@ -841,6 +844,7 @@ def test_a_message_with_half_a_character_still_is_one():
     assert to_json({"text": "found \ud800"}) == '{"text":"found ?"}'
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGHUP")
 def test_closing_the_terminal_ends_the_workbench(tmp_path):
     words = [sys.executable, "-m", "imulab", "open", "--no-browser"]

@@ -57,6 +57,7 @@ def test_a_hold_is_shown_within_a_second_of_stillness():
     assert max(late) <= 1.0
 
 
+@pytest.mark.slow
 def test_a_knocked_attitude_is_named_and_can_be_dropped():
     recording = il.simulate_tumble(
         attitudes=16, order=1, gravity=9.81, noise="0.1 mg", knock=9, knock_shift=0.02 * 9.81, gyro=False
@@ -78,6 +79,7 @@ def test_an_attitude_is_dropped_by_its_number():
         session.drop(3)
 
 
+@pytest.mark.slow
 def test_each_parameter_is_held_against_its_target():
     recording = il.simulate_tumble(attitudes=16, order=1, gravity=9.81, gyro=False)
     session, _ = session_of(recording, targets=read_targets("bias 100 ug, scale_factor 200 ppm"))
@@ -89,6 +91,7 @@ def test_each_parameter_is_held_against_its_target():
     assert {each.share for name, each in known.items() if name.startswith("misalignment")} == {None}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -107,12 +110,14 @@ def test_what_is_wrong_with_a_unit_is_said_when_it_happens(change, said):
     assert len(warnings) == len(set(warnings))
 
 
+@pytest.mark.slow
 def test_a_good_unit_is_not_warned_of(reduced):
     for seed in range(1, 3 if reduced else 6):
         _, events = session_of(il.simulate_tumble(attitudes=12, order=1, gravity=9.81, gyro=False, seed=seed))
         assert not [event.text for event in events if event.kind in ("warning", "knocked")]
 
 
+@pytest.mark.slow
 def test_the_same_samples_give_the_same_events():
     recording = il.simulate_tumble(attitudes=8, order=1, gravity=9.81)
     assert session_of(recording)[1] == session_of(recording)[1]
@@ -239,6 +244,7 @@ def test_what_a_higher_order_explains_is_no_knocked_attitude():
     assert "none is set aside; fit with --order " in said
 
 
+@pytest.mark.slow
 def test_it_is_not_enough_before_the_degrees_of_freedom_that_a_record_is_not_remarked_on_for():
     recording = il.simulate_tumble(attitudes=16, order=1, gravity=9.81, gyro=False)
     session, events = session_of(recording, targets=read_targets("bias 50 mg"))

@@ -43,6 +43,7 @@ def session() -> Session:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (120, 40), (60, 20), (40, 12)])
 def test_what_to_do_is_first_and_nothing_is_wider_or_longer_than_the_terminal(session, width, height):
     lines = shown(session, width, height)

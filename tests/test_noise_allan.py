@@ -177,6 +177,7 @@ def test_steps_of_the_output_larger_than_the_noise_give_no_number():
             assert "steps that are" in found.angle_random_walk.reason
 
 
+@pytest.mark.slow
 def test_lines_of_the_spectrum_are_named_and_do_not_count_as_noise():
     rng = np.random.default_rng(12)
     rate, n = 62.5, 20_000

@@ -50,6 +50,7 @@ def test_logs_of_the_same_noise_fail_as_often_as_is_said(truth, request):
         assert share(np.count_nonzero(p < limit), trials, limit)
 
 
+@pytest.mark.slow
 def test_a_larger_noise_is_found():
     """Of 6,000 samples u(N)/N is .9 %, of the record .6 %: 5 % are 4.3 of both; the walk's 20 % and 14 %."""
     assert np.mean(probabilities(TRUTHS[1], {"N": 1.05, "K": 0.03}, 4) < 0.05) >= 0.75
@@ -105,6 +106,7 @@ def test_an_unchanged_unit_passes(record):
     assert not any(map(found.differs, found.columns))
 
 
+@pytest.mark.slow
 def test_what_changed_is_said_with_its_interval(record):
     louder = simulated(white="0.33 deg/sqrt(h)")
     found = il.check_noise(record, louder)
@@ -115,6 +117,7 @@ def test_what_changed_is_said_with_its_interval(record):
     assert "angle random walk 10 % larger (" in repr(found) or "angle random walk 9 % larger (" in repr(found)
 
 
+@pytest.mark.slow
 def test_one_column_of_several_is_named(record):
     log = simulated()
     wild = simulated(walk="300 deg/h/sqrt(h)")
@@ -187,6 +190,7 @@ def test_what_cannot_be_is_refused(record, made, options, error, message):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_the_command_says_pass_or_fail_first(record, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     record.save("r.json")

@@ -180,6 +180,7 @@ def test_several_logs_add_up(record):
     assert both.fit["logs"] == 2
 
 
+@pytest.mark.slow
 def test_two_records_are_compared(record):
     other = il.fit_noise(log(7)).calibration
     noisier = il.Recording(
@@ -217,6 +218,7 @@ def test_like_is_compared_with_like():
         il.compare_records(walk, markov)
 
 
+@pytest.mark.slow
 def test_drift_with_temperature_is_told_apart_and_taken_out():
     t = np.arange(COUNT) / COUNT
     temperature = 25 + 3 * np.sin(2 * np.pi * 1.5 * t) + t

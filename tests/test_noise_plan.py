@@ -46,6 +46,7 @@ def record():
     return il.fit_noise(log.with_columns({"gyro_z": white.column("gyro_z")}, {"gyro_z": "deg/s"})).calibration
 
 
+@pytest.mark.slow
 def test_a_record_states_what_the_plan_predicts(record):
     plan = il.plan_noise(from_=record)
     for name in ("gyro_x_white", "gyro_x_walk", "gyro_y_walk"):
@@ -55,6 +56,7 @@ def test_a_record_states_what_the_plan_predicts(record):
     assert plan.length == pytest.approx(1800, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_what_is_not_seen_has_the_limit_of_the_record_or_of_a_longer_one(record):
     now, later = (term(il.plan_noise(from_=record, duration=d), "walk", "gyro_z") for d in (None, "2 h"))
     assert now.value == 0

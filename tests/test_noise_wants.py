@@ -45,6 +45,7 @@ def sizes(record, sensor):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "g", "b"), [("gyro", "GYR", "gyr"), ("accel", "ACC", "acc")])
 def test_each_filter_grows_as_white_noise_and_walk_do(record, sensor, g, b):
     """N^2 t of the angle (velocity) and K_h^2 t of the bias, by each filter's own recursion, over 10 s."""

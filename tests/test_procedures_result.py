@@ -209,6 +209,7 @@ def test_a_notebook_gets_json_and_html_and_the_library_once(fit, monkeypatch):
     assert len(fit.plot("sphere")._repr_mimebundle_()["text/html"]) > 400_000
 
 
+@pytest.mark.slow
 def test_a_browser_draws_what_a_notebook_gets_without_a_network(fit, chromium, tmp_path, monkeypatch):
     monkeypatch.setattr(plots_module, "_FIRST", plots_module._First())
     monkeypatch.setattr(plots_module, "_where", lambda: ("a", 1))

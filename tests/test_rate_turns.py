@@ -69,6 +69,7 @@ def test_a_real_recording_has_a_turn_about_each_axis(session):
         assert abs(own.scale - gravity) < 3 * np.hypot(own.scale_uncertainty, spread)
 
 
+@pytest.mark.slow
 def test_a_sample_rate_twice_too_high_or_low_is_found_and_said(session):
     with pytest.raises(il.ImulabError, match=r"was (1\.9\d|2\.0\d) times .*is the stated sample rate 2 times too high"):
         il.fit_turns(of(session, 204.8))

@@ -263,6 +263,7 @@ def test_gz_and_zip_of_one_file_are_read_as_what_they_hold(imulab, path, tmp_pat
     assert il.read(tmp_path / "l.csv.gz", tmp_path / "l.toml").units["accel_x"] == "g"
 
 
+@pytest.mark.slow
 def test_packed_files_that_are_refused(imulab, path, tmp_path):
     path.write_text(HEAD + "".join(rows(500)))
     data = path.read_bytes()

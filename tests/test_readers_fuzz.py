@@ -176,6 +176,7 @@ def test_the_walk_never_leaves_the_block(kind):
     run()
 
 
+@pytest.mark.slow
 @settings(FUZZ, max_examples=4 * COUNT)
 @given(
     st.lists(

@@ -319,6 +319,7 @@ def test_a_line_of_fifty_megabytes_is_refused_at_once(pipe, above):
         read("-")
 
 
+@pytest.mark.slow
 def test_two_hundred_thousand_comment_lines_are_read(file):
     recording = read(file(b"".join(b"# key %d: %d\n" % (k, k) for k in range(200_000)) + HEAD + b"0,1\n"))
     assert len(recording.metadata) == 200_000

@@ -212,6 +212,7 @@ def test_gyroscopes_are_calibrated_by_all_their_samples(seed):
             assert mine.standard_uncertainty < 1.3 * whole.parameters[name].standard_uncertainty
 
 
+@pytest.mark.slow
 def test_thermal_gyroscopes_are_calibrated_on_their_clock():
     recordings = il.simulate_thermal("0,20,40", attitudes=12, gyro=True)
     own = [two_clocks(each, every=1) for each in recordings]

@@ -136,6 +136,7 @@ PLAIN = st.recursive(
 )
 
 
+@pytest.mark.slow
 @FIXED
 @given(
     st.dictionaries(WORDS, st.builds(Parameter, FINITE, st.none() | SIZE, WORDS), max_size=3),

@@ -313,6 +313,7 @@ def test_the_terminal_sees_no_escape_sequences_of_a_file(tmp_path, capsys):
     assert "\x1b" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_page_loads_nothing_uploads_nothing_and_makes_no_links(tmp_path, chromium):
     recording = simulate_tumble(attitudes=15, order=1, hold=3.0, gravity=9.81, seed=2)
     record = il.fit_tumble(il.find_attitudes(recording), order=1, gravity=9.81).calibration

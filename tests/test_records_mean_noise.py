@@ -93,6 +93,7 @@ def array_at_rest(count=MEAN):
     return il.Recording({"time": INTERVAL * np.arange(count), **columns}, units, {"serial": "A"}, name="still.csv")
 
 
+@pytest.mark.slow
 def test_an_array_takes_the_uncertainty_of_its_biases_from_a_noise_record(tmp_path, capsys):
     still = array_at_rest()
     record = noise_record("walk", 3, ("gyro_1", "gyro_2", "gyro_3"), scale=1e-3, serial="A")
@@ -114,6 +115,7 @@ def test_an_array_takes_the_uncertainty_of_its_biases_from_a_noise_record(tmp_pa
     assert "would overwrite" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_noise_records_that_do_not_serve_are_refused_or_said():
     still = array_at_rest()
     with pytest.raises(RecordError, match="no column gyro_2; its columns: gyro_1"):
@@ -128,6 +130,7 @@ def test_noise_records_that_do_not_serve_are_refused_or_said():
     assert any("the record is of serial B, the recording of A" in line for line in warnings)
 
 
+@pytest.mark.slow
 def test_the_zeros_of_a_triad_are_no_more_certain_than_its_noise_record_says():
     recording = il.simulate_tumble(gravity=9.81)
     accelerometers = il.fit_tumble(recording, order=1, gravity=9.81).calibration

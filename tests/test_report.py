@@ -38,6 +38,7 @@ def browse(chromium, tmp_path, page, *options):
     ).stdout  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_browser_draws_every_figure_without_a_network(record, chromium, tmp_path):
     il.write_report(record, tmp_path / "r.html")
     dom = browse(chromium, tmp_path, tmp_path / "r.html", "--dump-dom")
@@ -68,6 +69,7 @@ def test_the_report_says_what_the_record_holds(record, tmp_path):
         assert name in page
 
 
+@pytest.mark.slow
 def test_user_text_is_escaped_everywhere(record, chromium, tmp_path):
     evil = "<script>document.title='owned'</script><img src=x onerror=\"document.title='owned'\">"
     hostile = replace(
@@ -232,6 +234,7 @@ def test_a_table_wider_than_its_card_says_that_it_scrolls(record, chromium, tmp_
     assert re.search(r'id="found">([^<]+)<', found)[1] == "block none;none none"
 
 
+@pytest.mark.slow
 def test_a_print_hides_buttons_and_is_a4(record, chromium, tmp_path):
     il.write_report(record, tmp_path / "r.html")
     style = (tmp_path / "r.html").read_text()

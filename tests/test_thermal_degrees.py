@@ -202,6 +202,7 @@ def test_a_recording_shows_its_lag_and_is_corrected_without_it(tmp_path):
     assert "lag behind the thermometer" not in str(exhibits(il.load(tmp_path / "older.json")))
 
 
+@pytest.mark.slow
 def test_soaks_say_nothing_of_lag_and_ramps_that_only_warm_say_that():
     soaks = il.fit_thermal(il.simulate_thermal(attitudes=10), degrees="3,2,1").calibration
     assert soaks.fit["lag"] is None

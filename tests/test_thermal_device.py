@@ -65,6 +65,7 @@ def test_blocks_of_any_size_give_the_same_bits(record):
         assert found.tobytes() == whole.tobytes()
 
 
+@pytest.mark.slow
 def test_the_exported_unit_agrees_to_the_last_bit(record, tmp_path, self_test):
     il.export("c", record, tmp_path / "unit")
     run = self_test(tmp_path / "unit")

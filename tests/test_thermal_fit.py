@@ -564,6 +564,7 @@ def soaks(unit, *, both=False):
     return [unit.soak(point) for point in oven.POINTS]
 
 
+@pytest.mark.slow
 def test_what_soaks_from_one_side_cannot_show_is_in_the_uncertainty_and_noted():
     one_sided = il.fit_thermal(soaks(oven.Oven(np.random.default_rng(1))), gravity=oven.G).calibration
     assert one_sided.verdict.state == "good"

@@ -197,6 +197,7 @@ def test_too_few_attitudes_give_none(tmp_path):
     assert "Points: what each" not in report_of(record, tmp_path)
 
 
+@pytest.mark.slow
 def test_scale_factors_of_gyroscopes_are_drawn_over_temperature(tmp_path):
     made = il.simulate_thermal((-20, 0, 20, 40, 60), attitudes=14, gyro=True, seed=3)
     record = il.fit_thermal(list(made), with_="gyro").calibration

@@ -147,6 +147,7 @@ def test_uncertainties_equal_the_cramer_rao_bound(noise_as_stated):
     np.testing.assert_allclose(found.covariance.array() / size, bound / size, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_noise_makes_single_samples_long_and_the_fit_knows():
     rng = np.random.default_rng(33)
     truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)}
@@ -442,6 +443,7 @@ def test_the_preset_scale_factors_are_where_the_iteration_starts():
         il.fit_tumble(attitudes, preset=8192)
 
 
+@pytest.mark.slow
 def test_linearised_and_its_plan_have_the_order_of_the_source_unless_another_is_given():
     data = outputs_linearised(reference.random_attitudes(np.random.default_rng(1), 30), part=0.1)
     attitudes = il.find_attitudes(table(data, "m/s^2", None))

@@ -232,6 +232,7 @@ def test_directions_scatter_as_the_document_says_in_and_out_of_the_sample(scatte
     np.testing.assert_allclose(scattered, expected, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_medians_over_the_instruments_are_those_of_the_document(real_data, scattered):
     assert np.median(scattered[:, 0].mean(axis=1)) <= 0.45
     assert np.median(scattered[:, 1]) <= 0.58

@@ -173,6 +173,7 @@ def disturbed(seed, by, attitude=7):
     return truth, table(outputs, mag)
 
 
+@pytest.mark.slow
 def test_a_disturbed_attitude_is_set_aside_and_named(reduced):
     trials = 15 if reduced else 40
     named_it, false = 0, 0

@@ -250,6 +250,7 @@ def predicted(attitudes):
     return np.sqrt([*worst, heading])
 
 
+@pytest.mark.slow
 def test_quarter_turns_give_the_figures_of_the_document(plan):
     found = predicted(turned(plan.directions, plan.headings.north))
     np.testing.assert_allclose(found, [0.42, 0.31, 0.37, 0.26, 1.37], rtol=0.06)

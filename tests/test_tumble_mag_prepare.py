@@ -196,6 +196,7 @@ def indoor(rng, share, lever):
     return heading_errors(fitted(table(*outputs(truth, turned, field, rng))), truth)
 
 
+@pytest.mark.slow
 def test_an_indoor_gradient_is_in_the_uncertainty_where_the_unit_is_put_down_anywhere(reduced):
     """And where it turns about a point beside the magnetometer, where much of it looks like hard iron."""
     trials = 12 if reduced else 24
@@ -377,6 +378,7 @@ def one_after_the_other(folder, *, field=()):
     return folder / "amg.json"
 
 
+@pytest.mark.slow
 def test_one_command_gives_what_three_give_one_after_the_other(folder):
     field = ["--field", "48uT"]
     three = one_after_the_other(folder, field=field)

@@ -52,6 +52,7 @@ def fit(data, sigma=SIGMA, **options):
     return il.fit_tumble(il.find_attitudes(table(data, sigma=sigma)), gravity=G, **options).calibration
 
 
+@pytest.mark.slow
 def test_sap5_predicts_what_it_has_not_seen_no_worse_than_order_one(real_data, reduced):
     trials = 10 if reduced else 30
     errors = {"auto": [], 1: []}
@@ -102,6 +103,7 @@ def test_intervals_of_auto_hold_whatever_the_order(planned, size, names, known, 
     assert np.mean(covered) >= 0.92 - 0.045
 
 
+@pytest.mark.slow
 def test_the_blend_is_that_of_the_published_formulas(planned):
     rng = np.random.default_rng(3)
     truth = {name: (1.0 if name[0] == "s" else 0.0) for name in triad(rng)}
@@ -496,6 +498,7 @@ def test_where_nothing_stands_out_the_result_is_the_plain_one_bit_for_bit(order,
     assert default.data == square.data
 
 
+@pytest.mark.slow
 def test_knocks_are_found_and_clean_attitudes_are_left_alone(reduced):
     trials = 14 if reduced else 40
     found, false = 0, 0

@@ -56,6 +56,7 @@ def test_plans_are_no_worse_than_the_table_of_the_method(count, order, table):
         assert worst(plan, stem) < value + 0.05, stem
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "order"), [(24, 2), (24, 4), pytest.param(48, 3, marks=pytest.mark.further)])
 def test_the_axes_of_a_plan_are_alike_at_no_cost_in_the_sum(count, order):
     """x, y and z of each kind within 4 %, the sum within 1 % of the least that is found without balancing."""
@@ -66,6 +67,7 @@ def test_the_axes_of_a_plan_are_alike_at_no_cost_in_the_sum(count, order):
     assert variance.sum() < 1.01 * least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("criterion", ["A", "D"])
 def test_a_plan_is_better_in_its_criterion_than_random_attitudes_and_than_the_other(criterion):
     plans = {c: planned(4, 18, c) for c in "AD"}
@@ -240,6 +242,7 @@ def test_roll_and_pitch_are_those_of_another_library():
         np.testing.assert_allclose(body_to_level.inv().apply([0, 0, 1]), up, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_order_turns_less_than_the_list_as_chosen():
     plan = planned(4, 48)
     shuffled = np.random.default_rng(1).permutation(plan.directions)
@@ -350,6 +353,7 @@ def test_add_takes_a_recording_and_a_record(imulab):
     assert noise == pytest.approx([700 / np.sqrt(140)] * 2, rel=0.2)
 
 
+@pytest.mark.slow
 def test_noise_is_asked_for_and_order_3_is_the_default(imulab, tmp_path):
     silent = imulab("tumble", "plan", "--attitudes", "24")
     assert silent.returncode == 2

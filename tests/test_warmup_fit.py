@@ -232,6 +232,7 @@ def fit_label(fit):
     return next(row["model"] for row in fit.calibration.fit["models"] if row["chosen"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["smooth", "bent"])
 def test_the_logarithm_leaves_at_most_six_tenths_of_the_cubic_in_time(fits, law):
     rows = {row.label: row for row in fits[law].models}

@@ -17,6 +17,7 @@ def flat(t):
     return 100 * HOUR * np.exp(-t / 60)
 
 
+@pytest.mark.slow
 def test_warnings_name_what_is_wrong_with_the_test():
     rng = np.random.default_rng(4)
 
@@ -79,6 +80,7 @@ def sloping_cycles(slope):
     return [cycle_of(law, t, name=f"c{t}{c}") for t in (-20, 0, 20) for c in (1, 2)]
 
 
+@pytest.mark.slow
 def test_a_time_constant_at_the_limit_of_the_search_is_said_to_be_so():
     """A slope, which no exponential of these cycles is; not where the one beside the true one has nothing to do."""
     said = []

@@ -262,6 +262,7 @@ def test_only_cubics_in_time_have_powers_of_seconds(folder: Path, capsys: Any) -
     assert not (folder / "p.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_stuck_gyro_a_pause_and_rows_of_zeros_are_said() -> None:
     good = cycles()
     stuck = [changed(r, gyro_x=np.full(len(r), 7.0)) for r in good]

@@ -43,6 +43,7 @@ def same(after: Recording, before: Recording) -> None:
         assert [repr(x) for x in after.column(name).tolist()] == [repr(x) for x in column.tolist()]
 
 
+@pytest.mark.slow
 @FIXED
 @given(st.lists(st.tuples(*[st.floats()] * len(UNITS)), min_size=1, max_size=20))
 def test_every_number_reads_back_exactly(rows):
