@@ -47,6 +47,7 @@ FUNCTIONS = {
     "noise check": il.check_noise,
     "noise simulate": il.simulate_noise,
     "thermal plan": il.plan_thermal,
+    "thermal ramp": il.plan_ramp,
     "thermal simulate": il.simulate_thermal,
     "thermal fit": il.fit_thermal,
     "thermal check": il.check_thermal,

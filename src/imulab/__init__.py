@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from imulab.procedures.thermal.fit import ThermalFit as ThermalFit
     from imulab.procedures.thermal.fit import fit_thermal as fit_thermal
     from imulab.procedures.thermal.plan import plan_thermal as plan_thermal
+    from imulab.procedures.thermal.plan_ramp import plan_ramp as plan_ramp
     from imulab.procedures.thermal.simulate import simulate_thermal as simulate_thermal
     from imulab.procedures.tumble.attitudes import Attitudes as Attitudes
     from imulab.procedures.tumble.attitudes import find_attitudes as find_attitudes
@@ -158,6 +159,7 @@ _HOME = {
     "plan_rate": "procedures.rate.plan",
     "plan_tumble": "procedures.tumble.plan",
     "plan_thermal": "procedures.thermal.plan",
+    "plan_ramp": "procedures.thermal.plan_ramp",
     "plan_warmup": "procedures.warmup.plan",
     "read": "readers",
     "read_blocks": "readers",

@@ -42,6 +42,16 @@ def plan(
     finish_plan(made, output, report, json=json)
 
 
+def ramp(*, json: AsJson = False, **options: Any) -> None:
+    """Say how long gyroscopes should rest while they warm.
+
+    And how well one such ramp tells their biases over temperature.
+    """
+    from imulab.cli.show import finish_plan
+
+    finish_plan(call(il.plan_ramp, **options), None, json=json)
+
+
 def simulate(
     *, output: Annotated[str, option("DIR", "Folder for the recordings.", "-o", "--output"), OUTPUT], **options: Any
 ) -> None:
@@ -107,6 +117,7 @@ def check(
 
 COMMANDS = (
     Command("thermal plan", plan, lambda: [il.plan_thermal]),
+    Command("thermal ramp", ramp, lambda: [il.plan_ramp]),
     Command("thermal simulate", simulate, lambda: [il.simulate_thermal]),
     Command("thermal fit", fit, lambda: [il.fit_thermal]),
     Command("thermal check", check, lambda: [il.check_thermal]),

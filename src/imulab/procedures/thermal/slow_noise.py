@@ -38,7 +38,7 @@ def fit_slow_noise(mean: Array, terms: Array, time: Array) -> Array:
     """
     u, sizes, _ = np.linalg.svd(terms / np.linalg.norm(terms, axis=0))
     free = u[:, np.count_nonzero(sizes > 1e-6 * sizes[0]) :].T
-    parts = [np.eye(len(time)), *_slow_covariances(time)]
+    parts = [np.eye(len(time)), *slow_covariances(time)]
     beside = [free @ part @ free.T for part in parts]
     level = [np.trace(each) / len(free) for each in beside]
     parts, beside = ([each / size for each, size in zip(these, level, strict=True)] for these in (parts, beside))
@@ -63,7 +63,7 @@ def fit_slow_noise(mean: Array, terms: Array, time: Array) -> Array:
     return covariance
 
 
-def _slow_covariances(time: Array) -> tuple[Array, Array]:
+def slow_covariances(time: Array) -> tuple[Array, Array]:
     """Return the covariances of 1/f noise and of a random walk at these times, shapes (n, n)."""
     apart, begun = np.abs(time[:, None] - time), time - time[0] + (time[1] - time[0]) / 2
     step, length = median(np.diff(time)), 2 * float(time[-1] - time[0])
