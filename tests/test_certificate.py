@@ -20,6 +20,7 @@ from imulab.cli import main
 from imulab.display import Verdict
 from imulab.errors import UnitError
 from imulab.fleet.limits import Limits, decide, probability_of_all
+from imulab.recording import Source
 
 LAB = (Path(__file__).resolve().parent / "data" / "lab.toml").read_text(encoding="utf-8")
 STANDARD = """
@@ -192,6 +193,17 @@ def test_records_that_cannot_be_certified_are_refused(issue, capsys, record, exp
     assert issue(LAB, record) == 2
     assert expected.lower() in capsys.readouterr().err.lower()
     assert not Path("cert.xml").exists()
+
+
+@pytest.mark.parametrize(
+    ("measured", "status"),
+    [("2026-11-24", 0), ("2026-11-23", 2), ("2026-11-23T23:10:05Z", 0), ("2026-11-25T11:00:00Z", 0), ("2027-01-01", 2)],
+)
+def test_days_of_work_are_those_of_the_recordings(issue, capsys, sound, measured, status):
+    record = il.load(sound / "sound.json")
+    replace(record, sources=(Source("t.csv", "0" * 64, measured),)).save("dated.json")
+    assert issue(record="dated.json") == status
+    assert (f"t.csv says that it was measured {measured}" in capsys.readouterr().err) == bool(status)
 
 
 def test_an_altered_or_bad_record_is_refused(issue, capsys, sound):

@@ -53,7 +53,7 @@ def test_what_it_gives_is_as_if_typed(work, capsys):
         del record["created"], record["content_sha256"]
     assert records[0] == records[1]
     assert records[0]["model"]["gravity"]["from"] == "argument"
-    assert records[0]["options"]["gravity"] == pytest.approx(9.81362)
+    assert records[0]["options"]["gravity"] == "9.81362+-2e-05"
 
 
 def test_what_is_typed_wins(work, capsys):

@@ -103,6 +103,16 @@ def test_what_gravity_does_to_the_parameters_is_what_another_gravity_does_to_a_f
     assert (block / np.outer(sigma, sigma)).min() > 0.9
     assert record.model["gravity"] == {"value": G, "unit": "m/s^2", "standard_uncertainty": u, "from": "argument"}
     assert "shared" not in exact.fit
+    assert record.options["gravity"] == f"{G}+-{u}"
+    assert exact.model["gravity"]["from"] == "argument, taken as exact"
+    assert exact.options["gravity"] == G
+
+
+@pytest.mark.parametrize("text", ["9.81362", "9.81362+-0", "9.81362+-0.00002", "9.81"])
+def test_the_option_in_a_record_is_the_same_gravity_again(text):
+    stated = stated_gravity(text, "gravity")
+    again = stated_gravity(str(stated.option), "gravity")
+    assert (again.value, again.standard_uncertainty) == (stated.value, stated.standard_uncertainty)
 
 
 def test_trials_draw_gravity_too():

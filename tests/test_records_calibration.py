@@ -80,6 +80,32 @@ def sealed(content: dict) -> bytes:
     return json.dumps({**rest, "content_sha256": digest}, ensure_ascii=False).encode()
 
 
+DATED = (
+    ({"date": "2026-11-24T23:10:05"}, "2026-11-24"),
+    ({"epoch": "1764025805.000000000 s"}, "2025-11-24T23:10:05Z"),
+    ({"epoch": "86.000000000 s after midnight"}, None),
+    ({"date": "on Tuesday"}, None),
+)
+
+
+@pytest.mark.parametrize(("head", "expected"), DATED, ids=["day", "epoch", "time of day", "words"])
+def test_the_day_of_a_recording_is_kept_and_read_back(tmp_path, head, expected):
+    rows = il.Recording.from_arrays(mag=np.zeros((3, 3)), rate=10.0, unit="uT")
+    il.write_csv(replace(rows, metadata=head), tmp_path / "dated.csv")
+    source = il.read(tmp_path / "dated.csv").source
+    content = json.loads(record(sources=(source,)).to_json())
+    assert content["sources"][0].get("measured") == expected
+    assert loads(sealed(content), "r.json").sources[0].measured == expected
+
+
+@pytest.mark.parametrize("day", ["", "yesterday", "2026-13-01", "2026-11-24 10:00", 7])
+def test_a_day_that_is_none_is_refused(day):
+    content = json.loads(TEXT)
+    content["sources"][0]["measured"] = day
+    with pytest.raises(RecordError, match="measured: expected"):
+        parsed(sealed(content), "r.json")
+
+
 # --- what is written -------------------------------------------------------------------------------------------
 
 

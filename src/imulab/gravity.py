@@ -54,6 +54,10 @@ _USELESS = 0.01
 _TO_MICRO = 1e6  # to ppm
 
 
+_EXACT = "argument, taken as exact"
+"""Origin of a value that was typed without an uncertainty, to five decimals or more."""
+
+
 class Gravity(Struct, frozen=True):
     """Local gravity and its standard uncertainty, m/s^2, the origin of the value, and remarks."""
 
@@ -66,6 +70,12 @@ class Gravity(Struct, frozen=True):
     def name(self) -> str:
         """Name that records with this gravity share: its error is the same in all of them."""
         return f"gravity {self.value!r} +- {self.standard_uncertainty!r} m/s^2"
+
+    @property
+    def option(self) -> float | str:
+        """What ``--gravity`` takes to be this again: the number alone where no uncertainty of it was stated."""
+        exact = not self.standard_uncertainty and self.origin != "argument"
+        return self.value if exact else f"{self.value!r}+-{self.standard_uncertainty!r}"
 
 
 Given = TypeVar("Given")
@@ -99,7 +109,7 @@ def local_gravity(stated: float | str | Gravity | None, recording: Recording) ->
     elif isinstance(stated, Gravity):
         local = stated
     elif isinstance(stated, numbers.Real):
-        local = Gravity(float(stated), "argument")
+        local = Gravity(float(stated), _EXACT)
     else:
         raise OptionError(f"gravity {quoted(stated)}: expected a number, m/s^2, or a text such as '9.81362+-0.00002'")
     _check_possible(local.value)
@@ -234,7 +244,7 @@ def stated_gravity(text: str, option: str) -> Gravity:
         return Gravity(value, "argument", uncertainty)
     half = _half_digit(first, "acceleration", "m/s^2")
     if half <= _ROUNDED:
-        return Gravity(value, "argument")
+        return Gravity(value, _EXACT)
     uncertainty = half / math.sqrt(3)
     if uncertainty > _USELESS * value:
         raise OptionError(
@@ -277,7 +287,8 @@ def _gravity_in_head(recording: Recording) -> Gravity | None:
         f"gravity {stated.value:.6g} m/s^2{known} was taken from the head of {recording.name}, "
         "as no option gave another"
     )
-    return Gravity(stated.value, f"head of {recording.name}", stated.standard_uncertainty, Note(words))
+    exact = ", taken as exact" * (stated.origin == _EXACT)
+    return Gravity(stated.value, f"head of {recording.name}{exact}", stated.standard_uncertainty, Note(words))
 
 
 def checked_latitude(latitude: float, name: str = "latitude") -> float:

@@ -49,10 +49,14 @@ RESAMPLED = "resampled"
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A file that a recording was read from, and the SHA-256 of its bytes."""
+    """A file that a recording was read from, and the SHA-256 of its bytes.
+
+    `measured` is the day of its first sample, or the time in UTC, where the recording tells it; else None.
+    """
 
     file: str
     sha256: str
+    measured: str | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)

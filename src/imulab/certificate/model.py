@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 
 import numpy as np
 
@@ -103,6 +104,7 @@ def make_certificate(record: Calibration, sha256: str, lab: Laboratory, limits: 
             _check_gravity(record, standard)
     if len(record.model.get("serials", ())) > 1:
         raise RecordError("the record is of several units; a certificate is of one item")
+    _check_days(record, lab)
     results = tuple(_results(record))
     if not results:
         raise RecordError("no parameter of the record has an uncertainty: there is nothing to certify")
@@ -155,6 +157,24 @@ def _check_verdict(record: Calibration, lab: Laboratory) -> None:
         raise RecordError(
             "the record's verdict is look; expected certificate.reviewed to say why it may be certified: " + reasons
         )
+
+
+_ZONES = timedelta(hours=12), timedelta(hours=14)
+"""How far clocks are behind and ahead of UTC at most."""
+
+
+def _check_days(record: Calibration, lab: Laboratory) -> None:
+    """Refuse days of work that are not those of the recordings, where these tell theirs."""
+    first, last = lab.certificate.performed
+    for source in record.sources:
+        if source.measured is None:
+            continue
+        begin = datetime.fromisoformat(source.measured)
+        behind, ahead = _ZONES if begin.tzinfo else (timedelta(), timedelta())
+        if (begin + ahead).date() < first or (begin - behind).date() > last:
+            raise OptionError(
+                f"certificate.performed {first} to {last}: {source.file} says that it was measured {source.measured}"
+            )
 
 
 def _check_gravity(record: Calibration, standard: Equipment) -> None:

@@ -8,7 +8,9 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
+from datetime import UTC, date, datetime
 from importlib import import_module
 from pathlib import Path
 from time import perf_counter
@@ -114,13 +116,23 @@ def _read(
     blocks = _log_reading(selection.of(_blocks(file, name, known, selection, hashed), name))
     if not in_memory:
         recording = on_disk(blocks)
-        return replace(recording, source=Source(name, hashed.of(file)))
+        return replace(recording, source=Source(name, hashed.of(file), measured(recording.metadata)))
     first, parts, notes = _gather(blocks)
-    source, stated = Source(name, hashed.of(file)), first.units
+    source, stated = Source(name, hashed.of(file), measured(first.metadata)), first.units
     first = replace(first, columns={})
     # The parts of a column are freed as soon as they are joined, so that a large file is not in memory twice.
     joined = {key: _join([part.pop(key) for part in parts]) for key in list(parts[0])}
     return packed(replace(first, columns=joined, units=stated, source=source, notes=notes))
+
+
+def measured(head: Mapping[str, str]) -> str | None:
+    """Return the day that the head of a recording states, or the time of its first sample in UTC; None without."""
+    with suppress(ValueError):
+        return str(date.fromisoformat(head.get("date", "")[:10]))
+    with suppress(ValueError, OverflowError, OSError):  # a time of day alone ends with "after midnight"
+        begin = datetime.fromtimestamp(float(head.get("epoch", "").removesuffix(" s")), UTC)
+        return begin.strftime("%Y-%m-%dT%H:%M:%SZ")
+    return None
 
 
 def _gather(blocks: Iterator[Recording]) -> tuple[Recording, list[dict[str, Array]], tuple[str, ...]]:

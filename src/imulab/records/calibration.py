@@ -303,7 +303,11 @@ class Calibration:
             "sensor": dict(self.sensor),
             "created": self.created,
             "software": self.software,
-            "sources": [{"file": source.file, "sha256": source.sha256} for source in self.sources],
+            "sources": [
+                {"file": source.file, "sha256": source.sha256}
+                | ({} if source.measured is None else {"measured": source.measured})
+                for source in self.sources
+            ],
             "model": self.model,
             "parameters": {
                 name: {"value": p.value, "standard_uncertainty": p.standard_uncertainty, "unit": p.unit}

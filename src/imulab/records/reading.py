@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from dataclasses import fields, replace
+from datetime import datetime
 from typing import Any
 
 import msgspec
@@ -19,6 +20,7 @@ from imulab.records.calibration import BLOB_MAGIC, FORMAT, SCHEMA_VERSION, Calib
 from imulab.records.sections import check_sizes, read
 
 _CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
+_MEASURED = re.compile(r"\d{4}-\d\d-\d\d(?:T\d\d:\d\d:\d\dZ)?", re.ASCII)
 _SCALE_FACTOR = re.compile(r"(?:\w+_)?scale_factor_[xyz](?:_at_\d+)?")
 _ROUNDING = 1.0 + 1e-6  # of a covariance in decimals, relative
 _NEEDED = ("procedure", "sensor", "created", "software", "sources", "model", "parameters", "covariance", "fit")
@@ -106,6 +108,11 @@ def _validated(content: dict[str, Any], name: str, *, plain: bool) -> Calibratio
         raise RecordError(f"{name}: {place} holds a control or bidirectional character; expected plain text")
     if not _CREATED.fullmatch(record.created):
         raise RecordError(f"{name}: created: expected a time such as 2026-11-20T12:00:00Z, found {record.created!r}")
+    for source in record.sources:
+        if source.measured is not None and not _is_day(source.measured):
+            raise RecordError(
+                f"{name}: sources: measured: expected a day such as 2026-11-20, found {source.measured!r}"
+            )
     size = len(record.covariance.names)
     if len(record.covariance.matrix) != size or any(len(row) != size for row in record.covariance.matrix):
         raise RecordError(f"{name}: covariance: expected a {size} x {size} matrix")
@@ -115,6 +122,13 @@ def _validated(content: dict[str, Any], name: str, *, plain: bool) -> Calibratio
         raise RecordError(f"{name}: {error}") from None
     verdict = replace(record.verdict, has_next="next" in content.get("verdict", {"next": ()}))
     return replace(record, warnings=as_judged(record.warnings, verdict), verdict=verdict)
+
+
+def _is_day(text: str) -> bool:
+    try:
+        return _MEASURED.fullmatch(text) is not None and bool(datetime.fromisoformat(text))
+    except ValueError:
+        return False
 
 
 def _check_numbers(record: Calibration) -> None:

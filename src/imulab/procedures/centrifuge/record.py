@@ -39,7 +39,7 @@ def make_record(
     model: dict[str, Any] = {
         "equation": "drift = K(a) (a_x cos direction + a_y sin direction), K(a) = K0 (1 + c1 a + c2 a^2)",
         "radius": {"value": manifest.radius, "unit": "m", "from": "manifest"},
-        "gravity": {"value": manifest.gravity, "unit": "m/s^2", "from": "manifest"},
+        "gravity": {"value": manifest.gravity, "unit": "m/s^2", "from": "manifest, taken as exact"},
         "reference": _value(manifest.reference, "m/s^2"),
         "curve": {prefix.rstrip("_"): fitted.model for prefix, fitted in estimates.curves.items()},
         "highest_specific_force": _value(max(level.force for level in levels.items), "m/s^2"),

@@ -195,7 +195,7 @@ def fit_thermal(
     covered, hidden = cover_hidden(problem, choice.solution, drift, name)
     options = {
         "degrees": wanted if isinstance(wanted, str) else ["spline", *wanted[1:]] if spline else list(wanted),
-        "gravity": local.value, "tilt": leaning, "with": list(further) or None,
+        "gravity": local.option, "tilt": leaning, "with": list(further) or None,
         "latitude": None if earth is None else earth.latitude,
         "turn_on_scatter": None if scatter is None else scatter * local.value,
         "gyro_turn_on_scatter": rates, "temperature_column": temperature_column, "settle": settling,

@@ -247,7 +247,7 @@ def fit_tumble(
         ageing=ageing, cross=cross,
     )  # fmt: skip
     options = {
-        "order": order, "method": method, "loss": loss, "gravity": local.value,
+        "order": order, "method": method, "loss": loss, "gravity": local.option,
         "nonlinearity": nonlinearity and list(nonlinearity), "asymmetry": asymmetry, "monte_carlo": monte_carlo,
         "cross": cross or None, "threshold": rest and rest.in_si(local.value), "preset": preset and list(preset),
     }  # fmt: skip

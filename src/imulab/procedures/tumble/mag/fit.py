@@ -94,7 +94,7 @@ def make_mag_record(
     """Return the record of both triads: parameters, covariance, and residuals of |m| and dip of each attitude."""
     accel = make_record(
         ready.estimate, ready.gravity, ready.scaling,
-        {"order": ready.order, "method": "norm", "loss": ready.loss, "gravity": ready.gravity.value},
+        {"order": ready.order, "method": "norm", "loss": ready.loss, "gravity": ready.gravity.option},
     )  # fmt: skip
     known = _parameter_covariance(ready, joint)
     heading = heading_uncertainty(joint, known)
