@@ -55,6 +55,27 @@ def test_from_the_plug_to_the_record(tmp_path):
     assert content(tmp_path / "live.json") == fitted(tmp_path, *FIT)
 
 
+@pytest.mark.slow
+def test_a_place_stands_for_gravity_and_is_in_the_command_that_makes_the_record_again(tmp_path):
+    words = [
+        "simulate:speed=40",
+        "--follow",
+        "--plain",
+        "--attitudes",
+        "12",
+        "--order",
+        "1",
+        "--place",
+        "48.1,11.6,520",
+    ]
+    with live([*words, "--save", "rec.csv", "-o", "live.json"], tmp_path) as process:
+        assert process.ended(60) == 0, process.text
+    assert "imulab tumble fit rec.csv --order 1 --place 48.1,11.6,520 makes the same record" in process.text
+    record = content(tmp_path / "live.json")
+    assert record["model"]["gravity"]["from"].startswith("normal gravity at latitude 48.1 deg, height 520 m")
+    assert record == fitted(tmp_path, "--order", "1", "--place", "48.1,11.6,520")
+
+
 def kills(folder: Path, times: int, seed: int) -> None:
     """Kill a session again and again, then let it end; what it had a second before is in the file each time."""
     rng, recording = np.random.default_rng(seed), tumble(240, seed=seed)
@@ -175,7 +196,8 @@ def test_the_magnetometers_follow_too_or_are_left_out_with_the_reason(tmp_path, 
     assert "a quarter turn about the vertical from the last" in process.text
     further = "gyro" if dead else "gyro,mag"
     assert content(tmp_path / "live.json") == fitted(tmp_path, *FIT, "--with", further)
-    assert f"imulab tumble fit rec.csv --with {further} makes the same record" in process.text
+    command = f"imulab tumble fit rec.csv --order 1 --gravity 9.81+-0 --with {further}"
+    assert f"{command} makes the same record" in process.text
     assert ("the magnetometers are not calibrated: rec.csv: column mag_x" in process.text) == dead
 
 

@@ -243,7 +243,7 @@ def _gravity_of_place(fitted: dict[str, str | None], texts: Mapping[str, str]) -
     from imulab.procedures.tumble.procedure import TASK
 
     gravity: Gravity = TASK.values(dict(texts), FLAG)["gravity"]
-    fitted.update({"gravity": None, "latitude": None, "height": None} | dict(texts))
+    fitted.update({"gravity": None, "latitude": None, "height": None, "place": None} | dict(texts))
     return gravity
 
 
@@ -253,9 +253,9 @@ def _make_record(save: str, fitted: dict[str, str | None], output: str | None, r
 
     if not Path(save).exists():
         raise OptionError(f"{save}: not written, as no row of readings came that could be used")
-    record, further, why = _all_triads(save, fitted)
+    record, _, why = _all_triads(save, fitted)
     finish(record, output, report, json=False)
-    _say_how(save, further, why)
+    _say_how(save, again(save, fitted, None, record), why)
     return record
 
 
@@ -292,10 +292,9 @@ def _number_of_attitudes(text: str | None, target: str | None) -> int | None:
     return number
 
 
-def _say_how(save: str, further: list[str], why: list[str]) -> None:
+def _say_how(save: str, command: str, why: list[str]) -> None:
     """Print the command that makes the same record, and why it lacks gyroscopes or magnetometers."""
-    others = f" --with {','.join(further)}" if further else ""
-    note(f"the recording is {save}; imulab tumble fit {save}{others} makes the same record")
+    note(f"the recording is {save}; {command} makes the same record")
     for each in why:
         note(each)
 
@@ -416,6 +415,11 @@ def _draw_view(runner: Runner, *, typed: bool) -> None:
 
 
 COMMANDS = (
-    Command("live", live, lambda: [il.fit_tumble], only=("order", "gravity", "latitude", "height", "layout", "units")),
+    Command(
+        "live",
+        live,
+        lambda: [il.fit_tumble],
+        only=("order", "gravity", "latitude", "height", "place", "layout", "units"),
+    ),
     Command("open", open),
 )
