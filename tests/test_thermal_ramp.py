@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.reference.rest_ramp import Ramp
+from tests.reference.rest_ramp import Ramp, flicker
 
 import imulab as il
 from imulab.errors import DataError, OptionError, RecordError
@@ -231,3 +231,73 @@ def test_intervals_hold_in_a_thousand(
     assert (0.88 if reduced else 0.93) <= share <= (1.0 if reduced else 0.97)
     one = 1 / 16 if reduced else 0.0  # may be otherwise by chance
     assert found is None or found[0] - one <= lag <= found[1] + one
+
+
+UP = np.array([0.6, -0.48, 0.64])
+G = 9.81
+
+
+def with_accelerometers(ramp: Ramp, seed: int) -> tuple[il.Recording, np.ndarray]:
+    """Return the ramp with accelerometers of known bias and scale over temperature, and their change along gravity."""
+    rng = np.random.default_rng([seed, 7])
+    d = ramp.temperature - 25.0
+    bias = np.outer(d, rng.normal(0, 2e-3, 3)) + np.outer(d**2, rng.normal(0, 3e-5, 3))
+    scale = np.outer(d, rng.normal(0, 5e-5, 3))
+    white = rng.choice([3e-3, 2e-2])
+    slow = np.column_stack([flicker(len(d), rng) for _ in UP]) * np.exp(rng.uniform(*np.log([1e-4, 2e-3])))
+    outputs = G * UP * (1 + scale) + bias + white * rng.standard_normal((len(d), 3)) + slow
+    recording = recorded(ramp)
+    columns = {f"accel_{a}": outputs[:, k] for k, a in enumerate(AXES)}
+    recording = recording.with_columns(columns, dict.fromkeys(columns, "m/s^2"))
+    return recording, (G * UP * scale + bias) @ UP
+
+
+def changes(recording: il.Recording) -> dict[str, np.ndarray]:
+    held = il.fit_thermal(recording, degrees="3,0,0").calibration.data["accel_change"]
+    assert held["recording"] == [recording.name]
+    return {name: np.array(values[0]) for name, values in held.items() if name != "recording"}
+
+
+def test_accelerometers_change_along_gravity_and_nothing_is_said_across(tmp_path: Path) -> None:
+    recording, along = with_accelerometers(Ramp(3), 3)
+    record = il.fit_thermal(recording).calibration
+    held = record.data["accel_change"]
+    np.testing.assert_allclose(held["up"][0], UP, atol=5e-3)  # biases of mg lean it
+    order = np.argsort(recording.column("temperature"))
+    truth = np.interp(held["temperature"][0], Ramp(3).temperature[order], along[order])
+    change, u = np.array(held["change"][0]), np.array(held["standard_uncertainty"][0])
+    assert (np.abs(change - (truth - truth[4])) < 3 * u + 1e-9).all()
+    assert (u < 0.2 * np.ptp(truth)).all()
+    assert any("along gravity" in each and "tilt" in each for each in record.warnings)
+    assert not any(name.startswith(("bias_", "scale_factor")) for name in record.parameters)
+    record.save(tmp_path / "r.json")
+    assert il.load(tmp_path / "r.json").data["accel_change"] == held
+    il.write_report(record, tmp_path / "r.html")
+    assert "along gravity" in (tmp_path / "r.html").read_text()
+    corrected = il.apply(record, recording)
+    np.testing.assert_array_equal(corrected.column("accel_x"), recording.column("accel_x"))
+
+
+@pytest.mark.slow
+def test_intervals_of_the_change_along_gravity_hold(reduced: bool) -> None:
+    inside = []
+    for seed in range(30 if reduced else 200):
+        ramp = Ramp(seed)
+        recording, along = with_accelerometers(ramp, seed)
+        held = changes(recording)
+        order = np.argsort(ramp.temperature)
+        truth = np.interp(held["temperature"], ramp.temperature[order], along[order])
+        apart = np.abs(held["change"] - (truth - truth[4])) < 1.96 * held["standard_uncertainty"]
+        inside.append(np.delete(apart, 4))
+    assert 0.90 < np.mean(inside) < 0.99
+
+
+def test_counts_and_a_missing_axis_tell_no_change_and_one_ramp_alone_is_good() -> None:
+    recording, _ = with_accelerometers(Ramp(3), 3)
+    columns = {f"accel_{a}": np.round(recording.column(f"accel_{a}") * 1000) for a in AXES}
+    counts = recording.with_columns(columns, dict.fromkeys(columns, "count"))
+    assert "accel_change" not in il.fit_thermal(counts).calibration.data
+    assert "accel_change" not in fitted().calibration.data
+    record = il.fit_thermal(recording).calibration
+    assert record.verdict.state == "good"
+    assert any("one recording is one power cycle" in each for each in record.warnings)

@@ -18,6 +18,7 @@ from imulab.procedures.thermal.record import (
     predict_parameters,
 )
 from imulab.procedures.thermal.schema import (
+    AccelChange,
     DegreesTried,
     LeftOutTemperature,
     RampRecord,
@@ -314,7 +315,35 @@ def _ramp_exhibits(record: Calibration, ramp: RampRecord) -> Exhibits:
     )
     facts, items = gyro_exhibits(record, temperature)
     facts.append(("not told", "scale factors, misalignments, g-sensitivities; accelerometers"))
+    if ramp.data.accel_change is not None:
+        items.append(_accel_change_figure(ramp.data.accel_change))
     return Exhibits(headline, facts, [_coefficients_table(record), *items])
+
+
+def _accel_change_figure(change: AccelChange) -> Figure:
+    """Return the figure of the accelerometers' output along gravity over temperature, by recording."""
+    traces = []
+    for k, name in enumerate(change.recording):
+        colour, at = COLOURS[k % len(COLOURS)], np.array(change.temperature[k])
+        values, u = from_si(np.array(change.change[k]), "mg"), from_si(np.array(change.standard_uncertainty[k]), "mg")
+        line = {"color": colour, "dash": DASHES[k % len(DASHES)]}
+        traces += [
+            band(at, values - 2 * u, values + 2 * u, colour, showlegend=False),
+            scatter(rounded(at), rounded(values), "lines", name=name, line=line),
+        ]
+    most = max(abs(each) for row in change.change for each in row)
+    return Figure(
+        title="Output of the accelerometers along gravity over temperature",
+        message=f"It changes by up to {plain_number(float(from_si(most, 'mg')), 2)} mg from the middle of the range.",
+        caption="Change of the mean output along gravity, with a band of two standard uncertainties: of bias and scale "
+        "factor together, which one attitude does not tell apart. Nothing is corrected by it.",
+        traces=traces,
+        layout={
+            "xaxis": figure_axis("temperature, degC"),
+            "yaxis": figure_axis("change along gravity, mg", exponentformat="none"),
+            "legend": LEGEND,
+        },
+    )
 
 
 def _lag_and_loop_facts(thermal: ThermalRecord) -> list[tuple[str, str]]:

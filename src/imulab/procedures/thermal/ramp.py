@@ -24,12 +24,13 @@ from imulab.estimation.least_squares import Observability
 from imulab.estimation.noise.readings import doubtful_units
 from imulab.estimation.rows import leave_out, median
 from imulab.gravity import EARTH, EarthRate
+from imulab.procedures.thermal.accel_change import find_changes, note_on
 from imulab.procedures.thermal.degrees import Degrees, judge_observability
 from imulab.procedures.thermal.gyro import ThermalGyroscopes, check_gyroscopes, fit_gyroscopes, rates_at_rest
 from imulab.procedures.thermal.holds import Holds, find_stretches_at_rest, reading_uncertainty
 from imulab.procedures.thermal.model import AXES, GROUPS, MISALIGNMENTS, SENSITIVITIES
 from imulab.procedures.thermal.record import with_gyroscopes
-from imulab.procedures.thermal.schema import RampModel, RampSummary
+from imulab.procedures.thermal.schema import RampEvidence, RampModel, RampSummary
 from imulab.procedures.thermal.slow_noise import fit_slow_noise
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance
@@ -113,6 +114,7 @@ def fit_ramps(
     known = 0.0 if tau is None and len(recordings) == 1 else tau
     gyros = fit_gyroscopes(held, low, high, wanted, known, name, spline=spline)
     _check_steady(gyros, name)
+    change = find_changes(recordings, holds)
     sensor = {key: text for key in ("serial", "model", "element") for r in recordings if (text := r.metadata.get(key))}
     sources = tuple(each.source for each in recordings if each.source is not None)
     middle = Quantity(value=gyros.solution.laws.middle, unit="degC")
@@ -127,14 +129,14 @@ def fit_ramps(
             **entries(RampSummary(not_told=list(NOT_TOLD))),
         },
         options=dict(options),
-        data={},
+        data=entries(RampEvidence(accel_change=change)),
         sensor=sensor,
         sources=sources,
         warnings=(*(note for each in recordings for note in each.notes), *_doubts(recordings), *notes),
         verdict=UNJUDGED,
     )
     record = with_gyroscopes(record, holds, gyros, None, name)
-    record = replace(record, warnings=(*record.warnings, *_say_untold(gyros, name)), verdict=UNJUDGED)
+    record = replace(record, warnings=(*record.warnings, *_say_untold(gyros, name), *note_on(change)), verdict=UNJUDGED)
     return record, judge_observability(gyros.solution)
 
 

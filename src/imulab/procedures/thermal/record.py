@@ -542,7 +542,14 @@ def _warn_gyroscopes(
     messages = [*gyros.held.notes, *([] if gyros.held.earth is None else [gyros.held.earth.note()])]
     messages += note_turns(holds, gyros.aside)
     scatter = gyros.solution.scatter
-    if not scatter.rank and "gyro_turn_on_scatter" not in record.options:
+    if not scatter.rank and "gyro_turn_on_scatter" not in record.options and len(holds.recordings) == 1:
+        messages.append(  # one ramp is all that was meant to be recorded, and tells what it can
+            Note(
+                f"gyro: {name}: one recording is one power cycle: how far the next one moves the biases is in no "
+                "uncertainty; further ramps tell, or --gyro-turn-on-scatter"
+            )
+        )
+    elif not scatter.rank and "gyro_turn_on_scatter" not in record.options:
         messages.append(
             f"gyro: {name}: too few recordings to tell how far biases move from one power cycle to the next; no "
             "uncertainty covers this: record more temperatures or come back to some, or state --gyro-turn-on-scatter"

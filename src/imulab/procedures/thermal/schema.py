@@ -13,6 +13,7 @@ T = TypeVar("T")
 PerHold = Annotated[list[T], "holds"]
 PerGyroHold = Annotated[list[T], "holds of gyroscopes"]
 PerCalibration = Annotated[list[T], "calibrations"]
+PerChange = Annotated[list[T], "recordings with accelerometers"]
 Three = Annotated[list[T], 3]
 Nine = Annotated[list[T], 9]
 
@@ -227,10 +228,24 @@ class OwnCalibrations(Part):
     standard_uncertainty: PerCalibration[Nine[float]]
 
 
+class AccelChange(Part):
+    """``data.accel_change`` of rest ramps: the change of the accelerometers' output along gravity, by recording.
+
+    `up` is the direction up in the body; `change`, m/s^2, at each `temperature`, degC, is from the middle of the range.
+    """
+
+    recording: PerChange[str]
+    up: PerChange[Three[float]]
+    temperature: PerChange[list[float]]
+    change: PerChange[list[float]]
+    standard_uncertainty: PerChange[list[float]]
+
+
 class RampEvidence(Part):
     """``data`` of rest ramps, and what the whole model has of gyroscopes."""
 
     gyro: GyroHoldResiduals | None = None
+    accel_change: AccelChange | None = None
 
 
 class ThermalEvidence(RampEvidence):

@@ -36,6 +36,20 @@ def fit_slow_noise(mean: Array, terms: Array, time: Array) -> Array:
     time
         Time of each part, s, shape (n,).
     """
+    sizes, parts = _fit_sizes(mean, terms, time)
+    covariance: Array = np.tensordot(sizes[:, 1:], np.array(parts[1:]), 1)
+    return covariance
+
+
+def fit_noise(mean: Array, terms: Array, time: Array) -> Array:
+    """Return the covariance by all noise, white noise too, of axes as many as there are, shape (axes, n, n)."""
+    sizes, parts = _fit_sizes(mean, terms, time)
+    covariance: Array = np.tensordot(sizes, np.array(parts), 1)
+    return covariance
+
+
+def _fit_sizes(mean: Array, terms: Array, time: Array) -> tuple[Array, list[Array]]:
+    """Return the sizes of white noise, 1/f noise and walk of each axis, shape (axes, 3), and their covariances."""
     u, sizes, _ = np.linalg.svd(terms / np.linalg.norm(terms, axis=0))
     free = u[:, np.count_nonzero(sizes > 1e-6 * sizes[0]) :].T
     parts = [np.eye(len(time)), *slow_covariances(time)]
@@ -53,14 +67,12 @@ def fit_slow_noise(mean: Array, terms: Array, time: Array) -> Array:
             relative = 1 + q * np.maximum(walk, 0.0)
             level_of_axis = (squares / relative[:, None]).mean(axis=0)
             half = np.log(np.diag(factor)).sum() + 0.5 * np.log(relative).sum()
-            likelihood.append(-3 * half - 0.5 * len(free) * np.log(level_of_axis).sum())
+            likelihood.append(-mean.shape[1] * half - 0.5 * len(free) * np.log(level_of_axis).sum())
             levels.append(level_of_axis)
-    ratios = np.array([(p, q) for p in _RATIOS for q in _RATIOS])
+    ratios = np.array([(1.0, p, q) for p in _RATIOS for q in _RATIOS])
     weight = np.exp(np.array(likelihood) - max(likelihood))
     weight /= weight.sum()
-    slow = np.einsum("k,ka,kp->ap", weight, np.array(levels), ratios)
-    covariance: Array = np.tensordot(slow, np.array(parts[1:]), 1)
-    return covariance
+    return np.einsum("k,ka,kp->ap", weight, np.array(levels), ratios), parts
 
 
 def slow_covariances(time: Array) -> tuple[Array, Array]:
