@@ -382,6 +382,4 @@ def test_the_template_is_that_of_the_guide_and_makes_a_valid_certificate(issue, 
 
 def test_what_is_missing_on_the_command_line_is_said(capsys):
     assert main(["certificate", "r.json", "-o", "c.xml"]) == 2
-    assert capsys.readouterr().err == ("imulab: expected RECORD, --lab LAB.toml and -o CERT.xml, or --template alone\n")
-    assert main(["certificate", "r.json", "--lab", "LAB.toml", "-o", "c.pdf"]) == 2
-    assert capsys.readouterr().err.startswith("imulab: c.pdf: expected a name that ends with .xml")
+    assert capsys.readouterr().err == ("imulab: expected RECORD, --lab LAB.toml and -o CERT.pdf, or --template alone\n")

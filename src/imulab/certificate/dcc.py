@@ -10,15 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from decimal import Decimal
-from typing import Any
 from xml.etree import ElementTree as ET
 
 from imulab.certificate.laboratory import Address, Condition, Equipment, Party
 from imulab.certificate.model import NORMAL, Certificate, Result
+from imulab.certificate.texts import Words, agreed_rule, equipment_text, evaluation, remarks, statements
 from imulab.certificate.units import dsi_unit
 from imulab.estimation.distributions import chi_square_upper_quantile
 from imulab.fleet.limits import Conformity, Limits
-from imulab.records.calibration import Covariance
 
 SCHEMA = "3.3.0"
 """Version of the schema that is written."""
@@ -27,16 +26,6 @@ _XSI = "http://www.w3.org/2001/XMLSchema-instance"
 _COVERED = 0.95
 """Probability of the ellipsoid of all parameters together, whose factor is the root of a quantile of chi-square."""
 _ISSUED_UNDER = "ISO/IEC 17025:2017"
-_RULES = {
-    "simple": "a value passes within its limits",
-    "guarded": "a value passes within its limits less its expanded uncertainty",
-    "bands": "a value passes within its limits less its expanded uncertainty, passes on condition within its limits, "
-    "fails on condition beyond them by at most its expanded uncertainty",
-}
-_STATEMENTS = (
-    ("7.8.2.1 l", "The results relate only to the item calibrated, in the condition described."),
-    ("7.8.2.1", "The certificate must not be reproduced except in full without the laboratory's written approval."),
-)
 
 
 def dcc_xml(certificate: Certificate) -> bytes:
@@ -50,8 +39,15 @@ def dcc_xml(certificate: Certificate) -> bytes:
             "xsi:schemaLocation": f"{_SPACES['dcc']} https://ptb.de/dcc/v{SCHEMA}/dcc.xsd",
         },
     )
-    _administrative(root, certificate)
-    _measurement(_add(_add(root, "measurementResults"), "measurementResult"), certificate)
+    words = Words(certificate.language)
+    _administrative(root, certificate, words)
+    results = _add(root, "measurementResults")
+    before = certificate.before
+    if before is not None:
+        _measurement(_add(results, "measurementResult"), before, words, "before")
+    _measurement(_add(results, "measurementResult"), certificate, words, "after" if before is not None else "")
+    for content in root.iter("dcc:content"):
+        content.attrib.setdefault("lang", words.language)
     ET.indent(root)
     text: str = ET.tostring(root, encoding="unicode")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()
@@ -67,9 +63,9 @@ def _add(parent: ET.Element, name: str, text: str | None = None, **attributes: s
     return child
 
 
-def _words(parent: ET.Element, name: str, text: str) -> None:
-    """Add a text in the language of the certificate."""
-    _add(_add(parent, name), "content", text, lang="en")
+def _words(parent: ET.Element, name: str, text: str, language: str | None = None) -> None:
+    """Add a text, in the language of the certificate if not stated."""
+    _add(_add(parent, name), "content", text, **({} if language is None else {"lang": language}))
 
 
 def _optional(parent: ET.Element, name: str, text: object | None) -> None:
@@ -80,22 +76,27 @@ def _optional(parent: ET.Element, name: str, text: object | None) -> None:
 # The head: who, what, when.
 
 
-def _administrative(root: ET.Element, certificate: Certificate) -> None:
+def _administrative(root: ET.Element, certificate: Certificate, words: Words) -> None:
     lab, head = certificate.lab, _add(root, "administrativeData")
     _software(_add(head, "dccSoftware"), certificate.record.software)
     core, identity = _add(head, "coreData"), lab.certificate
     _add(core, "countryCodeISO3166_1", lab.laboratory.address.country)
-    for name in ("usedLangCodeISO639_1", "mandatoryLangCodeISO639_1"):
-        _add(core, name, identity.language)
+    for language in dict.fromkeys((words.language, "en")):  # the record's own sentences are English
+        _add(core, "usedLangCodeISO639_1", language)
+    _add(core, "mandatoryLangCodeISO639_1", words.language)
     _add(core, "uniqueIdentifier", identity.number)
     if lab.customer.order is not None:
-        _identification(_add(core, "identifications"), "customer", lab.customer.order, "order")
+        _identification(_add(core, "identifications"), "customer", lab.customer.order, words("order"))
     _optional(core, "receiptDate", identity.received)
     _add(core, "beginPerformanceDate", str(identity.performed[0]))
     _add(core, "endPerformanceDate", str(identity.performed[1]))
     _add(core, "performanceLocation", identity.location)
     _add(core, "issueDate", str(identity.issued))
-    _item(_add(head, "items"), certificate)
+    if identity.replaces is not None:
+        amended = _add(core, "reportAmendedSubstituted")
+        _add(amended, "typeOfChange", "amended")
+        _add(amended, "replacedUniqueIdentifier", identity.replaces)
+    _item(_add(head, "items"), certificate, words)
     laboratory = _add(head, "calibrationLaboratory")
     _optional(laboratory, "calibrationLaboratoryCode", lab.laboratory.code)
     _contact(_add(laboratory, "contact"), lab.laboratory)
@@ -107,7 +108,7 @@ def _administrative(root: ET.Element, certificate: Certificate) -> None:
         if person.signs:
             _add(entry, "mainSigner", "true")
     _contact(_add(head, "customer"), lab.customer)
-    _statements(_add(head, "statements"), certificate)
+    _statements(_add(head, "statements"), certificate, words)
 
 
 def _software(parent: ET.Element, software: str) -> None:
@@ -125,13 +126,13 @@ def _identification(parent: ET.Element, issuer: str, value: str, name: str) -> N
     _words(entry, "name", name)
 
 
-def _item(parent: ET.Element, certificate: Certificate) -> None:
+def _item(parent: ET.Element, certificate: Certificate, words: Words) -> None:
     stated, item = certificate.lab.item, _add(parent, "item")
     _words(item, "name", stated.name)
-    _words(item, "description", f"Condition: {stated.condition}")
+    _words(item, "description", words("stated condition", stated.condition))
     _words(_add(item, "manufacturer"), "name", stated.manufacturer)
     _optional(item, "model", certificate.model)
-    _identification(_add(item, "identifications"), "manufacturer", certificate.serial, "serial number")
+    _identification(_add(item, "identifications"), "manufacturer", certificate.serial, words("serial number"))
 
 
 def _contact(parent: ET.Element, party: Party) -> None:
@@ -148,8 +149,8 @@ def _location(parent: ET.Element, address: Address) -> None:
     _add(parent, "countryCode", address.country)
 
 
-def _statements(parent: ET.Element, certificate: Certificate) -> None:
-    for clause, text in _STATEMENTS:
+def _statements(parent: ET.Element, certificate: Certificate, words: Words) -> None:
+    for clause, text in statements(certificate, words):
         entry = _add(parent, "statement")
         _add(entry, "norm", _ISSUED_UNDER)
         _add(entry, "reference", clause)
@@ -159,44 +160,34 @@ def _statements(parent: ET.Element, certificate: Certificate) -> None:
     _add(entry, "norm", _ISSUED_UNDER)
     _add(entry, "reference", "7.8.4.1 c")
     _words(entry, "declaration", certificate.lab.traceability.statement)
-    remarks = list(certificate.record.verdict.reasons)
-    if certificate.lab.certificate.reviewed is not None:
-        remarks.append(f"Reviewed: {certificate.lab.certificate.reviewed}")
-    if certificate.left_out:
-        values = "1 value" if certificate.left_out == 1 else f"{certificate.left_out} values"
-        remarks.append(f"{values} without uncertainty are in the record, not in this certificate.")
-    bands = {each.name: each.decision.acceptance for each in certificate.results if each.decision is not None}
-    if hopeless := [name for name, band in bands.items() if band.lower > band.upper]:
-        remarks.append(f"{', '.join(hopeless)}: the uncertainty is more than half of the tolerance, no value can pass.")
-    for remark in remarks:
-        _words(_add(parent, "statement"), "declaration", remark)
-    agreed = certificate.lab.conformity
-    if agreed is not None and certificate.state is not None:
+    if (next_time := certificate.lab.certificate.recalibration) is not None:
+        entry = _add(parent, "statement", refType="basic_recalibration")
+        _words(entry, "declaration", words("recalibration", next_time.agreed, next_time.date))
+        _add(entry, "date", str(next_time.date))
+    for remark, language in remarks(certificate, words):
+        _words(_add(parent, "statement"), "declaration", remark, language)
+    if (rule := agreed_rule(certificate, words)) is not None and certificate.state is not None:
         entry = _add(parent, "statement")
         _add(entry, "norm", _ISSUED_UNDER)
         _add(entry, "reference", "7.8.6")
-        _words(
-            entry,
-            "declaration",
-            f"Conformity with {agreed.specification}, decided by the rule {agreed.rule} ({_RULES[agreed.rule]}), as "
-            f"agreed: {agreed.agreed}. Probability that all values conform: {certificate.all_conform:.3f}.",
-        )
+        _words(entry, "declaration", rule)
         _add(entry, "conformity", certificate.state)
 
 
 # The results.
 
 
-def _measurement(result: ET.Element, certificate: Certificate) -> None:
+def _measurement(result: ET.Element, certificate: Certificate, words: Words, adjustment: str) -> None:
+    """Add what was measured; `adjustment` is ``before`` or ``after`` it, empty without one."""
     lab, record = certificate.lab, certificate.record
-    _words(result, "name", lab.method.name)
+    _words(result, "name", f"{lab.method.name}, {words(adjustment)}" if adjustment else lab.method.name)
     method = _add(_add(result, "usedMethods"), "usedMethod")
     _words(method, "name", lab.method.name)
     _words(
         method,
         "description",
-        f"Procedure {lab.method.procedure}; evaluated by the procedure {record.procedure}; "
-        f"deviations: {lab.method.deviations}",
+        f"{words('procedure')}: {lab.method.procedure}; {words('deviations')}: {lab.method.deviations}; "
+        f"{words('evaluation')}: {evaluation(certificate, words)}",
     )
     for standard in lab.method.standards:
         _add(method, "norm", standard)
@@ -204,52 +195,40 @@ def _measurement(result: ET.Element, certificate: Certificate) -> None:
     if lab.equipment:
         equipment = _add(result, "measuringEquipments")
         for known in lab.equipment:
-            _equipment(_add(equipment, "measuringEquipment", refType="basic_normalUsed"), known)
+            _equipment(_add(equipment, "measuringEquipment", refType="basic_normalUsed"), known, words)
     conditions = ET.Element("dcc:influenceConditions")
-    for condition in lab.conditions:
-        _condition(_add(conditions, "influenceCondition"), condition)
-    for name, key in (("Gravity in the evaluation", "gravity"), ("Temperature of the item", "temperature")):
-        if isinstance(stated := record.model.get(key), Mapping):
-            _stated_condition(_add(conditions, "influenceCondition"), name, stated)
+    for name, stated in certificate.conditions(words("gravity"), words("temperature")):
+        entry = _add(conditions, "influenceCondition")
+        _words(entry, "name", name)
+        if adjustment:
+            _add(entry, "status", f"{adjustment}Adjustment")
+        _condition(_add(_add(_add(entry, "data"), "quantity"), "si:real"), stated)
     if len(conditions):
         result.append(conditions)
     entry = _add(_add(result, "results"), "result")
-    _words(entry, "name", "Parameters")
+    _words(entry, "name", words("parameters"))
     data = _add(entry, "data")
     covered = [each.name for each in certificate.results if each.name in record.covariance.names]
-    for number, each in enumerate(certificate.results, start=1):
-        shared = {"id": f"parameter_{number}"} if each.name in covered else {}
-        _quantity(_add(data, "quantity", refType="basic_calibrationValue", **shared), each)
+    ids = {name: f"{adjustment}parameter_{number}" for number, name in enumerate(covered, start=1)}
+    for each in certificate.results:
+        shared = {"id": ids[each.name]} if each.name in ids else {}
+        _quantity(_add(data, "quantity", refType="basic_calibrationValue", **shared), each, words)
     if covered:
-        _covariance(data, certificate.results, record.covariance, covered)
-    _provenance(_add(result, "measurementMetaData"), certificate)
+        _covariance(data, certificate, ids, words)
+    _provenance(_add(result, "measurementMetaData"), certificate, words)
 
 
-def _equipment(parent: ET.Element, standard: Equipment) -> None:
+def _equipment(parent: ET.Element, standard: Equipment, words: Words) -> None:
     _words(parent, "name", standard.name)
-    known = standard.standard_uncertainty
-    size = "" if known is None else f", standard uncertainty {known.value!r} {known.unit}"
-    _words(parent, "description", f"Certificate {standard.certificate} of {standard.issuer}{size}")
-    _identification(_add(parent, "identifications"), "other", standard.certificate, "certificate")
+    _words(parent, "description", equipment_text(standard, words))
+    _identification(_add(parent, "identifications"), "other", standard.certificate, words("certificate"))
 
 
-def _condition(parent: ET.Element, condition: Condition) -> None:
-    _words(parent, "name", condition.name)
-    quantity = _add(_add(parent, "data"), "quantity")
-    real = _add(quantity, "si:real")
+def _condition(real: ET.Element, condition: Condition) -> None:
     _add(real, "si:value", repr(condition.value))
     _add(real, "si:unit", dsi_unit(condition.unit)[0])
-    _expanded(real, condition.expanded_uncertainty, condition.coverage_factor, NORMAL[1], "normal")
-
-
-def _stated_condition(parent: ET.Element, name: str, stated: Mapping[str, Any]) -> None:
-    """Add a condition that the record states, with its uncertainty where it states one above 0."""
-    _words(parent, "name", name)
-    real = _add(_add(_add(parent, "data"), "quantity"), "si:real")
-    _add(real, "si:value", repr(float(stated["value"])))
-    _add(real, "si:unit", dsi_unit(stated["unit"])[0])
-    if uncertainty := stated.get("standard_uncertainty"):
-        _expanded(real, NORMAL[0] * uncertainty, *NORMAL)
+    if condition.expanded_uncertainty:
+        _expanded(real, condition.expanded_uncertainty, condition.coverage_factor, NORMAL[1], "normal")
 
 
 def _expanded(real: ET.Element, uncertainty: float, factor: float, probability: float, distribution: str) -> None:
@@ -265,7 +244,7 @@ def _plain(number: float) -> str:
     return f"{Decimal(repr(number)):f}"
 
 
-def _quantity(quantity: ET.Element, result: Result) -> None:
+def _quantity(quantity: ET.Element, result: Result, words: Words) -> None:
     _words(quantity, "name", result.name)
     real = _add(quantity, "si:real")
     _add(real, "si:label", result.name)
@@ -292,12 +271,13 @@ def _quantity(quantity: ET.Element, result: Result) -> None:
             _add(unit, "nonSIDefinition", result.definition)
             _add(unit, "nonSIUnit", result.unit)
         if result.decision is not None and result.limits is not None:
-            _conformity(_add(told, "metaData", refType="basic_conformity"), result, result.decision, result.limits)
+            data = _add(told, "metaData", refType="basic_conformity")
+            _conformity(data, result, result.decision, result.limits, words)
 
 
-def _conformity(parent: ET.Element, result: Result, decision: Conformity, limits: Limits) -> None:
+def _conformity(parent: ET.Element, result: Result, decision: Conformity, limits: Limits, words: Words) -> None:
     """Add a decision with its probability, the limits, and those within which a value passes."""
-    _words(parent, "declaration", f"Probability of conformity: {decision.probability:.4f}")
+    _words(parent, "declaration", words("probability", words.number(f"{decision.probability:.4f}")))
     _add(parent, "conformity", decision.state)
     data = _add(parent, "data")
     for kind, ends in (("tolerance", limits), ("acceptance", decision.acceptance)):
@@ -309,13 +289,12 @@ def _conformity(parent: ET.Element, result: Result, decision: Conformity, limits
                 _add(real, "si:unit", result.dsi)
 
 
-def _covariance(data: ET.Element, results: tuple[Result, ...], covariance: Covariance, names: list[str]) -> None:
-    """Add the standard uncertainties and the covariance matrix, a column for each parameter."""
-    by_name = {result.name: (number, result) for number, result in enumerate(results, start=1)}
-    chosen = [by_name[name][1] for name in names]
-    references = " ".join(f"parameter_{by_name[name][0]}" for name in names)
-    quantity = _add(data, "quantity", refId=references)
-    _words(quantity, "name", "Covariance of the parameters")
+def _covariance(data: ET.Element, certificate: Certificate, ids: Mapping[str, str], words: Words) -> None:
+    """Add the standard uncertainties and the covariance matrix, a column for each parameter of `ids`."""
+    names, covariance = list(ids), certificate.record.covariance
+    chosen = [result for result in certificate.results if result.name in ids]
+    quantity = _add(data, "quantity", refId=" ".join(ids.values()))
+    _words(quantity, "name", words("covariance"))
     values = _add(quantity, "si:realListXMLList")
     _add(values, "si:labelXMLList", " ".join(names))
     _add(values, "si:valueXMLList", " ".join(repr(result.value) for result in chosen))
@@ -335,11 +314,9 @@ def _covariance(data: ET.Element, results: tuple[Result, ...], covariance: Covar
     _add(region, "si:coverageProbabilityXMLList", _plain(_COVERED))
 
 
-def _provenance(parent: ET.Element, certificate: Certificate) -> None:
+def _provenance(parent: ET.Element, certificate: Certificate, words: Words) -> None:
     """Add the hashes of the record and of the recordings that it was made from."""
-    entries = [("record", certificate.sha256)]
-    entries += [(source.file, source.sha256) for source in certificate.record.sources]
-    for name, sha256 in entries:
+    for name, sha256 in certificate.sources(words("record")):
         entry = _add(parent, "metaData", refType="imulab_source")
         _words(entry, "name", name)
         _add(entry, "reference", f"sha256:{sha256}")

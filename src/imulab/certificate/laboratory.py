@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from datetime import date
+from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
@@ -22,6 +23,7 @@ Text = Annotated[str, Meta(pattern=r"^\S+(\s+\S+)*$")]
 """A text that the schema of certificates takes: not empty, without spaces at its ends."""
 Size = Annotated[float, Meta(gt=0, le=LARGEST)]
 Country = Annotated[str, Meta(pattern="^[A-Z]{2}$")]
+Language = Literal["en", "de"]
 Location = Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"]
 
 
@@ -40,12 +42,13 @@ class Address(_Table, frozen=True, kw_only=True):
 
 
 class Party(_Table, frozen=True, kw_only=True):
-    """The laboratory or the customer."""
+    """The laboratory or the customer; `logo` is the laboratory's, PNG, JPEG or SVG."""
 
     name: Text
     address: Address
     email: Text | None = None
     code: Text | None = None
+    logo: Text | None = None
     order: Text | None = None
 
 
@@ -57,6 +60,13 @@ class Person(_Table, frozen=True, kw_only=True):
     signs: bool = False
 
 
+class Recalibration(_Table, frozen=True, kw_only=True):
+    """The day of the next calibration, which is stated only where the customer agreed to it (7.8.4.3)."""
+
+    date: date
+    agreed: Text
+
+
 class Identity(_Table, frozen=True, kw_only=True):
     """The table ``certificate``: number, dates and place."""
 
@@ -64,9 +74,12 @@ class Identity(_Table, frozen=True, kw_only=True):
     issued: date
     performed: tuple[date, date]
     location: Location
-    language: Literal["en"] = "en"
+    language: Language = "en"
     received: date | None = None
     reviewed: Text | None = None
+    replaces: Text | None = None
+    reason: Text | None = None
+    recalibration: Recalibration | None = None
 
 
 class Item(_Table, frozen=True, kw_only=True):
@@ -152,10 +165,14 @@ performed = [2026-11-24, 2026-11-24]     # first and last day of the measurement
 location = "laboratory"                  # or customer, laboratoryBranch, customerBranch, other
 # received = 2026-11-20
 # reviewed = "why a record whose verdict is look may be certified"
+# replaces = "EX-2026-0041"              # which certificate this one amends, and why
+# reason = "the customer's address was wrong"
+# recalibration = { date = 2027-11-24, agreed = "offer 2026-118" }
+language = "en"                          # or de
 [laboratory]
 name = "Example Inertial Laboratory"
 address = { street = "Plumb Line", number = "1", postcode = "12345", city = "Exampletown", country = "DE" }
-# code, email
+# code, email, logo = "logo.svg"
 [customer]
 name = "Example Drones Ltd"
 address = { street = "Propeller Road", number = "2", postcode = "54321", city = "Hovertown", country = "DE" }
@@ -193,6 +210,7 @@ expanded_uncertainty = 0.5
 # specification = "data sheet DS-0815 rev. C, table 2"
 """
 """A LAB.toml to start from."""
+_LARGEST_LOGO = 2_000_000
 _UNKNOWN = re.compile("^Object contains unknown field `(.*)`$")
 _MISSING = re.compile("^Object missing required field `(.*)`$")
 
@@ -213,15 +231,31 @@ def load_laboratory(path: str) -> Laboratory:
         lab = msgspec.convert(table, Laboratory)
     except msgspec.ValidationError as error:
         raise ReadError(f"{path}: {_reason(str(error))}") from None
+    if lab.laboratory.logo is not None:
+        lab = msgspec.structs.replace(lab, laboratory=_with_logo(lab.laboratory, path))
     identity = lab.certificate
     first, last = identity.performed
     if not any(person.signs for person in lab.persons):
         raise ReadError(f"{path}: persons: nobody signs; expected signs = true for who authorises the certificate")
     if not first <= last <= identity.issued:
         raise ReadError(f"{path}: certificate: performed {first} to {last}, issued {identity.issued}: out of order")
+    if (identity.replaces is None) != (identity.reason is None):
+        raise ReadError(f"{path}: certificate: expected replaces and reason together: which certificate, and why")
     if identity.received is not None and identity.received > first:
         raise ReadError(f"{path}: certificate: received {identity.received}, after the first day of work {first}")
     return lab
+
+
+def _with_logo(laboratory: Party, path: str) -> Party:
+    """Return the laboratory with the path of its logo, which lies beside the file."""
+    logo, place = Path(path).parent / str(laboratory.logo), f"{path}: laboratory.logo {laboratory.logo!r}"
+    if logo.suffix.lower() not in (".png", ".jpg", ".jpeg", ".svg"):
+        raise ReadError(f"{place}: expected a name that ends with .png, .jpg or .svg")
+    if not logo.is_file():
+        raise ReadError(f"{place}: no such file beside it")
+    if logo.stat().st_size > _LARGEST_LOGO:
+        raise ReadError(f"{place}: larger than 2 MB; expected a smaller picture")
+    return msgspec.structs.replace(laboratory, logo=str(logo))
 
 
 def _reason(message: str) -> str:

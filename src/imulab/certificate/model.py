@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 
 import numpy as np
 
-from imulab.certificate.laboratory import Equipment, Laboratory
+from imulab.certificate.laboratory import Condition, Equipment, Laboratory
 from imulab.certificate.units import dsi_unit
 from imulab.errors import OptionError, RecordError
 from imulab.files import unit_of
@@ -58,7 +58,7 @@ class Certificate:
     """All that a certificate holds.
 
     `left_out` counts parameters without an uncertainty; `all_conform` is the probability that all values that have
-    limits lie within them, None without limits.
+    limits lie within them, None without limits. `before` is the same of the unit before it was adjusted.
     """
 
     lab: Laboratory
@@ -69,6 +69,24 @@ class Certificate:
     results: tuple[Result, ...]
     left_out: int
     all_conform: float | None = None
+    language: str = "en"
+    before: Certificate | None = None
+
+    def conditions(self, gravity: str, temperature: str) -> list[tuple[str, Condition]]:
+        """Return the conditions by name: those of the laboratory, and what the record states under these names."""
+        stated = [(condition.name, condition) for condition in self.lab.conditions]
+        for name, key in ((gravity, "gravity"), (temperature, "temperature")):
+            if isinstance(known := self.record.model.get(key), Mapping):
+                k, u = NORMAL[0], float(known.get("standard_uncertainty") or 0.0)
+                condition = Condition(
+                    name=name, value=float(known["value"]), unit=known["unit"], expanded_uncertainty=k * u
+                )
+                stated.append((name, condition))
+        return stated
+
+    def sources(self, record: str) -> list[tuple[str, str]]:
+        """Return the names and hashes of the record, under this name, and of the recordings it was made from."""
+        return [(record, self.sha256), *((source.file, source.sha256) for source in self.record.sources)]
 
     @property
     def state(self) -> str | None:
@@ -77,10 +95,12 @@ class Certificate:
         return worst(states) if states else None
 
 
-def make_certificate(record: Calibration, sha256: str, lab: Laboratory, limits: str | None = None) -> Certificate:
+def make_certificate(
+    record: Calibration, sha256: str, lab: Laboratory, limits: str | None = None, language: str | None = None
+) -> Certificate:
     """Return the certificate of a record whose seal was checked; `sha256` is its ``content_sha256``.
 
-    `limits` is a TOML file of limits.
+    `limits` is a TOML file of limits, `language` that of the texts, the laboratory's if None.
 
     Raises
     ------
@@ -114,7 +134,29 @@ def make_certificate(record: Calibration, sha256: str, lab: Laboratory, limits: 
     together = None
     if limits is not None:
         results, together = _decide(record, results, lab, limits)
-    return Certificate(lab, record, sha256, serial, model, results, len(record.parameters) - len(results), together)
+    return Certificate(
+        lab, record, sha256, serial, model, results, len(record.parameters) - len(results), together,
+        language or lab.certificate.language,
+    )  # fmt: skip
+
+
+def with_before(certificate: Certificate, before: Certificate) -> Certificate:
+    """Return a certificate with the one of the same unit before it was adjusted.
+
+    Raises
+    ------
+    OptionError
+        The two are not of one unit and one procedure.
+    """
+    for what, found, expected in (
+        ("serial", before.serial, certificate.serial),
+        ("procedure", before.record.procedure, certificate.record.procedure),
+    ):
+        if found != expected:
+            raise OptionError(f"before: {what} {found!r}; expected {expected!r}, that of the record after it")
+    if before.sha256 == certificate.sha256:
+        raise OptionError("before: the same record; expected the one from before the adjustment")
+    return replace(certificate, before=before)
 
 
 def _decide(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import imulab as il
 from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import check_outputs
 from imulab.errors import OptionError
 from imulab.files import replacing
-from imulab.options import OUTPUT
+from imulab.options import OUTPUT, choice
 
 
 def certificate(
@@ -21,15 +21,25 @@ def certificate(
     limits: Annotated[
         str | None, option("LIMITS.toml", "Limits of parameters: whether each conforms, by the rule in LAB.toml.")
     ] = None,
-    output: Annotated[str | None, option("CERT.xml", "Certificate to write.", "-o", "--output"), OUTPUT] = None,
+    before: Annotated[
+        str | None, option("RECORD", "The unit's record from before it was adjusted; both are certified.")
+    ] = None,
+    language: Annotated[
+        Literal["en", "de"] | None, choice(("en", "de"), help="Language of the texts; else that of LAB.toml.")
+    ] = None,
+    fonts: Annotated[str | None, option("DIR", "Fonts for letters that those of the PDF lack.")] = None,
+    output: Annotated[
+        str | None, option("CERT.xml|CERT.pdf", "Certificate to write.", "-o", "--output"), OUTPUT
+    ] = None,
     template: Annotated[
         bool, option("", "Print a LAB.toml to start from, or write it to the output, and nothing else."), OUTPUT
     ] = False,
 ) -> None:
-    """Write a Digital Calibration Certificate.
+    """Write the certificate of a record, for people and for programs.
 
-    PTB's DCC 3.3.0 for other programs: values, uncertainties and covariances from the record, persons and places from
-    LAB.toml. What is missing is refused, and nothing is written then.
+    A PDF/A-3 with a Digital Calibration Certificate (PTB DCC 3.3.0) attached, or that XML alone: values, uncertainties
+    and covariances from the record, persons and places from LAB.toml. What is missing is refused, and nothing is
+    written then.
     """
     if template:
         from imulab.certificate.laboratory import TEMPLATE
@@ -43,11 +53,9 @@ def certificate(
         print(f"template: {output}")
         return
     if record is None or lab is None or output is None:
-        raise OptionError("expected RECORD, --lab LAB.toml and -o CERT.xml, or --template alone")
-    if output.endswith(".pdf"):
-        raise OptionError(f"{output}: expected a name that ends with .xml, in which programs read a certificate")
-    check_outputs([output], [each for each in (record, lab, limits) if each])
-    il.write_certificate(record, output, lab=lab, limits=limits)
+        raise OptionError("expected RECORD, --lab LAB.toml and -o CERT.pdf, or --template alone")
+    check_outputs([output], [each for each in (record, lab, limits, before) if each], paper=True)
+    il.write_certificate(record, output, lab=lab, limits=limits, before=before, language=language, fonts=fonts)
     print(f"certificate: {output}")
 
 

@@ -252,8 +252,10 @@ class GivenFiles:
         return str(path)
 
 
-def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
+def check_outputs(outputs: list[str | None], inputs: list[str], *, paper: bool = False) -> None:
     """Refuse, before the work, an output without a folder, or one that is an input or another output.
+
+    `paper` says that the command writes printed pages.
 
     Raises
     ------
@@ -268,7 +270,8 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
             continue
         if name in ("", "-"):
             raise OptionError(f"output {name!r}: expected the name of a file to write")
-        check_no_paper(name)
+        if not paper:
+            check_no_paper(name)
         target = real_path(name)
         if target in taken:
             raise OptionError(f"{name}: would overwrite {taken[target]}; expected another name")
