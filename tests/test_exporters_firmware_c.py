@@ -138,6 +138,19 @@ def test_gyro_to_the_last_bit(sensitive, powers, c_core, many):
     assert_near(c_core("float", [table], name, wide)[8:], np.column_stack(rate)[8:], 2e-6 * 5)
 
 
+@pytest.mark.parametrize(("turn", "unit"), [("wave", "uT"), ("wave", "count"), ("level", "uT")])
+def test_magnetometers_alone_to_the_last_bit(turn, unit, c_core, many):
+    rng = np.random.default_rng(6)
+    made = il.simulate_magnetometer(turn=turn)
+    if unit == "count":
+        made = replace(made, units=made.units | dict.fromkeys(("mag_x", "mag_y", "mag_z"), unit))
+    (table,) = tables_of(il.fit_magnetometer(made).calibration)
+    rows = outputs_of(table, 1e-4 if table.columns["field_unit"] == "T" else 2.0, rng, many)
+    field, _ = DeviceUnit.of(table).mag(list(rows.T))
+    assert_same(c_core("double", [table], "mag", rows), np.column_stack(field))
+    assert_near(c_core("float", [table], "mag", rows), np.column_stack(field), 2e-6 * np.nanmax(np.abs(field)))
+
+
 def test_centrifuge_to_the_last_bit(c_core, records, many):
     rng = np.random.default_rng(4)
     tables = tables_of(records[1])

@@ -46,7 +46,7 @@ HOSTILE = {
 BLOB = re.compile(r"golden_blob\[\] = \{[\d,\s]*\}")
 HOSTILE["all of them"] = " ".join(HOSTILE.values())
 QUICK = ("block comment", "all of them", "empty")
-INERTIAL = ("c", "px4", "ardupilot", "kalibr", "openvins", "ros", "fusion", "motioncal")
+INERTIAL = ("c", "px4", "ardupilot", "kalibr", "openvins", "ros", "fusion", "motioncal", "betaflight", "inav")
 
 
 def renamed(record, text):
@@ -101,7 +101,7 @@ def meaning(target, path, folder):
         return [pair for pair in pairs if pair[0] != "sentence"]
     if path.suffix == ".md":
         return document(text, folder)
-    if target in ("px4", "ardupilot", "motioncal"):
+    if target in ("px4", "ardupilot", "motioncal", "betaflight", "inav"):
         return [line for line in text.splitlines() if not line.startswith("#")]
     assert name in ("Makefile", "zephyr/Kconfig", "zephyr/CMakeLists.txt")
     return text
@@ -132,6 +132,8 @@ def exported(target, record, folder):
 def records_of(target):
     if target == "motioncal":
         return [nine_axes()]
+    if target in ("betaflight", "inav"):
+        return [nine_axes(unit="count", quadratic=0.0)]
     if target == "c":
         return [madeup.tumble(2, gyro=True), madeup.centrifuge(), madeup.warmup()]
     return [nine_axes(unit="uT", gyro="rad/s" if target in ("px4", "ardupilot") else "deg/s", quadratic=0.0)]

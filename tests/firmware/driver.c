@@ -1,6 +1,6 @@
 /* Runs one function of the exported core on rows of doubles from standard input; rows of doubles to standard output.
  *
- *   driver unit|BLOB tumble | gyro | gyro-force | centrifuge | warmup TEMPERATURE TICK | array
+ *   driver unit|BLOB tumble | gyro | gyro-force | mag | centrifuge | warmup TEMPERATURE TICK | array
  *
  * `unit` takes the numbers compiled into unit.c, anything else is the file of a blob. One sample at a time, as a unit does.
  */
@@ -65,6 +65,11 @@ int main(int count, char **words) {
     } else if (strcmp(words[2], "gyro-force") == 0) {
         while (row(6, in)) {
             (void)il_gyro_apply(&loaded.gyro, in, in + 3, out);
+            put(3, out);
+        }
+    } else if (strcmp(words[2], "mag") == 0) {
+        while (row(3, in)) {
+            (void)il_mag_apply(&loaded.mag, in, out);
             put(3, out);
         }
     } else if (strcmp(words[2], "centrifuge") == 0) {

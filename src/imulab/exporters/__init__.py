@@ -22,6 +22,8 @@ _HOMES = {
     "ros": "matrices",
     "fusion": "matrices",
     "motioncal": "matrices",
+    "betaflight": "betaflight",
+    "inav": "betaflight",
 }
 """Targets and their modules, which have ``export_TARGET(records, folder, options) -> list of the files written``."""
 EXPORTERS = tuple(_HOMES)

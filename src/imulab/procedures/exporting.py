@@ -50,7 +50,7 @@ def export(
     Parameters
     ----------
     to
-        c blob px4 ardupilot kalibr openvins ros fusion motioncal.
+        c blob px4 ardupilot kalibr openvins ros fusion motioncal betaflight inav.
     records
         The unit's records, or their files; one or several.
     folder
