@@ -201,7 +201,8 @@ def check_calibration(record: Calibration, name: str = "the record") -> None:
     """
     if record.procedure != "gyro_array" or record.model.get("kind") != "calibration":
         what = record.model.get("kind", record.procedure) if record.procedure == "gyro_array" else record.procedure
-        raise RecordError(f"{name}: expected the record of an array calibration, found one of a {what}")
+        other = "whole IMUs, which 'imulab array fuse --imus' takes" if what == "imus" else f"a {what}"
+        raise RecordError(f"{name}: expected the record of an array calibration, found one of {other}")
 
 
 def array_calibration(record: Calibration, elements: Elements, recording: str = "recording") -> ArrayCalibration:

@@ -9,6 +9,8 @@ import numpy as np
 
 from imulab.errors import RecordError
 from imulab.procedures.gyro_array.elements import JUMPED, NON_FINITE, STUCK, unit_of_angle
+from imulab.procedures.gyro_array.imus.figures import exhibits as imus_exhibits
+from imulab.procedures.gyro_array.imus.schema import imus_of
 from imulab.procedures.gyro_array.schema import (
     ArrayRecord,
     ComparisonRecord,
@@ -17,7 +19,6 @@ from imulab.procedures.gyro_array.schema import (
     PerGyro,
     array_of,
     comparison_of,
-    model_of,
 )
 from imulab.records.calibration import Calibration
 from imulab.report.traces import (
@@ -290,7 +291,10 @@ _ELEMENT_SHADES = ("#1f6f8b", "#c8553d", "#8e6bbd", "#c99a2e", "#4f9d69", "#2e40
 
 def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
-    return comparison_exhibits(record) if model_of(record).kind == "comparison" else _calibration(array_of(record))
+    kind = record.model.get("kind")
+    if kind == "imus":
+        return imus_exhibits(imus_of(record))
+    return comparison_exhibits(record) if kind == "comparison" else _calibration(array_of(record))
 
 
 def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:

@@ -228,7 +228,12 @@ def array_of(record: Calibration) -> ArrayRecord:
 
 def check(record: Calibration) -> None:
     """Check the sections of a record as it is read from its file; raises RecordError."""
-    if record.model.get("kind") == "comparison":
+    kind = record.model.get("kind")
+    if kind == "comparison":
         comparison_of(record)
+    elif kind == "imus":
+        from imulab.procedures.gyro_array.imus.schema import imus_of
+
+        imus_of(record)
     else:
         array_of(record)

@@ -1,0 +1,1 @@
+"""Whole IMUs on one board: where each sits, how it is turned, how late it answers."""
