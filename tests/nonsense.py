@@ -80,6 +80,7 @@ CALLS = {
     "magnetometer check": "wave.json wave.csv",
     "fleet run": "fleet/first.csv --workers 1 -o OUT",
     "fleet status": "done",
+    "fleet certificate": "done --lab lab.toml -o OUT",
     "fleet report": "done -o OUT.html",
     "fleet simulate": "--units 8 -o OUT",
     "layout guess": "foreign.csv -o OUT.toml",
@@ -173,7 +174,12 @@ def make_inputs(folder: Path) -> None:
         rows = [f"{0.01 * k:.2f},{0.1 * (k % period):.1f}" for k in range(200)]
         (folder / f"{name}.csv").write_text("\n".join(["time [s],gyro_z [deg/s]", *rows, ""]))
     readings = [f"{0.01 * k:.2f},{0.1 * (k % 7):.1f},0.2,9.8" for k in range(200)]
-    (folder / "lab.toml").write_bytes((Path(__file__).parent / "data" / "lab.toml").read_bytes())
+    lab = (Path(__file__).parent / "data" / "lab.toml").read_text(encoding="utf-8")
+    for single, of_all in (
+        ("EX-2026-0042", "EX-{serial}"), ("[2026-11-24,", "[2026-03-01,"), ("received = 2026-11-20", ""),
+    ):  # fmt: skip
+        lab = lab.replace(single, of_all)
+    (folder / "lab.toml").write_text(lab, encoding="utf-8")
     (folder / "foreign.csv").write_text("\n".join(["t,ax,ay,az", *readings, ""]))
     with contextlib.chdir(folder):
         for line in (*MADE, "fleet run fleet/first.csv -o done"):

@@ -263,3 +263,58 @@ def test_both_files_come_from_one_model(tmp_path):
     made = make_certificate(*load_sealed(WRITTEN / "tumble.json"), lab)
     other = replace(made, sha256="0" * 64)
     assert dcc_xml(with_before(made, other)).count(b"beforeparameter_1 ") == 1
+
+
+# Of a fleet.
+
+
+@pytest.fixture(scope="module")
+def line(made_once):
+    """The folder of two units that were calibrated on 2 and 3 March 2026, and of one that was not measured."""
+
+    def fill(folder):
+        first, _ = il.simulate_fleet(folder, units=8, rate="15 Hz")
+        rows = first.read_text(encoding="utf-8").splitlines()
+        first.write_text("\n".join([*rows[:3], rows[3].replace("first_0003", "nothing")]) + "\n", encoding="utf-8")
+        il.run_fleet(first, folder / "records", workers=1)
+
+    return made_once("certified_line", fill)
+
+
+@pytest.fixture
+def issue_all(line, tmp_path, monkeypatch):
+    """A function that certifies the fleet by a LAB.toml, and returns the exit status."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(number="EX-{serial}", days="[2026-03-01, 2026-03-31]"):
+        lab = REVIEWED.replace("EX-2026-0042", number).replace("[2026-11-24, 2026-11-24]", days)
+        Path("lab.toml").write_text(lab.replace("received = 2026-11-20\n", ""), encoding="utf-8")
+        return main(["fleet", "certificate", str(line / "records"), "--lab", "lab.toml", "-o", "out"])
+
+    return run
+
+
+def test_every_unit_of_a_fleet_has_its_certificate(issue_all, capsys):
+    assert issue_all() == 2
+    said = capsys.readouterr()
+    assert "certificates: 2 in out\nnone: LINE-0003: it has no record: nothing.csv: " in said.out
+    assert said.err.startswith("imulab: 1 of 3 units have no certificate: LINE-0003: ")
+    assert sorted(path.name for path in Path("out").iterdir()) == [
+        f"LINE-000{unit}.{ending}" for unit in (1, 2) for ending in ("pdf", "xml")
+    ]
+    for unit, day in ((1, "2026-03-02"), (2, "2026-03-03")):
+        pdf = Path(f"out/LINE-000{unit}.pdf").read_bytes()
+        assert f"EX-LINE-000{unit}" in texts(pdf)[0]
+        assert f"Calibrated {day} Place" in texts(pdf)[0]
+        xml = Path(f"out/LINE-000{unit}.xml").read_bytes()
+        assert pypdf.PdfReader(BytesIO(pdf)).attachments["certificate.xml"] == [xml]
+        assert f"<dcc:endPerformanceDate>{day}<".encode() in xml
+
+
+def test_a_fleet_needs_numbers_of_their_own_and_days_that_hold(issue_all, capsys):
+    assert issue_all(number="EX-1") == 2
+    assert "lab.toml: certificate.number 'EX-1': expected {serial} in it" in capsys.readouterr().err
+    assert not Path("out").exists()
+    assert issue_all(days="[2026-03-03, 2026-03-31]") == 2
+    assert "LINE-0001" in capsys.readouterr().err
+    assert [path.name for path in sorted(Path("out").glob("*.pdf"))] == ["LINE-0002.pdf"]

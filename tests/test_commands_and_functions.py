@@ -62,6 +62,7 @@ FUNCTIONS = {
     "fleet run": il.run_fleet,
     "fleet status": il.fleet_status,
     "fleet report": il.write_fleet_report,
+    "fleet certificate": il.write_fleet_certificates,
     "fleet simulate": il.simulate_fleet,
 }
 WITHOUT = {"demo", "live", "open"}

@@ -30,6 +30,7 @@ from imulab.views import Views, hand_down
 
 if TYPE_CHECKING:
     from imulab.certificate.issue import write_certificate as write_certificate
+    from imulab.certificate.issue import write_fleet_certificates as write_fleet_certificates
     from imulab.errors import ImulabError as ImulabError
     from imulab.fleet.report import write_fleet_report as write_fleet_report
     from imulab.fleet.run import fleet_status as fleet_status
@@ -175,6 +176,7 @@ _HOME = {
     "write": "writers",
     "write_certificate": "certificate.issue",
     "write_csv": "writers",
+    "write_fleet_certificates": "certificate.issue",
     "write_fleet_report": "fleet.report",
     "write_report": "procedures.views",
 }

@@ -39,7 +39,7 @@ def dcc_xml(certificate: Certificate) -> bytes:
             "xsi:schemaLocation": f"{_SPACES['dcc']} https://ptb.de/dcc/v{SCHEMA}/dcc.xsd",
         },
     )
-    words = Words(certificate.language)
+    words = Words(certificate.lab.certificate.language)
     _administrative(root, certificate, words)
     results = _add(root, "measurementResults")
     before = certificate.before

@@ -6,14 +6,19 @@ Alone, as the other modules write no file and read no record.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
-from imulab.arguments import checked
+from msgspec.structs import replace
+
+from imulab.arguments import Folder, checked
 from imulab.certificate.dcc import dcc_xml
 from imulab.certificate.laboratory import Laboratory, Language, load_laboratory
-from imulab.certificate.model import Certificate, make_certificate, with_before
-from imulab.errors import ImulabError, OptionError
+from imulab.certificate.model import SERIAL, Certificate, make_certificate, with_before, with_days_of_recordings
+from imulab.certificate.texts import LANGUAGES
+from imulab.errors import ImulabError, OptionError, RecordError, listed
 from imulab.files import replacing
+from imulab.fleet.store import Store
 from imulab.procedures.registry import load_sealed
 from imulab.procedures.result import Record, as_record
 
@@ -74,26 +79,104 @@ def write_certificate(
     """
     if Path(path).suffix not in (".xml", ".pdf"):
         raise OptionError(f"output {str(path)!r}: expected a name that ends with .xml or .pdf")
-    stated = load_laboratory(str(lab))
-    made = _certificate(record, stated, limits, language)
+    stated = _laboratory(lab, language)
+    made = _certificate(record, stated, limits)
     if before is not None:
-        made = with_before(made, _certificate(before, stated, limits, language))
-    content = dcc_xml(made)
-    if Path(path).suffix == ".pdf":
+        made = with_before(made, _certificate(before, stated, limits))
+    _write(made, Path(path), fonts)
+
+
+@checked
+def write_fleet_certificates(
+    folder: Folder,
+    output: Folder,
+    *,
+    lab: str | Path,
+    limits: str | Path | None = None,
+    language: Language | None = None,
+    fonts: str | Path | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> dict[str, str]:
+    """Return why units of a fleet have no certificate, by serial number; of all others PDF and XML are written.
+
+    Parameters
+    ----------
+    folder, output
+        Folder of the fleet, and the one in which ``SERIAL.pdf`` and ``SERIAL.xml`` are written.
+    lab
+        As for `write_certificate`; its number has ``{serial}``. Where a recording tells its day, that is the day of
+        calibration, within those that `lab` states.
+    limits, language, fonts
+        As for `write_certificate`.
+    progress
+        Called with the number of units that are done.
+
+    Raises
+    ------
+    ReadError, OptionError
+        The folder is none of a fleet, a folder cannot be made, the laboratory's file cannot be used.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.write_fleet_certificates("line", "certificates", lab="LAB.toml")
+    Traceback (most recent call last):
+    imulab.errors.ReadError: LAB.toml: no such laboratory file
+    """
+    stated = _laboratory(lab, language)
+    if SERIAL not in stated.certificate.number:
+        raise OptionError(
+            f"{lab}: certificate.number {stated.certificate.number!r}: expected {SERIAL} in it, so that each unit's "
+            "certificate has a number of its own"
+        )
+    store, refused = Store(Path(folder)), {}
+    units = store.manifest().units
+    try:
+        Path(output).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f"{output}: cannot be made: {error.strerror}") from None
+    for count, unit in enumerate(units, start=1):
+        try:
+            if not store.record(unit.serial).exists():
+                raise RecordError(f"it has no record: {store.reason(unit.serial) or 'fleet run makes it'}")
+            made = _certificate(store.record(unit.serial), stated, limits)
+            made = with_days_of_recordings(made)
+            for ending in (".xml", ".pdf"):
+                _write(made, Path(output) / f"{unit.serial}{ending}", fonts)
+        except ImulabError as error:
+            refused[unit.serial] = str(error)
+        if progress is not None:
+            progress(count)
+    return refused
+
+
+def _write(certificate: Certificate, path: Path, fonts: str | Path | None) -> None:
+    content = dcc_xml(certificate)
+    if path.suffix == ".pdf":
         from imulab.certificate.page import pdf  # typst is of an extra, and takes 20 ms to load
 
-        content = pdf(made, content, None if fonts is None else str(fonts))
+        content = pdf(certificate, content, None if fonts is None else str(fonts))
     with replacing(path) as stream:
         stream.write(content)
 
 
-def _certificate(record: Record, lab: Laboratory, limits: str | Path | None, language: Language | None) -> Certificate:
+def _laboratory(lab: str | Path, language: str | None) -> Laboratory:
+    """Return what the laboratory states, in this language if it is not None."""
+    stated = load_laboratory(str(lab))
+    if language is None:
+        return stated
+    if language not in LANGUAGES:
+        raise OptionError(f"language {language!r}: expected one of {listed(LANGUAGES, str(language))}")
+    return replace(stated, certificate=replace(stated.certificate, language=language))
+
+
+def _certificate(record: Record, lab: Laboratory, limits: str | Path | None) -> Certificate:
     if isinstance(record, str | os.PathLike):
         name, (calibration, sha256) = f"{record}: ", load_sealed(os.fspath(record))
     else:
         name, calibration = "", as_record(record, "write_certificate")
         sha256 = calibration.sealed()[0]
     try:
-        return make_certificate(calibration, sha256, lab, None if limits is None else str(limits), language)
+        return make_certificate(calibration, sha256, lab, None if limits is None else str(limits))
     except ImulabError as error:
         raise type(error)(f"{name}{error}") from None

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
+from datetime import date, datetime, timedelta
 
+import msgspec
 import numpy as np
 
 from imulab.certificate.laboratory import Condition, Equipment, Laboratory
@@ -16,6 +17,8 @@ from imulab.fleet.limits import Conformity, Limits, decide, load_limits, probabi
 from imulab.records.calibration import Calibration, Parameter
 from imulab.units import to_si
 
+SERIAL = "{serial}"
+"""In the number of a certificate: the serial number of the item."""
 NORMAL = (2.0, 0.9545, "normal")
 """Coverage factor, probability and distribution where the record states no factor of its own."""
 
@@ -69,7 +72,6 @@ class Certificate:
     results: tuple[Result, ...]
     left_out: int
     all_conform: float | None = None
-    language: str = "en"
     before: Certificate | None = None
 
     def conditions(self, gravity: str, temperature: str) -> list[tuple[str, Condition]]:
@@ -95,12 +97,10 @@ class Certificate:
         return worst(states) if states else None
 
 
-def make_certificate(
-    record: Calibration, sha256: str, lab: Laboratory, limits: str | None = None, language: str | None = None
-) -> Certificate:
+def make_certificate(record: Calibration, sha256: str, lab: Laboratory, limits: str | None = None) -> Certificate:
     """Return the certificate of a record whose seal was checked; `sha256` is its ``content_sha256``.
 
-    `limits` is a TOML file of limits, `language` that of the texts, the laboratory's if None.
+    `limits` is a TOML file of limits.
 
     Raises
     ------
@@ -116,6 +116,8 @@ def make_certificate(
     serial = record.sensor.get("serial")
     if not serial:
         raise RecordError("the record names no serial number: fit again with --serial; a certificate is of one item")
+    number = lab.certificate.number.replace(SERIAL, serial)
+    lab = msgspec.structs.replace(lab, certificate=msgspec.structs.replace(lab.certificate, number=number))
     for key, stated in (("serial", lab.item.serial), ("model", lab.item.model)):
         if stated is not None and stated != record.sensor.get(key, stated):
             raise OptionError(f"item.{key} {stated!r}: the record says {record.sensor[key]!r}")
@@ -134,10 +136,7 @@ def make_certificate(
     together = None
     if limits is not None:
         results, together = _decide(record, results, lab, limits)
-    return Certificate(
-        lab, record, sha256, serial, model, results, len(record.parameters) - len(results), together,
-        language or lab.certificate.language,
-    )  # fmt: skip
+    return Certificate(lab, record, sha256, serial, model, results, len(record.parameters) - len(results), together)
 
 
 def with_before(certificate: Certificate, before: Certificate) -> Certificate:
@@ -157,6 +156,16 @@ def with_before(certificate: Certificate, before: Certificate) -> Certificate:
     if before.sha256 == certificate.sha256:
         raise OptionError("before: the same record; expected the one from before the adjustment")
     return replace(certificate, before=before)
+
+
+def with_days_of_recordings(certificate: Certificate) -> Certificate:
+    """Return a certificate whose days of work are those that its recordings tell, where they do."""
+    days = sorted(source.measured for source in certificate.record.sources if source.measured is not None)
+    if not days or any("T" in day for day in days):  # a time in UTC does not tell the day of the place
+        return certificate
+    performed = date.fromisoformat(days[0]), date.fromisoformat(days[-1])
+    identity = msgspec.structs.replace(certificate.lab.certificate, performed=performed)
+    return replace(certificate, lab=msgspec.structs.replace(certificate.lab, certificate=identity))
 
 
 def _decide(

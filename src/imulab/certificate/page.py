@@ -105,7 +105,7 @@ def _texts(value: Any, place: str) -> Iterator[tuple[str, str]]:
 
 
 def _page(certificate: Certificate) -> dict[str, Any]:
-    lab, words = certificate.lab, Words(certificate.language)
+    lab, words = certificate.lab, Words(certificate.lab.certificate.language)
     issued = lab.certificate.issued
     logo = lab.laboratory.logo
     return {

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json as encoder
 import sys
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import imulab as il
 from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import AsJson, call, check_outputs, progress_bar, warn
 from imulab.display import SENTENCES
 from imulab.errors import OptionError
-from imulab.options import OUTPUT
+from imulab.options import OUTPUT, choice
 
 if TYPE_CHECKING:
     from imulab.fleet.run import FleetState
@@ -88,6 +88,36 @@ def report(
     print(f"report: {output}")
 
 
+def certificate(
+    folder: Annotated[str, Argument("DIR", "Folder of a fleet.")],
+    *,
+    lab: Annotated[str, option("LAB.toml", "Who issues them; certificate.number has {serial} in it.")],
+    limits: Annotated[str | None, option("LIMITS.toml", "Limits of parameters, by the rule in LAB.toml.")] = None,
+    language: Annotated[
+        Literal["en", "de"] | None, choice(("en", "de"), help="Language of the texts; else that of LAB.toml.")
+    ] = None,
+    fonts: Annotated[str | None, option("DIR", "Fonts for letters that those of the PDF lack.")] = None,
+    output: Annotated[str, option("DIR", "Folder of the certificates.", "-o", "--output"), OUTPUT],
+) -> int:
+    """Write the certificate of every unit.
+
+    SERIAL.pdf for people and SERIAL.xml for programs. Exit status 2 if a unit has none, with the reason; all others
+    are written.
+    """
+    units = il.fleet_status(folder).rows
+    with progress_bar("certificates", len(units)) as update:
+        refused = il.write_fleet_certificates(
+            folder, output, lab=lab, limits=limits, language=language, fonts=fonts, progress=update
+        )
+    print(f"certificates: {len(units) - len(refused)} in {output}")
+    if not refused:
+        return 0
+    print("".join(f"none: {serial}: {reason}\n" for serial, reason in refused.items()), end="")
+    first = next(iter(refused.items()))
+    print(f"imulab: {len(refused)} of {len(units)} units have no certificate: {first[0]}: {first[1]}", file=sys.stderr)
+    return 2
+
+
 def simulate(
     *, output: Annotated[str, option("DIR", "Folder to write to.", "-o", "--output"), OUTPUT], **options: Any
 ) -> None:
@@ -150,5 +180,6 @@ COMMANDS = (
     Command("fleet run", run, lambda: [il.run_fleet]),
     Command("fleet status", status),
     Command("fleet report", report, lambda: [il.write_fleet_report]),
+    Command("fleet certificate", certificate),
     Command("fleet simulate", simulate, lambda: [il.simulate_fleet]),
 )
