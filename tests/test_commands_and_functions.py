@@ -31,6 +31,7 @@ FUNCTIONS = {
     "tumble mag": il.fit_mag,
     "tumble check": il.check_tumble,
     "array simulate": il.simulate_array,
+    "array simulate --imus": il.simulate_imus,
     "array merge": il.merge_array,
     "array calibrate": il.calibrate_array,
     "array fuse": il.fuse,

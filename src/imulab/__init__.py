@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.public import compare_methods as compare_methods
     from imulab.procedures.gyro_array.public import fuse as fuse
     from imulab.procedures.gyro_array.public import merge_array as merge_array
+    from imulab.procedures.gyro_array.imus.simulate import simulate_imus as simulate_imus
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
     from imulab.procedures.magnetometer.check import check_magnetometer as check_magnetometer
     from imulab.procedures.magnetometer.fit import MagnetometerFit as MagnetometerFit
@@ -117,6 +118,7 @@ _HOME = {
     "fuse": "procedures.gyro_array.public",
     "run_fleet": "fleet.run",
     "simulate_array": "procedures.gyro_array.simulate",
+    "simulate_imus": "procedures.gyro_array.imus.simulate",
     "Attitudes": "procedures.tumble.attitudes",
     "Calibration": "records.calibration",
     "CentrifugeFit": "procedures.centrifuge.fit",

@@ -68,13 +68,15 @@ def find(words: Sequence[str]) -> Command | str:
     if not words or words[0].startswith("-") or words[0] not in _WHERE:
         return ""
     known = {command.path: command for command in commands(words[0])}
-    return known.get(words[0]) or known.get(" ".join(words[:2])) or words[0]
+    path = " ".join(words[:2])
+    variants = (known[f"{path} {word}"] for word in words[2:] if f"{path} {word}" in known)
+    return known.get(words[0]) or next(variants, None) or known.get(path) or words[0]
 
 
 def listed_commands(group: str = "") -> Iterator[tuple[str, str]]:
     """Yield the commands of a group, or the first words of all, and a line on each."""
     if group:
-        yield from ((command.path.split()[1], command.summary) for command in commands(group))
+        yield from ((command.name[-1], command.summary) for command in commands(group) if not command.switch)
         return
     for name in _WHERE:
         first = commands(name)[0]
@@ -104,7 +106,7 @@ def run(words: Sequence[str]) -> int | None:
         command = find([group, *words])
     if not isinstance(command, Command):
         raise _no_command(words[0], group)
-    values, typed = values_of(command, words[command.path.count(" ") :])
+    values, typed = values_of(command, words[len(command.name) - 1 :])
     if not typed & {HELP.keyword, HELP_ALL.keyword}:
         return run_command(command, values, typed)
     from imulab.cli.help import command_help
@@ -114,7 +116,7 @@ def run(words: Sequence[str]) -> int | None:
 
 
 def _names(group: str) -> list[str]:
-    return [command.path.split()[1] for command in commands(group)] if group else [*_WHERE]
+    return [name for name, _ in listed_commands(group)] if group else [*_WHERE]
 
 
 def _no_command(word: str, group: str) -> OptionError:

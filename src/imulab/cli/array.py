@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from json import dumps
 from typing import TYPE_CHECKING, Annotated, Any
@@ -121,20 +121,34 @@ def _gyros_of_mean(names: Sequence[str], working: Sequence[str]) -> str:
 # Fuse several gyroscopes on one axis into one rate.
 
 
-def simulate(
-    *, output: Annotated[str, option("OUT.csv", "Recording to write.", "-o", "--output"), OUTPUT], **options: Any
-) -> None:
+ToSimulate = Annotated[str, option("OUT.csv", "Recording to write.", "-o", "--output"), OUTPUT]
+WholeImus = Annotated[bool, option("", "A board of whole IMUs; it has options of its own (--imus --help).", "--imus")]
+
+
+def simulate(*, imus: WholeImus = False, output: ToSimulate, **options: Any) -> None:
     """Simulate a recording of an array.
 
     With its truth in the columns truth_rate.
     """
+    elements = options["elements"]
+    _simulate(il.simulate_array, output, f"{elements} gyros on each axis", options)
+
+
+def simulate_imus(*, imus: WholeImus = False, output: ToSimulate, **options: Any) -> None:
+    """Simulate a board of whole IMUs that is put down, then turned and shaken by hand.
+
+    With its truth in the head of the file.
+    """
+    _simulate(il.simulate_imus, output, f"{options['elements']} IMUs", options)
+
+
+def _simulate(function: Callable[..., Recording], output: str, what: str, options: dict[str, Any]) -> None:
     from imulab.writers import write_csv
 
     check_outputs([output], [])
-    recording = call(il.simulate_array, **options)
+    recording = call(function, **options)
     write_csv(recording, output)
-    elements, serial = options["elements"], recording.metadata["serial"]
-    print(f"{output}: {len(recording)} samples, {elements} gyros on each axis, serial {serial}")
+    print(f"{output}: {len(recording)} samples, {what}, serial {recording.metadata['serial']}")
 
 
 def merge(
@@ -337,6 +351,7 @@ def _calibrate_functions() -> list[Any]:
 
 COMMANDS = (
     Command("array simulate", simulate, lambda: [il.simulate_array]),
+    Command("array simulate --imus", simulate_imus, lambda: [il.simulate_imus]),
     Command("array merge", merge, lambda: [il.merge_array], without=("element",)),
     Command("array calibrate", calibrate, _calibrate_functions, without=("element",)),
     Command("array fuse", fuse, lambda: [il.fuse], without=("element",)),

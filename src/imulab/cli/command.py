@@ -75,7 +75,7 @@ class Command:
     Attributes
     ----------
     path
-        As one types it: ``tumble fit``.
+        As one types it: ``tumble fit``; with a switch that has options of its own, ``array simulate --imus``.
     function
         What it does. Its parameters are arguments and options of its own; ``**options`` takes those of `owners`.
     owners
@@ -89,6 +89,16 @@ class Command:
     owners: Callable[[], Sequence[Any]] = tuple
     without: tuple[str, ...] = ()
     only: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> list[str]:
+        """Words of its path without a switch."""
+        return [word for word in self.path.split() if not word.startswith("-")]
+
+    @property
+    def switch(self) -> bool:
+        """Whether a switch chooses it instead of the command without that."""
+        return "--" in self.path
 
     @property
     def summary(self) -> str:

@@ -134,7 +134,7 @@ def answer(
     words, incomplete = _typed(shell)
     place = find(words)
     if isinstance(place, Command):
-        completions = _complete_word(place, words[len(place.path.split()) :], incomplete)
+        completions = _complete_word(place, words[len(place.name) :], incomplete)
     elif incomplete.startswith("-"):
         known = [*([] if place else options), *((flag, HELP.help) for flag in HELP.flags)]
         completions = (each for each in known if each[0].startswith(incomplete))

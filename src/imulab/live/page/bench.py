@@ -275,7 +275,7 @@ class Workbench(PagePart):
         def output(name: str, ending: str) -> str:
             """Return a name from the last file, with the command's where the ending alone would not tell them apart."""
             stem = _stem(inputs, self._files.folder) if inputs else form.path.replace(" ", "-")
-            done = str(values.get("to") or form.path.split()[-1])
+            done = str(values.get("to") or form.path.split()[-1].lstrip("-"))
             default_name = (
                 f"{stem}-{done}{ending}"
                 if inputs and ending in ("", *(each.suffix for each in inputs))
