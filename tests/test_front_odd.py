@@ -72,6 +72,10 @@ RIGHT = {
     "lists by name": lambda g: ({"accel": g["a"].tolist()}, READ),
     "series by name": lambda g: ({f"accel_{n[6]}": g["frame"][n] for n in g["frame"] if n[:2] == "ac"}, READ),
     "a path": lambda g: (g["path"], {}),
+    "a column of texts": lambda g: (g["frame"].assign(run="a"), {}),
+    "texts of polars": lambda g: (g["polars"].with_columns(pl.lit("a").alias("run")), {}),
+    "a category": lambda g: (g["frame"].assign(run=pd.Categorical(["a"] * 4600)), {}),
+    "a category of polars": lambda g: (g["polars"].with_columns(pl.lit("a").cast(pl.Categorical).alias("run")), {}),
     "a text": lambda g: (str(g["path"]), {}),
     "dates of a time zone": lambda g: (by_index(g, pd.date_range("2026-1-1", tz="Europe/Berlin", **DATES)), {}),
     "durations": lambda g: (by_index(g, pd.timedelta_range(0, **DATES)), {}),
@@ -110,13 +114,6 @@ LINES = {
     "a text among numbers": (
         lambda g: (g["frame"].astype(object).replace({g["frame"].iloc[5, 1]: "x"}), {}),
         f"column accel_x [m/s^2]: {NUMBERS}",
-    ),
-    "a column of texts": (lambda g: (g["frame"].assign(run="a"), {}), f"column run: {NUMBERS}"),
-    "texts of polars": (lambda g: (g["polars"].with_columns(pl.lit("a").alias("run")), {}), f"column run: {NUMBERS}"),
-    "a category": (lambda g: (g["frame"].assign(run=pd.Categorical(["a"] * 4600)), {}), f"column run: {NUMBERS}"),
-    "a category of polars": (
-        lambda g: (g["polars"].with_columns(pl.lit("a").cast(pl.Categorical).alias("run")), {}),
-        f"column run: {NUMBERS}",
     ),
     "a column twice": (
         lambda g: (pd.concat([g["frame"], g["frame"].iloc[:, 1:2]], axis=1), {}),

@@ -326,10 +326,13 @@ def test_a_blob_is_known_by_the_records_that_it_was_made_from(tmp_path):
     assert il.apply(blob, again, again=True).corrected_by[1].endswith(loaded(blob).holds[0])
 
 
-def test_what_a_record_leaves_unchanged_is_not_called_corrected():
+def test_what_a_record_leaves_unchanged_is_refused_with_the_reason():
     time = {"time": np.arange(3.0), "gyro_x": np.zeros(3), "gyro_z": np.zeros(3)}
     cold = Recording(time, {"time": "s", "gyro_x": "rad/s", "gyro_z": "rad/s"}, name="cold.csv")
-    assert il.apply(madeup.warmup(), cold).corrected_by == ()
+    with pytest.raises(
+        DataError, match=r"cold\.csv: no power_on_temperature in the head of the file: nothing corrected"
+    ):
+        il.apply(madeup.warmup(), cold)
 
 
 def test_a_record_of_six_axes_corrects_the_triad_that_is_there_and_says_so():

@@ -125,6 +125,8 @@ def described(value: object) -> str:
     kind = type(value)
     if kind.__name__ == "Calibration":
         return f"a {getattr(value, 'procedure', '')} record (arguments in the wrong order?)"
+    if hasattr(value, "calibration"):
+        return f"a {type(value).__name__} (arguments in the wrong order?)"
     if kind.__name__ == "Recording":
         return f"the recording {getattr(value, 'name', '')} (arguments in the wrong order?)"
     if kind.__module__.partition(".")[0] == "imulab":

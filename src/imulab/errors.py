@@ -88,6 +88,17 @@ class ImulabError(Exception):
         text = one_thing(printable(" ".join(message.splitlines())))
         super().__init__(_DIGITS.sub(lambda match: f"{match[0][:12]}...({len(match[0])} digits)", text))
 
+    def _render_traceback_(self) -> list[str]:
+        """Return what a notebook shows: the line of the cell or script, and the message; all with IMULAB_DEBUG=1."""
+        from traceback import extract_tb, format_exception
+
+        if os.environ.get("IMULAB_DEBUG"):
+            return format_exception(self)
+        inside = (__file__.removesuffix("errors.py"), f"{os.sep}IPython{os.sep}")
+        outside = [each for each in extract_tb(self.__traceback__) if not any(part in each.filename for part in inside)]
+        lines = [f"----> {outside[-1].lineno} {outside[-1].line}"] if outside and outside[-1].line else []
+        return [*lines, f"{type(self).__name__}: {self}"]
+
 
 class ReadError(ImulabError):
     """A file cannot be read as what it should be."""

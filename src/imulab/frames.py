@@ -26,6 +26,7 @@ _OF_SENSORS = ("acceleration", "rate", "magnetic field", "output")
 _LIKE_NUMBERS = "iufb"
 _TEXTS = ("object", "str", "string", "category")
 _TIMES = ("datetime64", "timedelta64")
+_NUMBERS = ("float", "int", "uint", "bool", *_TIMES)
 
 Columns = dict[str, NDArray[np.float64]]
 
@@ -167,7 +168,10 @@ def columns_of_frame(
         raise DataError(f"{name}: column {twice} appears twice")
     index = getattr(frame, "index", None)
     titles = _with_times(frame, titles, index, name)
-    entries = [(*_title(title, name), _column(frame[at], title, name)) for at, title in titles.items()]
+    beside = texts_of(frame)
+    entries = [
+        (*_title(title, name), _column(frame[at], title, name)) for at, title in titles.items() if at not in beside
+    ]
     if index is not None and not any(key == "time" for key, _, _ in entries):
         entries[:0] = _index_times(index, name, stated=rate is not None)
     return _put_together(entries, known_units, rate)
@@ -189,6 +193,20 @@ def _with_times(frame: Frame, titles: Mapping[Any, str], index: Any, name: str) 
         known = " ".join(titles[at] for at in dated)
         raise DataError(f"{name}: several columns hold dates ({known}); expected the one of the samples called 'time'")
     return dict(titles) if named else {**titles, **dict.fromkeys(dated, "time")}
+
+
+def texts_of(frame: Frame) -> list[Any]:
+    """Return the titles of columns of texts that are no sensor's, such as labels: they are not read."""
+
+    def is_text(column: Any) -> bool:
+        return isinstance(next((value for value in column if value is not None and value == value), None), str)
+
+    foreign = [at for at in frame.columns if not _of_a_sensor(_joined(at).partition("[")[0].strip())]
+    return [at for at in foreign if not _dtype(frame[at]).startswith(_NUMBERS) and is_text(frame[at])]
+
+
+def _of_a_sensor(key: str) -> bool:
+    return expected_quantities(key) is not None or any(stem in TRIADS for stem in _stems(key))
 
 
 def _is_dated(column: Any) -> bool:

@@ -107,6 +107,9 @@ class Recording:
     corrected_by: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if isinstance(self.metadata, Mapping) and any(isinstance(each, int | float) for each in self.metadata.values()):
+            texts = {key: repr(each) if isinstance(each, int | float) else each for key, each in self.metadata.items()}
+            object.__setattr__(self, "metadata", texts)
         for what in ("columns", "units", "metadata"):
             if not isinstance(getattr(self, what), Mapping):
                 raise DataError(f"{what}: expected a mapping from names, found {described(getattr(self, what))}")
@@ -185,7 +188,11 @@ class Recording:
                     f"{several[0]} to {several[-1]} (--element {several[0]})"
                 ) from None
             advice = next((note for note in self.notes if "--layout" in note), None)
-            advice = advice or "a layout says where columns of other names are (--layout; docs/recordings.md)"
+            advice = advice or (
+                f"rename what is the sensor's, such as df.rename(columns={{{next(iter(self.columns))!r}: {name!r}}})"
+                if self.source is None
+                else "a layout says where columns of other names are (--layout; docs/recordings.md)"
+            )
             hint = f"; {advice}" if foreign else f"; {state_rate(self.name)}" if name == "time" else ""
             raise DataError(f"{self.name}: no column {name}; found {' '.join(self.columns)}{hint}") from None
 
@@ -355,7 +362,7 @@ class Recording:
         *,
         unit: str | None = None,
         rate: float | None = None,
-        metadata: Mapping[str, str] | None = None,
+        metadata: Mapping[str, str | float] | None = None,
         name: str = "frame",
     ) -> Recording:
         """Make a recording from a pandas or polars data frame with columns named as in files, ``accel_x [g]``.
@@ -388,7 +395,7 @@ class Recording:
         'm/s^2'
         """
         converted, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
-        return cls(converted, symbols, metadata or {}, name)
+        return cls(converted, symbols, {**(metadata or {})}, name)  # type: ignore[dict-item]
 
     @overload
     def to_frame(self, library: Literal["pandas"] | None = None) -> pandas.DataFrame: ...
@@ -716,6 +723,13 @@ def with_power_on_temperature(blocks: Iterable[Recording]) -> Iterator[Recording
             )
         head = {"power_on_temperature": f"{temperature!r}", TAKEN_FROM: "the first reading of the column temperature"}
         yield replace(block, metadata={**block.metadata, **head})
+
+
+def state_power_on(recording: Recording, example: str) -> str:
+    """Return how to state the power-on temperature, degC, of a file or of a recording in memory, for a message."""
+    if recording.source is not None:
+        return f"expected a line such as '# power_on_temperature: {example}'"
+    return f"expected it in the metadata: Recording.from_frame(frame, metadata={{'power_on_temperature': {example}}})"
 
 
 def head_temperature(recording: Recording, key: str) -> float | None:

@@ -67,7 +67,7 @@ class Views(Protocol):
     def write_report(self, record: Any, path: str | Path) -> None:
         """Write the report of a record as one HTML file."""
 
-    def apply_to(self, record: Any, data: Any, reading: Mapping[str, Any], *, again: bool, heading: bool | str) -> Any:
+    def apply_to(self, record: Any, data: Any, reading: Mapping[str, Any], **options: Any) -> Any:
         """Return data corrected by a record."""
 
     def export_to(self, record: Any, target: str, folder: str | Path, **options: Any) -> list[Path]:

@@ -50,10 +50,14 @@ class DeviationCurve:
     freedom: Array
 
     def __repr__(self) -> str:
+        return self._text(1.0, "")
+
+    def _text(self, factor: float, unit: str) -> str:
+        """Return the curve in a line, its least deviation times a factor, in a unit."""
         least = int(np.argmin(self.deviation))
         return (
             f"AllanCurve({len(self.tau)} averaging times from {self.tau[0]:.4g} to {self.tau[-1]:.4g} s, "
-            f"least deviation {self.deviation[least]:.3g} at {self.tau[least]:.4g} s)"
+            f"least deviation {factor * self.deviation[least]:.3g}{unit} at {self.tau[least]:.4g} s)"
         )
 
 

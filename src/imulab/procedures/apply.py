@@ -228,7 +228,8 @@ def apply(
     UnitError
         The recording's unit cannot be converted to the record's.
     DataError
-        The recording lacks the columns that the record corrects, or was corrected by this record already.
+        The recording lacks the columns that the record corrects, was corrected by this record already, or nothing in
+        it is to be corrected, such as after a warm-up.
 
     Examples
     --------
@@ -271,6 +272,9 @@ def apply(
     if ready.further is not None:
         corrected = ready.further(corrected)
     if corrected is recording:
+        if not isinstance(record, Loaded):  # a block of a chain may pass as it is
+            why = next(iter(_explain_unchanged([ready], recording)), f"{recording.name}: nothing to correct in it")
+            raise DataError(why)
         return recording
     return replace(corrected, corrected_by=(*recording.corrected_by, *_name_corrections(ready)))
 

@@ -98,9 +98,21 @@ class Result:
         return self.calibration.cov(*names)
 
     @checked
-    def apply(self, data: Data, *, again: bool = False, heading: bool | str = False, **reading: Unpack[Reading]) -> Any:
+    def apply(
+        self,
+        data: Data,
+        *,
+        again: bool = False,
+        heading: bool | str = False,
+        latest_start: float | str = "5 s",
+        temperature_column: bool = False,
+        **reading: Unpack[Reading],
+    ) -> Any:
         """Return data corrected by the record, of a data frame a data frame; see `Calibration.apply`."""
-        return self.calibration.apply(data, again=again, heading=heading, **reading)
+        return self.calibration.apply(
+            data, again=again, heading=heading, latest_start=latest_start, temperature_column=temperature_column,
+            **reading,
+        )  # fmt: skip
 
     @checked
     def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:

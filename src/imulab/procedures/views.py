@@ -18,7 +18,7 @@ from imulab import report
 from imulab.display import LINES, SENTENCES, WIDTH, aligned, html_table
 from imulab.errors import OptionError, RecordError, listed
 from imulab.files import write_page
-from imulab.frames import frame_library, is_frame
+from imulab.frames import frame_library, is_frame, texts_of
 from imulab.procedures.registry import joined_of, procedure_of
 from imulab.procedures.registry import load as load
 from imulab.procedures.result import Drawn, Record, as_read, as_record
@@ -266,16 +266,20 @@ def plots(record: Calibration, name: str | int | None) -> Plots | Plot:
     return drawn if name is None else drawn[name]
 
 
-def apply_to(
-    record: Calibration, data: Any, reading: Mapping[str, Any] | Reading, *, again: bool, heading: bool | str
-) -> Any:
+def apply_to(record: Calibration, data: Any, reading: Mapping[str, Any] | Reading, **options: Any) -> Any:
     """Return data corrected by a record: of a data frame a frame of the same library, of all else a recording."""
     from imulab.procedures.apply import apply
 
-    corrected = apply(record, as_read(data, reading, Calibration.apply), again=again, heading=heading)
+    corrected = apply(record, as_read(data, reading, Calibration.apply), **options)
     if not is_frame(data):
         return corrected
-    return corrected.to_frame("polars" if frame_library(data) == "polars" else "pandas")
+    polars = frame_library(data) == "polars"
+    frame: Any = corrected.to_frame("polars" if polars else "pandas")
+    if len(frame) != len(data):
+        return frame
+    if polars:
+        return frame.with_columns(data[title] for title in texts_of(data))
+    return frame.set_axis(data.index).assign(**{title: data[title] for title in texts_of(data)})
 
 
 def export_to(record: Calibration, target: str, folder: str | Path, **options: Any) -> list[Path]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from imulab._version import VERSION
 from imulab.arguments import checked
 from imulab.display import UNJUDGED, Verdict, first_hidden, has_hidden, printable, verdict_of
-from imulab.errors import RecordError
+from imulab.errors import OptionError, RecordError
 from imulab.files import write_text
 from imulab.frames import data_frame
 from imulab.recording import Source
@@ -342,8 +342,10 @@ class Calibration:
         RecordError
             A number is not finite.
         OptionError
-            The file cannot be written there.
+            The file cannot be written there, or its name is that of a page.
         """
+        if str(path).lower().endswith((".html", ".htm", ".pdf")):
+            raise OptionError(f"{path}: a record is JSON, expected a name such as record.json; its report is a page")
         write_text(path, self.to_json())
 
     @classmethod
@@ -419,12 +421,25 @@ class Calibration:
         return self.covariance.block(names) if names else self.covariance.array()
 
     @checked
-    def apply(self, data: Data, *, again: bool = False, heading: bool | str = False, **reading: Unpack[Reading]) -> Any:
+    def apply(
+        self,
+        data: Data,
+        *,
+        again: bool = False,
+        heading: bool | str = False,
+        latest_start: float | str = "5 s",
+        temperature_column: bool = False,
+        **reading: Unpack[Reading],
+    ) -> Any:
         """Return data corrected by the record: a file, a recording, a data frame or arrays; see `imulab.apply`.
 
-        Of a data frame this is a frame of the same library, with titles ``name [unit]``; of all else a `Recording`.
+        Of a data frame this is a frame of the same library and index, with titles ``name [unit]`` and its columns of
+        texts; of all else a `Recording`.
         """
-        return views().apply_to(self, data, reading, again=again, heading=heading)
+        return views().apply_to(
+            self, data, reading, again=again, heading=heading, latest_start=latest_start,
+            temperature_column=temperature_column,
+        )  # fmt: skip
 
     @checked
     def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:

@@ -69,7 +69,11 @@ class AllanCurve(Drawn, noise_coefficients.DeviationCurve):
         """Notes on the column, its rows and its coefficients, a sentence each."""
         return self._noise[1]
 
-    __repr__ = noise_coefficients.DeviationCurve.__repr__
+    def __repr__(self) -> str:
+        from imulab.report.parameters import small_unit
+
+        unit, factor = small_unit(self.unit).scale
+        return self._text(factor, "" if self.unit == "1" else f" {unit}")
 
     def exhibits(self) -> Exhibits:
         """Return the coefficients, if there are any, the curve with its 95 % interval, and a table of it."""

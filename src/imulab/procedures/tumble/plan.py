@@ -21,7 +21,7 @@ from imulab.errors import DataError, ImulabError, ObservabilityError, OptionErro
 from imulab.estimation.least_squares import observability
 from imulab.options import choice, either, file, parsed, text
 from imulab.procedures.registry import load
-from imulab.procedures.result import PlannedAttitudes, amount, as_recording
+from imulab.procedures.result import PlannedAttitudes, Result, amount, as_recording
 from imulab.procedures.tumble import CRITERIA, HIGHEST_ORDER, METHODS, SOURCE_ORDER
 from imulab.procedures.tumble.attitudes import find_attitudes
 from imulab.procedures.tumble.estimate import check_method
@@ -82,9 +82,10 @@ class Plan:
         near = self.directions @ self.directions.T > np.cos(CLOSEST)
         return [(int(i) + 1, int(j) + 1) for i, j in np.argwhere(np.triu(near, 1)).tolist()]
 
-    def uncertainties(self, noise: float) -> dict[str, float]:
-        """Return the standard uncertainty of every parameter in units of g, for a noise of |f| in g."""
-        sigma = noise * np.sqrt(np.diag(self.covariance))
+    def uncertainties(self, noise: float | str) -> dict[str, float]:
+        """Return the standard uncertainty of every parameter in units of g, for a noise of |f| in g or such as 20ug."""
+        size = from_si(in_si(noise, "noise", "acceleration", "ug"), "g") if isinstance(noise, str) else noise
+        sigma = size * np.sqrt(np.diag(self.covariance))
         return dict(zip(parameter_names(self.order), sigma.tolist(), strict=True))
 
 
@@ -452,6 +453,13 @@ class TumblePlan(PlannedAttitudes, Plan):
     distinct_verticals: bool
     headings: Headings | None = None
 
+    def uncertainties(self, noise: float | str | None = None) -> dict[str, float]:
+        """Return the standard uncertainty of every parameter in units of g, for the plan's noise or another of |f|.
+
+        In g, or a text such as ``"20 ug"``.
+        """
+        return super().uncertainties(self.noise if noise is None else noise)
+
     @property
     def finding(self) -> str | None:
         """What too few attitudes leave open; None where they are enough."""
@@ -670,6 +678,8 @@ def _record(data: object) -> Calibration | None:
     name = os.fspath(data) if isinstance(data, str | PathLike) else "the record"
     if isinstance(data, str | PathLike) and is_json(name):
         data = load(name)
+    elif isinstance(data, Result):
+        data = data.calibration
     if not isinstance(data, Calibration):
         return None
     if data.procedure != "tumble":

@@ -29,6 +29,7 @@ from imulab.recording import (
     first_reading,
     head_temperature,
     power_on_temperature,
+    state_power_on,
 )
 from imulab.units import conversion_factor, parse_unit, si_unit
 
@@ -230,7 +231,7 @@ def _power_on(recording: Recording, from_column: bool, reading: float | None) ->
     if from_column and reading is not None:
         return reading
     problem = "no power_on_temperature in the head of the file" if stated is None else "power_on_temperature is nan"
-    raise DataError(f"{recording.name}: {problem}; expected a line such as '# power_on_temperature: -20'")
+    raise DataError(f"{recording.name}: {problem}; {state_power_on(recording, '-20')}")
 
 
 def _chamber(recording: Recording) -> float | None:

@@ -16,7 +16,15 @@ from imulab.errors import DataError, RecordError, UnitError
 from imulab.estimation.sampling import times_in_order
 from imulab.procedures.warmup import EXITS, MODELS
 from imulab.procedures.warmup.model import record_table
-from imulab.recording import LATEST_START, Array, Recording, check_clock, check_start, power_on_temperature
+from imulab.recording import (
+    LATEST_START,
+    Array,
+    Recording,
+    check_clock,
+    check_start,
+    power_on_temperature,
+    state_power_on,
+)
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor
 
@@ -240,7 +248,7 @@ def unchanged(columns: Mapping[str, Any], recording: Recording) -> str | None:
     if temperature is None:
         return (
             f"{recording.name}: no power_on_temperature in the head of the file: nothing corrected; "
-            "expected a line such as '# power_on_temperature: 21.5'"
+            f"{state_power_on(recording, '21.5')}"
         )
     if not low <= temperature <= high:
         return (
