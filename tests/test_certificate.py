@@ -101,6 +101,17 @@ def test_certificates_of_other_procedures_are_valid(issue, schemas, name):
     assert len(_single("cert.xml")) == len([p for p in record.parameters.values() if p.standard_uncertainty])
 
 
+@pytest.mark.parametrize("name", ["tumble", "thermal_gyro", "centrifuge", "noise"])
+def test_ptbs_schematron_finds_no_error(issue, name):
+    schematron = pytest.importorskip("dcclib.validation.schematron", reason="dcclib (250 MB) has PTB's Schematron")
+    record = il.load(WRITTEN / f"{name}.json")
+    replace(record, sensor={**record.sensor, "serial": "SN-1"}).save("unit.json")
+    assert issue(REVIEWED, "unit.json") == 0
+    result = schematron.SchematronValidator.for_dcc().validate_file("cert.xml")
+    assert result.failed_assertions == []
+    assert [report.text for report in result.successful_reports if report.role == "error"] == []
+
+
 # Number, unit, and structure: each of them changed is seen.
 
 

@@ -494,8 +494,9 @@ def test_a_certificate_of_a_record_is_written_beside_it(bench):
     record, lab = (
         bench.ask(f"files/{name}", Path(name).read_bytes(), "PUT").json()["name"] for name in ("unit.json", "LAB.toml")
     )
-    job = run(bench, "certificate", record=record, lab=lab, output="unit.xml")
-    assert Path(job.outputs[0]).read_bytes().startswith(b"<?xml")
+    for ending, begin in (("xml", b"<?xml"), ("pdf", b"%PDF")):
+        job = run(bench, "certificate", record=record, lab=lab, language="de", output=f"unit.{ending}")
+        assert Path(job.outputs[0]).read_bytes().startswith(begin)
 
 
 def test_results_are_cleared_but_not_what_runs_nor_what_they_made(bench):

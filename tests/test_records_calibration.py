@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import imulab as il
+from imulab.cli import main
 from imulab.errors import OptionError, RecordError
 from imulab.files import replacing, write_text
 from imulab.procedures.apply import loaded, tables_of
@@ -96,6 +97,37 @@ def test_the_day_of_a_recording_is_kept_and_read_back(tmp_path, head, expected):
     content = json.loads(record(sources=(source,)).to_json())
     assert content["sources"][0].get("measured") == expected
     assert loads(sealed(content), "r.json").sources[0].measured == expected
+
+
+def dated(folder):
+    """Write the day into the head of every recording of a folder."""
+    for path in folder.glob("*.csv"):
+        path.write_text("# date: 2026-11-24T08:00:00\n" + path.read_text(encoding="utf-8"), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("simulate", "fit"),
+    [
+        ("noise simulate --duration 30 --white 0.3deg/sqrt(h) --columns gyro_z -o t/rest.csv", "noise fit t/rest.csv"),
+        (
+            "warmup simulate --temperatures 0,20 --cycles 2 -o t",
+            "warmup fit t/cycle_+0_1.csv t/cycle_+20_1.csv --temperatures 0,20",
+        ),
+        (
+            "centrifuge simulate --levels 1,5 --cycles 1 --duration 60 --static-duration 20 -o t",
+            "centrifuge reduce t/manifest.toml",
+        ),
+    ],
+    ids=["noise", "warmup", "centrifuge"],
+)
+def test_the_day_is_kept_by_procedures_that_read_in_blocks(tmp_path, monkeypatch, simulate, fit):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t").mkdir()
+    assert main([*simulate.split(), "-q"]) == 0
+    dated(tmp_path / "t")
+    assert main([*fit.split(), "-o", "rec.json", "-q"]) == 0
+    days = {source.measured for source in il.load("rec.json").sources if source.file.endswith(".csv")}
+    assert days == {"2026-11-24"}
 
 
 @pytest.mark.parametrize("day", ["", "yesterday", "2026-13-01", "2026-11-24 10:00", 7])

@@ -305,12 +305,26 @@ class Procedure:
         return None
 
 
-def source_of(access: Files, name: str, called: str | None = None) -> Source | None:
-    """Return a file as a source of a record, under `called` or its own name; None for what is no file."""
+def noting_head(blocks: Iterator[Recording], heads: dict[str, Mapping[str, str]], name: str) -> Iterator[Recording]:
+    """Yield the blocks of a file, and note its head under its name in `heads`, for `source_of`."""
+    for block in blocks:
+        heads.setdefault(name, block.metadata)
+        yield block
+
+
+def source_of(
+    access: Files, name: str, called: str | None = None, *, heads: Mapping[str, Mapping[str, str]] | None = None
+) -> Source | None:
+    """Return a file as a source of a record, under `called` or its own name; None for what is no file.
+
+    `heads` holds the heads of recordings that were read, which may tell their day.
+    """
+    from imulab.readers import measured
     from imulab.recording import Source
 
     path = access.path(name)
     if name == "-" or not path.is_file():
         return None
     with open_file(path) as stream:
-        return Source(called or name, hashlib.file_digest(stream, "sha256").hexdigest())
+        day = measured((heads or {}).get(name, {}))
+        return Source(called or name, hashlib.file_digest(stream, "sha256").hexdigest(), day)

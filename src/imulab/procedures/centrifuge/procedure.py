@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import ReadError
 from imulab.options import read_options
-from imulab.procedures.procedure import Files, Procedure, Section, Task, source_of
+from imulab.procedures.procedure import Files, Procedure, Section, Task, noting_head, source_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from imulab.device.tables import DeviceTable, Fusion
     from imulab.device.unit import DeviceUnit
     from imulab.procedures.centrifuge.fit import CentrifugeFit
+    from imulab.procedures.centrifuge.manifest import Run
     from imulab.recording import Recording, Source
     from imulab.records.calibration import Calibration
     from imulab.report.traces import Exhibits
@@ -37,13 +38,20 @@ def _fit(
         if not access.path(names[run.file]).is_file():
             raise ReadError(f"{test.place(index)}: no such file")
 
+    heads: dict[str, Mapping[str, str]] = {}
+
+    def blocks(run: Run) -> Iterable[Recording]:
+        name = names[run.file]
+        return on_clock_of(noting_head(access.blocks(name, values["layout"], window=run.window), heads, name))
+
     def sources() -> list[Source]:
         named = [(manifest, manifest), *names.items()]
-        return [source for called, name in named if (source := source_of(access, name, called)) is not None]
+        found = (source_of(access, name, called, heads=heads) for called, name in named)
+        return [source for source in found if source is not None]
 
     return fit_centrifuge(
         test,
-        lambda run: on_clock_of(access.blocks(names[run.file], values["layout"], window=run.window)),
+        blocks,
         method=values["method"],
         curve=values["curve"],
         sources=sources,

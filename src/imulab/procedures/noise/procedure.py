@@ -24,18 +24,23 @@ def _fit(
     files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
 ) -> Calibration:
     from imulab.procedures.noise.fit import chosen_columns, fit_recordings, read_log
+    from imulab.recording import Recording
+
+    heads: dict[str, Mapping[str, str]] = {}
 
     def read(name: str) -> Recording | Rest:
         part = {"layout": values["layout"], **values["part"]}
-        return read_log(
+        log = read_log(
             None if name == "-" else access.path(name),
             lambda: (access.blocks(name, **part), None),
             lambda: access.recording(name, **part),
             lambda first: chosen_columns(first, values["columns"]),
         )
+        heads[name] = (log if isinstance(log, Recording) else log.recording).metadata
+        return log
 
     recordings = map(read, files)
-    sources = (source for name in files if (source := source_of(access, name)) is not None)
+    sources = (source for name in files if (source := source_of(access, name, heads=heads)) is not None)
     fit = {name: values[name] for name in ("terms", "horizon", "band", "regress", "columns", "steps")}
     return fit_recordings(recordings, sources=sources, **fit).calibration
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from imulab.options import part_of, read_options
-from imulab.procedures.procedure import Files, Procedure, Section, Task, source_of
+from imulab.procedures.procedure import Files, Procedure, Section, Task, noting_head, source_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,13 +31,16 @@ def _fit(
     from imulab.procedures.warmup.fit import fit_warmup
     from imulab.readers.streams import on_clock_of
 
+    heads: dict[str, Mapping[str, str]] = {}
+
     def cycle(name: str) -> Cycle:
-        return find_power_cycle(
-            on_clock_of(access.blocks(name, values["layout"], **values["part"]), "gyro"),
+        blocks = noting_head(access.blocks(name, values["layout"], **values["part"]), heads, name)
+        found = find_power_cycle(
+            on_clock_of(blocks, "gyro"),
             latest_start=values["latest_start"],
             temperature_from_column=values["temperature_column"],
-            source=source_of(access, name),
         )
+        return replace(found, source=source_of(access, name, heads=heads))
 
     return fit_warmup([cycle(name) for name in files], **values["fit"]).calibration
 
