@@ -22,7 +22,7 @@ extern "C" {
 #endif
 typedef IMULAB_REAL il_real;
 
-#define IL_VERSION 2 /* of the table format; 2 where gyroscopes have powers of the rate, else 1 */
+#define IL_VERSION 3 /* of the table format; 3 with whole IMUs, 2 where gyroscopes have powers of the rate, else 1 */
 
 /* Elements of a gyro array per axis; each costs 16 words of state per axis. */
 #ifndef IL_ARRAY_ELEMENTS
@@ -331,10 +331,80 @@ void il_array_still(const il_array *settings, il_array_state *state);
 unsigned il_array_block(const il_array *settings, il_array_state *state, size_t n, const il_real *reading,
                         const uint8_t *still, il_real *rate, uint8_t *flags, il_real *weight);
 
+/* ---- whole IMUs on one rigid board, to one specific force, rate and angular acceleration ---------------------------
+ * Accelerometers read y = Ta (s + (W^2 + [al]x) r) + ba, gyroscopes z = Tg w + bg; W = [w]x, al = dw/dt. */
+
+#ifndef IL_IMUS
+#define IL_IMUS 32 /* each costs 26 words of state */
+#endif
+
+typedef struct {
+    int32_t count;              /* IMUs, 2 to IL_IMUS */
+    uint32_t stuck;             /* identical samples that may make a triad stuck */
+    uint32_t quiet;             /* most good samples that a returning triad is watched */
+    il_real gate;               /* chi-square of three degrees of freedom, beyond which a triad is left out */
+    il_real at[3];              /* where the specific force is wanted, m */
+    const il_real *position;    /* [count][3], m */
+    const il_real *accel;       /* [count][3][3] Ta^-1, 1 */
+    const il_real *accel_bias;  /* [count][3] ba, m/s^2 */
+    const il_real *accel_noise; /* [count] standard deviation of a reading, m/s^2 */
+    const il_real *accel_limit; /* [count] size of a reading at the end of the range, m/s^2 */
+    const il_real *gyro;        /* [count][3][3] Tg^-1, 1 */
+    const il_real *gyro_bias;   /* [count][3] bg, rad/s */
+    const il_real *gyro_noise;  /* [count] rad/s */
+    const il_real *gyro_limit;  /* [count] rad/s */
+    const il_real *gyro_rows;   /* [count][3][3] Tg, 1 */
+} il_imus;
+
+typedef struct {
+    int32_t members;                   /* accelerometers used in the last sample; what follows is of these: */
+    int32_t by_gyroscopes;             /* judged with the angular acceleration of the gyroscopes */
+    uint32_t unknown;                  /* bits of the principal axes about which they tell no angular acceleration */
+    il_real weight;                    /* sum of 1 / variance */
+    il_real centroid[3];               /* m */
+    il_real axes[3][3];                /* principal axes, as columns */
+    il_real root[3];                   /* square roots of the principal moments sum p rho rho' */
+    il_real inertia[3];                /* (tr R I - R)^-1 */
+    il_real leverage[IL_IMUS][3][3];   /* inverse covariance of a residual */
+    il_real last[6 * IL_IMUS];         /* last readings */
+    il_real share[2][IL_IMUS];         /* 1 / variance of accelerometers and gyroscopes */
+    il_real before[3];                 /* rate of the gyroscopes in the sample before, rad/s, */
+    il_real turning[3];                /* and how it changed into that, rad/s^2 */
+    il_real step;                      /* s, since that */
+    int32_t known;                     /* samples in a row with a rate of the gyroscopes, up to 3 */
+    uint32_t repeats[2][IL_IMUS];      /* accelerometers, gyroscopes: identical readings in a row, less one */
+    uint32_t compared[2][IL_IMUS];     /* readings that are numbers */
+    uint32_t changed[2][IL_IMUS];      /* those that differ from the one before */
+    uint32_t owed[2][IL_IMUS];         /* good samples until it is used again */
+    uint8_t used[IL_IMUS];             /* accelerometers */
+    uint8_t flags[2][IL_IMUS];         /* IL_NOT_FINITE ... of the last sample */
+} il_imus_state;
+
+typedef struct {
+    il_real force[3], rate[3], acceleration[3];             /* at settings.at, m/s^2; rad/s; rad/s^2 */
+    il_real force_std[3], rate_std[3], acceleration_std[3]; /* standard uncertainties from the noise */
+} il_imus_fused;
+
+/* Whether settings can be run; IL_OK or IL_ARGUMENT. */
+il_status il_imus_check(const il_imus *settings);
+
+/* Clear the state for the first sample. */
+il_status il_imus_start(const il_imus *settings, il_imus_state *state);
+
+/* One sample: count accelerometers x, y, z [m/s^2], then count gyroscopes [rad/s]; `step` seconds after the one before, or 0
+ * where that is not known. IL_BEYOND: a gyroscope is at the end of its range, and the accelerometers tell the rate.
+ * IL_ALONE: fewer than three accelerometers are left. What is not determined is not a number. */
+unsigned il_imus_step(const il_imus *settings, il_imus_state *state, il_real step, const il_real *reading,
+                      il_imus_fused *fused);
+
+/* n samples; flags [sample] and health [sample][2][count], of accelerometers and gyroscopes, may be NULL. */
+unsigned il_imus_block(const il_imus *settings, il_imus_state *state, size_t n, const il_real *step, const il_real *reading,
+                       il_imus_fused *fused, uint8_t *flags, uint8_t *health);
+
 /* ---- all that one unit has, from a table ("blob") ----------------------------------------------------------------- */
 
 enum { IL_HAS_TUMBLE = 1, IL_HAS_GYRO = 2, IL_HAS_CENTRIFUGE = 4, IL_HAS_WARMUP = 8, IL_HAS_ARRAY = 16, IL_HAS_MAG = 32,
-       IL_HAS_THERMAL = 64, IL_HAS_THERMAL_GYRO = 128 };
+       IL_HAS_THERMAL = 64, IL_HAS_THERMAL_GYRO = 128, IL_HAS_IMUS = 256 };
 
 typedef struct {
     uint32_t has; /* IL_HAS_TUMBLE ... or-ed */
@@ -346,6 +416,7 @@ typedef struct {
     il_mag mag;
     il_thermal thermal;
     il_thermal_gyro thermal_gyro;
+    il_imus imus;
 } il_unit;
 
 /* Check a table and unpack it; arrays go to the caller's memory, which must outlive the unit; the bytes need not. On

@@ -1,7 +1,7 @@
 /* Tables: the numbers of one unit as bytes ("blob"), checked to the last bit before any of them is believed.
  *
  *   offset 0   8 bytes  89 49 4D 55 4C 41 42 0A
- *          8   u16      version (1 or 2)      10  u16  bytes per number: 4 (float) or 8 (double)
+ *          8   u16      version (1 to 3)      10  u16  bytes per number: 4 (float) or 8 (double)
  *         12   u32      size of the whole table, CRC included
  *         16   sections: u32 kind, u32 size of what follows, then u32 counts and IEEE 754 numbers
  *   size - 4   u32      CRC-32 of everything before
@@ -12,7 +12,8 @@
 
 enum { HEAD = 16, TAIL = 4, SECTION_HEAD = 8, MANY = 65536 };
 enum { CROSSED = 256 }; /* on top of a tumble's order: cross terms follow the polynomial */
-enum { TEXT = 0, TUMBLE = 1, GYRO = 2, CENTRIFUGE = 3, WARMUP = 4, ARRAY = 5, MAG = 6, THERMAL = 7, THERMAL_GYRO = 8 };
+enum { TEXT = 0, TUMBLE = 1, GYRO = 2, CENTRIFUGE = 3, WARMUP = 4, ARRAY = 5, MAG = 6, THERMAL = 7, THERMAL_GYRO = 8,
+       IMUS = 9 };
 
 static const uint8_t MAGIC[8] = {0x89, 0x49, 0x4D, 0x55, 0x4C, 0x41, 0x42, 0x0A};
 
@@ -266,6 +267,26 @@ static void read_array(cursor *c, il_array *a) {
     if (il_array_check(a) != IL_OK) fail(c, IL_TABLE_CONTENT);
 }
 
+static void read_imus(cursor *c, il_imus *m) {
+    m->count = count(c, 2, IL_IMUS);
+    m->stuck = whole(c);
+    m->quiet = whole(c);
+    m->gate = positive(c);
+    numbers(c, m->at, 3);
+    const size_t n = (size_t)m->count;
+    m->position = kept(c, 3 * n);
+    m->accel = kept(c, 9 * n);
+    m->accel_bias = kept(c, 3 * n);
+    m->accel_noise = kept(c, n);
+    m->accel_limit = kept(c, n);
+    m->gyro = kept(c, 9 * n);
+    m->gyro_bias = kept(c, 3 * n);
+    m->gyro_noise = kept(c, n);
+    m->gyro_limit = kept(c, n);
+    m->gyro_rows = kept(c, 9 * n);
+    if (c->status == IL_OK && il_imus_check(m) != IL_OK) fail(c, IL_TABLE_CONTENT);
+}
+
 static void read_section(cursor *c, il_unit *unit, uint32_t kind) {
     uint32_t bit = kind == TEXT ? 0u : 1u << (kind - 1u);
     if (unit->has & bit) fail(c, IL_TABLE_CONTENT); /* one of each */
@@ -279,6 +300,7 @@ static void read_section(cursor *c, il_unit *unit, uint32_t kind) {
         case MAG: read_mag(c, &unit->mag); break;
         case THERMAL: read_thermal(c, &unit->thermal); break;
         case THERMAL_GYRO: read_thermal_gyro(c, &unit->thermal_gyro); break;
+        case IMUS: read_imus(c, &unit->imus); break;
         default: c->at = c->end; break;
     }
     if (c->at != c->end) fail(c, IL_TABLE_CONTENT);
@@ -300,7 +322,7 @@ static il_status load(il_unit *unit, const uint8_t *bytes, size_t size, il_real 
         if (end - c.at < SECTION_HEAD) return IL_TABLE_CONTENT;
         uint32_t kind = u32(c.at), length = u32(c.at + 4);
         c.at += SECTION_HEAD;
-        if (kind > THERMAL_GYRO || length > (size_t)(end - c.at)) return IL_TABLE_CONTENT;
+        if (kind > (version > 2 ? IMUS : THERMAL_GYRO) || length > (size_t)(end - c.at)) return IL_TABLE_CONTENT;
         c.end = c.at + length;
         read_section(&c, unit, kind);
     }

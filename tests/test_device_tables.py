@@ -71,7 +71,7 @@ def spoilt(data, how):
     if how == "altered":
         return data[:400] + bytes([data[400] ^ 4]) + data[401:]
     if how == "newer":
-        return closed(body[:8] + b"\3\0" + body[10:])
+        return closed(body[:8] + b"\4\0" + body[10:])
     if how == "without text":
         return pack(tables_of(madeup.tumble(1)), 4)
     assert how == "not finite"

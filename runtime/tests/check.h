@@ -38,6 +38,7 @@ void test_thermal(void);
 void test_warmup(void);
 void test_array(void);
 void test_robust(void);
+void test_imus(void);
 void test_table(void);
 
 #endif

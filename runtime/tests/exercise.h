@@ -62,6 +62,23 @@ static inline void exercise(const il_unit *unit) {
         free(reading);
         free(flags);
     }
+    if (unit->has & IL_HAS_IMUS) {
+        const size_t width = 6 * (size_t)unit->imus.count;
+        il_imus_state *state = malloc(sizeof *state);
+        il_real *reading = malloc(width * sizeof *reading);
+        il_imus_fused fused;
+        if (state != NULL && reading != NULL && il_imus_start(&unit->imus, state) == IL_OK) {
+            for (size_t k = 0; k < EXERCISE_SAMPLES; k++) {
+                for (size_t i = 0; i < width; i++) {
+                    reading[i] = (il_real)0.1 * (il_real)((i + k) % 11) + (il_real)0.01 * (il_real)(i * k % 7);
+                    if ((i + 3 * k) % 37 == 5 && k % 3) reading[i] = odd[(i + k) % 8];
+                }
+                (void)il_imus_step(&unit->imus, state, odd[k % 8], reading, &fused);
+            }
+        }
+        free(state);
+        free(reading);
+    }
 }
 
 #endif

@@ -2,7 +2,7 @@
 """Write vectors.h: what the C core must compute, from equations transcribed apart.
 
 Imports nothing of imulab. Triads, drift and warm-up are computed here, with 60 decimal digits; array_vectors.py has the
-array's methods, pack_blobs.py the blobs.
+array's methods, imus_vectors.py whole IMUs (with numpy), pack_blobs.py the blobs.
 
 `make_vectors.py --seeds DIR` writes the blobs, a file each, for the fuzzer.
 """
@@ -15,6 +15,7 @@ from decimal import Decimal, getcontext
 from pathlib import Path
 
 from array_vectors import ELEMENTS, EVERY, SAMPLES, SCENARIOS, array
+from imus_vectors import imus
 from pack_blobs import make_blobs, write_seeds
 from write_c import LINES, emit, emit_bytes, emit_words
 
@@ -272,7 +273,7 @@ def blobs():
     LINES.append(f"enum {{ V_BLOBS = {len(made)}, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8 }};")
     LINES.append(
         "enum { V_BLOB_DRIFT = 10, V_BLOB_CROSS = 11, V_BLOB_WARMUP = 12, V_BLOB_ARRAY = 16, V_BLOB_MAG = 23,"
-        " V_BLOB_THERMAL = 25, V_BLOB_BENT = 27, V_BLOB_THERMAL_GYRO = 28 };"
+        " V_BLOB_THERMAL = 25, V_BLOB_BENT = 27, V_BLOB_THERMAL_GYRO = 28, V_BLOB_IMUS = 30 };"
     )
     letters = b"imulab " * 40
     emit_bytes("v_crc_bytes", letters)
@@ -283,7 +284,7 @@ def main():
     if sys.argv[1:2] == ["--seeds"]:
         write_seeds(Path(sys.argv[2]))
         return
-    for part in (tumble, gyro, mag, centrifuge, warmup, array, blobs):
+    for part in (tumble, gyro, mag, centrifuge, warmup, array, imus, blobs):
         part()
     head = [
         "/* Written by make_vectors.py; do not edit. */",

@@ -51,6 +51,12 @@ def make_sections(w):
     return tumble_of, gyro_of, drift, warm, sensors
 
 
+def imus_reals(w):
+    """Gate, output point, and of three IMUs positions, matrices, biases, noises, limits: each its counted numbers."""
+    sizes = (9, 27, 9, 3, 3, 27, 9, 3, 3, 27)
+    return counted(w, 4, 30) + b"".join(counted(w, n, 1 + i) for i, n in enumerate(sizes))
+
+
 def make_blobs(w):
     tumble_of, gyro_of, drift, warm, sensors = make_sections(w)
     text = section(0, b'{"format": "imulab.blob"}')
@@ -68,7 +74,8 @@ def make_blobs(w):
     ]  # fmt: skip
     bent = section(2, words(1, 3), counted(w, 24, 1), counted(w, 12, 60))  # of order 3: version 2
     made += [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors, *field, *laws)]
-    return [*made, blob(w, bent, version=2), *(blob(w, s) for s in rates)]
+    board = section(9, words(3, 20, 16), imus_reals(w))  # three whole IMUs: version 3
+    return [*made, blob(w, bent, version=2), *(blob(w, s) for s in rates), blob(w, board, version=3)]
 
 
 def write_seeds(folder):

@@ -29,6 +29,7 @@ int main(void) {
     test_warmup();
     test_array();
     test_robust();
+    test_imus();
     test_table();
     printf("C core, %s: %lu checks, %lu failed\n", IS_FLOAT ? "float" : "double", checks, failures);
     return failures == 0 ? EXIT_SUCCESS : EXIT_FAILURE;

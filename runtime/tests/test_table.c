@@ -47,7 +47,7 @@ static void crc_is_that_of_ieee_802_3(void) {
 
 static void whole_tables_load(void) {
     static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16, 32, 32, 64, 64, 2,
-                                           128, 128};
+                                           128, 128, 256};
     for (int b = 0; b < V_BLOBS; b++) {
         uint32_t found = 99;
         CHECK(load_exactly(v_blob4[b], v_blob4_size[b], &found) == IL_OK && found == has[b]);
@@ -129,6 +129,14 @@ static void contents_arrive(void) {
             counted(t->knot, t->pieces + 1, REAL(-20), 0);
             counted(t->coefficient, 6 * t->pieces * t->terms, REAL(30), 0);
         }
+        CHECK(il_table_load(&unit, blobs[V_BLOB_IMUS], sizes[V_BLOB_IMUS], memory, LENGTH(memory)) == IL_OK);
+        CHECK(unit.imus.count == 3 && unit.imus.stuck == 20 && unit.imus.quiet == 16 && unit.imus.gate == REAL(30));
+        counted(unit.imus.at, 3, REAL(30), 1);
+        const il_real *const tables[] = {unit.imus.position, unit.imus.accel, unit.imus.accel_bias, unit.imus.accel_noise,
+                                         unit.imus.accel_limit, unit.imus.gyro, unit.imus.gyro_bias, unit.imus.gyro_noise,
+                                         unit.imus.gyro_limit, unit.imus.gyro_rows};
+        static const int lengths[] = {9, 27, 9, 3, 3, 27, 9, 3, 3, 27};
+        for (int i = 0; i < 10; i++) counted(tables[i], lengths[i], REAL(1 + i), 0);
         CHECK(il_table_load(&unit, blobs[V_BLOB_DRIFT], sizes[V_BLOB_DRIFT], NULL, 0) == IL_OK);
         CHECK(unit.centrifuge.has[0] == 1 && unit.centrifuge.has[1] == 0 && unit.centrifuge.highest == REAL(2));
         counted(unit.centrifuge.k0, 2, REAL(2), 1);
@@ -247,11 +255,18 @@ static void contents_that_cannot_be_are_refused(void) {
     enum { KIND = 4, LENGTH_WORD = 5, BODY = 6 }; /* words from the start of the blob */
     const uint32_t nan_bits = 0x7FC00000u, inf_bits = 0x7F800000u, minus = 0xBF800000u /* -1 */, zero = 0;
     EXPECT(0, 2, 0x00040000u, IL_TABLE_CONTENT); /* version 0 */
-    EXPECT(0, 2, 0x00040003u, IL_TABLE_NEWER);
+    EXPECT(0, 2, 0x00040004u, IL_TABLE_NEWER);
     EXPECT(0, 2, 0x00020001u, IL_TABLE_WIDTH);
     EXPECT(0, 2, 0x00000001u, IL_TABLE_WIDTH);
     EXPECT(0, 2, 0x00080001u, IS_FLOAT ? IL_TABLE_WIDTH : IL_OK); /* no numbers in it */
     EXPECT(V_BLOB_TUMBLE, KIND, 8, IL_TABLE_CONTENT);
+    EXPECT(V_BLOB_IMUS, 2, 0x00040002u, IL_TABLE_CONTENT); /* a kind that version 2 does not have */
+    EXPECT(V_BLOB_IMUS, KIND, 10, IL_TABLE_CONTENT);
+    EXPECT(V_BLOB_IMUS, BODY, 1, IL_TABLE_CONTENT); /* IMUs */
+    EXPECT(V_BLOB_IMUS, BODY, IL_IMUS + 1, IL_TABLE_CONTENT);
+    EXPECT(V_BLOB_IMUS, BODY + 1, 1, IL_TABLE_CONTENT); /* stuck */
+    EXPECT(V_BLOB_IMUS, BODY + 3, minus, IL_TABLE_CONTENT); /* gate */
+    EXPECT(V_BLOB_IMUS, BODY + 55, zero, IL_TABLE_CONTENT); /* noise of an accelerometer */
     EXPECT(V_BLOB_TUMBLE, KIND, 0xFFFFFFFFu, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_TUMBLE, LENGTH_WORD, 0xFFFFFFFFu, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_TUMBLE, LENGTH_WORD, 3, IL_TABLE_CONTENT);

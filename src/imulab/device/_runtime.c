@@ -327,6 +327,46 @@ static PyObject *array_block(PyObject *self, PyObject *args) {
     return result;
 }
 
+static PyObject *imus_start(PyObject *self, PyObject *capsule) {
+    (void)self;
+    il_unit *unit = unit_of(capsule, IL_HAS_IMUS);
+    if (unit == NULL) return NULL;
+    PyObject *state = PyByteArray_FromStringAndSize(NULL, (Py_ssize_t)sizeof(il_imus_state));
+    if (state == NULL) return NULL;
+    (void)il_imus_start(&unit->imus, (il_imus_state *)(void *)PyByteArray_AsString(state)); /* checked as it was loaded */
+    return state;
+}
+
+static PyObject *imus_block(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *capsule, *state, *steps, *readings, *outputs, *all_flags, *healths, *result = NULL;
+    buffers b = {.count = 0};
+    if (!PyArg_ParseTuple(args, "OOOOOOO", &capsule, &state, &steps, &readings, &outputs, &all_flags, &healths)) return NULL;
+    il_unit *unit = unit_of(capsule, IL_HAS_IMUS);
+    if (unit == NULL) return NULL;
+    const Py_ssize_t count = unit->imus.count, numbers = (Py_ssize_t)(sizeof(il_imus_fused) / sizeof(il_real));
+    void *bytes = memory_of(&b, state, 'B', (Py_ssize_t)sizeof(il_imus_state), 1);
+    if (bytes != NULL && (uintptr_t)bytes % sizeof(il_real) != 0) {
+        PyErr_SetString(PyExc_ValueError, "expected an aligned state");
+        bytes = NULL;
+    }
+    const il_real *step = bytes != NULL ? memory_of(&b, steps, 'd', -1, 0) : NULL;
+    const Py_ssize_t n = step != NULL ? items(&b, 1) : 0;
+    const il_real *reading = step != NULL ? memory_of(&b, readings, 'd', 6 * count * n, 0) : NULL;
+    il_imus_fused *fused = reading != NULL ? memory_of(&b, outputs, 'd', numbers * n, 1) : NULL;
+    uint8_t *flags = fused != NULL ? memory_of(&b, all_flags, 'B', n, 1) : NULL;
+    uint8_t *health = flags != NULL ? memory_of(&b, healths, 'B', 2 * count * n, 1) : NULL;
+    if (health != NULL) {
+        unsigned met;
+        Py_BEGIN_ALLOW_THREADS
+        met = il_imus_block(&unit->imus, bytes, (size_t)n, step, reading, fused, flags, health);
+        Py_END_ALLOW_THREADS
+        result = PyLong_FromUnsignedLong(met);
+    }
+    release(&b);
+    return result;
+}
+
 MODULE(_runtime, "The C core of imulab.",
        {"load", load, METH_VARARGS, "load(bytes): a checked table; ValueError says what is wrong with it."},
        {"has", has, METH_O, "has(unit): bits of the sections that a table holds."},
@@ -338,4 +378,6 @@ MODULE(_runtime, "The C core of imulab.",
        {"centrifuge", centrifuge, METH_VARARGS, "centrifuge(unit, forces, rates): flags; rates are changed in place."},
        {"warmup", warmup, METH_VARARGS, "warmup(unit, temperature, tick, ticks, inputs, factors, outputs): whether the table covers it."},
        {"array_start", array_start, METH_O, "array_start(unit): the state of a stream, as a bytearray."},
-       {"array_block", array_block, METH_VARARGS, "array_block(unit, state, readings, still, rates, flags, weights): flags met."})
+       {"array_block", array_block, METH_VARARGS, "array_block(unit, state, readings, still, rates, flags, weights): flags met."},
+       {"imus_start", imus_start, METH_O, "imus_start(unit): the state of a stream, as a bytearray."},
+       {"imus_block", imus_block, METH_VARARGS, "imus_block(unit, state, steps, readings, fused, flags, health): flags met."})

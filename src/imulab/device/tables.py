@@ -25,10 +25,14 @@ from imulab.units import conversion_factor, from_si
 # Structs and bytes.
 
 
-VERSION, WITH_POWERS = 1, 2
-"""Of the format; the second where gyroscopes have powers of the rate, which older cores then refuse as newer."""
+VERSION, WITH_POWERS, WITH_IMUS = 1, 2, 3
+"""Of the format; the second where gyroscopes have powers of the rate, the third with whole IMUs.
+
+Older cores refuse these as newer.
+"""
 TEXT = 0  # kind of the section that holds a record's text
-KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5, "mag": 6, "thermal": 7, "thermal_gyro": 8}
+KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5, "mag": 6, "thermal": 7, "thermal_gyro": 8,
+         "imus": 9}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,9 +92,9 @@ def pack(tables: Sequence[DeviceTable], width: int, text: Mapping[str, Any] | No
     sections += [(KINDS[table.kind], table.payload(width)) for table in tables]
     body = b"".join(struct.pack("<II", kind, len(payload)) + payload for kind, payload in sections)
     bent = any(table.kind == "gyro" and any(field.name == "order" for field in table.fields) for table in tables)
-    head = BLOB_MAGIC + struct.pack(
-        "<HHI", WITH_POWERS if bent else VERSION, width, len(BLOB_MAGIC) + 8 + len(body) + 4
-    )
+    whole_imus = any(table.kind == "imus" for table in tables)
+    version = WITH_IMUS if whole_imus else WITH_POWERS if bent else VERSION
+    head = BLOB_MAGIC + struct.pack("<HHI", version, width, len(BLOB_MAGIC) + 8 + len(body) + 4)
     return head + body + struct.pack("<I", zlib.crc32(head + body))
 
 

@@ -100,10 +100,10 @@ def export_blob(records: Sequence[Calibration], folder: Path, options: ExportOpt
 # Records to C: the core in one file, the unit's numbers, and a self-test against this computer's results.
 
 
-_HEADERS = ("real.h", "array.h", "robust.h")
+_HEADERS = ("real.h", "array.h", "robust.h", "imus.h")
 _CHECKOUT = Path(__file__).resolve().parents[3] / "runtime"
 _ELEMENTS = 32  # IL_ARRAY_ELEMENTS of imulab.h
-_OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array|robust)\.h"\n', re.MULTILINE)
+_OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array|robust|imus)\.h"\n', re.MULTILINE)
 
 
 def export_c(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
