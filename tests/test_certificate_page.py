@@ -114,6 +114,18 @@ def test_a_letter_that_no_font_has_is_named(printed, capsys, where):
     assert printed(lab, output="cert.xml")  # which takes every letter
 
 
+def test_further_fonts_have_further_letters(printed, capsys):
+    """Tifinagh is in DejaVu Sans, not in the fonts that typst brings."""
+    lab = REVIEWED.replace("A. Example", "ⵣ. Example")
+    assert printed(lab) == 2
+    assert "persons[0].name: no font of the PDF has the letter 'ⵣ' (U+2D63)" in capsys.readouterr().err
+    assert printed(lab, "tumble", "--fonts", "nowhere") == 2
+    assert "fonts 'nowhere': expected a folder of fonts" in capsys.readouterr().err
+    if not Path("/usr/share/fonts/truetype/dejavu/DejaVuSans.ttf").is_file():
+        pytest.skip("no DejaVu Sans on this machine (Debian package fonts-dejavu-core)")
+    assert "ⵣ. Example" in " ".join(texts(printed(lab, "tumble", "--fonts", "/usr/share/fonts/truetype/dejavu")))
+
+
 def test_without_typst_it_says_what_is_missing(printed, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "typst", None)
     assert printed() == 2
@@ -211,6 +223,9 @@ def test_a_logo_lies_beside_the_file(printed, capsys):
     assert "laboratory.logo 'logo.svg': no such file beside it" in capsys.readouterr().err
     Path("logo.svg").write_text(LOGO, encoding="utf-8")
     assert len(printed(lab)) > 10_000
+    Path("logo.png").write_bytes(b"no picture")
+    assert printed(lab.replace("logo.svg", "logo.png")) == 2
+    assert "imulab: laboratory.logo: the PDF cannot be laid out: failed to decode image" in capsys.readouterr().err
     assert printed(lab.replace("logo.svg", "lab.toml")) == 2
     assert "expected a name that ends with .png, .jpg or .svg" in capsys.readouterr().err
 

@@ -61,6 +61,8 @@ def pdf(certificate: Certificate, xml: bytes, fonts: str | None = None) -> bytes
         typst: Any = import_module("typst")
     except ImportError:
         raise OptionError(f"a PDF needs typst, which is not here: {install('certificate')}") from None
+    if fonts is not None and not Path(fonts).is_dir():
+        raise OptionError(f"fonts {fonts!r}: expected a folder of fonts")
     folders = [] if fonts is None else [fonts]
     families = {font.family for font in typst.Fonts(False, False, folders).fonts()} if folders else set()
     page = _page(certificate) | {"fonts": sorted(families)}
@@ -76,7 +78,8 @@ def pdf(certificate: Certificate, xml: bytes, fonts: str | None = None) -> bytes
     except typst.TypstError as error:
         if missing := _MISSING.search(str(error)):
             raise _no_letter(missing[1], certificate) from None
-        raise OptionError(f"the PDF cannot be laid out: {str(error).splitlines()[0]}") from None
+        place = "laboratory.logo: " if "decode image" in str(error) else ""
+        raise OptionError(f"{place}the PDF cannot be laid out: {str(error).splitlines()[0]}") from None
     return made
 
 
