@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from datetime import date
 from io import StringIO
 from pathlib import Path
 
@@ -185,6 +187,18 @@ def test_twenty_sudden_ends_leave_a_recording_to_go_on_with(tmp_path):
     read = il.read(path)
     assert np.diff(read.time).min() > 0
     assert 20 * len(recording) - 20 * 3 <= len(read) <= 20 * len(recording)
+
+
+@pytest.mark.parametrize("arrives", [True, False])
+def test_a_recording_of_what_arrives_has_its_day(tmp_path, arrives):
+    recording = il.simulate_tumble(attitudes=2, gravity=9.81, gyro=False)
+    head = recording.metadata | ({"format": "lines"} if arrives else {})
+    before = str(date.today())
+    recorder = Recorder(str(tmp_path / "rec.csv"), resume=False)
+    recorder.write(replace(recording, metadata=head), 0.0)
+    recorder.close()
+    day = il.read(tmp_path / "rec.csv").source.measured
+    assert day in ((before, str(date.today())) if arrives else (None,))
 
 
 def test_a_full_disk_keeps_whole_lines(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ import os
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from datetime import datetime
 from io import BytesIO
 from pathlib import Path
 
@@ -100,7 +101,10 @@ class Recorder:
         if self._units is None:
             self._units = block.units
             out = BytesIO()
-            write_csv_to(replace(block, columns={name: np.empty(0) for name in block.columns}), out)
+            head = dict(block.metadata)
+            if "format" in head:  # it arrives now, which a replay or a simulation does not
+                head = {"date": datetime.now().astimezone().isoformat(timespec="seconds"), **head}
+            write_csv_to(replace(block, columns={name: np.empty(0) for name in block.columns}, metadata=head), out)
             self._waiting.append(out.getvalue())
         self._waiting.append(bytes(decimal_rows(np.column_stack(list(block.columns.values())))))
         self.rows += len(block)
