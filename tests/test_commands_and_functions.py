@@ -34,6 +34,7 @@ FUNCTIONS = {
     "array simulate --imus": il.simulate_imus,
     "array merge": il.merge_array,
     "array calibrate": il.calibrate_array,
+    "array calibrate --imus": il.calibrate_imus,
     "array fuse": il.fuse,
     "array compare": il.compare_methods,
     "centrifuge plan": il.plan_centrifuge,

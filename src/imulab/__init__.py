@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.public import compare_methods as compare_methods
     from imulab.procedures.gyro_array.public import fuse as fuse
     from imulab.procedures.gyro_array.public import merge_array as merge_array
+    from imulab.procedures.gyro_array.imus.fit import ImusFit as ImusFit
+    from imulab.procedures.gyro_array.imus.fit import calibrate_imus as calibrate_imus
     from imulab.procedures.gyro_array.imus.simulate import simulate_imus as simulate_imus
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
     from imulab.procedures.magnetometer.check import check_magnetometer as check_magnetometer
@@ -109,8 +111,10 @@ _HOME = {
     "ArrayFit": "procedures.gyro_array.fit",
     "FuseOptions": "procedures.gyro_array.fuse",
     "Fused": "procedures.gyro_array.fuse",
+    "ImusFit": "procedures.gyro_array.imus.fit",
     "allan_deviation": "procedures.noise.allan",
     "calibrate_array": "procedures.gyro_array.public",
+    "calibrate_imus": "procedures.gyro_array.imus.fit",
     "check_noise": "procedures.noise.check",
     "check_thermal": "procedures.thermal.check",
     "check_tumble": "procedures.tumble.check",

@@ -83,6 +83,7 @@ _UNITS = {
         Unit("mA/(deg/s)", "output per rate", 1.0 / _DEGREE),
         Unit("pulse/s/(deg/s)", "output per rate", 1.0 / _DEGREE),
         Unit("m", "length"),
+        Unit("mm", "length", 1e-3),
         Unit("Hz", "frequency"),
         Unit("kHz", "frequency", 1e3),
         Unit("1", "number"),

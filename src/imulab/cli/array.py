@@ -178,6 +178,7 @@ def merge(
 def calibrate(
     still: Annotated[str, Argument("STILL", "Recording at rest.")],
     *,
+    imus: WholeImus = False,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -194,6 +195,29 @@ def calibrate(
     check_outputs([output, report], [name for name in (still, moving, options["layout"], options["noise"]) if name])
     files = [still] if moving is None else [still, moving]
     finish(run_task("array", files, options, GivenFiles()), output, report, json=json)
+
+
+def calibrate_imus(
+    file: RecordingFile,
+    *,
+    imus: WholeImus = False,
+    output: OutputFile = None,
+    report: ReportFile = None,
+    json: AsJson = False,
+    **options: Any,
+) -> None:
+    """Find where each IMU of a board sits, how it is turned, and how late it answers.
+
+    From one recording: the board lies still in several attitudes, and is turned and shaken by hand. No reference but
+    gravity.
+    """
+    from imulab.cli.options import read_recording
+    from imulab.cli.show import finish
+    from imulab.readers.streams import one_clock
+
+    check_outputs([output, report], [name for name in (file, options["layout"]) if name])
+    recording = one_clock(read_recording(file, **reading(options)))
+    finish(call(il.calibrate_imus, recording, **options).calibration, output, report, json=json)
 
 
 def fuse(file: RecordingFile, *, output: OutputFile = None, **options: Any) -> None:
@@ -354,6 +378,7 @@ COMMANDS = (
     Command("array simulate --imus", simulate_imus, lambda: [il.simulate_imus]),
     Command("array merge", merge, lambda: [il.merge_array], without=("element",)),
     Command("array calibrate", calibrate, _calibrate_functions, without=("element",)),
+    Command("array calibrate --imus", calibrate_imus, lambda: [il.calibrate_imus], without=("element",)),
     Command("array fuse", fuse, lambda: [il.fuse], without=("element",)),
     Command("array compare", compare, lambda: [il.compare_methods], without=("element",)),
 )

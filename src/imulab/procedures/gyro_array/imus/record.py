@@ -66,7 +66,7 @@ def parameters_of(numbers: Array, turned: Array | None = None) -> tuple[Array, A
         values[misalignment] = matrix[rows, columns] / factors[rows]
     values[AT_POSITION] = numbers[POSITION]
     values[AT_ACCEL_LATENCY], values[AT_GYRO_LATENCY] = numbers[ACCEL_LATENCY], numbers[GYRO_LATENCY]
-    return values, q
+    return values + 0.0, q  # no -0
 
 
 def record_values(board: Board, covariance: Array) -> tuple[Array, Array]:

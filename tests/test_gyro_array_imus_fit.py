@@ -1,0 +1,306 @@
+"""A board's calibration against simulated truth, what disturbs it, and a real board."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli import main
+from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
+from imulab.procedures.gyro_array.imus.fit import count_attitudes, parse_distance
+from imulab.procedures.gyro_array.imus.model import (
+    ACCEL,
+    ACCEL_BIAS,
+    ACCEL_LATENCY,
+    GYRO,
+    GYRO_LATENCY,
+    POSITION,
+    Board,
+)
+from imulab.procedures.gyro_array.imus.record import record_values
+from imulab.procedures.gyro_array.imus.schema import imus_of
+
+G = 9.80665
+REAL = Path(os.environ.get("IMULAB_DATA", "shared/data")) / "mimu4444" / "exp_1.bin"
+
+
+def a_board(**options):
+    return il.simulate_imus(
+        **({"elements": 3, "attitudes": 8, "duration": "12 s", "rate": "62.5 Hz", "seed": 3} | options)
+    )
+
+
+def truth_of(board):
+    """Return the true parameters of the record, shape (K, 29)."""
+
+    def told(name):
+        count = sum(key.startswith("truth_position_") for key in board.metadata)
+        return np.array([[float(x) for x in board.metadata[f"truth_{name}_{k + 1}"].split()] for k in range(count)])
+
+    late = told("latency")
+    numbers = np.zeros((len(late), 29))
+    for name, place in (("accel", ACCEL), ("accel_bias", ACCEL_BIAS), ("position", POSITION), ("gyro", GYRO)):
+        numbers[:, place] = told(name)
+    numbers[:, 25:28], numbers[:, ACCEL_LATENCY], numbers[:, GYRO_LATENCY] = told("gyro_bias"), late[:, 0], late[:, 1]
+    return record_values(Board(numbers), np.zeros((numbers.size, numbers.size)))[0]
+
+
+def errors(record, board, names):
+    """Return errors over standard uncertainties of the parameters that begin with one of the names."""
+    from imulab.procedures.gyro_array.imus.schema import PER_IMU
+
+    truth, z = truth_of(board), []
+    for k in range(len(truth)):
+        for (name, _), value in zip(PER_IMU, truth[k], strict=True):
+            stated = record.parameters.get(f"{name}_{k + 1}")
+            if stated is not None and name.startswith(names):
+                difference = stated.value - value
+                if name.startswith("rotation") and abs(difference) > np.pi:
+                    continue  # a half turn has two rotation vectors
+                z.append(difference / stated.standard_uncertainty)
+    return np.array(z)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    board = a_board(age="0 ms")
+    return board, il.calibrate_imus(board, gravity=G).calibration
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "position",
+        "accel_latency",
+        "gyro_latency",
+        "accel_bias",
+        "accel_scale_factor",
+        "accel_misal",
+        "gyro_scale",
+        "gyro_misal",
+    ],
+)
+def test_errors_are_as_large_as_their_uncertainties(simulated, names):
+    board, record = simulated
+    z = errors(record, board, (names,))
+    assert len(z) >= 2
+    assert 0.2 < np.sqrt(np.mean(z**2)) < 2.2
+    assert np.abs(z).max() < 4.0
+
+
+def test_positions_are_told_to_a_tenth_of_a_millimetre(simulated):
+    board, record = simulated
+    found = np.array([imu.position.value for imu in imus_of(record).imus])
+    assert np.abs(found - truth_of(board)[:, 0:3]).max() < 2e-4
+    assert imus_of(record).size_from == "gravity"
+    assert imus_of(record).not_determined == []
+    assert record.verdict.state == "good"
+
+
+def test_common_scale_and_bias_are_those_of_all_imus(simulated):
+    board, record = simulated
+    common = imus_of(record).common
+    told = [board.metadata[f"truth_accel_{k + 1}"] for k in range(3)]
+    accel = np.array([[float(x) for x in text.split()] for text in told]).reshape(3, 3, 3)
+    nominal = np.array([np.eye(3), np.diag([1, -1, -1]), np.eye(3)])  # every second IMU lies on the other side
+    mean = np.einsum("kij,kil->jl", nominal, accel).diagonal() / 3
+    z = (np.array(common.accel_scale_factor.value) - mean) / common.accel_scale_factor.standard_uncertainty
+    assert np.abs(z).max() < 3.5
+
+
+def test_few_attitudes_leave_common_scale_and_bias_null():
+    record = il.calibrate_imus(a_board(attitudes=1, age="0 ms"), gravity=G).calibration
+    held = imus_of(record)
+    assert held.common.accel_scale_factor is None
+    assert held.common.accel_bias is None
+    assert record.parameters["accel_bias_x_2"].standard_uncertainty is None
+    assert any("common scale factors and biases" in name for name in held.not_determined)
+    assert held.size_from == "gyro scale"
+    assert any(name.startswith("size of the board") for name in held.not_determined)
+
+
+def test_a_stated_distance_gives_the_size():
+    board = a_board(attitudes=1, age="0 ms")
+    true = float(np.linalg.norm(truth_of(board)[1, 0:3]))
+    record = il.calibrate_imus(board, gravity=G, distance=f"1:2:{1e3 * true:.4f}mm+-0.02mm").calibration
+    assert imus_of(record).size_from == "stated"
+    position = np.array([imu.position.value for imu in imus_of(record).imus])
+    assert np.linalg.norm(position[1]) == pytest.approx(true, abs=6e-5)
+    wrong = il.calibrate_imus(board, gravity=G, distance=f"1:2:{1.2e3 * true:.4f}mm+-0.02mm").calibration
+    assert any("nominal scale makes the board" in text for text in wrong.verdict.reasons)
+
+
+def test_the_age_of_readings_is_found():
+    record = il.calibrate_imus(a_board(age="2 ms", duration="20 s"), gravity=G).calibration
+    assert imus_of(record).fit.age.value == pytest.approx(2e-3 / np.sqrt(12), rel=0.15)
+
+
+def test_directions_count_as_attitudes_when_they_are_apart():
+    angles = np.radians([0, 5, 30, 31, 90, 180])
+    assert count_attitudes(np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)) == 4
+
+
+def test_a_distance_as_text():
+    known = parse_distance("1:8:53.9mm+-0.1mm")
+    assert (known.first, known.second, known.length, known.u) == (0, 7, pytest.approx(0.0539), pytest.approx(1e-4))
+    for text in ("1:8", "1:1:5mm", "0:2:5mm", "1:2:-5mm"):
+        with pytest.raises(OptionError, match="distance"):
+            parse_distance(text)
+
+
+# Disturbed recordings.
+
+
+def with_columns(board, **columns):
+    return replace(board, columns={**board.columns, **columns})
+
+
+def test_a_dead_or_stuck_imu_is_refused_by_its_column():
+    board = a_board(duration="6 s")
+    dead = with_columns(board, gyro_y_2=np.zeros(len(board)))
+    with pytest.raises(DataError, match=r"column gyro_y_2: all samples are 0: a dead sensor"):
+        il.calibrate_imus(dead, gravity=G)
+    stuck = board.columns["accel_z_3"].copy()
+    stuck[3500:] = stuck[3500]
+    with pytest.raises(DataError, match=r"column accel_z_3: .* a stuck sensor"):
+        il.calibrate_imus(with_columns(board, accel_z_3=stuck), gravity=G)
+
+
+def test_wrong_units_are_refused_by_name():
+    board = a_board(duration="6 s")
+    in_g = {name: board.columns[name] / G for name in ("accel_x_2", "accel_y_2", "accel_z_2")}
+    with pytest.raises(DataError, match=r"accelerometers of IMU 2: 0\.9.* m/s\^2 at rest"):
+        il.calibrate_imus(with_columns(board, **in_g), gravity=G)
+    in_rad = {name: np.radians(board.columns[name]) for name in ("gyro_x_2", "gyro_y_2", "gyro_z_2")}
+    with pytest.raises(DataError, match=r"gyroscopes of IMU 2 read 0\.01.* times the rate of the others"):
+        il.calibrate_imus(with_columns(board, **in_rad), gravity=G)
+    with pytest.raises(UnitError, match="accel_x_1"):
+        il.calibrate_imus(replace(board, units={**board.units, "accel_x_1": "deg/s"}), gravity=G)
+
+
+def test_missing_columns_are_named():
+    board = a_board(duration="6 s")
+    columns = {name: values for name, values in board.columns.items() if name != "accel_y_3"}
+    with pytest.raises(DataError, match="no column accel_y_3; expected 3 whole IMUs"):
+        il.calibrate_imus(replace(board, columns=columns), gravity=G)
+    with pytest.raises(DataError, match=r"expected columns accel_x_1 \.\. accel_z_K"):
+        il.calibrate_imus(il.simulate_tumble(attitudes=6), gravity=G)
+
+
+def test_dropouts_and_repeated_rows_are_left_out(simulated):
+    board, _ = simulated
+    columns = {name: values.copy() for name, values in board.columns.items()}
+    rng = np.random.default_rng(1)
+    for row in rng.choice(np.arange(3400, 3900), 6, replace=False):
+        for name in columns:
+            if name != "time":
+                columns[name][row] = columns[name][row - 1]
+    columns["gyro_x_2"][3700:3703] = np.nan
+    disturbed = il.calibrate_imus(replace(board, columns=columns), gravity=G).calibration
+    assert any("3 of" in text and "not finite" in text for text in disturbed.warnings)
+    assert any("exact repeats of the row before" in text for text in disturbed.warnings)
+    z = errors(disturbed, board, ("position", "accel_latency", "gyro_latency"))
+    assert np.abs(z).max() < 4.0
+
+
+def test_a_loose_imu_is_named():
+    board = a_board(duration="20 s", age="0 ms")
+    columns = dict(board.columns)
+    half = len(board) - 1000  # in the middle of the motion IMU 3 slips, as by a knock
+    moved = shifted(board, 3, [1.5e-3, -1.5e-3, 1.5e-3])
+    for axis in "xyz":
+        name = f"accel_{axis}_3"
+        columns[name] = np.where(np.arange(len(board)) < half, board.columns[name], moved.columns[name])
+    record = il.calibrate_imus(replace(board, columns=columns), gravity=G).calibration
+    assert record.verdict.state == "look"
+    assert any("IMU 3 sits elsewhere" in text for text in record.verdict.reasons)
+
+
+def shifted(board, number, by):
+    """Return a board whose IMU reads as if it sat elsewhere, by lever arms from rates of the gyroscopes' derivative."""
+    truth = {name: np.array(board.metadata[f"truth_{name}_1"].split(), float) for name in ("gyro", "gyro_bias")}
+    rate = np.radians(np.stack([board.columns[f"gyro_{axis}_1"] for axis in "xyz"], 1)) - truth["gyro_bias"]
+    rate = rate @ np.linalg.inv(truth["gyro"].reshape(3, 3)).T
+    kernel = np.ones(5) / 5
+    rate = np.stack([np.convolve(column, kernel, mode="same") for column in rate.T], 1)
+    slope = np.gradient(rate, np.median(np.diff(board.columns["time"])), axis=0)
+    force = np.cross(slope, by) + np.cross(rate, np.cross(rate, by))
+    accel = np.array(board.metadata[f"truth_accel_{number}"].split(), float).reshape(3, 3)
+    readings = force @ accel.T
+    return with_columns(
+        board,
+        **{f"accel_{a}_{number}": board.columns[f"accel_{a}_{number}"] + readings[:, i] for i, a in enumerate("xyz")},
+    )
+
+
+def test_motion_that_does_not_turn_about_all_axes_is_refused_or_said():
+    with pytest.raises(ObservabilityError, match="does not turn about every axis"):
+        il.calibrate_imus(a_board(about="x", attitudes=1), gravity=G)
+    with pytest.raises(DataError, match="samples in motion"):
+        il.calibrate_imus(a_board(turning="5 deg/s", attitudes=1), gravity=G)
+
+
+def test_two_imus_in_one_place_are_named():
+    board = a_board(elements=3, age="0 ms")
+    rng = np.random.default_rng(4)
+    twin = {f"accel_{axis}_3": board.columns[f"accel_{axis}_2"] + rng.normal(0, 0.03, len(board)) for axis in "xyz"}
+    twin |= {f"gyro_{axis}_3": board.columns[f"gyro_{axis}_2"] + rng.normal(0, 0.1, len(board)) for axis in "xyz"}
+    record = il.calibrate_imus(with_columns(board, **twin), gravity=G).calibration
+    assert any("IMUs 2 and 3 are" in text and "one sensor, recorded twice" in text for text in record.verdict.reasons)
+
+
+def test_the_command_makes_the_record_of_the_function(tmp_path, monkeypatch, capsys, simulated):
+    monkeypatch.chdir(tmp_path)
+    il.write(simulated[0], "board.csv")
+    words = ["array", "calibrate", "board.csv", "--imus", "--gravity", str(G), "-o", "r.json", "--report", "r.html"]
+    assert main(words) == 0
+    assert "size of the board from gravity" in capsys.readouterr().out
+    il.calibrate_imus("board.csv", gravity=str(G)).save("f.json")
+    one, other = (json.loads((tmp_path / name).read_text()) for name in ("r.json", "f.json"))
+    for content in (one, other):
+        del content["created"], content["content_sha256"]
+    assert one == other
+    assert (tmp_path / "r.html").stat().st_size > 10_000
+
+
+# Many trials, and a real board.
+
+
+@pytest.mark.slow
+def test_intervals_of_95_percent_cover_the_truth(record_property):
+    """Of doubled uncertainties: over many boards, 93 to 97 % of the positions, within what so few trials can tell."""
+    z = {name: [] for name in ("position", "accel_latency", "gyro_latency", "accel_bias")}
+    for seed in range(30):
+        board = a_board(elements=4, attitudes=12, duration="20 s", rate="100 Hz", age="0 ms", seed=100 + seed)
+        record = il.calibrate_imus(board, gravity=G).calibration
+        for name, values in z.items():
+            values += errors(record, board, (name,)).tolist()
+    for name, values in z.items():
+        covered = np.mean(np.abs(values) < 1.96)
+        record_property(name, f"{covered:.3f} of {len(values)}, rms z {np.sqrt(np.mean(np.square(values))):.3f}")
+        assert 0.9 < covered <= 1.0, name
+
+
+@pytest.mark.skipif(not REAL.is_file(), reason="no real recording here")
+def test_a_real_board_has_the_size_of_its_drawing():
+    """MIMU4444, 19.05 mm between columns of chips; size by the nominal scale of 96 gyroscopes, as its table has it."""
+    record = il.calibrate_imus(str(REAL), gravity=9.82).calibration
+    held = imus_of(record)
+    position = np.array([imu.position.value for imu in held.imus])
+    nominal = 0.01905
+    # Chips 1, 3, 5, 7 lie alike, so that where their sensing points are cancels.
+    size = np.mean([position[4, 0], position[6, 0], -position[2, 1], -position[6, 1]]) / nominal
+    by_nominal_scale = size * held.fit.size.gyro_scale.value
+    assert by_nominal_scale == pytest.approx(0.9967, abs=0.005)
+    assert abs(size - 1) < 4 * held.fit.size.gravity.standard_uncertainty
+    assert np.degrees(held.fit.gyro_residual.value) == pytest.approx(7.0, abs=1.0)
+    assert held.fit.age.value == pytest.approx(0.29e-3, abs=0.04e-3)
+    assert held.fit.halves < 1.5
+    assert 0.1 < held.fit.clipped < 0.2
+    assert any("reading at its limit" in text for text in record.verdict.reasons)
