@@ -33,6 +33,7 @@ def write_certificate(
     before: Record | None = None,
     language: Language | None = None,
     fonts: str | Path | None = None,
+    sign: str | Path | None = None,
 ) -> None:
     """Write the certificate of a record, whole or not at all: XML for programs, or a PDF for people that holds it.
 
@@ -56,6 +57,8 @@ def write_certificate(
         "en" or "de"; that of `lab` if not given.
     fonts
         Folder of fonts for letters that the PDF's own do not have.
+    sign
+        PEM file of a private key and its certificate, by which the XML is signed (XMLDSig).
 
     Raises
     ------
@@ -83,7 +86,7 @@ def write_certificate(
     made = _certificate(record, stated, limits)
     if before is not None:
         made = with_before(made, _certificate(before, stated, limits))
-    _write(made, Path(path), fonts)
+    _write(made, Path(path), fonts, sign)
 
 
 @checked
@@ -95,6 +98,7 @@ def write_fleet_certificates(
     limits: str | Path | None = None,
     language: Language | None = None,
     fonts: str | Path | None = None,
+    sign: str | Path | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> dict[str, str]:
     """Return why units of a fleet have no certificate, by serial number; of all others PDF and XML are written.
@@ -106,7 +110,7 @@ def write_fleet_certificates(
     lab
         As for `write_certificate`; its number has ``{serial}``. Where a recording tells its day, that is the day of
         calibration, within those that `lab` states.
-    limits, language, fonts
+    limits, language, fonts, sign
         As for `write_certificate`.
     progress
         Called with the number of units that are done.
@@ -142,7 +146,7 @@ def write_fleet_certificates(
             made = _certificate(store.record(unit.serial), stated, limits)
             made = with_days_of_recordings(made)
             for ending in (".xml", ".pdf"):
-                _write(made, Path(output) / f"{unit.serial}{ending}", fonts)
+                _write(made, Path(output) / f"{unit.serial}{ending}", fonts, sign)
         except ImulabError as error:
             refused[unit.serial] = str(error)
         if progress is not None:
@@ -150,8 +154,12 @@ def write_fleet_certificates(
     return refused
 
 
-def _write(certificate: Certificate, path: Path, fonts: str | Path | None) -> None:
+def _write(certificate: Certificate, path: Path, fonts: str | Path | None, sign: str | Path | None) -> None:
     content = dcc_xml(certificate)
+    if sign is not None:
+        from imulab.certificate.signature import signed  # signxml is of an extra, and takes 90 ms to load
+
+        content = signed(content, str(sign), certificate.lab.certificate.issued)
     if path.suffix == ".pdf":
         from imulab.certificate.page import pdf  # typst is of an extra, and takes 20 ms to load
 

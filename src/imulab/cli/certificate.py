@@ -28,6 +28,9 @@ def certificate(
         Literal["en", "de"] | None, choice(("en", "de"), help="Language of the texts; else that of LAB.toml.")
     ] = None,
     fonts: Annotated[str | None, option("DIR", "Fonts for letters that those of the PDF lack.")] = None,
+    sign: Annotated[
+        str | None, option("KEY.pem", "Private key and its certificate, by which the XML is signed.")
+    ] = None,
     output: Annotated[
         str | None, option("CERT.xml|CERT.pdf", "Certificate to write.", "-o", "--output"), OUTPUT
     ] = None,
@@ -54,8 +57,10 @@ def certificate(
         return
     if record is None or lab is None or output is None:
         raise OptionError("expected RECORD, --lab LAB.toml and -o CERT.pdf, or --template alone")
-    check_outputs([output], [each for each in (record, lab, limits, before) if each], paper=True)
-    il.write_certificate(record, output, lab=lab, limits=limits, before=before, language=language, fonts=fonts)
+    check_outputs([output], [each for each in (record, lab, limits, before, sign) if each], paper=True)
+    il.write_certificate(
+        record, output, lab=lab, limits=limits, before=before, language=language, fonts=fonts, sign=sign
+    )
     print(f"certificate: {output}")
 
 

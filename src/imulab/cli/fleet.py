@@ -97,6 +97,9 @@ def certificate(
         Literal["en", "de"] | None, choice(("en", "de"), help="Language of the texts; else that of LAB.toml.")
     ] = None,
     fonts: Annotated[str | None, option("DIR", "Fonts for letters that those of the PDF lack.")] = None,
+    sign: Annotated[
+        str | None, option("KEY.pem", "Private key and its certificate, by which the XML is signed.")
+    ] = None,
     output: Annotated[str, option("DIR", "Folder of the certificates.", "-o", "--output"), OUTPUT],
 ) -> int:
     """Write the certificate of every unit.
@@ -107,7 +110,7 @@ def certificate(
     units = il.fleet_status(folder).rows
     with progress_bar("certificates", len(units)) as update:
         refused = il.write_fleet_certificates(
-            folder, output, lab=lab, limits=limits, language=language, fonts=fonts, progress=update
+            folder, output, lab=lab, limits=limits, language=language, fonts=fonts, sign=sign, progress=update
         )
     print(f"certificates: {len(units) - len(refused)} in {output}")
     if not refused:

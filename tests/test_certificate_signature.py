@@ -1,0 +1,125 @@
+"""Signatures of certificates: verified by another library's reader, broken by one digit, refused by name."""
+
+import sys
+from datetime import UTC, datetime
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+
+from imulab.cli import main
+
+signxml = pytest.importorskip("signxml", reason="signxml signs certificates")
+pytest.importorskip("typst", reason="typst lays out certificates")
+pypdf = pytest.importorskip("pypdf", reason="pypdf reads their PDF")
+
+from cryptography import x509  # noqa: E402
+from cryptography.hazmat.primitives import hashes, serialization  # noqa: E402
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa  # noqa: E402
+from lxml import etree  # noqa: E402
+
+DATA = Path(__file__).resolve().parent / "data"
+RECORD = str(DATA / "written_by" / "0.2.0" / "tumble.json")
+PEM = serialization.Encoding.PEM
+YEARS = datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo=UTC)
+
+
+def certificate_of(key, years=YEARS):
+    """A certificate that the key signs for itself, PEM."""
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "Example Inertial Laboratory")])
+    made = x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
+    made = made.serial_number(7).not_valid_before(years[0]).not_valid_after(years[1])
+    return made.sign(key, None if isinstance(key, ed25519.Ed25519PrivateKey) else hashes.SHA256()).public_bytes(PEM)
+
+
+def pem_of(key, passphrase=None):
+    lock = serialization.NoEncryption() if passphrase is None else serialization.BestAvailableEncryption(passphrase)
+    return key.private_bytes(PEM, serialization.PrivateFormat.PKCS8, lock)
+
+
+@pytest.fixture(scope="module")
+def keys():
+    return {"rsa": rsa.generate_private_key(65537, 2048), "ec": ec.generate_private_key(ec.SECP256R1())}
+
+
+@pytest.fixture
+def sign(tmp_path, monkeypatch):
+    """A function that certifies a record by the command with this PEM file, and returns the exit status."""
+    monkeypatch.chdir(tmp_path)
+    lab = (DATA / "lab.toml").read_text(encoding="utf-8")
+    Path("lab.toml").write_text(lab.replace("location =", 'reviewed = "seen"\nlocation ='), encoding="utf-8")
+
+    def run(pem, output="cert.xml"):
+        Path("key.pem").write_bytes(pem)
+        return main(["certificate", RECORD, "--lab", "lab.toml", "--sign", "key.pem", "-o", output])
+
+    return run
+
+
+def verified(xml, key):
+    """The signed content as the verifier returns it."""
+    return signxml.XMLVerifier().verify(xml, x509_cert=certificate_of(key).decode()).signed_xml
+
+
+@pytest.mark.parametrize("kind", ["rsa", "ec"])
+def test_a_signature_is_verified_and_changes_nothing_else(sign, keys, kind):
+    key = keys[kind]
+    assert sign(pem_of(key) + certificate_of(key)) == 0
+    assert main(["certificate", RECORD, "--lab", "lab.toml", "-o", "plain.xml"]) == 0
+    content = verified(Path("cert.xml").read_bytes(), key)
+    plain = etree.parse("plain.xml").getroot()
+    for one in (content, plain):  # the break before the end of the root stood before the signature
+        one[-1].tail = None
+    assert etree.tostring(content, method="c14n") == etree.tostring(plain, method="c14n")
+
+
+def test_the_signed_xml_is_in_the_pdf_and_the_same_twice(sign, keys):
+    pem = certificate_of(keys["rsa"]) + pem_of(keys["rsa"])
+    assert [sign(pem, name) for name in ("cert.xml", "cert.pdf", "again.pdf")] == [0, 0, 0]
+    pdf = Path("cert.pdf").read_bytes()
+    assert pdf == Path("again.pdf").read_bytes()
+    assert pypdf.PdfReader(BytesIO(pdf)).attachments["certificate.xml"] == [Path("cert.xml").read_bytes()]
+
+
+def test_one_digit_or_another_indent_breaks_it(sign, keys):
+    assert sign(pem_of(keys["ec"]) + certificate_of(keys["ec"])) == 0
+    xml = Path("cert.xml").read_bytes()
+    tree = etree.fromstring(xml)
+    etree.indent(tree, space="    ")
+    for changed in (xml.replace(b"<si:value>2", b"<si:value>3", 1), etree.tostring(tree)):
+        assert changed != xml
+        with pytest.raises(signxml.InvalidSignature):
+            verified(changed, keys["ec"])
+
+
+def test_the_schema_holds(sign, keys, real_data):
+    path = real_data / "dcc" / "dcc" / "v3.3.0.xsd"
+    if not path.exists():
+        pytest.skip("PTB's schemas are not here (IMULAB_DATA)")
+    assert sign(pem_of(keys["rsa"]) + certificate_of(keys["rsa"])) == 0
+    schema = etree.XMLSchema(etree.parse(path))
+    schema.validate(etree.parse("cert.xml"))
+    assert list(schema.error_log) == []
+
+
+def test_what_cannot_sign_is_refused_and_nothing_is_written(sign, keys, capsys, monkeypatch):
+    key, other = keys["ec"], certificate_of(keys["rsa"])
+    before = certificate_of(key, (YEARS[0].replace(year=2024), YEARS[0]))
+    new = ed25519.Ed25519PrivateKey.generate()
+    for pem, said in (
+        (b"", "expected one private key and the signer's certificate"),
+        (pem_of(key), "expected one private key and the signer's certificate"),
+        (pem_of(key) + other, "the private key is not that of the certificate, CN=Example Inertial Laboratory"),
+        (pem_of(key) + before, "the certificate is valid from 2024-01-01 to 2026-01-01, not on 2026-11-27"),
+        (pem_of(key, b"secret") + certificate_of(key), "the private key is locked by a pass phrase"),
+        (pem_of(key).replace(b"M", b"-", 1) + certificate_of(key), "key.pem: the key or the certificate is damaged"),
+        (pem_of(new) + certificate_of(new), "expected a private key of RSA or on an elliptic curve"),
+    ):
+        assert sign(pem) == 2
+        error = capsys.readouterr().err
+        assert said in error
+        assert error.count("\n") == 1
+        assert not Path("cert.xml").exists()
+    monkeypatch.setitem(sys.modules, "signxml", None)
+    assert sign(pem_of(key) + certificate_of(key)) == 2
+    assert "a signature needs signxml, which is not here: pip install '.[sign]'" in capsys.readouterr().err
