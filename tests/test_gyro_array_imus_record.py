@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,7 +12,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.errors import DataError, RecordError
 from imulab.gravity import Gravity
-from imulab.procedures.gyro_array.imus import schema
+from imulab.procedures.gyro_array.imus import figures, schema
 from imulab.procedures.gyro_array.imus.model import ACCEL, GYRO, NUMBERS, Board
 from imulab.procedures.gyro_array.imus.record import GAUGE, make_record, parameters_of, record_values
 from imulab.procedures.gyro_array.imus.schema import imus_of
@@ -173,3 +175,21 @@ def test_a_record_of_one_imu_or_of_something_else_is_refused():
         )
     with pytest.raises(RecordError, match="--imus', found one of a comparison"):
         imus_of(il.Calibration(**{**record.__dict__, "model": {**record.model, "kind": "comparison"}}))
+
+
+def test_the_report_draws_the_board_with_its_ellipses():
+    record, board, _ = a_record()
+    exhibits = figures.exhibits(record)
+    drawn = next(item for item in exhibits.figures if item.title == "The board, x and y")
+    ellipses, places = drawn.traces[:-1], drawn.traces[-1]
+    np.testing.assert_allclose(places["x"], 1e3 * board.position[:, 0], rtol=1e-6)
+    assert len(ellipses) == 2  # IMU 1 is the origin
+    factor = int(re.search(r"drawn (\d+) times", drawn.caption)[1])
+    covariance = record.covariance.block(["position_x_2", "position_y_2"])
+    # The ellipse of 95 % reaches sqrt(5.991) standard deviations along each axis.
+    reach = [np.ptp(ellipses[0][axis]) / 2 / factor for axis in "xy"]
+    np.testing.assert_allclose(reach, 1e3 * np.sqrt(5.991 * np.diag(covariance)), rtol=0.01)
+    late = next(item for item in exhibits.figures if item.title == "How late each IMU answers")
+    np.testing.assert_allclose(late.traces[0]["y"], 1e3 * board.numbers[:, 15], rtol=1e-6)
+    residuals = next(item for item in exhibits.figures if item.title == "Residuals of the gyroscopes in motion")
+    assert residuals.traces[-1]["y"][0] == pytest.approx(np.degrees(0.002), rel=1e-5)

@@ -10,7 +10,6 @@ import numpy as np
 from imulab.errors import RecordError
 from imulab.procedures.gyro_array.elements import JUMPED, NON_FINITE, STUCK, unit_of_angle
 from imulab.procedures.gyro_array.imus.figures import exhibits as imus_exhibits
-from imulab.procedures.gyro_array.imus.schema import imus_of
 from imulab.procedures.gyro_array.schema import (
     ArrayRecord,
     ComparisonRecord,
@@ -293,7 +292,7 @@ def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
     kind = record.model.get("kind")
     if kind == "imus":
-        return imus_exhibits(imus_of(record))
+        return imus_exhibits(record)
     return comparison_exhibits(record) if kind == "comparison" else _calibration(array_of(record))
 
 

@@ -4,9 +4,32 @@ from __future__ import annotations
 
 import math
 
-from imulab.procedures.gyro_array.imus.schema import Imu, ImusRecord, Three
-from imulab.report.traces import Exhibits, Figure, ReportTable, format_uncertain, plain_number
+import numpy as np
 
+from imulab.procedures.gyro_array.imus.schema import Imu, ImusRecord, Three, imus_of
+from imulab.records.calibration import Calibration
+from imulab.report.traces import (
+    BAD,
+    DASHES,
+    GOOD,
+    INK,
+    LEGEND,
+    MARGIN,
+    SYMBOLS,
+    TIME,
+    Exhibits,
+    Figure,
+    ReportTable,
+    figure_axis,
+    format_uncertain,
+    log_axis,
+    plain_number,
+    rounded,
+    scatter,
+)
+
+_CHI = math.sqrt(-2 * math.log(0.05))
+"""Axes of an ellipse that holds two normal variates with 95 %, in standard deviations."""
 _SOURCES = {
     "gravity": "gravity turned from rest to rest",
     "stated": "a stated distance",
@@ -14,8 +37,9 @@ _SOURCES = {
 }
 
 
-def exhibits(record: ImusRecord) -> Exhibits:
+def exhibits(calibration: Calibration) -> Exhibits:
     """Return headline, facts, figures and tables of a board's record."""
+    record = imus_of(calibration)
     fit = record.fit
     largest = max(u or 0.0 for imu in record.imus for u in imu.position.standard_uncertainty)
     facts = [
@@ -30,18 +54,116 @@ def exhibits(record: ImusRecord) -> Exhibits:
         headline=f"{record.model.imus} IMUs: positions known to {plain_number(1e3 * largest, 2)} mm or better, the "
         f"size of the board from {_SOURCES[record.size_from]}",
         facts=facts,
-        items=_items(record),
+        items=_items(record, calibration),
     )
 
 
-def summary(record: ImusRecord) -> tuple[list[str], list[list[str]]]:
-    """Return the table of the IMUs."""
-    first = _imus_table(record)
-    return first.columns, first.rows
+def _items(record: ImusRecord, calibration: Calibration) -> list[Figure | ReportTable]:
+    items: list[Figure | ReportTable] = [_imus_table(record), _biases_table(record), _size_table(record)]
+    if record.not_determined:
+        rows = [[name] for name in record.not_determined]
+        caption = "What is known no better than before the recording; it is held near its nominal value."
+        items.append(ReportTable("Not told by this recording", caption, ["what"], rows))
+    items += [_board(record, calibration, 0, 1), _board(record, calibration, 0, 2), _latencies(record)]
+    return [*items, _residuals(record, "accel"), _residuals(record, "gyro")]
 
 
-def _items(record: ImusRecord) -> list[Figure | ReportTable]:
-    return [_imus_table(record)]
+def _board(record: ImusRecord, calibration: Calibration, across: int, up: int) -> Figure:
+    """Return the board seen along an axis, with its IMUs and the ellipses of their positions."""
+    place = 1e3 * np.array([imu.position.value for imu in record.imus])
+    names = ["xyz"[axis] for axis in (across, up)]
+    x, y = place[:, across], place[:, up]
+    turn = np.linspace(0, 2 * math.pi, 49)
+    circle = _CHI * np.stack([np.cos(turn), np.sin(turn)])
+    ellipses = {}
+    for k in range(1, len(place)):
+        keys = [f"position_{name}_{k + 1}" for name in names]
+        if all(key in calibration.covariance.names for key in keys):
+            ellipses[k] = 1e3 * np.linalg.cholesky(calibration.covariance.block(keys)) @ circle
+    largest = max((float(np.abs(ellipse).max()) for ellipse in ellipses.values()), default=1.0)
+    room = 0.1 * max(float(np.ptp(x)), float(np.ptp(y)), 1e-3)
+    factor = max((each for each in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if each * largest <= room), default=1)
+    traces = [
+        scatter(
+            rounded(x[k] + factor * ellipse[0]), rounded(y[k] + factor * ellipse[1]), "lines",
+            line={"color": GOOD, "width": 1.2}, fill="toself", fillcolor="rgba(31,111,139,0.18)", hoverinfo="skip",
+            showlegend=False,
+        )
+        for k, ellipse in ellipses.items()
+    ]  # fmt: skip
+    traces.append(
+        scatter(
+            rounded(x), rounded(y), "markers+text", marker={"color": INK, "size": 7},
+            text=[imu.name for imu in record.imus], textposition="top right", showlegend=False,
+            hovertemplate=f"IMU %{{text}}<br>{names[0]} %{{x:.3f}} mm, {names[1]} %{{y:.3f}} mm<extra></extra>",
+        )
+    )  # fmt: skip
+    layout = {
+        "xaxis": figure_axis(f"{names[0]}, mm"),
+        "yaxis": figure_axis(f"{names[1]}, mm", scaleanchor="x", scaleratio=1),
+        "margin": MARGIN,
+    }
+    enlarged = f", drawn {factor} times as large" if factor > 1 else ""
+    caption = (
+        f"Sensing elements of the accelerometers from IMU 1, body axes {names[0]} and {names[1]}. Ellipses "
+        f"hold the place with 95 %{enlarged}; the size of the board, common to all, is part of them."
+    )
+    return Figure(f"The board, {names[0]} and {names[1]}", caption, traces, layout, 460)
+
+
+def _latencies(record: ImusRecord) -> Figure:
+    traces = []
+    for number, (name, values) in enumerate(
+        (
+            ("accelerometers", [imu.accel_latency for imu in record.imus]),
+            ("gyroscopes", [i.gyro_latency for i in record.imus]),
+        )
+    ):
+        traces.append(
+            scatter(
+                [f"{imu.name}" for imu in record.imus], rounded([1e3 * each.value for each in values]), "markers",
+                name=name, marker={"color": (GOOD, BAD)[number], "symbol": SYMBOLS[number], "size": 9},
+                error_y={
+                    "type": "data", "array": rounded([1.96e3 * (each.standard_uncertainty or 0.0) for each in values]),
+                    "color": (GOOD, BAD)[number],
+                },
+                hovertemplate=f"{name} of IMU %{{x}}: %{{y:.4f}} ms<extra></extra>",
+            )
+        )  # fmt: skip
+    layout = {
+        "xaxis": figure_axis("IMU", type="category"),
+        "yaxis": figure_axis("latency, ms"),
+        "legend": LEGEND,
+        "margin": MARGIN,
+    }
+    caption = "How much later each triad answers than the gyroscopes of IMU 1; bars are 95 % intervals."
+    return Figure("How late each IMU answers", caption, traces, layout)
+
+
+def _residuals(record: ImusRecord, sensor: str) -> Figure:
+    """Return the residuals in motion of one kind of sensor by stretches, with their noise at rest."""
+    motion, accel = record.data.motion, sensor == "accel"
+    values = np.array(motion.accel_residual if accel else np.degrees(motion.gyro_residual))
+    unit, word = ("m/s²", "accelerometers") if accel else ("deg/s", "gyroscopes")
+    noise = float(np.mean(record.accel_noise if accel else np.degrees(record.gyro_noise)))
+    traces = [
+        scatter(
+            rounded(motion.time), rounded(values[:, k]), "lines+markers", name=f"IMU {imu.name}",
+            line={"width": 1.2, "dash": DASHES[k % len(DASHES)]},
+            marker={"size": 5, "symbol": SYMBOLS[k % len(SYMBOLS)]},
+        )
+        for k, imu in enumerate(record.imus)
+    ]  # fmt: skip
+    ends = [motion.time[0], motion.time[-1]]
+    traces.append(
+        scatter(ends, [noise, noise], "lines", name="at rest", line={"color": INK, "dash": "dot", "width": 1.2})
+    )
+    layout = {"xaxis": figure_axis(TIME), "yaxis": log_axis(f"rms, {unit}"), "legend": LEGEND, "margin": MARGIN}
+    caption = (
+        f"Readings of the {word} less those of the fitted board, rms of 20 stretches of the motion; dotted: noise at "
+        "rest. Far above it, the IMUs are not read at one instant, or the board shakes faster than it is sampled."
+    )
+    return Figure(f"Residuals of the {word} in motion", caption, traces, layout)
 
 
 def _cell(value: float, uncertainty: float | None, factor: float) -> str:
@@ -65,4 +187,38 @@ def _imus_table(record: ImusRecord) -> ReportTable:
         "gyroscopes of IMU 1; standard uncertainties.",
         [*titles, "accel latency ms", "gyro latency ms"],
         [row(imu) for imu in record.imus],
+    )
+
+
+def _biases_table(record: ImusRecord) -> ReportTable:
+    def row(imu: Imu) -> list[str]:
+        scales = [*_three(imu.accel.scale_factor, 1.0), *_three(imu.gyro.scale_factor, 1.0)]
+        return [imu.name, *_three(imu.accel.bias, 1.0), *_three(imu.gyro.bias, math.degrees(1)), *scales]
+
+    titles = [
+        *(f"accel bias {axis} m/s²" for axis in "xyz"),
+        *(f"gyro bias {axis} deg/s" for axis in "xyz"),
+        *(f"accel scale {axis}" for axis in "xyz"),
+        *(f"gyro scale {axis}" for axis in "xyz"),
+    ]
+    caption = "Biases and scale factors of each IMU along its own axes; misalignments are in the record."
+    return ReportTable("Biases and scale factors", caption, ["IMU", *titles], [row(imu) for imu in record.imus])
+
+
+def _size_table(record: ImusRecord) -> ReportTable:
+    size = record.fit.size
+    said = (("gravity", size.gravity), ("stated", size.stated), ("gyro scale", size.gyro_scale))
+    rows = [
+        [
+            ("* " if name == record.size_from else "") + _SOURCES[name],
+            _cell(value.value, value.standard_uncertainty, 1.0),
+        ]
+        for name, value in said
+        if value is not None
+    ]
+    return ReportTable(
+        "The size of the board",
+        "What each source makes of the size of the board, as a factor on the one that was taken (*).",
+        ["source", "factor"],
+        rows,
     )

@@ -24,7 +24,7 @@ _PASSES = 6
 _ROTATION, _BIAS = 0.01, 1e-3  # rad, rad/s: standard deviations of what is solved beside the scale
 _START = 0.01  # rad, of a pair, at first
 _FAR, _MEDIAN = 3.0, 1.177  # standard deviations at which a pair counts half, and of the median of a Rayleigh variate
-_LEAST = 5e-4  # of the factor's standard uncertainty: a stretch of the rate beyond half the sampling rate is unseen
+_LEAST = 2e-4  # of the factor's standard uncertainty: a stretch of the rate beyond half the sampling rate is unseen
 
 
 @dataclass(frozen=True)
