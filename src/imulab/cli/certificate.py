@@ -38,11 +38,11 @@ def certificate(
         bool, option("", "Print a LAB.toml to start from, or write it to the output, and nothing else."), OUTPUT
     ] = False,
 ) -> None:
-    """Write the certificate of a record, for people and for programs.
+    """Write a certificate for people and for programs.
 
-    A PDF/A-3 with a Digital Calibration Certificate (PTB DCC 3.3.0) attached, or that XML alone: values, uncertainties
-    and covariances from the record, persons and places from LAB.toml. What is missing is refused, and nothing is
-    written then.
+    Of a record: a PDF/A-3 with a Digital Calibration Certificate (PTB DCC 3.3.0) attached, or that XML alone. Values,
+    uncertainties and covariances are the record's, persons and places those of LAB.toml. What is missing is refused,
+    and nothing is written then.
     """
     if template:
         from imulab.certificate.laboratory import TEMPLATE
