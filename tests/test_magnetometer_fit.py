@@ -380,6 +380,22 @@ def test_other_programs_hold_it(target, tmp_path):
         il.export(target, il.fit_magnetometer(recorded(outputs)).calibration, tmp_path)
 
 
+@pytest.mark.parametrize("level", [False, True])
+def test_a_phone_that_comes_to_the_unit_is_named_with_its_time(level):
+    _, outputs = levelled(3) if level else waved(3)
+    assert not any(
+        "hard iron is another" in each for each in il.fit_magnetometer(recorded(outputs)).calibration.warnings
+    )
+    middle = len(outputs) // 2
+    outputs[middle:] += np.array([1.8, -1.5, 0.0 if level else 1.9])
+    record = il.fit_magnetometer(recorded(outputs)).calibration
+    (said,) = [each for each in record.warnings if "hard iron is another" in each]
+    begin = float(re.search(r"from ([\d.]+) s on the hard iron", said)[1])
+    assert abs(begin - middle / 20.0) < 0.1 * len(outputs) / 20.0
+    assert record.verdict.state == "look"
+    assert any("nothing else near" in each for each in record.verdict.next)
+
+
 # Real instruments.
 
 

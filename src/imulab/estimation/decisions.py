@@ -154,6 +154,7 @@ ACCELEROMETERS_CONTRADICT_RECORD = Decision(
 
 # Magnetometer alone
 FIELD_ALONE_STEP = Decision(1e-3, "verdict", {"magnetometer": 1}, "|m| is another from some time on")
+HARD_IRON_STEP = Decision(1e-3, "verdict", {"magnetometer": 1}, "the hard iron is another from some time on")
 READINGS_SET_ASIDE = Decision(
     5.7e-7, "verdict", {"magnetometer": 8000}, "readings, or their means over windows, lie off all others", limit=5.0
 )

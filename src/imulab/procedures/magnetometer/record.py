@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.display import UNJUDGED, Bad, Finding, Note
-from imulab.estimation.decisions import FIELD_ALONE_STEP
+from imulab.estimation.decisions import FIELD_ALONE_STEP, HARD_IRON_STEP
 from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.magnetometer import ALL_WAYS, GAUGE, LEVEL
 from imulab.procedures.magnetometer.model import FittedTurn, MagReadings, not_told, parameter_names
 from imulab.procedures.magnetometer.schema import FieldModel, FieldReadings, FieldSummary
-from imulab.procedures.magnetometer.solve import BLOCKS, uncertainties, widest_gap
+from imulab.procedures.magnetometer.solve import BLOCKS, find_change, uncertainties, widest_gap
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, entries
@@ -71,7 +71,7 @@ def make_record(turned: FittedTurn, known: float | None, origin: str, options: M
             *_warn_disturbed(readings, residual, turned.aside),
             *_warn_scatter(summary, turned.upright),
             *_warn_coverage(summary, turned.upright),
-            *_warn_step(readings, residual, turned.aside),
+            *(_warn_step(readings, residual, turned.aside) or _warn_change(turned)),
         ),
         verdict=UNJUDGED,
     )  # fmt: skip
@@ -255,5 +255,25 @@ def _warn_step(readings: MagReadings, r: Array, aside: NDArray[np.bool_]) -> lis
             f"mag: from {where} on |m| is {100 * abs(size):.2g} % {'higher' if size > 0 else 'lower'} than before "
             f"(p {p:.1g}): did iron come near, or did the place change?",
             "record again at one place, away from phones and iron",
+        )
+    ]
+
+
+def _warn_change(turned: FittedTurn) -> list[str]:
+    """Return a warning of another hard iron from some time on: a magnet or a current that turns with the unit."""
+    kept = np.flatnonzero(~turned.aside)
+    if len(kept) < _LEAST_IN_BLOCK * BLOCKS:
+        return []
+    first, change, p = find_change(turned.surface.theta, turned.output[kept])
+    if p > HARD_IRON_STEP.level:
+        return []
+    readings, row = turned.readings, int(kept[first])
+    where = f"row {readings.row[row] + 1}" if readings.time is None else f"{readings.time[row]:.1f} s"
+    share = float(np.linalg.norm(change)) / turned.surface.gain
+    return [
+        Finding(
+            f"mag: from {where} on the hard iron is another by {100 * share:.2g} % of the field (p {p:.1g}): did a "
+            "phone, a magnet or a current come to the unit?",
+            "record again with all that belongs to the unit in place and switched on, and nothing else near",
         )
     ]

@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.estimation.decisions import READINGS_SET_ASIDE
+from imulab.estimation.distributions import f_tail
 from imulab.estimation.rows import MAD_TO_SIGMA, median
 from imulab.recording import Array
 
@@ -279,6 +280,42 @@ def find_inflation(whitened: Array, q: Array, sigma: float) -> float:
     shares = np.add.reduceat(q[:, :, None] * q[:, None, :], edges, axis=0)
     free = q.shape[1] - float((shares**2).sum())
     return float(np.maximum(1.0, (scores**2).sum() / (sigma**2 * max(free, 1.0))))
+
+
+_LEAST_PART = 3  # blocks before and after a change
+
+
+def find_change(theta: Array, outputs: Array) -> tuple[int, Array, float]:
+    """Return the reading from which the hard iron is most probably another, by how much, (d,), and the probability.
+
+    A change of the hard iron shows in no mean of |m|. For each split the residuals are fitted by a change of the hard
+    iron and of |m| after it, beside all parameters. The one that explains most is tested by F over what is left, with
+    the errors that readings in a row have in common, times the number of splits.
+    """
+    d = outputs.shape[1]
+    r, jacobian, weight = evaluate(theta, outputs)
+    rows = jacobian / weight[:, None]
+    q = orthonormal(rows)
+    left = r / weight - q @ (q.T @ (r / weight))
+    edges = np.linspace(0, len(left), BLOCKS + 1).astype(np.intp)[_LEAST_PART : BLOCKS - _LEAST_PART + 1].tolist()
+
+    def beside(edge: int) -> Array:
+        after = np.zeros((len(left), d + 1))
+        after[edge:] = np.column_stack([rows[edge:, :d], 1 / weight[edge:]])
+        changed: Array = after - q @ (q.T @ after)
+        return changed
+
+    explained = [float(((orthonormal(beside(edge)).T @ left) ** 2).sum()) for edge in edges]
+    best = int(np.argmax(explained))
+    columns = beside(edges[best])
+    change = np.asarray(np.linalg.lstsq(columns, left)[0], dtype=np.float64)
+    both = np.hstack([q, orthonormal(columns)])
+    remain = left - columns @ change
+    sigma = float(np.sqrt((remain**2).sum() / (len(left) - both.shape[1])))
+    inflation = find_inflation(remain, both, sigma)
+    ratio = explained[best] / max((d + 1) * inflation * sigma**2, 1e-300)
+    freedom = max(len(left) / inflation - both.shape[1], 1.0)
+    return edges[best], change[:d], min(float(f_tail(ratio, d + 1.0, freedom)) * len(edges), 1.0)
 
 
 # What the parameters leave open of the corrected field, and directions without readings.
