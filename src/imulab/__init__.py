@@ -46,13 +46,13 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
     from imulab.procedures.gyro_array.fuse import Fused as Fused
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
+    from imulab.procedures.gyro_array.imus.fit import ImusFit as ImusFit
+    from imulab.procedures.gyro_array.imus.fit import calibrate_imus as calibrate_imus
+    from imulab.procedures.gyro_array.imus.simulate import simulate_imus as simulate_imus
     from imulab.procedures.gyro_array.public import calibrate_array as calibrate_array
     from imulab.procedures.gyro_array.public import compare_methods as compare_methods
     from imulab.procedures.gyro_array.public import fuse as fuse
     from imulab.procedures.gyro_array.public import merge_array as merge_array
-    from imulab.procedures.gyro_array.imus.fit import ImusFit as ImusFit
-    from imulab.procedures.gyro_array.imus.fit import calibrate_imus as calibrate_imus
-    from imulab.procedures.gyro_array.imus.simulate import simulate_imus as simulate_imus
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
     from imulab.procedures.magnetometer.check import check_magnetometer as check_magnetometer
     from imulab.procedures.magnetometer.fit import MagnetometerFit as MagnetometerFit

@@ -189,12 +189,16 @@ class Recording:
                 ) from None
             advice = next((note for note in self.notes if "--layout" in note), None)
             advice = advice or (
-                f"rename what is the sensor's, such as df.rename(columns={{{next(iter(self.columns))!r}: {name!r}}})"
+                f"rename what is the sensor's, such as df.rename(columns={{{self._foreign()!r}: {name!r}}})"
                 if self.source is None
                 else "a layout says where columns of other names are (--layout; docs/recordings.md)"
             )
             hint = f"; {advice}" if foreign else f"; {state_rate(self.name)}" if name == "time" else ""
             raise DataError(f"{self.name}: no column {name}; found {' '.join(self.columns)}{hint}") from None
+
+    def _foreign(self) -> str:
+        """Return the first column that is no sensor's, nor the time."""
+        return next((name for name in self.columns if expected_quantities(name) is None), "x")
 
     def si(self, name: str) -> Array:
         """Return the samples of a column in SI (counts and volts as they are), shape (n,)."""
