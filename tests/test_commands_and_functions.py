@@ -30,6 +30,7 @@ FUNCTIONS = {
     "tumble gyro": il.fit_gyro,
     "tumble mag": il.fit_mag,
     "tumble check": il.check_tumble,
+    "array plan": il.plan_imus,
     "array simulate": il.simulate_array,
     "array simulate --imus": il.simulate_imus,
     "array merge": il.merge_array,

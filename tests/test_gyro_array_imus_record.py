@@ -99,13 +99,9 @@ def test_readings_of_the_record_are_those_of_its_equations(tmp_path):
 
 def test_uncertainties_are_those_of_boards_drawn_at_random():
     _, board, covariance = a_record()
-    values, carried = record_values(board, covariance)
+    _, carried = record_values(board, covariance)
     drawn = np.random.default_rng(6).multivariate_normal(board.numbers.ravel(), covariance, 400)
-    turned = Rotation.from_rotvec(values[:, schema.AT_ROTATION]).as_matrix()
-    others = [
-        [parameters_of(each, q)[0] for each, q in zip(numbers.reshape(3, NUMBERS), turned, strict=True)]
-        for numbers in drawn
-    ]
+    others = [[parameters_of(each)[0] for each in numbers.reshape(3, NUMBERS)] for numbers in drawn]
     spread, stated = np.std(others, axis=0).ravel(), np.sqrt(np.diag(carried))
     ratio = spread[stated > 1e-12] / stated[stated > 1e-12]
     assert len(ratio) == 3 * NUMBERS - 7

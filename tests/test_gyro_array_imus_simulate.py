@@ -19,7 +19,7 @@ def truth(board, name):
 
 
 def test_rates_and_forces_are_those_of_the_path_by_differences():
-    path, _ = simulate._path(3, 6.0, 6.0, "xyz", np.random.default_rng(2))
+    path, _ = simulate.path_by_hand(3, 6.0, 6.0, "xyz", np.random.default_rng(2))
     time, h = np.linspace(20, 24, 60), 1e-5
     force, rate, acceleration = path.at(time)
 
@@ -38,7 +38,7 @@ def test_rates_and_forces_are_those_of_the_path_by_differences():
 
 def test_an_imu_reads_what_its_place_on_the_board_does():
     """The force at IMU 2 from its own path through space, not from lever arms."""
-    path, _ = simulate._path(3, 6.0, 6.0, "xyz", np.random.default_rng(2))
+    path, _ = simulate.path_by_hand(3, 6.0, 6.0, "xyz", np.random.default_rng(2))
     time, h, r = np.linspace(20, 24, 40), 1e-4, np.array([0.04, 0.04, 0.0])
     force, rate, acceleration = path.at(time)
     there = force + np.cross(acceleration, r) + np.cross(rate, np.cross(rate, r))

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
     from imulab.procedures.gyro_array.imus.fit import ImusFit as ImusFit
     from imulab.procedures.gyro_array.imus.fit import calibrate_imus as calibrate_imus
+    from imulab.procedures.gyro_array.imus.plan import plan_imus as plan_imus
     from imulab.procedures.gyro_array.imus.simulate import simulate_imus as simulate_imus
     from imulab.procedures.gyro_array.public import calibrate_array as calibrate_array
     from imulab.procedures.gyro_array.public import compare_methods as compare_methods
@@ -162,6 +163,7 @@ _HOME = {
     "merge_array": "procedures.gyro_array.public",
     "normal_gravity": "gravity",
     "plan_centrifuge": "procedures.centrifuge.plan",
+    "plan_imus": "procedures.gyro_array.imus.plan",
     "plan_noise": "procedures.noise.plan",
     "plan_rate": "procedures.rate.plan",
     "plan_tumble": "procedures.tumble.plan",

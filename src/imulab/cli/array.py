@@ -125,6 +125,16 @@ ToSimulate = Annotated[str, option("OUT.csv", "Recording to write.", "-o", "--ou
 WholeImus = Annotated[bool, option("", "A board of whole IMUs; it has options of its own (--imus --help).", "--imus")]
 
 
+def plan(*, imus: WholeImus = False, json: AsJson = False, **options: Any) -> None:
+    """Say how to put down and to move a board of whole IMUs.
+
+    And what that will give. Elements of one axis need no plan.
+    """
+    from imulab.cli.show import finish_plan
+
+    finish_plan(call(il.plan_imus, **options), None, json=json)
+
+
 def simulate(*, imus: WholeImus = False, output: ToSimulate, **options: Any) -> None:
     """Simulate a recording of an array.
 
@@ -374,6 +384,7 @@ def _calibrate_functions() -> list[Any]:
 
 
 COMMANDS = (
+    Command("array plan", plan, lambda: [il.plan_imus]),
     Command("array simulate", simulate, lambda: [il.simulate_array]),
     Command("array simulate --imus", simulate_imus, lambda: [il.simulate_imus]),
     Command("array merge", merge, lambda: [il.merge_array], without=("element",)),

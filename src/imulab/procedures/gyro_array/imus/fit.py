@@ -63,6 +63,7 @@ _SLOW = math.radians(30.0)  # rad/s rms about an axis
 _SHORT, _CLIPPED, _BEYOND, _SIGMA = 5.0, 0.1, 0.5, 3.0  # s, share, m, standard deviations
 _UNLIKE_REST = 5.0  # times the noise at rest
 _BOARD = 2e-4  # m: uncertainty of a stated distance, unless stated
+_ONE_CHIP = 3e-4  # m: two chips are farther apart, on two sides of a board too
 _BENT = 2e-5  # m: differences of halves below this do no harm
 
 
@@ -392,7 +393,7 @@ def warn_positions(solution: Solution, covariance: Array) -> list[str]:
             spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
             length = float(np.linalg.norm(apart))
             u = math.sqrt(max(float(apart @ spread @ apart), 0.0)) / max(length, 1e-12)
-            if length < _SIGMA * u:
+            if length < max(_SIGMA * u, _ONE_CHIP):
                 findings.append(
                     Finding(
                         f"IMUs {j + 1} and {i + 1} are {1e3 * length:.2g} mm apart, with a standard uncertainty of "

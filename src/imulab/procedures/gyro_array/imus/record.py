@@ -7,7 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from imulab.errors import DataError
-from imulab.procedures.gyro_array.imus.model import ACCEL, ACCEL_LATENCY, GYRO, GYRO_LATENCY, NUMBERS, POSITION, Board
+from imulab.procedures.gyro_array.imus.model import (
+    ACCEL,
+    ACCEL_LATENCY,
+    GYRO,
+    GYRO_LATENCY,
+    NUMBERS,
+    POSITION,
+    Board,
+    cross,
+)
 from imulab.procedures.gyro_array.imus.schema import (
     ACCEL_PAIRS,
     AT_ACCEL_BIAS,
@@ -69,6 +78,14 @@ def parameters_of(numbers: Array, turned: Array | None = None) -> tuple[Array, A
     return values + 0.0, q  # no -0
 
 
+def _vector_by_turn(vector: Array) -> Array:
+    """Return how a rotation vector changes with a small turn about the body axes, shape (3, 3)."""
+    angle, matrix = float(np.linalg.norm(vector)), cross(vector)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) - matrix / 2)
+    return np.asarray(np.eye(3) - matrix / 2 + (1 - angle / 2 / np.tan(angle / 2)) / angle**2 * (matrix @ matrix))
+
+
 def record_values(board: Board, covariance: Array) -> tuple[Array, Array]:
     """Return the parameters of the record, shape (K, 29), and their covariance, shape (29 K, 29 K).
 
@@ -88,6 +105,7 @@ def record_values(board: Board, covariance: Array) -> tuple[Array, Array]:
             shift[column] = _STEP
             ahead, behind = (parameters_of(numbers + sign * shift, turned)[0] for sign in (1, -1))
             jacobian[k, :, column] = (ahead - behind) / (2 * _STEP)
+        jacobian[k, AT_ROTATION] = _vector_by_turn(values[k, AT_ROTATION]) @ jacobian[k, AT_ROTATION]
     blocks = covariance.reshape(count, NUMBERS, count, NUMBERS)
     carried = np.einsum("kab,kblc,ldc->kald", jacobian, blocks, jacobian, optimize=True)
     return values, carried.reshape(covariance.shape)

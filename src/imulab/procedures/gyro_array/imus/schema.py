@@ -63,8 +63,7 @@ class GyroTriad(Part):
 class Imu(Part):
     """One of ``imus``.
 
-    The uncertainty of `rotation` is that of small turns about the body axes. `accel_noise` and `gyro_noise` are the
-    standard deviations of a sample at rest, mean of the three axes.
+    `accel_noise` and `gyro_noise` are the standard deviations of a sample at rest, mean of the three axes.
     """
 
     name: str

@@ -139,7 +139,7 @@ def simulate_imus(
         if not low <= value <= high:
             raise OptionError(f"{what} {value:g}: expected {low:g} to {high:g}, in SI")
     rng = np.random.default_rng(seed)
-    path, end = _path(attitudes, length, size, about, rng)
+    path, end = path_by_hand(attitudes, length, size, about, rng)
     time = np.arange(int(end * hertz)) / hertz
     position = _positions(imus)
     columns: dict[str, Array] = {"time": time}
@@ -202,7 +202,9 @@ def _matrices(k: int, rng: np.random.Generator) -> tuple[Array, Array]:
     return near_one() @ chip, (near_one() + upper) @ _turned(np.radians(rng.normal(0, 0.1, (1, 3))))[0] @ chip
 
 
-def _path(attitudes: int, duration: float, turning: float, about: str, rng: np.random.Generator) -> tuple[_Path, float]:
+def path_by_hand(
+    attitudes: int, duration: float, turning: float, about: str, rng: np.random.Generator
+) -> tuple[_Path, float]:
     """Return the path and when it ends, s."""
     from scipy.interpolate import make_interp_spline
 

@@ -47,6 +47,7 @@ _LENGTH = 1e-4  # m/s^2, by which |s| at rest may differ from gravity
 _AT_ONCE = 1 << 22  # numbers of the largest array of a part of the samples
 _STEPS, _AFTER = 5, 2  # Gauss-Newton steps at first, and after each new set of weights
 _REWEIGHTED = 3
+_ACCELERATION = 1e3  # rad/s^2, standard deviation of each sample's
 _SAME_SIZE = 1e-5  # of the mean scale factor, between halves of one motion
 STRETCHES = 20
 """Parts of the motion whose scatter is compared with the stated covariance."""
@@ -236,7 +237,7 @@ class _Problem:
         for part in self._parts(1):
             accel, gyro = self.whitened(board, motion, weights, part)
             h, e = self._by_motion(board, motion[part], (readings[0][part], readings[1][part]), accel, gyro)
-            moved[part] += np.linalg.solve(h.swapaxes(1, 2) @ h, np.einsum("nri,nr->ni", h, e)[..., None])[..., 0]
+            moved[part] += np.linalg.solve(_normal(h), np.einsum("nri,nr->ni", h, e)[..., None])[..., 0]
         return moved
 
     def _by_motion(
@@ -279,7 +280,7 @@ class _Problem:
                 for columns, by_board in ((OF_ACCEL, by_accel), (OF_GYRO, by_gyro)):
                     rows = by_board[:, k].reshape(3 * n, -1)
                     diagonal[half, k, columns, columns] += rows.T @ rows
-            lower = np.linalg.cholesky(h.swapaxes(1, 2) @ h)
+            lower = np.linalg.cholesky(_normal(h))
             inverse = np.linalg.inv(lower)
             z = (inverse @ g.reshape(n, 9, size)).reshape(9 * n, size)
             total[half] -= z.T @ z
@@ -385,6 +386,13 @@ class _Problem:
         )
 
 
+def _normal(h: Array) -> Array:
+    """Return M = H'H of each sample; IMUs in one line do not tell the angular acceleration about that line."""
+    matrix = h.swapaxes(1, 2) @ h
+    matrix[:, ACCELERATION, ACCELERATION] += np.eye(3) / _ACCELERATION**2
+    return np.asarray(matrix)
+
+
 def _factors(square: Array, freedom: int) -> Array:
     return np.maximum(1.0, np.sqrt(square / freedom)) if freedom else np.ones_like(square)
 
@@ -427,6 +435,20 @@ def solve(
         board, motion, weights, force, total, scores, still, score, information, pull, free,
         (readings[0] - accel, readings[1] - gyro),
     )  # fmt: skip
+
+
+def expected_covariance(measured: Measured, board: Board, motion: Array, force: Array, size: Held) -> Array:
+    """Return the covariance of a fit to readings of such a board in such a motion, shape (29 K, 29 K)."""
+    problem = _Problem(measured, [size])
+    ones = np.ones(len(motion))
+    weights = Weights(ones, ones, np.ones(len(force)))
+    _, accel, gyro = predicted(board, motion)
+    information = problem.equations(board, motion, (accel, gyro), weights)[0].sum(0)
+    information += problem.at_rest(board, force, weights)[0] + problem.priors(board)[0]
+    free = problem.free.ravel()
+    covariance = np.zeros(information.shape)
+    covariance[np.ix_(free, free)] = np.linalg.inv(information[np.ix_(free, free)])
+    return covariance
 
 
 def with_scale(solution: Solution, factor: float) -> Solution:
