@@ -87,7 +87,8 @@ def test_the_files_that_contributing_names_are_there():
 
 
 @pytest.mark.parametrize(
-    "page", ["tumble", "gyro_array", "warmup", "centrifuge", "noise", "thermal", "rate", "magnetometer_alone"]
+    "page",
+    ["tumble", "gyro_array", "warmup", "centrifuge", "noise", "thermal", "rate", "magnetometer_alone", "whole_arrays"],
 )
 def test_every_procedure_has_a_worked_example(page):
     assert page in [found.stem for found in PAGES]

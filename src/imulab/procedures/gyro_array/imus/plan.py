@@ -171,8 +171,8 @@ def plan_imus(
     Examples
     --------
     >>> import imulab as il
-    >>> round(1e3 * il.plan_imus(elements=3, duration="8 s").chosen.position, 1)
-    0.1
+    >>> [each.duration for each in il.plan_imus(elements=3, duration="8 s").others]
+    [2.0, 4.0, 8.0, 16.0]
     """
     count, faces = whole(elements, "elements"), whole(attitudes, "attitudes")
     across, length = in_si(span, "span", "length", "mm"), in_si(duration, "duration", "time", "s")
