@@ -189,8 +189,10 @@ def test_missing_columns_are_named():
     columns = {name: values for name, values in board.columns.items() if name != "accel_y_3"}
     with pytest.raises(DataError, match="no column accel_y_3; expected 3 whole IMUs"):
         il.calibrate_imus(replace(board, columns=columns), gravity=G)
-    with pytest.raises(DataError, match=r"expected columns accel_x_1 \.\. accel_z_K"):
+    with pytest.raises(DataError, match=r"one IMU, .* PX4 or ArduPilot cannot tell where its IMUs sit"):
         il.calibrate_imus(il.simulate_tumble(attitudes=6), gravity=G)
+    with pytest.raises(DataError, match=r"expected columns accel_x_1 \.\. accel_z_K"):
+        il.calibrate_imus(il.simulate_array(elements=3, duration=10.0), gravity=G)
 
 
 def test_dropouts_and_repeated_rows_are_left_out(simulated):
@@ -302,5 +304,6 @@ def test_a_real_board_has_the_size_of_its_drawing():
     assert np.degrees(held.fit.gyro_residual.value) == pytest.approx(7.0, abs=1.0)
     assert held.fit.age.value == pytest.approx(0.29e-3, abs=0.04e-3)
     assert held.fit.halves < 1.5
+    assert record.sources[0].file.endswith("exp_1.bin")
     assert 0.1 < held.fit.clipped < 0.2
     assert any("reading at its limit" in text for text in record.verdict.reasons)

@@ -81,6 +81,12 @@ def names_of(recording: Recording) -> Mapping[str, list[list[str]]]:
     names = {
         sensor: [[f"{sensor}_{axis}_{k + 1}" for axis in "xyz"] for k in range(count)] for sensor in ("accel", "gyro")
     }
+    if count < 2 and "accel_x" in recording and "gyro_x" in recording:
+        raise DataError(
+            f"{recording.name}: one IMU, accel_x .. gyro_z; expected two or more, accel_x_1 .. gyro_z_K, on one clock. "
+            "A log of PX4 or ArduPilot cannot tell where its IMUs sit: each has times of its own, and is filtered and "
+            "thinned out before it is logged; record them raw on one clock, turned by hand, and write that as one CSV"
+        )
     if count < 2:
         raise DataError(
             f"{recording.name}: expected columns accel_x_1 .. accel_z_K and gyro_x_1 .. gyro_z_K of two or more IMUs; "

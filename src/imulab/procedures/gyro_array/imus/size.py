@@ -21,7 +21,7 @@ from imulab.recording import Array
 _LONGEST = 30.0  # s between two rests
 _FEWEST = 5  # pairs of rests
 _PASSES = 6
-_ROTATION, _BIAS = 0.01, 1e-3  # rad, rad/s: standard deviations of what is solved beside the scale
+_ROTATION, _BIAS = 2e-3, 2e-4  # rad, rad/s: standard deviations of what is solved beside the scale
 _START = 0.01  # rad, of a pair, at first
 _FAR, _MEDIAN = 3.0, 1.177  # standard deviations at which a pair counts half, and of the median of a Rayleigh variate
 _LEAST = 2e-4  # of the factor's standard uncertainty: a stretch of the rate beyond half the sampling rate is unseen
