@@ -248,6 +248,24 @@ def test_motion_that_does_not_turn_about_all_axes_is_refused_or_said():
         il.calibrate_imus(a_board(turning="5 deg/s", attitudes=1), gravity=G)
 
 
+def test_clipped_readings_are_left_out_and_said():
+    board = a_board(duration="20 s", age="0 ms")
+    names = [f"gyro_{axis}_{k}" for axis in "xyz" for k in (1, 2, 3)]
+    clipped = with_columns(board, **{name: np.clip(board.columns[name], -350, 350) for name in names})
+    record = il.calibrate_imus(clipped, gravity=G).calibration
+    assert imus_of(record).fit.clipped > 0.1
+    assert any("have a reading at its limit" in text for text in record.verdict.reasons)
+    # Taken for readings, the clipped samples would make the board larger by millimetres.
+    found = np.array([imu.position.value for imu in imus_of(record).imus])
+    assert np.abs(found - truth_of(board)[:, 0:3]).max() < 4e-4
+    assert np.abs(errors(record, board, ("position", "gyro_scale"))).max() < 4.5
+
+
+def test_a_short_motion_is_said():
+    record = il.calibrate_imus(a_board(duration="4 s", attitudes=1, rate="100 Hz"), gravity=G).calibration
+    assert any("s of motion: below 5 s" in text for text in record.verdict.reasons)
+
+
 def test_two_imus_in_one_place_are_named():
     board = a_board(elements=3, age="0 ms")
     rng = np.random.default_rng(4)
@@ -275,10 +293,11 @@ def test_the_command_makes_the_record_of_the_function(tmp_path, monkeypatch, cap
 
 
 @pytest.mark.slow
-def test_intervals_of_95_percent_cover_the_truth(record_property):
-    """Of doubled uncertainties: over many boards, 93 to 97 % of the positions, within what so few trials can tell."""
+def test_intervals_of_95_percent_cover_the_truth(record_property, reduced):
+    """Over many boards 93 to 97 % of what is told, within two standard deviations of what so few trials can tell."""
     z = {name: [] for name in ("position", "accel_latency", "gyro_latency", "accel_bias")}
-    for seed in range(30):
+    trials = 6 if reduced else 30
+    for seed in range(trials):
         board = a_board(elements=4, attitudes=12, duration="20 s", rate="100 Hz", age="0 ms", seed=100 + seed)
         record = il.calibrate_imus(board, gravity=G).calibration
         for name, values in z.items():
@@ -286,7 +305,9 @@ def test_intervals_of_95_percent_cover_the_truth(record_property):
     for name, values in z.items():
         covered = np.mean(np.abs(values) < 1.96)
         record_property(name, f"{covered:.3f} of {len(values)}, rms z {np.sqrt(np.mean(np.square(values))):.3f}")
-        assert 0.9 < covered <= 1.0, name
+        # Coordinates of one board share its motion: counted as three for each board.
+        doubt = 2 * np.sqrt(0.95 * 0.05 / (3 * trials))
+        assert 0.93 - doubt < covered <= 1.0, name
 
 
 @pytest.mark.skipif(not REAL.is_file(), reason="no real recording here")
