@@ -22,6 +22,7 @@ from imulab.recording import Array
 
 
 GOOD, BAD, QUIET, INK = "#1f6f8b", "#c8553d", "#9aa5ad", "#22303a"
+AXIS_COLOURS = (GOOD, BAD, "#7a5c99")
 """Colours: what holds, what stands out, what is background, text."""
 LEGEND = {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}
 """The legend of a figure: above the plot, where a second line of it pushes the plot down."""

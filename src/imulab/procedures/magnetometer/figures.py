@@ -11,6 +11,8 @@ from imulab.records.calibration import Calibration
 from imulab.records.sections import part
 from imulab.report.parameters import parameters_table, rows_of
 from imulab.report.traces import (
+    AXIS_COLOURS,
+    DASHES,
     GOOD,
     INK,
     LEGEND,
@@ -105,9 +107,9 @@ def _sphere_figure(record: Calibration, model: FieldModel, data: FieldReadings) 
             scatter(rounded(after[:, i]), rounded(after[:, j]), "markers", name="corrected",
                     marker={"color": GOOD, "size": 4}, **axes),
         ]  # fmt: skip
-        width = 0.31 if len(planes) > 1 else 0.6
+        width = 0.26 if len(planes) > 1 else 0.6
         layout[f"xaxis{number}"] = figure_axis(
-            first, domain=[0.345 * place, 0.345 * place + width], range=[-reach, reach], anchor=f"y{number}"
+            first, domain=[0.37 * place, 0.37 * place + width], range=[-reach, reach], anchor=f"y{number}"
         )
         layout[f"yaxis{number}"] = figure_axis(
             second, range=[-reach, reach], anchor=f"x{number}", scaleanchor=f"x{number}"
@@ -129,13 +131,14 @@ def _direction_figure(record: Calibration, model: FieldModel, fit: FieldSummary)
     axes, angle = model.axes, np.radians(np.arange(0, 361, 5))
     traces = []
     theta, covariance = surface_of(record)
-    for first, second in (plane for plane in _PLANES if set(plane) <= set(axes)):
+    for k, (first, second) in enumerate(plane for plane in _PLANES if set(plane) <= set(axes)):
         directions = np.zeros((len(angle), len(axes)))
         directions[:, axes.index(first)], directions[:, axes.index(second)] = np.cos(angle), np.sin(angle)
         rows, _ = direction_rows(theta, directions)
         known = np.sqrt(np.einsum("np,pq,nq->n", rows, covariance, rows))
         traces.append(
             scatter(rounded(np.degrees(angle)), rounded(100 * known), "lines", name=f"{first} to {second}",
+                    line={"color": AXIS_COLOURS[k], "dash": DASHES[k]},
                     hovertemplate="%{x} deg<br>%{y:.2g} %<extra></extra>")
         )  # fmt: skip
     return Figure(

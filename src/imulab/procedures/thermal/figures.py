@@ -31,6 +31,7 @@ from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.parameters import ReadingUnit, parameters_table, reading_unit, rows_of, small_text, small_unit
 from imulab.report.traces import (
+    AXIS_COLOURS,
     BAD,
     DASHES,
     GOOD,
@@ -56,7 +57,6 @@ from imulab.units import from_si
 # A figure of laws: the curves above, and beneath them their uncertainty and single recordings.
 
 
-COLOURS = (GOOD, "#b58a1b", "#7a5c99")
 SYMBOLS = ("circle", "diamond", "square")
 _UPPER, _LOWER = [0.5, 1.0], [0.0, 0.38]
 """Shares of the figure's height."""
@@ -65,7 +65,7 @@ _UPPER, _LOWER = [0.5, 1.0], [0.0, 0.38]
 def axis_groups(count: int) -> list[Group]:
     """Return the looks of three axes' points, for values of `count` holds in the order of holds, then axes."""
     axis = np.tile(np.arange(len(AXES)), count)
-    return [Group(name, axis == k, SYMBOLS[k], COLOURS[k]) for k, name in enumerate(AXES)]
+    return [Group(name, axis == k, SYMBOLS[k], AXIS_COLOURS[k]) for k, name in enumerate(AXES)]
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ def law_figure(
     beneath: dict[str, Any] = {"yaxis": "y2", "showlegend": False}
     traces = []
     for k, name in enumerate(curves.names):
-        line = {"color": COLOURS[k], "dash": DASHES[k]}
-        around = band(temperature, -reach[k], reach[k], COLOURS[k], **beneath) | {"line": line | {"width": 1}}
+        line = {"color": AXIS_COLOURS[k], "dash": DASHES[k]}
+        around = band(temperature, -reach[k], reach[k], AXIS_COLOURS[k], **beneath) | {"line": line | {"width": 1}}
         traces += [
             scatter(rounded(temperature), rounded(curves.values[k] - zero[k]), "lines", name=name, line=line),
             around,
@@ -162,7 +162,7 @@ def _alone_points(
     temperature: Array, values: Array, reach: Array | None, axis: int, label: str, **more: Any
 ) -> list[dict[str, Any]]:
     """Return the values of single recordings as points with bars, in the look of an axis, without a key."""
-    group = Group(f"{label} alone", np.ones(len(values), dtype=np.bool_), SYMBOLS[axis], COLOURS[axis])
+    group = Group(f"{label} alone", np.ones(len(values), dtype=np.bool_), SYMBOLS[axis], AXIS_COLOURS[axis])
     return point_traces(temperature, values, reach, [group], size=7, **{"showlegend": False, **more})
 
 
@@ -324,7 +324,7 @@ def _accel_change_figure(change: AccelChange) -> Figure:
     """Return the figure of the accelerometers' output along gravity over temperature, by recording."""
     traces = []
     for k, name in enumerate(change.recording):
-        colour, at = COLOURS[k % len(COLOURS)], np.array(change.temperature[k])
+        colour, at = AXIS_COLOURS[k % len(AXIS_COLOURS)], np.array(change.temperature[k])
         values, u = from_si(np.array(change.change[k]), "mg"), from_si(np.array(change.standard_uncertainty[k]), "mg")
         line = {"color": colour, "dash": DASHES[k % len(DASHES)]}
         traces += [
