@@ -37,6 +37,7 @@ FUNCTIONS = {
     "array calibrate": il.calibrate_array,
     "array calibrate --imus": il.calibrate_imus,
     "array fuse": il.fuse,
+    "array fuse --imus": il.fuse_imus,
     "array compare": il.compare_methods,
     "centrifuge plan": il.plan_centrifuge,
     "centrifuge simulate": il.simulate_centrifuge,

@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
     from imulab.procedures.gyro_array.imus.fit import ImusFit as ImusFit
     from imulab.procedures.gyro_array.imus.fit import calibrate_imus as calibrate_imus
+    from imulab.procedures.gyro_array.imus.fuse import FusedBoard as FusedBoard
+    from imulab.procedures.gyro_array.imus.fuse import fuse_imus as fuse_imus
     from imulab.procedures.gyro_array.imus.plan import plan_imus as plan_imus
     from imulab.procedures.gyro_array.imus.simulate import simulate_imus as simulate_imus
     from imulab.procedures.gyro_array.public import calibrate_array as calibrate_array
@@ -123,6 +125,8 @@ _HOME = {
     "fuse": "procedures.gyro_array.public",
     "run_fleet": "fleet.run",
     "simulate_array": "procedures.gyro_array.simulate",
+    "FusedBoard": "procedures.gyro_array.imus.fuse",
+    "fuse_imus": "procedures.gyro_array.imus.fuse",
     "simulate_imus": "procedures.gyro_array.imus.simulate",
     "Attitudes": "procedures.tumble.attitudes",
     "Calibration": "records.calibration",

@@ -62,6 +62,7 @@ _UNITS = {
         Unit("mdeg/s", "rate", 1e-3 * _DEGREE),
         Unit("deg/min", "rate", _DEGREE / 60.0),
         Unit("deg/h", "rate", _DEGREE / 3600.0),
+        Unit("rad/s^2", "angular acceleration"),
         Unit("degC", "temperature"),
         Unit("K", "temperature", 1.0, -273.15),
         Unit("T", "magnetic field"),

@@ -230,7 +230,7 @@ def calibrate_imus(
     finish(call(il.calibrate_imus, recording, **options).calibration, output, report, json=json)
 
 
-def fuse(file: RecordingFile, *, output: OutputFile = None, **options: Any) -> None:
+def fuse(file: RecordingFile, *, imus: WholeImus = False, output: OutputFile = None, **options: Any) -> None:
     """Fuse a file or a live stream into one rate.
 
     CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes.
@@ -274,6 +274,44 @@ def fuse(file: RecordingFile, *, output: OutputFile = None, **options: Any) -> N
         write_csv_to(_flushed(first, blocks), sys.stdout.buffer)
         sys.stdout.buffer.flush()
     _print_findings(fuser, verdict=output is not None)
+
+
+def fuse_imus(file: RecordingFile, *, imus: WholeImus = False, output: OutputFile = None, **options: Any) -> None:
+    """Fuse a board of whole IMUs into one specific force, rate and angular acceleration.
+
+    Each with its standard uncertainty; rates beyond the gyroscopes' range are bridged by the accelerometers.
+    """
+    from imulab.estimation.sampling import mend_blocks
+    from imulab.procedures.gyro_array.imus.fuse import BoardFuser, board_of, ranges
+    from imulab.procedures.registry import load_any
+    from imulab.readers import is_pipe, read_blocks
+    from imulab.readers.streams import on_clock_of
+    from imulab.writers import check_writable, write, write_csv_to
+
+    calibration = options["calibration"]
+    check_outputs([output], [name for name in (file, options["layout"], calibration) if name])
+    how = reading(options)
+    if output:
+        check_writable(output)
+    known = load_any(calibration)
+    board_of(known, options["at"])  # refuses before a recording is read
+
+    def blocks() -> Iterable[Recording]:
+        rows: Iterable[Recording] = on_clock_of(read_blocks(file, **how))
+        return rows if is_pipe(file) else mend_blocks(rows)
+
+    limits = ranges(() if is_pipe(file) else blocks(), options["gyro_range"], options["accel_range"])
+    fuser = BoardFuser(board_of(known, options["at"], limits))
+    parts = (part.recording() for part in fuser.fuse(with_notes(blocks())))
+    if output:
+        write(parts, output)
+        print(f"{output}: {fuser.share()}")
+    else:
+        first = next(parts)
+        write_csv_to(_flushed(first, parts), sys.stdout.buffer)
+        sys.stdout.buffer.flush()
+    for line in fuser.notes():
+        warn(line)
 
 
 def _load(name: str, option: str) -> Calibration:
@@ -391,5 +429,6 @@ COMMANDS = (
     Command("array calibrate", calibrate, _calibrate_functions, without=("element",)),
     Command("array calibrate --imus", calibrate_imus, lambda: [il.calibrate_imus], without=("element",)),
     Command("array fuse", fuse, lambda: [il.fuse], without=("element",)),
+    Command("array fuse --imus", fuse_imus, lambda: [il.fuse_imus], without=("element",)),
     Command("array compare", compare, lambda: [il.compare_methods], without=("element",)),
 )
