@@ -11,6 +11,7 @@ enum { ACCELEROMETER = 0, GYROSCOPE = 1 };
 enum { OWES = 4 };           /* good samples for a bad one */
 enum { CHANGES = 20 };       /* changes that a stuck triad would have shown */
 enum { HALVED = 1 << 20 };   /* samples after which counts are halved */
+#define OLD IL_C(1.5e-3)     /* s: chips with clocks of their own are read up to so far apart, which is no fault */
 enum { FEWEST = 3 };         /* triads of which one can be found wrong */
 
 /* Whether a triad's readings repeat for longer than they usually do. */
@@ -140,6 +141,7 @@ static void judge_gyroscopes(const il_imus *a, il_imus_state *s, il_imus_sample 
     uint8_t whole[IL_IMUS] = {0}, blamed[IL_IMUS] = {0};
     int32_t count = 0;
     il_real mean[3], total, squares;
+    const il_real apart = s->known > 1 ? OLD * OLD * il_dot(s->turning, s->turning) : IL_C(0.0);
     for (int32_t k = 0; k < a->count; k++) {
         whole[k] = used[k] && !(p->clipped[k][0] | p->clipped[k][1] | p->clipped[k][2]);
         count += whole[k];
@@ -164,6 +166,7 @@ static void judge_gyroscopes(const il_imus *a, il_imus_state *s, il_imus_sample 
         most *= total / left;
         const il_real rest = (squares - most) / (il_real)(3 * count - 6);
         if (!(most > a->gate * (rest > IL_C(1.0) ? rest : IL_C(1.0)))) break;
+        if (squared_distance(p->g[worst], mean) <= apart) break;
         whole[worst] = used[worst] = 0;
         blamed[worst] = 1;
         count--;
@@ -173,8 +176,9 @@ static void judge_gyroscopes(const il_imus *a, il_imus_state *s, il_imus_sample 
     for (int32_t k = 0; k < a->count; k++) {
         if (s->owed[GYROSCOPE][k] == 0 || blamed[k] || !p->usable[GYROSCOPE][k]) continue;
         if (p->clipped[k][0] | p->clipped[k][1] | p->clipped[k][2]) continue;
-        const il_real c = squared_distance(p->g[k], mean) / (IL_C(1.0) / s->share[GYROSCOPE][k] + IL_C(1.0) / total);
-        if (c <= a->gate * (usual > IL_C(1.0) ? usual : IL_C(1.0))) {
+        const il_real square = squared_distance(p->g[k], mean);
+        const il_real c = square / (IL_C(1.0) / s->share[GYROSCOPE][k] + IL_C(1.0) / total);
+        if (square <= apart || c <= a->gate * (usual > IL_C(1.0) ? usual : IL_C(1.0))) {
             s->owed[GYROSCOPE][k]--;
         } else if (!used[k]) {
             blame(a, s, GYROSCOPE, k);

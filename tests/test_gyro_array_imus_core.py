@@ -226,3 +226,16 @@ def test_boards_that_cannot_be_are_refused():
     with pytest.raises(DataError, match=r"expected readings of shape \(m, 2, 4, 3\)"):
         ImusStream.of(settings_of(board)).process(np.zeros(3), np.zeros((3, 2, 3, 3)))
     assert pytest.approx(board.gate) == GATE
+
+
+def test_chips_that_are_read_up_to_a_millisecond_apart_are_no_fault():
+    rng = np.random.default_rng(11)
+    board = reference.make_board(reference.CUBE, rng, limit=100.0)
+    motion = reference.hand_motion(2000, STEP, rng)
+    y = noisy(board, motion, rng)
+    late = rng.uniform(-5e-4, 5e-4, (2000, 8, 1))
+    y[:, 1] += late * np.einsum("kij,nj->nki", board.gyro, motion[2])
+    out = fused(board, y)
+    assert np.mean((out.health[:, 1] & EXCLUDED) != 0) < 0.002
+    y[1000:, 1, 5] = 0
+    assert ((fused(board, y).health[1001:, 1, 5] & EXCLUDED) != 0).mean() > 0.9

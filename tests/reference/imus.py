@@ -135,13 +135,14 @@ class Fusion:
         whole = used[~clipped[used].any(axis=1)]
         blamed = []
         weight = b.gyro_noise**-2.0
+        apart = 0.0 if self.turned is None else (1.5e-3) ** 2 * (self.turned @ self.turned)
         while len(whole) > 2:
             mean = np.average(rates[whole], axis=0, weights=weight[whole])
             squares = weight[whole] * np.square(rates[whole] - mean).sum(axis=1)
             chi = squares / (1 - weight[whole] / weight[whole].sum())
             worst = int(np.argmax(chi))
             rest = (squares.sum() - chi[worst]) / (3 * len(whole) - 6)
-            if not chi[worst] > b.gate * max(1.0, rest):
+            if not chi[worst] > b.gate * max(1.0, rest) or np.square(rates[whole[worst]] - mean).sum() <= apart:
                 break
             blamed.append(whole[worst])
             self._blame(1, whole[worst])
@@ -155,7 +156,7 @@ class Fusion:
                 if k in blamed:
                     continue
                 chi = np.square(rates[k] - mean).sum() / (1 / weight[k] + 1 / weight[whole].sum())
-                if chi <= b.gate * usual:
+                if chi <= b.gate * usual or np.square(rates[k] - mean).sum() <= apart:
                     self.owed[1, k] -= 1
                 elif k not in used:
                     self._blame(1, k)
