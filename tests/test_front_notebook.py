@@ -35,6 +35,24 @@ def test_a_corrected_frame_has_the_index_and_the_texts_of_the_frame(frame, fit):
     np.testing.assert_array_equal(again["accel_x [m/s^2]"], corrected["accel_x [m/s^2]"])
 
 
+def test_a_cell_that_is_run_twice_corrects_once(frame, fit):
+    corrected = fit.apply(frame)
+    with pytest.raises(DataError, match=r"already corrected by tumble.*again=True"):
+        fit.apply(corrected.iloc[100:200])
+    twice = fit.apply(corrected, again=True)
+    assert len(twice.attrs["corrected_by"]) == 2
+
+
+def test_columns_of_others_keep_title_type_and_values(frame, fit):
+    some = frame.iloc[:50].assign(ok=True, n=range(50), **{"speed [km/h]": 3.5})
+    corrected = fit.apply(some)
+    for title in ("ok", "n", "speed [km/h]"):
+        assert corrected[title].dtype == some[title].dtype
+        assert list(corrected[title]) == list(some[title])
+    assert set(corrected.columns) == set(some.columns)
+    assert set(fit.apply(polars.from_pandas(some)).columns) == set(some.columns)
+
+
 def test_a_sensor_of_texts_is_refused_as_before(frame, fit):
     with pytest.raises(DataError, match=r"column accel_x.*expected numbers, found texts"):
         fit.apply(frame.assign(**{"accel_x [m/s^2]": "1.0 g"}))

@@ -201,12 +201,21 @@ def texts_of(frame: Frame) -> list[Any]:
     def is_text(column: Any) -> bool:
         return isinstance(next((value for value in column if value is not None and value == value), None), str)
 
-    foreign = [at for at in frame.columns if not _of_a_sensor(_joined(at).partition("[")[0].strip())]
-    return [at for at in foreign if not _dtype(frame[at]).startswith(_NUMBERS) and is_text(frame[at])]
+    return [at for at in foreign_of(frame) if not _dtype(frame[at]).startswith(_NUMBERS) and is_text(frame[at])]
 
 
-def _of_a_sensor(key: str) -> bool:
-    return expected_quantities(key) is not None or any(stem in TRIADS for stem in _stems(key))
+def foreign_of(frame: Frame) -> list[Any]:
+    """Return the titles of columns that are no sensor's, nor a time: no record corrects them."""
+
+    def known(key: str) -> bool:
+        return expected_quantities(key) is not None or any(stem in TRIADS for stem in _stems(key))
+
+    return [at for at in frame.columns if not known(name_of(at)) and not _is_dated(frame[at])]
+
+
+def name_of(title: Any) -> str:
+    """Return the name in a title ``name [unit]``."""
+    return _joined(title).partition("[")[0].strip()
 
 
 def _is_dated(column: Any) -> bool:

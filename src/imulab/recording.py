@@ -399,7 +399,8 @@ class Recording:
         'm/s^2'
         """
         converted, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
-        return cls(converted, symbols, {**(metadata or {})}, name)  # type: ignore[dict-item]
+        before = tuple(map(str, getattr(frame, "attrs", {}).get("corrected_by", ())))
+        return cls(converted, symbols, {**(metadata or {})}, name, corrected_by=before)  # type: ignore[dict-item]
 
     @overload
     def to_frame(self, library: Literal["pandas"] | None = None) -> pandas.DataFrame: ...
@@ -417,7 +418,10 @@ class Recording:
             `library` is neither of the two.
         """
         titled = {f"{name} [{self.units[name]}]": values for name, values in self.columns.items()}
-        return data_frame(titled, library)
+        frame = data_frame(titled, library)
+        if self.corrected_by and hasattr(frame, "attrs"):  # of pandas; a frame of polars does not know what made it
+            frame.attrs["corrected_by"] = list(self.corrected_by)
+        return frame
 
 
 def _is_column(values: object) -> bool:

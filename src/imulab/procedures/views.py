@@ -18,7 +18,7 @@ from imulab import report
 from imulab.display import LINES, SENTENCES, WIDTH, aligned, html_table
 from imulab.errors import OptionError, RecordError, listed
 from imulab.files import write_page
-from imulab.frames import frame_library, is_frame, texts_of
+from imulab.frames import foreign_of, frame_library, is_frame, name_of
 from imulab.procedures.registry import joined_of, procedure_of
 from imulab.procedures.registry import load as load
 from imulab.procedures.result import Drawn, Record, as_read, as_record
@@ -277,9 +277,12 @@ def apply_to(record: Calibration, data: Any, reading: Mapping[str, Any] | Readin
     frame: Any = corrected.to_frame("polars" if polars else "pandas")
     if len(frame) != len(data):
         return frame
+    foreign = foreign_of(data)
+    read = {f"{name} [{corrected.units[name]}]" for title in foreign if (name := name_of(title)) in corrected}
+    frame = frame.drop(list(read)) if polars else frame.drop(columns=list(read)).set_axis(data.index)
     if polars:
-        return frame.with_columns(data[title] for title in texts_of(data))
-    return frame.set_axis(data.index).assign(**{title: data[title] for title in texts_of(data)})
+        return frame.with_columns(data[title] for title in foreign)
+    return frame.assign(**{title: data[title] for title in foreign})
 
 
 def export_to(record: Calibration, target: str, folder: str | Path, **options: Any) -> list[Path]:
