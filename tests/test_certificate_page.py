@@ -333,3 +333,9 @@ def test_a_fleet_needs_numbers_of_their_own_and_days_that_hold(issue_all, capsys
     assert issue_all(days="[2026-03-03, 2026-03-31]") == 2
     assert "LINE-0001" in capsys.readouterr().err
     assert [path.name for path in sorted(Path("out").glob("*.pdf"))] == ["LINE-0002.pdf"]
+
+
+def test_a_unit_whose_pdf_is_refused_has_no_xml_either(issue_all, capsys):
+    assert issue_all(number="漢-{serial}") == 2
+    assert "3 of 3 units have no certificate" in capsys.readouterr().err
+    assert list(Path("out").iterdir()) == []

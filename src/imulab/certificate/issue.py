@@ -86,7 +86,7 @@ def write_certificate(
     made = _certificate(record, stated, limits)
     if before is not None:
         made = with_before(made, _certificate(before, stated, limits))
-    _write(made, Path(path), fonts, sign)
+    _write(made, [Path(path)], fonts, sign)
 
 
 @checked
@@ -145,8 +145,7 @@ def write_fleet_certificates(
                 raise RecordError(f"it has no record: {store.reason(unit.serial) or 'fleet run makes it'}")
             made = _certificate(store.record(unit.serial), stated, limits)
             made = with_days_of_recordings(made)
-            for ending in (".xml", ".pdf"):
-                _write(made, Path(output) / f"{unit.serial}{ending}", fonts, sign)
+            _write(made, [Path(output) / f"{unit.serial}{ending}" for ending in (".xml", ".pdf")], fonts, sign)
         except ImulabError as error:
             refused[unit.serial] = str(error)
         if progress is not None:
@@ -154,18 +153,22 @@ def write_fleet_certificates(
     return refused
 
 
-def _write(certificate: Certificate, path: Path, fonts: str | Path | None, sign: str | Path | None) -> None:
-    content = dcc_xml(certificate)
+def _write(certificate: Certificate, paths: list[Path], fonts: str | Path | None, sign: str | Path | None) -> None:
+    """Write the files of a certificate; all are made before the first is written, as a PDF may be refused."""
+    xml = dcc_xml(certificate)
     if sign is not None:
         from imulab.certificate.signature import signed  # signxml is of an extra, and takes 90 ms to load
 
-        content = signed(content, str(sign), certificate.lab.certificate.issued)
-    if path.suffix == ".pdf":
+        xml = signed(xml, str(sign), certificate.lab.certificate.issued)
+    contents = [xml] * len(paths)
+    if any(path.suffix == ".pdf" for path in paths):
         from imulab.certificate.page import pdf  # typst is of an extra, and takes 20 ms to load
 
-        content = pdf(certificate, content, None if fonts is None else str(fonts))
-    with replacing(path) as stream:
-        stream.write(content)
+        page = pdf(certificate, xml, None if fonts is None else str(fonts))
+        contents = [page if path.suffix == ".pdf" else xml for path in paths]
+    for path, content in zip(paths, contents, strict=True):
+        with replacing(path) as stream:
+            stream.write(content)
 
 
 def _laboratory(lab: str | Path, language: str | None) -> Laboratory:

@@ -22,7 +22,7 @@ _TEXTS: Mapping[str, tuple[str, str]] = {
     "laboratory": ("Laboratory", "Laboratorium"),
     "customer": ("Customer", "Auftraggeber"),
     "order": ("order", "Auftrag"),
-    "item": ("Item", "Gegenstand"),
+    "item": ("Item", "Kalibriergegenstand"),
     "manufacturer": ("Manufacturer", "Hersteller"),
     "model": ("Model", "Typ"),
     "serial": ("Serial number", "Seriennummer"),
@@ -38,7 +38,7 @@ _TEXTS: Mapping[str, tuple[str, str]] = {
         "Dieser Kalibrierschein ändert und ersetzt den Kalibrierschein {}. Grund: {}",
     ),
     "at laboratory": ("laboratory", "Laboratorium"),
-    "at customer": ("customer", "beim Auftraggeber"),
+    "at customer": ("customer", "Auftraggeber"),
     "at laboratoryBranch": ("branch of the laboratory", "Außenstelle des Laboratoriums"),
     "at customerBranch": ("branch of the customer", "Außenstelle des Auftraggebers"),
     "at other": ("another place", "anderer Ort"),
@@ -53,11 +53,11 @@ _TEXTS: Mapping[str, tuple[str, str]] = {
     "conditions": ("Conditions", "Bedingungen"),
     "gravity": ("Gravity in the evaluation", "Schwerebeschleunigung in der Auswertung"),
     "temperature": ("Temperature of the item", "Temperatur des Gegenstands"),
-    "equipment": ("Standards used", "Normale"),
+    "equipment": ("Standards used", "Verwendete Normale"),
     "standard": ("Certificate {} of {}", "Kalibrierschein {} von {}"),
-    "standard uncertainty": ("standard uncertainty {} {}", "Standardunsicherheit {} {}"),
+    "standard uncertainty": ("standard uncertainty {} {}", "Standardmessunsicherheit {} {}"),
     "certificate": ("certificate", "Kalibrierschein"),
-    "traceability": ("Traceability", "Rückführung"),
+    "traceability": ("Traceability", "Metrologische Rückführung"),
     "results": ("Results", "Ergebnisse"),
     "before": ("before the adjustment", "vor der Justierung"),
     "after": ("after the adjustment", "nach der Justierung"),
@@ -65,7 +65,7 @@ _TEXTS: Mapping[str, tuple[str, str]] = {
     "parameter": ("Parameter", "Parameter"),
     "value": ("Value", "Wert"),
     "unit": ("Unit", "Einheit"),
-    "limits": ("Limits", "Grenzen"),
+    "limits": ("Limits", "Grenzwerte"),
     "conformity": ("Conformity", "Konformität"),
     "covariance": ("Covariance of the parameters", "Kovarianz der Parameter"),
     "correlations": ("Correlations, numbered as above", "Korrelationen, nummeriert wie oben"),
@@ -77,7 +77,7 @@ _TEXTS: Mapping[str, tuple[str, str]] = {
         "U = k u is the expanded uncertainty: the standard uncertainty u times the coverage factor k, for a coverage "
         "probability of {}, evaluated by JCGM 100:2008. It holds what the evaluation states; drift in later use is "
         "not in it.",
-        "U = k u ist die erweiterte Messunsicherheit: die Standardunsicherheit u mal dem Erweiterungsfaktor k, für "
+        "U = k u ist die erweiterte Messunsicherheit: die Standardmessunsicherheit u mal dem Erweiterungsfaktor k, für "
         "eine Überdeckungswahrscheinlichkeit von {}, ermittelt nach JCGM 100:2008. Sie enthält, was die Auswertung "
         "angibt; eine Drift bei späterem Gebrauch ist nicht enthalten.",
     ),
@@ -86,24 +86,24 @@ _TEXTS: Mapping[str, tuple[str, str]] = {
     "or": (" or ", " oder "),
     "interval": (
         "Where an interval stands in place of U, it holds the value with 95 %.",
-        "Wo statt U ein Intervall steht, enthält es den Wert mit 95 %.",
+        "Wo statt U ein Intervall steht, enthält es den Wert mit einer Wahrscheinlichkeit von 95 %.",
     ),
     "not SI": ("Unit outside the SI: {}.", "Einheit außerhalb des SI: {}."),
-    "statement of conformity": ("Statement of conformity", "Aussage zur Konformität"),
+    "statement of conformity": ("Statement of conformity", "Konformitätsaussage"),
     "simple": ("a value passes within its limits", "ein Wert besteht innerhalb seiner Grenzen"),
     "guarded": (
         "a value passes within its limits less its expanded uncertainty",
-        "ein Wert besteht innerhalb seiner um die erweiterte Unsicherheit verengten Grenzen",
+        "ein Wert besteht innerhalb seiner um die erweiterte Messunsicherheit verengten Grenzen",
     ),
     "bands": (
         "a value passes within its limits less its expanded uncertainty, passes on condition within its limits, fails "
         "on condition beyond them by at most its expanded uncertainty",
-        "ein Wert besteht innerhalb seiner um die erweiterte Unsicherheit verengten Grenzen, besteht bedingt innerhalb "
-        "seiner Grenzen, besteht bedingt nicht bis zur erweiterten Unsicherheit jenseits davon",
+        "ein Wert besteht innerhalb seiner um die erweiterte Messunsicherheit verengten Grenzen, besteht bedingt "
+        "innerhalb seiner Grenzen, besteht bedingt nicht bis zur erweiterten Messunsicherheit jenseits davon",
     ),
     "agreed": (
         "Conformity with {}, decided by the rule {} ({}), as agreed: {}.",
-        "Konformität mit {}, entschieden nach der Regel {} ({}), wie vereinbart: {}.",
+        "Konformität mit {}, bewertet nach der Entscheidungsregel {} ({}), wie vereinbart: {}.",
     ),
     "all conform": (
         "Probability that all values conform: {}.",
@@ -127,15 +127,15 @@ _TEXTS: Mapping[str, tuple[str, str]] = {
     ),
     "left out": (
         "{} values without uncertainty are in the record, not in this certificate.",
-        "{} Werte ohne Unsicherheit stehen im Datensatz, nicht in diesem Kalibrierschein.",
+        "{} Werte ohne Messunsicherheit stehen im Datensatz, nicht in diesem Kalibrierschein.",
     ),
     "one left out": (
         "1 value without uncertainty is in the record, not in this certificate.",
-        "1 Wert ohne Unsicherheit steht im Datensatz, nicht in diesem Kalibrierschein.",
+        "1 Wert ohne Messunsicherheit steht im Datensatz, nicht in diesem Kalibrierschein.",
     ),
     "hopeless": (
         "{}: the uncertainty is more than half of the tolerance, no value can pass.",
-        "{}: Die Unsicherheit ist mehr als die halbe Toleranz, kein Wert kann bestehen.",
+        "{}: Die Messunsicherheit ist mehr als die halbe Toleranz, kein Wert kann bestehen.",
     ),
     "only this": (
         "The results relate only to the item calibrated, in the condition described.",
