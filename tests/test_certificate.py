@@ -314,6 +314,18 @@ REFUSED = {
     "issued before": (LAB.replace("issued = 2026-11-27", "issued = 2026-11-23"), "out of order"),
     "received after": (LAB.replace("received = 2026-11-20", "received = 2026-11-25"), "received 2026-11-25, after"),
     "infinite": (LAB.replace("23.0", "inf"), "conditions[0].value: "),
+    "long unit": (
+        LAB.replace('"degC"', f'"{"(" * 3000}m{")" * 3000}"'),
+        "conditions[0].unit: expected `str` of length",
+    ),
+    "own number": (
+        LAB.replace("location =", 'replaces = "EX-2026-0042"\nreason = "typing"\nlocation ='),
+        "certificate: replaces 'EX-2026-0042' is its own number",
+    ),
+    "next before": (
+        LAB.replace("location =", 'recalibration = { date = 2026-11-27, agreed = "offer" }\nlocation ='),
+        "certificate.recalibration: 2026-11-27; expected a day after",
+    ),
     "unit": (LAB.replace('"degC"', '"furlong"'), "unit furlong: the D-SI"),
     "serial": (LAB.replace("condition =", 'serial = "SN-1"\ncondition ='), "item.serial 'SN-1': the record says"),
     "gravity": (LAB + STANDARD.replace("1e-6", "1e-3"), "fit again with --gravity 9.81362+-0.001"),
@@ -366,6 +378,15 @@ def test_an_altered_or_bad_record_is_refused(issue, capsys, sound):
     replace(il.load(sound / "sound.json"), verdict=Verdict("bad", ("no gravity",))).save("bad.json")
     assert issue(REVIEWED, "bad.json") == 2
     assert "verdict is bad: no gravity" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("key", "text"), [("serial", " "), ("model", "triad ")])
+def test_names_that_the_schema_refuses_are_refused(issue, capsys, sound, key, text):
+    record = il.load(sound / "sound.json")
+    replace(record, sensor={**record.sensor, key: text}).save("unit.json")
+    assert issue(record="unit.json") == 2
+    assert f"{key} {text!r}: a space at an end" in capsys.readouterr().err
+    assert not Path("cert.xml").exists()
 
 
 def test_an_output_that_is_an_input_or_no_certificate_is_refused(issue, capsys):

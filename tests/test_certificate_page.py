@@ -17,6 +17,7 @@ from imulab.certificate.model import make_certificate, with_before
 from imulab.certificate.texts import _TEXTS
 from imulab.cli import main
 from imulab.procedures.registry import load_sealed
+from imulab.recording import Source
 
 pytest.importorskip("typst", reason="typst lays out certificates")
 pypdf = pytest.importorskip("pypdf", reason="pypdf reads their PDF")
@@ -207,6 +208,17 @@ def test_a_record_of_another_unit_or_the_same_is_not_before(adjusted, capsys):
     assert main([*adjusted[:-1], "other.json", "-o", "cert.pdf"]) == 2
     assert "before: serial 'SN-9'; expected" in capsys.readouterr().err
     assert not Path("cert.pdf").exists()
+
+
+def test_a_record_measured_after_the_adjustment_is_not_before(adjusted, capsys):
+    for name, day in (("after", "2026-11-24"), ("before", "2026-11-25")):
+        replace(il.load(f"{name}.json"), sources=(Source(f"{name}.csv", "0" * 64, day),)).save(f"{name}.json")
+    lab = Path("lab.toml")
+    days = "[2026-11-24, 2026-11-25]"
+    lab.write_text(lab.read_text(encoding="utf-8").replace("[2026-11-24, 2026-11-24]", days), encoding="utf-8")
+    assert main([*adjusted, "-o", "cert.xml"]) == 2
+    assert "before: measured 2026-11-25, after 2026-11-24" in capsys.readouterr().err
+    assert not Path("cert.xml").exists()
 
 
 def test_what_replaces_says_why(printed, capsys):

@@ -21,6 +21,7 @@ from imulab.quantities import LARGEST
 
 Text = Annotated[str, Meta(pattern=r"^\S+(\s+\S+)*$")]
 """A text that the schema of certificates takes: not empty, without spaces at its ends."""
+Unit = Annotated[Text, Meta(max_length=64)]
 Size = Annotated[float, Meta(gt=0, le=LARGEST)]
 Country = Annotated[str, Meta(pattern="^[A-Z]{2}$")]
 Language = Literal["en", "de"]
@@ -111,7 +112,7 @@ class Stated(_Table, frozen=True, kw_only=True):
     """A value with its unit."""
 
     value: Size
-    unit: Text
+    unit: Unit
 
 
 class Equipment(_Table, frozen=True, kw_only=True):
@@ -129,7 +130,7 @@ class Condition(_Table, frozen=True, kw_only=True):
 
     name: Text
     value: Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-    unit: Text
+    unit: Unit
     expanded_uncertainty: Size
     coverage_factor: Annotated[float, Meta(ge=1, le=LARGEST)] = 2.0
 
@@ -241,6 +242,12 @@ def load_laboratory(path: str) -> Laboratory:
         raise ReadError(f"{path}: certificate: performed {first} to {last}, issued {identity.issued}: out of order")
     if (identity.replaces is None) != (identity.reason is None):
         raise ReadError(f"{path}: certificate: expected replaces and reason together: which certificate, and why")
+    if identity.replaces == identity.number:
+        raise ReadError(f"{path}: certificate: replaces {identity.replaces!r} is its own number; expected another")
+    if identity.recalibration is not None and identity.recalibration.date <= identity.issued:
+        raise ReadError(
+            f"{path}: certificate.recalibration: {identity.recalibration.date}; expected a day after the day of issue"
+        )
     if identity.received is not None and identity.received > first:
         raise ReadError(f"{path}: certificate: received {identity.received}, after the first day of work {first}")
     return lab

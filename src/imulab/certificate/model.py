@@ -116,6 +116,9 @@ def make_certificate(record: Calibration, sha256: str, lab: Laboratory, limits: 
     serial = record.sensor.get("serial")
     if not serial:
         raise RecordError("the record names no serial number: fit again with --serial; a certificate is of one item")
+    for key in ("serial", "model"):  # the schema of certificates takes no text that begins or ends with a space
+        if (text := record.sensor.get(key, "")) != text.strip():
+            raise RecordError(f"{key} {text!r}: a space at an end; fit again with --{key} without it")
     number = lab.certificate.number.replace(SERIAL, serial)
     lab = msgspec.structs.replace(lab, certificate=msgspec.structs.replace(lab.certificate, number=number))
     for key, stated in (("serial", lab.item.serial), ("model", lab.item.model)):
@@ -145,7 +148,7 @@ def with_before(certificate: Certificate, before: Certificate) -> Certificate:
     Raises
     ------
     OptionError
-        The two are not of one unit and one procedure.
+        The two are not of one unit and one procedure, or in the wrong order.
     """
     for what, found, expected in (
         ("serial", before.serial, certificate.serial),
@@ -155,6 +158,12 @@ def with_before(certificate: Certificate, before: Certificate) -> Certificate:
             raise OptionError(f"before: {what} {found!r}; expected {expected!r}, that of the record after it")
     if before.sha256 == certificate.sha256:
         raise OptionError("before: the same record; expected the one from before the adjustment")
+    earlier, later = (
+        [source.measured for source in each.record.sources if source.measured is not None]
+        for each in (before, certificate)
+    )
+    if earlier and later and min(earlier)[:10] > max(later)[:10]:
+        raise OptionError(f"before: measured {min(earlier)}, after {max(later)}, the last day of the record after it")
     return replace(certificate, before=before)
 
 
