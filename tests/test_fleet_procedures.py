@@ -56,6 +56,9 @@ def line(tmp_path_factory):
         il.write(unnamed(il.simulate_tumble(attitudes=16, order=1, hold=3.0, seed=4, gravity=9.81)), "tumble.csv")
         for number, soak in enumerate(il.simulate_thermal(attitudes=10, gyro=True, seed=1)):
             il.write(unnamed(soak), f"soak_{number}.csv")
+        il.write(unnamed(il.simulate_magnetometer(duration="20 s", seed=3)), "waved.csv")
+        (ramp,) = il.simulate_thermal("0,40", attitudes=0, ramps=1, gyro=True, duration="10 min", seed=5)
+        il.write(unnamed(ramp), "ramp.csv")
         rest = il.simulate_noise(white="0.005 deg/s/sqrt(Hz)", rate="20 Hz", duration="20 min", columns="gyro_x,gyro_y")
         il.write(unnamed(rest), "rest.csv")
         assert run("tumble", "fit", "tumble.csv", "--order", 1, "--gravity", "9.81+-0", "-o", "accel.json") == 0
@@ -71,6 +74,8 @@ def line(tmp_path_factory):
         {"serial": "D", "procedure": "rate", "file": "r/test.toml", "accel": "accel.json", "prior": "prior.json",
          "latitude": "48"},
         {"serial": "E", "procedure": "noise", "file": "rest.csv", "terms": "NBK"},
+        {"serial": "F", "procedure": "magnetometer", "file": "waved.csv", "field": "48 uT"},
+        {"serial": "G", "procedure": "thermal", "file": "ramp.csv", "degrees": "2,0,0"},
     ]  # fmt: skip
     return folder, rows
 
@@ -160,7 +165,7 @@ def test_a_fault_of_a_unit_with_gyroscopes_is_that_units(line, monkeypatch):
 def test_the_report_shows_gyroscopes_in_the_units_that_people_read(line, monkeypatch):
     folder, rows = line
     monkeypatch.chdir(folder)
-    write_manifest(folder / "all.csv", rows)
+    write_manifest(folder / "all.csv", rows[:-1])
     run_fleet("all.csv", "shown", workers=1)
     (folder / "limits.toml").write_text(
         '[rate]\n"gyro_scale_factor_*" = { lower = -2500, upper = 2500, unit = "ppm" }\n'
