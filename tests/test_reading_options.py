@@ -13,7 +13,9 @@ from imulab.readers import read_blocks
 from test_readers_logs import low_rate_log
 
 PART = {"layout", "topic", "instance", "window"}
-NOT_BY_ELEMENT = {"array merge", "array calibrate", "array calibrate --imus", "array fuse", "array compare"}
+NOT_BY_ELEMENT = {
+    "array merge", "array calibrate", "array calibrate --imus", "array fuse", "array fuse --imus", "array compare",
+}  # fmt: skip
 """What an array is needed for."""
 BY_MANIFEST = {"centrifuge reduce"}
 """The manifest of a test says the window of each run."""

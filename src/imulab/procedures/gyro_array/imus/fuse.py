@@ -19,15 +19,15 @@ from imulab.device.unit import ALONE, BEYOND, EXCLUDED, GATED, NOT_FINITE, STUCK
 from imulab.display import Finding, prefixed
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.estimation.clock import GAP
-from imulab.options import RARE, measure, text
+from imulab.options import RARE, READING, measure, parsed, text
 from imulab.procedures.gyro_array.elements import SampleClock
 from imulab.procedures.gyro_array.imus.columns import SENSORS, RangeFinder, readings_of
 from imulab.procedures.gyro_array.imus.model import ACCEL_LATENCY, GYRO_LATENCY
 from imulab.procedures.gyro_array.imus.prepare import names_of
 from imulab.procedures.gyro_array.imus.schema import imus_of
 from imulab.procedures.result import Drawn, Record, as_record, as_recording
-from imulab.quantities import in_si
-from imulab.recording import Array, Data, Part, Recording
+from imulab.quantities import in_si, span
+from imulab.recording import Array, Data, Part, Recording, Window
 from imulab.records.calibration import Calibration
 from imulab.report.noise_figures import thinned
 from imulab.report.traces import BAD, DASHES, GOOD, TIME, Exhibits, Figure, ReportTable, figure_axis, rounded, scatter
@@ -369,6 +369,7 @@ def fuse_imus(
     at: Annotated[str, text("centroid|imu:N|X,Y,Z", ("centroid",))] = "centroid",
     gyro_range: Annotated[float | str | None, measure("rate", "deg/s"), RARE] = None,
     accel_range: Annotated[float | str | None, measure("acceleration", "g"), RARE] = None,
+    window: Annotated[Window | None, parsed(span, "FROM:TO", unit="s"), READING] = None,
     **reading: Unpack[Part],
 ) -> FusedBoard:
     """Fuse a board of whole IMUs into one specific force, rate and angular acceleration.
@@ -383,6 +384,8 @@ def fuse_imus(
         Point of the specific force. ``centroid`` of the accelerometers, ``imu:N``, or x,y,z, in m from IMU 1.
     gyro_range, accel_range
         Largest reading of the gyroscopes, and of the accelerometers; found in a recording that reaches it.
+    window
+        Part to fuse. First and last time, s, as ``(10, 60)`` or ``"10:60"``; ``"+10:+60"`` counts from the start.
     reading
         How arrays and files are to be understood: `time`, `unit` or `units`; `layout`, `topic`, `instance`.
 
@@ -403,7 +406,7 @@ def fuse_imus(
     >>> callable(il.fuse_imus)
     True
     """
-    recording = as_recording(data, reading, fuse_imus)
+    recording = as_recording(data, {**reading, "window": window}, fuse_imus)
     known: Calibration | Blob
     if isinstance(calibration, Blob):
         known = calibration
