@@ -186,7 +186,8 @@ def test_a_late_stream_on_the_page(tmp_path, new_page):
         page = new_page(next(line for _, line in process.lines if line.startswith("http://")))
         page.wait_for_selector(".now[data-state='waiting'], .now[data-state='silent']")
         begin()
-        page.wait_for_selector("figure figcaption:has-text('a quarter turn about the vertical')")
+        # The page hides the figure where nothing is to be turned, which may be before this looks.
+        page.wait_for_selector("figure figcaption:has-text('a quarter turn about the vertical')", state="attached")
         page.get_by_role("button", name="Make the record").click()
         page.wait_for_selector(".result")
         assert "is its unit" not in page.inner_text("main")
