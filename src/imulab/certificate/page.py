@@ -174,11 +174,11 @@ def _sections(certificate: Certificate, words: Words) -> Iterator[dict[str, Any]
     if (rule := agreed_rule(certificate, words)) is not None and certificate.state is not None:
         overall = f"{words('overall')}: {words(certificate.state)}."
         yield _section(words("statement of conformity"), *map(_text, (rule, words("p"), overall)))
-    said = [_text(text, language) for text, language in remarks(certificate, words)]
-    said += [_text(text) for clause, text in statements(certificate, words) if clause != "7.8.2.1"]
+    notes = [_text(text, language) for text, language in remarks(certificate, words)]
+    notes += [_text(text) for clause, text in statements(certificate, words) if clause != "7.8.2.1"]
     if (following := lab.certificate.recalibration) is not None:
-        said.append(_text(words("recalibration", following.agreed, following.date)))
-    yield _section(words("remarks"), *said)
+        notes.append(_text(words("recalibration", following.agreed, following.date)))
+    yield _section(words("remarks"), *notes)
     hashes = [(name, f"sha256:{sha256}") for name, sha256 in certificate.sources(words("record"))]
     if before is not None:
         hashes += [

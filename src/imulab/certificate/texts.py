@@ -191,21 +191,21 @@ def statements(certificate: Certificate, words: Words) -> Iterator[tuple[str, st
 def remarks(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
     """Return what the reader must know besides, each with its language: the verdict's reasons are the record's own."""
     record = certificate.record
-    said = [(reason, "en") for reason in record.verdict.reasons]
+    reasons = [(reason, "en") for reason in record.verdict.reasons]
     if certificate.before is not None:
-        said += [(f"before the adjustment: {reason}", "en") for reason in certificate.before.record.verdict.reasons]
-    own: list[str] = []
+        reasons += [(f"before the adjustment: {reason}", "en") for reason in certificate.before.record.verdict.reasons]
+    others: list[str] = []
     if certificate.lab.certificate.reviewed is not None:
-        own.append(words("reviewed", certificate.lab.certificate.reviewed))
+        others.append(words("reviewed", certificate.lab.certificate.reviewed))
     gravity = record.model.get("gravity")
     if isinstance(gravity, Mapping) and str(gravity.get("from", "")).endswith("taken as exact"):
-        own.append(words("exact", words.number(repr(gravity["value"]))))
+        others.append(words("exact", words.number(repr(gravity["value"]))))
     if certificate.left_out:
-        own.append(words("one left out" if certificate.left_out == 1 else "left out", certificate.left_out))
+        others.append(words("one left out" if certificate.left_out == 1 else "left out", certificate.left_out))
     bands = {each.name: each.decision.acceptance for each in certificate.results if each.decision is not None}
     if hopeless := [name for name, band in bands.items() if band.lower > band.upper]:
-        own.append(words("hopeless", ", ".join(hopeless)))
-    return said + [(text, words.language) for text in own]
+        others.append(words("hopeless", ", ".join(hopeless)))
+    return reasons + [(text, words.language) for text in others]
 
 
 def agreed_rule(certificate: Certificate, words: Words) -> str | None:

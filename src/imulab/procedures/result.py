@@ -389,15 +389,18 @@ class PlannedTest(Shown):
             lines += ["", *aligned(more, cells)]
         return "\n".join([*lines, *self.remarks()])
 
+    no_file: ClassVar[str] = "this plan has no file"
+    """Why there is nothing to write of a plan that has no table of attitudes."""
+
     def save(self, path: str | Path) -> None:
         """Write the plan.
 
         Raises
         ------
         OptionError
-            The file cannot be written.
+            The file cannot be written, or the plan has none.
         """
-        raise NotImplementedError
+        raise OptionError(f"{path}: {self.no_file}; expected the plan without -o")
 
 
 class PlannedAttitudes(PlannedTest):

@@ -46,8 +46,8 @@ def _fit(
 
     def sources() -> list[Source]:
         named = [(manifest, manifest), *names.items()]
-        found = (source_of(access, name, called, heads=heads) for called, name in named)
-        return [source for source in found if source is not None]
+        stated = (source_of(access, name, called, heads=heads) for called, name in named)
+        return [source for source in stated if source is not None]
 
     return fit_centrifuge(
         test,

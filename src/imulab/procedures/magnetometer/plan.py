@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -68,6 +67,8 @@ class MagnetometerPlan(PlannedTest):
         Wanted standard uncertainty of the direction, rad.
     """
 
+    no_file: ClassVar[str] = "a turn by hand has no file"
+
     turn: str
     chosen: PredictedTurn
     others: tuple[PredictedTurn, ...]
@@ -122,16 +123,6 @@ class MagnetometerPlan(PlannedTest):
             "others": [row(each) for each in self.others],
             "tilts": [row(each) for each in self.tilts],
         }
-
-    def save(self, path: str | Path) -> None:
-        """Refuse: there are no attitudes to write.
-
-        Raises
-        ------
-        OptionError
-            Always.
-        """
-        raise OptionError(f"{path}: a turn by hand has no file; expected the plan without -o")
 
 
 def plan_magnetometer(

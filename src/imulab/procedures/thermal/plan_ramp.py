@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -82,6 +81,8 @@ class RampPlan(PlannedTest):
         Wanted standard uncertainty of the biases beside the Earth's rate, rad/s.
     """
 
+    no_file: ClassVar[str] = "a ramp at rest has no attitudes"
+
     low: float
     high: float
     degree: int
@@ -125,16 +126,6 @@ class RampPlan(PlannedTest):
             **row(self.chosen),
             "others": [row(each) for each in self.others],
         }
-
-    def save(self, path: str | Path) -> None:
-        """Refuse: there are no attitudes to write.
-
-        Raises
-        ------
-        OptionError
-            Always.
-        """
-        raise OptionError(f"{path}: a ramp at rest has no attitudes; expected the plan without -o")
 
 
 def plan_ramp(

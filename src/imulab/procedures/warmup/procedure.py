@@ -35,12 +35,12 @@ def _fit(
 
     def cycle(name: str) -> Cycle:
         blocks = noting_head(access.blocks(name, values["layout"], **values["part"]), heads, name)
-        found = find_power_cycle(
+        measured = find_power_cycle(
             on_clock_of(blocks, "gyro"),
             latest_start=values["latest_start"],
             temperature_from_column=values["temperature_column"],
         )
-        return replace(found, source=source_of(access, name, heads=heads))
+        return replace(measured, source=source_of(access, name, heads=heads))
 
     return fit_warmup([cycle(name) for name in files], **values["fit"]).calibration
 

@@ -207,13 +207,13 @@ def _biases_table(record: ImusRecord) -> ReportTable:
 
 def _size_table(record: ImusRecord) -> ReportTable:
     size = record.fit.size
-    said = (("gravity", size.gravity), ("stated", size.stated), ("gyro scale", size.gyro_scale))
+    sources = (("gravity", size.gravity), ("stated", size.stated), ("gyro scale", size.gyro_scale))
     rows = [
         [
             ("* " if name == record.size_from else "") + _SOURCES[name],
             _cell(value.value, value.standard_uncertainty, 1.0),
         ]
-        for name, value in said
+        for name, value in sources
         if value is not None
     ]
     return ReportTable(

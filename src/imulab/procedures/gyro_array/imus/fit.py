@@ -336,9 +336,9 @@ def _not_determined(
         unknown = [AT_ACCEL_BIAS, AT_ACCEL_SCALE]
     deviation = np.sqrt(np.diag(covariance)).reshape(-1, NUMBERS)
     for name, place in _NAMES:
-        untold = [k + 1 for k, u in enumerate(deviation[:, place]) if (u > _UNTOLD * PRIOR[place]).any()]
-        if untold:
-            names.append(f"{name} of IMU {' '.join(map(str, untold))}")
+        undetermined = [k + 1 for k, u in enumerate(deviation[:, place]) if (u > _UNTOLD * PRIOR[place]).any()]
+        if undetermined:
+            names.append(f"{name} of IMU {' '.join(map(str, undetermined))}")
     return names, unknown
 
 

@@ -172,10 +172,10 @@ def read_late(time: Array, values: Array, rows: slice, latency: float, limit: fl
             others = np.delete(np.arange(6), i)
             away = np.where(fine[:, None], t[:, [i]] - t[:, others], 1.0)
             smooth += ((x[:, None] - t[:, others]) / away).prod(axis=1)[:, None] * (v[:, i] - before)
-        found = np.where(fine[:, None], smooth, linear)
-        found = np.where(np.abs(after) >= limit, after, np.where(np.abs(before) >= limit, before, found))
+        resampled = np.where(fine[:, None], smooth, linear)
+        resampled = np.where(np.abs(after) >= limit, after, np.where(np.abs(before) >= limit, before, resampled))
     outside = (left < 0) | (left > count - 2) | (step > longest)
-    return np.asarray(np.where(outside[:, None], values[rows], found))
+    return np.asarray(np.where(outside[:, None], values[rows], resampled))
 
 
 # Fusion of recordings, as a whole or block by block.
@@ -291,11 +291,11 @@ class BoardFuser:
     def notes(self) -> list[str]:
         """Return messages after the last block: gaps, what was bridged, and what was left out."""
         lines: list[str] = []
-        for (sensor, k), seen in sorted(self.left_out.items()):
-            why = " and ".join(dict.fromkeys(seen["why"])) or "off the others"
+        for (sensor, k), lost in sorted(self.left_out.items()):
+            why = " and ".join(dict.fromkeys(lost["why"])) or "off the others"
             text = (
-                f"{_WORDS[SENSORS[sensor]]} {k + 1}: left out of {seen['samples']} of {self.samples} samples, first at "
-                f"{seen['first']:.6g} s: {why}"
+                f"{_WORDS[SENSORS[sensor]]} {k + 1}: left out of {lost['samples']} of {self.samples} samples, first at "
+                f"{lost['first']:.6g} s: {why}"
             )
             lines.append(Finding(text, "look at this sensor; the others were fused without it"))
         if self.alone:
@@ -348,10 +348,10 @@ class BoardFuser:
         excluded = (out.health & EXCLUDED) != 0
         for sensor, k in np.argwhere(excluded.any(axis=0)).tolist():
             at = np.flatnonzero(excluded[:, sensor, k])
-            seen = self.left_out.setdefault((sensor, k), {"samples": 0, "first": float(time[at[0]]), "why": []})
+            lost = self.left_out.setdefault((sensor, k), {"samples": 0, "first": float(time[at[0]]), "why": []})
             met = int(np.bitwise_or.reduce(out.health[at, sensor, k]))
-            seen["samples"] += len(at)
-            seen["why"] += [word for bit, word in _KINDS if met & bit and word not in seen["why"]]
+            lost["samples"] += len(at)
+            lost["why"] += [word for bit, word in _KINDS if met & bit and word not in lost["why"]]
         bridged = (out.flags & BEYOND) != 0
         self.samples += len(time)
         self.bridged += int(bridged.sum())
@@ -403,7 +403,9 @@ def fuse_imus(
     Examples
     --------
     >>> import imulab as il
-    >>> callable(il.fuse_imus)
+    >>> board = il.simulate_imus(elements=4, attitudes=6, duration="10 s", rate="50 Hz")
+    >>> fused = il.fuse_imus(board, calibration=il.calibrate_imus(board, gravity=9.80665))
+    >>> fused.force.shape == (len(board), 3)
     True
     """
     recording = as_recording(data, {**reading, "window": window}, fuse_imus)

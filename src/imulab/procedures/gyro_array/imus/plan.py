@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -71,6 +70,8 @@ class ImusPlan(PlannedTest):
         Shorter and longer motions.
     """
 
+    no_file: ClassVar[str] = "a motion by hand has no file"
+
     attitudes: int
     chosen: PredictedBoard
     others: tuple[PredictedBoard, ...]
@@ -118,16 +119,6 @@ class ImusPlan(PlannedTest):
             }  # fmt: skip
 
         return {"attitudes": self.attitudes, **row(self.chosen), "others": [row(each) for each in self.others]}
-
-    def save(self, path: str | Path) -> None:
-        """Refuse: a motion by hand has no file.
-
-        Raises
-        ------
-        OptionError
-            Always.
-        """
-        raise OptionError(f"{path}: a motion by hand has no file; expected the plan without -o")
 
 
 def plan_imus(
