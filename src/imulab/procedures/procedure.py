@@ -127,6 +127,40 @@ class Section:
         return []
 
 
+class GyroscopeSection(Section):
+    """Bias, scale factor, misalignment and g-sensitivity of gyroscopes, of tumble and rate tests."""
+
+    kind = "gyro"
+    triad = "gyro"
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.device.unit import golden_gyroscopes
+
+        return golden_gyroscopes(table, random)
+
+    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+        from imulab.device.unit import correct_gyroscopes
+
+        return correct_gyroscopes(unit, columns, recording)
+
+
+class MagnetometerSection(Section):
+    """Bias and matrix of magnetometers, beside accelerometers or alone."""
+
+    kind = "mag"
+    triad = "mag"
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.device.unit import golden_magnetometers
+
+        return golden_magnetometers(table, random)
+
+    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+        from imulab.device.unit import correct_magnetometers
+
+        return correct_magnetometers(unit, columns, recording)
+
+
 class OnLine(Struct, frozen=True):
     """Parameters by which units of a line are compared, where those of a record depend on its reference temperature.
 

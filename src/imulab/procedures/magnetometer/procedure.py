@@ -7,14 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from imulab.errors import RecordError
 from imulab.options import part_of, read_options
-from imulab.procedures.procedure import Files, Procedure, Section, Task
+from imulab.procedures.procedure import Files, MagnetometerSection, Procedure, Task
 from imulab.quantities import labelled
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from imulab.device.tables import DeviceTable, Fusion
-    from imulab.device.unit import DeviceUnit
     from imulab.procedures.magnetometer.fit import MagnetometerFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
@@ -54,23 +51,6 @@ TASK = Task(
 )
 
 
-class MagnetometerAloneSection(Section):
-    """Bias and matrix of magnetometers."""
-
-    kind = "mag"
-    triad = "mag"
-
-    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
-        from imulab.device.unit import golden_magnetometers
-
-        return golden_magnetometers(table, random)
-
-    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-        from imulab.device.unit import correct_magnetometers
-
-        return correct_magnetometers(unit, columns, recording)
-
-
 class MagnetometerProcedure(Procedure):
     """A magnetometer triad alone, waved or turned level."""
 
@@ -81,7 +61,7 @@ class MagnetometerProcedure(Procedure):
     elsewhere = "{target} wants accelerometers too, and this record holds magnetometers alone"
     has_heading = True
     task = TASK
-    sections = (MagnetometerAloneSection(),)
+    sections = (MagnetometerSection(),)
 
     def check(self, record: Calibration) -> None:
         from imulab.procedures.magnetometer.schema import check

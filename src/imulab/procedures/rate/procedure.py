@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING, Any
 from imulab.errors import OptionError
 from imulab.gravity import checked_latitude
 from imulab.options import part_of, read_options
-from imulab.procedures.procedure import Files, Procedure, Section, Task, source_of
+from imulab.procedures.procedure import Files, GyroscopeSection, Procedure, Task, source_of
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from imulab.device.tables import DeviceTable, Fusion
-    from imulab.device.unit import DeviceUnit
     from imulab.procedures.rate.fit import RateFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
@@ -74,23 +71,6 @@ TASK = Task(
 )
 
 
-class RateSection(Section):
-    """Bias, scale factor, misalignment and nonlinearity of gyroscopes."""
-
-    kind = "gyro"
-    triad = "gyro"
-
-    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
-        from imulab.device.unit import golden_gyroscopes
-
-        return golden_gyroscopes(table, random)
-
-    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-        from imulab.device.unit import correct_gyroscopes
-
-        return correct_gyroscopes(unit, columns, recording)
-
-
 class RateProcedure(Procedure):
     """The test of gyroscopes at known rates or by whole turns."""
 
@@ -101,7 +81,7 @@ class RateProcedure(Procedure):
     elsewhere = "{target} wants accelerometers too, and a rate record holds gyroscopes alone"
     joins = True
     task = TASK
-    sections = (RateSection(),)
+    sections = (GyroscopeSection(),)
 
     def check(self, record: Calibration) -> None:
         from imulab.procedures.rate.schema import check

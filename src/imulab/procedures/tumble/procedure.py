@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from imulab.errors import DataError, RecordError
 from imulab.options import part_of, read_options
-from imulab.procedures.procedure import Files, Procedure, Section, Task
+from imulab.procedures.procedure import Files, GyroscopeSection, MagnetometerSection, Procedure, Section, Task
 from imulab.quantities import labelled
 
 if TYPE_CHECKING:
@@ -145,40 +145,6 @@ class AccelerometerSection(Section):
         from imulab.procedures.tumble.device import apply_tumble
 
         return apply_tumble(unit, columns, recording)
-
-
-class GyroscopeSection(Section):
-    """Bias, scale factor, misalignment and g-sensitivity of gyroscopes."""
-
-    kind = "gyro"
-    triad = "gyro"
-
-    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
-        from imulab.device.unit import golden_gyroscopes
-
-        return golden_gyroscopes(table, random)
-
-    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-        from imulab.device.unit import correct_gyroscopes
-
-        return correct_gyroscopes(unit, columns, recording)
-
-
-class MagnetometerSection(Section):
-    """Bias and matrix of magnetometers."""
-
-    kind = "mag"
-    triad = "mag"
-
-    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
-        from imulab.device.unit import golden_magnetometers
-
-        return golden_magnetometers(table, random)
-
-    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-        from imulab.device.unit import correct_magnetometers
-
-        return correct_magnetometers(unit, columns, recording)
 
 
 class TumbleProcedure(Procedure):
