@@ -8,6 +8,7 @@ import os
 import resource
 import shutil
 import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -212,9 +213,9 @@ def outcome(words: list[str]) -> tuple[int | str, str]:
         os.dup2(write, 2)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        if words[:2] == ["fleet", "certificate"]:  # the threads that lay pages out are lost to a forked process
+            os.execv(sys.executable, [sys.executable, "-m", "imulab", *words])
         status = 97
-        import sys
-
         sys.stdin, sys.stdout, sys.stderr = (
             os.fdopen(0, closefd=False),
             os.fdopen(1, "w", closefd=False),

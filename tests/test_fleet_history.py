@@ -135,9 +135,7 @@ def server():
     folder = Path(tempfile.mkdtemp(prefix="imulab-postgres-"))
     if user:
         shutil.chown(folder, **user)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = 20_000 + os.getpid() % 10_000  # none that the system lends to others while the server is down
     run_as = {"cwd": folder, "check": True, "capture_output": True, **user}
     data = folder / "data"
     subprocess.run(
