@@ -6,9 +6,13 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.interpolate import make_interp_spline
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
 import imulab as il
 from imulab.cli import main
@@ -25,6 +29,7 @@ from imulab.procedures.gyro_array.imus.model import (
 )
 from imulab.procedures.gyro_array.imus.record import record_values
 from imulab.procedures.gyro_array.imus.schema import imus_of
+from imulab.procedures.gyro_array.imus.size import by_gravity
 
 G = 9.80665
 REAL = Path(os.environ.get("IMULAB_DATA", "shared/data")) / "mimu4444" / "exp_1.bin"
@@ -289,6 +294,66 @@ def test_the_command_makes_the_record_of_the_function(tmp_path, monkeypatch, cap
     assert (tmp_path / "r.html").stat().st_size > 10_000
 
 
+# The size by gravity: boards that are put down softly, or fall onto a face between two samples.
+
+
+def turned_from_face_to_face(rng, hard, scale=1.0, drift=0.0):
+    """Return rests, gyroscopes' readings and gravity of turns of 40 to 60 deg, of which the hard ones stop at once."""
+    step, still, noise = 0.016, 125, np.radians(0.2)
+    turn, forces = Rotation.identity(), [np.array([0.0, 0.0, G])]
+    blocks, rests, begin = [], [], 0
+    for abrupt in (*hard, None):
+        blocks.append(np.zeros((still, 3)))
+        rests.append((begin, begin + still))
+        begin += still
+        if abrupt is None:
+            break
+        axis, angle = rng.normal(size=3), np.radians(rng.uniform(40, 60))
+        axis /= np.linalg.norm(axis)
+        lasts, grid = rng.uniform(0.6, 0.9), step * np.arange(80)
+        rise = np.clip(grid / lasts, 0, 1)
+        rate = (2 * rise if abrupt else 1 - np.cos(2 * np.pi * rise)) * (rise < 1) * angle / lasts
+        blocks.append(rate[:, None] * axis)
+        begin += len(grid)
+        turn = turn * Rotation.from_rotvec(angle * axis)
+        forces.append(turn.inv().apply(forces[0]))
+    rate = np.concatenate(blocks)
+    time = step * np.arange(len(rate))
+    readings = rate / scale + (drift * time / time[-1])[:, None] + rng.normal(0, noise, (2, *rate.shape))
+    numbers = np.zeros((2, 29))
+    numbers[:, GYRO] = np.eye(3).ravel()
+    measured = SimpleNamespace(
+        gyro=[make_interp_spline(time, each, k=5) for each in readings], gyro_noise=np.full((2, 3), noise),
+        rest_gyro=np.array([[each[a:b].mean(0) for each in readings] for a, b in rests]),
+    )  # fmt: skip
+    broken = np.zeros(len(time), bool)
+    prepared = SimpleNamespace(measured=measured, time=time, broken=broken, rests=np.array(rests), rate=1 / step)
+    return prepared, Board(numbers), np.array(forces)
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.2])
+def test_gravity_tells_the_scale_as_well_as_it_says_where_boards_fall_onto_faces(drift):
+    z, error = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        factor = by_gravity(*turned_from_face_to_face(rng, [True, False, True, True] * 4, 1.004, np.radians(drift)))
+        z.append((factor.value - 1.004) / factor.u)
+        error.append(factor.value - 1.004)
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
+    # A fall ends within 1/sqrt(12) of 16 ms at 150 deg/s: 0.7 deg of 50, 1.4 %; soft turns tell tenths of that.
+    assert np.sqrt(np.mean(np.square(error))) < 6e-4
+
+
+def test_falls_alone_tell_the_scale_as_their_instants_do():
+    z, stated = [], []
+    for seed in range(40):
+        factor = by_gravity(*turned_from_face_to_face(np.random.default_rng(seed), [True] * 16))
+        z.append((factor.value - 1) / factor.u)
+        stated.append(factor.u)
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
+    assert 2e-3 < np.mean(stated) < 6e-3
+
+
 # Many trials, and a real board.
 
 
@@ -328,3 +393,41 @@ def test_a_real_board_has_the_size_of_its_drawing():
     assert record.sources[0].file.endswith("exp_1.bin")
     assert 0.1 < held.fit.clipped < 0.2
     assert any("reading at its limit" in text for text in record.verdict.reasons)
+
+
+@pytest.mark.skipif(not REAL.is_file(), reason="no real recording here")
+def test_accelerometers_of_a_real_board_answer_as_late_as_their_readings_must_be_moved():
+    """Centripetal forces between the four chips that lie alike, against products of the mean rate; apart from the fit.
+
+    The accelerometers are moved until nothing is left along the derivative of the products.
+    """
+    recording = il.read(str(REAL))
+    time = recording.columns["time"]
+    accel, gyro = (
+        {k: np.stack([recording.si(f"{sensor}_{a}_{k}") for a in "xyz"], 1) for k in (1, 3, 5, 7)}
+        for sensor in ("accel", "gyro")
+    )
+    rate = np.mean(list(gyro.values()), 0)
+    rate -= rate[:1200].mean(0)
+    fastest = np.max([np.abs(each).max(1) for each in gyro.values()], 0) > np.radians(1900)
+    use = np.flatnonzero(~np.convolve(fastest, np.ones(9), "same").astype(bool) & (time > 496) & (time < 596))
+    x, y, z = rate.T
+    products = np.column_stack([x * y, x * z, y * z, x * x, y * y, z * z])
+    slopes = np.zeros_like(products)
+    slopes[2:-2] = (products[4:] + products[3:-1] - products[1:-3] - products[:-4]) / (6 * 0.016)
+    splines = {k: make_interp_spline(time, readings, k=5) for k, readings in accel.items()}
+
+    def left_along_slope(late, axis, plus, minus, squares):
+        moved = {k: spline(time[use] + late) for k, spline in splines.items()}
+        force = (sum(moved[k] for k in plus) - sum(moved[k] for k in minus))[:, axis]
+        centripetal = slopes[:, squares].sum(1)
+        columns = [centripetal, *slopes[:, :3].T, *products.T]
+        design = np.column_stack([*(c[use] for c in columns), sum(moved.values()), np.ones(len(use))])
+        return np.linalg.lstsq(design, force, rcond=None)[0][0]
+
+    sides = ((0, (5, 7), (1, 3), [4, 5]), (1, (1, 5), (3, 7), [3, 5]))
+    late = np.mean([brentq(left_along_slope, 0, 5e-3, args=side) for side in sides])
+    record = il.calibrate_imus(recording, gravity=9.82).calibration
+    fitted = [imu.accel_latency.value - imu.gyro_latency.value for imu in imus_of(record).imus]
+    assert np.mean(fitted) == pytest.approx(late, abs=0.25e-3)
+    assert np.std(fitted) < 0.05e-3
