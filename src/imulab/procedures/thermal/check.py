@@ -41,7 +41,7 @@ from imulab.procedures.thermal.check_gyro import GyroCheck, check_gyros, gyro_fi
 from imulab.procedures.thermal.check_ramp import RampCheck, check_ramp
 from imulab.procedures.thermal.degrees import within_and_between
 from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepare_recordings
-from imulab.procedures.thermal.model import AXES, Laws, forces
+from imulab.procedures.thermal.model import AXES, forces
 from imulab.procedures.thermal.record import laws_in_g
 from imulab.procedures.thermal.schema import is_ramp, thermal_of
 from imulab.procedures.thermal.solve import ThermalProblem, linearise, row_covariance
@@ -421,7 +421,7 @@ def _run_tests(
         holds.mean / scale, holds.covariance / (scale[:, None] * scale), holds.temperature, np.zeros(len(holds)),
         holds.step, holds.shared, holds.recording, holds.group, tilt, np.zeros(3), wander=holds.wander,
     )  # fmt: skip
-    rows = linearise(problem, laws, coefficients, _mean_directions(problem, laws, coefficients))
+    rows = linearise(problem, laws, coefficients)
     excess = (fit.excess.value / g) ** 2
     of_scale = fit.between_recordings.scale_factor.value
     noise = row_covariance(rows, excess, np.zeros(2))
@@ -433,12 +433,3 @@ def _run_tests(
     residual_u = g * np.sqrt(np.diag(whole)[rows.magnitude])[order]
     force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
     return (g * rows.residual[rows.magnitude][order], residual_u, within, between), force
-
-
-def _mean_directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
-    """Return the mean direction of each unmoved group under the record, shape (G, 3)."""
-    force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
-    count = int(problem.group.max(initial=-1)) + 1
-    directions = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
-    return directions

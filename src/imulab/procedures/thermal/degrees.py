@@ -122,7 +122,7 @@ def judge_observability(solution: ThermalSolution) -> Observability:
 
 @dataclass(frozen=True)
 class Split:
-    """One temperature left out: its rows with their covariance V, and all others whitened.
+    """One temperature left out: its rows with their covariance V, and all others whitened, as their triangle R.
 
     `untold` are the columns of the spline's knot there, which fits to all other temperatures do not determine.
     """
@@ -143,13 +143,16 @@ def split_temperatures(solution: ThermalSolution, cluster: NDArray[np.int64]) ->
     whole[: len(solution.coefficients)] = solution.coefficients
     target = rows.jacobian @ whole - rows.residual
     at = np.where(rows.owner >= 0, cluster[rows.owner], -1)
+    white = whitener(rows, solution.excess**2, solution.scatter.tau)
+    covariance = row_covariance(rows, solution.excess**2, solution.scatter.tau)
     for number in range(1, int(cluster.max(initial=0))):
         jacobian, missing = _remove_knot(rows.jacobian, solution.laws, number)
-        train, test = at != number, (at == number) & rows.magnitude
-        white = whitener(rows.part(train), solution.excess**2, solution.scatter.tau)
-        test_weight = row_covariance(rows.part(test), solution.excess**2, solution.scatter.tau)
-        rest = white(jacobian[train]), white(target[train])
-        parts.append(Split(number, jacobian[test], target[test], test_weight, *rest, missing))
+        out, test = np.flatnonzero(at == number), (at == number) & rows.magnitude
+        test_weight = covariance[np.ix_(test, test)]
+        # A row is left out by an unknown of its own: the triangle below these unknowns is that of the other rows.
+        columns = np.column_stack([np.eye(len(at))[:, out], jacobian, target])
+        rest = np.asarray(np.linalg.qr(white(columns), mode="r"))[len(out) :, len(out) :]
+        parts.append(Split(number, jacobian[test], target[test], test_weight, rest[:, :-1], rest[:, -1], missing))
     return parts
 
 

@@ -521,10 +521,12 @@ def solve(
         white = whitener(rows, excess, scatter.tau)
         columns = white(rows.jacobian)
         size = np.linalg.norm(columns, axis=0)
-        if not size.min() > 0 or np.linalg.matrix_rank(columns / size, tol=_RANK * np.sqrt(len(size))) < len(size):
+        if not size.min() > 0 or not len(rows.residual) >= len(size):
             return None
-        step = np.linalg.lstsq(columns / size, white(rows.residual), rcond=None)[0] / size
-        coefficients = coefficients - step
+        step, _, _, values = np.linalg.lstsq(columns / size, white(rows.residual), rcond=None)
+        if not values[-1] > _RANK * np.sqrt(len(size)):
+            return None
+        coefficients = coefficients - step / size
         excess, freedom = fit_excess(rows, excess)
         if tau is None:
             scatter = fit_turn_on_scatter(rows, excess)

@@ -97,8 +97,8 @@ class Rows:
         )  # fmt: skip
 
 
-def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directions: Array) -> Rows:
-    """Return the rows at these coefficients; `directions` are those of the unmoved groups, shape (G, 3)."""
+def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Rows:
+    """Return the rows at these coefficients and the mean direction of each unmoved group there."""
     n, count = len(problem.reading), int(problem.recording.max(initial=0)) + 1
     parameters, design, drift, slope = evaluate_parameters(problem, laws, coefficients)
     force, change = forces(parameters, problem.reading)
@@ -110,6 +110,7 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, directio
     lengthening = 0.5 * (np.trace(noise, axis1=1, axis2=2) - along)
     by_heat = np.einsum("nij,nj->ni", change, slope)
     member = np.flatnonzero(problem.group >= 0)
+    directions = _mean_directions(force, problem.group)
     base, across = _frames(unit, directions, problem.group)
     basis = np.concatenate([unit[:, None, :], across], axis=1)  # (n, 3, 3): along, two across
     rows = np.concatenate([np.arange(n) * 3, (member[:, None] * 3 + np.array([1, 2])).ravel()])
@@ -167,6 +168,14 @@ def evaluate_parameters(problem: ThermalProblem, laws: Laws, coefficients: Array
     drift[:, range(3), range(1, 4)] = turn[:, None]
     parameters = design @ coefficients[:size] + drift @ lag_and_loops
     return parameters, design - lag_and_loops[0] * problem.rate[:, None, None] * slopes, drift, slope
+
+
+def _mean_directions(force: Array, group: NDArray[np.int64]) -> Array:
+    """Return the mean direction of the forces of each group, shape (G, 3)."""
+    means = [force[group == k].mean(axis=0) for k in range(int(group.max(initial=-1)) + 1)]
+    directions: Array = np.array(means).reshape(-1, 3)
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    return directions
 
 
 def _frames(unit: Array, directions: Array, group: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -373,16 +382,16 @@ def solve(problem: ThermalProblem, laws: Laws, *, tau: float | None = None) -> T
     still = replace(problem, free=())
     coefficients = _start(still, laws)
     if problem.free:  # the derivative by a lag is the slope of laws, which must be fitted first
-        begun = _mean_directions(still, laws, coefficients)
+        begun = linearise(still, laws, coefficients)
         coefficients = _iterate(still, laws, coefficients, begun, _LOOSE**2, np.zeros(2), 1e-6)[0]
         coefficients = np.append(coefficients, np.zeros(len(problem.free)))
-    directions = _mean_directions(problem, laws, coefficients)
+    rows = linearise(problem, laws, coefficients)
     excess, excess_freedom, scatter, converged = 0.0, np.inf, Scatter(), False
     if tau is not None:
         scatter = Scatter(np.array([tau, 0.0]))
     for number in range(_PASSES):
-        coefficients, directions, rows, converged = _iterate(
-            problem, laws, coefficients, directions, excess, scatter.tau, _RESTS if number else 1e-6
+        coefficients, rows, converged = _iterate(
+            problem, laws, coefficients, rows, excess, scatter.tau, _RESTS if number else 1e-6
         )
         if not converged:
             break
@@ -417,10 +426,9 @@ def _start(problem: ThermalProblem, laws: Laws) -> Array:
     """Return the coefficients to start from: those of a fit with constant parameters."""
     flat = replace(laws, degrees=(0, 0, 0), knots=())
     start = nominal(flat, problem.zero)
-    start, _, _, _ = _iterate(
-        problem, flat, start, _mean_directions(problem, flat, start), _LOOSE**2, np.zeros(2), 1e-3
+    return laws.constant(
+        _iterate(problem, flat, start, linearise(problem, flat, start), _LOOSE**2, np.zeros(2), 1e-3)[0]
     )
-    return laws.constant(start)
 
 
 def nominal(laws: Laws, zero: Array) -> Array:
@@ -428,39 +436,26 @@ def nominal(laws: Laws, zero: Array) -> Array:
     return laws.constant(np.concatenate([zero, np.ones(3), np.zeros(3)]))
 
 
-def _mean_directions(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Array:
-    """Return the mean direction of each unmoved group at these coefficients, shape (G, 3)."""
-    count = int(problem.group.max(initial=-1)) + 1
-    if not count:
-        return np.empty((0, 3))
-    force, _ = forces(evaluate_parameters(problem, laws, coefficients)[0], problem.reading)
-    directions = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
-    return directions
-
-
 def _iterate(
     problem: ThermalProblem,
     laws: Laws,
     coefficients: Array,
-    directions: Array,
+    rows: Rows,
     excess: float,
     tau: Array,
     tolerance: float,
-) -> tuple[Array, Array, Rows, bool]:
-    """Return coefficients, directions and rows after Gauss-Newton steps with fixed V, and whether they converged."""
-    rows = linearise(problem, laws, coefficients, directions)
+) -> tuple[Array, Rows, bool]:
+    """Return coefficients and rows after Gauss-Newton steps with fixed V, and whether they converged."""
     for _ in range(_STEPS):
         white = whitener(rows, excess, tau)
         jacobian = white(rows.jacobian)
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
         step = -np.linalg.lstsq(jacobian / scale, white(rows.residual), rcond=1e-11)[0] / scale
         coefficients = coefficients + step[: len(coefficients)]
-        directions = _mean_directions(problem, laws, coefficients)
-        rows = linearise(problem, laws, coefficients, directions)
+        rows = linearise(problem, laws, coefficients)
         if np.abs(step[: laws.size]).max() < tolerance:
-            return coefficients, directions, rows, True
-    return coefficients, directions, rows, False
+            return coefficients, rows, True
+    return coefficients, rows, False
 
 
 def fit_excess(rows: Rows, excess: float) -> tuple[float, float]:
@@ -486,10 +481,10 @@ def fit_turn_on_scatter(rows: Rows, excess: float) -> Scatter:
     modes of offsets beside the laws, s_k their singular values.
     """
     white = whitener(rows, excess, np.zeros(2))
-    residual, laws = white(rows.residual), white(rows.jacobian)
-    bias, scale = (white(columns) for columns in rows.offsets)
-    s, force = offset_modes(np.hstack([laws, bias]), scale, residual)
-    second, probability = 0.0, None
+    residual, laws, bias = white(rows.residual), white(rows.jacobian), white(rows.offsets[0])
+    s, force, second, probability = np.empty(0), np.empty(0), 0.0, None
+    if rows.offsets[1].any():  # gyroscopes have none
+        s, force = offset_modes(np.hstack([laws, bias]), white(rows.offsets[1]), residual)
     if len(s):
         probability = chi_square_probability(float((force**2).sum()), len(s))
         if probability < SCALES_SCATTER_BETWEEN_CYCLES.level:
