@@ -13,6 +13,7 @@ from scipy.stats import chi2
 
 import imulab as il
 from imulab.errors import DataError, OptionError
+from imulab.estimation import _allan
 from imulab.estimation.column_noise import analyse, columns_noise, noise_lines
 from imulab.estimation.noise.simulate import simulated
 from imulab.estimation.noise_coefficients import allan_deviation
@@ -33,6 +34,12 @@ def test_it_equals_allantools(count, taus):
     np.testing.assert_allclose(mine.tau, peer_taus[: len(mine.tau)], rtol=1e-15)
     np.testing.assert_allclose(mine.deviation, peer[: len(mine.tau)], rtol=1e-12)
     assert len(peer_taus) - len(mine.tau) <= 1
+
+
+@pytest.mark.parametrize(("sums", "lags"), [(1, [0]), (1, [51]), (2, [1])])
+def test_sums_of_lags_that_samples_do_not_have_are_refused(sums, lags):
+    with pytest.raises(ValueError, match="do not go together"):
+        _allan.fill_squares(np.empty(sums), np.zeros(100), np.array(lags))
 
 
 def test_dense_taus_are_24_a_decade_and_contain_those_of_allantools():

@@ -15,6 +15,7 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError
 from imulab.estimation import TAUS
+from imulab.estimation._allan import fill_squares
 from imulab.estimation.decisions import NOISE_MODEL_REJECTED
 from imulab.estimation.noise.analysis import Analysis, average, intervals_of
 from imulab.estimation.noise.spectrum import frequencies
@@ -25,7 +26,6 @@ from imulab.recording import Array, release
 # Allan deviation.
 
 
-_CHUNK = 1 << 14  # samples whose differences are squared at once: they stay in the processor's cache
 _DENSE_PER_DECADE = 24  # averaging times in a decade of a dense curve, 10 % apart
 _FEWEST = 3  # samples: an Allan variance needs two neighbouring means, and one more for a second pair
 
@@ -100,7 +100,8 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
     np.add.accumulate(centred, out=centred)
     integral *= 1 / rate
     counts = _averages(len(integral), rate, taus)
-    squares = np.array([_square(integral, m) for m in counts.tolist()])
+    squares = np.empty(len(counts))
+    fill_squares(squares, integral, counts)
     variance = squares / (2.0 * (len(integral) - 2 * counts)) / counts.astype(np.float64) ** 2 * rate**2
     freedom = _freedom(len(integral), counts, variance)
     deviation = np.sqrt(variance)
@@ -127,21 +128,6 @@ def _averages(length: int, rate: float, taus: str | Array) -> np.ndarray:
     if not counts.size:
         raise OptionError(f"taus: expected averaging times from {1 / rate:g} s to {most / rate:g} s")
     return counts
-
-
-def _square(integral: Array, m: int) -> float:
-    """Return the sum of squared second differences at lag m, computed in pieces that stay in the cache."""
-    count = len(integral) - 2 * m
-    buffer = np.empty(min(_CHUNK, count))
-    total = []
-    for start in range(0, count, _CHUNK):
-        stop = min(start + _CHUNK, count)
-        piece = buffer[: stop - start]
-        np.multiply(integral[start + m : stop + m], -2.0, out=piece)
-        piece += integral[start + 2 * m : stop + 2 * m]
-        piece += integral[start:stop]
-        total.append(float(np.einsum("i,i", piece, piece)))  # not BLAS, whose threads cost more than they save here
-    return math.fsum(total)
 
 
 def _freedom(length: int, counts: np.ndarray, variance: Array) -> Array:

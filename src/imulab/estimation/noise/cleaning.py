@@ -52,8 +52,14 @@ class LevelChange:
     standard_uncertainty: float
 
 
-def spikes_removed(samples: Array) -> tuple[Array, int]:
-    """Return samples, shape (n,), with spikes replaced, and the number of spikes.
+def block_medians(samples: Array) -> Array:
+    """Return the medians of blocks of 50 samples, shape (n // 50,)."""
+    count = len(samples) // _BLOCK
+    return medians(samples[: count * _BLOCK].reshape(count, _BLOCK))
+
+
+def spikes_removed(samples: Array, level: Array) -> tuple[Array, int]:
+    """Return samples, shape (n,), with spikes replaced, and the number of spikes; `level` are their `block_medians`.
 
     A spike is more than 6 sigma off the line through medians of 50 samples, with sigma from the 95 % of the deviations
     of the 65,536 samples around it: 4 % of spikes do not change it. Samples that hardly ever change have no spikes.
@@ -62,14 +68,13 @@ def spikes_removed(samples: Array) -> tuple[Array, int]:
     --------
     >>> x = np.random.default_rng(1).standard_normal(1000)
     >>> x[500] = 20.0
-    >>> cleaned, count = spikes_removed(x)
+    >>> cleaned, count = spikes_removed(x, block_medians(x))
     >>> count, bool(abs(cleaned[500]) < 1)
     (1, True)
     """
-    blocks = len(samples) // _BLOCK
+    blocks = len(level)
     if blocks < 4:
         return samples, 0
-    level = medians(samples[: blocks * _BLOCK].reshape(blocks, _BLOCK))
     # Lines join the middles of neighbouring blocks; the outer ones are extended.
     rise = np.diff(level)
     share = (np.arange(_BLOCK) + 0.5) / _BLOCK
@@ -95,19 +100,18 @@ def spikes_removed(samples: Array) -> tuple[Array, int]:
     return cleaned, count
 
 
-def knocks_removed(samples: Array) -> tuple[Array, NDArray[np.int64]]:
+def knocks_removed(samples: Array, level: Array) -> tuple[Array, NDArray[np.int64]]:
     """Return samples, shape (n,), with knocks replaced by straight lines, and the knocks' first and last + 1, (k, 2).
 
-    A knock is a block of 50 samples whose median is 6 sigma off the median of the 21 blocks around it, or with ten
-    samples farther from that than three times what nineteen of twenty blocks have; half a block on both sides belongs
-    to it. Where more than 5 % of all blocks are knocked, none is replaced.
+    `level` are their `block_medians`. A knock is a block of 50 samples whose median is 6 sigma off the median of the 21
+    blocks around it, or with ten samples farther from that than three times what nineteen of twenty blocks have; half a
+    block on both sides belongs to it. Where more than 5 % of all blocks are knocked, none is replaced.
     """
-    count = len(samples) // _BLOCK
+    count = len(level)
     none = np.empty((0, 2), dtype=np.int64)
     if count < _FEWEST_BLOCKS:
         return samples, none
     blocks = samples[: count * _BLOCK].reshape(count, _BLOCK)
-    level = medians(blocks)
     far = np.partition(np.abs(blocks - level[:, None]), _BLOCK - _FIFTH, axis=1)[:, _BLOCK - _FIFTH]
     around = np.lib.stride_tricks.sliding_window_view(np.pad(level, _AROUND // 2, mode="reflect"), _AROUND)
     off = np.abs(level - medians(around))
@@ -248,9 +252,9 @@ def find_steps(
         Limit of ``|z|``.
     """
     steps: list[LevelChange] = []
-    c = slow
+    c, places = slow, _places_of_steps(variances, count)
     while len(steps) < _MOST_STEPS:
-        place, size, u = _largest_step(c, variances, count)
+        place, size, u = _largest_step(c, places, count)
         if not abs(size) > limit * u:
             break
         steps.append(LevelChange(place * interval, size, u))
@@ -264,18 +268,22 @@ def step_coefficients(many: int, place: float, count: int) -> Array:
     return np.asarray(-np.sqrt(2 / count) * np.sin(np.pi * j * place / count) / (2 * np.sin(np.pi * j / (2 * count))))
 
 
-def _largest_step(c: Array, variances: Array, count: int) -> tuple[float, float, float]:
-    """Return place, size and uncertainty of the step with the largest z, with all places tried by two transforms."""
+def _places_of_steps(variances: Array, count: int) -> tuple[int, Array, Array]:
+    """Return in how many intervals places are tried, ``1/(lambda_j s_j)``, and ``1/u^2`` of the size at each place."""
     # The spacing of places is that of the highest coefficient, but no finer than the samples.
-    grid = len(c) + 1 if len(c) + 1 >= count else 1 << (len(c)).bit_length()
+    grid = len(variances) + 1 if len(variances) + 1 >= count else 1 << (len(variances)).bit_length()
     grid = min(grid, count)
-    used = c[: grid - 1]
-    s = 2 * np.sin(np.pi * np.arange(1, len(used) + 1) / (2 * count))
+    s = 2 * np.sin(np.pi * np.arange(1, min(len(variances), grid - 1) + 1) / (2 * count))
+    weight = 1 / variances[: len(s)] / s
+    return grid, weight, (np.sum(weight / s) - _cosines(weight / s, grid)) / count
+
+
+def _largest_step(c: Array, places: tuple[int, Array, Array], count: int) -> tuple[float, float, float]:
+    """Return place, size and uncertainty of the step with the largest z, with all places tried by a transform."""
+    grid, weight, information = places
     padded = np.zeros(2 * grid)
-    padded[1 : 1 + len(used)] = used / variances[: len(used)] / s
+    padded[1 : 1 + len(weight)] = c[: len(weight)] * weight
     score = np.sqrt(2 / count) * np.fft.rfft(padded).imag[1:grid]  # minus the sums of sines
-    weight = 1 / variances[: len(used)] / s**2
-    information = (weight.sum() - _cosines(weight, grid)) / count
     z = np.abs(score) / np.sqrt(np.maximum(information, 1e-300))
     beside = math.ceil(_BLOCK * grid / count)  # places as near to an end as a spike or knock is long are no level
     if 2 * beside < len(z):

@@ -13,7 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.noise.cleaning import Line, knocks_removed, line_groups, spikes_removed, strong_lines_removed
+from imulab.estimation.noise.cleaning import (
+    Line,
+    block_medians,
+    knocks_removed,
+    line_groups,
+    spikes_removed,
+    strong_lines_removed,
+)
 from imulab.estimation.rows import distinct
 from imulab.recording import Array
 
@@ -241,9 +248,10 @@ class Accumulator:
     def _cleaned(self, samples: Array) -> Array:
         if not self._despike:
             return samples
-        samples, knocks = knocks_removed(samples)
+        level = block_medians(samples)
+        without, knocks = knocks_removed(samples, level)
         self._knocks.append(knocks + self._stretches * STRETCH)
-        samples, count = spikes_removed(samples)
+        samples, count = spikes_removed(without, level if without is samples else block_medians(without))
         self._spikes += count
         return samples
 
@@ -276,13 +284,16 @@ class Accumulator:
         if not len(self._means):
             self._means = np.empty(_MEANS)
         if self._filled + len(samples) // self._averaged > _MEANS:
-            half = self._means[: self._filled].reshape(-1, 2).mean(axis=1)
-            self._filled = len(half)
-            self._means[: len(half)] = half
+            self._filled //= 2
+            self._means[: self._filled] = 0.5 * (
+                self._means[: 2 * self._filled : 2] + self._means[1 : 2 * self._filled : 2]
+            )
             self._averaged *= 2
         count = len(samples) // self._averaged
-        part = samples[: count * self._averaged].reshape(count, self._averaged)
-        self._means[self._filled : self._filled + count] = part.mean(axis=1)
+        part = samples[: count * self._averaged]
+        while len(part) > count:
+            part = 0.5 * (part[::2] + part[1::2])
+        self._means[self._filled : self._filled + count] = part
         self._filled += count
 
     def _two_parts(self) -> Stretch:
