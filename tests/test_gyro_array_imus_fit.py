@@ -27,9 +27,11 @@ from imulab.procedures.gyro_array.imus.model import (
     POSITION,
     Board,
 )
+from imulab.procedures.gyro_array.imus.prepare import prepare
 from imulab.procedures.gyro_array.imus.record import record_values
 from imulab.procedures.gyro_array.imus.schema import imus_of
 from imulab.procedures.gyro_array.imus.size import by_gravity
+from imulab.procedures.gyro_array.imus.solve import Weights, _Problem
 
 G = 9.80665
 REAL = Path(os.environ.get("IMULAB_DATA", "shared/data")) / "mimu4444" / "exp_1.bin"
@@ -352,6 +354,63 @@ def test_falls_alone_tell_the_scale_as_their_instants_do():
         stated.append(factor.u)
     assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
     assert 2e-3 < np.mean(stated) < 6e-3
+
+
+# The equations, against dense ones from differences of the model as it is written.
+
+
+def written_model(numbers, motion):
+    """Return what one sample reads, accelerometers then gyroscopes, IMU by IMU, shape (6 K,)."""
+    s, al, w = motion.reshape(3, 3)
+    accel = [n[0:9].reshape(3, 3) @ (s + np.cross(w, np.cross(w, n[12:15])) + np.cross(al, n[12:15])) for n in numbers]
+    gyro = [n[16:25].reshape(3, 3) @ w + n[25:28] for n in numbers]
+    return np.concatenate([*(a + n[9:12] for a, n in zip(accel, numbers, strict=True)), *gyro])
+
+
+def differences(function, at):
+    steps = 1e-5 * np.maximum(1.0, np.abs(at))
+    return np.stack(
+        [(function(at + e) - function(at - e)) / (2 * h) for h, e in zip(steps, np.diag(steps), strict=True)], axis=1
+    )
+
+
+def test_equations_are_those_of_dense_least_squares():
+    prepared = prepare(a_board(duration="6 s", attitudes=1), G)
+    n, numbers, motion = 60, prepared.start.numbers, prepared.motion[:60]
+    measured = replace(prepared.measured, time=prepared.measured.time[:n], first=prepared.measured.first[:1])
+    rng = np.random.default_rng(3)
+    accel_weight, gyro_weight = rng.uniform(1, 3, (2, n))
+    weights = Weights(accel_weight, gyro_weight, np.ones(1), 0.3e-3)
+    problem = _Problem(measured, [])
+    readings = measured.at(prepared.start)
+    total, scores = problem.equations(prepared.start, motion, readings, weights)
+    change = problem.changes(motion)
+    dense, right = np.zeros((87, 87)), np.zeros(87)
+    for i in range(n):
+        h = differences(lambda x: written_model(numbers, x), motion[i])
+        j = differences(lambda x, sample=motion[i]: written_model(x.reshape(3, 29), sample), numbers.ravel())
+        for k in range(3):  # by the latencies: the readings move backwards in time
+            j[3 * k : 3 * k + 3, 29 * k + 15] = -h[3 * k : 3 * k + 3] @ change[i]
+            j[9 + 3 * k : 12 + 3 * k, 29 * k + 28] = -h[9 + 3 * k : 12 + 3 * k] @ change[i]
+        e = np.concatenate([readings[0][i].ravel(), readings[1][i].ravel()]) - written_model(numbers, motion[i])
+        covariance = np.diag(
+            np.concatenate([(accel_weight[i] * measured.accel_noise) ** 2, (gyro_weight[i] * measured.gyro_noise) ** 2])
+            .reshape(-1)
+        )  # fmt: skip
+        for k in range(9, 18, 3):
+            old = 0.3e-3 * h[k : k + 3, 6:9] @ motion[i, 3:6]
+            covariance[k : k + 3, k : k + 3] += np.outer(old, old)
+        inverse = np.linalg.inv(covariance)
+        m = h.T @ inverse @ h + np.diag([0] * 3 + [1e-6] * 3 + [0] * 3)
+        g = h.T @ inverse @ j
+        dense += j.T @ inverse @ j - g.T @ np.linalg.solve(m, g)
+        right += j.T @ inverse @ e - g.T @ np.linalg.solve(m, h.T @ inverse @ e)
+    size = np.sqrt(np.abs(np.outer(np.diag(dense), np.diag(dense)))) + 1e-12
+    assert np.abs((total.sum(0) - dense) / size).max() < 1e-4
+    assert (
+        np.abs((scores.sum(0) - right) / np.sqrt(np.diag(size))).max()
+        < 1e-3 * np.abs(right / np.sqrt(np.diag(size))).max()
+    )
 
 
 # Many trials, and a real board.

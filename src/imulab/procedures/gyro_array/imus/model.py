@@ -80,10 +80,11 @@ def predicted(board: Board, motion: Array) -> tuple[Array, Array, Array]:
 
     `motion` has s, al, w of each sample, shape (n, 9).
     """
-    by_lever = np.einsum("nij,kj->nki", lever(motion[:, RATE], motion[:, ACCELERATION]), board.position)
-    force = motion[:, None, FORCE] + by_lever
-    accel = np.einsum("kij,nkj->nki", board.accel, force) + board.accel_bias
-    gyro = np.einsum("kij,nj->nki", board.gyro, motion[:, RATE]) + board.gyro_bias
+    shape = (len(motion), len(board.numbers), 3)
+    by_lever = lever(motion[:, RATE], motion[:, ACCELERATION]) @ board.position.T
+    force = motion[:, None, FORCE] + np.swapaxes(by_lever, 1, 2)
+    accel = np.matmul(force.swapaxes(0, 1), board.accel.swapaxes(1, 2)).swapaxes(0, 1) + board.accel_bias
+    gyro = (motion[:, RATE] @ board.gyro.reshape(-1, 3).T).reshape(shape) + board.gyro_bias
     return force, accel, gyro
 
 
@@ -92,14 +93,15 @@ def motion_jacobian(board: Board, motion: Array) -> tuple[Array, Array]:
 
     ``d(W^2 r)/dw = (w.r) I + w r' - 2 r w'``; ``d([al]x r)/d al = -[r]x``.
     """
-    rate, r = motion[:, RATE], board.position
-    force = np.empty((len(motion), len(r), 3, 9))
-    force[..., FORCE] = np.eye(3)
-    force[..., ACCELERATION] = -cross(r)
-    along = np.einsum("nj,kj->nk", rate, r)[:, :, None, None] * np.eye(3)
-    w_r = rate[:, None, :, None] * r[None, :, None, :]
-    force[..., RATE] = along + w_r - 2 * np.swapaxes(w_r, 2, 3)
-    return np.matmul(board.accel, force), board.gyro
+    r, unit = board.position, np.eye(3)
+    accel = np.empty((len(motion), len(r), 3, 9))
+    accel[..., FORCE] = board.accel
+    accel[..., ACCELERATION] = board.accel @ -cross(r)
+    # By w it is linear in w: of each component of w, shape (3, K, 3, 3).
+    along, w_r = r.T[:, :, None, None] * unit, unit[:, None, :, None] * r[None, :, None, :]
+    by_rate = np.matmul(board.accel, along + w_r - 2 * np.swapaxes(w_r, 2, 3))
+    accel[..., RATE] = (motion[:, RATE] @ by_rate.reshape(3, -1)).reshape(len(motion), len(r), 3, 3)
+    return accel, board.gyro
 
 
 def board_jacobian(board: Board, motion: Array, change: Array) -> tuple[Array, Array]:
@@ -114,13 +116,14 @@ def board_jacobian(board: Board, motion: Array, change: Array) -> tuple[Array, A
     each = rate[:, :, None] * slope[:, None, :]
     turning = each + np.swapaxes(each, 1, 2) - 2 * np.einsum("nj,nj->n", rate, slope)[:, None, None] * np.eye(3)
     turning += cross(change[:, ACCELERATION])
-    force_change = change[:, None, FORCE] + np.einsum("nij,kj->nki", turning, board.position)
+    force_change = change[:, None, FORCE] + np.swapaxes(turning @ board.position.T, 1, 2)
     accel, gyro = np.zeros((n, count, 3, 16)), np.zeros((n, count, 3, 13))
     for row in range(3):
         accel[:, :, row, 3 * row : 3 * row + 3] = force
         gyro[:, :, row, 3 * row : 3 * row + 3] = rate[:, None]
         accel[:, :, row, 9 + row] = gyro[:, :, row, 9 + row] = 1.0
     accel[..., POSITION] = np.matmul(board.accel, lever(rate, motion[:, ACCELERATION])[:, None])
-    accel[..., ACCEL_LATENCY] = -np.einsum("kij,nkj->nki", board.accel, force_change)
-    gyro[..., 12] = -np.einsum("kij,nj->nki", board.gyro, slope)
+    by_time = np.matmul(force_change.swapaxes(0, 1), board.accel.swapaxes(1, 2))
+    accel[..., ACCEL_LATENCY] = -by_time.swapaxes(0, 1)
+    gyro[..., 12] = -(slope @ board.gyro.reshape(-1, 3).T).reshape(n, count, 3)
     return accel, gyro

@@ -11,6 +11,7 @@ accelerometers and gyroscopes apart. The covariance is the larger of S^-1 and a 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -45,7 +46,8 @@ PRIOR[ACCEL], PRIOR[ACCEL_BIAS], PRIOR[POSITION], PRIOR[ACCEL_LATENCY] = 0.05, 0
 PRIOR[GYRO], PRIOR[25:28], PRIOR[GYRO_LATENCY] = 0.05, np.inf, 0.01
 _LENGTH = 1e-4  # m/s^2, by which |s| at rest may differ from gravity
 _AT_ONCE = 1 << 22  # numbers of the largest array of a part of the samples
-_STEPS, _AFTER = 5, 2  # Gauss-Newton steps at first, and after each new set of weights
+_STEPS, _LAST = 5, 4  # Gauss-Newton steps at most, at first and with the last weights; one with those between
+_SMALL = 1.0  # squared length of a step, in standard deviations, that the next divides by a hundred or more
 _REWEIGHTED = 3
 _ACCELERATION = 1e3  # rad/s^2, standard deviation of each sample's
 _SAME_SIZE = 1e-5  # of the mean scale factor, between halves of one motion
@@ -203,6 +205,41 @@ def common_accel(measured: Measured) -> list[Array]:
     return [*rows[::2], *rows[1::2]]
 
 
+@dataclass(frozen=True)
+class _Rows:
+    """Whitened rows of some samples.
+
+    Attributes
+    ----------
+    accel_scale, gyro_scale
+        What whitens them: scales, shape (n, K, 3), and matrices, shape (n, K, 3, 3).
+    by_accel, by_gyro
+        H of the accelerometers by s, al, w, shape (n, 3 K, 9), and of the gyroscopes by w, shape (n, 3 K, 3).
+    accel, gyro
+        Residuals, shape (n, 3 K).
+    """
+
+    accel_scale: Array
+    gyro_scale: Array
+    by_accel: Array
+    by_gyro: Array
+    accel: Array
+    gyro: Array
+
+    def normal(self) -> Array:
+        """Return M = H'H; IMUs in one line do not tell the angular acceleration about that line."""
+        matrix = self.by_accel.swapaxes(1, 2) @ self.by_accel
+        matrix[:, RATE, RATE] += self.by_gyro.swapaxes(1, 2) @ self.by_gyro
+        matrix[:, ACCELERATION, ACCELERATION] += np.eye(3) / _ACCELERATION**2
+        return np.asarray(matrix)
+
+    def score(self) -> Array:
+        """Return v = H'e, shape (n, 9)."""
+        v = (self.accel[:, None] @ self.by_accel)[:, 0]
+        v[:, RATE] += (self.gyro[:, None] @ self.by_gyro)[:, 0]
+        return np.asarray(v)
+
+
 class _Problem:
     """Residuals and derivatives of a board at its samples, whitened."""
 
@@ -234,70 +271,64 @@ class _Problem:
     def samples(self, board: Board, motion: Array, readings: tuple[Array, Array], weights: Weights) -> Array:
         """Return the motion after a Newton step of each sample."""
         moved = motion.copy()
-        for part in self._parts(1):
-            accel, gyro = self.whitened(board, motion, weights, part)
-            h, e = self._by_motion(board, motion[part], (readings[0][part], readings[1][part]), accel, gyro)
-            moved[part] += np.linalg.solve(_normal(h), np.einsum("nri,nr->ni", h, e)[..., None])[..., 0]
+        for part, _ in self._parts():
+            rows = self._by_motion(board, motion, readings, weights, part)
+            moved[part] += np.linalg.solve(rows.normal(), rows.score()[..., None])[..., 0]
         return moved
 
     def _by_motion(
-        self, board: Board, motion: Array, readings: tuple[Array, Array], accel: Array, gyro: Array
-    ) -> tuple[Array, Array]:
-        """Return the whitened derivatives by the motion, shape (n, 6 K, 9), and residuals, shape (n, 6 K)."""
-        n, count = len(motion), self.measured.count
-        _, its_accel, its_gyro = predicted(board, motion)
-        by_accel, by_gyro = motion_jacobian(board, motion)
-        h = np.zeros((n, 2, count, 3, 9))
-        h[:, 0] = by_accel * accel[..., None]
-        h[:, 1, :, :, RATE] = gyro @ by_gyro
-        e = np.empty((n, 2, count, 3))
-        e[:, 0] = (readings[0] - its_accel) * accel
-        e[:, 1] = np.einsum("nkij,nkj->nki", gyro, readings[1] - its_gyro)
-        return h.reshape(n, 6 * count, 9), e.reshape(n, 6 * count)
+        self, board: Board, motion: Array, readings: tuple[Array, Array], weights: Weights, part: slice
+    ) -> _Rows:
+        n, count = part.stop - part.start, self.measured.count
+        accel, gyro = self.whitened(board, motion, weights, part)
+        _, its_accel, its_gyro = predicted(board, motion[part])
+        by_accel, by_gyro = motion_jacobian(board, motion[part])
+        by_accel *= accel[..., None]
+        return _Rows(
+            accel, gyro, by_accel.reshape(n, 3 * count, 9), (gyro @ by_gyro).reshape(n, 3 * count, 3),
+            ((readings[0][part] - its_accel) * accel).reshape(n, 3 * count),
+            (gyro @ (readings[1][part] - its_gyro)[..., None]).reshape(n, 3 * count),
+        )  # fmt: skip
 
     def equations(
         self, board: Board, motion: Array, readings: tuple[Array, Array], weights: Weights
     ) -> tuple[Array, Array]:
-        """Return S of two halves, shape (2, 29 K, 29 K), and q of STRETCHES parts of the motion, without priors."""
+        """Return S of two halves, shape (2, 29 K, 29 K), and q of STRETCHES parts of the motion, without priors.
+
+        The gyroscopes read w alone, the last of a sample's unknowns: with M = L L', their columns of L^-1 G have three
+        rows, not nine.
+        """
         count = self.measured.count
-        size = NUMBERS * count
-        total, scores = np.zeros((2, size, size)), np.zeros((STRETCHES, size))
+        across = [np.zeros((2, a * count, b * count)) for a, b in ((16, 16), (16, 13), (13, 13))]
+        own = [np.zeros((2, count, size, size)) for size in (16, 13)]
+        scores = np.zeros((STRETCHES, count, NUMBERS))
         change = self.changes(motion)
-        stretch = np.arange(len(motion)) * STRETCHES // max(len(motion), 1)
-        diagonal = np.zeros((2, count, NUMBERS, NUMBERS))
-        for part in self._parts(count):
-            accel, gyro = self.whitened(board, motion, weights, part)
-            h, e = self._by_motion(board, motion[part], (readings[0][part], readings[1][part]), accel, gyro)
-            by_accel, by_gyro = board_jacobian(board, motion[part], change[part])
-            by_accel *= accel[..., None]
-            by_gyro = gyro @ by_gyro
-            n, half = len(h), int(part.start >= len(motion) // 2)
-            by_sensor, off = h.reshape(n, 2, count, 3, 9), e.reshape(n, 2, count, 3)
-            g = np.empty((n, 9, count, NUMBERS))
-            g[..., OF_ACCEL] = np.swapaxes(by_sensor[:, 0].swapaxes(2, 3) @ by_accel, 1, 2)
-            g[..., OF_GYRO] = np.swapaxes(by_sensor[:, 1].swapaxes(2, 3) @ by_gyro, 1, 2)
-            for k in range(count):
-                for columns, by_board in ((OF_ACCEL, by_accel), (OF_GYRO, by_gyro)):
-                    rows = by_board[:, k].reshape(3 * n, -1)
-                    diagonal[half, k, columns, columns] += rows.T @ rows
-            lower = np.linalg.cholesky(_normal(h))
-            inverse = np.linalg.inv(lower)
-            z = (inverse @ g.reshape(n, 9, size)).reshape(9 * n, size)
-            total[half] -= z.T @ z
-            score = np.concatenate(
-                [
-                    np.einsum("nkri,nkr->nki", by_accel, off[:, 0]),
-                    np.einsum("nkri,nkr->nki", by_gyro, off[:, 1]),
-                ],
-                axis=2,
-            ).reshape(n, size)
-            across = np.einsum("nij,nj->ni", inverse, np.einsum("nri,nr->ni", h, e))
-            score -= np.einsum("ni,nij->nj", across, z.reshape(n, 9, size))
-            np.add.at(scores, stretch[part], score)
-        for k in range(count):
-            each = slice(k * NUMBERS, (k + 1) * NUMBERS)
-            total[:, each, each] += diagonal[:, k]
-        return total, scores
+        for part, stretch in self._parts():
+            half = 2 * stretch // STRETCHES
+            rows = self._by_motion(board, motion, readings, weights, part)
+            n = part.stop - part.start
+            inverse = np.linalg.inv(np.linalg.cholesky(rows.normal()))
+            step = inverse.swapaxes(1, 2) @ (inverse @ rows.score()[..., None])
+            left = (rows.accel - (rows.by_accel @ step)[..., 0], rows.gyro - (rows.by_gyro @ step[:, RATE])[..., 0])
+            by_board = board_jacobian(board, motion[part], change[part])
+            by_board = by_board[0] * rows.accel_scale[..., None], rows.gyro_scale @ by_board[1]
+            z = []
+            for k, (mine, h, lower) in enumerate(
+                zip(by_board, (rows.by_accel, rows.by_gyro), (inverse, inverse[:, RATE, RATE]), strict=True)
+            ):
+                columns, size = (OF_ACCEL, OF_GYRO)[k], mine.shape[-1]
+                turned = (lower @ h.swapaxes(1, 2)).reshape(n, len(lower[0]), count, 3).swapaxes(1, 2)
+                z.append((turned @ mine).swapaxes(1, 2).reshape(n, -1, size * count))
+                by_imu = mine.swapaxes(0, 1).reshape(count, 3 * n, size)
+                own[k][half] += by_imu.swapaxes(1, 2) @ by_imu
+                off = left[k].reshape(n, count, 3).swapaxes(0, 1).reshape(count, 3 * n, 1)
+                scores[stretch, :, columns] += (by_imu.swapaxes(1, 2) @ off)[..., 0]
+            last = z[0][:, RATE].reshape(3 * n, -1)
+            whole, gyro = z[0].reshape(9 * n, -1), z[1].reshape(3 * n, -1)
+            across[0][half] += whole.T @ whole
+            across[1][half] += last.T @ gyro
+            across[2][half] += gyro.T @ gyro
+        return _assembled(across, own), scores.reshape(STRETCHES, -1)
 
     def at_rest(self, board: Board, force: Array, weights: Weights) -> tuple[Array, Array, Array]:
         """Return S and q of the rests, and the force at each after a Newton step, shape (rests, 3)."""
@@ -351,13 +382,13 @@ class _Problem:
             pull += held.row * (held.value - float(held.row @ board.numbers.ravel())) / held.u**2
         return information, pull
 
-    def _parts(self, count: int) -> Iterator[slice]:
-        """Yield the samples in parts, none of which reaches over the middle."""
-        size = max(16, _AT_ONCE // (9 * NUMBERS * max(count, self.measured.count)))
-        n = len(self.measured.time)
-        for begin, end in ((0, n // 2), (n // 2, n)):
+    def _parts(self) -> Iterator[tuple[slice, int]]:
+        """Yield the samples in parts, none of which reaches beyond the stretch that is yielded with it."""
+        size = max(16, _AT_ONCE // (9 * NUMBERS * self.measured.count))
+        edges = (np.arange(STRETCHES + 1) * len(self.measured.time) // STRETCHES).tolist()
+        for stretch, (begin, end) in enumerate(itertools.pairwise(edges)):
             for start in range(begin, end, size):
-                yield slice(start, min(start + size, end))
+                yield slice(start, min(start + size, end)), stretch
 
     def weights(self, board: Board, motion: Array, readings: tuple[Array, Array], force: Array) -> Weights:
         """Return how much noisier than at rest each sample is, after the age of the readings is accounted for."""
@@ -386,11 +417,19 @@ class _Problem:
         )
 
 
-def _normal(h: Array) -> Array:
-    """Return M = H'H of each sample; IMUs in one line do not tell the angular acceleration about that line."""
-    matrix = h.swapaxes(1, 2) @ h
-    matrix[:, ACCELERATION, ACCELERATION] += np.eye(3) / _ACCELERATION**2
-    return np.asarray(matrix)
+def _assembled(across: list[Array], own: list[Array]) -> Array:
+    """Return what the IMUs' own products exceed those across by, of columns IMU by IMU, shape (2, 29 K, 29 K)."""
+    count = own[0].shape[1]
+    total = np.zeros((2, count, NUMBERS, count, NUMBERS))
+    for matrix, rows, columns in zip(across, (OF_ACCEL, OF_ACCEL, OF_GYRO), (OF_ACCEL, OF_GYRO, OF_GYRO), strict=True):
+        block = matrix.reshape(2, count, rows.stop - rows.start, count, columns.stop - columns.start)
+        total[:, :, rows, :, columns] = -block
+        if rows != columns:
+            total[:, :, columns, :, rows] = -block.transpose(0, 3, 4, 1, 2)
+    for each, columns in zip(own, (OF_ACCEL, OF_GYRO), strict=True):
+        for k in range(count):
+            total[:, k, columns, k, columns] += each[:, k]
+    return total.reshape(2, count * NUMBERS, count * NUMBERS)
 
 
 def _factors(square: Array, freedom: int) -> Array:
@@ -413,22 +452,26 @@ def solve(
     for stage in range(_REWEIGHTED + 1):
         if stage:
             weights = problem.weights(board, motion, measured.at(board), force)
-        for _ in range(_AFTER if stage else steps):
+        for _ in range(steps if stage == 0 else _LAST if stage == _REWEIGHTED else 1):
             readings = measured.at(board)
-            # Each time from the gyroscopes: forces alone fit a rate and its opposite alike.
-            motion[:, RATE] = np.einsum("kij,nkj->ni", np.linalg.inv(board.gyro), readings[1] - board.gyro_bias)
-            motion[:, RATE] /= measured.count
-            for _ in range(2):
+            if stage == 0:
+                # Each time from the gyroscopes: forces alone fit a rate and its opposite alike.
+                motion[:, RATE] = np.einsum("kij,nkj->ni", np.linalg.inv(board.gyro), readings[1] - board.gyro_bias)
+                motion[:, RATE] /= measured.count
                 motion = problem.samples(board, motion, readings, weights)
-            for _ in range(2):
-                still, score, force = problem.at_rest(board, force, weights)
+                force = problem.at_rest(board, force, weights)[2]
+            motion = problem.samples(board, motion, readings, weights)
+            still, score, force = problem.at_rest(board, force, weights)
             total, scores = problem.equations(board, motion, readings, weights)
             information, pull = problem.priors(board)
             matrix = (total.sum(0) + still + information)[np.ix_(free, free)]
-            step = np.zeros(len(free))
-            step[free] = np.linalg.solve(matrix, (scores.sum(0) + score + pull)[free])
+            step, slope = np.zeros(len(free)), (scores.sum(0) + score + pull)[free]
+            step[free] = np.linalg.solve(matrix, slope)
             board = Board(board.numbers + step.reshape(board.numbers.shape))
+            if float(slope @ step[free]) < _SMALL:
+                break
     readings = measured.at(board)
+    motion = problem.samples(board, motion, readings, weights)
     _, accel, gyro = predicted(board, motion)
     information = information - np.multiply.outer(size.row, size.row) / size.u**2
     return Solution(
