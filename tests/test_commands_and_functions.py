@@ -39,6 +39,7 @@ FUNCTIONS = {
     "array fuse": il.fuse,
     "array fuse --imus": il.fuse_imus,
     "array compare": il.compare_methods,
+    "array compare --imus": il.compare_imus,
     "centrifuge plan": il.plan_centrifuge,
     "centrifuge simulate": il.simulate_centrifuge,
     "centrifuge reduce": il.fit_centrifuge,

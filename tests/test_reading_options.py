@@ -15,6 +15,7 @@ from test_readers_logs import low_rate_log
 PART = {"layout", "topic", "instance", "window"}
 NOT_BY_ELEMENT = {
     "array merge", "array calibrate", "array calibrate --imus", "array fuse", "array fuse --imus", "array compare",
+    "array compare --imus",
 }  # fmt: skip
 """What an array is needed for."""
 BY_MANIFEST = {"centrifuge reduce"}

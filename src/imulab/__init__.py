@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
     from imulab.procedures.gyro_array.fuse import Fused as Fused
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
+    from imulab.procedures.gyro_array.imus.compare import compare_imus as compare_imus
     from imulab.procedures.gyro_array.imus.fit import ImusFit as ImusFit
     from imulab.procedures.gyro_array.imus.fit import calibrate_imus as calibrate_imus
     from imulab.procedures.gyro_array.imus.fuse import FusedBoard as FusedBoard
@@ -121,6 +122,7 @@ _HOME = {
     "check_noise": "procedures.noise.check",
     "check_thermal": "procedures.thermal.check",
     "check_tumble": "procedures.tumble.check",
+    "compare_imus": "procedures.gyro_array.imus.compare",
     "compare_methods": "procedures.gyro_array.public",
     "fuse": "procedures.gyro_array.public",
     "run_fleet": "fleet.run",

@@ -415,6 +415,47 @@ def compare(
         warn(message)
 
 
+def compare_imus(
+    file: RecordingFile, *, imus: WholeImus = False, report: ReportFile = None, json: AsJson = False, **options: Any
+) -> None:
+    """Compare each IMU of a board with what the others say.
+
+    Fused, by their mean, and one by one: what fusing the board buys, without any truth.
+    """
+    from imulab.cli.options import read_recording
+    from imulab.cli.show import verdict_lines
+    from imulab.display import Note, verdict_of
+    from imulab.files import write_text
+    from imulab.readers.streams import one_clock
+    from imulab.report import render_page
+    from imulab.report.traces import ReportTable
+
+    calibration = options["calibration"]
+    check_outputs([report], [name for name in (file, options["layout"], calibration) if name])
+    recording = one_clock(read_recording(file, **reading(options)))
+    compared = call(il.compare_imus, recording, **options)
+    verdict, exhibits = verdict_of(compared.notes), compared.exhibits()
+    if report:
+        notes = [note for note in compared.notes if isinstance(note, Note)]
+        page = render_page(
+            "Fused board", recording.metadata.get("serial", recording.name), exhibits, verdict=verdict, notes=notes,
+            provenance=[("recording", file), ("record", calibration)],
+        )  # fmt: skip
+        write_text(report, page)
+    if json:
+        print(dumps(compared.content(), indent=1))
+    else:
+        lines = [*verdict_lines(verdict), exhibits.headline]
+        for item in exhibits.items:
+            if isinstance(item, ReportTable):
+                lines += ["", item.title, *aligned(item.columns, item.rows)]
+        print("\n".join(lines))
+        if report:
+            print(f"report: {report}")
+    for message in compared.notes:
+        warn(message)
+
+
 def _calibrate_functions() -> list[Any]:
     from imulab.procedures.gyro_array.procedure import Older
 
@@ -431,4 +472,5 @@ COMMANDS = (
     Command("array fuse", fuse, lambda: [il.fuse], without=("element",)),
     Command("array fuse --imus", fuse_imus, lambda: [il.fuse_imus], without=("element",)),
     Command("array compare", compare, lambda: [il.compare_methods], without=("element",)),
+    Command("array compare --imus", compare_imus, lambda: [il.compare_imus], without=("element",)),
 )

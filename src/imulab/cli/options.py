@@ -113,12 +113,12 @@ def note(message: str) -> None:
 
 def warn(message: str) -> None:
     """Print one line on standard error, after the lines that were held; a `Note` is printed as a note."""
-    if isinstance(message, Note):
-        if message not in speech().released:
-            note(message)
-        return
     release()
-    if message not in speech().released:
+    if message in speech().released:
+        return
+    if isinstance(message, Note):
+        note(message)
+    else:
         _warning(message)
 
 

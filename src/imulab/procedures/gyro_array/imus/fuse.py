@@ -155,7 +155,7 @@ def read_late(time: Array, values: Array, rows: slice, latency: float, limit: fl
     row itself.
     """
     at, count = time[rows] + latency, len(time)
-    if count < 2:
+    if count < 2 or abs(latency) <= _NONE:
         return values[rows].copy()
     left = np.searchsorted(time, at, "right") - 1
     j = np.clip(left, 0, count - 2)
@@ -176,6 +176,16 @@ def read_late(time: Array, values: Array, rows: slice, latency: float, limit: fl
         resampled = np.where(np.abs(after) >= limit, after, np.where(np.abs(before) >= limit, before, resampled))
     outside = (left < 0) | (left > count - 2) | (step > longest)
     return np.asarray(np.where(outside[:, None], values[rows], resampled))
+
+
+def read_all_late(time: Array, values: Array, rows: slice, latency: Array, limits: Array, longest: float) -> Array:
+    """Return the readings of all triads, (n, 2, K, 3), as `read_late` does; latencies and limits of shape (2, K)."""
+    late = np.empty_like(values[rows])
+    for sensor, k in np.ndindex(latency.shape):
+        late[:, sensor, k] = read_late(
+            time, values[:, sensor, k], rows, float(latency[sensor, k]), float(limits[sensor, k]), longest
+        )
+    return late
 
 
 # Fusion of recordings, as a whole or block by block.
@@ -329,11 +339,7 @@ class BoardFuser:
         limits = np.full(latency.shape, NO_LIMIT)
         if self.board.settings is not None:
             limits = np.array([self.board.settings.accel_limit, self.board.settings.gyro_limit])
-        readings = held.values[rows].copy()
-        for sensor, k in np.argwhere(np.abs(latency) > _NONE):
-            readings[:, sensor, k] = read_late(
-                held.time, held.values[:, sensor, k], rows, latency[sensor, k], limits[sensor, k], longest
-            )
+        readings = read_all_late(held.time, held.values, rows, latency, limits, longest)
         time, raw = held.time[rows], held.raw[rows]
         step = np.diff(time, prepend=self.until)
         step = np.where(step <= longest, step, 0.0)  # of the first sample, and after a gap: not known
