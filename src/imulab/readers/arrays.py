@@ -111,7 +111,7 @@ def to_floats(values: Any, where: str) -> Array:
     array = np.asarray(values)
     if array.dtype.kind not in "iufb":
         raise ReadError(f"{where}: expected real numbers, found {array.dtype}")
-    return array.astype(np.float64)
+    return array.astype(np.float64, copy=not array.flags.owndata)  # views, of mapped files, must not outlive them
 
 
 def recordings(
