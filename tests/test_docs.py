@@ -22,6 +22,10 @@ FOLDER = sorted((REPOSITORY / "docs").glob("*.md"))
 PAGES = [page for page in (README, *FOLDER) if BLOCK.search(page.read_text(encoding="utf-8"))]
 
 
+# Of what a page shows, the part that the reduced run makes.
+SHORTER = {"imulab array compare --experiment static": ["--seeds", "2"]}
+
+
 def _expanded(word: str) -> list[str]:
     """Return the files that a pattern names, as a shell has it; the word where it is none."""
     return sorted(str(path) for path in Path().glob(word)) if "*" in word else [word]
@@ -29,7 +33,7 @@ def _expanded(word: str) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_what_a_page_shows_runs(page, tmp_path, monkeypatch, capsys):
+def test_what_a_page_shows_runs(page, tmp_path, monkeypatch, capsys, reduced):
     monkeypatch.chdir(tmp_path)
     for language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
         if language == "python":
@@ -42,6 +46,7 @@ def test_what_a_page_shows_runs(page, tmp_path, monkeypatch, capsys):
                 continue
             assert words[0] in ("imulab", "make"), line
             if words[0] == "imulab":
+                words += SHORTER.get(line.strip(), []) if reduced else []
                 assert main(words[1:]) == 0, f"{page.name}: {line}\n{capsys.readouterr().err}"
                 continue
             done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)

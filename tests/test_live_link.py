@@ -7,7 +7,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -262,34 +262,31 @@ def test_what_is_missing_for_a_record_is_said(recording):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("enough", [True, False])
-def test_after_half_a_minute_a_record_is_made_of_what_there_is(enough, lines, tmp_path):
-    unit = Device(pieces(lines), 400 / PIECE, patient=True)
-    words = [
-        f"serial:{unit.port}",
-        "--plain",
-        "--order",
-        "1",
-        "--gravity",
-        "9.81",
-        "--save",
-        "rec.csv",
-        "-o",
-        "rec.json",
-    ]
-    with live(words, tmp_path) as process:
+def test_after_half_a_minute_a_record_is_made_of_what_there_is(lines, tmp_path):
+    """Two sessions side by side: they wait for the same half minute."""
+    words = ["--plain", "--order", "1", "--gravity", "9.81", "--save", "rec.csv", "-o", "rec.json"]
+    units = {10: Device(pieces(lines), 400 / PIECE, patient=True), 3: Device(pieces(lines), 400 / PIECE, patient=True)}
+    with ExitStack() as sessions:
+        processes = {}
+        for enough, unit in units.items():
+            (tmp_path / str(enough)).mkdir()
+            started = live([f"serial:{unit.port}", *words], tmp_path / str(enough))
+            processes[enough] = sessions.enter_context(started)
         time.sleep(3.0)  # until somebody listens, since opening a port empties it
-        unit.begin()
-        process.said(f"attitude {10 if enough else 3} accepted")
-        unit.unplug()
-        lost = process.said("reconnecting")
-        assert process.ended(45) == (0 if enough else 2), process.text
-        assert 28 < time.monotonic() - lost < 40
-    unit.close()
-    assert "for 30 s: the session ends with what there is" in process.text
-    assert (tmp_path / "rec.json").exists() == enough
-    if not enough:
-        assert "rec.csv keeps 3 attitudes: --resume goes on with it" in process.text
+        for unit in units.values():
+            unit.begin()
+        lost = {}
+        for count in (3, 10):
+            assert processes[count].said(f"attitude {count} accepted", 60) < float("inf"), processes[count].text
+            units[count].unplug()
+            lost[count] = processes[count].said("reconnecting")
+        for count in (3, 10):
+            assert processes[count].ended(45) == (0 if count == 10 else 2), processes[count].text
+            assert 28 < time.monotonic() - lost[count] < 40
+            units[count].close()
+            assert "for 30 s: the session ends with what there is" in processes[count].text
+            assert (tmp_path / str(count) / "rec.json").exists() == (count == 10)
+    assert "rec.csv keeps 3 attitudes: --resume goes on with it" in processes[3].text
 
 
 def test_a_server_where_nobody_listens_yet_is_waited_for(lines, tmp_path):

@@ -260,7 +260,7 @@ def test_cancelling_leaves_nothing_behind(tmp_path, monkeypatch):
     slow = ["tumble", "fit", "rec.csv", "--order", "2", "--monte-carlo", "500000", "-o", "r.json", "--report", "r.html"]
     job = jobs.run("tumble fit", slow, ["r.json", "r.html"])
     group = jobs._processes[job.number].pid
-    time.sleep(2.5)
+    time.sleep(1.0)
     assert job.state == "running"
     jobs.cancel(job.number)
     until(lambda: job.ended)

@@ -78,7 +78,7 @@ def test_a_place_stands_for_gravity_and_is_in_the_command_that_makes_the_record_
 
 def kills(folder: Path, times: int, seed: int) -> None:
     """Kill a session again and again, then let it end; what it had a second before is in the file each time."""
-    rng, recording = np.random.default_rng(seed), tumble(240, seed=seed)
+    rng, recording = np.random.default_rng(seed), tumble(100 + 7 * times, seed=seed)
     lines, stamps = lines_of(recording), np.round(recording.time * 1e6)
     with device(lines, 100 * SPEED) as unit:
         words = [f"serial:{unit.port}", "--plain", "--resume", "--attitudes", "12", *FIT, "--save", "rec.csv"]

@@ -1,6 +1,7 @@
 """Turns without a beginning: windows and readings by themselves, and the fit under a hand that is not quiet."""
 
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,7 @@ HANDS = {
 }
 
 
+@cache
 def fitted(seed, hand):
     made, truth = turned_by_hand(seed, hand)
     record = il.fit_tumble(made, order=1, gravity=9.80665, with_="gyro").calibration

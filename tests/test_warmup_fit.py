@@ -313,7 +313,7 @@ def test_intervals_of_the_curve_cover(reduced, slow_noise):
 
     The scatter between cycles holds what a cycle's mean at rest, its reference, is uncertain by, whatever the colour.
     """
-    trials, inside, total = (30 if reduced else 600), 0, 0
+    trials, inside, total = (15 if reduced else 600), 0, 0
     rng = np.random.default_rng(7)
     at = np.array([-40.0, -30, -20])
     times = np.array([2.0, 20, 60, 120, 200, 290])
