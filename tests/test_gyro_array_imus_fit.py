@@ -261,6 +261,8 @@ def test_clipped_readings_are_left_out_and_said():
     clipped = with_columns(board, **{name: np.clip(board.columns[name], -350, 350) for name in names})
     record = il.calibrate_imus(clipped, gravity=G).calibration
     assert imus_of(record).fit.clipped > 0.1
+    at_end = np.any([np.abs(clipped.columns[name]) == 350 for name in names], axis=0)
+    assert imus_of(record).fit.bridged == pytest.approx(at_end.mean(), rel=1e-9)
     assert any("have a reading at its limit" in text for text in record.verdict.reasons)
     # Taken for readings, the clipped samples would make the board larger by millimetres.
     found = np.array([imu.position.value for imu in imus_of(record).imus])

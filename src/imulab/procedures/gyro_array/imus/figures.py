@@ -50,6 +50,8 @@ def exhibits(calibration: Calibration) -> Exhibits:
         ("size from", record.size_from),
         ("age of readings", f"{plain_number(1e3 * fit.age.value, 2)} ms"),
     ]
+    if fit.bridged is not None:
+        facts.append(("samples that fusion bridges", f"{plain_number(100 * fit.bridged, 2)} %"))
     return Exhibits(
         headline=f"{record.model.imus} IMUs: positions known to {plain_number(1e3 * largest, 2)} mm or better, the "
         f"size of the board from {_SOURCES[record.size_from]}",

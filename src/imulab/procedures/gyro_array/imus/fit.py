@@ -270,6 +270,7 @@ def _summary(
     return ImusSummary(
         sample_rate=Above0(value=prepared.rate, unit="Hz"), duration=Above0(value=prepared.duration, unit="s"),
         samples_in_motion=len(solution.motion), rests=len(prepared.rests), clipped=prepared.clipped,
+        bridged=prepared.bridged,
         axis_rates=Three(value=prepared.axis_rates.tolist(), standard_uncertainty=[None] * 3, unit="rad/s"),
         accel_residual=Length(value=rms(accel), unit="m/s^2"), gyro_residual=Length(value=rms(gyro), unit="rad/s"),
         accel_factor=float(np.median(solution.weights.accel)), gyro_factor=float(np.median(solution.weights.gyro)),

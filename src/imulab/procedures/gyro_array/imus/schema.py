@@ -110,6 +110,8 @@ class ImusSummary(Part):
     the standard deviation of the readings' age. `coherence` is the correlation of the angular acceleration from the
     accelerometers with the derivative of the rate; `halves` the rms of the positions' differences between two halves of
     the motion over their uncertainty; `widening` the factor of the sandwich over the stated uncertainty, by median.
+    `clipped` is the share of the samples in motion that have a reading at its limit, `bridged` that of all samples with
+    a gyroscope at its limit.
     """
 
     sample_rate: Above0
@@ -117,6 +119,7 @@ class ImusSummary(Part):
     samples_in_motion: int
     rests: int
     clipped: Size
+    bridged: Size | None = null()
     axis_rates: Three
     accel_residual: Length
     gyro_residual: Length
