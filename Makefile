@@ -75,7 +75,7 @@ format: $(STAMP)
 
 # All of it, quick parts first, into RESULTS.md; BENCH="tumble fleet" measures these parts alone and only prints.
 bench: $(STAMP) $(VENV)/.bench
-	$(BIN)/python benchmarks/run.py $(BENCH)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/run.py $(BENCH)
 
 # What an exported unit costs on a Cortex-M4F, emulated, into docs/runtime.md (Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm).
 footprint: $(STAMP)

@@ -13,6 +13,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -233,13 +234,13 @@ def processes(case: Case, folder: Path) -> dict[str, list[float]]:
 
 
 def fits(case: Case) -> dict[str, float]:
-    """Time, s, of a fit to attitudes that are already found, in turn within one process, medians."""
+    """Processor time, s, of a fit to attitudes that are already found, in turn within one process."""
     work = {"imulab": lambda: il.fit_tumble(case.attitudes, gravity=case.gravity)}
     work["imulab, order 1"] = lambda: il.fit_tumble(case.attitudes, order=1, gravity=case.gravity)
     if here("imu-calib-toolkit"):
         fit, means = _toolkit(), (case.attitudes.mean - case.nominal[0]) / case.nominal[1]
         work["imu-calib-toolkit"] = lambda: fit(means, case.gravity)
-    return dict(zip(work, seconds(*work.values(), repeats=5 * REPEATS), strict=True))
+    return dict(zip(work, seconds(*work.values(), repeats=5 * REPEATS, clock=time.process_time), strict=True))
 
 
 def session() -> dict[str, Any]:

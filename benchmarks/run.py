@@ -22,6 +22,7 @@ PARTS = {
     "gyro_array": "Gyro array and Allan deviation",
     "tumble": "Tumble",
     "runtime": "The C core",
+    "door": "At the door",
     "peers": "The same tasks call by call with peers",
     "growth": "Growth",
     "recordings": "Recordings",
@@ -39,7 +40,11 @@ def main(chosen: list[str]) -> None:
     unknown = [name for name in chosen if name not in PARTS]
     if unknown:
         sys.exit(f"unknown part {unknown[0]}; known parts: {' '.join(PARTS)}")
-    lines = ["# Measurements", "", f"Made by `make bench`; medians of interleaved runs. {_versions()}."]
+    lines = [
+        "# Measurements",
+        "",
+        f"Made by `make bench`; medians of interleaved runs and, in brackets, the range. {_versions()}.",
+    ]
     for name in chosen or PARTS:
         lines += ["", f"## {PARTS[name]}", "", "| what | found | asked |", "|---|---|---|"]
         begin = time.perf_counter()

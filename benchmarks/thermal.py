@@ -20,15 +20,20 @@ def rows() -> list[Row]:
         lambda: il.fit_thermal(units[0], degrees="3,2,1"),
         lambda: il.fit_thermal(units[0]),
         repeats=15,
+        clock=time.process_time,
     )
-    begin = time.perf_counter()
+    begin = time.process_time()
     for number in range(COUNT):
         il.fit_thermal(units[number % DIFFERENT], degrees="3,2,1")
-    batch = time.perf_counter() - begin
+    batch = time.process_time() - begin
     what = "five recordings of 100 s at 50 Hz to a record, holds found"
     return [
         (f"{what}, turn-on scatter stated", f"{1e3 * stated:.0f} ms", "solve alone <= 10 ms"),
         (f"{what}, turn-on scatter found", f"{1e3 * fitted:.0f} ms", "<= 200 ms"),
         (f"{what}, degrees chosen", f"{1e3 * auto:.0f} ms", "<= 1 s"),
-        (f"{COUNT:,} such fits one after another, turn-on scatter found", f"{batch:.1f} s", "<= 4 s"),
+        (
+            f"{COUNT:,} such fits one after another, turn-on scatter found",
+            f"{batch:.1f} s of processor time",
+            "<= 12 s",
+        ),
     ]

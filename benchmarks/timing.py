@@ -8,22 +8,59 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 Row = tuple[str, str, str]
 """What was measured, what was found, what was asked."""
 
 
-def seconds(*functions: Callable[[], object], repeats: int = 5) -> list[float]:
-    """Median time of each function, the functions taking turns."""
+class Times(float):
+    """The median of the rounds of a measurement, which is printed with its range; over another, a ratio in each round.
+
+    Functions that took turns met the same machine in a round, so that the ratio of a round says more than that of
+    medians.
+    """
+
+    rounds: tuple[float, ...]
+
+    def __new__(cls, rounds: Iterable[float]) -> Times:
+        kept = tuple(rounds)
+        made = super().__new__(cls, statistics.median(kept))
+        made.rounds = kept
+        return made
+
+    def __truediv__(self, other: float) -> Times:
+        by = other.rounds if isinstance(other, Times) else (other,) * len(self.rounds)
+        return Times(mine / its for mine, its in zip(self.rounds, by, strict=True))
+
+    def __sub__(self, other: float) -> Times:
+        by = other.rounds if isinstance(other, Times) else (other,) * len(self.rounds)
+        return Times(mine - its for mine, its in zip(self.rounds, by, strict=True))
+
+    def __mul__(self, factor: float) -> Times:
+        return Times(factor * mine for mine in self.rounds)
+
+    __rmul__ = __mul__
+
+    def __format__(self, form: str) -> str:
+        if len(self.rounds) < 2:
+            return format(float(self), form)
+        low, middle, high = (format(value, form) for value in (min(self.rounds), float(self), max(self.rounds)))
+        return f"{middle} ({low} to {high})"
+
+
+def seconds(
+    *functions: Callable[[], object], repeats: int = 5, clock: Callable[[], float] = time.perf_counter
+) -> list[Times]:
+    """Return the times of each function by a clock, that of the day if not stated, the functions taking turns."""
     times: list[list[float]] = [[] for _ in functions]
     for _ in range(repeats):
         for collected, function in zip(times, functions, strict=True):
-            begin = time.perf_counter()
+            begin = clock()
             function()
-            collected.append(time.perf_counter() - begin)
-    return [statistics.median(collected) for collected in times]
+            collected.append(clock() - begin)
+    return [Times(collected) for collected in times]
 
 
 def compiled() -> dict[str, str]:
@@ -31,8 +68,8 @@ def compiled() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 
 
-def processor_seconds(*commands: list[str], repeats: int = 7) -> list[float]:
-    """Median processor time of each command, started in turn, after a first time that does not count."""
+def processor_seconds(*commands: list[str], repeats: int = 7) -> list[Times]:
+    """Return the processor times of each command, started in turn, after a first time that does not count."""
     times: list[list[float]] = [[] for _ in commands]
     for _ in range(repeats + 1):
         for collected, command in zip(times, commands, strict=True):
@@ -40,7 +77,7 @@ def processor_seconds(*commands: list[str], repeats: int = 7) -> list[float]:
             subprocess.run([sys.executable, *command], check=True, capture_output=True, env=compiled())
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
             collected.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
-    return [statistics.median(collected[1:]) for collected in times]
+    return [Times(collected[1:]) for collected in times]
 
 
 _MEASURER = """
