@@ -32,11 +32,12 @@ FLAGS = [*M4F, "-std=gnu99", "-DIMULAB_REAL=float", "-DIL_ARRAY_ELEMENTS=6", "-f
 LINK = ["-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections", "--specs=rdimon.specs", "-nostartfiles"]
 QEMU = ["qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting-config", "enable=on,target=native"]
 HELD = "the temperature as before"
+BRIDGED = "beyond the gyroscopes' range"
 TITLES = ["one sample of", "flash, bytes", "state, bytes", "stack, bytes", "instructions, -Os", "instructions, -O2"]
 
 
 def cases() -> Iterator[tuple[str, list[Calibration], Fusion | None]]:
-    """Yield titles, records and how an array fuses; a title that ends in HELD is of samples at one temperature."""
+    """Yield titles, records and how sensors are fused; `defines` says what the title's end asks of the samples."""
     for order in (1, 2, 3):
         yield f"accelerometers, order {order}", [madeup.tumble(order)], None
     yield "accelerometers and gyroscopes, order 1", [madeup.tumble(1, gyro=True)], None
@@ -57,6 +58,17 @@ def cases() -> Iterator[tuple[str, list[Calibration], Fusion | None]]:
     array = il.calibrate_array(il.simulate_array(experiment="static", duration=30.0)).calibration
     for method in ("mean", "feedback", "least-squares", "robust"):
         yield f"array of six gyros, `{method}`", [array], Fusion(method)
+    for name, count in (("four", 4), ("eight", 8)):
+        made = il.simulate_imus(elements=count, attitudes=6, duration="20 s", seed=1)
+        board, ranged = il.calibrate_imus(made, gravity=9.80665).calibration, Fusion(gyro_range=34.9)
+        yield f"board of {name} whole IMUs", [board], ranged
+        yield f"board of {name} whole IMUs, {BRIDGED}", [board], ranged
+
+
+def defines(title: str, records: Sequence[Calibration]) -> list[str]:
+    """Return what is compiled in for a case: how samples are made, and room for the IMUs of the board alone."""
+    imus = [f"IL_IMUS={record.model['imus']}" for record in records if "imus" in record.model]
+    return imus + [name for name, end in (("HELD", HELD), ("BRIDGED", BRIDGED)) if title.endswith(end)]
 
 
 def _nine() -> Calibration:
@@ -108,7 +120,7 @@ def table() -> str:
     """Return the table in Markdown."""
     lines = [f"| {' | '.join(TITLES)} |", f"|{'---|' * len(TITLES)}"]
     for title, records, fusion in cases():
-        found = measured(records, fusion, *(["HELD"] if title.endswith(HELD) else []))
+        found = measured(records, fusion, *defines(title, records))
         names = ("flash", "state", "stack", "instructions -Os", "instructions -O2")
         lines.append(f"| {title} | {' | '.join(f'{found[name]:.0f}' for name in names)} |")
         print(lines[-1], flush=True)

@@ -1,5 +1,5 @@
 /* One sample of everything that an exported unit corrects, on a Cortex-M4F; each at a temperature of its own, or with
- * HELD all at one.
+ * HELD all at one; of whole IMUs each turned anew, with BRIDGED beyond the range of the gyroscopes.
  *
  * With EMPTY or CALLS only what is linked matters: the difference of the two images is what the unit costs in flash.
  * Otherwise the emulator counts: with `qemu -icount shift=0` each instruction takes 1 ns of the clock that SysTick counts,
@@ -13,6 +13,11 @@ static il_real warming[UNIT_WARMUP_AXES];
 #if UNIT_HAS_ARRAY
 static il_array_state array;
 static il_real reading[UNIT_ARRAY_AXES * UNIT_ARRAY_ELEMENTS], rates[UNIT_ARRAY_AXES];
+#endif
+#if UNIT_HAS_IMUS
+static il_imus_state board;
+static il_imus_fused fused;
+static il_real readings[6 * UNIT_IMUS];
 #endif
 #if UNIT_HAS_THERMAL
 static il_thermal_state warmth;
@@ -52,6 +57,9 @@ __attribute__((noinline)) static void sample(void) {
 #if UNIT_HAS_ARRAY
     (void)il_array_step(&unit_array, &array, reading, rates);
 #endif
+#if UNIT_HAS_IMUS
+    (void)il_imus_step(&unit_imus, &board, (il_real)0.01, readings, &fused);
+#endif
 #endif
     __asm volatile("" ::: "memory");
 }
@@ -70,6 +78,9 @@ static int start(void) {
 #endif
 #if UNIT_HAS_ARRAY
     if (il_array_start(&unit_array, &array) != IL_OK) return 0;
+#endif
+#if UNIT_HAS_IMUS
+    if (il_imus_start(&unit_imus, &board) != IL_OK) return 0;
 #endif
 #endif
     return 1;
@@ -102,6 +113,45 @@ static il_real uniform(void) {
     state = state * 1664525u + 1013904223u;
     return (il_real)((int32_t)(state >> 8) - (1 << 23)) / (il_real)(1 << 23);
 }
+
+#if UNIT_HAS_IMUS
+static void cross(const il_real a[3], const il_real b[3], il_real out[3]) {
+    ONCE(i) out[i] = a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3];
+}
+
+/* What a triad reads of x: the solution of m (y - bias) = x, with noise, within its range. */
+static void read_triad(const il_real *m, const il_real *bias, il_real noise, il_real limit, const il_real x[3], il_real *y) {
+    il_real column[3][3];
+    ONCE(i) cross(m + 3 * ((i + 1) % 3), m + 3 * ((i + 2) % 3), column[i]);
+    const il_real volume = m[0] * column[0][0] + m[1] * column[0][1] + m[2] * column[0][2];
+    ONCE(i) {
+        const il_real z = bias[i] + (x[0] * column[0][i] + x[1] * column[1][i] + x[2] * column[2][i]) / volume + noise * uniform();
+        y[i] = z > limit ? limit : z < -limit ? -limit : z;
+    }
+}
+
+/* The board turned at up to 6 rad/s about each axis, or with BRIDGED at 40, which is beyond the range of gyroscopes. */
+static void load_board(void) {
+#ifdef BRIDGED
+    const il_real size = (il_real)40;
+#else
+    const il_real size = (il_real)6;
+#endif
+    const il_imus *u = &unit_imus;
+    il_real w[3], force[3];
+    ONCE(i) w[i] = size * (uniform() < (il_real)0 ? (il_real)-1 : (il_real)1) * ((il_real)0.95 + (il_real)0.05 * uniform());
+    ONCE(i) force[i] = (il_real)9.8 * uniform();
+    for (int k = 0; k < UNIT_IMUS; k++) {
+        il_real turned[3], twice[3], felt[3];
+        cross(w, u->position + 3 * k, turned);
+        cross(w, turned, twice);
+        ONCE(i) felt[i] = force[i] + twice[i];
+        read_triad(u->accel + 9 * k, u->accel_bias + 3 * k, u->accel_noise[k], u->accel_limit[k], felt, readings + 3 * k);
+        read_triad(u->gyro + 9 * k, u->gyro_bias + 3 * k, u->gyro_noise[k], u->gyro_limit[k], w,
+                   readings + 3 * (UNIT_IMUS + k));
+    }
+}
+#endif
 
 /* Outputs of 1.5 g, 3 rad/s, one field; of gyros at rest with noise; as the unit's own numbers make them. */
 static void load(void) {
@@ -142,6 +192,9 @@ static void load(void) {
     for (int i = 0; i < UNIT_ARRAY_AXES * UNIT_ARRAY_ELEMENTS; i++) {
         reading[i] = (il_real)1e-3 * (uniform() + uniform() + uniform());
     }
+#endif
+#if UNIT_HAS_IMUS
+    load_board();
 #endif
     tick++;
 }
@@ -213,6 +266,9 @@ int main(void) {
 #endif
 #if UNIT_HAS_ARRAY
     ram += (unsigned)sizeof array;
+#endif
+#if UNIT_HAS_IMUS
+    ram += (unsigned)sizeof board;
 #endif
     printf("instructions %.1f stack %u state %u\n", instructions, stack, ram);
     return 0;

@@ -282,7 +282,7 @@ def fuse_imus(file: RecordingFile, *, imus: WholeImus = False, output: OutputFil
     Each with its standard uncertainty; rates beyond the gyroscopes' range are bridged by the accelerometers.
     """
     from imulab.estimation.sampling import mend_blocks
-    from imulab.procedures.gyro_array.imus.fuse import BoardFuser, board_of, ranges
+    from imulab.procedures.gyro_array.imus.fuse import BoardFuser, board_of, limits_of
     from imulab.procedures.registry import load_any
     from imulab.readers import is_pipe, read_blocks
     from imulab.readers.streams import on_clock_of
@@ -300,7 +300,8 @@ def fuse_imus(file: RecordingFile, *, imus: WholeImus = False, output: OutputFil
         rows: Iterable[Recording] = on_clock_of(read_blocks(file, **how))
         return rows if is_pipe(file) else mend_blocks(rows)
 
-    limits = ranges(() if is_pipe(file) else blocks(), options["gyro_range"], options["accel_range"])
+    stated = {name: options[name] for name in ("gyro_range", "accel_range")}
+    limits = call(limits_of, known, () if is_pipe(file) else blocks(), **stated)
     fuser = BoardFuser(board_of(known, options["at"], limits))
     parts = (part.recording() for part in fuser.fuse(with_notes(blocks())))
     if output:

@@ -158,6 +158,8 @@ class ImusStream:
         ------
         DataError
             The shape does not fit.
+        RecordError
+            The board has another number of IMUs.
         """
         block = np.ascontiguousarray(readings, dtype=np.float64)
         if block.shape[1:] != (2, self.count, 3) or np.shape(step) != (len(block),):
@@ -165,6 +167,9 @@ class ImusStream:
         numbers, flags = np.empty((len(block), 6, 3)), np.empty(len(block), dtype=np.uint8)
         health = np.empty((len(block), 2, self.count), dtype=np.uint8)
         steps = np.ascontiguousarray(step, dtype=np.float64)
-        _runtime.imus_block(self._unit, self._state, steps, block, numbers, flags, health)
+        try:
+            _runtime.imus_block(self._unit, self._state, steps, block, numbers, flags, health)
+        except ValueError:  # a blob whose text was changed
+            raise RecordError(f"the blob holds other than {self.count} IMUs, as its text says") from None
         force, rate, acceleration, *stated = (numbers[:, k] for k in range(6))
         return FusedImus(force, rate, acceleration, stated[0], stated[1], stated[2], flags, health)

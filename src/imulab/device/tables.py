@@ -149,18 +149,29 @@ MOST_COUNT = 1_000_000_000
 
 @dataclass(frozen=True)
 class Fusion:
-    """The method of fusion of a unit, with its memory: None for the growing one that begins at k = `start`."""
+    """How a unit fuses several sensors.
+
+    Attributes
+    ----------
+    method, memory, start
+        Of gyros on one axis; None for the growing memory that begins at k = `start`.
+    at, gyro_range, accel_range
+        Of whole IMUs: the point of the specific force, and where their ranges end, rad/s and m/s^2; None if not known.
+    """
 
     method: str = "robust"
     memory: float | None = None
     start: int = 1
+    at: str = "centroid"
+    gyro_range: float | None = None
+    accel_range: float | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise OptionError(f"method {self.method!r}: expected one of {listed(METHODS, self.method)}")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as it stands in a record or a blob."""
+        """Return that of gyros on one axis as it stands in a record or a blob."""
         return {"method": self.method, "memory": "growing" if self.memory is None else self.memory, "start": self.start}
 
 

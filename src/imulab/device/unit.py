@@ -28,7 +28,7 @@ from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.files import open_file
 from imulab.recording import Array, Recording
 from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
-from imulab.records.sections import Part, Positive, Size, check_sizes, holds, read
+from imulab.records.sections import Part, Positive, Size, check_sizes, holds, null, read
 from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
 
 # One unit: its tables are loaded once; arrays in and out.
@@ -444,6 +444,16 @@ class _Array(Part):
     rate: Positive
 
 
+class _Imus(Part):
+    imus: int
+    at: Annotated[list[float], 3]
+    rate: Positive
+    accel_latency: Annotated[list[float], "imus"]
+    gyro_latency: Annotated[list[float], "imus"]
+    accel_range: Positive | None = null()
+    gyro_range: Positive | None = null()
+
+
 _COLUMNS: dict[str, type[Part]] = {
     "tumble": _Triad,
     "gyro": _Triad,
@@ -453,6 +463,7 @@ _COLUMNS: dict[str, type[Part]] = {
     "centrifuge": _Centrifuge,
     "warmup": _Warmup,
     "array": _Array,
+    "imus": _Imus,
 }
 """Keys of the text for a section of each kind."""
 

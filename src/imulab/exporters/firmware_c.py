@@ -213,6 +213,8 @@ def _unit_h(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> st
     if "array" in kinds:
         lines.append(f"#define UNIT_ARRAY_AXES {kinds['array'].columns['axes']}")
         lines.append(f"#define UNIT_ARRAY_ELEMENTS {kinds['array'].columns['elements']}")
+    if "imus" in kinds:
+        lines.append(f"#define UNIT_IMUS {kinds['imus'].columns['imus']}")
     lines += ["", "#ifdef __cplusplus", 'extern "C" {', "#endif"]
     lines += ["", *(f"extern const il_{kind} unit_{kind};" for kind in kinds), ""]
     lines += ["#ifdef __cplusplus", "}", "#endif", "#endif", ""]

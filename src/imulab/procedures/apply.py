@@ -128,14 +128,15 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
         unknown = [kind for (kind, _), (known_section, _) in zip(entries, known, strict=True) if known_section is None]
         if unknown:
             raise RecordError(f"{record.name}: a section {unknown[0]!r} cannot be applied to a recording")
-        # The table of an array is for `array fuse`, and corrects no columns.
+        # The table of an array, or of whole IMUs, is for `array fuse`, and corrects no columns.
         chain = tuple(
             (known_section, entry)
             for known_section, entry in known
             if known_section is not None and known_section.corrects
         )
         if not chain:
-            raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse takes it")
+            whole = " --imus" if any(kind == "imus" for kind, _ in entries) else ""
+            raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse{whole} takes it")
         holds = (sha256(record.data).hexdigest(), *map(str, record.text.get("records", ())))
         return Loaded(DeviceUnit(record.data), chain, name or record.name, holds, again)
     made_by = procedure_of(record)

@@ -17,7 +17,7 @@ from imulab.display import SENTENCES
 from imulab.errors import ImulabError, OptionError, listed
 from imulab.exporters import EXPORTERS, MAG_MOUNTS, ExportOptions
 from imulab.files import open_file
-from imulab.options import choice, file, text
+from imulab.options import RARE, choice, file, measure, text
 from imulab.procedures.apply import tables_of
 from imulab.procedures.registry import load, procedure_of
 from imulab.procedures.result import Record, as_record
@@ -42,6 +42,9 @@ def export(
     noise: Annotated[str | PathLike[str] | Mapping[str, Any] | Calibration | None, file()] = None,
     method: Annotated[str | None, text("METHOD", METHODS)] = None,
     memory: Annotated[str | float | None, text("growing|growing:N|GAIN", ("growing",))] = None,
+    at: Annotated[str | None, text("centroid|imu:N|X,Y,Z", ("centroid",)), RARE] = None,
+    gyro_range: Annotated[float | str | None, measure("rate", "deg/s"), RARE] = None,
+    accel_range: Annotated[float | str | None, measure("acceleration", "g"), RARE] = None,
     mag_mount: Annotated[str, choice(("external", "internal"))] = "external",
     tell: Callable[[str], object] = _nothing,
 ) -> list[Path]:
@@ -65,6 +68,10 @@ def export(
         c, blob: how an array fuses; what its record carries if not given. As for `fuse`.
     memory
         c, blob: growing, growing:COUNT, or a gain between 0 and 1.
+    at
+        c, blob: where whole IMUs give the specific force; their centroid if not given. As for `fuse_imus`.
+    gyro_range, accel_range
+        c, blob: largest reading of whole IMUs, beyond which the unit does not believe them.
     mag_mount
         px4, ardupilot: whether the magnetometers have a rotation of their own there, which holds their mounting.
         ``external`` where the autopilot turns the magnetometers by a rotation of their own, which then holds their
@@ -108,7 +115,9 @@ def export(
         for item in listed_records
     ]
     names = [os.fspath(item) if isinstance(item, str | PathLike) else "the record" for item in listed_records]
-    fusion = None if method is None and memory is None else _choose_fusion(to, method, memory, loaded)
+    named = {"method": method, "memory": memory, "at": at, "gyro_range": gyro_range, "accel_range": accel_range}
+    stated = {name: value for name, value in named.items() if value is not None}
+    fusion = _choose_fusion(to, stated, loaded) if stated else None
     if to in _FIRMWARE:
         for name, record in zip(names, loaded, strict=True):
             try:
@@ -126,13 +135,15 @@ def export(
     return exporters.export(to, loaded, Path(folder), options)
 
 
-def _choose_fusion(to: str, method: str | None, memory: str | float | None, records: Sequence[Calibration]) -> Fusion:
+def _choose_fusion(to: str, stated: Mapping[str, Any], records: Sequence[Calibration]) -> Fusion:
     """Return how the array among the records is to fuse; refuses these options without one."""
     for record in records if to in _FIRMWARE else ():
         procedure = procedure_of(record)
         if procedure.fuses:
-            return procedure.fusion(record, method, None if memory is None else str(memory))
-    raise OptionError("method and memory say how a gyro array fuses: expected its record, and target c or blob")
+            return procedure.fusion(record, stated)
+    raise OptionError(
+        f"{' and '.join(stated)}: how a gyro array or whole IMUs are fused; expected its record, and target c or blob"
+    )
 
 
 def _state_noise(record: Calibration, name: str) -> Mapping[str, Any]:

@@ -213,7 +213,7 @@ class Procedure:
     over_temperature
         Whether its records hold laws over temperature, which autopilots take as offsets.
     fuses
-        Whether its records say how a unit fuses several gyroscopes.
+        Whether its records say how a unit fuses several sensors.
     has_heading
         Whether a record can hold magnetometers, which give magnetic heading and dip.
     joins
@@ -279,11 +279,11 @@ class Procedure:
     # Use of a record in a unit, and for recordings.
 
     def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
-        """Return the tables of a unit, in the order in which they are applied; an array fuses by `fusion`."""
+        """Return the tables of a unit, in the order in which they are applied; sensors are fused by `fusion`."""
         raise NotImplementedError
 
-    def fusion(self, record: Calibration, method: str | None, memory: str | None) -> Fusion:
-        """Return how the unit is to fuse, by texts of method and memory, or as the record states for None."""
+    def fusion(self, record: Calibration, stated: Mapping[str, Any]) -> Fusion:
+        """Return how the unit is to fuse: by keywords of `imulab.export` that are stated, else as its record says."""
         raise NotImplementedError
 
     def heading(self, record: Calibration, *, true: bool = False) -> Callable[[Recording], Recording]:

@@ -8,7 +8,7 @@ steady-state gain. Method and memory as texts, and in records and blobs, are rea
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -355,15 +355,19 @@ def carried(calibration: Calibration | Blob | None) -> Fusion:
     return fusion_of(None if calibration is None else calibration.model.get("fusion"))
 
 
-def fusion_of_record(record: Calibration, method: str | None, memory: str | None) -> Fusion:
-    """Return the fusion of a unit: the texts where they are stated, else as in its record.
+def fusion_of_record(record: Calibration, stated: Mapping[str, Any]) -> Fusion:
+    """Return the fusion of a unit: `method` and `memory` where they are stated, else as in its record.
 
     Raises
     ------
     OptionError
-        A text is unknown.
+        A text is unknown, or a keyword of whole IMUs is stated.
     """
-    return fusion_text(method, memory, "{}", carried(record))
+    for name in ("at", "gyro_range", "accel_range"):
+        if name in stated:
+            raise OptionError(f"{name}: for whole IMUs; expected the record of 'imulab array calibrate --imus'")
+    memory = stated.get("memory")
+    return fusion_text(stated.get("method"), None if memory is None else str(memory), "{}", carried(record))
 
 
 def memory_text(memory: str | float, start: int) -> str:

@@ -96,6 +96,18 @@ class ArraySection(Section):
         return golden(table, random)
 
 
+class ImusSection(Section):
+    """Places, matrices, biases and noise of the whole IMUs of a board."""
+
+    kind = "imus"
+    corrects = False
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        from imulab.procedures.gyro_array.imus.device import golden
+
+        return golden(table, random)
+
+
 class GyroArrayProcedure(Procedure):
     """The array of gyroscopes that are fused into one rate."""
 
@@ -103,11 +115,11 @@ class GyroArrayProcedure(Procedure):
     command = "array"
     title = "Gyro array"
     line_title = "Gyro array"
-    not_applied = "'imulab array fuse --calibration' takes it"
-    elsewhere = "{target} fuses no array of gyroscopes"
+    not_applied = "'imulab array fuse --calibration' takes it, with --imus that of whole IMUs"
+    elsewhere = "{target} fuses no array of gyroscopes or of whole IMUs"
     fuses = True
     task = TASK
-    sections = (ArraySection(),)
+    sections = (ArraySection(), ImusSection())
 
     def check(self, record: Calibration) -> None:
         from imulab.procedures.gyro_array.schema import check
@@ -125,11 +137,23 @@ class GyroArrayProcedure(Procedure):
         return summary(record)
 
     def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
+        if _whole(record):
+            from imulab.procedures.gyro_array.imus.device import tables_of_board
+
+            return tables_of_board(record, fusion)
         from imulab.procedures.gyro_array.device import tables_of
 
         return tables_of(record, fusion)
 
-    def fusion(self, record: Calibration, method: str | None, memory: str | None) -> Fusion:
+    def fusion(self, record: Calibration, stated: Mapping[str, Any]) -> Fusion:
+        if _whole(record):
+            from imulab.procedures.gyro_array.imus.device import fusion_of_board
+
+            return fusion_of_board(record, stated)
         from imulab.procedures.gyro_array.fuse import fusion_of_record
 
-        return fusion_of_record(record, method, memory)
+        return fusion_of_record(record, stated)
+
+
+def _whole(record: Calibration) -> bool:
+    return record.model.get("kind") == "imus"

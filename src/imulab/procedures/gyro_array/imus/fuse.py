@@ -44,12 +44,13 @@ _COLOURS = (GOOD, BAD, "#8e6bbd")
 
 @dataclass(frozen=True)
 class KnownBoard:
-    """A calibrated board: positions and noise where they are known, and latencies, s, shape (2, K)."""
+    """A calibrated board: positions and noise where they are known, latencies, s, and ends of ranges, shape (2, K)."""
 
     name: str
     settings: ImusSettings | None
     blob: bytes | None
     latency: Array
+    limits: Array
 
     @property
     def count(self) -> int:
@@ -78,18 +79,20 @@ def board_of(calibration: Calibration | Blob, at: str = "centroid", limits: Arra
                 f"--at {at}: the blob {calibration.name} gives the force at the point it was exported for"
             )
         latency = np.array([section["accel_latency"], section["gyro_latency"]])
-        return KnownBoard(calibration.name, None, calibration.data, latency)
+        stated = (section["accel_range"], section["gyro_range"])
+        limits = np.array([np.full(latency.shape[1], NO_LIMIT if end is None else end) for end in stated])
+        return KnownBoard(calibration.name, None, calibration.data, latency, limits)
     held = imus_of(calibration)
     board, noise = held.board, held.accel_noise
     if limits is None or limits.shape[1] not in (1, len(noise)):  # of another board, which fusion refuses
         limits = np.full((2, 1), NO_LIMIT)
-    ends = np.broadcast_to(limits, (2, len(noise)))
+    ends = np.broadcast_to(limits, (2, len(noise))).copy()
     settings = ImusSettings(
         board.accel, board.accel_bias, noise, board.gyro, board.gyro_bias, held.gyro_noise, board.position,
-        point_of(at, board.position, noise), ends[0].copy(), ends[1].copy(), float(held.fit.sample_rate.value),
+        point_of(at, board.position, noise), ends[0], ends[1], float(held.fit.sample_rate.value),
     )  # fmt: skip
     latency = np.array([board.numbers[:, ACCEL_LATENCY], board.numbers[:, GYRO_LATENCY]])
-    return KnownBoard("the record", settings, None, latency)
+    return KnownBoard("the record", settings, None, latency, ends)
 
 
 def point_of(at: str, position: Array, noise: Array) -> Array:
@@ -332,13 +335,10 @@ class BoardFuser:
     def _fused(
         self, stream: ImusStream, held: _Readings, block: Recording, names: Mapping[str, list[list[str]]], *, last: bool
     ) -> Iterator[FusedBoard]:
-        latency, longest = self.board.latency, GAP / self.clock.rate
+        latency, limits, longest = self.board.latency, self.board.limits, GAP / self.clock.rate
         rows = held.ready(float(max(latency.max(), 0.0)), last=last)
         if rows.start == rows.stop:
             return
-        limits = np.full(latency.shape, NO_LIMIT)
-        if self.board.settings is not None:
-            limits = np.array([self.board.settings.accel_limit, self.board.settings.gyro_limit])
         readings = read_all_late(held.time, held.values, rows, latency, limits, longest)
         time, raw = held.time[rows], held.raw[rows]
         step = np.diff(time, prepend=self.until)
@@ -422,17 +422,36 @@ def fuse_imus(
         known = load_blob(fspath(calibration))
     else:
         known = as_record(calibration, "fuse_imus: calibration")
-    fuser = BoardFuser(board_of(known, at, ranges([recording], gyro_range, accel_range)))
+    fuser = BoardFuser(board_of(known, at, limits_of(known, [recording], gyro_range, accel_range)))
     parts = list(fuser.fuse([recording]))
     if not parts:
         raise DataError(f"{recording.name}: no samples to fuse")
     return replace(joined_boards(parts), notes=(*fuser.notes(), f"{recording.name}: {fuser.share()}"))
 
 
-def ranges(
-    blocks: Iterable[Recording], gyro_range: float | str | None, accel_range: float | str | None
+def limits_of(
+    known: Calibration | Blob,
+    blocks: Iterable[Recording],
+    gyro_range: float | str | None,
+    accel_range: float | str | None,
 ) -> Array | None:
-    """Return the ends of the ranges, shape (2, K): as stated, else as recordings reach them; None of no recording."""
+    """Return the ends of the ranges for `board_of`; a blob has them in itself.
+
+    Raises
+    ------
+    OptionError
+        A range is stated for a blob, or is none.
+    """
+    if not isinstance(known, Blob):
+        return ranges(blocks, gyro_range, accel_range)
+    for name, value in (("gyro_range", gyro_range), ("accel_range", accel_range)):
+        if value is not None:
+            raise OptionError(f"{name}: the blob {known.name} holds the range that it was exported with")
+    return None
+
+
+def ranges(blocks: Iterable[Recording], gyro_range: float | str | None, accel_range: float | str | None) -> Array:
+    """Return the ends of the ranges, shape (2, K) or (2, 1): as stated, else as recordings reach them."""
     finder: RangeFinder | None = None
     for block in blocks:
         names = names_of(block)
