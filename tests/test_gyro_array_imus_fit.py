@@ -231,6 +231,29 @@ def test_a_loose_imu_is_named():
     assert any("IMU 3 sits elsewhere" in text for text in record.verdict.reasons)
 
 
+def test_an_imu_on_another_clock_is_named():
+    """100 ppm of the motion's halves are a millisecond, of which positions are wrong by more than they say."""
+    board = a_board(duration="20 s", age="0 ms")
+    columns = {
+        name: make_interp_spline(board.columns["time"], values, k=5)(board.columns["time"] * (1 + 1e-4))
+        if name.endswith("_3")
+        else values
+        for name, values in board.columns.items()
+    }
+    record = il.calibrate_imus(replace(board, columns=columns), gravity=G).calibration
+    assert record.verdict.state == "look"
+    assert any("gyroscopes of IMU 3 answer" in text and "another clock" in text for text in record.verdict.reasons)
+
+
+def test_biases_that_drift_between_rests_are_said():
+    board = a_board(age="0 ms")
+    ramp = np.linspace(-0.1, 0.1, len(board))
+    drift = {f"accel_{axis}_2": board.columns[f"accel_{axis}_2"] + ramp for axis in "xyz"}
+    record = il.calibrate_imus(with_columns(board, **drift), gravity=G).calibration
+    assert record.verdict.state == "look"
+    assert any("accelerometers disagree by" in text for text in record.verdict.reasons)
+
+
 def shifted(board, number, by):
     """Return a board whose IMU reads as if it sat elsewhere, by lever arms from rates of the gyroscopes' derivative."""
     truth = {name: np.array(board.metadata[f"truth_{name}_1"].split(), float) for name in ("gyro", "gyro_bias")}
@@ -454,6 +477,7 @@ def test_a_real_board_has_the_size_of_its_drawing():
     assert record.sources[0].file.endswith("exp_1.bin")
     assert 0.1 < held.fit.clipped < 0.2
     assert any("reading at its limit" in text for text in record.verdict.reasons)
+    assert not any("disagree" in text or "answer" in text for text in record.verdict.reasons)
 
 
 @pytest.mark.skipif(not REAL.is_file(), reason="no real recording here")

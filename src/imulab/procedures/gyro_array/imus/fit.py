@@ -18,11 +18,13 @@ from imulab.procedures.gyro_array.imus.model import (
     ACCEL_BIAS,
     ACCEL_LATENCY,
     ACCELERATION,
+    FORCE,
     GYRO,
     GYRO_LATENCY,
     NUMBERS,
     POSITION,
     RATE,
+    predicted,
 )
 from imulab.procedures.gyro_array.imus.prepare import Prepared, prepare
 from imulab.procedures.gyro_array.imus.record import GAUGE, make_record
@@ -64,7 +66,8 @@ _SHORT, _CLIPPED, _BEYOND, _SIGMA = 5.0, 0.1, 0.5, 3.0  # s, share, m, standard 
 _UNLIKE_REST = 5.0  # times the noise at rest
 _BOARD = 2e-4  # m: uncertainty of a stated distance, unless stated
 _ONE_CHIP = 3e-4  # m: two chips are farther apart, on two sides of a board too
-_BENT = 2e-5  # m: differences of halves below this do no harm
+_BENT, _SLIPPED = 2e-5, 1e-4  # m, s: differences of halves below these do no harm
+_DRIFTED = 0.01  # m/s^2 between rests, above which positions of 20 mm boards are wrong by 0.1 mm and more
 
 
 @dataclass(frozen=True, repr=False)
@@ -212,6 +215,7 @@ def fit_board(recording: Recording, gravity: Gravity, distance: Distance | None,
         *warn_motion(prepared, attitudes),
         *warn_positions(solution, covariance),
         *warn_halves(solution, apart, deviation),
+        *warn_rests(prepared, solution),
         *warn_scatter(summary),
         *warn_size(factors, source),
     ]
@@ -416,19 +420,52 @@ def warn_positions(solution: Solution, covariance: Array) -> list[str]:
 
 
 def warn_halves(solution: Solution, apart: Array, deviation: Array) -> list[str]:
-    """Return which IMUs sit elsewhere in the second half of the motion."""
+    """Return which IMUs sit elsewhere, or are read later, in the second half of the motion."""
+    findings: list[str] = []
     z = np.sqrt(np.square((apart / deviation)[:, POSITION]).mean(axis=1))
     size = np.linalg.norm(apart[:, POSITION], axis=1)
     moved = [k for k in range(1, len(z)) if z[k] > _SIGMA and size[k] > _BENT]
-    if not moved:
+    if moved:
+        worst = max(moved, key=lambda k: float(size[k]))
+        who = f"IMU {worst + 1} sits" if len(moved) == 1 else f"{len(moved)} of {len(z) - 1} IMUs sit"
+        findings.append(
+            Finding(
+                f"{who} elsewhere against IMU 1 in the second half of the motion, by up to {1e3 * size[worst]:.2g} mm "
+                f"or {z[worst]:.2g} standard deviations: is an IMU loose, does the board bend, or did it get a knock?",
+                "fix the IMUs, and record again",
+            )
+        )
+    for sensors, place in (("accelerometers", ACCEL_LATENCY), ("gyroscopes", GYRO_LATENCY)):
+        later, z = apart[:, place], apart[:, place] / deviation[:, place]
+        sure = (np.abs(later) > _SLIPPED) & (np.abs(z) > _SIGMA)
+        if sure.any():
+            k = int(np.argmax(np.abs(later) * sure))
+            findings.append(
+                Finding(
+                    f"the {sensors} of IMU {k + 1} answer {'later' if later[k] > 0 else 'earlier'} against the "
+                    f"gyroscopes of IMU 1 in the second half of the motion than in the first, by {abs(z[k]):.2g} "
+                    "standard deviations: do they run on another clock, or were samples lost?",
+                    "record all IMUs on one clock",
+                )
+            )
+    return findings
+
+
+def warn_rests(prepared: Prepared, solution: Solution) -> list[str]:
+    """Return by what the IMUs' forces at rest differ beyond their noise."""
+    measured = prepared.measured
+    still = np.zeros((len(solution.force), 9))
+    still[:, FORCE] = solution.force
+    left = measured.rest_accel - predicted(solution.board, still)[1]
+    scatter = np.sqrt(np.square(left).mean(axis=(1, 2)))
+    factor = scatter * np.sqrt(measured.rest_count / np.square(measured.accel_noise).mean())
+    if np.median(factor) < _SIGMA or np.median(scatter) < _DRIFTED:
         return []
-    worst = max(moved, key=lambda k: float(size[k]))
-    who = f"IMU {worst + 1} sits" if len(moved) == 1 else f"{len(moved)} of {len(z) - 1} IMUs sit"
     return [
         Finding(
-            f"{who} elsewhere against IMU 1 in the second half of the motion, by up to {1e3 * size[worst]:.2g} mm or "
-            f"{z[worst]:.2g} standard deviations: is an IMU loose, does the board bend, or did it get a knock?",
-            "fix the IMUs, and record again",
+            f"the accelerometers disagree by {np.median(scatter):.2g} m/s^2 from rest to rest, {np.median(factor):.2g} "
+            "times their noise: do their biases drift, or does the board bend?",
+            "let the board warm up first, and record faster",
         )
     ]
 
