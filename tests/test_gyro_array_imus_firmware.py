@@ -26,12 +26,12 @@ RANGE = 300.0  # deg/s
 STEPS = """
 int main(void) {
     static double z[1 + 6 * UNIT_IMUS], out[19];
-    static il_real all[2][UNIT_IMUS][3];
+    static il_real all[6 * UNIT_IMUS];
     static il_imus_fused fused;
     if (!compensation_start()) return 1;
     while (fread(z, sizeof z, 1, stdin) == 1) {
-        for (int i = 0; i < 6 * UNIT_IMUS; i++) all[i / (3 * UNIT_IMUS)][i / 3 % UNIT_IMUS][i % 3] = (il_real)z[1 + i];
-        out[18] = fuse_board((il_real)z[0], (const il_real(*)[UNIT_IMUS][3])all, &fused);
+        for (int i = 0; i < 6 * UNIT_IMUS; i++) all[i] = (il_real)z[1 + i];
+        out[18] = fuse_board((il_real)z[0], all, &fused);
         const il_real *const found[] = {fused.force, fused.rate, fused.acceleration,
                                         fused.force_std, fused.rate_std, fused.acceleration_std};
         for (int i = 0; i < 18; i++) out[i] = (double)found[i / 3][i % 3];
