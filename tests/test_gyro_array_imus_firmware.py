@@ -11,11 +11,12 @@ import imulab as il
 from conftest import STRICT
 from imulab.cli import main
 from imulab.device.tables import Fusion, pack
-from imulab.device.unit import BEYOND, EXCLUDED, Blob
+from imulab.device.unit import BEYOND, EXCLUDED, Blob, load_blob
 from imulab.errors import OptionError
 from imulab.exporters import EXPORTERS
 from imulab.procedures.apply import tables_of
 from imulab.procedures.gyro_array.imus.columns import readings_of
+from imulab.procedures.gyro_array.imus.figures import exhibits
 from imulab.procedures.gyro_array.imus.fuse import board_of
 from imulab.procedures.gyro_array.imus.prepare import names_of
 from reference import imus as reference
@@ -296,3 +297,26 @@ def test_a_board_beside_other_records_and_with_too_many_imus(record, tmp_path):
         il.export("c", many, tmp_path / "many")
     assert not (tmp_path / "many").exists()
     assert tables_of(record, Fusion(at="imu:1"))[0].columns["at"] == [0.0, 0.0, 0.0]
+
+
+def test_ranges_that_the_record_holds_reach_fusion_and_unit(tmp_path):
+    """Stated, or as the recording reaches them; nobody has to state them again."""
+    board = il.simulate_imus(elements=4, attitudes=6, duration="20 s", rate="50 Hz", age="0 s")
+    fit = il.calibrate_imus(board, gravity=9.80665, gyro_range=f"{RANGE} deg/s", accel_range="16 g").calibration
+    held = fit.sections["imus"][0]
+    assert held["gyro_range"] == {"value": pytest.approx(np.radians(RANGE)), "unit": "rad/s"}
+    assert held["accel_range"] == {"value": pytest.approx(16 * 9.80665), "unit": "m/s^2"}
+    assert fit.options["gyro_range"] == f"{RANGE} deg/s"
+    (table,) = (item for item in exhibits(fit).items if item.title == "Ends of the ranges")
+    assert ["2", "156.91", "300.00"] in table.rows
+    clipped = clipped_board(board, RANGE)
+    alone, told = (il.fuse_imus(clipped, calibration=fit, **by) for by in ({}, {"gyro_range": f"{RANGE} deg/s"}))
+    assert np.array_equal(alone.bridged, told.bridged)
+    (blob,) = il.export("blob", fit, tmp_path)
+    (section,) = load_blob(blob).text["sections"]
+    assert section["gyro_range"] == pytest.approx(np.radians(RANGE))
+    reached = il.calibrate_imus(clipped, gravity=9.80665).calibration
+    ends = [imu["gyro_range"]["value"] for imu in reached.sections["imus"]]
+    assert ends == pytest.approx([np.radians(RANGE)] * len(ends))
+    assert reached.sections["imus"][0]["accel_range"] is None
+    assert 0 < reached.fit["bridged"] < 1

@@ -145,7 +145,6 @@ def test_show_lists_the_imus(tmp_path, capsys):
     "words",
     [
         ["apply", "REC", "rec.csv", "-o", "o.csv"],
-        ["export", "--to", "c", "REC", "-o", "out"],
         ["export", "--to", "px4", "REC", "-o", "out"],
     ],
 )

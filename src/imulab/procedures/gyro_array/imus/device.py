@@ -59,8 +59,10 @@ def tables_of_board(record: Calibration, fusion: Fusion | None = None) -> tuple[
         "rate": known.settings.rate,
         "accel_latency": known.latency[0].tolist(),
         "gyro_latency": known.latency[1].tolist(),
-        "accel_range": by.accel_range,
-        "gyro_range": by.gyro_range,
+        **{
+            name: float(ends.min()) if (ends < NO_LIMIT).any() else None
+            for name, ends in zip(("accel_range", "gyro_range"), known.limits, strict=True)
+        },
     }
     return (DeviceTable(table.kind, table.fields, columns),)
 

@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 
+from imulab.device.imus import NO_LIMIT
 from imulab.procedures.gyro_array.imus.schema import Imu, ImusRecord, Three, imus_of
 from imulab.records.calibration import Calibration
+from imulab.records.sections import Above0
 from imulab.report.traces import (
     BAD,
     DASHES,
@@ -62,6 +64,8 @@ def exhibits(calibration: Calibration) -> Exhibits:
 
 def _items(record: ImusRecord, calibration: Calibration) -> list[Figure | ReportTable]:
     items: list[Figure | ReportTable] = [_imus_table(record), _biases_table(record), _size_table(record)]
+    if (record.limits < NO_LIMIT).any():
+        items.append(_ranges_table(record))
     if record.not_determined:
         rows = [[name] for name in record.not_determined]
         caption = "What is known no better than before the recording; it is held near its nominal value."
@@ -205,6 +209,18 @@ def _biases_table(record: ImusRecord) -> ReportTable:
     ]
     caption = "Biases and scale factors of each IMU along its own axes; misalignments are in the record."
     return ReportTable("Biases and scale factors", caption, ["IMU", *titles], [row(imu) for imu in record.imus])
+
+
+def _ranges_table(record: ImusRecord) -> ReportTable:
+    def cell(end: Above0 | None, factor: float) -> str:
+        return "–" if end is None else plain_number(end.value * factor, 5)
+
+    return ReportTable(
+        "Ends of the ranges",
+        "As stated, or as this recording reaches them; fusion bridges samples with a gyroscope there.",
+        ["IMU", "accelerometers m/s²", "gyroscopes deg/s"],
+        [[imu.name, cell(imu.accel_range, 1.0), cell(imu.gyro_range, math.degrees(1))] for imu in record.imus],
+    )
 
 
 def _size_table(record: ImusRecord) -> ReportTable:

@@ -12,7 +12,8 @@ import numpy as np
 from imulab.display import Bad, Finding, Note
 from imulab.errors import OptionError
 from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_place, gravity_findings, local_gravity
-from imulab.options import measure, text
+from imulab.options import RARE, measure, text
+from imulab.procedures.gyro_array.imus.fuse import ranges
 from imulab.procedures.gyro_array.imus.model import (
     ACCEL,
     ACCEL_BIAS,
@@ -125,6 +126,8 @@ def calibrate_imus(
     *,
     distance: Annotated[str | None, text("IMU:IMU:LENGTH")] = None,
     tolerance: Annotated[float | str, measure("number", "1")] = 0.01,
+    gyro_range: Annotated[float | str | None, measure("rate", "deg/s"), RARE] = None,
+    accel_range: Annotated[float | str | None, measure("acceleration", "g"), RARE] = None,
     gravity: LocalGravity = None,
     latitude: Latitude = None,
     height: Height = None,
@@ -146,6 +149,8 @@ def calibrate_imus(
     tolerance
         How well the mean scale factor of all gyroscopes is known. A standard uncertainty; the size of the board, known
         half as well, rests on it where neither gravity between rests nor a distance tell more.
+    gyro_range, accel_range
+        Largest reading of the gyroscopes, and of the accelerometers, for fusion; found where the recording reaches it.
     gravity
         As for `fit_tumble`.
     latitude, height
@@ -178,13 +183,21 @@ def calibrate_imus(
         raise OptionError(f"tolerance {spread:g}: expected a standard uncertainty of 1e-6 to 0.2, such as 0.01")
     stated = at_place(gravity, latitude, height)
     recording = as_recording(data, reading, calibrate_imus)
-    return fit_board(recording, local_gravity(stated, recording), known, spread)
+    named = {"gyro_range": gyro_range, "accel_range": accel_range}
+    return fit_board(recording, local_gravity(stated, recording), known, spread, named)
 
 
-def fit_board(recording: Recording, gravity: Gravity, distance: Distance | None, tolerance: float) -> ImusFit:
-    """Calibrate a board; errors as for `calibrate_imus`."""
+def fit_board(
+    recording: Recording,
+    gravity: Gravity,
+    distance: Distance | None,
+    tolerance: float,
+    stated: dict[str, float | str | None],
+) -> ImusFit:
+    """Calibrate a board; `stated` are its ``gyro_range`` and ``accel_range``; errors as for `calibrate_imus`."""
     prepared = prepare(recording, gravity.value)
     measured = prepared.measured
+    limits = np.broadcast_to(ranges([recording], stated["gyro_range"], stated["accel_range"]), (2, measured.count))
     if distance is not None and max(distance.first, distance.second) >= measured.count:
         raise OptionError(f"distance: expected IMUs 1 to {measured.count}, as {recording.name} has")
     row = mean_scale(measured)
@@ -220,7 +233,7 @@ def fit_board(recording: Recording, gravity: Gravity, distance: Distance | None,
         *warn_size(factors, source),
     ]
     record = make_record(
-        recording, solution.board, covariance, (measured.accel_noise, measured.gyro_noise),
+        recording, solution.board, covariance, (measured.accel_noise, measured.gyro_noise), limits,
         model=ImusModel(
             kind="imus", imus=measured.count, gauge=GAUGE, gravity=StatedGravity.of(gravity),
             units=[recording.units["accel_x_1"], recording.units["gyro_x_1"]],
@@ -228,7 +241,10 @@ def fit_board(recording: Recording, gravity: Gravity, distance: Distance | None,
         fit=summary, data=ImusData(motion=_motion_data(prepared, solution)),
         common=_common(prepared, solution, covariance) if attitudes >= _ATTITUDES else Common(),
         size_from=source, not_determined=names, unknown=unknown, warnings=findings,
-        options={"gravity": gravity.option, "tolerance": tolerance, **({} if distance is None else distance.option)},
+        options={
+            "gravity": gravity.option, "tolerance": tolerance, **({} if distance is None else distance.option),
+            **{name: value for name, value in stated.items() if value is not None},
+        },
     )  # fmt: skip
     return ImusFit(record)
 

@@ -61,7 +61,7 @@ class KnownBoard:
 def board_of(calibration: Calibration | Blob, at: str = "centroid", limits: Array | None = None) -> KnownBoard:
     """Return the board of a record, or of an exported blob, that gives the specific force `at` a point.
 
-    `limits` are the ends of the ranges, shape (2, K) or (2, 1); ``NO_LIMIT`` where they are not known.
+    `limits` are the ends of the ranges, shape (2, K) or (2, 1); ``NO_LIMIT`` where the record is to say.
 
     Raises
     ------
@@ -84,9 +84,9 @@ def board_of(calibration: Calibration | Blob, at: str = "centroid", limits: Arra
         return KnownBoard(calibration.name, None, calibration.data, latency, limits)
     held = imus_of(calibration)
     board, noise = held.board, held.accel_noise
-    if limits is None or limits.shape[1] not in (1, len(noise)):  # of another board, which fusion refuses
-        limits = np.full((2, 1), NO_LIMIT)
-    ends = np.broadcast_to(limits, (2, len(noise))).copy()
+    ends = held.limits
+    if limits is not None and limits.shape[1] in (1, len(noise)):  # others are of another board, which fusion refuses
+        ends = np.where(limits < NO_LIMIT, limits, ends)
     settings = ImusSettings(
         board.accel, board.accel_bias, noise, board.gyro, board.gyro_bias, held.gyro_noise, board.position,
         point_of(at, board.position, noise), ends[0], ends[1], float(held.fit.sample_rate.value),

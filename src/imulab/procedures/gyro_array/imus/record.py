@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from imulab.device.imus import NO_LIMIT
 from imulab.errors import DataError
 from imulab.procedures.gyro_array.imus.model import (
     ACCEL,
@@ -116,6 +117,7 @@ def make_record(
     board: Board,
     covariance: Array,
     noise: tuple[Array, Array],
+    limits: Array | None = None,
     *,
     model: ImusModel,
     fit: ImusSummary,
@@ -129,6 +131,7 @@ def make_record(
 ) -> Calibration:
     """Return the record of a board; `noise` are standard deviations at rest, m/s^2 and rad/s, shape (K, 3) each.
 
+    `limits` are the ends of the ranges, shape (2, K), ``NO_LIMIT`` where they are not known.
     `unknown` are places among the parameters of each IMU whose uncertainty cannot be stated.
     """
     values, carried = record_values(board, covariance)
@@ -138,10 +141,9 @@ def make_record(
     unstated = np.zeros((count, NUMBERS), dtype=bool)
     for place in unknown:
         unstated[:, place] = True
-    imus = [
-        _imu(k, values[k], [None if no else float(u) for u, no in zip(deviation[k], unstated[k], strict=True)], noise)
-        for k in range(count)
-    ]
+    told = deviation.astype(object)
+    told[unstated] = None
+    imus = [_imu(k, values[k], told[k].tolist(), noise, limits) for k in range(count)]
     names = np.array([[f"{name}_{k + 1}" for name, _ in PER_IMU] for k in range(count)])
     units = np.broadcast_to(np.array([unit for _, unit in PER_IMU]), names.shape)
     parameters = {
@@ -175,13 +177,17 @@ def make_record(
     )
 
 
-def _imu(k: int, values: Array, deviation: list[float | None], noise: tuple[Array, Array]) -> Imu:
+def _imu(k: int, values: Array, deviation: list[float | None], noise: tuple[Array, Array], limits: Array | None) -> Imu:
     def three(place: slice, unit: str) -> Three:
         return Three(value=values[place].tolist(), standard_uncertainty=deviation[place], unit=unit)
 
     def single(place: int) -> Measured:
         return Measured(value=float(values[place]), standard_uncertainty=deviation[place], unit="s")
 
+    ranges = [
+        Above0(value=float(limits[s, k]), unit=unit) if limits is not None and limits[s, k] < NO_LIMIT else None
+        for s, unit in enumerate(("m/s^2", "rad/s"))
+    ]
     six = Six(
         value=values[AT_GYRO_MISALIGNMENT].tolist(), standard_uncertainty=deviation[AT_GYRO_MISALIGNMENT], unit="rad"
     )
@@ -199,4 +205,6 @@ def _imu(k: int, values: Array, deviation: list[float | None], noise: tuple[Arra
         gyro=GyroTriad(bias=three(AT_GYRO_BIAS, "rad/s"), scale_factor=three(AT_GYRO_SCALE, "1"), misalignment=six),
         accel_noise=Above0(value=float(np.sqrt(np.square(noise[0][k]).mean())), unit="m/s^2"),
         gyro_noise=Above0(value=float(np.sqrt(np.square(noise[1][k]).mean())), unit="rad/s"),
+        accel_range=ranges[0],
+        gyro_range=ranges[1],
     )

@@ -15,6 +15,7 @@ from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 
+from imulab.device.imus import NO_LIMIT
 from imulab.errors import RecordError
 from imulab.procedures.gyro_array.imus.model import ACCEL, GYRO, NUMBERS, Board, cross
 from imulab.recording import Array
@@ -64,6 +65,7 @@ class Imu(Part):
     """One of ``imus``.
 
     `accel_noise` and `gyro_noise` are the standard deviations of a sample at rest, mean of the three axes.
+    `accel_range` and `gyro_range` are the readings at the ends of the ranges, None where neither stated nor reached.
     """
 
     name: str
@@ -75,6 +77,8 @@ class Imu(Part):
     gyro: GyroTriad
     accel_noise: Above0
     gyro_noise: Above0
+    accel_range: Above0 | None = null()
+    gyro_range: Above0 | None = null()
 
 
 class Common(Part):
@@ -173,6 +177,12 @@ class ImusRecord(Part):
     def gyro_noise(self) -> Array:
         """Standard deviation of a sample of each IMU's gyroscopes at rest, rad/s, shape (K,)."""
         return np.array([imu.gyro_noise.value for imu in self.imus])
+
+    @property
+    def limits(self) -> Array:
+        """Readings at the ends of the ranges, m/s^2 and rad/s, shape (2, K); ``NO_LIMIT`` where they are not known."""
+        ends = [[imu.accel_range for imu in self.imus], [imu.gyro_range for imu in self.imus]]
+        return np.array([[NO_LIMIT if end is None else end.value for end in each] for each in ends])
 
 
 def imus_of(record: Calibration) -> ImusRecord:
