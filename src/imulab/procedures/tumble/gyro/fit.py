@@ -191,7 +191,7 @@ def fit_gyro_triad(
             raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
         time = comparison.on_other(stamps.time)
         stamps = Stamps(time, time)
-        solved = solve_turns(case, stamps, sensitivity)
+        solved = solve_turns(case, stamps, sensitivity, near=solved)
     solved, noise_notes = (solved, []) if noise is None else _with_noise_record(solved, noise, attitudes, recording)
     known = clock_of_scale(comparison, clock, clock_of, counted=is_counted(check_time(recording)))
     notes = [
@@ -248,15 +248,16 @@ def _solve_with_earth(
     case: TurnProblem, stamps: Stamps, sensitivity: str, earth: EarthRate | None
 ) -> tuple[TurnProblem, TurnSolution]:
     """Return the problem, with the Earth's rate (known, or its largest possible value) as output, and the solution."""
-    solved = solve_turns(case, stamps, sensitivity)
+    # Of the scale factors only the size matters for whether gravity shows in the zeros: a plain fit will do.
+    first = solve_turns(case, stamps, "no" if sensitivity == "auto" and earth is None else sensitivity)
     up = case.force / np.linalg.norm(case.force, axis=1, keepdims=True)
     if earth is not None:
-        case = replace(case, earth=solved.output_of(earth.vertical * up))
-    elif sensitivity == "auto" and solved.rest.slope is not None:
-        case = replace(case, vertical=solved.output_of(EARTH * up))
+        case = replace(case, earth=first.output_of(earth.vertical * up))
+    elif sensitivity == "auto":
+        case = replace(case, vertical=first.output_of(EARTH * up))
     else:
-        return case, solved
-    return case, solve_turns(case, stamps, sensitivity)
+        return case, first
+    return case, solve_turns(case, stamps, sensitivity, near=first)
 
 
 def _check_request(record: Calibration, attitudes: Attitudes, sensitivity: str, clock: float, clock_of: str) -> None:
@@ -303,7 +304,7 @@ def _with_even_stamps(
     if even is not None:
         # Only the turns can tell stamps that jitter from samples that do.
         evened = Stamps(even[0], even[0] + (stamps.on_accel - stamps.time))
-        other = solve_turns(case, evened, sensitivity)
+        other = solve_turns(case, evened, sensitivity, near=solved)
         if other.typical_miss < _EVENER * solved.typical_miss:
             note = Note(
                 f"gyro: the time stamps jitter by {1e3 * even[1]:.2g} ms rms: replaced by even ones, with which "

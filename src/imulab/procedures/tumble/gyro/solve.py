@@ -356,9 +356,12 @@ class TurnSolution:
         return float(np.mean(self.residual**2)) * 3
 
 
-def solve_turns(case: TurnProblem, stamps: Stamps, sensitivity: str, *, rough: bool = False) -> TurnSolution:
+def solve_turns(
+    case: TurnProblem, stamps: Stamps, sensitivity: str, *, near: TurnSolution | None = None, rough: bool = False
+) -> TurnSolution:
     """Return the fit of the turns with zero and g-sensitivity from rest; ``auto`` drops a slope that fits worse.
 
+    `near` is an earlier solution: outputs of unknown size need no fit of their own to find their scale factors then.
     A `rough` one is for clocks that differ by unknown delays: its turns go from the middle of a hold to that of the
     next.
     """
@@ -377,7 +380,9 @@ def solve_turns(case: TurnProblem, stamps: Stamps, sensitivity: str, *, rough: b
         left_out = f"gyro: {int(beside.sum())} turns left out, beside attitudes that the record set aside ({numbers})"
         chosen, notes = chosen[~beside], [*notes, Note(left_out)]
     known = parse_unit(case.unit)
-    nominal = np.full(3, 1 / to_si(1.0, known.symbol)) if known.quantity == "rate" else None
+    nominal = None if near is None else near.scale * (1 + near.theta[:3])
+    if known.quantity == "rate":
+        nominal = np.full(3, 1 / to_si(1.0, known.symbol))
 
     def solved(wanted: str, scale: Array | None) -> TurnSolution:
         rest = at_rest(holds, stamps.time, case.output, case.force, wanted, density, scale, case.earth, case.vertical)
