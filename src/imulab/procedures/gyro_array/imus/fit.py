@@ -68,6 +68,7 @@ _UNLIKE_REST = 5.0  # times the noise at rest
 _BOARD = 2e-4  # m: uncertainty of a stated distance, unless stated
 _ONE_CHIP = 3e-4  # m: two chips are farther apart, on two sides of a board too
 _BENT, _SLIPPED = 2e-5, 1e-4  # m, s: differences of halves below these do no harm
+_LATER = 6.0  # standard deviations: twice as many latencies as IMUs are compared, with ages that a sawtooth moves
 _DRIFTED = 0.01  # m/s^2 between rests, above which positions of 20 mm boards are wrong by 0.1 mm and more
 
 
@@ -453,7 +454,7 @@ def warn_halves(solution: Solution, apart: Array, deviation: Array) -> list[str]
         )
     for sensors, place in (("accelerometers", ACCEL_LATENCY), ("gyroscopes", GYRO_LATENCY)):
         later, z = apart[:, place], apart[:, place] / deviation[:, place]
-        sure = (np.abs(later) > _SLIPPED) & (np.abs(z) > _SIGMA)
+        sure = (np.abs(later) > _SLIPPED) & (np.abs(z) > _LATER)
         if sure.any():
             k = int(np.argmax(np.abs(later) * sure))
             findings.append(
