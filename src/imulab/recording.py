@@ -873,6 +873,21 @@ DAMAGED = ("refuse", "skip")
 """What to do with lines of text that cannot be read."""
 
 
+EVERY = "all"
+"""The instance that stands for all of a flight log."""
+
+
+def instance_number(typed: str, called: str) -> int | str:
+    """Return the number of an instance, or `EVERY`.
+
+    Raises
+    ------
+    OptionError
+        It is neither.
+    """
+    return EVERY if typed == EVERY else whole_number(typed, called)
+
+
 class Part(TypedDict, total=False):
     """How data are to be understood: arrays and data frames by `time` to `units`, files by `units` to `instance`.
 
@@ -889,7 +904,7 @@ class Part(TypedDict, total=False):
     topic
         Topic of a bag or log, where there are several; with a comma, the magnetometer's beside it.
     instance
-        Sensor of a flight log, from 0; the first if not given.
+        Sensor of a flight log, from 0, or all, as whole IMUs on one clock; the first if not given.
     element
         One IMU of a file of several, from 1.
     damaged
@@ -903,7 +918,7 @@ class Part(TypedDict, total=False):
     units: Annotated[Mapping[str, str] | None, parsed(parse_units, "NAME=UNIT", flags=("--unit",)), READING]
     layout: Annotated[str | os.PathLike[str] | Layout | None, file("NAME|L.toml"), READING]
     topic: Annotated[str | None, text("TOPIC"), READING]
-    instance: Annotated[int | None, parsed(whole_number, "N"), READING]
+    instance: Annotated[int | str | None, parsed(instance_number, "N"), READING]
     element: Annotated[int | None, parsed(whole_number, "N"), READING]
     damaged: Annotated[str | None, choice(DAMAGED), READING]
     serial: Annotated[str | None, text("TEXT"), READING]

@@ -223,10 +223,11 @@ def calibrate_imus(
     """
     from imulab.cli.options import read_recording
     from imulab.cli.show import finish
+    from imulab.procedures.gyro_array.imus.logs import with_all_instances
     from imulab.readers.streams import one_clock
 
     check_outputs([output, report], [name for name in (file, options["layout"]) if name])
-    recording = one_clock(read_recording(file, **reading(options)))
+    recording = one_clock(read_recording(file, **with_all_instances(file, reading(options))))
     finish(call(il.calibrate_imus, recording, **options).calibration, output, report, json=json)
 
 
@@ -283,6 +284,7 @@ def fuse_imus(file: RecordingFile, *, imus: WholeImus = False, output: OutputFil
     """
     from imulab.estimation.sampling import mend_blocks
     from imulab.procedures.gyro_array.imus.fuse import BoardFuser, board_of, limits_of
+    from imulab.procedures.gyro_array.imus.logs import with_all_instances
     from imulab.procedures.registry import load_any
     from imulab.readers import is_pipe, read_blocks
     from imulab.readers.streams import on_clock_of
@@ -290,7 +292,7 @@ def fuse_imus(file: RecordingFile, *, imus: WholeImus = False, output: OutputFil
 
     calibration = options["calibration"]
     check_outputs([output], [name for name in (file, options["layout"], calibration) if name])
-    how = reading(options)
+    how = with_all_instances(file, reading(options))
     if output:
         check_writable(output)
     known = load_any(calibration)
@@ -427,13 +429,14 @@ def compare_imus(
     from imulab.cli.show import verdict_lines
     from imulab.display import Note, verdict_of
     from imulab.files import write_text
+    from imulab.procedures.gyro_array.imus.logs import with_all_instances
     from imulab.readers.streams import one_clock
     from imulab.report import render_page
     from imulab.report.traces import ReportTable
 
     calibration = options["calibration"]
     check_outputs([report], [name for name in (file, options["layout"], calibration) if name])
-    recording = one_clock(read_recording(file, **reading(options)))
+    recording = one_clock(read_recording(file, **with_all_instances(file, reading(options))))
     compared = call(il.compare_imus, recording, **options)
     verdict, exhibits = verdict_of(compared.notes), compared.exhibits()
     if report:

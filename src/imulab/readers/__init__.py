@@ -44,7 +44,7 @@ def read(
     layout: str | Path | Layout | None = None,
     *,
     topic: str | None = None,
-    instance: int | None = None,
+    instance: int | str | None = None,
     window: Window | None = None,
     element: int | None = None,
     units: Mapping[str, str] | None = None,
@@ -63,7 +63,7 @@ def read(
     topic
         Which topic of a bag or log, where there are several; with a comma between, the magnetometer's beside it.
     instance
-        Which sensor of a flight log, from 0; by default the first.
+        Which sensor of a flight log, from 0; by default the first. ``all``: all of them, as whole IMUs on one clock.
     window
         First and last time to read, s; None for no bound.
     element
@@ -158,7 +158,7 @@ def read_blocks(
     layout: str | Path | Layout | None = None,
     *,
     topic: str | None = None,
-    instance: int | None = None,
+    instance: int | str | None = None,
     window: Window | None = None,
     element: int | None = None,
     units: Mapping[str, str] | None = None,

@@ -18,9 +18,10 @@ from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError
 from imulab.files import open_file
 from imulab.readers import logs
+from imulab.readers.instances import LoggedTriad, imus_on_one_clock
 from imulab.readers.selection import Selection
 from imulab.readers.streams import LoggedStream, Piece, side_by_side
-from imulab.recording import Array, Recording
+from imulab.recording import EVERY, Array, Recording
 
 MAGIC = b"\xa3\x95\x80"
 _FMT = 128  # message that describes the layout of the others
@@ -90,11 +91,12 @@ class _Format:
         values = logs.field(rows, f.offset, f.kind).astype(np.float64)
         return values if f.factor == 1.0 else values * f.factor
 
-    def ticks(self, rows: np.ndarray) -> np.ndarray:
-        """Return the time since boot, microseconds."""
+    def ticks(self, rows: np.ndarray, *, sampled: bool = False) -> np.ndarray:
+        """Return the time since boot, microseconds, of the message, or of its sample where the log tells that."""
         key = "TimeUS" if "TimeUS" in self.fields else "TimeMS"
+        key = "SampleUS" if sampled and "SampleUS" in self.fields else key
         stamps = logs.field(rows, self.fields[key].offset, self.fields[key].kind).astype(np.int64)
-        return stamps if key == "TimeUS" else stamps * 1000
+        return stamps * 1000 if key == "TimeMS" else stamps
 
 
 @dataclass(slots=True)
@@ -119,6 +121,9 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
         An unknown message name.
     """
     contents = _survey(path, name)
+    if selection.instance == EVERY:
+        yield _every_imu(path, contents, selection, name)
+        return
     streams, sources = _choose(contents, selection, name)
     metadata = {"autopilot": contents.version or "ArduPilot", "time_origin": "boot"}
     yield from side_by_side(
@@ -251,7 +256,7 @@ def _choose(
     if not titles:
         known = " ".join(sorted(contents.other | {title for title, _ in every})) or "none"
         raise ReadError(f"{name}: no IMU, ACC or GYR messages; messages found: {known}")
-    instance = selection.instance or 0
+    instance = selection.single
     topic = wanted or ("IMU" if "IMU" in titles else "ACC" if "ACC" in titles else "GYR")
     samples = {title: contents.counts[there[title, instance][0], instance] for title, n in there if n == instance}
     if not wanted and samples.get("ACC", 0) > logs.PLAINLY_MORE * samples.get("IMU", np.inf):
@@ -355,3 +360,36 @@ def _pieces(
                         mine, values = mine[values[:, 3] != 0], values[values[:, 3] != 0, :3]
                     if len(mine):
                         yield Piece(slot, form.ticks(mine), values)
+
+
+# --- all IMUs ----------------------------------------------------------------------------------------------------
+
+
+def _every_imu(path: Path, contents: _Contents, selection: Selection, name: str) -> Recording:
+    """Return all IMUs on one clock: of ACC and GYR, or of IMU where that has more samples."""
+    topic, _ = selection.beside("MAG")
+    if topic not in (None, "IMU", "ACC", "GYR"):
+        raise OptionError(f"{name}: topic {topic!r}; all IMUs of a DataFlash log are in IMU, or in ACC and GYR")
+    counts: dict[str, list[int]] = {"IMU": [], "ACC": [], "GYR": []}
+    for (kind, _), count in contents.counts.items():
+        counts.get(str(contents.formats[kind].sensor), []).append(count)
+    second = {title: (sorted(each, reverse=True)[1:2] or [0])[0] for title, each in counts.items()}
+    raw = min(second["ACC"], second["GYR"]) >= max(second["IMU"], 1) if topic is None else topic != "IMU"
+    titles = ("ACC", "GYR") if raw else ("IMU",)
+    pieces: dict[tuple[str, int], list[tuple[np.ndarray, Array]]] = {}
+    with open_file(path) as stream:
+        for records in logs.walk_stream(stream, logs.DATAFLASH, 0, path.stat().st_size, []):
+            for kind, instance in (place for place in contents.counts if contents.formats[place[0]].sensor in titles):
+                form = contents.formats[kind]
+                rows = form.rows(records, kind, name)
+                mine = rows if form.instance is not None else rows[form.column(rows, "I") == instance]
+                values = np.column_stack([form.column(mine, key) for key in _FIELDS[str(form.sensor)]])
+                pieces.setdefault((str(form.sensor), instance), []).append((form.ticks(mine, sampled=True), values))
+    triads: dict[str, list[LoggedTriad]] = {"ACC": [], "GYR": []}
+    for (title, instance), parts in sorted(pieces.items()):
+        ticks, values = (np.concatenate(each) for each in zip(*parts, strict=True))
+        for sensor, place in (("ACC", slice(0, 3)), ("GYR", slice(3, 6))) if title == "IMU" else ((title, slice(3)),):
+            triads[sensor].append(LoggedTriad(f"{title} {instance}", ticks, values[:, place]))
+    head = {"autopilot": contents.version or "ArduPilot", "time_origin": "boot"}
+    corrected = Note("ArduPilot logs outputs that it has already corrected by its INS_ parameters")
+    return imus_on_one_clock(triads["ACC"], triads["GYR"], name, head, [*contents.notes, corrected])

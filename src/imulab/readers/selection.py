@@ -12,7 +12,7 @@ from imulab.columns import check_unit, element_number, kind_of, stated_unit
 from imulab.display import Note
 from imulab.errors import OptionError, listed
 from imulab.quantities import FromStart, span
-from imulab.recording import DAMAGED, Array, Ends, Recording, Window, packed
+from imulab.recording import DAMAGED, EVERY, Array, Ends, Recording, Window, instance_number, packed
 from imulab.units import parse_unit
 
 
@@ -26,7 +26,7 @@ class Selection:
         ROS topic (two, separated by a comma: the accelerometer's and the gyroscope's), ULog topic or DataFlash message;
         with a comma between, a magnetometer's beside it (``sensor_mag:1``: instance 1 of these).
     instance
-        Number of the sensor in a flight log, from 0.
+        Number of the sensor in a flight log, from 0; ``all`` for all of them as whole IMUs on one clock.
     window
         First and last time to read, s, each None for no bound; a text such as ``10:60`` is read.
     element
@@ -40,7 +40,7 @@ class Selection:
     """
 
     topic: str | None = None
-    instance: int | None = None
+    instance: int | str | None = None
     window: Window | None = None
     element: int | None = None
     units: Mapping[str, str] | None = None
@@ -51,7 +51,9 @@ class Selection:
         check_fields(self)
         if self.damaged is not None and self.damaged not in DAMAGED:
             raise OptionError(f"damaged {self.damaged!r}: expected one of {listed(DAMAGED, self.damaged)}")
-        if self.instance is not None and self.instance < 0:
+        if isinstance(self.instance, str):
+            instance_number(self.instance, "instance")
+        elif self.instance is not None and self.instance < 0:
             raise OptionError(f"instance {self.instance}: expected a number from 0")
         if self.element is not None and self.element < 1:
             raise OptionError(f"element {self.element}: expected a number from 1")
@@ -59,6 +61,11 @@ class Selection:
         alike = isinstance(first, FromStart) == isinstance(last, FromStart)
         if first is not None and last is not None and alike and not first < last:
             raise OptionError(f"window {first:g}:{last:g}: expected a start before its end")
+
+    @property
+    def single(self) -> int:
+        """The instance of a log that is to be read, the first if none was named."""
+        return self.instance if isinstance(self.instance, int) else 0
 
     @property
     def ends(self) -> Ends | None:
@@ -93,7 +100,7 @@ class Selection:
         """Refuse choices that a kind of file cannot offer."""
         if topic and self.topic is not None:
             raise OptionError(f"{name}: {kind} has no topics to choose from; leave out the topic {self.topic!r}")
-        if instance and self.instance is not None:
+        if instance and self.instance not in (None, EVERY):
             raise OptionError(f"{name}: {kind} has no instances to choose from; leave out the instance {self.instance}")
 
 

@@ -18,9 +18,10 @@ from imulab.display import Finding, Note
 from imulab.errors import OptionError, ReadError
 from imulab.files import open_file
 from imulab.readers import logs
+from imulab.readers.instances import LoggedTriad, imus_on_one_clock
 from imulab.readers.selection import Selection
 from imulab.readers.streams import LoggedStream, Piece, side_by_side
-from imulab.recording import Recording
+from imulab.recording import EVERY, Array, Recording
 
 MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16  # bytes: magic, version, start time
@@ -39,12 +40,13 @@ _SIZES = {
     "double": "<f8",
 }
 _TOPICS = ("sensor_accel", "sensor_gyro", "sensor_combined")
+_INTEGRALS = "vehicle_imu"
 _ACCEL = dict.fromkeys(triad("accel"), "m/s^2")
 _GYRO = dict.fromkeys(triad("gyro"), "rad/s")
 _MAGS = ("sensor_mag", "vehicle_magnetometer")
 """Magnetometers, gauss: as measured, and as corrected and rotated by PX4."""
 _MAG = dict.fromkeys(triad("mag"), "gauss")
-_VECTORS = ("gyro_rad", "accelerometer_m_s2", "magnetometer_ga")
+_VECTORS = ("gyro_rad", "accelerometer_m_s2", "magnetometer_ga", "delta_angle", "delta_velocity")
 _NO_ACCEL = 2**31 - 1  # relative time that marks a sample without acceleration
 _KEPT = {"sys_name": "autopilot", "ver_hw": "hardware", "sys_uuid": "autopilot_uuid"}
 
@@ -81,6 +83,9 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
         An unknown topic.
     """
     contents = _survey(path, name)
+    if selection.instance == EVERY:
+        yield _every_imu(path, contents, selection, name)
+        return
     streams, sources = _choose(contents, selection, name)
     yield from side_by_side(
         streams,
@@ -182,7 +187,7 @@ def _choose(
             f"{name}: no {' '.join(_TOPICS[:2])} or {_TOPICS[2]}; topics found: {' '.join(others) or 'none'}"
         )
     titles = {title for title, _ in there}
-    instance = selection.instance or 0
+    instance = selection.single
     raw = [t for t in _TOPICS[:2] if t in titles]
     wanted = [topic] if topic else raw or ["sensor_combined"]
     if wanted == ["sensor_accel"] and "sensor_gyro" in titles:
@@ -202,11 +207,7 @@ def _choose(
     sources: dict[int, tuple[int, str, dict[str, _Field]]] = {}
     for title, number in [(title, there[title, instance]) for title in chosen] + mag:
         fields = _fields(contents, title, name)
-        needed = max(f.offset + np.dtype(f.kind).itemsize * f.count for f in fields.values())
-        if contents.smallest[number] < needed:
-            raise ReadError(
-                f"{name}: a {title} message of {contents.smallest[number]} bytes, expected at least {needed}"
-            )
+        _check_size(contents, number, title, fields, name)
         sources[number] = (len(streams), title, fields)
         if title == "sensor_accel":
             warm = {"temperature": "degC"} if "temperature" in fields else {}
@@ -264,8 +265,8 @@ def _raw_or_combined(samples: dict[str, int], raw: list[str], notes: list[str]) 
     return ["sensor_combined"] if read else raw
 
 
-def _fields(contents: _Contents, title: str, name: str) -> dict[str, _Field]:
-    """Return the places of the needed fields in a message."""
+def _fields(contents: _Contents, title: str, name: str, *, device: bool = False) -> dict[str, _Field]:
+    """Return the places of the needed fields in a message, with `device` that of the sensor's number too."""
     if title not in contents.formats:
         raise ReadError(f"{name}: {title} is logged, but its format is not in the file")
     layout: dict[str, _Field] = {}
@@ -285,7 +286,20 @@ def _fields(contents: _Contents, title: str, name: str) -> dict[str, _Field]:
     for key in needed:
         if key not in layout or layout[key].count != (3 if key in _VECTORS else 1):
             raise ReadError(f"{name}: {title} has no field {key}; found {' '.join(layout)}")
-    return {key: layout[key] for key in needed}
+    more = [key for key in ("device_id", "accel_device_id", "gyro_device_id") if device and key in layout]
+    return {key: layout[key] for key in (*needed, *more)}
+
+
+def _width(fields: dict[str, _Field]) -> int:
+    """Return the bytes of a message up to the end of its last needed field."""
+    return max(f.offset + np.dtype(f.kind).itemsize * f.count for f in fields.values())
+
+
+def _check_size(contents: _Contents, number: int, title: str, fields: dict[str, _Field], name: str) -> None:
+    if contents.smallest[number] < _width(fields):
+        raise ReadError(
+            f"{name}: a {title} message of {contents.smallest[number]} bytes, expected at least {_width(fields)}"
+        )
 
 
 def _needed(title: str, layout: dict[str, _Field]) -> list[str]:
@@ -293,6 +307,8 @@ def _needed(title: str, layout: dict[str, _Field]) -> list[str]:
         relative = ["accelerometer_timestamp_relative"] if "accelerometer_timestamp_relative" in layout else []
         return ["timestamp", "gyro_rad", "accelerometer_m_s2", *relative]
     stamp = "timestamp_sample" if "timestamp_sample" in layout else "timestamp"
+    if title == _INTEGRALS:
+        return [stamp, "delta_angle", "delta_velocity", "delta_angle_dt", "delta_velocity_dt"]
     if title == _MAGS[1]:
         return [stamp, "magnetometer_ga"]
     warm = ["temperature"] if title == "sensor_accel" and "temperature" in layout else []
@@ -311,8 +327,7 @@ def _pieces(
                 indices = records.of(ord("D") | number << 8)
                 if not indices.size:
                     continue
-                width = max(f.offset + np.dtype(f.kind).itemsize * f.count for f in fields.values())
-                rows = logs.gather(records.block, records.offsets[indices], width)
+                rows = logs.gather(records.block, records.offsets[indices], _width(fields))
                 got = {key: logs.field(rows, f.offset, f.kind, f.count) for key, f in fields.items()}
                 if title == "sensor_combined":
                     yield from _combined(got, slot)
@@ -329,3 +344,78 @@ def _combined(got: dict[str, np.ndarray], slot: int) -> Iterator[Piece]:
     there = relative != _NO_ACCEL
     yield Piece(slot, (stamp + relative)[there], got["accelerometer_m_s2"][there].astype(np.float64))
     yield Piece(slot + 1, stamp, got["gyro_rad"].astype(np.float64))
+
+
+# --- all IMUs ----------------------------------------------------------------------------------------------------
+
+
+def _every_imu(path: Path, contents: _Contents, selection: Selection, name: str) -> Recording:
+    """Return all IMUs on one clock: of sensor_accel and sensor_gyro, or of vehicle_imu where that has more samples."""
+    topic, _ = selection.beside(_MAGS[0])
+    there: dict[str, list[tuple[int, int]]] = {}
+    for number, (title, instance) in contents.subscriptions.items():
+        if contents.counts.get(number):
+            there.setdefault(title, []).append((instance, number))
+    if topic not in (None, *_TOPICS[:2], _INTEGRALS):
+        raise OptionError(
+            f"{name}: topic {topic!r}; all IMUs of a ULog are in sensor_accel and sensor_gyro, or in {_INTEGRALS}"
+        )
+    second = {
+        title: (sorted((contents.counts[n] for _, n in there.get(title, [])), reverse=True)[1:2] or [0])[0]
+        for title in (*_TOPICS[:2], _INTEGRALS)
+    }
+    integrals = second[_INTEGRALS] > min(second["sensor_accel"], second["sensor_gyro"])
+    wanted = (_INTEGRALS,) if (integrals if topic is None else topic == _INTEGRALS) else _TOPICS[:2]
+    places = {number: (title, instance) for title in wanted for instance, number in sorted(there.get(title, []))}
+    if not places and _TOPICS[2] in there:
+        raise ReadError(
+            f"{name}: sensor_combined holds the one IMU that PX4 flies by; log sensor_accel and sensor_gyro of all "
+            "instances at full rate"
+        )
+    fields = {number: _fields(contents, title, name, device=True) for number, (title, _) in places.items()}
+    for number, (title, _) in places.items():
+        _check_size(contents, number, title, fields[number], name)
+    triads: dict[str, list[LoggedTriad]] = {"accel": [], "gyro": []}
+    for number, got in _whole(path, contents, fields).items():
+        title, instance = places[number]
+        for sensor, logged in _triads(title, instance, got, name):
+            triads[sensor].append(logged)
+    if wanted == (_INTEGRALS,):
+        contents.notes.append(Note("vehicle_imu holds means over its interval of outputs that PX4 has corrected"))
+    head = {**contents.info, "time_origin": "boot"}
+    return imus_on_one_clock(triads["accel"], triads["gyro"], name, head, contents.notes)
+
+
+def _whole(path: Path, contents: _Contents, fields: dict[int, dict[str, _Field]]) -> dict[int, dict[str, Array]]:
+    """Return the fields of all messages of some subscriptions, by subscription and field."""
+    parts: dict[int, list[np.ndarray]] = {number: [] for number in fields}
+    with open_file(path) as stream:
+        for records in logs.walk_stream(stream, logs.ULOG, _HEADER, contents.limit, []):
+            for number, needed in fields.items():
+                indices = records.of(ord("D") | number << 8)
+                parts[number].append(logs.gather(records.block, records.offsets[indices], _width(needed)))
+    return {
+        number: {key: logs.field(rows, f.offset, f.kind, f.count) for key, f in fields[number].items()}
+        for number, rows in ((number, np.concatenate(every)) for number, every in parts.items())
+    }
+
+
+def _triads(title: str, instance: int, got: dict[str, Array], name: str) -> list[tuple[str, LoggedTriad]]:
+    """Return the triads of an instance by sensor; an integral is a mean, at the middle of its interval."""
+    stamp = next(iter(got.values())).astype(np.int64)
+    what = f"{title} {instance}"
+    for key in (key for key in got if key.endswith("device_id")):
+        if (got[key] != got[key][0]).any():
+            raise ReadError(f"{name}: {what} changes from one sensor to another, by its {key}; expected one sensor")
+    if title != _INTEGRALS:
+        values = np.column_stack([got[key].astype(np.float64) for key in "xyz"])
+        device = int(got["device_id"][0]) if "device_id" in got else 0
+        return [(title.removeprefix("sensor_"), LoggedTriad(what, stamp, values, device))]
+    triads = []
+    for sensor, key in (("accel", "delta_velocity"), ("gyro", "delta_angle")):
+        interval = got[f"{key}_dt"].astype(np.int64)
+        there = interval > 0
+        values = got[key][there].astype(np.float64) / (interval[there, None] / 1e6)
+        device = int(got[f"{sensor}_device_id"][0]) if f"{sensor}_device_id" in got else 0
+        triads.append((sensor, LoggedTriad(what, stamp[there] - interval[there] // 2, values, device)))
+    return triads

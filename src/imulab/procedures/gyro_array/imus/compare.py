@@ -24,6 +24,7 @@ from imulab.estimation.sampling import sampling_rate
 from imulab.options import RARE, READING, measure, parsed
 from imulab.procedures.gyro_array.imus.columns import readings_of
 from imulab.procedures.gyro_array.imus.fuse import board_of, ranges, read_all_late
+from imulab.procedures.gyro_array.imus.logs import with_all_instances
 from imulab.procedures.gyro_array.imus.prepare import names_of
 from imulab.procedures.result import Drawn, Record, amount, as_record, as_recording
 from imulab.quantities import span
@@ -177,7 +178,7 @@ def compare_imus(
     >>> len(il.compare_imus(board, calibration=il.calibrate_imus(board, gravity=9.80665)).gyro["turning"])
     4
     """
-    recording = as_recording(data, {**reading, "window": window}, compare_imus)
+    recording = as_recording(data, {**with_all_instances(data, reading), "window": window}, compare_imus)
     record = as_record(calibration, "compare_imus: calibration")
     board = board_of(record, limits=ranges([recording], gyro_range, accel_range))
     names = names_of(recording)

@@ -14,6 +14,7 @@ from imulab.errors import OptionError
 from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_place, gravity_findings, local_gravity
 from imulab.options import RARE, measure, text
 from imulab.procedures.gyro_array.imus.fuse import ranges
+from imulab.procedures.gyro_array.imus.logs import prepare_board, with_all_instances
 from imulab.procedures.gyro_array.imus.model import (
     ACCEL,
     ACCEL_BIAS,
@@ -27,7 +28,7 @@ from imulab.procedures.gyro_array.imus.model import (
     RATE,
     predicted,
 )
-from imulab.procedures.gyro_array.imus.prepare import Prepared, prepare
+from imulab.procedures.gyro_array.imus.prepare import Prepared
 from imulab.procedures.gyro_array.imus.record import GAUGE, make_record
 from imulab.procedures.gyro_array.imus.schema import (
     AT_ACCEL_BIAS,
@@ -143,7 +144,8 @@ def calibrate_imus(
     Parameters
     ----------
     data
-        A file, recording or data frame with columns ``accel_x_1 .. gyro_z_K`` of K IMUs.
+        A file, recording or data frame with columns ``accel_x_1 .. gyro_z_K`` of K IMUs; of a PX4 or ArduPilot log all
+        instances are read.
     distance
         A distance on the board that is known: 1:8:53.9mm+-0.1mm. Between the sensing elements of two IMUs; without an
         uncertainty 0.2 mm. It gives the size of the board where it tells that better than gravity between rests.
@@ -164,7 +166,7 @@ def calibrate_imus(
     DataError
         Columns are missing, dead or in another unit; there is no rest, or too little motion within the range.
     ObservabilityError
-        The motion does not turn about every axis.
+        The motion does not turn about every axis, or a log cannot tell for another reason, which is stated.
     OptionError
         An option has a value that cannot be.
 
@@ -183,7 +185,7 @@ def calibrate_imus(
     if not 1e-6 <= spread <= 0.2:
         raise OptionError(f"tolerance {spread:g}: expected a standard uncertainty of 1e-6 to 0.2, such as 0.01")
     stated = at_place(gravity, latitude, height)
-    recording = as_recording(data, reading, calibrate_imus)
+    recording = as_recording(data, with_all_instances(data, reading), calibrate_imus)
     named = {"gyro_range": gyro_range, "accel_range": accel_range}
     return fit_board(recording, local_gravity(stated, recording), known, spread, named)
 
@@ -196,7 +198,7 @@ def fit_board(
     stated: dict[str, float | str | None],
 ) -> ImusFit:
     """Calibrate a board; `stated` are its ``gyro_range`` and ``accel_range``; errors as for `calibrate_imus`."""
-    prepared = prepare(recording, gravity.value)
+    prepared = prepare_board(recording, gravity.value)
     measured = prepared.measured
     limits = np.broadcast_to(ranges([recording], stated["gyro_range"], stated["accel_range"]), (2, measured.count))
     if distance is not None and max(distance.first, distance.second) >= measured.count:
@@ -233,8 +235,9 @@ def fit_board(
         *warn_scatter(summary),
         *warn_size(factors, source),
     ]
+    at_rest = measured.accel_noise / prepared.correlation[0], measured.gyro_noise / prepared.correlation[1]
     record = make_record(
-        recording, solution.board, covariance, (measured.accel_noise, measured.gyro_noise), limits,
+        recording, solution.board, covariance, at_rest, limits,
         model=ImusModel(
             kind="imus", imus=measured.count, gauge=GAUGE, gravity=StatedGravity.of(gravity),
             units=[recording.units["accel_x_1"], recording.units["gyro_x_1"]],

@@ -22,6 +22,7 @@ from imulab.estimation.clock import GAP
 from imulab.options import RARE, READING, measure, parsed, text
 from imulab.procedures.gyro_array.elements import SampleClock
 from imulab.procedures.gyro_array.imus.columns import SENSORS, RangeFinder, readings_of
+from imulab.procedures.gyro_array.imus.logs import with_all_instances
 from imulab.procedures.gyro_array.imus.model import ACCEL_LATENCY, GYRO_LATENCY
 from imulab.procedures.gyro_array.imus.prepare import names_of
 from imulab.procedures.gyro_array.imus.schema import imus_of
@@ -414,7 +415,7 @@ def fuse_imus(
     >>> fused.force.shape == (len(board), 3)
     True
     """
-    recording = as_recording(data, {**reading, "window": window}, fuse_imus)
+    recording = as_recording(data, {**with_all_instances(data, reading), "window": window}, fuse_imus)
     known: Calibration | Blob
     if isinstance(calibration, Blob):
         known = calibration

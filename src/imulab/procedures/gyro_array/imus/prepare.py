@@ -53,6 +53,9 @@ class Prepared:
         Root mean square of the rate about each axis in motion, rad/s, shape (3,).
     notes
         What was left out.
+    correlation
+        By what the noise of accelerometers and of gyroscopes in `measured` is larger than at rest, because a filter
+        makes it alike from sample to sample.
     """
 
     measured: Measured
@@ -67,6 +70,7 @@ class Prepared:
     rate: float
     axis_rates: Array
     notes: tuple[str, ...]
+    correlation: tuple[float, float] = (1.0, 1.0)
 
 
 def names_of(recording: Recording) -> Mapping[str, list[list[str]]]:
@@ -86,9 +90,8 @@ def names_of(recording: Recording) -> Mapping[str, list[list[str]]]:
     }
     if count < 2 and "accel_x" in recording and "gyro_x" in recording:
         raise DataError(
-            f"{recording.name}: one IMU, accel_x .. gyro_z; expected two or more, accel_x_1 .. gyro_z_K, on one clock. "
-            "A log of PX4 or ArduPilot cannot tell where its IMUs sit: each has times of its own, and is filtered and "
-            "thinned out before it is logged; record them raw on one clock, turned by hand, and write that as one CSV"
+            f"{recording.name}: one IMU, accel_x .. gyro_z; expected two or more, accel_x_1 .. gyro_z_K, on one clock "
+            "(of a log of PX4 or ArduPilot all instances: --instance all)"
         )
     if count < 2:
         raise DataError(
