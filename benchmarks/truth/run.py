@@ -26,9 +26,10 @@ PAGE = HERE.parent.parent / "docs" / "truth.md"
 HEAD = """# Is it true?
 
 Each row is a disturbance, a habit or a default that people have, simulated many times with a known truth. The
-simulators are in `benchmarks/truth/` and share no code with the fits. A row holds if the stated 95 % intervals contain
-the truth as often as asked, or if imulab says what is wrong as often as asked. `make truth` makes this page anew
-in less than 5 minutes on two processors; `make truth-all` has 500 trials or more in each row, which tell 3 from 5 %.
+simulators are in `benchmarks/truth/` (of whole arrays it is that of `imulab array simulate --imus`) and share no code
+with the fits. A row holds if the stated 95 % intervals contain the truth as often as asked, or if imulab says what is
+wrong as often as asked. `make truth` makes this page anew in some minutes on two processors;
+`make truth-all` has 500 trials or more in each row, which tell 3 from 5 %.
 
 *Coverage* is the share of stated 95 % intervals that hold the truth, over all quantities and trials of the row.
 *Warned* is the share of trials in which imulab named the fault or refused the data. Limits that were asked are in
