@@ -25,8 +25,8 @@ def truth(board, name):
     return np.array([[float(v) for v in board.metadata[f"truth_{name}_{k + 1}"].split()] for k in range(count)])
 
 
-def true_record(board):
-    """The record of a simulated board whose calibration is without error."""
+def true_record(board, limits=None):
+    """The record of a simulated board whose calibration is without error; `limits` as in `make_record`."""
     names = ("accel", "accel_bias", "position", "latency", "gyro", "gyro_bias")
     accel, bias, position, late, gyro, gyro_bias = (truth(board, name) for name in names)
     count = len(accel)
@@ -46,6 +46,7 @@ def true_record(board):
     return make_record(
         board, Board(numbers), 1e-12 * np.eye(NUMBERS * count),
         (np.full((count, 3), 0.03), np.full((count, 3), np.radians(0.1))),
+        limits,
         model=schema.ImusModel(kind="imus", imus=count, gauge=GAUGE, gravity=gravity, units=["m/s^2", "deg/s"]),
         fit=summary, data=schema.ImusData(motion=motion), common=schema.Common(), size_from="gyro scale",
         not_determined=[], options={},
@@ -169,6 +170,23 @@ def test_clipped_gyroscopes_are_bridged_and_flagged(board, record):
     assert np.median(error) < 5
     stated = il.fuse_imus(clipped_board(board, 300.0), calibration=record, gyro_range="300 deg/s")
     assert np.array_equal(stated.bridged, out.bridged)
+
+
+def test_only_a_range_that_is_stated_now_overrules_that_of_the_record(board, record):
+    """A reading that a log repeats at its maximum is no end of a range that the record holds."""
+    columns = {name: values.copy() for name, values in board.columns.items()}
+    top = int(np.argmax(columns["gyro_x_1"][10:-10])) + 10
+    columns["gyro_x_1"][top - 2 : top + 3] = columns["gyro_x_1"][top]
+    repeated = il.Recording(columns, board.units, board.metadata, "repeated.csv")
+    wide = true_record(board, np.array([[1e30] * 4, [np.radians(2000.0)] * 4]))
+    assert il.fuse_imus(repeated, calibration=record).bridged[top]  # nothing else is known of the range
+    assert not il.fuse_imus(repeated, calibration=wide).bridged.any()
+    assert il.fuse_imus(repeated, calibration=wide, gyro_range="300 deg/s").bridged[top]
+    apart = [
+        [entry.samples for entry in il.compare_imus(repeated, calibration=known, **by).gyro["turning"] if entry]
+        for known, by in ((record, {}), (wide, {}), (record, {"gyro_range": "2000 deg/s"}))
+    ]
+    assert apart[0] != apart[1] == apart[2]
 
 
 def disturbed(board):

@@ -156,7 +156,8 @@ def compare_imus(
     calibration
         Record of array calibrate --imus. Or its file.
     gyro_range, accel_range
-        Largest reading of the gyroscopes, and of the accelerometers; found in a recording that reaches it.
+        Largest reading of the gyroscopes, and of the accelerometers; else as the record holds it, or the data
+        reach it.
     window
         Part to compare. First and last time, s, as ``(10, 60)`` or ``"10:60"``; ``"+10:+60"`` counts from the start.
     reading
@@ -180,7 +181,7 @@ def compare_imus(
     """
     recording = as_recording(data, {**with_all_instances(data, reading), "window": window}, compare_imus)
     record = as_record(calibration, "compare_imus: calibration")
-    board = board_of(record, limits=ranges([recording], gyro_range, accel_range))
+    board = board_of(record, limits=ranges([recording], gyro_range, accel_range, record))
     names = names_of(recording)
     if board.settings is None or board.count < _FEWEST:
         raise RecordError(f"a board of {board.count} IMUs: expected {_FEWEST} or more, to predict each from the others")

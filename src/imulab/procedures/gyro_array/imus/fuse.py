@@ -390,7 +390,8 @@ def fuse_imus(
     at
         Point of the specific force. ``centroid`` of the accelerometers, ``imu:N``, or x,y,z, in m from IMU 1.
     gyro_range, accel_range
-        Largest reading of the gyroscopes, and of the accelerometers; found in a recording that reaches it.
+        Largest reading of the gyroscopes, and of the accelerometers; else as the record holds it, or the data
+        reach it.
     window
         Part to fuse. First and last time, s, as ``(10, 60)`` or ``"10:60"``; ``"+10:+60"`` counts from the start.
     reading
@@ -444,15 +445,24 @@ def limits_of(
         A range is stated for a blob, or is none.
     """
     if not isinstance(known, Blob):
-        return ranges(blocks, gyro_range, accel_range)
+        return ranges(blocks, gyro_range, accel_range, known)
     for name, value in (("gyro_range", gyro_range), ("accel_range", accel_range)):
         if value is not None:
             raise OptionError(f"{name}: the blob {known.name} holds the range that it was exported with")
     return None
 
 
-def ranges(blocks: Iterable[Recording], gyro_range: float | str | None, accel_range: float | str | None) -> Array:
-    """Return the ends of the ranges, shape (2, K) or (2, 1): as stated, else as recordings reach them."""
+def ranges(
+    blocks: Iterable[Recording],
+    gyro_range: float | str | None,
+    accel_range: float | str | None,
+    record: Calibration | None = None,
+) -> Array:
+    """Return the ends of the ranges, shape (2, K) or (2, 1).
+
+    They are as stated, else as the record holds them, else as recordings reach them: three equal readings at an extreme
+    can also come of a log in which each reading stands several times.
+    """
     finder: RangeFinder | None = None
     for block in blocks:
         names = names_of(block)
@@ -462,13 +472,16 @@ def ranges(blocks: Iterable[Recording], gyro_range: float | str | None, accel_ra
         None if accel_range is None else in_si(accel_range, "accel_range", "acceleration", "g"),
         None if gyro_range is None else in_si(gyro_range, "gyro_range", "rate", "deg/s"),
     ]
-    found = np.full((2, 1), NO_LIMIT) if finder is None else finder.limits()
+    ends = np.full((2, 1), NO_LIMIT) if finder is None else finder.limits()
+    held = ends if record is None else imus_of(record).limits
+    if ends.shape[1] in (1, held.shape[1]):  # others are of another board, which fusion refuses
+        ends = np.where(held < NO_LIMIT, held, ends)
     for sensor, value in enumerate(stated):
         if value is not None:
             if not 0 < value < NO_LIMIT:
                 raise OptionError(f"{SENSORS[sensor]}_range: expected more than 0")
-            found[sensor] = value
-    return found
+            ends[sensor] = value
+    return ends
 
 
 def joined_boards(parts: list[FusedBoard]) -> FusedBoard:
