@@ -310,8 +310,10 @@ def test_ranges_that_the_record_holds_reach_fusion_and_unit(tmp_path):
     (table,) = (item for item in exhibits(fit).items if item.title == "Ends of the ranges")
     assert ["2", "156.91", "300.00"] in table.rows
     clipped = clipped_board(board, RANGE)
-    alone, told = (il.fuse_imus(clipped, calibration=fit, **by) for by in ({}, {"gyro_range": f"{RANGE} deg/s"}))
+    alone, told = (il.fuse_imus(board, calibration=fit, **by) for by in ({}, {"gyro_range": f"{RANGE} deg/s"}))
+    assert alone.bridged.any()  # the board itself goes beyond without reaching an end
     assert np.array_equal(alone.bridged, told.bridged)
+    assert not il.fuse_imus(board, calibration=true_record(board)).bridged.any()
     (blob,) = il.export("blob", fit, tmp_path)
     (section,) = load_blob(blob).text["sections"]
     assert section["gyro_range"] == pytest.approx(np.radians(RANGE))
