@@ -71,7 +71,7 @@ def export(
     at
         c, blob: where whole IMUs give the specific force; their centroid if not given. As for `fuse_imus`.
     gyro_range, accel_range
-        c, blob: largest reading of whole IMUs, beyond which the unit does not believe them; else as the record holds it.
+        c, blob: largest reading of whole IMUs, beyond which the unit believes none; else as the record holds it.
     mag_mount
         px4, ardupilot: whether the magnetometers have a rotation of their own there, which holds their mounting.
         ``external`` where the autopilot turns the magnetometers by a rotation of their own, which then holds their
