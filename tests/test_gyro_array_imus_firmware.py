@@ -288,6 +288,27 @@ def test_options_of_a_board_are_refused_for_other_records(tmp_path):
         il.export("c", fit, tmp_path / "out", at="centroid", accel_range="16 g")
 
 
+@pytest.mark.parametrize("first", ["array", "board"])
+def test_each_record_is_fused_by_the_options_that_its_kind_takes(first, record, tmp_path):
+    still = il.simulate_array(experiment="static", duration=30.0)
+    array = il.calibrate_array(still, method="mean", memory=0.01).calibration
+    records = [replace(array, sensor=record.sensor), record]
+    records = records if first == "array" else records[::-1]
+
+    def exported(**options):
+        (blob,) = il.export("blob", records, tmp_path, **options)
+        sections = {section["kind"]: section for section in load_blob(blob).text["sections"]}
+        return [sections["array"][name] for name in ("method", "memory")], sections["imus"]
+
+    fused, board = exported(gyro_range="2000 deg/s")
+    assert fused == ["mean", 0.01]  # as its record states, not by default
+    assert board["gyro_range"] == pytest.approx(np.radians(2000.0))
+    fused, board = exported(memory=0.02, at="imu:1")
+    assert (fused, board["at"]) == (["mean", 0.02], [0.0, 0.0, 0.0])
+    fused, board = exported(method="robust")
+    assert (fused, board["gyro_range"]) == (["robust", 0.01], None)
+
+
 def test_a_board_beside_other_records_and_with_too_many_imus(record, tmp_path):
     array = il.calibrate_array(il.simulate_array(experiment="static", duration=30.0)).calibration
     il.export("c", [replace(array, sensor=record.sensor), record], tmp_path / "both")

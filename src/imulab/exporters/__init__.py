@@ -50,8 +50,8 @@ class ExportOptions:
         What ``allan --json`` found, for targets with noise keys.
     noise_file
         What messages call the file that it came from.
-    fusion
-        Method and memory of an array in firmware or a blob; what its record carries where None.
+    fusions
+        How each record is fused in firmware or a blob; what it carries where None or empty.
     mag_mount
         ``external``: the autopilot turns the magnetometers by a rotation of their own; ``internal``: it does not.
     tell
@@ -62,7 +62,7 @@ class ExportOptions:
     device_id: int = 0
     noise: Mapping[str, Any] = field(default_factory=dict)
     noise_file: str = "the noise file"
-    fusion: Fusion | None = None
+    fusions: Sequence[Fusion | None] = ()
     mag_mount: str = "external"
     tell: Callable[[str], object] = _nothing
 

@@ -41,10 +41,11 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Device
     return procedure_of(record).tables(record, fusion)
 
 
-def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[DeviceTable]:
-    """Return the tables of several records of one unit, in their order; an array fuses by `fusion` where it is given.
+def tables_of_all(records: Sequence[Calibration], fusions: Sequence[Fusion | None] = ()) -> list[DeviceTable]:
+    """Return the tables of several records of one unit, in their order.
 
-    The columns of each table hold the SHA-256 of its record, so that a blob names the records that are in it.
+    Each is fused by its entry of `fusions`, or as it states where that is None or there are none. The columns of each
+    table hold the SHA-256 of its record, so that a blob names the records that are in it.
 
     Raises
     ------
@@ -56,7 +57,7 @@ def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) 
         raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
     tables = [
         replace(table, columns={**table.columns, "record": record.sealed()[0]})
-        for record in records
+        for record, fusion in zip(records, fusions or [None] * len(records), strict=True)
         for table in tables_of(record, fusion)
     ]
     kinds = [table.kind for table in tables]

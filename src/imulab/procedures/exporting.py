@@ -117,9 +117,9 @@ def export(
     names = [os.fspath(item) if isinstance(item, str | PathLike) else "the record" for item in listed_records]
     named = {"method": method, "memory": memory, "at": at, "gyro_range": gyro_range, "accel_range": accel_range}
     stated = {name: value for name, value in named.items() if value is not None}
-    fusion = _choose_fusion(to, stated, loaded) if stated else None
+    fusions = _choose_fusions(to, stated, loaded) if stated else [None] * len(loaded)
     if to in _FIRMWARE:
-        for name, record in zip(names, loaded, strict=True):
+        for name, record, fusion in zip(names, loaded, fusions, strict=True):
             try:
                 tables_of(record, fusion)
             except ImulabError as error:
@@ -131,19 +131,27 @@ def export(
     noise_keys: Mapping[str, Any] = _state_noise(noise, file) if isinstance(noise, Calibration) else {}
     if noise and not isinstance(noise, Calibration):
         noise_keys = noise if isinstance(noise, Mapping) else _read_noise(file)
-    options = ExportOptions(lossy, number, noise_keys, file if noise else "", fusion, mag_mount, tell)
+    options = ExportOptions(lossy, number, noise_keys, file if noise else "", fusions, mag_mount, tell)
     return exporters.export(to, loaded, Path(folder), options)
 
 
-def _choose_fusion(to: str, stated: Mapping[str, Any], records: Sequence[Calibration]) -> Fusion:
-    """Return how the array among the records is to fuse; refuses these options without one."""
-    for record in records if to in _FIRMWARE else ():
-        procedure = procedure_of(record)
-        if procedure.fuses:
-            return procedure.fusion(record, stated)
-    raise OptionError(
-        f"{' and '.join(stated)}: how a gyro array or whole IMUs are fused; expected its record, and target c or blob"
-    )
+def _choose_fusions(to: str, stated: Mapping[str, Any], records: Sequence[Calibration]) -> list[Fusion | None]:
+    """Return how each record is fused by the keywords that its kind takes, None where none of them is stated.
+
+    Keywords that no record takes are refused.
+    """
+    taken = [procedure_of(record).fused_by(record) if to in _FIRMWARE else () for record in records]
+    if not any(taken):
+        raise OptionError(
+            f"{' and '.join(stated)}: how a gyro array or whole IMUs are fused; expected its record, and target c or "
+            "blob"
+        )
+    strange = stated.keys() - {name for names in taken for name in names}  # the first record that fuses refuses them
+    fusions: list[Fusion | None] = []
+    for record, names in zip(records, taken, strict=True):
+        chosen = {name: value for name, value in stated.items() if name in names or name in strange}
+        fusions.append(procedure_of(record).fusion(record, chosen) if names and chosen else None)
+    return fusions
 
 
 def _state_noise(record: Calibration, name: str) -> Mapping[str, Any]:

@@ -212,8 +212,6 @@ class Procedure:
         Whether its records state accelerometers and gyroscopes as matrices, which other programs' files are made from.
     over_temperature
         Whether its records hold laws over temperature, which autopilots take as offsets.
-    fuses
-        Whether its records say how a unit fuses several sensors.
     has_heading
         Whether a record can hold magnetometers, which give magnetic heading and dip.
     joins
@@ -230,7 +228,6 @@ class Procedure:
     not_applied: ClassVar[str] = ""
     states_triads: ClassVar[bool] = False
     over_temperature: ClassVar[bool] = False
-    fuses: ClassVar[bool] = False
     has_heading: ClassVar[bool] = False
     joins: ClassVar[bool] = False
 
@@ -281,6 +278,10 @@ class Procedure:
     def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
         """Return the tables of a unit, in the order in which they are applied; sensors are fused by `fusion`."""
         raise NotImplementedError
+
+    def fused_by(self, record: Calibration) -> tuple[str, ...]:
+        """Return the keywords of `imulab.export` that say how a unit fuses the sensors of a record; none by default."""
+        return ()
 
     def fusion(self, record: Calibration, stated: Mapping[str, Any]) -> Fusion:
         """Return how the unit is to fuse: by keywords of `imulab.export` that are stated, else as its record says."""

@@ -117,7 +117,6 @@ class GyroArrayProcedure(Procedure):
     line_title = "Gyro array"
     not_applied = "'imulab array fuse --calibration' takes it, with --imus that of whole IMUs"
     elsewhere = "{target} fuses no array of gyroscopes or of whole IMUs"
-    fuses = True
     task = TASK
     sections = (ArraySection(), ImusSection())
 
@@ -144,6 +143,9 @@ class GyroArrayProcedure(Procedure):
         from imulab.procedures.gyro_array.device import tables_of
 
         return tables_of(record, fusion)
+
+    def fused_by(self, record: Calibration) -> tuple[str, ...]:
+        return ("at", "gyro_range", "accel_range") if _whole(record) else ("method", "memory")
 
     def fusion(self, record: Calibration, stated: Mapping[str, Any]) -> Fusion:
         if _whole(record):
