@@ -232,7 +232,7 @@ CALLS = [
     ('simulate_centrifuge(ramp="x")', "simulate_centrifuge: ramp: expected a number"),
     ('read("dir")', "dir: expected a file"),
     ('read("rec.csv", 3)', "read: layout: expected a layout or the name of its file"),
-    ('read("rec.csv", instance="a")', "read: instance: expected a whole number"),
+    ('read("rec.csv", instance="a")', "instance 'a': expected a whole number, or all"),
     ('read("rec.csv", window=3)', "read: window: expected"),
     ('read("rec.csv", wndow=3)', "read: unknown option 'wndow'"),
     ('list(read_blocks("rec.csv", window=("a",1)))', "read_blocks: window: expected"),

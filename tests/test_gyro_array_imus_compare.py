@@ -96,6 +96,27 @@ def test_a_record_that_does_not_hold_is_said():
     assert "IMU 2 3" in said[0]
 
 
+def test_slow_turning_accuses_no_record():
+    """Fused others are noisier than their mean, since they extrapolate: no sign of a wrong calibration."""
+    recording, _, _ = board_in_hand(PLACES[:4] * 0.3, turning=0.9)
+    compared = il.compare_imus(recording, calibration=true_record(recording))
+    assert all(row.fused > row.mean for row in compared.accel["turning"])
+    assert not [note for note in compared.notes if not isinstance(note, Note)]
+
+
+def test_rows_that_others_do_not_determine_do_not_hide_the_rest():
+    recording, _, _ = board_in_hand(PLACES[:4])
+    columns = dict(recording.columns)
+    lost = np.arange(1200) == 900
+    for k in (1, 2, 3):
+        columns[f"gyro_x_{k}"] = np.where(lost, np.nan, columns[f"gyro_x_{k}"])
+        columns[f"accel_x_{k}"] = np.where(lost, np.nan, columns[f"accel_x_{k}"])
+    spoilt = il.Recording(columns, recording.units, recording.metadata, "hand.csv")
+    whole, compared = (il.compare_imus(each, calibration=true_record(recording)) for each in (recording, spoilt))
+    assert compared.accel["turning"][3].fused == pytest.approx(whole.accel["turning"][3].fused, rel=0.02)
+    assert "m/s² from the fused others" in compared.headline()
+
+
 def test_readings_at_the_end_of_the_range_do_not_count():
     recording, _, _ = board_in_hand(turning=8.3)
     record = true_record(recording)

@@ -223,7 +223,7 @@ def test_a_blob_whose_text_speaks_of_other_imus_is_refused(board, record):
     text = {"format": "imulab.blob", "sensor": {}, "software": "x", "records": [], "sections": [section]}
     columns = {name: values for name, values in board.columns.items() if not name.endswith("_4")}
     three = il.Recording(columns, board.units, {}, "three.csv")
-    with pytest.raises(il.ImulabError, match="the blob holds other than 3 IMUs, as its text says"):
+    with pytest.raises(il.ImulabError, match="the blob's table and its text, which says 3 IMUs, differ"):
         il.fuse_imus(three, calibration=Blob("unit.blob", pack([table], 4, text), text))
 
 

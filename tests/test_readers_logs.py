@@ -115,6 +115,11 @@ def test_another_instance(file, streams):
     path = file(px4_log(*streams))
     accel_times, gyro_times, accel, gyro = streams
     recording = il.read(path, instance=1)
+    for other in ("1", np.int64(1)):
+        assert np.array_equal(il.read(path, instance=other).columns["accel_x"], recording.columns["accel_x"])
+    for wrong in (1.5, [0], "-1", -1, True):
+        with pytest.raises(OptionError, match=r"instance.*: expected a (whole )?number"):
+            il.read(path, instance=wrong)
     check(recording, (accel_times, gyro_times, accel, None), -1, 40.0)
     assert "gyro_x" not in recording
     with pytest.raises(OptionError, match="no sensor_accel sensor_gyro of instance 2; found sensor_accel 0,"):

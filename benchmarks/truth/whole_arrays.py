@@ -149,7 +149,7 @@ SCENARIOS = [
     row("8 IMUs, 40 s, nothing disturbed: positions", 4, imus=8, duration=40.0, false_alarms=4.0),
     row("32 IMUs, 10 s, nothing disturbed: positions", 2, imus=32, duration=10.0, false_alarms=4.0),
     *(
-        row(f"readings up to 1 ms old, 62.5 Hz: {name}", 12, name, age=1e-3, rate=62.5, coverage=(85.0, 100.0))
+        row(f"readings up to 1 ms old, 62.5 Hz: {name}", 12, name, age=1e-3, rate=62.5, coverage=(92.0, 100.0))
         for name in ("positions", "latencies of gyroscopes")
     ),
     row("an IMU slips by 2.6 mm in the motion", what="loose", size=1.5e-3, coverage=None, warned=95.0),

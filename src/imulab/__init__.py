@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
     from imulab.procedures.gyro_array.fuse import Fused as Fused
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
+    from imulab.procedures.gyro_array.imus.compare import BoardComparison as BoardComparison
     from imulab.procedures.gyro_array.imus.compare import compare_imus as compare_imus
     from imulab.procedures.gyro_array.imus.fit import ImusFit as ImusFit
     from imulab.procedures.gyro_array.imus.fit import calibrate_imus as calibrate_imus
@@ -127,6 +128,7 @@ _HOME = {
     "fuse": "procedures.gyro_array.public",
     "run_fleet": "fleet.run",
     "simulate_array": "procedures.gyro_array.simulate",
+    "BoardComparison": "procedures.gyro_array.imus.compare",
     "FusedBoard": "procedures.gyro_array.imus.fuse",
     "fuse_imus": "procedures.gyro_array.imus.fuse",
     "simulate_imus": "procedures.gyro_array.imus.simulate",

@@ -22,10 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 from imulab.arguments import checked, described
 from imulab.columns import check_unit, clocks_of, element_number, expected_quantities, kind_of, triad
 from imulab.display import Note, has_hidden, printable, reverses
-from imulab.errors import DataError, UnitError
+from imulab.errors import DataError, OptionError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.options import PROGRAM, READING, choice, file, parsed, text
-from imulab.quantities import LARGEST, parse_units, span, whole_number
+from imulab.quantities import LARGEST, parse_units, span, whole, whole_number
 from imulab.units import parse_unit, to_si
 from imulab.views import AnyPlot, AnyPlots, views
 
@@ -877,15 +877,23 @@ EVERY = "all"
 """The instance that stands for all of a flight log."""
 
 
-def instance_number(typed: str, called: str) -> int | str:
-    """Return the number of an instance, or `EVERY`.
+def instance_number(value: int | str, called: str) -> int | str:
+    """Return the number of an instance, from 0, or `EVERY`.
 
     Raises
     ------
     OptionError
         It is neither.
     """
-    return EVERY if typed == EVERY else whole_number(typed, called)
+    if isinstance(value, str) and value == EVERY:
+        return EVERY
+    try:
+        number = whole(value, called)
+    except OptionError as error:
+        raise OptionError(f"{error}, or {EVERY}") from None
+    if number < 0:
+        raise OptionError(f"{called} {number}: expected a number from 0")
+    return number
 
 
 class Part(TypedDict, total=False):
@@ -904,7 +912,7 @@ class Part(TypedDict, total=False):
     topic
         Topic of a bag or log, where there are several; with a comma, the magnetometer's beside it.
     instance
-        Sensor of a flight log, from 0, or all, as whole IMUs on one clock; the first if not given.
+        Sensor of a flight log, from 0, or all, as whole IMUs on one clock; not given, the first, all for --imus.
     element
         One IMU of a file of several, from 1.
     damaged
@@ -918,7 +926,7 @@ class Part(TypedDict, total=False):
     units: Annotated[Mapping[str, str] | None, parsed(parse_units, "NAME=UNIT", flags=("--unit",)), READING]
     layout: Annotated[str | os.PathLike[str] | Layout | None, file("NAME|L.toml"), READING]
     topic: Annotated[str | None, text("TOPIC"), READING]
-    instance: Annotated[int | str | None, parsed(instance_number, "N"), READING]
+    instance: Annotated[int | str | None, parsed(instance_number, "N|all", (EVERY,)), READING]
     element: Annotated[int | None, parsed(whole_number, "N"), READING]
     damaged: Annotated[str | None, choice(DAMAGED), READING]
     serial: Annotated[str | None, text("TEXT"), READING]

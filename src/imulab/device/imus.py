@@ -170,6 +170,6 @@ class ImusStream:
         try:
             _runtime.imus_block(self._unit, self._state, steps, block, numbers, flags, health)
         except ValueError:  # a blob whose text was changed
-            raise RecordError(f"the blob holds other than {self.count} IMUs, as its text says") from None
+            raise RecordError(f"the blob's table and its text, which says {self.count} IMUs, differ") from None
         force, rate, acceleration, *stated = (numbers[:, k] for k in range(6))
         return FusedImus(force, rate, acceleration, stated[0], stated[1], stated[2], flags, health)

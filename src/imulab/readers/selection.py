@@ -51,10 +51,8 @@ class Selection:
         check_fields(self)
         if self.damaged is not None and self.damaged not in DAMAGED:
             raise OptionError(f"damaged {self.damaged!r}: expected one of {listed(DAMAGED, self.damaged)}")
-        if isinstance(self.instance, str):
-            instance_number(self.instance, "instance")
-        elif self.instance is not None and self.instance < 0:
-            raise OptionError(f"instance {self.instance}: expected a number from 0")
+        if self.instance is not None:
+            object.__setattr__(self, "instance", instance_number(self.instance, "instance"))
         if self.element is not None and self.element < 1:
             raise OptionError(f"element {self.element}: expected a number from 1")
         first, last = self.ends or (None, None)

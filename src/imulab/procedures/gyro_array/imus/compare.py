@@ -119,10 +119,11 @@ class BoardComparison(Drawn):
         turning = any(self.accel["turning"])
         part, begin = ("turning", "Turning, the") if turning else ("slow", "The")
         fused, mean, single = (_middle(self.accel[part], name) for name in ("fused", "mean", "single"))
-        known = "is not told by the others fused" if fused is None else f"is {number(fused, 2)} m/s² from the fused"
+        if fused is None or mean is None or single is None:
+            return f"{begin} others do not determine the specific force of an IMU"
         return (
-            f"{begin} specific force of an IMU {known} others, "
-            f"{number(mean or 0.0, 2)} from their mean, {number(single or 0.0, 2)} from one of them (median)"
+            f"{begin} specific force of an IMU is {number(fused, 2)} m/s² from the fused others, {number(mean, 2)} "
+            f"from their mean, {number(single, 2)} from one of them (median)"
         )
 
     def exhibits(self) -> Exhibits:
@@ -190,7 +191,7 @@ def compare_imus(
     time, logged = recording.si("time"), readings_of(recording, names)
     rate, notes = sampling_rate(recording)
     settings = replace(board.settings, rate=rate)
-    limits = np.array([settings.accel_limit, settings.gyro_limit])
+    limits = np.broadcast_to(board.limits, (2, board.count))
     logged = read_all_late(time, logged, slice(0, len(time)), board.latency, limits, GAP / rate)
     whole = np.all(np.isfinite(logged) & (np.abs(logged) < limits[..., None]), axis=3)
     step = np.diff(time, prepend=time[:1])
@@ -241,18 +242,20 @@ def _apart(
 ) -> Apart | None:
     """Return how far IMU k is from the others; `values` are those of all, `sound` which of the others count."""
     rows = rows & sound.any(axis=1)
+    determined = rows & np.isfinite(fused).all(axis=1)
+    if known := determined.sum() >= _FEWEST_SAMPLES:
+        rows = determined
     if rows.sum() < _FEWEST_SAMPLES:
         return None
     mine, others = values[rows, k], np.delete(values, k, axis=1)[rows]
     counts = sound[rows, :, None]
     mean = np.where(counts, others, 0.0).sum(axis=1) / counts.sum(axis=1)
     single = np.where(counts, others - mine[:, None], 0.0)
-    told = np.isfinite(fused[rows]).all()
     return Apart(
-        fused=_rms(fused[rows] - mine) if told else None,
+        fused=_rms(fused[rows] - mine) if known else None,
         mean=_rms(mean - mine),
         single=math.sqrt(float((single**2).sum() / (3 * counts.sum()))),
-        stated=math.sqrt(float(np.mean(std[rows] ** 2)) + noise**2) if told else None,
+        stated=math.sqrt(float(np.mean(std[rows] ** 2)) + noise**2) if known else None,
         samples=int(rows.sum()),
     )
 
@@ -264,6 +267,11 @@ def _rms(values: Array) -> float:
 def _middle(rows: list[Apart | None], name: str) -> float | None:
     values = [value for row in rows if row is not None and (value := getattr(row, name)) is not None]
     return float(np.median(values)) if values else None
+
+
+def _is_worse(row: Apart) -> bool:
+    """Return whether the mean is nearer than the fused others, and noise, which these have more of, is not why."""
+    return row.fused is not None and row.stated is not None and row.fused > max(row.mean, _FAR * row.stated)
 
 
 def _findings(accel: dict[str, list[Apart | None]], gyro: dict[str, list[Apart | None]]) -> list[str]:
@@ -278,7 +286,7 @@ def _findings(accel: dict[str, list[Apart | None]], gyro: dict[str, list[Apart |
                     "noise at rest makes them; synchronised IMUs, or a time of each, lower that"
                 )
             )
-    worse = [str(k + 1) for k, row in enumerate(accel["turning"]) if row is not None and (row.fused or 0.0) > row.mean]
+    worse = [str(k + 1) for k, row in enumerate(accel["turning"]) if row is not None and _is_worse(row)]
     if worse:
         lines.append(
             Finding(

@@ -463,8 +463,9 @@ def warn_halves(solution: Solution, apart: Array, deviation: Array) -> list[str]
             findings.append(
                 Finding(
                     f"the {sensors} of IMU {k + 1} answer {'later' if later[k] > 0 else 'earlier'} against the "
-                    f"gyroscopes of IMU 1 in the second half of the motion than in the first, by {abs(z[k]):.2g} "
-                    "standard deviations: do they run on another clock, or were samples lost?",
+                    f"gyroscopes of IMU 1 in the second half of the motion than in the first, by "
+                    f"{1e3 * abs(later[k]):.2g} ms ({abs(z[k]):.2g} standard deviations): do they run on "
+                    "another clock, or were samples lost?",
                     "record all IMUs on one clock",
                 )
             )
