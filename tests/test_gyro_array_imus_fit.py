@@ -293,6 +293,22 @@ def test_clipped_readings_are_left_out_and_said():
     assert np.abs(errors(record, board, ("position", "gyro_scale"))).max() < 4.5
 
 
+def test_the_share_that_fusion_bridges_is_that_of_the_range_which_fusion_takes():
+    """Stated: what lies beyond; else what three equal readings in a row show, not two."""
+    board = a_board(duration="20 s", age="0 ms")
+    stated = il.calibrate_imus(board, gravity=G, gyro_range="200 deg/s").calibration
+    columns = [values for name, values in board.columns.items() if name.startswith("gyro")]
+    beyond = np.any([np.abs(values) >= 200 for values in columns], axis=0).mean()
+    assert beyond > 0.1
+    assert imus_of(stated).fit.bridged == pytest.approx(beyond, rel=1e-9)
+    assert il.fuse_imus(board, calibration=stated).bridged.mean() == pytest.approx(beyond, abs=0.02)
+    twice = board.columns["gyro_x_1"].copy()
+    top = int(np.argmax(twice))
+    twice[top + 1] = twice[top]
+    record = il.calibrate_imus(with_columns(board, gyro_x_1=twice), gravity=G).calibration
+    assert imus_of(record).fit.bridged == 0
+
+
 def test_a_short_motion_is_said():
     record = il.calibrate_imus(a_board(duration="4 s", attitudes=1, rate="100 Hz"), gravity=G).calibration
     assert any("s of motion: below 5 s" in text for text in record.verdict.reasons)

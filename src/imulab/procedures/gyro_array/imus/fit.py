@@ -13,6 +13,7 @@ from imulab.display import Bad, Finding, Note
 from imulab.errors import OptionError
 from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_place, gravity_findings, local_gravity
 from imulab.options import RARE, measure, text
+from imulab.procedures.gyro_array.imus.columns import readings_of
 from imulab.procedures.gyro_array.imus.fuse import ranges
 from imulab.procedures.gyro_array.imus.logs import prepare_board, with_all_instances
 from imulab.procedures.gyro_array.imus.model import (
@@ -28,7 +29,7 @@ from imulab.procedures.gyro_array.imus.model import (
     RATE,
     predicted,
 )
-from imulab.procedures.gyro_array.imus.prepare import Prepared
+from imulab.procedures.gyro_array.imus.prepare import Prepared, names_of
 from imulab.procedures.gyro_array.imus.record import GAUGE, make_record
 from imulab.procedures.gyro_array.imus.schema import (
     AT_ACCEL_BIAS,
@@ -224,7 +225,7 @@ def fit_board(
     covariance, widening = solution.covariance(size)
     apart, deviation = solution.halves(size)
     names, unknown = _not_determined(prepared, covariance, source, attitudes)
-    summary = _summary(prepared, solution, factors, factor, widening, apart, deviation)
+    summary = _summary(prepared, solution, factors, factor, widening, apart, deviation, _bridged(recording, limits))
     findings = [
         *gravity_findings(gravity, recording),
         *prepared.notes,
@@ -276,9 +277,15 @@ def _by_distance(solution: Solution, distance: Distance) -> Factor:
 # What the record holds beside the board.
 
 
+def _bridged(recording: Recording, limits: Array) -> float:
+    """Return the share of samples with a gyroscope at the end of its range, as fusion takes it."""
+    rates = readings_of(recording, names_of(recording))[:, 1]
+    return float((np.abs(rates) >= limits[1, :, None]).any(axis=(1, 2)).mean())
+
+
 def _summary(
     prepared: Prepared, solution: Solution, factors: dict[SizeFrom, Factor | None], chosen: Factor, widening: float,
-    apart: Array, deviation: Array,
+    apart: Array, deviation: Array, bridged: float,
 ) -> ImusSummary:  # fmt: skip
     def size_of(name: SizeFrom) -> Measured | None:
         factor = factors[name]
@@ -294,7 +301,7 @@ def _summary(
     return ImusSummary(
         sample_rate=Above0(value=prepared.rate, unit="Hz"), duration=Above0(value=prepared.duration, unit="s"),
         samples_in_motion=len(solution.motion), rests=len(prepared.rests), clipped=prepared.clipped,
-        bridged=prepared.bridged,
+        bridged=bridged,
         axis_rates=Three(value=prepared.axis_rates.tolist(), standard_uncertainty=[None] * 3, unit="rad/s"),
         accel_residual=Length(value=rms(accel), unit="m/s^2"), gyro_residual=Length(value=rms(gyro), unit="rad/s"),
         accel_factor=float(np.median(solution.weights.accel)), gyro_factor=float(np.median(solution.weights.gyro)),

@@ -45,8 +45,6 @@ class Prepared:
         First and one past the last sample of each rest, shape (rests, 2).
     clipped
         Share of the samples in motion that have a reading at its limit.
-    bridged
-        Share of all samples that have a gyroscope at its limit, where fusion takes the rate from the accelerometers.
     duration, rate
         Of the motion that is used, s, and of the samples, Hz.
     axis_rates
@@ -65,7 +63,6 @@ class Prepared:
     broken: NDArray[np.bool_]
     rests: NDArray[np.intp]
     clipped: float
-    bridged: float
     duration: float
     rate: float
     axis_rates: Array
@@ -158,7 +155,7 @@ def prepare(recording: Recording, gravity: float) -> Prepared:
     start, motion = _start(measured, sensing, bias)
     return Prepared(
         measured, start, motion, time, gyro_limit | gap | bad, np.array([[part.start, part.stop] for part in rests]),
-        clipped, float(gyro_limit.mean()), len(kept) * step, 1 / step,
+        clipped, len(kept) * step, 1 / step,
         np.sqrt(np.square(motion[:, RATE]).mean(axis=0)), (*notes, *more),
     )  # fmt: skip
 

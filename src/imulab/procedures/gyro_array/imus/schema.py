@@ -115,7 +115,7 @@ class ImusSummary(Part):
     accelerometers with the derivative of the rate; `halves` the rms of the positions' differences between two halves of
     the motion over their uncertainty; `widening` the factor of the sandwich over the stated uncertainty, by median.
     `clipped` is the share of the samples in motion that have a reading at its limit, `bridged` that of all samples with
-    a gyroscope at its limit.
+    a gyroscope at the end of its range, stated or reached, where fusion takes the rate from the accelerometers.
     """
 
     sample_rate: Above0
