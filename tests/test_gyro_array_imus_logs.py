@@ -191,6 +191,24 @@ def test_a_log_of_one_imu_says_what_to_log(file, capsys):
         il.read(path, instance="both")
 
 
+@pytest.mark.parametrize("kind", [b"char[04]", b"float[1]"])
+def test_a_device_that_is_no_whole_number_is_not_read(hand, file, kind):
+    infinity = 0x7F800000  # as a float
+    log = px4({key: (t[:100], v[:100]) for key, (t, v) in hand[2].items()}, dict.fromkeys(hand[2], infinity))
+    with pytest.raises(ReadError, match=f"sensor_accel 0 and .* are one sensor, device {infinity}"):
+        il.read(file(log), instance="all")
+    recording = il.read(file(log.replace(b"uint32_t device_id", kind + b" device_id")), instance="all")
+    assert sum(name.startswith("gyro_x_") for name in recording.columns) == 3
+
+
+@pytest.mark.parametrize("key", ["TimeUS", "SampleUS"])
+def test_text_in_the_place_of_a_time_is_refused(hand, file, key):
+    log = ardupilot({key: (t[:50], v[:50]) for key, (t, v) in hand[2].items()}, raw=True)
+    types = {"TimeUS": b"nBQfff", "SampleUS": b"QBnfff"}[key]
+    with pytest.raises(ReadError, match=f"message ACC: expected a whole number in field {key}, found type 'n'"):
+        il.read(file(log.replace(b"QBQfff", types), "log.bin"), instance="all")
+
+
 # --- calibration ---------------------------------------------------------------------------------------------------
 
 

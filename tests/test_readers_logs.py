@@ -363,6 +363,10 @@ ULOG_DAMAGE = {
         lambda w: w.replace(b"uint32_t device_id;float x", b"uint99_t device_id;float x"),
         "found 'uint99_t devi",
     ),
+    "time": (
+        lambda w: w.replace(b"uint64_t timestamp_sample", b"float[1] timestamp_sample"),
+        "expected whole microseconds in timestamp_sample",
+    ),
     "utf-8": (lambda w: w.replace(b"sensor_gyro:", b"sensor_gyr\xff:"), "expected UTF-8 text"),
 }
 
@@ -491,6 +495,15 @@ DATAFLASH_DAMAGE = {
     "no imu": (lambda w: w.replace(b"IMU\0", b"IMV\0"), "no IMU, ACC or GYR messages; messages found: IMV MSG"),
     "field": (lambda w: w.replace(b"AccZ", b"AccW"), "message IMU has no field AccZ"),
     "types": (lambda w: w.replace(b"QBffffffIIfBBHH", b"QBdddddddddBBHH"), "message IMU: fields of"),
+    "text for time": (
+        lambda w: w.replace(b"QBffff", b"ZBffff"),
+        "expected a whole number in field TimeUS, found type 'Z'",
+    ),
+    "fraction for instance": (lambda w: w.replace(b"QBffff", b"Qfffff"), "a whole number in field I, found type 'f'"),
+    "text for a reading": (
+        lambda w: w.replace(b"QBffff", b"QBfnff"),
+        "expected a number in field GyrY, found type 'n'",
+    ),
     "only head": (lambda w: w[:89], "messages found: none"),
     "three bytes": (lambda w: w[:3], "messages found: none"),
 }

@@ -57,6 +57,7 @@ _FIELDS = {
     "MAG": ("MagX", "MagY", "MagZ"),
 }
 _MAG = dict.fromkeys(triad("mag"), "mgauss")
+_WHOLE = ("I", "TimeUS", "TimeMS", "SampleUS")  # fields that hold whole numbers
 _NAME = re.compile(
     r"(IMU|ACC|GYR|MAG)([1-9]?)"
 )  # before ArduPilot 4.1 each instance had its own message: IMU, IMU2, ACC1 ...
@@ -205,6 +206,7 @@ def _define(contents: _Contents, payload: bytes, name: str) -> None:
     if kind == _FMT:
         return
     fields: dict[str, _Field] = {}
+    kinds = {key.strip(): code for code, key in zip(types, names, strict=False)}
     offset = 0
     for code, key in zip(types, names, strict=False):
         if code not in _KINDS:
@@ -220,12 +222,18 @@ def _define(contents: _Contents, payload: bytes, name: str) -> None:
         instance = None if "I" in fields else int(match[2] or 1) - 1
         missing = [key for key in wanted if key not in fields]
         lacks = missing[0] if missing else "" if {"TimeUS", "TimeMS"} & set(fields) else "TimeUS"
-        odd = offset > length - 3 or any(fields[key].kind[0] == "S" for key in (*wanted, "I") if key in fields)
-        if sensor == "MAG" and (lacks or odd):
+        read = [key for key in (*wanted, *_WHOLE, "Health") if key in fields]
+        odd = next(
+            (key for key in read if np.dtype(fields[key].kind).kind not in ("iu" if key in _WHOLE else "iuf")), ""
+        )
+        if sensor == "MAG" and (lacks or odd or offset > length - 3):
             sensor = None  # the rest of the log can be read without it
         elif lacks:
             raise ReadError(f"{name}: message {title} has no field {lacks}; found {' '.join(fields) or 'none'}")
         elif odd:
+            number = "a whole number" if odd in _WHOLE else "a number"
+            raise ReadError(f"{name}: message {title}: expected {number} in field {odd}, found type {kinds[odd]!r}")
+        elif offset > length - 3:
             raise ReadError(f"{name}: message {title}: fields of {offset} bytes in {length - 3}")
     if sensor is None and offset > length - 3:
         fields = {}

@@ -286,7 +286,11 @@ def _fields(contents: _Contents, title: str, name: str, *, device: bool = False)
     for key in needed:
         if key not in layout or layout[key].count != (3 if key in _VECTORS else 1):
             raise ReadError(f"{name}: {title} has no field {key}; found {' '.join(layout)}")
-    more = [key for key in ("device_id", "accel_device_id", "gyro_device_id") if device and key in layout]
+    whole = [key for key, f in layout.items() if f.count == 1 and np.dtype(f.kind).kind in "iu"]
+    odd = next((key for key in needed if key.startswith("timestamp") and key not in whole), None)
+    if odd:
+        raise ReadError(f"{name}: {title}: expected whole microseconds in {odd}, found numbers with a point")
+    more = [key for key in ("device_id", "accel_device_id", "gyro_device_id") if device and key in whole]
     return {key: layout[key] for key in (*needed, *more)}
 
 
