@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from imulab.device.imus import NO_LIMIT, FusedImus, ImusSettings, ImusStream
 from imulab.device.unit import ALONE, BEYOND, EXCLUDED, GATED, NOT_FINITE, STUCK, Blob, is_blob, load_blob
-from imulab.display import Finding, prefixed
+from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.estimation.clock import GAP
 from imulab.options import RARE, READING, measure, parsed, text
@@ -35,7 +35,9 @@ from imulab.report.traces import BAD, DASHES, GOOD, TIME, Exhibits, Figure, Repo
 from imulab.units import from_si
 
 _NONE = 1e-7  # s: a latency below is none
-_KINDS = ((STUCK, "stuck"), (NOT_FINITE, "no number"), (BEYOND, "at the end of its range"), (GATED, "off the others"))
+_OFF = "off the others"
+_RARE = 0.01  # share of samples off the others that chips without a common clock have in motion
+_KINDS = ((STUCK, "stuck"), (NOT_FINITE, "no number"), (BEYOND, "at the end of its range"), (GATED, _OFF))
 _WORDS = {"accel": "accelerometer", "gyro": "gyroscope"}
 _COLOURS = (GOOD, BAD, "#8e6bbd")
 
@@ -306,12 +308,15 @@ class BoardFuser:
         """Return messages after the last block: gaps, what was bridged, and what was left out."""
         lines: list[str] = []
         for (sensor, k), lost in sorted(self.left_out.items()):
-            why = " and ".join(dict.fromkeys(lost["why"])) or "off the others"
+            why = " and ".join(dict.fromkeys(lost["why"])) or _OFF
             text = (
                 f"{_WORDS[SENSORS[sensor]]} {k + 1}: left out of {lost['samples']} of {self.samples} samples, first at "
                 f"{lost['first']:.6g} s: {why}"
             )
-            lines.append(Finding(text, "look at this sensor; the others were fused without it"))
+            scattered = why == _OFF and lost["samples"] < _RARE * self.samples
+            lines.append(
+                Note(text) if scattered else Finding(text, "look at this sensor; the others were fused without it")
+            )
         if self.alone:
             text = f"fewer than three accelerometers left in {self.alone} samples: nothing to compare them with"
             lines.append(Finding(text, "do not trust the angular acceleration there"))
