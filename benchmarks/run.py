@@ -27,6 +27,7 @@ PARTS = {
     "growth": "Growth",
     "recordings": "Recordings",
     "thermal": "Thermal",
+    "whole_arrays": "Whole arrays",
     "warmup": "Warm-up",
     "fleet": "Fleet",
     "accuracy": "Accuracy and real recordings",
