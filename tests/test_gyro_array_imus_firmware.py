@@ -178,7 +178,9 @@ def test_the_readme_tells_how_late_each_imu_is_and_whether_rates_are_bridged(boa
     values = board_of(late).latency * 1e3
     assert all(f"| {k + 1} | {a:.4f} | {g:.4f} |" in first for k, (a, g) in enumerate(values.T))
     assert "range was not stated (`imulab export --gyro-range`)" in first
-    assert "Gyroscopes end at 34.9066 rad/s" in second
+    assert "range was not stated" not in second
+    assert first.count("| not known | not known |") == 4
+    assert second.count("| not known | 34.9066 |") == 4
     assert "-DIL_IMUS=4" in first
 
 
@@ -227,12 +229,31 @@ def test_a_blob_whose_text_speaks_of_other_imus_is_refused(board, record):
         il.fuse_imus(three, calibration=Blob("unit.blob", pack([table], 4, text), text))
 
 
+def test_a_board_of_mixed_ranges_keeps_those_of_each_imu(tmp_path):
+    """The range of the narrowest IMU for all of them took the latency out of the others only below it."""
+    board = il.simulate_imus(elements=4, attitudes=1, duration="6 s", rate="100 Hz", age="0 s", seed=3)
+    limits = np.array([[1e30, 160.0, 160.0, 1e30], [*np.radians([250.0, 2000.0, 2000.0]), 1e30]])
+    mixed = true_record(board, limits)
+    (blob,) = il.export("blob", mixed, tmp_path)
+    read = board_of(load_blob(blob))
+    assert np.array_equal(read.limits, limits)
+    out, again = (il.fuse_imus(board, calibration=known) for known in (mixed, blob))
+    assert out.bridged.mean() > 0.05
+    assert np.array_equal(again.bridged, out.bridged)
+    assert (np.abs(again.rate - out.rate) < 1e-3 * out.rate_std).all()  # 600 of them with one range for all
+    il.export("c", mixed, tmp_path / "c")
+    readme = (tmp_path / "c" / "README.md").read_text(encoding="utf-8")
+    assert "The end of some gyroscopes' range was not stated" in readme
+    ends = [line.rsplit("|", 3)[1:3] for line in readme.split("gyroscopes end at")[1].splitlines()[2:6]]
+    assert ends == [[" not known ", " 4.36332 "], *[[" 160 ", " 34.9066 "]] * 2, [" not known "] * 2]
+
+
 def test_the_text_of_the_blob_holds_what_only_the_desk_needs(blob, record):
     text = json.loads(blob.read_bytes().partition(b"{")[2].partition(b"}]")[0].join((b"{", b"}]}")))
     (section,) = text["sections"]
     assert section["imus"] == 4
-    assert section["gyro_range"] == pytest.approx(np.radians(RANGE))
-    assert section["accel_range"] is None
+    assert section["gyro_range"] == pytest.approx([np.radians(RANGE)] * 4)
+    assert section["accel_range"] == [None] * 4
     assert len(section["accel_latency"]) == len(section["gyro_latency"]) == 4
 
 
@@ -302,11 +323,11 @@ def test_each_record_is_fused_by_the_options_that_its_kind_takes(first, record, 
 
     fused, board = exported(gyro_range="2000 deg/s")
     assert fused == ["mean", 0.01]  # as its record states, not by default
-    assert board["gyro_range"] == pytest.approx(np.radians(2000.0))
+    assert board["gyro_range"] == pytest.approx([np.radians(2000.0)] * 4)
     fused, board = exported(memory=0.02, at="imu:1")
     assert (fused, board["at"]) == (["mean", 0.02], [0.0, 0.0, 0.0])
     fused, board = exported(method="robust")
-    assert (fused, board["gyro_range"]) == (["robust", 0.01], None)
+    assert (fused, board["gyro_range"]) == (["robust", 0.01], [None] * 4)
 
 
 def test_a_board_beside_other_records_and_with_too_many_imus(record, tmp_path):
@@ -337,7 +358,7 @@ def test_ranges_that_the_record_holds_reach_fusion_and_unit(tmp_path):
     assert not il.fuse_imus(board, calibration=true_record(board)).bridged.any()
     (blob,) = il.export("blob", fit, tmp_path)
     (section,) = load_blob(blob).text["sections"]
-    assert section["gyro_range"] == pytest.approx(np.radians(RANGE))
+    assert section["gyro_range"] == pytest.approx([np.radians(RANGE)] * 4)
     reached = il.calibrate_imus(clipped, gravity=9.80665).calibration
     ends = [imu["gyro_range"]["value"] for imu in reached.sections["imus"]]
     assert ends == pytest.approx([np.radians(RANGE)] * len(ends))

@@ -28,7 +28,7 @@ from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.files import open_file
 from imulab.recording import Array, Recording
 from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
-from imulab.records.sections import Part, Positive, Size, check_sizes, holds, null, read
+from imulab.records.sections import Part, Positive, Size, check_sizes, holds, read
 from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
 
 # One unit: its tables are loaded once; arrays in and out.
@@ -450,8 +450,8 @@ class _Imus(Part):
     rate: Positive
     accel_latency: Annotated[list[float], "imus"]
     gyro_latency: Annotated[list[float], "imus"]
-    accel_range: Positive | None = null()
-    gyro_range: Positive | None = null()
+    accel_range: Annotated[list[Positive | None], "imus"]
+    gyro_range: Annotated[list[Positive | None], "imus"]
 
 
 _COLUMNS: dict[str, type[Part]] = {

@@ -60,7 +60,7 @@ def tables_of_board(record: Calibration, fusion: Fusion | None = None) -> tuple[
         "accel_latency": known.latency[0].tolist(),
         "gyro_latency": known.latency[1].tolist(),
         **{
-            name: float(ends.min()) if (ends < NO_LIMIT).any() else None
+            name: [end if end < NO_LIMIT else None for end in ends.tolist()]
             for name, ends in zip(("accel_range", "gyro_range"), known.limits, strict=True)
         },
     }
@@ -74,7 +74,7 @@ def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     slower where they are beyond theirs. From four IMUs on the last accelerometer is dead for a while, and the first
     gyroscope gives no number.
     """
-    end, count = table.columns["gyro_range"], int(table.columns["imus"])
+    end, count = min(filter(None, table.columns["gyro_range"]), default=None), int(table.columns["imus"])
     step = np.full(_SAMPLES, 1 / table.columns["rate"])
     step[0] = 0.0
     noise = rng.standard_normal((_SAMPLES, 2, count, 3))

@@ -82,8 +82,7 @@ def board_of(calibration: Calibration | Blob, at: str = "centroid", limits: Arra
                 f"--at {at}: the blob {calibration.name} gives the force at the point it was exported for"
             )
         latency = np.array([section["accel_latency"], section["gyro_latency"]])
-        stated = (section["accel_range"], section["gyro_range"])
-        limits = np.array([np.full(latency.shape[1], NO_LIMIT if end is None else end) for end in stated])
+        limits = np.array([[end or NO_LIMIT for end in section[name]] for name in ("accel_range", "gyro_range")])
         return KnownBoard(calibration.name, None, calibration.data, latency, limits)
     held = imus_of(calibration)
     board, noise = held.board, held.accel_noise
