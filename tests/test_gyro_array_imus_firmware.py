@@ -229,6 +229,16 @@ def test_a_blob_whose_text_speaks_of_other_imus_is_refused(board, record):
         il.fuse_imus(three, calibration=Blob("unit.blob", pack([table], 4, text), text))
 
 
+@pytest.mark.parametrize("end", [250.0, 300.0])  # deg/s: in float above itself, and below
+def test_a_blob_in_float_takes_clipped_readings_for_the_end_of_the_range(end, tmp_path):
+    clipped = clipped_board(il.simulate_imus(elements=4, attitudes=1, duration="2 s", age="0 s", seed=3), end)
+    record = true_record(clipped)
+    (blob,) = il.export("blob", record, tmp_path, gyro_range=f"{end} deg/s")
+    told = il.fuse_imus(clipped, calibration=record, gyro_range=f"{end} deg/s")
+    assert told.bridged.mean() > 0.03
+    assert np.array_equal(il.fuse_imus(clipped, calibration=blob).bridged, told.bridged)
+
+
 def test_a_board_of_mixed_ranges_keeps_those_of_each_imu(tmp_path):
     """The range of the narrowest IMU for all of them took the latency out of the others only below it."""
     board = il.simulate_imus(elements=4, attitudes=1, duration="6 s", rate="100 Hz", age="0 s", seed=3)

@@ -17,6 +17,7 @@ GATE = 30.664849706213795
 """Chi-square of three degrees of freedom that one triad in a million exceeds: ``scipy.stats.chi2.isf(1e-6, 3)``."""
 NO_LIMIT = 1e30
 _STUCK, _QUIET = 0.5, 1.0  # s
+_WITHIN = 1 - 1e-6  # of a range: a reading at its end, or the end itself, may be rounded to float
 
 
 @dataclass(frozen=True)
@@ -87,11 +88,11 @@ def imus_table(settings: ImusSettings) -> DeviceTable:
         "accel": np.linalg.inv(s.accel),
         "accel_bias": s.accel_bias,
         "accel_noise": s.accel_noise,
-        "accel_limit": s.accel_limit,
+        "accel_limit": _WITHIN * s.accel_limit,
         "gyro": np.linalg.inv(s.gyro),
         "gyro_bias": s.gyro_bias,
         "gyro_noise": s.gyro_noise,
-        "gyro_limit": s.gyro_limit,
+        "gyro_limit": _WITHIN * s.gyro_limit,
         "gyro_rows": s.gyro,
     }
     fields = [Field(name, whole(value)) for name, value in words.items()]
