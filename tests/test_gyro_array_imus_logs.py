@@ -141,6 +141,27 @@ def test_gyroscopes_stand_beside_the_accelerometer_of_their_device(hand, file):
     assert any("of the same device" in note for note in recording.notes)
 
 
+def test_devices_of_which_some_match_are_paired_and_the_rest_stand_in_order(hand, file):
+    # Of accelerometers 1000, 1001, 1002 and gyroscopes 1001, 7, 1000 the last accelerometer has a chip of two numbers.
+    recording = il.read(file(px4(hand[2], {("gyro", 0): 1001, ("gyro", 1): 7, ("gyro", 2): 1000})), instance="all")
+    as_logged = il.read(file(px4(hand[2])), instance="all")
+    for to, logged in ((1, 3), (2, 1), (3, 2)):
+        difference = recording.columns[f"gyro_x_{to}"] - as_logged.columns[f"gyro_x_{logged}"]
+        assert np.abs(difference[100:-100]).max() < 1e-9
+    assert any(note.endswith("numbers differ: sensor_gyro 1 beside sensor_accel 2") for note in recording.notes)
+    assert not any("numbers differ" in note for note in as_logged.notes)
+
+
+@pytest.mark.parametrize(("skipped", "much"), [(2.0, False), (30.0, True)])
+def test_an_instance_that_begins_late_is_named(hand, file, skipped, much):
+    data = changed(hand[2], [("accel", 1)], lambda t, v: (t[t > t[0] + 1e6 * skipped], v[t > t[0] + 1e6 * skipped]))
+    recording = il.read(file(px4(data)), instance="all")
+    (said,) = [note for note in recording.notes if "rows begin there" in note]
+    assert re.search(rf"sensor_accel 1 begins {skipped:.3g}\d*(\.\d+)? s after sensor_\w+ \d: ", said)
+    assert said.startswith("truncated stream: ") == much
+    assert not any("rows begin there" in note for note in il.read(file(px4(hand[2])), instance="all").notes)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -296,7 +317,7 @@ def clocked(share):
 def test_an_instance_with_a_wrong_clock_is_named(hand, file, share, shown):
     data = changed(hand[2], [("accel", 1), ("gyro", 1)], clocked(share))
     way = "fast" if share > 0 else "slow"
-    with pytest.raises(DataError, match=f"gyroscopes of IMU 2 run {shown} {way} against IMU 1's"):
+    with pytest.raises(DataError, match=f"gyroscopes of IMU 2 run {shown} {way} against IMU 1's.*with --instance all"):
         il.calibrate_imus(file(px4(data)), gravity=G)
 
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from imulab.display import Finding, Note
 from imulab.errors import ReadError
+from imulab.estimation.sampling import WIDEST_GAP
+from imulab.readers.streams import loss
 from imulab.recording import RESAMPLED, Array, Recording
 
 INSTANCES = "instances"
@@ -22,7 +24,6 @@ INSTANCES = "instances"
 _GAP = 2.5  # usual steps: one missing sample is bridged, more are not
 _SHORTEST = 8  # samples of a stretch without a gap
 _NEARLY = 0.95  # of a rate: of triads so close the first gyroscope is the clock
-_MUCH = 0.1  # share of a triad behind the end of another from which every command warns
 _UNITS = {"accel": "m/s^2", "gyro": "rad/s"}
 
 
@@ -78,14 +79,14 @@ def imus_on_one_clock(
     gyros = _paired(accels, gyros, name, notes)
     triads = [_without_repeats(each, name) for each in (*gyros, *accels)]
     notes += _losses([*gyros, *accels], triads)
-    start, end = max(int(each.ticks[0]) for each in triads), min(int(each.ticks[-1]) for each in triads)
-    first, last = (max(triads, key=lambda t: t.ticks[0]), min(triads, key=lambda t: t.ticks[-1]))
+    latest, soonest = max(triads, key=lambda t: t.ticks[0]), min(triads, key=lambda t: t.ticks[-1])
+    start, end = int(latest.ticks[0]), int(soonest.ticks[-1])
     if start >= end:
         raise ReadError(
-            f"{name}: {last.what} ends at {end / 1e6:.6g} s and {first.what} begins at {start / 1e6:.6g} s: they have "
-            "no time in common"
+            f"{name}: {soonest.what} ends at {end / 1e6:.6g} s and {latest.what} begins at {start / 1e6:.6g} s: they "
+            "have no time in common"
         )
-    notes += _ends(triads, last)
+    notes += _ends(triads, latest, soonest)
     slowest = max(each.step for each in triads)
     clock = next(each for each in triads if each.step >= _NEARLY * slowest)
     ticks = clock.ticks[(clock.ticks >= start) & (clock.ticks <= end)]
@@ -113,19 +114,23 @@ def imus_on_one_clock(
 def _paired(
     accels: Sequence[LoggedTriad], gyros: Sequence[LoggedTriad], name: str, notes: list[str]
 ) -> list[LoggedTriad]:
-    """Return the gyroscopes in the order of their accelerometers: by device where that tells, else by instance."""
+    """Return the gyroscopes in the order of their accelerometers: by device where that tells, the rest in order."""
     for triads in (accels, gyros):
         devices = [each.device for each in triads if each.device]
         twice = next((each for each in triads if each.device and devices.count(each.device) > 1), None)
         if twice is not None:
             both = " and ".join(each.what for each in triads if each.device == twice.device)
             raise ReadError(f"{name}: {both} are one sensor, device {twice.device}; expected sensors of their own")
-    by_device = {each.device: each for each in gyros}
-    if {each.device for each in accels} != set(by_device) or 0 in by_device:
-        return list(gyros)
-    ordered = [by_device[each.device] for each in accels]
-    if ordered != list(gyros):
+    by_device = {each.device: each for each in gyros if each.device}
+    known = {each.device for each in accels}
+    rest = iter([each for each in gyros if each.device not in known or not each.device])
+    ordered = [by_device.get(each.device) or next(rest) for each in accels]
+    if [each.what for each in ordered] != [each.what for each in gyros]:
         notes.append(Note("gyroscopes are put beside the accelerometers of the same device, not of the same instance"))
+    pairs = [(g, a) for g, a in zip(ordered, accels, strict=True) if g.device != a.device and g.what != a.what]
+    if pairs:
+        shown = ", ".join(f"{gyro.what} beside {accel.what}" for gyro, accel in pairs)
+        notes.append(Note(f"put in the order of instances, as their device numbers differ: {shown}"))
     return ordered
 
 
@@ -172,20 +177,18 @@ def _losses(logged: Sequence[LoggedTriad], kept: Sequence[LoggedTriad]) -> list[
     return notes
 
 
-def _ends(triads: Sequence[LoggedTriad], first: LoggedTriad) -> list[str]:
-    """Return how far the triad that ends first ends before the longest, where that is more than a gap."""
-    longest = max(triads, key=lambda each: each.ticks[-1])
-    left = float(longest.ticks[-1] - first.ticks[-1])
-    if left <= 10 * max(first.step, longest.step):
-        return []
-    share = left / float(longest.ticks[-1] - longest.ticks[0])
-    return [
-        Finding(
-            f"{'truncated stream: ' if share > _MUCH else ''}{first.what} ends {left / 1e6:.4g} s before "
-            f"{longest.what}: rows end there, and {100 * share:.2g} % of the log are left out",
-            "check that the log is whole, or record again",
-        )
-    ]
+def _ends(triads: Sequence[LoggedTriad], latest: LoggedTriad, soonest: LoggedTriad) -> list[str]:
+    """Return what is left out before the last triad begins and after the first ends, where that is more than a gap."""
+    first, last = min(triads, key=lambda each: each.ticks[0]), max(triads, key=lambda each: each.ticks[-1])
+    notes: list[str] = []
+    for bound, other, left, at_start in (
+        (latest, first, float(latest.ticks[0] - first.ticks[0]), True),
+        (soonest, last, float(last.ticks[-1] - soonest.ticks[-1]), False),
+    ):
+        if left > WIDEST_GAP * max(bound.step, other.step):
+            share = left / float(other.ticks[-1] - other.ticks[0])
+            notes.append(loss(bound.what, other.what, left / 1e6, share, at_start=at_start))
+    return notes
 
 
 def _at(triad: LoggedTriad, ticks: NDArray[np.int64]) -> Array:

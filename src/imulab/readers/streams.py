@@ -287,17 +287,22 @@ def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
     for last, start, buffer in timed:
         left = last - end
         if left > WIDEST_GAP * np.nan_to_num(max(first.step, buffer.step)):
-            lost = f"{left / per_second:.4g} s"
-            share = left / max(last - start, 1)
-            messages.append(
-                Finding(
-                    f"{'truncated stream: ' if share > _MUCH else ''}the {first.stream.what} ends {lost} before the "
-                    f"{buffer.stream.what}: rows end there, and {lost} ({100 * share:.2g} %) of the "
-                    f"{buffer.stream.what} are left out",
-                    _WHOLE,
-                )
-            )
+            names = f"the {first.stream.what}", f"the {buffer.stream.what}"
+            messages.append(loss(*names, left / per_second, left / max(last - start, 1)))
     return messages
+
+
+def loss(bound: str, other: str, lost: float, share: float, *, at_start: bool = False) -> Finding:
+    """Return what another stream loses, s and as a share, where rows end, or begin, with the stream that bounds them.
+
+    Every command warns of a large share.
+    """
+    does, when, rows = ("begins", "after", "begin") if at_start else ("ends", "before", "end")
+    return Finding(
+        f"{'truncated stream: ' if share > _MUCH else ''}{bound} {does} {lost:.4g} s {when} {other}: rows {rows} "
+        f"there, and {lost:.4g} s ({100 * share:.2g} %) of {other} are left out",
+        _WHOLE,
+    )
 
 
 def _placements(clock: _Buffer, others: list[_Buffer], rows: int, per_second: int) -> list[str]:

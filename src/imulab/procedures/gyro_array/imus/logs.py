@@ -16,7 +16,8 @@ import numpy as np
 
 from imulab.display import Finding, Note
 from imulab.errors import DataError, ObservabilityError
-from imulab.procedures.gyro_array.imus.prepare import Prepared, prepare
+from imulab.procedures.gyro_array.imus.columns import readings_of
+from imulab.procedures.gyro_array.imus.prepare import Prepared, names_of, prepare
 from imulab.readers.instances import INSTANCES
 from imulab.recording import EVERY, Array, Recording
 
@@ -36,6 +37,10 @@ _VIBRATES, _SEVERAL = 2.0, 4  # times the noise at rest, and IMUs of which the f
 _DO = (
     "log raw readings of all instances (PX4: sensor_accel and sensor_gyro; ArduPilot: ACC and GYR), motors off, while "
     "the board is put down in twelve attitudes and turned by hand about all axes"
+)
+
+_LEAVE_OUT = (
+    "convert the log with --instance all, leave the columns of this IMU out, number the others anew, and read that"
 )
 
 
@@ -105,16 +110,12 @@ class _Series:
 
 
 def _series(recording: Recording) -> _Series:
-    count = sum(name.startswith("gyro_x_") for name in recording.columns)
-    accel, gyro = (
-        np.stack([np.stack([recording.si(f"{s}_{x}_{k + 1}") for x in "xyz"], axis=1) for k in range(count)], axis=1)
-        for s in ("accel", "gyro")
-    )
-    good = np.isfinite(accel).all(axis=(1, 2)) & np.isfinite(gyro).all(axis=(1, 2))
+    readings = readings_of(recording, names_of(recording))
+    good = np.isfinite(readings).all(axis=(1, 2, 3))
     if good.sum() < 2:
         raise DataError(f"{recording.name}: no time at which all of {recording.metadata[INSTANCES]} have readings")
     time = recording.si("time")[good]
-    return _Series(time, accel[good], gyro[good], 1 / float(np.median(np.diff(time))))
+    return _Series(time, readings[good, 0], readings[good, 1], 1 / float(np.median(np.diff(time))))
 
 
 def _check_turning(recording: Recording, series: _Series) -> None:
@@ -155,13 +156,13 @@ def _check_clocks(recording: Recording, series: _Series) -> list[str]:
             if abs(drift) > _DRIFT[sensor] and abs(slope) > _SURE * u:
                 raise DataError(
                     f"{recording.name}: {who} run {100 * abs(slope):.2g} % {way} against IMU 1's: "
-                    f"their lag goes from {1e3 * lag[0]:.3g} to {1e3 * lag[-1]:.3g} ms; expected one clock, so leave "
-                    "this instance out or stamp it anew"
+                    f"their lag goes from {1e3 * lag[0]:.3g} to {1e3 * lag[-1]:.3g} ms; expected one clock: "
+                    f"{_LEAVE_OUT}"
                 )
             if abs(late) > _FAR:
                 raise DataError(
                     f"{recording.name}: {who} are {1e3 * abs(late):.3g} ms {'late' if late > 0 else 'early'} against "
-                    "IMU 1's; expected stamps of the moment of sampling"
+                    "IMU 1's; expected stamps of the moment of sampling: {_LEAVE_OUT}"
                 )
             if sensor == "gyroscopes" and abs(drift) > _APART and abs(slope) > _SURE * u:
                 said.append(
