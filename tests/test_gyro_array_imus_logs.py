@@ -321,6 +321,15 @@ def test_an_instance_with_a_wrong_clock_is_named(hand, file, share, shown):
         il.calibrate_imus(file(px4(data)), gravity=G)
 
 
+def test_the_clock_of_an_accelerometer_is_checked_however_its_imu_is_turned(hand, file):
+    turn = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    data = changed(hand[2], [("accel", 1), ("gyro", 1)], lambda t, v: (t, v @ turn))
+    record = il.calibrate_imus(file(px4(data)), gravity=G).calibration
+    assert not any("time stamps" in reason for reason in record.verdict.reasons)
+    with pytest.raises(DataError, match=r"accelerometers of IMU 2 run (0\.1\d?|0\.09\d?) % fast against IMU 1's"):
+        il.calibrate_imus(file(px4(changed(data, [("accel", 1)], clocked(1e-3)))), gravity=G)
+
+
 def test_a_small_drift_is_said(hand, file):
     data = changed(hand[2], [("accel", 1), ("gyro", 1)], clocked(3e-5))
     record = il.calibrate_imus(file(px4(data)), gravity=G).calibration

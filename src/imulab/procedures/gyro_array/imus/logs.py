@@ -26,7 +26,9 @@ _TURNING = math.radians(30.0)  # rad/s rms about each axis, as for every board
 _WINDOW, _LIVELIEST, _MOVING = 0.5, 10.0, 5.0  # s: windows, and the parts whose rates are stated
 _LAG_WINDOW, _FURTHEST = 8.0, 1.0  # s: of a lag, and the longest that is looked for
 _ALIKE = 0.8  # correlation from which a lag is known
-_DRIFT = {"gyroscopes": 2e-3, "accelerometers": 2e-2}  # s between first and last lag: refused
+_DRIFT = {"gyroscopes": 2e-3, "accelerometers": 2e-2}
+"""s between first and last lag that are refused. Lever arms of 0.1 m move accelerometers' by up to 0.01 s."""
+_SMOOTH = 0.1  # s: of accelerometers, whose noise else exceeds their slope where the board turns slowly
 _APART, _FAR = 2e-4, 5e-2  # s: drifts that are said, and lags that are refused
 _SURE, _FEWEST_LAGS = 6.0, 4  # standard deviations of a drift, of so few windows, and their least number
 _STILL = 0.3  # m/s^2: no accelerometer that lies still is noisier
@@ -142,7 +144,7 @@ def _check_clocks(recording: Recording, series: _Series) -> list[str]:
     """Refuse instances whose time stamps run fast or slow against those of IMU 1, or are far off; say small drifts."""
     said: list[str] = []
     rates = np.linalg.norm(series.gyro, axis=2, keepdims=True)  # however the chips are turned
-    for sensor, readings in (("gyroscopes", rates), ("accelerometers", series.accel)):
+    for sensor, readings in (("gyroscopes", rates), ("accelerometers", _turned_alike(series))):
         for k in range(1, readings.shape[1]):
             at, lag = _lags(series, readings[:, 0], readings[:, k])
             if len(at) < _FEWEST_LAGS:
@@ -173,6 +175,17 @@ def _check_clocks(recording: Recording, series: _Series) -> list[str]:
                     )
                 )
     return said
+
+
+def _turned_alike(series: _Series) -> Array:
+    """Return the accelerometers' readings, smoothed and turned into the frame of IMU 1's, shape (n, K, 3), m/s^2."""
+    taper = np.hanning(max(round(_SMOOTH * series.rate), 1) + 2)[1:-1]
+    smooth = np.apply_along_axis(np.convolve, 0, series.accel, taper / taper.sum(), "same")
+    for k in range(1, smooth.shape[1]):
+        left, _, right = np.linalg.svd(smooth[:, 0].T @ smooth[:, k])
+        upright = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
+        smooth[:, k] = smooth[:, k] @ (left @ upright @ right).T
+    return np.asarray(smooth)
 
 
 def _lags(series: _Series, first: Array, other: Array) -> tuple[Array, Array]:
