@@ -83,7 +83,7 @@ def measured(records: Sequence[Calibration], fusion: Fusion | None = None, *defi
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        export("c", list(records), folder, ExportOptions(fusion=fusion))
+        export("c", list(records), folder, ExportOptions(fusions=[fusion] * len(records)))
         for level in ("-Os", "-O2"):
             image = _built(folder, level, "count", *defined)
             done = subprocess.run(

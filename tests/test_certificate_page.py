@@ -182,7 +182,7 @@ def adjusted(tmp_path, monkeypatch):
     return ["certificate", "after.json", "--lab", "lab.toml", "--before", "before.json"]
 
 
-def test_both_results_stand_in_the_certificate(adjusted):
+def test_both_results_stand_in_the_certificate(adjusted, real_data):
     assert main([*adjusted, "-o", "cert.pdf"]) == 0
     pdf = Path("cert.pdf").read_bytes()
     whole = " ".join(texts(pdf))
@@ -193,11 +193,7 @@ def test_both_results_stand_in_the_certificate(adjusted):
     assert xml.index("beforeAdjustment") < xml.index("afterAdjustment")
     assert "<dcc:replacedUniqueIdentifier>EX-2026-0041<" in xml
     schema = pytest.importorskip("xmlschema", reason="xmlschema checks certificates")
-    import os
-
-    path = Path(os.environ.get("IMULAB_DATA", ".")) / "dcc" / "dcc" / "v3.3.0.xsd"
-    if not path.exists():
-        pytest.skip("PTB's schemas are not here (IMULAB_DATA)")
+    path = real_data / "dcc" / "dcc" / "v3.3.0.xsd"
     schema.XMLSchema(str(path)).validate(xml)
 
 

@@ -34,7 +34,7 @@ from imulab.procedures.gyro_array.imus.size import by_gravity
 from imulab.procedures.gyro_array.imus.solve import Weights, _Problem
 
 G = 9.80665
-REAL = Path(os.environ.get("IMULAB_DATA", "shared/data")) / "mimu4444" / "exp_1.bin"
+REAL = Path(os.environ.get("IMULAB_DATA", Path(__file__).parents[2] / "shared/data")) / "mimu4444" / "exp_1.bin"
 
 
 def a_board(**options):
