@@ -167,6 +167,13 @@ def real_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def tools() -> None:
+    for name in ("gcc", "g++"):
+        if shutil.which(name) is None:
+            pytest.skip(f"no {name} on this machine")
+
+
+@pytest.fixture(scope="session")
 def chromium() -> str:
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:

@@ -465,13 +465,6 @@ WARN = ["-Wall", "-Wextra", "-Werror"]
 SINGLE = 2e-6  # of full scale
 
 
-@pytest.fixture(scope="module")
-def tools():
-    for name in ("gcc", "g++"):
-        if shutil.which(name) is None:
-            pytest.skip(f"no {name} on this machine")
-
-
 def run(*command, **options):
     done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False, timeout=120, **options)
     assert done.returncode == 0, done.stderr or done.stdout

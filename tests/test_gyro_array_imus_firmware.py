@@ -20,7 +20,7 @@ from imulab.procedures.gyro_array.imus.figures import exhibits
 from imulab.procedures.gyro_array.imus.fuse import board_of
 from imulab.procedures.gyro_array.imus.prepare import names_of
 from reference import imus as reference
-from test_exporters_firmware_c import arduino, tools, worst  # noqa: F401 (a fixture)
+from test_exporters_firmware_c import arduino, worst
 from test_gyro_array_imus_fuse import clipped_board, true_record, without_latency
 
 RANGE = 300.0  # deg/s
@@ -160,7 +160,7 @@ def test_the_self_test_notices_a_wrong_number(self_test, record, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_arduino_example_fuses_the_board(tools, board, record, rows, tmp_path):  # noqa: F811
+def test_the_arduino_example_fuses_the_board(tools, board, record, rows, tmp_path):
     il.export("c", record, tmp_path)
     some = rows[560:640]
     found = arduino(tmp_path, some[:, 1:])

@@ -67,14 +67,16 @@ def imus_on_one_clock(
         Fewer than two IMUs, an accelerometer without its gyroscope, one sensor twice, or triads that have no time in
         common or whose time runs backwards.
     """
-    said = " and ".join(dict.fromkeys(", ".join(each.what for each in triads) or "none" for triads in (accels, gyros)))
+    logged = " and ".join(
+        dict.fromkeys(", ".join(each.what for each in triads) or "none" for triads in (accels, gyros))
+    )
     if min(len(accels), len(gyros)) < 2:
         raise ReadError(
-            f"{name}: accelerometers and gyroscopes of two IMUs or more are needed, found {said}; log the raw readings "
-            "of all instances: sensor_accel and sensor_gyro (PX4), IMU or ACC and GYR (ArduPilot)"
+            f"{name}: accelerometers and gyroscopes of two IMUs or more are needed, found {logged}; log the raw "
+            "readings of all instances: sensor_accel and sensor_gyro (PX4), IMU or ACC and GYR (ArduPilot)"
         )
     if len(accels) != len(gyros):
-        raise ReadError(f"{name}: {len(accels)} accelerometers and {len(gyros)} gyroscopes: {said}; log all of them")
+        raise ReadError(f"{name}: {len(accels)} accelerometers and {len(gyros)} gyroscopes: {logged}; log all of them")
     notes = list(notes)
     gyros = _paired(accels, gyros, name, notes)
     triads = [_without_repeats(each, name) for each in (*gyros, *accels)]
@@ -99,13 +101,13 @@ def imus_on_one_clock(
     rates = [1e6 / each.step for each in triads]
     notes.append(
         Note(
-            f"{len(accels)} IMUs, of {said}, interpolated to the time stamps of {clock.what} ({1e6 / clock.step:.6g} "
+            f"{len(accels)} IMUs, of {logged}, interpolated to the time stamps of {clock.what} ({1e6 / clock.step:.6g} "
             f"Hz) from {min(rates):.6g} to {max(rates):.6g} Hz"
         )
     )
     head = {
         **metadata,
-        INSTANCES: said,
+        INSTANCES: logged,
         RESAMPLED: f"accel and gyro from {min(rates):.6g} to {max(rates):.6g} Hz to {1e6 / clock.step:.6g} Hz",
     }
     return Recording(columns, units, head, name, notes=tuple(notes))
@@ -204,8 +206,8 @@ def _at(triad: LoggedTriad, ticks: NDArray[np.int64]) -> Array:
     for part in np.split(np.arange(len(triad.ticks)), cuts):
         if len(part) < _SHORTEST:
             continue
-        own = triad.ticks[part]
-        inside = (ticks >= own[0]) & (ticks <= own[-1])
-        spline = make_interp_spline((own - own[0]) / 1e6, triad.values[part], k=5)
-        values[inside] = np.clip(spline((ticks[inside] - own[0]) / 1e6), low, high)
+        stamps = triad.ticks[part]
+        inside = (ticks >= stamps[0]) & (ticks <= stamps[-1])
+        spline = make_interp_spline((stamps - stamps[0]) / 1e6, triad.values[part], k=5)
+        values[inside] = np.clip(spline((ticks[inside] - stamps[0]) / 1e6), low, high)
     return values

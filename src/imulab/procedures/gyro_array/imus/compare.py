@@ -25,14 +25,13 @@ from imulab.options import RARE, READING, measure, parsed
 from imulab.procedures.gyro_array.imus.columns import readings_of
 from imulab.procedures.gyro_array.imus.fuse import board_of, ranges, read_all_late
 from imulab.procedures.gyro_array.imus.logs import with_all_instances
-from imulab.procedures.gyro_array.imus.prepare import names_of
+from imulab.procedures.gyro_array.imus.prepare import MOVING, names_of
 from imulab.procedures.result import Drawn, Record, amount, as_record, as_recording
 from imulab.quantities import span
 from imulab.recording import Array, Data, Part, Window
 from imulab.report.traces import GOOD, LEGEND, MARGIN, SYMBOLS, Exhibits, Figure, ReportTable, figure_axis, scatter
 from imulab.report.traces import plain_number as number
 
-_TURNING = math.radians(30.0)  # rad/s: as in the calibration, faster is motion
 _FEWEST = 4  # IMUs: three others, not in one line, tell the angular acceleration
 _FEWEST_SAMPLES = 50  # of one IMU, turning or not, whose rms is worth a statement
 _FAR = 3.0  # times the stated uncertainty: beyond, what the fusion states does not hold in motion
@@ -211,8 +210,8 @@ def compare_imus(
             gyro[part].append(_apart(turn, k, sound[:, 1], chosen, out.rate, out.rate_std, settings.gyro_noise[k]))
     if not any(row for rows in accel.values() for row in rows):
         raise DataError(f"{recording.name}: no IMU has {_FEWEST_SAMPLES} samples within its range")
-    said = [*recording.notes, *notes, *_findings(accel, gyro)]
-    return BoardComparison(accel, gyro, tuple(prefixed(recording.name, line) for line in said))
+    messages = [*recording.notes, *notes, *_findings(accel, gyro)]
+    return BoardComparison(accel, gyro, tuple(prefixed(recording.name, line) for line in messages))
 
 
 def _corrected(logged: Array, settings: ImusSettings) -> tuple[Array, Array]:
@@ -227,7 +226,7 @@ def _parts(turn: Array, whole: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]
     known = whole.any(axis=1)
     middle = np.zeros(len(turn))
     middle[known] = np.nanmedian(size[known], axis=1)
-    turning = middle > _TURNING
+    turning = middle > MOVING
     return {"turning": turning, "slow": known & ~turning}
 
 

@@ -29,7 +29,7 @@ from imulab.procedures.gyro_array.imus.model import (
     RATE,
     predicted,
 )
-from imulab.procedures.gyro_array.imus.prepare import Prepared, names_of
+from imulab.procedures.gyro_array.imus.prepare import MOVING, Prepared, names_of
 from imulab.procedures.gyro_array.imus.record import GAUGE, make_record
 from imulab.procedures.gyro_array.imus.schema import (
     AT_ACCEL_BIAS,
@@ -64,7 +64,6 @@ _ATTITUDES = 6  # fewest that tell common scale factors and biases of the accele
 _APART = math.cos(math.radians(20.0))  # between directions that count as two attitudes
 _HELD = (1e-4, 1e-3)  # common scale and bias, m/s^2, where they are not told
 _UNTOLD = 0.5  # of a prior's standard deviation: what is less is told by the recording
-_SLOW = math.radians(30.0)  # rad/s rms about an axis
 _SHORT, _CLIPPED, _BEYOND, _SIGMA = 5.0, 0.1, 0.5, 3.0  # s, share, m, standard deviations
 _UNLIKE_REST = 5.0  # times the noise at rest
 _BOARD = 2e-4  # m: uncertainty of a stated distance, unless stated
@@ -381,7 +380,7 @@ def warn_motion(prepared: Prepared, attitudes: int) -> list[str]:
     """Return what rests and motion leave out."""
     findings: list[str] = []
     slowest = float(prepared.axis_rates.min())
-    if slowest < _SLOW:
+    if slowest < MOVING:
         axis = "xyz"[int(np.argmin(prepared.axis_rates))]
         findings.append(
             Finding(

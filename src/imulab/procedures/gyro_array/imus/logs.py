@@ -17,13 +17,12 @@ import numpy as np
 from imulab.display import Finding, Note
 from imulab.errors import DataError, ObservabilityError
 from imulab.procedures.gyro_array.imus.columns import readings_of
-from imulab.procedures.gyro_array.imus.prepare import Prepared, names_of, prepare
+from imulab.procedures.gyro_array.imus.prepare import MOVING, Prepared, names_of, prepare
 from imulab.readers.instances import INSTANCES
 from imulab.recording import EVERY, Array, Recording
 
 _LEAST_RATE, _MOST_RATE = 80.0, 400.0  # Hz: below, splines miss a hand's motion; above, a fit takes minutes
-_TURNING = math.radians(30.0)  # rad/s rms about each axis, as for every board
-_WINDOW, _LIVELIEST, _MOVING = 0.5, 10.0, 5.0  # s: windows, and the parts whose rates are stated
+_WINDOW, _LIVELIEST = 0.5, 10.0  # s: windows, and the parts whose rates are stated
 _LAG_WINDOW, _FURTHEST = 8.0, 1.0  # s: of a lag, and the longest that is looked for
 _ALIKE = 0.8  # correlation from which a lag is known
 _DRIFT = {"gyroscopes": 2e-3, "accelerometers": 2e-2}
@@ -69,7 +68,7 @@ def prepare_board(recording: Recording, gravity: float) -> Prepared:
         raise _cannot_tell(
             recording, f"{series.rate:.3g} readings a second of each IMU, where {_LEAST_RATE:g} are needed"
         )
-    said = _check_clocks(recording, series)
+    messages = _check_clocks(recording, series)
     _check_turning(recording, series)
     prepared = prepare(recording, gravity)
     noise = float(np.sqrt(np.square(prepared.measured.accel_noise).mean()))
@@ -80,21 +79,21 @@ def prepare_board(recording: Recording, gravity: float) -> Prepared:
     if step > 1:
         thinned = replace(recording, columns={name: values[::step] for name, values in recording.columns.items()})
         prepared = prepare(thinned, gravity)
-        said.append(Note(f"one row in {step} of {series.rate:.4g} a second is used"))
+        messages.append(Note(f"one row in {step} of {series.rate:.4g} a second is used"))
     wider = [max(1.0, math.sqrt(prepared.rate / (2 * band))) for band in bands]
     measured = prepared.measured
     measured = replace(measured, accel_noise=measured.accel_noise * wider[0], gyro_noise=measured.gyro_noise * wider[1])
     prepared = replace(prepared, measured=measured, correlation=(wider[0], wider[1]))
     if min(bands) < _NARROW:
         what = "accelerometers" if bands[0] <= bands[1] else "gyroscopes"
-        said.append(
+        messages.append(
             Finding(
                 f"the {what} were filtered at about {min(bands):.2g} Hz before they were logged, by their noise at "
                 "rest: positions and latencies can be off by more than stated",
                 "set the filters wider, or log raw readings",
             )
         )
-    return replace(prepared, notes=(*recording.notes, *said, *prepared.notes))
+    return replace(prepared, notes=(*recording.notes, *messages, *prepared.notes))
 
 
 def _cannot_tell(recording: Recording, reason: str) -> ObservabilityError:
@@ -127,22 +126,22 @@ def _check_turning(recording: Recording, series: _Series) -> None:
     count = len(rate) // size
     square = np.square(rate[: count * size]).reshape(count, size, 3).mean(axis=1)
     fastest = np.argsort(-square.sum(axis=1))
-    moving = int((square.sum(axis=1) > _TURNING**2).sum())
+    moving = int((square.sum(axis=1) > MOVING**2).sum())
     most = max(moving, round(_LIVELIEST / _WINDOW))
     about = np.sqrt(square[fastest[:most]].mean(axis=0)) if count else np.zeros(3)
     shown = ", ".join(f"{math.degrees(value):.2g} about {axis}" for value, axis in zip(about, "xyz", strict=True))
-    if about.min() < _TURNING:
+    if about.min() < MOVING:
         raise _cannot_tell(
             recording,
             f"it is turned by only {math.degrees(float(about.min())):.2g} deg/s rms about axis "
             f"{'xyz'[int(about.argmin())]} of IMU 1 in the {min(most, count) * _WINDOW:g} s in which it turns most "
-            f"({shown}), where {math.degrees(_TURNING):.0f} are needed about each",
+            f"({shown}), where {math.degrees(MOVING):.0f} are needed about each",
         )
 
 
 def _check_clocks(recording: Recording, series: _Series) -> list[str]:
     """Refuse instances whose time stamps run fast or slow against those of IMU 1, or are far off; say small drifts."""
-    said: list[str] = []
+    messages: list[str] = []
     rates = np.linalg.norm(series.gyro, axis=2, keepdims=True)  # however the chips are turned
     for sensor, readings in (("gyroscopes", rates), ("accelerometers", _turned_alike(series))):
         for k in range(1, readings.shape[1]):
@@ -167,14 +166,14 @@ def _check_clocks(recording: Recording, series: _Series) -> list[str]:
                     "IMU 1's; expected stamps of the moment of sampling: {_LEAVE_OUT}"
                 )
             if sensor == "gyroscopes" and abs(drift) > _APART and abs(slope) > _SURE * u:
-                said.append(
+                messages.append(
                     Finding(
                         f"{who} run {1e6 * abs(slope):.2g} ppm {way} against IMU 1's, by "
                         f"{1e3 * abs(drift):.2g} ms in all: its latencies hold in the middle of the motion only",
                         "stamp all instances by one clock",
                     )
                 )
-    return said
+    return messages
 
 
 def _turned_alike(series: _Series) -> Array:
@@ -196,7 +195,7 @@ def _lags(series: _Series, first: Array, other: Array) -> tuple[Array, Array]:
     for begin in range(0, len(first) - size + 1, size // 2):
         part = slice(begin, begin + size)
         whole = series.time[begin + size - 1] - series.time[begin] < 1.1 * _LAG_WINDOW
-        if not whole or np.square(turning[part]).mean() < _TURNING**2:
+        if not whole or np.square(turning[part]).mean() < MOVING**2:
             continue
         a, b = (np.fft.rfft(x[part] - x[part].mean(axis=0), 2 * size, axis=0) for x in (first, other))
         products = np.fft.irfft((np.conj(a) * b).sum(axis=1))

@@ -22,7 +22,8 @@ from imulab.units import parse_unit
 
 _WINDOW = 0.5  # s
 _QUIET, _THIRD = 3.0, 1 / 30  # times the scatter of the quietest parts, of which a share of three percent
-_MOVING = math.radians(30.0)  # rad/s, root mean square in a window
+MOVING = math.radians(30.0)
+"""Root mean square of the rate in a window from which the board moves, rad/s."""
 _BESIDE = 4  # samples beside a reading at its limit, or a gap
 _FEWEST, _SHORTEST = 300, 6  # samples in motion, and of an unbroken run of them
 _FEW_LOST = 0.01  # share of rows without a reading up to which it is a note
@@ -141,7 +142,7 @@ def prepare(recording: Recording, gravity: float) -> Prepared:
     if len(kept) < _FEWEST:
         raise DataError(
             f"{recording.name}: {len(kept)} samples in motion without a reading at its limit; expected {_FEWEST} or "
-            f"more, turned and shaken by hand above {math.degrees(_MOVING):.0f} deg/s"
+            f"more, turned and shaken by hand above {math.degrees(MOVING):.0f} deg/s"
         )
     noise = [np.sqrt(np.mean([readings[part].var(axis=0) for part in rests], axis=0)) for readings in (accel, gyro)]
     floor = [np.maximum(each, 0.1 * each.mean()) for each in noise]
@@ -281,7 +282,7 @@ def _rests(accel: Array, gyro: Array, size: int) -> tuple[list[slice], NDArray[n
 def _moving(rate: Array, size: int) -> NDArray[np.bool_]:
     """Return the samples in windows that turn, by the median IMU."""
     square = medians(np.square(rate).sum(axis=2)) if rate.shape[1] > 2 else np.square(rate).sum(axis=2).mean(axis=1)
-    windows = np.sqrt(_windows(square, size).mean(axis=1)) > _MOVING
+    windows = np.sqrt(_windows(square, size).mean(axis=1)) > MOVING
     moving = np.zeros(len(rate), dtype=bool)
     moving[: len(windows) * size] = np.repeat(windows, size)
     return moving

@@ -141,9 +141,9 @@ def make_record(
     unstated = np.zeros((count, NUMBERS), dtype=bool)
     for place in unknown:
         unstated[:, place] = True
-    told = deviation.astype(object)
-    told[unstated] = None
-    imus = [_imu(k, values[k], told[k].tolist(), noise, limits) for k in range(count)]
+    shown = deviation.astype(object)
+    shown[unstated] = None
+    imus = [_imu(k, values[k], shown[k].tolist(), noise, limits) for k in range(count)]
     names = np.array([[f"{name}_{k + 1}" for name, _ in PER_IMU] for k in range(count)])
     units = np.broadcast_to(np.array([unit for _, unit in PER_IMU]), names.shape)
     parameters = {

@@ -300,7 +300,7 @@ class _Problem:
         """
         count = self.measured.count
         across = [np.zeros((2, a * count, b * count)) for a, b in ((16, 16), (16, 13), (13, 13))]
-        own = [np.zeros((2, count, size, size)) for size in (16, 13)]
+        within = [np.zeros((2, count, size, size)) for size in (16, 13)]
         scores = np.zeros((STRETCHES, count, NUMBERS))
         change = self.changes(motion)
         for part, stretch in self._parts():
@@ -320,7 +320,7 @@ class _Problem:
                 turned = (lower @ h.swapaxes(1, 2)).reshape(n, len(lower[0]), count, 3).swapaxes(1, 2)
                 z.append((turned @ mine).swapaxes(1, 2).reshape(n, -1, size * count))
                 by_imu = mine.swapaxes(0, 1).reshape(count, 3 * n, size)
-                own[k][half] += by_imu.swapaxes(1, 2) @ by_imu
+                within[k][half] += by_imu.swapaxes(1, 2) @ by_imu
                 off = left[k].reshape(n, count, 3).swapaxes(0, 1).reshape(count, 3 * n, 1)
                 scores[stretch, :, columns] += (by_imu.swapaxes(1, 2) @ off)[..., 0]
             last = z[0][:, RATE].reshape(3 * n, -1)
@@ -328,7 +328,7 @@ class _Problem:
             across[0][half] += whole.T @ whole
             across[1][half] += last.T @ gyro
             across[2][half] += gyro.T @ gyro
-        return _assembled(across, own), scores.reshape(STRETCHES, -1)
+        return _assembled(across, within), scores.reshape(STRETCHES, -1)
 
     def at_rest(self, board: Board, force: Array, weights: Weights) -> tuple[Array, Array, Array]:
         """Return S and q of the rests, and the force at each after a Newton step, shape (rests, 3)."""
@@ -417,16 +417,16 @@ class _Problem:
         )
 
 
-def _assembled(across: list[Array], own: list[Array]) -> Array:
+def _assembled(across: list[Array], within: list[Array]) -> Array:
     """Return what the IMUs' own products exceed those across by, of columns IMU by IMU, shape (2, 29 K, 29 K)."""
-    count = own[0].shape[1]
+    count = within[0].shape[1]
     total = np.zeros((2, count, NUMBERS, count, NUMBERS))
     for matrix, rows, columns in zip(across, (OF_ACCEL, OF_ACCEL, OF_GYRO), (OF_ACCEL, OF_GYRO, OF_GYRO), strict=True):
         block = matrix.reshape(2, count, rows.stop - rows.start, count, columns.stop - columns.start)
         total[:, :, rows, :, columns] = -block
         if rows != columns:
             total[:, :, columns, :, rows] = -block.transpose(0, 3, 4, 1, 2)
-    for each, columns in zip(own, (OF_ACCEL, OF_GYRO), strict=True):
+    for each, columns in zip(within, (OF_ACCEL, OF_GYRO), strict=True):
         for k in range(count):
             total[:, k, columns, k, columns] += each[:, k]
     return total.reshape(2, count * NUMBERS, count * NUMBERS)
