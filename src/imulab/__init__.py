@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.fuse import Fused as Fused
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
     from imulab.procedures.gyro_array.imus.compare import BoardComparison as BoardComparison
+    from imulab.procedures.gyro_array.imus.compare import ImuDifference as ImuDifference
     from imulab.procedures.gyro_array.imus.compare import compare_imus as compare_imus
     from imulab.procedures.gyro_array.imus.fit import ImusFit as ImusFit
     from imulab.procedures.gyro_array.imus.fit import calibrate_imus as calibrate_imus
@@ -129,6 +130,7 @@ _HOME = {
     "run_fleet": "fleet.run",
     "simulate_array": "procedures.gyro_array.simulate",
     "BoardComparison": "procedures.gyro_array.imus.compare",
+    "ImuDifference": "procedures.gyro_array.imus.compare",
     "FusedBoard": "procedures.gyro_array.imus.fuse",
     "fuse_imus": "procedures.gyro_array.imus.fuse",
     "simulate_imus": "procedures.gyro_array.imus.simulate",

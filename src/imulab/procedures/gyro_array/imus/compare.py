@@ -38,7 +38,7 @@ _FAR = 3.0  # times the stated uncertainty: beyond, what the fusion states does 
 _COLOURS = (GOOD, "#8e6bbd", "#8a8a8a")
 
 
-class Apart(Struct, frozen=True):
+class ImuDifference(Struct, frozen=True):
     """How far an IMU is from what others say, rms over three axes: m/s^2 of accelerometers, rad/s of gyroscopes.
 
     Attributes
@@ -53,6 +53,13 @@ class Apart(Struct, frozen=True):
         Uncertainty of the difference from the fused others, by the noise at rest; None as `fused`.
     samples
         Samples that it is of; readings at the end of a range do not count.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> still = il.ImuDifference(fused=None, mean=0.21, single=0.34, stated=None, samples=900)
+    >>> still.mean < still.single
+    True
     """
 
     fused: float | None
@@ -69,7 +76,7 @@ class BoardComparison(Drawn):
     Attributes
     ----------
     accel, gyro
-        By ``turning`` (faster than 30 deg/s) and ``slow``: an `Apart` for each IMU, None of too few samples.
+        By ``turning`` (faster than 30 deg/s) and ``slow``: an `ImuDifference` for each IMU, None of too few samples.
     notes
         What speaks against the fusion, and what was left out.
 
@@ -82,8 +89,8 @@ class BoardComparison(Drawn):
     True
     """
 
-    accel: dict[str, list[Apart | None]]
-    gyro: dict[str, list[Apart | None]]
+    accel: dict[str, list[ImuDifference | None]]
+    gyro: dict[str, list[ImuDifference | None]]
     notes: tuple[str, ...]
 
     subject: ClassVar[str] = "Fused board"
@@ -94,7 +101,7 @@ class BoardComparison(Drawn):
     def content(self) -> dict[str, Any]:
         """Return it for scripts, in SI."""
 
-        def plain(rows: list[Apart | None], unit: str) -> list[dict[str, Any] | None]:
+        def plain(rows: list[ImuDifference | None], unit: str) -> list[dict[str, Any] | None]:
             return [
                 None if row is None else {
                     **{
@@ -197,8 +204,8 @@ def compare_imus(
     step[step > GAP / rate] = 0.0
     force, turn = _corrected(logged, settings)
     parts = _parts(turn, whole[:, 1])
-    accel: dict[str, list[Apart | None]] = {part: [] for part in parts}
-    gyro: dict[str, list[Apart | None]] = {part: [] for part in parts}
+    accel: dict[str, list[ImuDifference | None]] = {part: [] for part in parts}
+    gyro: dict[str, list[ImuDifference | None]] = {part: [] for part in parts}
     for k in range(board.count):
         others = np.delete(np.arange(board.count), k)
         out = ImusStream.of(_some(settings, others, settings.position[k])).process(step, logged[:, :, others])
@@ -238,7 +245,7 @@ def _some(settings: ImusSettings, chosen: NDArray[np.int_], at: Array) -> ImusSe
 
 def _apart(
     values: Array, k: int, sound: NDArray[np.bool_], rows: NDArray[np.bool_], fused: Array, std: Array, noise: float
-) -> Apart | None:
+) -> ImuDifference | None:
     """Return how far IMU k is from the others; `values` are those of all, `sound` which of the others count."""
     rows = rows & sound.any(axis=1)
     determined = rows & np.isfinite(fused).all(axis=1)
@@ -250,7 +257,7 @@ def _apart(
     counts = sound[rows, :, None]
     mean = np.where(counts, others, 0.0).sum(axis=1) / counts.sum(axis=1)
     single = np.where(counts, others - mine[:, None], 0.0)
-    return Apart(
+    return ImuDifference(
         fused=_rms(fused[rows] - mine) if known else None,
         mean=_rms(mean - mine),
         single=math.sqrt(float((single**2).sum() / (3 * counts.sum()))),
@@ -263,17 +270,17 @@ def _rms(values: Array) -> float:
     return math.sqrt(float(np.mean(values**2)))
 
 
-def _middle(rows: list[Apart | None], name: str) -> float | None:
+def _middle(rows: list[ImuDifference | None], name: str) -> float | None:
     values = [value for row in rows if row is not None and (value := getattr(row, name)) is not None]
     return float(np.median(values)) if values else None
 
 
-def _is_worse(row: Apart) -> bool:
+def _is_worse(row: ImuDifference) -> bool:
     """Return whether the mean is nearer than the fused others, and noise, which these have more of, is not why."""
     return row.fused is not None and row.stated is not None and row.fused > max(row.mean, _FAR * row.stated)
 
 
-def _findings(accel: dict[str, list[Apart | None]], gyro: dict[str, list[Apart | None]]) -> list[str]:
+def _findings(accel: dict[str, list[ImuDifference | None]], gyro: dict[str, list[ImuDifference | None]]) -> list[str]:
     """Return what speaks against the fusion in this recording."""
     lines: list[str] = []
     for word, rows in (("accelerometers", accel), ("gyroscopes", gyro)):
@@ -302,8 +309,8 @@ def _findings(accel: dict[str, list[Apart | None]], gyro: dict[str, list[Apart |
 _COLUMNS = ("the others fused", "their mean", "one of them", "stated")
 
 
-def _table(title: str, rows: list[Apart | None], unit: str, factor: float) -> ReportTable:
-    def cells(row: Apart | None) -> list[str]:
+def _table(title: str, rows: list[ImuDifference | None], unit: str, factor: float) -> ReportTable:
+    def cells(row: ImuDifference | None) -> list[str]:
         if row is None:
             return ["–"] * (len(_COLUMNS) + 1)
         values = (row.fused, row.mean, row.single, row.stated)
@@ -317,7 +324,7 @@ def _table(title: str, rows: list[Apart | None], unit: str, factor: float) -> Re
     return ReportTable(title, caption, titles, [[str(k + 1), *cells(row)] for k, row in enumerate(rows)])
 
 
-def _figure(title: str, rows: list[Apart | None], unit: str, factor: float) -> Figure:
+def _figure(title: str, rows: list[ImuDifference | None], unit: str, factor: float) -> Figure:
     there = [(str(k + 1), row) for k, row in enumerate(rows) if row is not None]
     traces = [
         scatter(
