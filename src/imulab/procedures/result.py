@@ -306,6 +306,8 @@ def check_keywords(keywords: Mapping[str, Any], function: Callable[..., Any]) ->
     OptionError
         There is one, and the message suggests the nearest; or an option of reading has another type.
     """
+    if not keywords:
+        return
     parameters = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
     known = dict.fromkeys([*parameters, *Sampling.__annotations__, *Reading.__annotations__])
     if unknown := [key for key in keywords if key not in known]:
@@ -331,6 +333,8 @@ def _as_array(data: object, called: str, name: str) -> NDArray[Any]:
 
 def _select_part(recording: Recording, window: Window | None, element: int | None, serial: str | None) -> Recording:
     """Return the part of a recording within a window of time, and one IMU of several, with a serial number."""
+    if window is None and element is None and serial is None:
+        return recording
     parts = list(Selection(window=window, element=element, serial=serial).of(iter([recording]), recording.name))
     if len(parts) == 1:
         return parts[0]

@@ -52,7 +52,7 @@ from imulab.procedures.thermal.degrees import (
     wald_probability,
 )
 from imulab.procedures.thermal.device import tables_of
-from imulab.procedures.thermal.holds import Cut, Holds, average_cut, pool_covariance
+from imulab.procedures.thermal.holds import Cut, Holds, average_cuts, pool_covariance
 from imulab.procedures.thermal.model import AXES, Laws, forces
 from imulab.procedures.thermal.solve import (
     Rows,
@@ -289,7 +289,8 @@ def _average_still(
             cuts.append(None)
             continue
         kept = np.flatnonzero(still) + piece.start
-        cuts.append(average_cut(output[kept], temperature[kept], time[kept], 0, len(kept), index))
+        start = np.zeros(1, dtype=np.int64)
+        cuts += average_cuts(output[kept], temperature[kept], time[kept], start, start, start + index)
     return rest, cuts, notes
 
 

@@ -14,19 +14,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
+import imulab.procedures.tumble._segment as _segment
 from imulab.columns import triad
 from imulab.display import Bad, Finding, Note, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import DIRECTION_WANDERS
 from imulab.estimation.noise.readings import no_gravity
-from imulab.estimation.rows import MAD_TO_SIGMA, leave_out, median, medians, quantile
+from imulab.estimation.rows import MAD_TO_SIGMA, median, medians, quantile
 from imulab.procedures.thermal import LEAST_SPAN, SETTLE
-from imulab.procedures.tumble.attitudes import POOL_DEGREES, TIME_DOUBTED, Attitudes, find_attitudes
+from imulab.procedures.tumble.attitudes import POOL_DEGREES, TIME_DOUBTED, Attitudes, attitudes_and_samples
 from imulab.recording import Array, Recording, check_finite
 from imulab.records.comparison import different_units
 from imulab.units import parse_unit
@@ -47,22 +48,39 @@ _RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e4, 81)])
 
 def find_stretches_at_rest(outputs: Array, time: Array) -> NDArray[np.int64] | None:
     """Return the stretches between knocks of a unit at rest, rows (first, last + 1); None where it is turned."""
-    still = _exclude_knocks(outputs, time)
-    ends = np.quantile(outputs[still], [_SHARE_IN_TAILS, 1 - _SHARE_IN_TAILS], axis=0)
+    columns = np.ascontiguousarray(outputs.T)
+    still = _exclude_knocks(columns, time)
+    at_rest = columns if still.all() else columns[:, still]
+    if _clearly_turns(at_rest):
+        return None
+    ends = np.quantile(at_rest, [_SHARE_IN_TAILS, 1 - _SHARE_IN_TAILS], axis=1)
     if np.ptp(ends, axis=0).max() > _TURNED * np.linalg.norm(ends.mean(axis=0)):
         return None
-    return np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
+    return np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
 
 
-def _exclude_knocks(outputs: Array, time: Array) -> NDArray[np.bool_]:
-    """Return which samples lie in no knock nor beside one, shape (n,); all of them if few would remain."""
+def _clearly_turns(columns: Array) -> bool:
+    """Return whether so many outputs, shape (3, n), lie at either end of an axis that quantiles need not be formed."""
+    low, high = columns.min(axis=1), columns.max(axis=1)
+    axis = int(np.argmax(high - low))
+    quarter = (high[axis] - low[axis]) / 4
+    beyond = min(
+        np.count_nonzero(columns[axis] <= low[axis] + quarter), np.count_nonzero(columns[axis] >= high[axis] - quarter)
+    )
+    longest = float(np.linalg.norm(np.maximum(-low, high)))
+    return bool(beyond > _SHARE_IN_TAILS * columns.shape[1] + 1 and 2 * quarter > _TURNED * longest)
+
+
+def _exclude_knocks(columns: Array, time: Array) -> NDArray[np.bool_]:
+    """Return which samples (3, n) lie in no knock nor beside one, shape (n,); all of them if few would remain."""
     every = np.ones(len(time), dtype=np.bool_)
     size = max(_LEAST_BLOCK, round(_BLOCK * (len(time) - 1) / (time[-1] - time[0])))
     count = len(time) // size
     if count < 4 * _BESIDE:
         return every
-    blocks = outputs[: count * size].reshape(count, size, 3)
-    mean, scatter = blocks.mean(axis=1), blocks.var(axis=1)
+    mean, scatter = np.empty((count, 3)), np.empty((count, 3))
+    x, y, z = columns
+    _segment.blocks(x, y, z, time, size, mean, scatter, np.empty(count))
     padded = np.pad(mean, ((_BESIDE, _BESIDE), (0, 0)), "reflect")
     beside = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
     off = np.abs(mean - medians(beside, -1))
@@ -174,8 +192,7 @@ class Holds:
         return f"{name}, {self.start[index]:.0f} to {self.stop[index]:.0f} s, {self.temperature[index]:.1f} degC"
 
 
-@dataclass(frozen=True)
-class Cut:
+class Cut(Struct, frozen=True):
     """A stretch of a hold: mean, covariance of the mean and its degrees of freedom, temperature and change, times."""
 
     mean: Array
@@ -202,13 +219,11 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
     attitudes: list[Attitudes] = []
     for number, item in enumerate(recordings):
         temperature = item.si("temperature")
-        at_rest = find_attitudes(item)
+        at_rest, read = attitudes_and_samples(item, "accel")
         if at_rest.trace is None:
             stretches = _cut_table(at_rest, temperature)
         else:
-            columns = triad("accel")
-            read = leave_out(item, columns).recording
-            outputs = np.column_stack([read.column(name) for name in columns])
+            outputs = read.triad("accel")
             at_rest = _join_rest(at_rest, outputs)
             stretches = _cut_recording(at_rest, outputs, temperature)
         attitudes.append(at_rest)
@@ -216,14 +231,10 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
         owner += [number] * len(stretches)
         steps += [reading_uncertainty(temperature)] * len(stretches)
     recording = np.array(owner)
-    attitude = np.array([cut.attitude for cut in cuts])
-    group, shared = np.full(len(cuts), -1), np.ones(len(cuts), dtype=np.bool_)
-    for number in range(len(recordings)):
-        for each in np.unique(attitude[recording == number]):
-            members = np.flatnonzero((recording == number) & (attitude == each))
-            if len(members) > 1:
-                group[members] = group.max() + 1
-                shared[members] = False
+    held = np.array([[number, cut.attitude] for number, cut in zip(owner, cuts, strict=True)])
+    _, hold, parts = np.unique(held, axis=0, return_inverse=True, return_counts=True)
+    group = np.where(parts > 1, np.cumsum(parts > 1) - 1, -1)[hold]
+    shared = group < 0
     wander, drift_notes = _wander_covariance(cuts, group, [recordings[number].name for number in owner])
     return Holds(
         mean=np.array([cut.mean for cut in cuts]),
@@ -310,40 +321,66 @@ def _cut_recording(attitudes: Attitudes, outputs: Array, temperature: Array) -> 
     whole = attitudes.recording.time
     assert whole is not None
     assert attitudes.pieces is not None
-    cuts = []
-    for attitude in np.unique(attitudes.pieces[:, 2]).tolist():
-        samples = np.concatenate([np.arange(a, b) for a, b, number in attitudes.pieces.tolist() if number == attitude])
-        time, read, output = whole[samples], temperature[samples], outputs[samples]
-        drift = abs(_slope(time, read)) * (time[-1] - time[0])
-        count = int(max(1, min(np.ceil(drift / _CUT), len(samples) // _FEWEST)))
-        edges = np.linspace(0, len(samples), count + 1).astype(np.int64)
-        cuts += [average_cut(output, read, time, a, b, attitude) for a, b in pairwise(edges.tolist())]
-    return cuts
+    pieces = attitudes.pieces[np.argsort(attitudes.pieces[:, 2], kind="stable")]
+    samples = np.concatenate([np.arange(a, b) for a, b, _ in pieces.tolist()])
+    number, index = np.unique(pieces[:, 2], return_index=True)
+    size = np.add.reduceat(pieces[:, 1] - pieces[:, 0], index)
+    first = np.cumsum(size) - size
+    time, read = whole[samples], temperature[samples]
+    drift = np.abs(_slopes(time, read, first)) * (time[first + size - 1] - time[first])
+    count = np.maximum(np.minimum(np.ceil(drift / _CUT), size // _FEWEST), 1).astype(np.int64)
+    hold, begin = _divide(size, count, np.zeros_like(size))
+    return average_cuts(outputs[samples], read, time, first[hold] + begin, begin, number[hold])
 
 
-def average_cut(outputs: Array, temperature: Array, time: Array, first: int, last: int, attitude: int) -> Cut:
-    """Return the mean of outputs (n, 3) from sample `first` to before `last`, with its covariance by batches."""
-    batches = max(3, min(_BATCHES, (last - first) // 4))
-    edges = np.linspace(first, last, batches + 1).astype(np.int64)[:-1]
-    counts = np.diff(np.append(edges, last))[:, None]
-    means = np.add.reduceat(outputs[first:last], edges - first) / counts
-    at = np.add.reduceat(temperature[first:last], edges - first) / counts[:, 0]
-    left, heated, freedom = means - means.mean(axis=0), at - at.mean(), batches - 1
-    if np.ptp(at) > 0:
-        left -= np.outer(heated, heated @ left / (heated @ heated))
-        freedom -= 1
-    middle = time[first:last]
-    rate = _slope(middle, temperature[first:last])
-    return Cut(
-        outputs[first:last].mean(axis=0), left.T @ left / freedom / batches, float(freedom),
-        float(temperature[first:last].mean()), rate, float(middle[0]), float(middle[-1]), int(attitude),
-    )  # fmt: skip
+def _divide(
+    size: NDArray[np.int64], count: NDArray[np.int64], begin: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the parts of stretches, each cut into `count` of equal length: whose they are, and where they begin."""
+    whose = np.repeat(np.arange(len(count)), count)
+    part = np.arange(len(whose)) - np.repeat(np.cumsum(count) - count, count)
+    return whose, (part * (size / count)[whose] + begin[whose]).astype(np.int64)
 
 
-def _slope(time: Array, values: Array) -> float:
-    """Return the slope of the straight line through values over time, shape (n,)."""
-    centred = time - time.mean()
-    return float(centred @ (values - values.mean()) / (centred @ centred))
+def average_cuts(
+    outputs: Array,
+    temperature: Array,
+    time: Array,
+    first: NDArray[np.int64],
+    begin: NDArray[np.int64],
+    attitude: NDArray[np.int64],
+) -> list[Cut]:
+    """Return the means of outputs (n, 3) over cuts that follow each other, with their covariances by batches.
+
+    `first` is the first sample of each cut, `begin` its number within its hold, shape (k,).
+    """
+    size = np.diff(first, append=len(time))
+    batches = np.clip(size // 4, 3, _BATCHES)
+    whose, edges = _divide(size, batches, begin)
+    edges += (first - begin)[whose]
+    counts, starts = np.diff(edges, append=len(time)), np.cumsum(batches) - batches
+    left = np.add.reduceat(outputs, edges) / counts[:, None]
+    at = np.add.reduceat(temperature, edges) / counts
+    left -= (np.add.reduceat(left, starts) / batches[:, None])[whose]
+    heated = at - (np.add.reduceat(at, starts) / batches)[whose]
+    warmed = np.maximum.reduceat(at, starts) > np.minimum.reduceat(at, starts)
+    along = np.add.reduceat(heated[:, None] * left, starts)
+    along /= np.where(warmed, np.add.reduceat(heated**2, starts), np.inf)[:, None]
+    left -= heated[:, None] * along[whose]
+    freedom = batches - 1.0 - warmed
+    covariance = np.add.reduceat(left[:, :, None] * left[:, None, :], starts) / (freedom * batches)[:, None, None]
+    values = (freedom, np.add.reduceat(temperature, first) / size, _slopes(time, temperature, first), time[first])
+    ends = time[first + size - 1].tolist(), attitude.tolist()
+    mean = np.add.reduceat(outputs, first) / size[:, None]
+    return [Cut(*each) for each in zip(mean, covariance, *(each.tolist() for each in values), *ends, strict=True)]
+
+
+def _slopes(time: Array, values: Array, first: NDArray[np.int64]) -> Array:
+    """Return the slopes of straight lines through values over time, one for the samples from each `first` on."""
+    size = np.diff(first, append=len(time))
+    centred, high = (each - np.repeat(np.add.reduceat(each, first) / size, size) for each in (time, values))
+    slopes: Array = np.add.reduceat(centred * high, first) / np.add.reduceat(centred**2, first)
+    return slopes
 
 
 def pool_covariance(cuts: Sequence[Cut]) -> Array:
@@ -485,7 +522,7 @@ def _check_together(recordings: Sequence[Recording], sensor: str) -> None:
     first = recordings[0]
     if apart := different_units(*((r.name, r.metadata) for r in recordings), keys=("serial", "element")):
         raise DataError(f"{apart}; expected recordings of one unit")
-    earlier: list[tuple[str, NDArray[np.uint64]]] = []
+    hashes = []
     for recording in recordings:
         unit, other = first.triad_unit(sensor), recording.triad_unit(sensor)
         if unit != other:
@@ -493,7 +530,16 @@ def _check_together(recordings: Sequence[Recording], sensor: str) -> None:
                 f"{recording.name}: columns {' '.join(triad(sensor))} are in {other}, but in {unit} in {first.name}; "
                 "expected one unit"
             )
-        row_marks = np.sort(_hash_rows(recording, sensor))
+        hashes.append(_hash_rows(recording, sensor))
+    every = np.sort(np.concatenate(hashes))
+    if (every[1:] == every[:-1]).any():  # else no row is there twice
+        _check_overlap(recordings, [np.sort(each) for each in hashes])
+
+
+def _check_overlap(recordings: Sequence[Recording], marks_of_rows: Sequence[NDArray[np.uint64]]) -> None:
+    """Refuse a recording with many of the rows of an earlier one; marks of rows are sorted."""
+    earlier: list[tuple[str, NDArray[np.uint64]]] = []
+    for recording, row_marks in zip(recordings, marks_of_rows, strict=True):
         for before, marks in earlier:
             if np.array_equal(row_marks, marks):
                 raise DataError(f"{recording.name}: the same recording as {before}, which would count twice")
@@ -558,10 +604,10 @@ def _check_stuck(recording: Recording, values: Array) -> None:
     edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
     runs, changes = np.diff(edges), np.abs(np.diff(values[edges[:-1]]))
     longest = int(np.argmax(runs))
-    # Readings with steps larger than their noise rest at one value wherever the temperature is steady.
-    if not changes.size or median(changes) < _STEPS * changes.min():
+    if len(runs) < _READINGS or runs[longest] < _STUCK:
         return
-    if len(runs) < _READINGS or runs[longest] < max(_STUCK, _SHORT * quantile(np.delete(runs, longest), 0.95)):
+    # Readings with steps larger than their noise rest at one value wherever the temperature is steady.
+    if median(changes) < _STEPS * changes.min() or runs[longest] < _SHORT * quantile(np.delete(runs, longest), 0.95):
         return
     first, last = int(edges[longest]), int(edges[longest + 1]) - 1
     if _settles(values[:first], values[first]):

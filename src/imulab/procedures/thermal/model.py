@@ -131,9 +131,10 @@ class Laws:
 
     def _powers(self, count: int) -> Array:
         """Return the matrix from Chebyshev coefficients of one law to those of powers of T - T0."""
-        block = np.zeros((count, count))
-        for k in range(count):
-            block[: k + 1, k] = chebyshev.cheb2poly([0.0] * k + [1.0])
+        block = np.eye(count)
+        for k in range(2, count):  # T_k = 2 x T_k-1 - T_k-2
+            block[1:, k] = 2 * block[:-1, k - 1]
+            block[:, k] -= block[:, k - 2]
         block /= self.half ** np.arange(float(count))[:, None]
         return block
 

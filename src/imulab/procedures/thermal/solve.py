@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.estimation.decisions import SCALES_SCATTER_BETWEEN_CYCLES
-from imulab.estimation.least_squares import chi_square_probability, plausible_excess
+from imulab.estimation.least_squares import chi_square_probability, excess_variance, plausible_excess
 from imulab.procedures.thermal.model import Laws, forces
 from imulab.recording import Array
 
@@ -512,13 +512,7 @@ def offset_modes(laws: Array, offsets: Array, residual: Array) -> tuple[Array, A
 
 def _moments(s: Array, force: Array) -> float:
     """Return the tau at which ``sum force^2 / (1 + s^2 tau^2)`` is the number of terms; 0 if it is less at tau = 0."""
-    if (force**2).sum() <= len(s):
-        return 0.0
-    low, high = 0.0, float(np.sqrt((force**2).sum())) / float(s.min())
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if (force**2 / (1 + (s * middle) ** 2)).sum() > len(s) else (low, middle)
-    return 0.5 * (low + high)
+    return float(np.sqrt(excess_variance((force / s)[None], 1 / s[None] ** 2, len(s))[0]))
 
 
 # The calibration of each recording at a steady temperature by itself, to be drawn beside the laws.

@@ -601,6 +601,13 @@ def find_attitudes(
         if value < 0:
             raise OptionError(f"{name} {value:g} s: expected 0 or more")
     as_read = as_recording(data, reading, find_attitudes, lambda samples: {sensor: samples}, clock=OWN_CLOCKS)
+    return attitudes_and_samples(as_read, sensor, window, settling, shortest)[0]
+
+
+def attitudes_and_samples(
+    as_read: Recording, sensor: str, window: float = 1.0, settling: float = 0.3, shortest: float = 1.0
+) -> tuple[Attitudes, Recording]:
+    """Return the attitudes by `find_attitudes`, and the samples that they are the means of, none without numbers."""
     recording = one_clock(as_read, sensor)
     unit, names = recording.triad_unit(sensor), triad(sensor)
     if not len(recording):
@@ -610,7 +617,7 @@ def find_attitudes(
     if "time" not in recording:
         check_clipped_rows(recording, names)
         attitudes = attitude_table(recording, sensor, names, unit, temperature)
-        return replace(attitudes, notes=(*_corrected_notes(recording), *attitudes.notes))
+        return replace(attitudes, notes=(*_corrected_notes(recording), *attitudes.notes)), recording
     time, left_out = check_time(recording), leave_out(recording, names)
     original, recording = recording, left_out.recording
     blocks = _form_blocks(recording, names, time, window)
@@ -628,7 +635,7 @@ def find_attitudes(
     held = HeldStill.of(recording, names, stretches, blocks.duration / blocks.length)
     covariance, motion = covariance_and_motion(held, recording, names, resolution)
     first = np.unique(pieces.attitude, return_index=True)[1]
-    return Attitudes(
+    attitudes = Attitudes(
         mean=pieces.mean,
         covariance=covariance,
         samples=np.bincount(pieces.attitude, pieces.stop - pieces.start).astype(np.int64) * blocks.length,
@@ -648,6 +655,7 @@ def find_attitudes(
             *_notes(blocks, variance),
         ),
     )
+    return attitudes, recording
 
 
 def without_single_gaps(recording: Recording, names: list[str]) -> tuple[Recording, list[str]]:
