@@ -140,4 +140,5 @@ static PyObject *noise(PyObject *module, PyObject *args) {
 }
 
 MODULE(_model, "The inverse error model of a triad.", METHOD(lengths), METHOD(noise),
-       {"fit", model_fit, METH_VARARGS, model_fit_doc}, {"left_out", model_left_out, METH_VARARGS, model_left_out_doc})
+       {"fit", model_fit, METH_VARARGS, model_fit_doc}, {"left_out", model_left_out, METH_VARARGS, model_left_out_doc},
+       {"best_subset", model_best_subset, METH_VARARGS, model_best_subset_doc})

@@ -40,3 +40,9 @@ def left_out(
     most: int,
     errors: NDArray[Any],
 ) -> None: ...
+def best_subset(
+    residual: NDArray[Any],
+    matrix: NDArray[Any],
+    least: float,
+    best: NDArray[Any],
+) -> None: ...

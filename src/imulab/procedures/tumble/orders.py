@@ -27,14 +27,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache
-from itertools import combinations
 from math import comb, lgamma, log
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+import imulab.procedures.tumble._model as _model
 from imulab.display import Finding
 from imulab.estimation.decisions import (
     ATTITUDE_SET_ASIDE,
@@ -396,7 +395,6 @@ _SEPARABLE = 0.02
 """Least eigenvalue of R_SS: below it the others do not say where these attitudes should be."""
 _DETERMINED = 2000.0  # singular values apart, beyond which the others do not determine the model
 _PASSES, _SEARCHES = 5, 5  # exchanges of members of a set; searches, each by the fit without the set found before
-_FIRST_LOOK = 32  # likeliest sets whose gain is computed first; mostly these hold the best
 
 
 class Aside(Struct, frozen=True):
@@ -580,50 +578,11 @@ def _criterion(rss: float, n: int, size: int, m: int, known: bool) -> float:
     return (n - m) * log(scale) + rss / scale + (size + 1.5 * m) * log(n) + 2 * sets + price
 
 
-@cache
-def _subsets(n: int, m: int) -> Index:
-    """All subsets of m of n, shape (m, count)."""
-    return np.array(list(combinations(range(n), m)), dtype=np.intp).T.copy()
-
-
 def _best_subset(white: _Whitened, m: int) -> Index | None:
     """Return the m attitudes that explain most of the sum of squares; None if no set can be separated."""
-    subsets = _subsets(len(white.residual), m)
-    r, off = white.residual, -white.basis @ white.basis.T
-    diagonal = 1 + np.diag(off)
-    with np.errstate(all="ignore"):
-        if m == 1:
-            gain, separable = r**2 / diagonal, diagonal >= _SEPARABLE
-        else:
-            gain, separable = _explained(r, diagonal, off, subsets), np.ones(subsets.shape[1], dtype=np.bool_)
-    gain = np.where(separable & np.isfinite(gain), gain, -np.inf)
-    for count in (_FIRST_LOOK, len(gain)):
-        first = np.argpartition(-gain, min(count, len(gain)) - 1)[:count]
-        members = subsets[:, first].T
-        blocks = off[members[:, :, None], members[:, None, :]] + np.eye(m)
-        allowed = (np.linalg.eigvalsh(blocks)[:, 0] >= _SEPARABLE) & np.isfinite(gain[first])
-        if allowed.any():
-            best: Index = members[np.argmax(np.where(allowed, gain[first], -np.inf))]
-            return best
-    return None
-
-
-def _explained(r: Array, diagonal: Array, off: Array, subsets: Index) -> Array:
-    """``r_S' R_SS^-1 r_S`` of pairs or triples, by cofactors; negative where R_SS is no better than singular."""
-    i, j = subsets[0], subsets[1]
-    a, b, x = diagonal[i], diagonal[j], off[i, j]
-    p, q = r[i], r[j]
-    pair = a * b - x * x
-    if len(subsets) == 2:
-        return np.asarray(np.where(pair > 0, (b * p * p - 2 * x * p * q + a * q * q) / pair, -1.0))
-    k = subsets[2]
-    c, y, z, s = diagonal[k], off[i, k], off[j, k], r[k]
-    # Cofactors of [[a, x, y], [x, b, z], [y, z, c]].
-    xx, yy, xy = b * c - z * z, a * c - y * y, y * z - x * c
-    xz, yz = x * z - b * y, x * y - a * z
-    determinant = a * xx + x * xy + y * xz
-    whole = p * p * xx + q * q * yy + s * s * pair + 2 * (p * q * xy + p * s * xz + q * s * yz)
-    return np.asarray(np.where((pair > 0) & (determinant > 0), whole / determinant, -1.0))
+    best: Index = np.empty(m, dtype=np.int64)
+    _model.best_subset(white.residual, np.eye(len(white.residual)) - white.basis @ white.basis.T, _SEPARABLE, best)
+    return None if best[0] < 0 else best
 
 
 def _extended(white: _Whitened, chosen: Index) -> Index | None:
