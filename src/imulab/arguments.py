@@ -137,8 +137,11 @@ def described(value: object) -> str:
     return f"{kind.__name__} of shape {shape}" if isinstance(shape, tuple) and shape else quoted(value)
 
 
+_signature = cache(inspect.signature)
+
+
 def _check_call(function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
-    name, signature = function.__qualname__, inspect.signature(function)
+    name, signature = function.__qualname__, _signature(function)
     parameters = {key: p for key, p in signature.parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
     try:
         bound = signature.bind(*args, **kwargs).arguments
@@ -167,7 +170,7 @@ def unknown_options(name: str, unknown: Sequence[str], known: Iterable[str]) -> 
 
 def _further(function: Callable[..., Any]) -> list[str]:
     """Return the keywords that a function takes by ``**options: Unpack[...]``."""
-    for key, parameter in inspect.signature(function).parameters.items():
+    for key, parameter in _signature(function).parameters.items():
         hint = types_of(function).get(key) if parameter.kind is parameter.VAR_KEYWORD else None
         if get_origin(hint) is Unpack:
             return [*get_args(hint)[0].__annotations__]

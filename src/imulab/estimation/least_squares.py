@@ -206,12 +206,17 @@ def observability(jacobian: Array, weights: Array) -> Observability:
     )
 
 
-def leverage(jacobian: Array, weights: Array) -> Array:
-    """Return the leverage of each observation, the diagonal of the hat matrix, shape (b, n)."""
+def column_space(jacobian: Array, weights: Array) -> Array:
+    """Return an orthonormal basis of the columns of ``sqrt(W) J`` of each problem, shape (b, n, p)."""
     weighted = jacobian * np.sqrt(weights)[:, :, None]
     scale = np.maximum(np.linalg.norm(weighted, axis=1), np.finfo(float).tiny)
-    q = np.linalg.qr(weighted / scale[:, None, :])[0]
-    result: Array = np.einsum("bnp,bnp->bn", q, q)
+    return np.asarray(np.linalg.qr(weighted / scale[:, None, :])[0])
+
+
+def leverage(jacobian: Array, weights: Array) -> Array:
+    """Return the leverage of each observation, the diagonal of the hat matrix, shape (b, n)."""
+    basis = column_space(jacobian, weights)
+    result: Array = np.einsum("bnp,bnp->bn", basis, basis)
     return result
 
 

@@ -324,7 +324,7 @@ def _highest_shown(problem: TumbleProblem, choice: OrderChoice) -> int:
             break
         solution = choice.solutions[row.order]
         below = covariance(solution.jacobian[:, :, : parameter_count(row.order - 1)], 1 / solution.variance)[0]
-        above = covariance(solution.jacobian, 1 / solution.variance)[0]
+        above = solution.covariance[0]
         if (np.diag(above)[:6] > _UNSEEN**2 * np.diag(below)[:6]).any():
             break
         shown = row.order
@@ -354,5 +354,5 @@ def _effect_of_left_out(problem: TumbleProblem, solution: TumbleSolution, order:
     theta[:, : solution.theta.shape[1]] = solution.theta
     left_out = norm_and_jacobian(theta, problem.reading, order)[1][0, :, -3:]
     pull = solution.jacobian[0].T @ (left_out / solution.variance[0][:, None])
-    moved = np.abs(covariance(solution.jacobian, 1 / solution.variance)[0] @ pull)
+    moved = np.abs(solution.covariance[0] @ pull)
     return float(moved[0:3].max()), float(moved[3:6].max())

@@ -31,8 +31,8 @@ _LEAST_EIGENVALUE = 1e-12  # of a stated correlation matrix, for rounding
 _SHAKES, _LEAST_SHORTENING = 3.0, 2e-5  # standard uncertainties of |f| in an attitude; of g
 
 
-def check_attitudes(attitudes: Attitudes, gravity: float) -> None:
-    """Check that attitudes can be those of an accelerometer triad under `gravity`, m/s^2.
+def check_attitudes(attitudes: Attitudes, gravity: float, zero: Array) -> None:
+    """Check that attitudes can be those of an accelerometer triad under `gravity`, m/s^2; `zero` is their `far_zero`.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def check_attitudes(attitudes: Attitudes, gravity: float) -> None:
         A gyroscope's recording, a dead or doubled axis, a wrong unit.
     """
     _check_turned(attitudes)
-    _check_magnitude(attitudes, gravity)
+    _check_magnitude(attitudes, gravity, zero)
 
 
 def _check_turned(attitudes: Attitudes) -> None:
@@ -94,11 +94,11 @@ def untilted(means: Array) -> str:
     return f": the unit was never tilted, the same axis is up within {max(spread, 1.0):.0f} deg in all of them"
 
 
-def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
+def _check_magnitude(attitudes: Attitudes, gravity: float, zero: Array) -> None:
     unit = parse_unit(attitudes.unit)
     if unit.quantity != "acceleration" or untilted(attitudes.mean):  # an offset and gravity cannot be told apart
         return
-    lengths = to_si(np.linalg.norm(attitudes.mean - far_zero(attitudes.mean), axis=1), unit.symbol)
+    lengths = to_si(np.linalg.norm(attitudes.mean - zero, axis=1), unit.symbol)
     force = median(lengths)
     if not gravity / _ANOTHER_UNIT <= force <= _ANOTHER_UNIT * gravity:
         raise DataError(

@@ -13,12 +13,12 @@ import numpy as np
 
 from imulab.display import Note
 from imulab.errors import DataError, ObservabilityError, OptionError, first_of, listed
-from imulab.estimation.least_squares import Observability, covariance, huber_inflation, observability
+from imulab.estimation.least_squares import Observability, huber_inflation, observability
 from imulab.gravity import Gravity
 from imulab.procedures.tumble import FROM_DATA, FURTHER, HIGHEST_ORDER, LOSSES, METHODS
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.blend import Blended, blend_orders, with_known_spread
-from imulab.procedures.tumble.checks import check_residuals, far_zero, untilted
+from imulab.procedures.tumble.checks import check_attitudes, check_residuals, far_zero, untilted
 from imulab.procedures.tumble.gyro.rotation import check_axes
 from imulab.procedures.tumble.model import GROUPS, MISALIGNMENTS, parameter_count, parameter_names
 from imulab.procedures.tumble.orders import (
@@ -328,8 +328,9 @@ def _with_aside(
     if not aside.index:
         return FittedAttitudes(attitudes, problem, solution, aside)
     every = evaluate(problem, solution)
-    every.down_weights[0, list(aside.index)] = 0.0
-    return FittedAttitudes(attitudes, problem, every, aside)
+    kept = every.down_weights.copy()
+    kept[0, list(aside.index)] = 0.0
+    return FittedAttitudes(attitudes, problem, replace(every, down_weights=kept), aside)
 
 
 def _blended(
@@ -368,18 +369,21 @@ def _scaled_ageing(ageing: Sequence[float], gravity: float) -> tuple[float | Non
     return (*known, *[None] * (len(GROUPS) - len(known)))
 
 
-def nominal_scaling(
+def checked_scaling(
     attitudes: Attitudes, gravity: float, method: str = "norm", preset: Sequence[float] | None = None
 ) -> Scaling:
-    """Nominal sensor: by its unit, for counts and volts from the span of each axis; a far zero by the outputs' sphere.
+    """Return the nominal sensor, once the attitudes can be those of an accelerometer triad.
 
-    Method linearised starts where its source does: at no bias, and at the `preset` scale factors, if there are any.
+    By its unit, for counts and volts from the span of each axis; a far zero by the outputs' sphere. Method linearised
+    starts where its source does: at no bias, and at the `preset` scale factors, if there are any.
     """
+    centre = far_zero(attitudes.mean)
+    check_attitudes(attitudes, gravity, centre)
     if preset is not None:
         return Scaling(np.zeros(3), np.broadcast_to(np.asarray(preset, float), 3).copy())
     unit = parse_unit(attitudes.unit)
     if unit.quantity == "acceleration":
-        zero = far_zero(attitudes.mean) if method == "norm" else np.zeros(3)
+        zero = centre if method == "norm" else np.zeros(3)
         return Scaling(zero, np.full(3, gravity / to_si(1.0, unit.symbol)))
     high, low = attitudes.mean.max(axis=0), attitudes.mean.min(axis=0)
     if np.array_equal(high, low):  # a single attitude has no span: its length is 1 g
@@ -436,7 +440,7 @@ def _uncertainty_given_order(problem: TumbleProblem, solution: TumbleSolution) -
     """Return the covariance of theta given the order; None where the noise cannot be estimated."""
     n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     freedom = n - size
-    base = covariance(solution.jacobian, 1 / solution.variance)[0]
+    base = solution.covariance[0]
     if problem.robust and freedom > 0:
         factor = huber_inflation(solution.standardised(), size)[0] * solution.scale[0] ** 2
         return StatedUncertainty(base * factor, float(freedom))

@@ -26,16 +26,15 @@ from imulab.procedures import tumble
 from imulab.procedures.result import Record, Result, as_record
 from imulab.procedures.tumble import FURTHER, HEMISPHERES, LOSSES, METHODS, ORDERS
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
-from imulab.procedures.tumble.checks import check_attitudes
 from imulab.procedures.tumble.estimate import (
     check_options,
+    checked_scaling,
     estimate_triad,
     further_triads,
-    nominal_scaling,
     with_assumed_alignment,
 )
 from imulab.procedures.tumble.model import parameter_count
-from imulab.procedures.tumble.record import Estimate, Scaling, make_record
+from imulab.procedures.tumble.record import Estimate, make_record
 from imulab.procedures.tumble.schema import OrderRow, model_of
 from imulab.procedures.tumble.solve import SOURCE_THRESHOLD, Threshold
 from imulab.quantities import in_si, whole
@@ -239,7 +238,7 @@ def fit_tumble(
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
     beside = "gyro" in further or place is not None
     local = local_gravity(at_place(gravity, latitude, height, beside=beside), attitudes.recording)
-    scaling = _checked_scaling(attitudes, local.value, method, preset)
+    scaling = checked_scaling(attitudes, local.value, method, preset)
     known, order = _known_and_order(prior, order, method, attitudes)
     rest = _threshold(threshold, local.value) if method == "linearised" else None
     estimate = estimate_triad(
@@ -291,12 +290,6 @@ def _known_and_order(
         known = prior_record(as_record(prior, "fit_tumble: prior"), attitudes)
         return known, _prior_order(known, order, attitudes)
     return None, tumble.SOURCE_ORDER if order == "auto" and method == "linearised" else order
-
-
-def _checked_scaling(attitudes: Attitudes, gravity: float, method: str, preset: Sequence[float] | None) -> Scaling:
-    """Return the nominal sensor, once the attitudes can be those of an accelerometer triad."""
-    check_attitudes(attitudes, gravity)
-    return nominal_scaling(attitudes, gravity, method, preset)
 
 
 def _stated_place(

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import cache
 from math import comb, lgamma, log
 
 import numpy as np
@@ -50,22 +51,21 @@ from imulab.estimation.least_squares import (
     chi_square_limit,
     covariance,
     f_test,
-    leverage,
     observability,
 )
 from imulab.procedures.tumble import HIGHEST_ORDER
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.model import AXES, MISALIGNMENTS, norm_and_jacobian, parameter_count
+from imulab.procedures.tumble.model import AXES, MISALIGNMENTS, parameter_count
 from imulab.procedures.tumble.schema import OrderRow
 from imulab.procedures.tumble.solve import (
     TumbleProblem,
     TumbleSolution,
     evaluate,
     forces,
+    information_rows,
     leave_one_out,
     solve_norm,
     sphere_points,
-    start_parameters,
 )
 from imulab.recording import Array
 from imulab.records.triads import CROSS_TERMS
@@ -147,7 +147,7 @@ def choose_order(problem: TumbleProblem, gravity: float, solutions: Mapping[int,
         if not row.observable or squares is None:
             continue
         if best is None or (
-            _is_clearly_smaller(squares, best, 1 - leverage(fit.jacobian, fit.weights)[0])
+            _is_clearly_smaller(squares, best, 1 - fit.leverage[0])
             and _significant(costs, chosen, order, n)
             and (row.largest_uncertainty or 0.0) <= BLIND_SPOT * rows[0].scatter
         ):
@@ -209,10 +209,15 @@ def _row(
 
 def _worst_direction_uncertainty(problem: TumbleProblem, fit: TumbleSolution) -> float:
     """Predicted standard uncertainty of |f|, in g, in the direction where it is largest."""
-    points = sphere_points(_DIRECTIONS)[None]
-    rows = norm_and_jacobian(start_parameters(problem.order), points, problem.order)[1][0]
+    rows = _rows_over_the_sphere(problem.order)
     matrix = covariance(fit.jacobian, absolute_weights(problem, fit)[None])[0]
-    return float(np.sqrt(np.einsum("ni,ij,nj->n", rows, matrix, rows, optimize=True).max()))
+    return float(np.sqrt(((rows @ matrix) * rows).sum(axis=1).max()))
+
+
+@cache
+def _rows_over_the_sphere(order: int) -> Array:
+    """Derivatives of |f| by the parameters of a nominal sensor in all directions, shape (d, p)."""
+    return information_rows(sphere_points(_DIRECTIONS), order)
 
 
 def absolute_weights(problem: TumbleProblem, fit: TumbleSolution) -> Array:
@@ -265,9 +270,7 @@ def find_pattern(columns: Array, solution: TumbleSolution) -> Pattern | None:
     size = solution.jacobian.shape[2]
     if n - size - k < _FEWEST:
         return None
-    root = np.sqrt(solution.weights[0, used])[:, None]
-    model = solution.jacobian[0, used] * root
-    basis = np.linalg.qr(model / np.linalg.norm(model, axis=0))[0]
+    root, basis = np.sqrt(solution.weights[0, used])[:, None], solution.basis[0, used]
     y, weighted = solution.residuals[0, used] * root[:, 0], columns[used] * root
     y, left = y - basis @ (basis.T @ y), weighted - basis @ (basis.T @ weighted)
     scale = np.linalg.norm(weighted, axis=0)

@@ -24,7 +24,7 @@ from imulab.estimation.decisions import (
     SCALE_OF_ANOTHER_UNIT,
     SCALE_OFF_UNIT,
 )
-from imulab.estimation.least_squares import Observability, chi_square_probability, coverage_factor, leverage
+from imulab.estimation.least_squares import Observability, chi_square_probability, coverage_factor
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.blend import Blended
@@ -325,6 +325,7 @@ def make_record(
     their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share.
     """
     attitudes, problem, solution, complete = estimate.attitudes, estimate.problem, estimate.solution, estimate.found
+    outliers = _find_outliers(problem, solution)
     g, recording = gravity.value, attitudes.recording
     parameters, matrix, shared = _parameters(estimate, gravity, scaling)
     freedom = data_freedom(problem, solution.jacobian[0], 1 / solution.variance[0])
@@ -354,10 +355,10 @@ def make_record(
         sensor={key: recording.metadata[key] for key in ("serial", "model", "element") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
         warnings=(
-            *_warnings(attitudes, gravity, problem, solution, estimate, options),
+            *_warnings(estimate, gravity, options, outliers),
             *_scatter_warnings(problem, solution, chi_square, freedom, order_chosen=bool(estimate.orders)),
             *shake_warnings(problem.motion, solution),
-            *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(estimate.orders)),
+            *_pattern_warnings(attitudes, problem, solution, outliers, order_chosen=bool(estimate.orders)),
             *source_warnings(complete, str(options["method"])),
             *aside_warnings(complete, options),
             *assumption_notes(estimate.stated),
@@ -535,7 +536,7 @@ def _leave_one_out(
             return Length(value=row.leave_one_out, unit="m/s^2")
     if problem.reading.shape[1] <= solution.theta.shape[1]:
         return None
-    free = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-12)
+    free = np.maximum(1 - solution.leverage[0], 1e-12)
     felt = solution.down_weights[0] * solution.residuals[0] / free
     return Length(value=g * float(np.sqrt(np.mean(felt**2))), unit="m/s^2")
 
@@ -574,18 +575,14 @@ def _evidence(
 
 
 def _warnings(
-    attitudes: Attitudes,
-    gravity: Gravity,
-    problem: TumbleProblem,
-    solution: TumbleSolution,
-    estimate: Estimate,
-    options: Mapping[str, Any],
+    estimate: Estimate, gravity: Gravity, options: Mapping[str, Any], outliers: Mapping[int, float]
 ) -> list[str]:
+    attitudes, problem, solution = estimate.attitudes, estimate.problem, estimate.solution
     return [
         *attitudes.recording.notes,
         *attitudes.notes,
         *gravity_findings(gravity, attitudes.recording),
-        *(_order_warnings(estimate) or _attitude_warnings(attitudes, problem, solution, options)),
+        *(_order_warnings(estimate) or _attitude_warnings(attitudes, problem, solution, options, outliers)),
         *_freedom_warnings(problem, solution, estimate.observability),
         *size_warnings(attitudes, solution),
     ]
@@ -640,14 +637,19 @@ def _scatter_warnings(
 
 
 def _pattern_warnings(
-    attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution, *, order_chosen: bool
+    attitudes: Attitudes,
+    problem: TumbleProblem,
+    solution: TumbleSolution,
+    outliers: Mapping[int, float],
+    *,
+    order_chosen: bool,
 ) -> list[str]:
     """Warn of residuals that depend on direction or time, outliers left out; not with a prior, which bends them too."""
     if problem.prior is not None:
         return []
     kept = np.where(solution.down_weights < _DOWN_WEIGHTED, 0.0, solution.down_weights)
-    kept[0, list(_find_outliers(problem, solution))] = 0.0
-    regular = replace(solution, down_weights=kept)
+    kept[0, list(outliers)] = 0.0
+    regular = solution if np.array_equal(kept, solution.down_weights) else replace(solution, down_weights=kept)
     return [
         *direction_findings(problem, regular, order_chosen=order_chosen),
         *time_findings(attitudes, problem, regular),
@@ -655,7 +657,11 @@ def _pattern_warnings(
 
 
 def _attitude_warnings(
-    attitudes: Attitudes, problem: TumbleProblem, solution: TumbleSolution, options: Mapping[str, Any]
+    attitudes: Attitudes,
+    problem: TumbleProblem,
+    solution: TumbleSolution,
+    options: Mapping[str, Any],
+    outliers: Mapping[int, float],
 ) -> list[str]:
     deviation = 1e3 * solution.deviations[0]
     if problem.robust:
@@ -675,7 +681,7 @@ def _attitude_warnings(
                 f"(residual {deviation[i]:+.3f} mg); {_REMEDIES[options['method'], options['loss']]}",
                 "measure this attitude again",
             )
-            for i, standard in _find_outliers(problem, solution).items()
+            for i, standard in outliers.items()
         ]
     if len(single) <= _MOST_NAMED:
         return single
@@ -720,7 +726,7 @@ def _find_outliers(problem: TumbleProblem, solution: TumbleSolution) -> dict[int
     freedom = n - size
     if freedom < FEW_DEGREES:
         return {}
-    share = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-3)
+    share = np.maximum(1 - solution.leverage[0], 1e-3)
     standard = np.abs(solution.residuals[0]) / np.sqrt(solution.variance[0] * share)
     others = np.sqrt(np.maximum(((standard**2 * share).sum() - standard**2) / (freedom - 1), 0.0))
     stated = np.sqrt(solution.own_variance[0] / solution.variance[0])

@@ -27,7 +27,15 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from imulab.errors import DataError
-from imulab.estimation.least_squares import Fit, huber_weights, leverage, plausible_excess, robust_scale
+from imulab.estimation.least_squares import (
+    Fit,
+    column_space,
+    covariance,
+    huber_weights,
+    leverage,
+    plausible_excess,
+    robust_scale,
+)
 from imulab.procedures.tumble.attitudes import Motion
 from imulab.procedures.tumble.model import (
     fit_lengths,
@@ -168,6 +176,21 @@ class TumbleSolution:
     def weights(self) -> Array:
         """Weights of the last pass, shape (b, n)."""
         return self.down_weights / self.variance
+
+    @cached_property
+    def basis(self) -> Array:
+        """Orthonormal basis of what the model explains, in units of the weights, shape (b, n, p)."""
+        return column_space(self.jacobian, self.weights)
+
+    @cached_property
+    def leverage(self) -> Array:
+        """Leverage of each attitude under the weights, shape (b, n)."""
+        return np.asarray(np.einsum("bnp,bnp->bn", self.basis, self.basis))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """``(J' W J)^-1`` without down-weights, shape (b, p, p)."""
+        return covariance(self.jacobian, 1 / self.variance)
 
     def standardised(self) -> Array:
         """Residuals over their standard deviations, shape (b, n)."""
@@ -316,7 +339,7 @@ def leave_one_out(problem: TumbleProblem, solution: TumbleSolution) -> Array:
     fit, and the linear formula r / (1 - h) is exact enough.
     """
     if problem.reading.shape[1] > _REFIT_AT_MOST or problem.cross:
-        errors: Array = (solution.residuals / (1 - leverage(solution.jacobian, solution.weights)))[0]
+        errors: Array = (solution.residuals / (1 - solution.leverage))[0]
         return errors
     return left_out_lengths(
         solution.theta, problem.reading, solution.weights, solution.lengthening, problem.order,
@@ -370,7 +393,7 @@ def solve_linearised(problem: TumbleProblem, name: str, threshold: Threshold = S
         return solution
     for _ in range(REWEIGHTING_PASSES[False]):
         before = solution.excess
-        spare = 1 - leverage(solution.jacobian, solution.weights)
+        spare = 1 - solution.leverage
         excess, freedom = plausible_excess(solution.residuals, solution.own_variance, spare)
         variance = solution.own_variance[0] + excess
         theta, passes = _linearised_iteration(problem, solution.lengthening[0], variance, name, threshold)

@@ -15,8 +15,8 @@ from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.gravity import Gravity, check_field_magnitude, local_gravity
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.checks import check_attitudes, check_prior, made_from
-from imulab.procedures.tumble.estimate import estimate_triad, nominal_scaling
+from imulab.procedures.tumble.checks import check_prior, made_from
+from imulab.procedures.tumble.estimate import checked_scaling, estimate_triad
 from imulab.procedures.tumble.mag.model import (
     ACCELEROMETERS,
     FEWEST,
@@ -284,8 +284,7 @@ def prepare(
     local = _choose_gravity(gravity, known, attitudes)
     order, loss = _choose_order_and_loss(known, order, attitudes)
     used = attitudes.only(kept) if dropped.size else attitudes
-    check_attitudes(used, local.value)
-    scaling = nominal_scaling(used, local.value)
+    scaling = checked_scaling(used, local.value)
     estimate = estimate_triad(used, local, scaling, order, loss)
     kept = kept[estimate.found.aside.others(len(kept))] if estimate.found.aside.index else kept
     if len(kept) < FEWEST:
