@@ -137,12 +137,18 @@ def described(value: object) -> str:
     return f"{kind.__name__} of shape {shape}" if isinstance(shape, tuple) and shape else quoted(value)
 
 
-_signature = cache(inspect.signature)
+@cache
+def _expected_by(
+    function: Callable[..., Any],
+) -> tuple[inspect.Signature, dict[str, inspect.Parameter], dict[str, Any]]:
+    """Return a function's signature, its parameters that have names, and the types of those that are checked."""
+    signature = inspect.signature(function)
+    parameters = {key: p for key, p in signature.parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    return signature, parameters, {key: hint for key, hint in hints(function).items() if key in parameters}
 
 
 def _check_call(function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
-    name, signature = function.__qualname__, _signature(function)
-    parameters = {key: p for key, p in signature.parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    name, (signature, parameters, types) = function.__qualname__, _expected_by(function)
     try:
         bound = signature.bind(*args, **kwargs).arguments
     except TypeError as error:
@@ -156,9 +162,9 @@ def _check_call(function: Callable[..., Any], args: tuple[Any, ...], kwargs: Map
         shown = [f"{key}=" if p.kind is p.KEYWORD_ONLY else key for key, p in parameters.items()]
         shown = [key for key in shown if key not in ("self", "cls")] + [f"{key}=" for key in _further(function)]
         raise OptionError(f"{name}: {problem}; expected {name}({', '.join(shown)})") from None
-    for key, hint in hints(function).items():
-        if key in parameters and key in bound:
-            check(bound[key], hint, f"{name}: {key}")
+    for key, value in bound.items():
+        if key in types and not _fits(value, types[key]):
+            check(value, types[key], f"{name}: {key}")
 
 
 def unknown_options(name: str, unknown: Sequence[str], known: Iterable[str]) -> str:
@@ -170,7 +176,7 @@ def unknown_options(name: str, unknown: Sequence[str], known: Iterable[str]) -> 
 
 def _further(function: Callable[..., Any]) -> list[str]:
     """Return the keywords that a function takes by ``**options: Unpack[...]``."""
-    for key, parameter in _signature(function).parameters.items():
+    for key, parameter in inspect.signature(function).parameters.items():
         hint = types_of(function).get(key) if parameter.kind is parameter.VAR_KEYWORD else None
         if get_origin(hint) is Unpack:
             return [*get_args(hint)[0].__annotations__]

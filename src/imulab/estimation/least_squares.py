@@ -393,9 +393,9 @@ class Blend(Struct, frozen=True):
     Attributes
     ----------
     values, covariance
-        Shapes (p,), (p, p).
+        Shapes (..., p), (..., p, p).
     noise
-        Share of each step that is noise, shape (m - 1,).
+        Share of each step that is noise, shape (..., m - 1).
     """
 
     values: Array
@@ -420,11 +420,11 @@ def blend(
     Parameters
     ----------
     values
-        Estimates of each model, terms that it lacks as zero, shape (m, p).
+        Estimates of each model, terms that it lacks as zero, shape (m, p), or (..., m, p) for many blends alike.
     covariances
-        For observations whose variance is the stated one, ``(J' W J)^-1`` padded with zeros, shape (m, p, p).
+        For observations whose variance is the stated one, ``(J' W J)^-1`` padded with zeros, shape (..., m, p, p).
     gains
-        What chi-square loses with each step, shape (m - 1,).
+        What chi-square loses with each step, shape (..., m - 1).
     added
         How many terms each step adds, shape (m - 1,).
     scale
@@ -435,11 +435,11 @@ def blend(
         b of `noise_share`: 1/2 for steps of three terms; 0 for steps of one, whose gain says less.
     """
     kept, spread = noise_share(np.asarray(gains) / scale, added, freedom, prior)
-    steps = np.diff(values, axis=0)
-    total = values[0] + np.einsum("e,ep->p", 1 - kept, steps)
-    growth = scale * np.einsum("e,epq->pq", 1 - kept, np.diff(covariances, axis=0))
-    growth += np.einsum("e,ep,eq->pq", spread, steps, steps)
-    return Blend(total, scale * covariances[0] + _WIDER * growth, kept)
+    steps = np.diff(values, axis=-2)
+    total = values[..., 0, :] + np.einsum("...e,...ep->...p", 1 - kept, steps)
+    growth = scale * np.einsum("...e,...epq->...pq", 1 - kept, np.diff(covariances, axis=-3))
+    growth += np.swapaxes(steps, -1, -2) @ (spread[..., None] * steps)
+    return Blend(total, scale * covariances[..., 0, :, :] + _WIDER * growth, kept)
 
 
 def noise_share(

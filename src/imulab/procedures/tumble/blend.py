@@ -13,7 +13,6 @@ are blended for each size of q, and averaged by how probable they make the attit
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 
 import numpy as np
 from msgspec import Struct
@@ -202,12 +201,11 @@ class _Beside(Struct, frozen=True):
         """Return the average of the blends over the sizes of q, by their shares, or the blend at a known one."""
         sizes = np.array([asymmetry]) if of_sizes is None else _half_cauchy(*_ASYMMETRIES, _SYMMETRIC)[0]
         shares = np.ones(1) if of_sizes is None else of_sizes.sum(axis=(0, 1))
-        blends = [self._blend(float(size)) for size in sizes]
-        values = np.array([each.values for each in blends])
-        mean = shares @ values
-        matrix = np.einsum("t,tpq->pq", shares, np.array([each.covariance for each in blends]))
-        matrix += np.einsum("t,tp,tq->pq", shares, values - mean, values - mean)
-        return Blend(mean, matrix, shares @ np.array([each.noise for each in blends]))
+        blends = self._blends(sizes)
+        mean = shares @ blends.values
+        away = blends.values - mean
+        matrix = np.einsum("t,tpq->pq", shares, blends.covariance) + away.T @ (shares[:, None] * away)
+        return Blend(mean, matrix, shares @ blends.noise)
 
     def shares(self) -> Array:
         """Return how probable the attitudes make each size of k2, k3 and q, shape (k2, k3, q)."""
@@ -218,37 +216,51 @@ class _Beside(Struct, frozen=True):
         q, r = np.linalg.qr(columns - basis @ (basis.T @ columns))
         values, residuals = self.fits[-1]
         observed = q.T @ (self.rows[:, :size] @ values - residuals)
-        of_order, none, steps = _half_cauchy(*_SIZES, _LINEAR), (np.zeros(1), np.ones(1)), len(self.nonlinear) // 3
-        grids = [*[of_order] * steps, *[none] * (2 - steps), _half_cauchy(*_ASYMMETRIES, _SYMMETRIC)]
-        before = [share for _, share in grids]
-        mesh = np.stack(np.meshgrid(*(grid for grid, _ in grids), indexing="ij"), axis=-1)
-        tau = np.repeat(mesh[..., [*range(steps), 2]], 3, axis=-1)
-        total = np.einsum("ij,...j,kj->...ik", r, tau**2, r) + np.eye(len(r))
-        square = np.einsum("i,...i->...", observed, np.linalg.inv(total) @ observed)
-        logs = -np.linalg.slogdet(total)[1] / 2
+        # The covariance of what is observed is V = I + sum tau^2 R_i R_i'. Given the sizes of k2 and k3 the terms of q
+        # become I + tau^2 G, whose eigenvalues serve every size of q.
+        grids = [_half_cauchy(*_SIZES, _LINEAR)] * (len(self.nonlinear) // 3)
+        grids += [(np.zeros(1), np.ones(1))] * (2 - len(grids))
+        (k2, before_k2), (k3, before_k3), (q, before_q) = *grids, _half_cauchy(*_ASYMMETRIES, _SYMMETRIC)
+        total = np.eye(len(r)) + np.zeros((len(k2), len(k3), 1, 1))
+        for sizes, start in zip((k2[:, None], k3), range(0, len(normal) - 3, 3), strict=False):
+            total += sizes[..., None, None] ** 2 * (r[:, start : start + 3] @ r[:, start : start + 3].T)
+        root = np.linalg.cholesky(total)
+        white = np.linalg.solve(root, np.column_stack([r[:, -3:], observed]))
+        columns, left = white[..., :3], white[..., 3:]
+        eigenvalues, vectors = np.linalg.eigh(np.swapaxes(columns, -1, -2) @ columns)
+        along = np.swapaxes(columns @ vectors, -1, -2) @ left
+        growth = 1 + q[:, None] ** 2 * eigenvalues[..., None, :]
+        square = (left**2).sum(axis=-2) - (q[:, None] ** 2 * along[..., 0][..., None, :] ** 2 / growth).sum(axis=-1)
+        spread = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)[..., None]
+        logs = -spread - np.log(growth).sum(axis=-1) / 2
         logs -= square / 2 if self.freedom is None else (self.freedom + len(r)) / 2 * np.log1p(square / self.freedom)
-        shares = np.exp(logs - logs.max()) * before[0][:, None, None] * before[1][:, None] * before[2]
+        shares = np.exp(logs - logs.max()) * before_k2[:, None, None] * before_k3[:, None] * before_q
         return np.asarray(shares / shares.sum())
 
-    def _blend(self, tau: float) -> Blend:
-        """Blend the orders where q is normal about 0: a step of generalised least squares from each fit."""
-        size, count = self.rows.shape[1] - 3, len(self.rows)
-        left, values, _ = np.linalg.svd(tau * self.rows[:, size:], full_matrices=False)
-        shrunk = left * (1 - 1 / np.sqrt(1 + values**2))
+    def _blends(self, sizes: Array) -> Blend:
+        """Blend the orders where q is normal about 0, of each size: a step of generalised least squares from each fit.
 
-        def whitened(columns: Array) -> Array:
-            return np.asarray(columns - shrunk @ (left.T @ columns))
-
-        theta, matrices, costs = np.zeros((len(self.fits), size)), np.zeros((len(self.fits), size, size)), []
-        for row, (parameters, residuals) in enumerate(self.fits):
+        The orders are nested, so that the factor of the highest holds those of the others.
+        """
+        size, count = self.rows.shape[1] - 3, len(self.fits)
+        left, values, _ = np.linalg.svd(self.rows[:, size:], full_matrices=False)
+        shrunk = left * (1 - 1 / np.sqrt(1 + (sizes[:, None] * values) ** 2))[:, None]
+        all_rows = np.column_stack([self.rows[:, :size], *(residuals for _, residuals in self.fits)])
+        white = all_rows - shrunk @ (left.T @ all_rows)
+        rows, missed = white[..., :size], white[..., size:]
+        scale = np.sqrt((rows**2).sum(axis=1))
+        inverse = np.linalg.inv(np.linalg.qr(rows / scale[:, None], mode="r")) / scale[..., None]
+        pull = np.swapaxes(rows, 1, 2) @ missed
+        theta, matrices = np.zeros((len(sizes), count, size)), np.zeros((len(sizes), count, size, size))
+        for row, (parameters, _) in enumerate(self.fits):
             p = len(parameters)
-            columns, missed = whitened(self.rows[:, :p]), whitened(residuals)
-            matrix = covariance(columns[None], np.ones((1, count)))[0]
-            change = -matrix @ (columns.T @ missed) if tau else np.zeros(p)
-            theta[row, :p], matrices[row, :p, :p] = parameters + change, matrix
-            costs.append(float(((missed + columns @ change) ** 2).sum()))
-        gains = [before - after for before, after in pairwise(costs)]
-        return blend(theta, matrices, gains, [3] * len(gains), freedom=self.freedom)
+            matrices[:, row, :p, :p] = inverse[:, :p, :p] @ np.swapaxes(inverse[:, :p, :p], 1, 2)
+            theta[:, row, :p] = -(matrices[:, row, :p, :p] @ pull[:, :p, row, None])[..., 0]
+        theta[sizes == 0] = 0.0  # a fit is the minimum already
+        costs = ((missed + rows @ np.swapaxes(theta, 1, 2)) ** 2).sum(axis=1)
+        for row, (parameters, _) in enumerate(self.fits):
+            theta[:, row, : len(parameters)] += parameters
+        return blend(theta, matrices, costs[:, :-1] - costs[:, 1:], [3] * (count - 1), freedom=self.freedom)
 
     def two_explanations(self, shares: Array) -> Asymmetry:
         """Return how k2 and q, each beside order 1, explain the same; `shares` of all sizes."""
@@ -291,19 +303,18 @@ def with_known_spread(
     weights, lengthening = start.weights[0], start.lengthening[0]
     cost, left = float((weights * start.residuals[0] ** 2).sum()), max(n - start.theta.shape[1], 1)
     scale, freedom = _noise(problem, start, cost, left)
+    norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, top)
     for _ in range(_BLEND_PASSES):
-        norm, rows, _, _ = norm_and_jacobian(theta, problem.reading, top)
-        information = rows[0].T @ (rows[0] * weights[:, None])
-        gradient = rows[0].T @ (weights * (norm[0] - 1 - lengthening)) + scale * precision * theta[0]
+        information = jacobian[0].T @ (jacobian[0] * weights[:, None])
+        gradient = jacobian[0].T @ (weights * (norm[0] - 1 - lengthening)) + scale * precision * theta[0]
         whole = information + scale * np.diag(precision)
         root = np.sqrt(np.diag(whole))
         inverse = np.linalg.inv(whole / np.outer(root, root)) / np.outer(root, root)
         theta = theta - (inverse @ gradient)[None]
+        norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, top)
         if problem.covariance is None and not problem.robust:
-            residuals = norm_and_jacobian(theta, problem.reading, top)[0][0] - 1 - lengthening
             freedom = max(n - float(np.trace(inverse @ information)), 1.0)
-            scale = max(float((weights * residuals**2).sum()) / freedom, _TINY_WEIGHT)
-    norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, top)
+            scale = max(float((weights * (norm[0] - 1 - lengthening) ** 2).sum()) / freedom, _TINY_WEIGHT)
     root = np.sqrt(scale * start.variance[0])
     rows = np.hstack([jacobian[0], _asymmetry_columns(problem, theta, top)]) / root[:, None]
     residuals = start.down_weights[0] * (norm[0] - 1 - lengthening) / root

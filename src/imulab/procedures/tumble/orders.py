@@ -260,33 +260,36 @@ class Pattern(Struct, frozen=True):
     size: float
 
 
-def find_pattern(columns: Array, solution: TumbleSolution) -> Pattern | None:
-    """Regress the residuals of a batch of one on `columns`, shape (n, k), beside the model; None if it cannot tell.
+def find_patterns(groups: Mapping[str, Array], solution: TumbleSolution) -> dict[str, Pattern]:
+    """Regress the residuals of a batch of one on groups of columns, shapes (n, k), each beside the model.
 
-    Attitudes of weight 0 do not count.
+    Attitudes of weight 0 do not count. Groups that cannot be told from the model, or leave too few degrees of freedom,
+    are left out.
     """
-    used = solution.weights[0] > 0
-    n, k = int(used.sum()), columns.shape[1]
-    size = solution.jacobian.shape[2]
-    if n - size - k < _FEWEST:
-        return None
-    root, basis = np.sqrt(solution.weights[0, used])[:, None], solution.basis[0, used]
-    y, weighted = solution.residuals[0, used] * root[:, 0], columns[used] * root
-    y, left = y - basis @ (basis.T @ y), weighted - basis @ (basis.T @ weighted)
-    scale = np.linalg.norm(weighted, axis=0)
-    u, values, vt = np.linalg.svd(left / scale, full_matrices=False)
-    if values[-1] < _TOLD_APART:
-        return None
-    inverse = vt.T / values
-    value = inverse @ (u.T @ y) / scale
-    cost, gain = float(y @ y), float(((u.T @ y) ** 2).sum())
-    noise = (cost - gain) / (n - size - k)
-    return Pattern(
-        probability=f_test(cost, size, cost - gain, size + k, n),
-        value=value,
-        uncertainty=np.sqrt(max(noise, 0.0) * (inverse**2).sum(axis=1)) / scale,
-        size=float(np.sqrt(np.mean((left @ value / root[:, 0]) ** 2))),
-    )
+    used, size = solution.weights[0] > 0, solution.jacobian.shape[2]
+    root, basis = np.sqrt(solution.weights[0, used]), solution.basis[0, used]
+    weighted = np.column_stack([solution.residuals[0], *groups.values()])[used] * root[:, None]
+    left, scale = weighted - basis @ (basis.T @ weighted), np.sqrt((weighted**2).sum(axis=0))
+    y, n, patterns, start = left[:, 0], len(root), dict[str, Pattern](), 1
+    for name, columns in groups.items():
+        k = columns.shape[1]
+        which, start = slice(start, start + k), start + k
+        if n - size - k < _FEWEST:
+            continue
+        u, values, vt = np.linalg.svd(left[:, which] / scale[which], full_matrices=False)
+        if values[-1] < _TOLD_APART:
+            continue
+        inverse, along = vt.T / values, u.T @ y
+        value = inverse @ along / scale[which]
+        cost, gain = float(y @ y), float(along @ along)
+        noise = (cost - gain) / (n - size - k)
+        patterns[name] = Pattern(
+            probability=f_test(cost, size, cost - gain, size + k, n),
+            value=value,
+            uncertainty=np.sqrt(max(noise, 0.0) * (inverse**2).sum(axis=1)) / scale[which],
+            size=float(np.sqrt((((left[:, which] @ value) / root) ** 2).sum() / n)),
+        )
+    return patterns
 
 
 def direction_findings(problem: TumbleProblem, solution: TumbleSolution, *, order_chosen: bool) -> list[str]:
@@ -311,10 +314,7 @@ def direction_findings(problem: TumbleProblem, solution: TumbleSolution, *, orde
         groups["order"] = np.column_stack(alike)
     if problem.cross:
         del groups["cross"]
-    fitted_patterns = {name: find_pattern(columns, solution) for name, columns in groups.items()}
-    patterns = {
-        name: pattern for name, pattern in fitted_patterns.items() if pattern is not None and pattern.size > _TINY
-    }
+    patterns = {name: each for name, each in find_patterns(groups, solution).items() if each.size > _TINY}
     if not patterns:
         return []
     likeliest = min(patterns, key=lambda name: patterns[name].probability)
@@ -364,7 +364,7 @@ def time_findings(attitudes: Attitudes, problem: TumbleProblem, solution: Tumble
     middle = (attitudes.start + attitudes.stop) / 2
     span = float(attitudes.stop[-1] - attitudes.start[0])
     time = (middle - middle.mean()) / span
-    pattern = find_pattern(-solution.jacobian[0][:, 0:3] * time[:, None], solution)
+    pattern = find_patterns({"zeros": -solution.jacobian[0][:, 0:3] * time[:, None]}, solution).get("zeros")
     if pattern is None or pattern.size < _TINY or pattern.probability > RESIDUALS_FOLLOW_TIME.level:
         return []
     sizes = ", ".join(
