@@ -674,3 +674,20 @@ def test_trials_that_cannot_be_are_refused_before_the_recording_is_read(imulab, 
     refused = imulab("tumble", "fit", "there_is_no_such_file.csv", *options)
     assert refused.returncode == 2
     assert words in refused.stderr
+
+
+@pytest.mark.parametrize("loss", ["auto", "square", "huber"])
+@pytest.mark.parametrize("order", ["auto", 0, 1, "blend"])
+def test_attitudes_that_are_exact_give_exact_parameters(order, loss):
+    faces = np.concatenate([np.eye(3), -np.eye(3)])
+    edges = np.array(
+        sorted({(a * x, b * y, 0.0) for a in (1, -1) for b in (1, -1) for x, y in ((0.6, 0.8), (0.8, 0.6))})
+    )
+    outputs = np.concatenate([faces, *(np.roll(edges, shift, axis=1) for shift in range(3))])
+    columns = {f"accel_{axis}": outputs[:, i].copy() for i, axis in enumerate("xyz")}
+    recording = il.Recording(columns, dict.fromkeys(columns, "g"))
+    record = il.fit_tumble(recording, order=order, loss=loss, gravity=9.80665).calibration
+    for name, parameter in record.parameters.items():
+        ideal = 1 / 9.80665 if name.startswith("scale") else 0.0
+        assert parameter.value == pytest.approx(ideal, abs=1e-12)
+        assert 0 <= (parameter.standard_uncertainty or 0.0) < 1e-9

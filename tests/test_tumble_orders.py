@@ -532,10 +532,14 @@ def test_the_best_set_is_that_of_solving_for_every_one(m):
             gains[subset] = r[list(subset)] @ np.linalg.solve(block, r[list(subset)])
     best = max(gains, key=gains.get)
     white = _Whitened(r, basis)
-    assert tuple(sorted(_best_subset(white, m).tolist())) == best
+    chosen, gain = _best_subset(white, m)
+    assert tuple(chosen.tolist()) == best
+    assert gain == pytest.approx(gains[best], rel=1e-10)
     greedy = np.empty(0, dtype=np.intp)
     for _ in range(m):
-        greedy = _extended(white, greedy)
+        greedy, gain = _extended(white, greedy)
+        explained = r[greedy] @ np.linalg.solve(whole[np.ix_(greedy, greedy)], r[greedy])
+        assert gain == pytest.approx(explained, rel=1e-10)
     assert gains[tuple(sorted(greedy.tolist()))] >= 0.8 * gains[best]
 
 

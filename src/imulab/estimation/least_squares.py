@@ -134,14 +134,19 @@ def least_squares(
     )  # fmt: skip
 
 
+def inverse_root(jacobian: Array, weights: Array) -> Array:
+    """Return U, upper triangular, with ``U U' = (J' W J)^-1`` of each problem, shape (b, p, p), by a QR decomposition.
+
+    Its leading block belongs to the model of the first parameters alone.
+    """
+    scaled, scale = _scaled_columns(jacobian, weights)
+    return np.asarray(np.linalg.inv(np.linalg.qr(scaled, mode="r")) / scale[:, :, None])
+
+
 def covariance(jacobian: Array, weights: Array) -> Array:
-    """Return ``(J' W J)^-1`` of each problem, shape (b, p, p), through a QR decomposition of sqrt(W) J."""
-    weighted = jacobian * np.sqrt(weights)[:, :, None]
-    scale = np.maximum(np.linalg.norm(weighted, axis=1), np.finfo(float).tiny)
-    r = np.linalg.qr(weighted / scale[:, None, :], mode="r")
-    inverse = np.linalg.inv(r) / scale[:, :, None]
-    result: Array = inverse @ inverse.transpose(0, 2, 1)
-    return result
+    """Return ``(J' W J)^-1`` of each problem, shape (b, p, p)."""
+    root = inverse_root(jacobian, weights)
+    return np.asarray(root @ root.transpose(0, 2, 1))
 
 
 class Observability(Struct, frozen=True):
@@ -208,9 +213,14 @@ def observability(jacobian: Array, weights: Array) -> Observability:
 
 def column_space(jacobian: Array, weights: Array) -> Array:
     """Return an orthonormal basis of the columns of ``sqrt(W) J`` of each problem, shape (b, n, p)."""
+    return np.asarray(np.linalg.qr(_scaled_columns(jacobian, weights)[0])[0])
+
+
+def _scaled_columns(jacobian: Array, weights: Array) -> tuple[Array, Array]:
+    """Return ``sqrt(W) J`` of each problem with columns of length 1, shape (b, n, p), and their lengths (b, p)."""
     weighted = jacobian * np.sqrt(weights)[:, :, None]
     scale = np.maximum(np.linalg.norm(weighted, axis=1), np.finfo(float).tiny)
-    return np.asarray(np.linalg.qr(weighted / scale[:, None, :])[0])
+    return weighted / scale[:, None, :], scale
 
 
 def leverage(jacobian: Array, weights: Array) -> Array:

@@ -58,9 +58,9 @@ static void try_members(Search *s, Py_ssize_t depth, const double *residual, con
 }
 
 const char model_best_subset_doc[] =
-    "best_subset(residual, matrix, least, best) -> None\n\n"
+    "best_subset(residual, matrix, least, best) -> float\n\n"
     "The members S, rising, int64 (m), of which residual (n) and matrix (n, n), R, make r_S' R_SS^-1 r_S largest, among those\n"
-    "whose R_SS has no eigenvalue below `least`; -1 where there are none. m is 1 to 3.";
+    "whose R_SS has no eigenvalue below `least`; returns that, or -1 where there are none. m is 1 to 3.";
 
 PyObject *model_best_subset(PyObject *module, PyObject *args) {
     enum { RESIDUAL, MATRIX, BEST, BUFFERS };
@@ -70,15 +70,16 @@ PyObject *model_best_subset(PyObject *module, PyObject *args) {
     if (!PyArg_ParseTuple(args, "y*y*dw*", &v[RESIDUAL], &v[MATRIX], &least, &v[BEST])) return NULL;
     const Py_ssize_t n = v[RESIDUAL].len / DOUBLE_BYTES, size = v[BEST].len / INDEX_BYTES;
     const int fits = size >= 1 && size <= MOST && v[MATRIX].len == n * n * DOUBLE_BYTES;
-    double *room = fits ? PyMem_Malloc(sizeof(double) * (size_t)(MOST * (n + n * n))) : NULL;
+    double gain = 0.0, *room = fits ? PyMem_Malloc(sizeof(double) * (size_t)(MOST * (n + n * n))) : NULL;
     if (room != NULL) {
         int64_t *best = v[BEST].buf;
         Search s = {.n = n, .size = size, .residual = v[RESIDUAL].buf, .matrix = v[MATRIX].buf, .least = least,
-                    .best = {-1, -1, -1}, .gain = -1.0};
+                    .gain = -1.0};
         try_members(&s, 0, s.residual, s.matrix, 0.0, room);
         for (Py_ssize_t a = 0; a < size; a++) best[a] = (int64_t)s.best[a];
+        gain = s.gain;
         PyMem_Free(room);
     }
     if (!released(v, BUFFERS, fits, WRONG_BUFFERS)) return NULL;
-    return room == NULL ? PyErr_NoMemory() : Py_NewRef(Py_None);
+    return room == NULL ? PyErr_NoMemory() : PyFloat_FromDouble(gain);
 }

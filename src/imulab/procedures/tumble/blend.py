@@ -21,8 +21,8 @@ from imulab.estimation.least_squares import (
     Blend,
     Fit,
     blend,
-    covariance,
     huber_inflation,
+    inverse_root,
 )
 from imulab.estimation.rows import median
 from imulab.procedures.tumble.model import fit_lengths, norm_and_jacobian, parameter_count
@@ -39,7 +39,8 @@ _UNSEEN = 10.0
 _LEAST_FREEDOM = 2  # degrees of freedom that an order must leave where the noise is estimated
 _TOLERANCE, _STEPS = 1e-9, 40  # of a fit in scaled parameters, and its most steps
 _BLEND_PASSES = 8  # in which noise, weights and order agree
-_TINY_WEIGHT = 1e-300  # stands for a variance of 0
+_AT_REST = 1e-13  # change of scaled parameters, and relative one of their noise, below which they do
+_LEAST_VARIANCE = 1e-40  # g^2, far below that of rounding: stands for a variance of 0
 _SIZES = (np.geomspace(5e-6, 5e-3, 7), 40e-6)
 """Sizes of k2 and k3 before the data, in units of g: the grid and the half width of a half-Cauchy distribution."""
 _ASYMMETRIES = (np.geomspace(20e-6, 5e-3, 9), 250e-6)  # the same of q
@@ -214,24 +215,25 @@ class _Beside(Struct, frozen=True):
         others, columns = np.delete(self.rows, normal, axis=1), self.rows[:, normal]
         basis = np.linalg.qr(others / np.linalg.norm(others, axis=0))[0]
         q, r = np.linalg.qr(columns - basis @ (basis.T @ columns))
-        values, residuals = self.fits[-1]
-        observed = q.T @ (self.rows[:, :size] @ values - residuals)
-        # The covariance of what is observed is V = I + sum tau^2 R_i R_i'. Given the sizes of k2 and k3 the terms of q
-        # become I + tau^2 G, whose eigenvalues serve every size of q.
+        parameters, residuals = self.fits[-1]
+        observed = q.T @ (self.rows[:, :size] @ parameters - residuals)
+        # The covariance of what is observed is I + sum tau^2 R_i R_i'. Given the sizes of k2 and k3 it is U' U, of a QR
+        # decomposition; then the singular values of the terms of q serve every size of q.
         grids = [_half_cauchy(*_SIZES, _LINEAR)] * (len(self.nonlinear) // 3)
         grids += [(np.zeros(1), np.ones(1))] * (2 - len(grids))
         (k2, before_k2), (k3, before_k3), (q, before_q) = *grids, _half_cauchy(*_ASYMMETRIES, _SYMMETRIC)
-        total = np.eye(len(r)) + np.zeros((len(k2), len(k3), 1, 1))
-        for sizes, start in zip((k2[:, None], k3), range(0, len(normal) - 3, 3), strict=False):
-            total += sizes[..., None, None] ** 2 * (r[:, start : start + 3] @ r[:, start : start + 3].T)
-        root = np.linalg.cholesky(total)
-        white = np.linalg.solve(root, np.column_stack([r[:, -3:], observed]))
-        columns, left = white[..., :3], white[..., 3:]
-        eigenvalues, vectors = np.linalg.eigh(np.swapaxes(columns, -1, -2) @ columns)
-        along = np.swapaxes(columns @ vectors, -1, -2) @ left
-        growth = 1 + q[:, None] ** 2 * eigenvalues[..., None, :]
-        square = (left**2).sum(axis=-2) - (q[:, None] ** 2 * along[..., 0][..., None, :] ** 2 / growth).sum(axis=-1)
-        spread = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)[..., None]
+        tau = np.repeat(np.stack(np.meshgrid(k2, k3, indexing="ij"), axis=-1), 3, axis=-1)[..., : len(normal) - 3]
+        stacked = np.zeros((len(k2), len(k3), len(normal) - 3 + len(r), len(r)))
+        stacked[..., : len(normal) - 3, :] = tau[..., None] * r[:, :-3].T
+        stacked[..., len(normal) - 3 :, :] = np.eye(len(r))
+        root = np.linalg.qr(stacked, mode="r")
+        white = np.linalg.solve(np.swapaxes(root, -1, -2), np.column_stack([r[:, -3:], observed]))
+        directions, values, _ = np.linalg.svd(white[..., :3], full_matrices=False)
+        left = white[..., 3:]
+        along = np.swapaxes(directions, -1, -2) @ left
+        growth = 1 + (q[:, None] * values[..., None, :]) ** 2
+        square = ((left - directions @ along) ** 2).sum(axis=-2) + (along[..., None, :, 0] ** 2 / growth).sum(axis=-1)
+        spread = np.log(np.abs(np.diagonal(root, axis1=-2, axis2=-1))).sum(axis=-1)[..., None]
         logs = -spread - np.log(growth).sum(axis=-1) / 2
         logs -= square / 2 if self.freedom is None else (self.freedom + len(r)) / 2 * np.log1p(square / self.freedom)
         shares = np.exp(logs - logs.max()) * before_k2[:, None, None] * before_k3[:, None] * before_q
@@ -248,8 +250,7 @@ class _Beside(Struct, frozen=True):
         all_rows = np.column_stack([self.rows[:, :size], *(residuals for _, residuals in self.fits)])
         white = all_rows - shrunk @ (left.T @ all_rows)
         rows, missed = white[..., :size], white[..., size:]
-        scale = np.sqrt((rows**2).sum(axis=1))
-        inverse = np.linalg.inv(np.linalg.qr(rows / scale[:, None], mode="r")) / scale[..., None]
+        inverse = inverse_root(rows, np.ones(rows.shape[:2]))
         pull = np.swapaxes(rows, 1, 2) @ missed
         theta, matrices = np.zeros((len(sizes), count, size)), np.zeros((len(sizes), count, size, size))
         for row, (parameters, _) in enumerate(self.fits):
@@ -310,11 +311,14 @@ def with_known_spread(
         whole = information + scale * np.diag(precision)
         root = np.sqrt(np.diag(whole))
         inverse = np.linalg.inv(whole / np.outer(root, root)) / np.outer(root, root)
-        theta = theta - (inverse @ gradient)[None]
+        step, before = inverse @ gradient, scale
+        theta = theta - step[None]
         norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, top)
         if problem.covariance is None and not problem.robust:
             freedom = max(n - float(np.trace(inverse @ information)), 1.0)
-            scale = max(float((weights * (norm[0] - 1 - lengthening) ** 2).sum()) / freedom, _TINY_WEIGHT)
+            scale = max(float((weights * (norm[0] - 1 - lengthening) ** 2).sum()) / freedom, _LEAST_VARIANCE)
+        if np.abs(step).max() < _AT_REST and abs(scale - before) <= _AT_REST * scale:
+            break
     root = np.sqrt(scale * start.variance[0])
     rows = np.hstack([jacobian[0], _asymmetry_columns(problem, theta, top)]) / root[:, None]
     residuals = start.down_weights[0] * (norm[0] - 1 - lengthening) / root
@@ -334,8 +338,7 @@ def _highest_shown(problem: TumbleProblem, choice: OrderChoice) -> int:
         if not row.observable or n - row.parameters < least:
             break
         solution = choice.solutions[row.order]
-        below = covariance(solution.jacobian[:, :, : parameter_count(row.order - 1)], 1 / solution.variance)[0]
-        above = solution.covariance[0]
+        below, above = solution.covariance(parameter_count(row.order - 1))[0], solution.covariance()[0]
         if (np.diag(above)[:6] > _UNSEEN**2 * np.diag(below)[:6]).any():
             break
         shown = row.order
@@ -353,9 +356,9 @@ def _noise(problem: TumbleProblem, solution: TumbleSolution, cost: float, left: 
     """Variance of the attitudes over that of the solution, and its degrees of freedom; None where it is known."""
     if problem.robust and left > 0:
         factor = float(huber_inflation(solution.standardised(), solution.theta.shape[1])[0])
-        return factor * float(solution.scale[0] ** 2), float(left)
+        return max(factor * float(solution.scale[0] ** 2), _LEAST_VARIANCE), float(left)
     if problem.covariance is None and left > 0:
-        return max(cost / left, _TINY_WEIGHT), float(left)
+        return max(cost / left, _LEAST_VARIANCE), float(left)
     return 1.0, float(solution.freedom[0]) if np.isfinite(solution.freedom[0]) else None
 
 
@@ -365,5 +368,5 @@ def _effect_of_left_out(problem: TumbleProblem, solution: TumbleSolution, order:
     theta[:, : solution.theta.shape[1]] = solution.theta
     left_out = norm_and_jacobian(theta, problem.reading, order)[1][0, :, -3:]
     pull = solution.jacobian[0].T @ (left_out / solution.variance[0][:, None])
-    moved = np.abs(solution.covariance[0] @ pull)
+    moved = np.abs(solution.covariance()[0] @ pull)
     return float(moved[0:3].max()), float(moved[3:6].max())

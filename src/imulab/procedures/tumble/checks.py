@@ -122,15 +122,19 @@ def far_zero(mean: Array) -> Array:
 
     ``|M|^2 = 2 c M + d`` by least squares: firmware that takes gravity off leaves offsets of 1 g and more.
     """
-    centred = mean - mean.mean(axis=0)
-    spread = np.linalg.svd(centred, compute_uv=False) if len(mean) >= _ENOUGH_TO_TELL else np.zeros(3)
-    if spread[-1] <= _FLAT * spread[0]:
-        return np.zeros(3)
     size = float(np.abs(mean).max())
-    rows = np.column_stack([2 * mean / size, np.ones(len(mean))])
-    *centre, rest = np.linalg.lstsq(rows, (mean**2).sum(axis=1) / size**2, rcond=None)[0].tolist()
-    zero = np.array(centre)
-    return size * zero if zero @ zero > _FAR_ZERO**2 * (rest + zero @ zero) else np.zeros(3)
+    if len(mean) < _ENOUGH_TO_TELL or not size:
+        return np.zeros(3)
+    scaled = mean / size
+    middle, squares = scaled.mean(axis=0), (scaled**2).sum(axis=1)
+    centred = scaled - middle
+    normal = centred.T @ centred
+    spread = np.linalg.eigvalsh(normal)
+    if spread[0] <= _FLAT**2 * spread[-1]:
+        return np.zeros(3)
+    zero = np.linalg.solve(2 * normal, centred.T @ squares)
+    radius_squared = squares.mean() - 2 * zero @ middle + zero @ zero
+    return size * zero if zero @ zero > _FAR_ZERO**2 * radius_squared else np.zeros(3)
 
 
 def _untimed(attitudes: Attitudes) -> str:

@@ -440,7 +440,7 @@ def _uncertainty_given_order(problem: TumbleProblem, solution: TumbleSolution) -
     """Return the covariance of theta given the order; None where the noise cannot be estimated."""
     n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     freedom = n - size
-    base = solution.covariance[0]
+    base = solution.covariance()[0]
     if problem.robust and freedom > 0:
         factor = huber_inflation(solution.standardised(), size)[0] * solution.scale[0] ** 2
         return StatedUncertainty(base * factor, float(freedom))

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, cached_property
 from math import comb, lgamma, log
 
 import numpy as np
@@ -49,8 +49,8 @@ from imulab.estimation.least_squares import (
     Observability,
     bayesian_information,
     chi_square_limit,
-    covariance,
     f_test,
+    inverse_root,
     observability,
 )
 from imulab.procedures.tumble import HIGHEST_ORDER
@@ -209,9 +209,10 @@ def _row(
 
 def _worst_direction_uncertainty(problem: TumbleProblem, fit: TumbleSolution) -> float:
     """Predicted standard uncertainty of |f|, in g, in the direction where it is largest."""
-    rows = _rows_over_the_sphere(problem.order)
-    matrix = covariance(fit.jacobian, absolute_weights(problem, fit)[None])[0]
-    return float(np.sqrt(((rows @ matrix) * rows).sum(axis=1).max()))
+    weights = absolute_weights(problem, fit)
+    level = weights[0] / fit.weights[0, 0]  # the same for all attitudes
+    root = inverse_root(fit.jacobian, weights[None])[0] if problem.robust else fit.inverse_root[0] / np.sqrt(level)
+    return float(np.sqrt(((_rows_over_the_sphere(problem.order) @ root) ** 2).sum(axis=1).max()))
 
 
 @cache
@@ -274,7 +275,7 @@ def find_patterns(groups: Mapping[str, Array], solution: TumbleSolution) -> dict
     for name, columns in groups.items():
         k = columns.shape[1]
         which, start = slice(start, start + k), start + k
-        if n - size - k < _FEWEST:
+        if n - size - k < _FEWEST or not scale[which].all():
             continue
         u, values, vt = np.linalg.svd(left[:, which] / scale[which], full_matrices=False)
         if values[-1] < _TOLD_APART:
@@ -414,11 +415,16 @@ class Aside(Struct, frozen=True):
 NONE_ASIDE = Aside((), ())
 
 
-class _Whitened(Struct, frozen=True):
+class _Whitened(Struct, frozen=True, dict=True):
     """Residuals of one order in units of their noise, (n,), and an orthonormal basis of what the model explains."""
 
     residual: Array
     basis: Array
+
+    @cached_property
+    def matrix(self) -> Array:
+        """R = I - H, shape (n, n)."""
+        return np.eye(len(self.residual)) - self.basis @ self.basis.T
 
     @property
     def squares(self) -> float:
@@ -533,14 +539,16 @@ def _candidates(white: _Whitened, known: bool) -> Iterator[tuple[Aside, float]]:
         freedom = n - size - m
         if freedom < FREEDOM[known]:
             return
-        subset = _best_subset(white, m) if n <= _EXHAUSTIVE else _extended(white, chosen)
-        if subset is None:
+        best = _best_subset(white, m) if n <= _EXHAUSTIVE else _extended(white, chosen)
+        if best is None:
             return
-        chosen = subset
-        shift, spread, gain = _shifts(white, chosen)
+        chosen, gain = best
         rss = max(white.squares - gain, 1e-12 * white.squares, 1e-300)
+        if comb(n, m) * f_tail(gain * freedom / (m * rss), m, freedom) >= ATTITUDE_SET_ASIDE.level:
+            continue
+        shift, spread = _shifts(white, chosen)
         z = shift / spread
-        if _admissible(z, gain, rss, n, freedom, known):
+        if _members_stand_out(z, rss, n, freedom, known):
             scale = (
                 1.0
                 if known and rss <= chi_square_limit(freedom, ATTITUDES_FIT_STATED_NOISE.level)
@@ -551,22 +559,18 @@ def _candidates(white: _Whitened, known: bool) -> Iterator[tuple[Aside, float]]:
             yield aside, _criterion(rss, n, size, m, known)
 
 
-def _shifts(white: _Whitened, chosen: Index) -> tuple[Array, Array, float]:
-    """Estimated shifts g of a set, their standard deviations, and the sum of squares that they explain."""
-    rows = white.basis[chosen]
-    inverse = np.linalg.inv(np.eye(len(chosen)) - rows @ rows.T)
-    shift = inverse @ white.residual[chosen]
-    return shift, np.sqrt(np.diag(inverse)), float(white.residual[chosen] @ shift)
+def _shifts(white: _Whitened, chosen: Index) -> tuple[Array, Array]:
+    """Estimated shifts g of a set, and their standard deviations."""
+    inverse = np.linalg.inv(white.matrix[np.ix_(chosen, chosen)])
+    return inverse @ white.residual[chosen], np.sqrt(np.diag(inverse))
 
 
-def _admissible(z: Array, gain: float, rss: float, n: int, freedom: int, known: bool) -> bool:
-    """Return whether both the weakest member of a set and the whole set are significant."""
-    m, least = len(z), float(np.abs(z).min())
-    tests = n - m + 1
+def _members_stand_out(z: Array, rss: float, n: int, freedom: int, known: bool) -> bool:
+    """Return whether the weakest member of a set is significant."""
+    tests, least = n - len(z) + 1, float(np.abs(z).min())
     return bool(
         2 * tests * t_cdf(-least / np.sqrt(rss / freedom), freedom) < ATTITUDE_SET_ASIDE.level
         and (not known or 2 * tests * normal_cdf(-least) < ATTITUDE_SET_ASIDE.level)
-        and comb(n, m) * f_tail(gain * freedom / (m * rss), m, freedom) < ATTITUDE_SET_ASIDE.level
     )
 
 
@@ -581,15 +585,15 @@ def _criterion(rss: float, n: int, size: int, m: int, known: bool) -> float:
     return (n - m) * log(scale) + rss / scale + (size + 1.5 * m) * log(n) + 2 * sets + price
 
 
-def _best_subset(white: _Whitened, m: int) -> Index | None:
-    """Return the m attitudes that explain most of the sum of squares; None if no set can be separated."""
+def _best_subset(white: _Whitened, m: int) -> tuple[Index, float] | None:
+    """Return the m attitudes that explain most of the sum of squares, and how much; None if no set can be separated."""
     best: Index = np.empty(m, dtype=np.int64)
-    _model.best_subset(white.residual, np.eye(len(white.residual)) - white.basis @ white.basis.T, _SEPARABLE, best)
-    return None if best[0] < 0 else best
+    gain = _model.best_subset(white.residual, white.matrix, _SEPARABLE, best)
+    return None if gain < 0 else (best, gain)
 
 
-def _extended(white: _Whitened, chosen: Index) -> Index | None:
-    """Add the attitude that explains most, then exchange members while that explains more."""
+def _extended(white: _Whitened, chosen: Index) -> tuple[Index, float] | None:
+    """Add the attitude that explains most, then exchange members while that explains more; return what they explain."""
     added = _best_addition(white, chosen)
     if added is None:
         return None
@@ -603,7 +607,7 @@ def _extended(white: _Whitened, chosen: Index) -> Index | None:
                 members = np.append(rest, best)
         if set(members.tolist()) == before:
             break
-    return members
+    return members, float(white.residual[members] @ _shifts(white, members)[0])
 
 
 def _best_addition(white: _Whitened, chosen: Index) -> int | None:

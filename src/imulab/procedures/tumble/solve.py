@@ -30,8 +30,8 @@ from imulab.errors import DataError
 from imulab.estimation.least_squares import (
     Fit,
     column_space,
-    covariance,
     huber_weights,
+    inverse_root,
     leverage,
     plausible_excess,
     robust_scale,
@@ -51,6 +51,7 @@ from imulab.units import from_si
 
 
 REWEIGHTING_PASSES = {False: 4, True: 30}
+_LEAST_SCALE = 1e-20  # g, far below rounding: stands for the scatter of attitudes that are exact
 WEIGHTS_AT_REST = 1e-4  # relative change of the weights that ends the iteration
 _FIT_STEPS = 40  # of Levenberg and Marquardt
 _REFIT_STEPS = 15  # without one attitude of many the solution is near; what wanders for longer is not determined
@@ -188,13 +189,18 @@ class TumbleSolution:
         return np.asarray(np.einsum("bnp,bnp->bn", self.basis, self.basis))
 
     @cached_property
-    def covariance(self) -> Array:
-        """``(J' W J)^-1`` without down-weights, shape (b, p, p)."""
-        return covariance(self.jacobian, 1 / self.variance)
+    def inverse_root(self) -> Array:
+        """``U U' = (J' W J)^-1`` without down-weights, upper triangular, shape (b, p, p)."""
+        return inverse_root(self.jacobian, 1 / self.variance)
+
+    def covariance(self, size: int | None = None) -> Array:
+        """Return the covariance of the parameters, or of the first `size` where the model has no others, (b, p, p)."""
+        root = self.inverse_root[:, :size, :size]
+        return np.asarray(root @ root.transpose(0, 2, 1))
 
     def standardised(self) -> Array:
         """Residuals over their standard deviations, shape (b, n)."""
-        return self.residuals / (np.sqrt(self.variance) * self.scale[:, None])
+        return np.asarray(self.residuals / (np.sqrt(self.variance) * np.maximum(self.scale, _LEAST_SCALE)[:, None]))
 
 
 def start_parameters(order: int, count: int = 1, cross: bool = False) -> Array:
