@@ -803,10 +803,9 @@ def _warn_offset(holds: Holds, problem: ThermalProblem, solution: ThermalSolutio
         if scatter.rank:
             tests.append((0, scatter.tau, float(scatter.rank), _OFF_BIAS))
         for kind, tau, rank, least in tests:
-            white = whitener(rows, excess, tau)
-            s, force = offset_modes(
-                white(rows.jacobian), white(rows.offsets[kind][:, of_recording]), white(rows.residual)
-            )
+            columns = np.column_stack([rows.jacobian, rows.offsets[kind][:, of_recording], rows.residual])
+            laws, offsets, residual = np.hsplit(whitener(rows, excess, tau)(columns), [-4, -1])
+            s, force = offset_modes(laws, offsets, residual[:, 0])
             if not len(s):
                 continue
             size = float(np.sqrt(np.sum((force / s) ** 2) / 3))

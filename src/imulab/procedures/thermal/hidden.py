@@ -115,7 +115,7 @@ def cover_hidden(
 
     def spread(matrix: Array) -> Array:
         """Return the mean variances of biases, scale factors and misalignments over the range, shape (3,)."""
-        each = np.einsum("tpc,cd,tpd->p", design, matrix[:size, :size], design) / _PLACES
+        each = ((design @ matrix[:size, :size]) * design).sum(axis=2).mean(axis=0)
         means: Array = each.reshape(3, 3).mean(axis=1)
         return means
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -88,6 +89,14 @@ class Rows:
     magnitude: NDArray[np.bool_]
     recording: NDArray[np.int64]
 
+    @cached_property
+    def members(self) -> list[NDArray[np.intp]]:
+        """Rows of each recording, shape (r, m): an item for all r recordings of m rows."""
+        order = np.argsort(self.recording, kind="stable")
+        count = np.unique(self.recording, return_counts=True)[1]
+        first = np.cumsum(count) - count
+        return [order[first[count == m][:, None] + np.arange(m)] for m in np.unique(count).tolist()]
+
     def part(self, which: NDArray[Any]) -> Rows:
         """Return some of the rows, with every column."""
         return Rows(
@@ -97,50 +106,60 @@ class Rows:
         )  # fmt: skip
 
 
-def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Rows:
+@dataclass(frozen=True)
+class LawsAtHolds:
+    """What the rows keep at any coefficients: the laws' `design` and `slope` at the holds, shape (n, 9, size) each.
+
+    `owner` and `kind`, shape (N,), are each row's hold and its direction, 0 along the force, 1 and 2 across; `error`
+    marks the column of its temperature's error.
+    """
+
+    design: Array
+    slope: Array
+    owner: NDArray[np.int64]
+    kind: NDArray[np.int64]
+    error: Array
+
+    @classmethod
+    def of(cls, problem: ThermalProblem, laws: Laws) -> LawsAtHolds:
+        """Return those of the laws at the holds of a problem."""
+        n = len(problem.reading)
+        member = np.flatnonzero(problem.group >= 0)
+        rows = np.concatenate([np.arange(n) * 3, (member[:, None] * 3 + np.array([1, 2])).ravel()])
+        owner = rows // 3
+        # One error for a recording, or for each hold of one that drifts.
+        number = np.where(problem.shared, problem.recording, problem.recording.max(initial=0) + 1 + np.arange(n))
+        temperature = problem.temperature
+        return cls(laws.design(temperature), laws.slope(temperature), owner, rows % 3, one_hot(number[owner]))
+
+
+def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, at: LawsAtHolds | None = None) -> Rows:
     """Return the rows at these coefficients and the mean direction of each unmoved group there."""
-    n, count = len(problem.reading), int(problem.recording.max(initial=0)) + 1
-    parameters, design, drift, slope = evaluate_parameters(problem, laws, coefficients)
+    at = at or LawsAtHolds.of(problem, laws)
+    count, owner, kind = int(problem.recording.max(initial=0)) + 1, at.owner, at.kind
+    parameters, design, drift, slope = evaluate_parameters(problem, laws, coefficients, at)
     force, change = forces(parameters, problem.reading)
     length = np.linalg.norm(force, axis=1)
-    unit = force / length[:, None]
-    sensed = -change[:, :, 0:3] / parameters[:, None, 3:6]  # df / d reading
-    noise = np.einsum("nij,njk,nlk->nil", sensed, problem.covariance, sensed)
-    along = np.einsum("ni,nij,nj->n", unit, noise, unit)
-    lengthening = 0.5 * (np.trace(noise, axis1=1, axis2=2) - along)
-    by_heat = np.einsum("nij,nj->ni", change, slope)
-    member = np.flatnonzero(problem.group >= 0)
+    sensed = change[:, :, 0:3] / -parameters[:, None, 3:6]  # df / d reading
+    noise = sensed @ problem.covariance @ sensed.swapaxes(1, 2)
     directions = _mean_directions(force, problem.group)
-    base, across = _frames(unit, directions, problem.group)
-    basis = np.concatenate([unit[:, None, :], across], axis=1)  # (n, 3, 3): along, two across
-    rows = np.concatenate([np.arange(n) * 3, (member[:, None] * 3 + np.array([1, 2])).ravel()])
-    owner, kind = rows // 3, rows % 3
-    pick = basis[owner, kind]  # (N, 3)
-    full = np.einsum("nai,nij,nbj->nab", basis, noise, basis)
-    full[:, 1, 1] += problem.tilt**2
-    full[:, 2, 2] += problem.tilt**2
-    first, second = np.nonzero(owner[:, None] == owner)
-    row_noise = np.zeros((len(rows), len(rows)))
-    row_noise[first, second] = full[owner[first], kind[first], kind[second]]
-    if problem.wander is not None and problem.wander.any():
-        tipped = np.where((kind[:, None] == kind) & (kind > 0), problem.wander[owner[:, None], owner], 0.0)
-        row_noise = row_noise + tipped
-    jacobian = np.einsum("Ni,Nij,Njc->Nc", pick, change[owner], design[owner])
-    turns = np.zeros((len(rows), 2 * len(directions)))
-    side = kind > 0
+    base, basis = _frames(force / length[:, None], directions, problem.group)
+    full = basis @ noise @ basis.swapaxes(1, 2)
+    lengthening = 0.5 * (np.trace(noise, axis1=1, axis2=2) - full[:, 0, 0])
+    side, pick = kind > 0, basis[owner, kind]  # (N, 3)
+    felt = (pick[:, None, :] @ change[owner])[:, 0]
+    turns = np.zeros((len(owner), 2 * len(directions)))
     turns[side, 2 * problem.group[owner[side]] + kind[side] - 1] = -1.0
     residual = np.where(
         side, np.einsum("Ni,Ni->N", pick, force[owner] - base[owner]), (length - 1 - lengthening)[owner]
     )
-    felt = np.einsum("Ni,Nij->Nj", pick, change[owner])
     offsets = tuple(_columns_by_recording(felt[:, 3 * k : 3 * k + 3], problem.recording[owner], count) for k in (0, 1))
-    heat = np.einsum("Ni,Ni->N", pick, by_heat[owner]) * problem.step[owner]
-    errors = _temperature_loadings(heat, owner, problem, count)
-    by_drift = np.einsum("Nj,Njk->Nk", felt, drift[owner])
-    jacobian = np.hstack([jacobian, by_drift[:, list(problem.free)], turns])
+    heat = np.einsum("Nj,Nj->N", felt, slope[owner]) * problem.step[owner]
+    by_drift = (felt[:, None, :] @ drift[owner])[:, 0]
+    jacobian = np.hstack([(felt[:, None, :] @ design[owner])[:, 0], by_drift[:, list(problem.free)], turns])
     linearised = Rows(
-        residual, jacobian, row_noise, (offsets[0], offsets[1]), errors, by_drift, owner.astype(np.int64), ~side,
-        problem.recording[owner],
+        residual, jacobian, _row_noise(problem, full, owner, kind), (offsets[0], offsets[1]), at.error * heat[:, None],
+        by_drift, owner, ~side, problem.recording[owner],
     )  # fmt: skip
     return (
         linearised
@@ -149,16 +168,32 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array) -> Rows:
     )
 
 
-def evaluate_parameters(problem: ThermalProblem, laws: Laws, coefficients: Array) -> tuple[Array, Array, Array, Array]:
+def _row_noise(problem: ThermalProblem, full: Array, owner: NDArray[np.int64], kind: NDArray[np.int64]) -> Array:
+    """Return the covariance of the rows by the noise of each hold along and across, shape (n, 3, 3), and by tilts."""
+    if not kind.any():
+        return np.diag(full[owner, 0, 0])
+    full[:, 1, 1] += problem.tilt**2
+    full[:, 2, 2] += problem.tilt**2
+    first, second = np.nonzero(owner[:, None] == owner)
+    noise = np.zeros((len(owner), len(owner)))
+    noise[first, second] = full[owner[first], kind[first], kind[second]]
+    if problem.wander is not None and problem.wander.any():
+        noise += np.where((kind[:, None] == kind) & (kind > 0), problem.wander[owner[:, None], owner], 0.0)
+    return noise
+
+
+def evaluate_parameters(
+    problem: ThermalProblem, laws: Laws, coefficients: Array, at: LawsAtHolds | None = None
+) -> tuple[Array, Array, Array, Array]:
     """Return the parameters of each hold (n, 9), and their derivatives by coefficients, by lag and loops, and by T.
 
     ``p(T - L dT/dt)`` is taken to first order; the error ``p'' (L dT/dt)^2 / 2`` is a microgram at 20 s and 1 K/min.
     The loop of a bias, ``h sign(dT/dt) (1 - theta^2)``, is 0 at the ends of the range, where the temperature turns.
     """
+    at = at or LawsAtHolds.of(problem, laws)
     size, lag_and_loops = laws.size, np.zeros(4)
     lag_and_loops[list(problem.free)] = coefficients[size:]
-    design, slopes = laws.design(problem.temperature), laws.slope(problem.temperature)
-    slope = slopes @ coefficients[:size]
+    slope = at.slope @ coefficients[:size]
     drift = np.zeros((len(slope), 9, 4))
     drift[:, :, 0] = -problem.rate[:, None] * slope
     way = np.sign(problem.rate)
@@ -166,8 +201,11 @@ def evaluate_parameters(problem: ThermalProblem, laws: Laws, coefficients: Array
         way = np.where(way == 0, problem.side, way)
     turn = way * (1 - laws.place(problem.temperature) ** 2)
     drift[:, range(3), range(1, 4)] = turn[:, None]
-    parameters = design @ coefficients[:size] + drift @ lag_and_loops
-    return parameters, design - lag_and_loops[0] * problem.rate[:, None, None] * slopes, drift, slope
+    parameters, design = at.design @ coefficients[:size], at.design
+    if problem.free:
+        parameters = parameters + drift @ lag_and_loops
+        design = design - lag_and_loops[0] * problem.rate[:, None, None] * at.slope
+    return parameters, design, drift, slope
 
 
 def _mean_directions(force: Array, group: NDArray[np.int64]) -> Array:
@@ -179,13 +217,20 @@ def _mean_directions(force: Array, group: NDArray[np.int64]) -> Array:
 
 
 def _frames(unit: Array, directions: Array, group: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return the direction of each hold's group, and two unit vectors across it, shapes (n, 3) and (n, 2, 3)."""
-    base = unit.copy()
-    base[group >= 0] = directions[group[group >= 0]]
-    helper = np.eye(3)[np.argmin(np.abs(base), axis=1)]
-    first = np.cross(base, helper)
-    first /= np.linalg.norm(first, axis=1)[:, None]
-    return base, np.stack([first, np.cross(base, first)], axis=1)
+    """Return the direction of each hold's group, shape (n, 3); and of the hold, and two across the group's, (n, 3, 3).
+
+    Holds of no group have 0 for directions across.
+    """
+    member = group >= 0
+    base, basis = unit.copy(), np.zeros((len(unit), 3, 3))
+    basis[:, 0] = unit
+    if member.any():
+        base[member] = directions[group[member]]
+        helper = np.eye(3)[np.argmin(np.abs(base[member]), axis=1)]
+        first = np.cross(base[member], helper)
+        first /= np.linalg.norm(first, axis=1)[:, None]
+        basis[member, 1], basis[member, 2] = first, np.cross(base[member], first)
+    return base, basis
 
 
 def _columns_by_recording(felt: Array, recording: NDArray[np.int64], count: int) -> Array:
@@ -193,12 +238,6 @@ def _columns_by_recording(felt: Array, recording: NDArray[np.int64], count: int)
     columns = np.zeros((len(felt), count, 3))
     columns[np.arange(len(felt)), recording] = felt
     return columns.reshape(len(felt), -1)
-
-
-def _temperature_loadings(heat: Array, owner: NDArray[np.int64], problem: ThermalProblem, count: int) -> Array:
-    """Return the columns of the temperature's errors: one for a recording, or for each hold of one that drifts."""
-    number = np.where(problem.shared, problem.recording, count + np.arange(len(problem.recording)))[owner]
-    return one_hot(number) * heat[:, None]
 
 
 def one_hot(number: NDArray[np.int64]) -> Array:
@@ -238,19 +277,20 @@ def _add_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coeffi
 
 def row_covariance(rows: Rows, excess: float, tau: Array) -> Array:
     """Return V, shape (N, N)."""
-    every = np.arange(len(rows.residual))
-    return _covariance_of(rows, every, np.arange(rows.errors.shape[1]), excess, tau)
+    whole: Array = _covariances(rows, np.arange(len(rows.residual))[None], rows.errors, excess, tau)[0]
+    return whole
 
 
-def _covariance_of(rows: Rows, which: NDArray[np.int64], felt: NDArray[np.int64], excess: float, tau: Array) -> Array:
-    """Return V of some of the rows by noise, offsets, and some columns of `errors`."""
-    errors = rows.errors[np.ix_(which, felt)]
-    whole: Array = rows.noise[np.ix_(which, which)] + errors @ errors.T
-    whole[np.diag_indices(len(whole))] += np.where(rows.owner[which] >= 0, excess, 0.0)
-    for size, offsets in zip(tau, rows.offsets, strict=True):
+def _covariances(rows: Rows, which: NDArray[np.intp], errors: Array, excess: float, tau: Array) -> Array:
+    """Return V of some of the rows (r, m) by noise, offsets and these errors of the temperature, shape (r, m, m)."""
+    whole: Array = rows.noise[which[:, :, None], which[:, None, :]]
+    diagonal = np.arange(which.shape[1])
+    whole[:, diagonal, diagonal] += np.where(rows.owner[which] >= 0, excess, 0.0)
+    for size, columns in zip([1.0, *tau.tolist()], (errors, *rows.offsets), strict=True):
         if size > 0:
-            columns = offsets[which]
-            whole += size**2 * columns @ columns.T
+            felt = columns[which]
+            felt = size * felt[:, :, felt.any(axis=(0, 1))]
+            whole += felt @ felt.swapaxes(1, 2)
     return whole
 
 
@@ -261,22 +301,17 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
     share. What this adds, once whitened, has the factor of ``1 + c c'``: row i less ``c_i`` times the mean of the
     unknown as told by the rows before, over the root of its variance.
     """
-    if len(rows.residual) <= _FEW:
-        return whitener_of(row_covariance(rows, excess, tau))
-    members = [np.flatnonzero(rows.recording == number) for number in np.unique(rows.recording)]
-    felt = np.array([rows.errors[which].any(axis=0) for which in members])
+    felt = np.concatenate([rows.errors[which].any(axis=1) for which in rows.members])
     shared = felt.sum(axis=0) > 1
-    blocks = [
-        whitener_of(_covariance_of(rows, which, np.flatnonzero(its), excess, tau))
-        for which, its in zip(members, felt & ~shared, strict=True)
-    ]
+    its = rows.errors[:, ~shared]
+    blocks = [(which, whitener_of(_covariances(rows, which, its, excess, tau))) for which in rows.members]
     common: list[Array] = []
 
     def white(columns: Array) -> Array:
-        whitened: Array = np.empty(np.shape(columns))
-        for which, block in zip(members, blocks, strict=True):
-            whitened[which] = block(columns[which])
-        whitened = whitened.reshape(len(whitened), -1)
+        beside = columns.reshape(len(columns), -1)
+        whitened: Array = np.empty(beside.shape)
+        for which, block in blocks:
+            whitened[which] = block(beside[which])
         for loading in common:
             known = 1 + np.append(0.0, np.cumsum(loading**2))
             summed = np.cumsum(loading[:, None] * whitened, axis=0)
@@ -290,25 +325,27 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
 
 
 def whitener_of(covariance: Array) -> Callable[[Array], Array]:
-    """Return a function that multiplies by the inverse of a covariance's Cholesky factor.
+    """Return a function that multiplies by the inverse of a covariance's Cholesky factor, or by those of a stack.
 
     It substitutes forward, block by block; scipy's solver of triangles takes as long to load as a fit takes.
     """
     factor = np.linalg.cholesky(covariance)
-    blocks = [slice(start, start + _BLOCK) for start in range(0, len(factor), _BLOCK)]
-    inverses = [np.linalg.inv(factor[block, block]) for block in blocks]
+    blocks = [slice(start, start + _BLOCK) for start in range(0, factor.shape[-1], _BLOCK)]
+    inverses = [np.linalg.inv(factor[..., block, block]) for block in blocks]
 
     def white(columns: Array) -> Array:
-        whitened = np.array(columns, dtype=np.float64)
+        whitened = np.array(columns if columns.ndim > 1 else columns[:, None], dtype=np.float64)
         for block, inverse in zip(blocks, inverses, strict=True):
-            before = slice(block.start)
-            whitened[block] = inverse @ (whitened[block] - factor[block, before] @ whitened[before])
-        return whitened
+            left = whitened[..., block, :]
+            if block.start:
+                left = left - factor[..., block, : block.start] @ whitened[..., : block.start, :]
+            whitened[..., block, :] = inverse @ left
+        return whitened.reshape(columns.shape)
 
     return white
 
 
-_FEW, _BLOCK = 200, 64  # rows that are factored whole in less time, and that are substituted at once
+_BLOCK = 64  # rows that are substituted at once
 
 
 # The fit.
@@ -446,13 +483,14 @@ def _iterate(
     tolerance: float,
 ) -> tuple[Array, Rows, bool]:
     """Return coefficients and rows after Gauss-Newton steps with fixed V, and whether they converged."""
+    at = LawsAtHolds.of(problem, laws)
     for _ in range(_STEPS):
         white = whitener(rows, excess, tau)
         jacobian = white(rows.jacobian)
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
         step = -np.linalg.lstsq(jacobian / scale, white(rows.residual), rcond=1e-11)[0] / scale
         coefficients = coefficients + step[: len(coefficients)]
-        rows = linearise(problem, laws, coefficients)
+        rows = linearise(problem, laws, coefficients, at)
         if np.abs(step[: laws.size]).max() < tolerance:
             return coefficients, rows, True
     return coefficients, rows, False
@@ -461,11 +499,11 @@ def _iterate(
 def fit_excess(rows: Rows, excess: float) -> tuple[float, float]:
     """Return the variance of magnitudes beyond noise, with free offsets of power cycles, and degrees of freedom."""
     white = whitener(rows, excess, np.zeros(2))
-    columns = white(np.hstack([rows.jacobian, rows.offsets[0]]))
-    u, values, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
-    u = u[:, values > _SEEN * values[0]]
-    whitened = white(rows.residual)
-    left = whitened - u @ (u.T @ whitened)
+    columns = white(np.column_stack([rows.jacobian, rows.offsets[0], rows.residual]))
+    laws = _basis(columns[:, : rows.jacobian.shape[1]])
+    beside = columns[:, rows.jacobian.shape[1] :]
+    u = np.hstack([laws, _basis_beside(beside[:, :-1], beside[:, :-1] - laws @ (laws.T @ beside[:, :-1]))])
+    left = columns[:, -1] - u @ (u.T @ columns[:, -1])
     noise = np.diag(rows.noise)
     spare = 1 - (u**2).sum(axis=1)
     used = rows.magnitude & (rows.owner >= 0)
@@ -480,18 +518,18 @@ def fit_turn_on_scatter(rows: Rows, excess: float) -> Scatter:
     tau is the root of ``sum c_k^2 / (1 + s_k^2 tau^2) = q``: c_k the components of the whitened residual along the q
     modes of offsets beside the laws, s_k their singular values.
     """
-    white = whitener(rows, excess, np.zeros(2))
-    residual, laws, bias = white(rows.residual), white(rows.jacobian), white(rows.offsets[0])
+    bias, scale, columns, beside = _offsets_beside_laws(rows, excess, np.zeros(2))
     s, force, second, probability = np.empty(0), np.empty(0), 0.0, None
     if rows.offsets[1].any():  # gyroscopes have none
-        s, force = offset_modes(np.hstack([laws, bias]), white(rows.offsets[1]), residual)
+        u = _basis_beside(columns[:, bias], beside[:, bias])
+        further = beside - u @ (u.T @ beside)
+        s, force = _modes(columns[:, scale], further[:, scale], further[:, -1])
     if len(s):
         probability = chi_square_probability(float((force**2).sum()), len(s))
         if probability < SCALES_SCATTER_BETWEEN_CYCLES.level:
             second = _moments(s, force)
-            white = whitener(rows, excess, np.array([0.0, second]))
-            residual, laws, bias = white(rows.residual), white(rows.jacobian), white(rows.offsets[0])
-    s, force = offset_modes(laws, bias, residual)
+            bias, _, columns, beside = _offsets_beside_laws(rows, excess, np.array([0.0, second]))
+    s, force = _modes(columns[:, bias], beside[:, bias], beside[:, -1])
     if not len(s):
         return Scatter(np.array([0.0, second]), 0, np.zeros(2), probability)
     tau = _moments(s, force)
@@ -501,13 +539,59 @@ def fit_turn_on_scatter(rows: Rows, excess: float) -> Scatter:
 
 def offset_modes(laws: Array, offsets: Array, residual: Array) -> tuple[Array, Array]:
     """Return the singular values of the offsets' columns beside the laws, and the residual's component along each."""
-    columns = laws / np.maximum(np.linalg.norm(laws, axis=0), 1e-300)
-    u, values, _ = np.linalg.svd(columns, full_matrices=False)
-    u = u[:, values > _SEEN * values[0]]
-    beside = offsets - u @ (u.T @ offsets)
+    beside = _beside(laws, np.column_stack([offsets, residual]))
+    return _modes(offsets, beside[:, :-1], beside[:, -1])
+
+
+def _offsets_beside_laws(rows: Rows, excess: float, tau: Array) -> tuple[slice, slice, Array, Array]:
+    """Return the whitened offsets of biases and scale factors, and the residual as last column, beside the laws.
+
+    Returned are the places of both among these columns, the whole columns, and their parts beside the laws.
+    """
+    bias, scale = (offsets.shape[1] for offsets in rows.offsets)
+    columns = whitener(rows, excess, tau)(np.column_stack([rows.jacobian, *rows.offsets, rows.residual]))
+    laws, others = columns[:, : rows.jacobian.shape[1]], columns[:, rows.jacobian.shape[1] :]
+    return slice(0, bias), slice(bias, bias + scale), others, _beside(laws, others)
+
+
+def _modes(offsets: Array, beside: Array, residual: Array) -> tuple[Array, Array]:
+    """Return the singular values of the offsets beside the laws, and the component along each of the residual there."""
     v, s, _ = np.linalg.svd(beside, full_matrices=False)
     observable = s > _TELLS * np.linalg.norm(offsets, axis=0).max()
-    return s[observable], v[:, observable].T @ (residual - u @ (u.T @ residual))
+    return s[observable], v[:, observable].T @ residual
+
+
+def _beside(laws: Array, columns: Array) -> Array:
+    """Return the part of columns (N, c) beside the laws, in any orthonormal basis of what the laws leave free."""
+    size = laws.shape[1]
+    laws = laws / np.maximum(np.linalg.norm(laws, axis=0), 1e-300)
+    triangle = np.asarray(np.linalg.qr(np.hstack([laws, columns]), mode="r"))
+    if len(triangle) > size and _is_independent(triangle[:size, :size]):
+        return triangle[size:, size:]
+    u = _basis(laws)
+    return columns - u @ (u.T @ columns)
+
+
+def _basis(columns: Array) -> Array:
+    """Return an orthonormal basis of columns, shape (N, rank)."""
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    q, triangle = np.linalg.qr(columns)
+    if len(triangle) == triangle.shape[1] and _is_independent(triangle):
+        return np.asarray(q)
+    u, values, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(u[:, values > _SEEN * values[0]])
+
+
+def _basis_beside(columns: Array, beside: Array) -> Array:
+    """Return an orthonormal basis of what of columns lies beside others, shape (N, rank)."""
+    u, values, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    return np.asarray(u[:, values > _SEEN])
+
+
+def _is_independent(triangle: Array) -> bool:
+    """Return whether the columns of a triangle, each of length 1, are independent."""
+    values = np.linalg.svd(triangle, compute_uv=False)
+    return bool(values[-1] > _SEEN * values[0])
 
 
 def _moments(s: Array, force: Array) -> float:
