@@ -280,7 +280,8 @@ class Recording:
         """Return the mean temperature, degC: of the column, or else as the head of the file states it."""
         if "temperature" in self.columns and parse_unit(self.units["temperature"]).quantity == "temperature":
             values = self.si("temperature")
-            values = values[np.isfinite(values)]
+            finite = np.isfinite(values)
+            values = values if finite.all() else values[finite]
             if values.size:
                 return float(values.mean())
         for key in ("temperature", "power_on_temperature"):
@@ -490,8 +491,9 @@ def check_finite(recording: Recording, names: list[str]) -> None:
     """
     for name in names:
         values = recording.column(name)
-        finite = np.abs(values) <= LARGEST  # neither NaN nor infinite, nor of a size whose square is
-        if not finite.all():
+        # Neither NaN nor infinite, nor of a size whose square is. Without a copy where all are so.
+        if len(values) and not (values.min() >= -LARGEST and values.max() <= LARGEST):
+            finite = np.abs(values) <= LARGEST
             index = int(np.argmin(finite))
             count = int(np.size(finite) - np.count_nonzero(finite))
             more = f" (and {count - 1} more)" if count > 1 else ""
@@ -530,15 +532,15 @@ def check_time(recording: Recording) -> Array:
     """
     check_finite(recording, ["time"])
     time = recording.si("time")
-    step = np.diff(time)
-    if step.size and not step.min() > 0:
-        index = int(np.argmax(step <= 0)) + 1
+    rises = time[1:] > time[:-1]
+    if not rises.all():
+        index = int(np.argmin(rises)) + 1
         raw = recording.column("time")
-        verb = "stands still" if step[index - 1] == 0 else "runs backwards"
+        verb = "stands still" if time[index] == time[index - 1] else "runs backwards"
         unit = recording.units["time"]
         bits = bits_of_wrap(float(raw[index - 1]), float(raw[index]))
         wraps = f"a counter that began again at 2^{bits}: bits = {bits} beside its unit in a layout carries it on"
-        advice = EVEN_SAMPLES if step[index - 1] == 0 else wraps if bits else _BACKWARDS
+        advice = EVEN_SAMPLES if time[index] == time[index - 1] else wraps if bits else _BACKWARDS
         raise DataError(
             f"{recording.name}: {recording.place(index)}, column time: time {verb}: "
             f"expected more than {raw[index - 1]:.15g} {unit}, found {raw[index]:.15g} {unit}; {advice}"

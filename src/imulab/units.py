@@ -202,7 +202,9 @@ def to_si(values: float | NDArray[np.float64], unit: str) -> float | NDArray[np.
     known = parse_unit(unit)
     if known.factor == 1.0 and known.offset == 0.0:
         return values
-    return values * known.factor + known.offset
+    converted = values * known.factor
+    converted += known.offset  # in place: a column of a long log is large
+    return converted
 
 
 @overload

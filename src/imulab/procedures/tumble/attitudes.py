@@ -814,8 +814,9 @@ def _drifts(recording: Recording) -> bool:
     """Return whether the temperature changes too much for one ellipsoid to fit all outputs at rest."""
     if "temperature" not in recording:
         return False
-    read = recording.column("temperature")
-    read = read[np.isfinite(read)]
+    column = recording.column("temperature")
+    read = column[np.isfinite(column)]
+    release(column)
     return bool(read.size) and quantile(read, 0.95) - quantile(read, 0.05) > _DRIFT
 
 

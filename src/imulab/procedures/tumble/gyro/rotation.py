@@ -148,8 +148,7 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
         return
     if any(parse_unit(recording.units[name]).quantity != "rate" for name in names):
         return
-    columns = [recording.column(name) for name in names]
-    if not all(np.isfinite(column).all() for column in columns):
+    if not all(np.isfinite(recording.column(name)).all() for name in names):
         return
     first = np.unique(pieces[:, 2], return_index=True)[1]
     last = np.append(first[1:], len(pieces)) - 1
@@ -158,21 +157,26 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
     if np.count_nonzero(short) < _FEWEST_TURNS:
         return
     edges, samples = pieces[:, :2].ravel(), pieces[:, 1] - pieces[:, 0]
-    bias = [np.mean(np.add.reduceat(c[: edges[-1]], edges[:-1])[::2] / samples) for c in columns]
-    start, stop = start[short], stop[short]
-    # Only the samples of the turns, one turn behind the other.
-    size = stop - start + 1
-    begin = np.cumsum(size) - size
-    turning = np.arange(size.sum()) + np.repeat(start - begin, size)
-    rates = [to_si(c[turning] - b, recording.units[name]) for c, b, name in zip(columns, bias, names, strict=True)]
-    rate, when = np.column_stack(rates), time[turning]
-    start, stop = begin, begin + size - 1
-    turn = frame_rotations(rate, when, start, stop)
+    bias = {
+        name: np.mean(np.add.reduceat(recording.column(name)[: edges[-1]], edges[:-1])[::2] / samples) for name in names
+    }
+    rows = [slice(first, last + 1) for first, last in zip(start[short].tolist(), stop[short].tolist(), strict=True)]
+
+    def turns(sign: float) -> Array:
+        """Return the turns by the gyroscopes, or by all reversed, one at a time: a long log is large."""
+        ends, matrices = np.zeros(1, dtype=np.int64), []
+        for part in rows:
+            rates = [to_si(recording.column(name)[part] - bias[name], recording.units[name]) for name in names]
+            ends[0] = part.stop - part.start - 1
+            matrices.append(frame_rotations(sign * np.column_stack(rates), time[part], np.zeros_like(ends), ends))
+        return np.concatenate(matrices)
+
+    turn = turns(1.0)
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
     before, after = up[:-1][short], up[1:][short]
     if not _median_miss(turn, before, after) > _WRONG:
         return
-    mirrored = frame_rotations(-rate, when, start, stop)
+    mirrored = turns(-1.0)
     miss = {name: _median_miss(turn, before @ m.T, after @ m.T) for name, m in _signed_permutations().items()}
     miss |= {
         f"{name} and the gyroscopes all reversed": _median_miss(mirrored, before @ m.T, after @ m.T)
