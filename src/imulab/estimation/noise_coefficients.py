@@ -98,11 +98,10 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
         raise DataError("Allan deviation: expected finite samples")
     centred -= mean
     np.add.accumulate(centred, out=centred)
-    integral *= 1 / rate
     counts = _averages(len(integral), rate, taus)
     squares = np.empty(len(counts))
     fill_squares(squares, integral, counts)
-    variance = squares / (2.0 * (len(integral) - 2 * counts)) / counts.astype(np.float64) ** 2 * rate**2
+    variance = squares / (2.0 * (len(integral) - 2 * counts)) / counts.astype(np.float64) ** 2
     freedom = _freedom(len(integral), counts, variance)
     deviation = np.sqrt(variance)
     return DeviationCurve(counts / rate, deviation, deviation / np.sqrt(2 * freedom), freedom)

@@ -899,7 +899,8 @@ def _window_statistics(readings: Callable[[slice], Array], count: int, size: int
         part = readings(slice(first * size, min(first + at_once, count) * size))
         windows = part.reshape(-1, size, *part.shape[1:])
         mean.append(windows.mean(axis=1))
-        spread.append(windows.std(axis=1))
+        off = windows - mean[-1][:, None]
+        spread.append(np.sqrt(np.einsum("wkan,wkan->wan", off, off) / size))
     return np.concatenate(spread), np.concatenate(mean)
 
 

@@ -37,7 +37,7 @@ from imulab.procedures.gyro_array.elements import (
     on_one_clock,
 )
 from imulab.procedures.result import Result
-from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.recording import Array, Recording, check_finite, check_time, release
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import parse_unit, to_si
 
@@ -110,14 +110,14 @@ def calibrate_array(
         raise DataError(f"{still.name}: {elements.count} element on each axis; expected 2 or more")
     if not averaging_time > 0:
         raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
-    _check_readings(still, elements)
+    checks = _check_readings(still, elements)
     left_out = _bridge_rows(still, elements)
     warnings = [prefixed(still.name, note) for note in still.notes]
     warnings += [prefixed(still.name, note) for note in left_out.notes()]
     still, cut = _still_part(left_out, elements)
     warnings += cut
     if cut or left_out.kinds:
-        _check_readings(still, elements)
+        checks = _check_readings(still, elements)
     rate, timing = sampling_rate(still)
     rest, notes = at_rest(still, rate, elements, noise)
     warnings += [*(prefixed(still.name, line) for line in notes), *timing]
@@ -125,9 +125,6 @@ def calibrate_array(
     if moving is not None:
         aligned, more = _align_in_motion(moving, elements, rest)
         warnings += more
-    checks = Checks(elements.names)
-    for rows in _blocks_of_rows(len(still)):
-        checks.watch(_readings_si(still, elements, rows) - rest.bias)
     warnings += [prefixed(still.name, line) for line in checks.units()]
     covariance, used, count = _allan_covariance(still, elements, rest, aligned, averaging_time)
     if used < averaging_time * 0.999:
@@ -160,14 +157,16 @@ def _blocks_of_rows(count: int) -> Iterator[slice]:
 
 
 def _readings_si(recording: Recording, elements: Elements, rows: slice = slice(None)) -> Array:
-    readings = elements.readings(recording, rows)
-    for axis, unit in enumerate(elements.units):
-        readings[:, axis] = to_si(readings[:, axis], unit)
-    return readings
+    """Return the readings of all rows or some, rad/s, shape (m, axes, n), with those of a gyro side by side."""
+    columns = dict(recording.columns)  # which gives back the memory of columns on disk below, for all at once
+    by_unit = zip(elements.names, elements.units, strict=True)
+    readings = np.array([[to_si(columns[name][rows], unit) for name in row] for row, unit in by_unit])
+    release(*columns.values())
+    return np.moveaxis(readings, 2, 0)
 
 
-def _check_readings(recording: Recording, elements: Elements) -> None:
-    """Refuse readings that are no numbers, and dead gyros."""
+def _check_readings(recording: Recording, elements: Elements) -> Checks:
+    """Return the checks of readings; those that are no numbers are refused, and so are dead gyros."""
     names = [name for row in elements.names for name in row]
     check_finite(recording, names)
     for name in names:
@@ -176,9 +175,10 @@ def _check_readings(recording: Recording, elements: Elements) -> None:
             raise DataError(f"{recording.name}: column {name}: all samples are {values[0]:g}: a dead gyro")
     checks = Checks(elements.names)
     for rows in _blocks_of_rows(len(recording)):
-        checks.watch(elements.readings(recording, rows))
+        checks.watch(_readings_si(recording, elements, rows))
     for line in checks.doubled():
         raise DataError(f"{recording.name}: {line}")
+    return checks
 
 
 def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[str]]:
