@@ -43,6 +43,7 @@ Refit = Callable[[Sequence[Spectrum]], tuple[Sequence[Array], float]]
 # How often regression and noise model are fitted in turn, at least and at most, and the change of the slopes, in their
 # uncertainties, that ends it
 _REGRESSION_ROUNDS, _MOST_ROUNDS, _SETTLED = 3, 12, 0.01
+_STANDS = 1e-9  # such a change that ends it at once: the rounds to come would change no more
 _HIDES = 0.1
 """Variance of a coefficient by what a covariate's rounding hides, over its noise, from which it is left out."""
 # Price of a covariate in deviance, as of a term of the model; further fall of the deviance that is asked for
@@ -78,10 +79,12 @@ class Regression:
 def ramp_coefficients(stretch: Stretch) -> Array:
     """Return the slow cosine coefficients of time, s, over a stretch, shape (J,)."""
     n = stretch.count
-    j = np.arange(1, len(stretch.slow) + 1)
+    ramp = np.zeros(len(stretch.slow))
+    j = np.arange(1, len(ramp) + 1, 2)  # a ramp has no even ones
     # sum_i i cos(pi j (i + 1/2)/n) = -(1 - (-1)^j)/(4 sin^2(pi j/2n)) cos(pi j/2n)
     half = np.pi * j / (2 * n)
-    return np.asarray(-np.sqrt(2 / n) * stretch.interval * (j % 2) * np.cos(half) / (2 * np.sin(half) ** 2))
+    ramp[::2] = -np.sqrt(2 / n) * stretch.interval * np.cos(half) / (2 * np.sin(half) ** 2)
+    return ramp
 
 
 def regress(
@@ -122,7 +125,8 @@ def regress(
         slope, covariance = _slopes(stretches, covariates, variances, [last[0] * each for each in hidden])
         cleaned = [without(stretch, slope @ np.atleast_2d(x)) for stretch, x in zip(stretches, covariates, strict=True)]
         variances, after = refit([each for stretch in cleaned for each in stretch.spectra])
-        if number + 1 >= rounds and (np.abs(slope - last) < _SETTLED * np.sqrt(np.diag(covariance))).all():
+        change = float((np.abs(slope - last) / np.sqrt(np.diag(covariance))).max())
+        if change < (_SETTLED if number + 1 >= rounds else _STANDS):
             break
     scaled = [slope[0] * each for each in hidden]
     slope, covariance = _slopes(stretches, covariates, variances, scaled)
@@ -140,8 +144,9 @@ def _slopes(
         stop = start + len(stretch.spectra)
         weight = counted(stretch) / variances_of_coefficients(variances[start:stop], stretch)
         x = np.atleast_2d(covariate)
-        normal += x * weight @ x.T
-        right += x * weight @ stretch.slow
+        by_weight = x * weight
+        normal += by_weight @ x.T
+        right += by_weight @ stretch.slow
         if rows.any():
             lowest = np.s_[: rows.shape[1]]
             weighted = rows * weight[lowest]
@@ -172,12 +177,12 @@ def _without_hidden(stretch: Stretch, rows: Array) -> Stretch:
 def counted(stretch: Stretch) -> Array:
     """Return the weight of each slow coefficient, shape (J,): the share of its bin's coefficients that count."""
     counts = np.zeros(len(stretch.slow))
-    f = np.arange(1, len(counts) + 1) / stretch.count
     for spectrum in stretch.spectra:
-        share = spectrum.freedom / (spectrum.last - spectrum.first + 1)
-        place = np.searchsorted(spectrum.first / spectrum.count, f + 1e-12, side="right") - 1
-        inside = (place >= 0) & (f <= spectrum.last[-1] / spectrum.count + 1e-12)
-        counts[inside] = np.minimum(share[place[inside]], 1.0)
+        share = np.minimum(spectrum.freedom / (spectrum.last - spectrum.first + 1), 1.0)
+        scale, near = stretch.count / spectrum.count, 1e-12 * stretch.count
+        start, stop = np.ceil(spectrum.first * scale - near), np.floor(spectrum.last[-1] * scale + near)
+        edge = np.minimum(np.append(start, stop + 1).astype(np.int64) - 1, len(counts))
+        counts[edge[0] : edge[-1]] = np.repeat(share, np.diff(edge))
     return np.where(stretch.used, counts, 0.0)
 
 
@@ -307,7 +312,8 @@ def _weights(spectrum: Spectrum, m: np.ndarray) -> Array:
     # Midpoints stand for the j of a bin; those of a narrow one are repeated.
     offset = np.floor(share * width[:, None])
     half = np.pi * (spectrum.first[:, None] + offset) / (2 * spectrum.count)
-    return np.stack([np.mean(2 * np.sin(k * half) ** 4 / (k * np.sin(half)) ** 2, axis=1) for k in m])
+    over = 2 / np.square(np.sin(half))
+    return np.stack([np.mean(np.square(np.square(np.sin(k * half)) / k) * over, axis=1) for k in m])
 
 
 # Choice of the terms of a model, and quantities averaged over all candidate models.

@@ -297,6 +297,5 @@ def _cosines(weight: Array, grid: int) -> Array:
     """Return ``sum_j w_j cos(2 pi j q/grid)``, j = 1 .. grid - 1, for q = 1 .. grid - 1."""
     padded = np.zeros(grid)
     padded[1 : 1 + len(weight)] = weight
-    half = np.fft.rfft(padded).real
-    q = np.arange(1, grid)
-    return np.asarray(half[np.minimum(q, grid - q)])
+    half = np.fft.rfft(padded).real[1:]
+    return np.concatenate([half, half[: (grid - 1) // 2][::-1]])

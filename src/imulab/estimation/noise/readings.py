@@ -123,7 +123,7 @@ def _step(samples: Array) -> float:
 # Rows at rest that are no readings: zeros in place of lost readings, and readings repeated over several rows.
 
 
-_SEEN, _SOME = 100_000, 5000  # samples that are used; samples that show the levels of an output
+_SEEN, _SOME, _FIRST = 100_000, 5000, 100  # samples that are used; samples that show the levels of an output
 LEVELS = 6
 """Fewest different values of an output among which lost readings can be recognised."""
 _CHANCE_ZEROS, _PILED, _MOST = 10, 4, 0.05
@@ -184,6 +184,11 @@ def own_readings(recording: Recording, names: Sequence[str]) -> tuple[Recording,
             )
         )
     return recording, notes
+
+
+def takes_levels(values: Array) -> bool:
+    """Return whether samples take so many different values that lost readings can be recognised among them."""
+    return any(len(distinct(part)) >= LEVELS for part in (values[:_FIRST], values))  # the first tell it as a rule
 
 
 def dropouts(values: Array) -> NDArray[np.bool_] | None:

@@ -18,7 +18,7 @@ from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError
 from imulab.estimation.clock import read_clock
 from imulab.estimation.column_noise import most_reach, moved_columns
-from imulab.estimation.noise.readings import LEVELS, doubtful_units, dropouts, own_readings
+from imulab.estimation.noise.readings import doubtful_units, dropouts, own_readings, takes_levels
 from imulab.estimation.noise.spectrum import Accumulator, Stretch, slow_coefficients, transformed
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.rows import deviation_of_steps, distinct
@@ -154,7 +154,7 @@ class Rest:
 def coarse_step(values: Array) -> float:
     """Return the step of readings of a slow quantity, shape (n,), that takes few levels and mostly repeats; else 0."""
     changes = np.flatnonzero(np.diff(values))
-    step = resolution(values[np.unique(np.concatenate([[0], changes, changes + 1]))])
+    step = resolution(values[distinct(np.concatenate([[0], changes, changes + 1]))])
     return 0.0 if 2 * len(changes) > len(values) or float(np.ptp(values)) > _MOST_LEVELS * step else step
 
 
@@ -379,7 +379,7 @@ def is_clipped(piled: int, next_to: int) -> bool:
 
 def _clipped(values: Array) -> float | None:
     """Return the limit at which samples pile up (more than twice as many as at the next level), or None."""
-    if len(distinct(values[:_SEEN])) < LEVELS:
+    if not takes_levels(values[:_SEEN]):
         return None
     for limit, outside, nearest in ((values.max(), np.less, np.max), (values.min(), np.greater, np.min)):
         piled = int(np.count_nonzero(values == limit))
@@ -457,7 +457,7 @@ class _Level:
 
     def __init__(self, samples: Array, size: int) -> None:
         self._size = size
-        self._fine = len(distinct(samples)) >= LEVELS
+        self._fine = takes_levels(samples)
         self._unfinished, self._last = samples[:0], samples[:0]
         self._least, self._most = np.inf, -np.inf
         self._sums = np.zeros(3)

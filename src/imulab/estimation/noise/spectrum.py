@@ -151,8 +151,10 @@ def smooth_count(count: int) -> int:
     return best
 
 
-def cosine_coefficients(samples: Array) -> Array:
+def cosine_coefficients(samples: Array, most: int | None = None) -> Array:
     """Return ``c_j = sqrt(2/n) sum_i x_i cos(pi j (i + 1/2)/n)``, j = 1 .. n - 1, of samples of shape (n,).
+
+    With `most` only those are returned whose j is not above it.
 
     Examples
     --------
@@ -165,11 +167,13 @@ def cosine_coefficients(samples: Array) -> Array:
     ordered -= samples.mean()
     turned = np.fft.rfft(ordered)
     del ordered
+    low = turned if most is None or most >= len(turned) else turned[: most + 1]
     # Each angle is the sum of a coarse and a fine one, which needs a thousandth of the exponentials.
-    fine, coarse = np.arange(_FINE), _FINE * np.arange(len(turned) // _FINE + 1)
+    fine, coarse = np.arange(_FINE), _FINE * np.arange(len(low) // _FINE + 1)
     turn = np.multiply.outer(np.exp(-0.5j * np.pi / n * coarse), np.exp(-0.5j * np.pi / n * fine))
-    turned *= turn.ravel()[: len(turned)]
-    return np.asarray(np.concatenate([turned.real[1:], -turned.imag[n - len(turned) : 0 : -1]]) * np.sqrt(2 / n))
+    low *= turn.ravel()[: len(low)]
+    c = low.real[1:] if low is not turned else np.concatenate([low.real[1:], -low.imag[n - len(low) : 0 : -1]])[:most]
+    return np.asarray(c * np.sqrt(2 / n))
 
 
 class Accumulator:
@@ -240,7 +244,7 @@ class Accumulator:
         if self._stretches:
             return self.stretch().slow
         held = self._all()
-        return cosine_coefficients(held[: smooth_count(len(held))])[:SLOW]
+        return cosine_coefficients(held[: smooth_count(len(held))], SLOW)
 
     def _all(self) -> Array:
         return self._waiting[: self._held]
@@ -300,7 +304,7 @@ class Accumulator:
         many = smooth_count(self._filled)
         count = many * self._averaged
         used = many // _SHARE
-        slow = cosine_coefficients(self._means[:many])[:used] * np.sqrt(self._averaged)
+        slow = cosine_coefficients(self._means[:many], used) * np.sqrt(self._averaged)
         edges = bins(count)
         low = edges[1] <= used
         kept = (edges[0][low], edges[1][low])

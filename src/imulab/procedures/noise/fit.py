@@ -49,7 +49,7 @@ from imulab.estimation.noise.terms import (
     walk_square,
     white_square,
 )
-from imulab.estimation.rows import NORMAL_95
+from imulab.estimation.rows import NORMAL_95, distinct
 from imulab.frames import is_frame
 from imulab.options import choice, measure, names_of_columns, parsed
 from imulab.procedures.noise import (
@@ -484,7 +484,7 @@ def durations(length: float) -> Array:
     """Return 1, 10, 100 s ... up to a tenth of a record, and that tenth, shape (t,)."""
     longest = length / _PART
     decades = 10.0 ** np.arange(0, max(int(np.floor(np.log10(max(longest, 1)))) + 1, 0))
-    return np.unique(np.append(decades[decades <= longest], longest))
+    return distinct(np.append(decades[decades <= longest], longest))
 
 
 def _ends(averaged: Any) -> dict[str, Any]:
