@@ -11,6 +11,8 @@ import pytest
 
 import imulab as il
 from conftest import REPOSITORY
+from imulab.cli import main
+from imulab.cli.demo import SCENARIOS
 
 G = "9.80665"
 
@@ -213,6 +215,14 @@ def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
     for name, parameter in record.parameters.items():
         error = (parameter.value - float(truth[f"truth_{name}"])) / parameter.standard_uncertainty
         assert abs(error) < 4, name
+
+
+def test_how_much_the_demonstration_runs_is_said(capsys):
+    assert len([scenario for scenario in SCENARIOS if scenario.record.endswith(".json")]) == 5
+    said = "five procedures and a fleet on simulated instruments"
+    assert main(["demo", "--help"]) == 0
+    pages = [(REPOSITORY / name).read_text() for name in ("README.md", "docs/quickstart.md")]
+    assert all(said in text for text in (capsys.readouterr().out, *pages))
 
 
 def test_no_path_of_a_machine_is_in_the_sources():

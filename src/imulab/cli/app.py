@@ -22,7 +22,7 @@ EXAMPLES = """
     imulab tumble fit recording.csv --gravity 9.81362 -o sn42.json --report sn42.html
     imulab apply sn42.json flight.csv -o corrected.csv
 
-  'imulab COMMAND --help' says more, '--help-all' all; 'imulab demo' runs everything on simulated instruments."""
+  'imulab COMMAND --help' says more, '--help-all' all; 'imulab demo' runs five procedures on simulated units."""
 ROOT_OPTIONS = (
     ("--version", "Print the version."),
     ("--install-completion", "Install completion for the current shell."),

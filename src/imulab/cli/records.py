@@ -334,9 +334,9 @@ def report(
 
 
 def demo(folder: Annotated[str, Argument("[DIR]", "Folder to write to.")] = "demo") -> None:
-    """Run all procedures on simulated instruments.
+    """Run five procedures and a fleet on simulated instruments.
 
-    Writes recordings, records, corrected data and reports.
+    Writes recordings, records, corrected data, reports, and a page that shows them.
     """
     from functools import partial
 
