@@ -110,6 +110,39 @@ def test_coarse_stamps_give_the_rate_by_number_over_time(time, rate):
     assert (np.diff(mended.time) > 0).all()
 
 
+def fetched(kind):
+    """Return the time at which a program has each of N readings, taken every .01 s, in hand."""
+    if kind == "bursts, the last cut short":
+        return np.minimum(NUMBER // 25 * 25 + 24, N - 1) / 100
+    longest = 0.35 if kind == "seldom" else 0.06
+    at = np.cumsum(np.random.default_rng(5).uniform(0.4 * longest, longest, 2 * N))
+    return at[np.searchsorted(at, NUMBER / 100)]
+
+
+@pytest.mark.parametrize("kind", ["bursts, the last cut short", "seldom", "often"])
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_stamp_is_of_the_last_reading_where_readings_are_stamped_as_they_are_fetched(kind, backwards):
+    time = fetched(kind)
+    if backwards:  # the same as though each stamp were of its first reading
+        time = (time[-1] - time)[::-1]
+    clock = read_clock(time)
+    assert clock.rate == pytest.approx(100, rel=3e-5)
+    assert not clock.missing.size
+    late = clock.even - NUMBER / 100
+    assert np.ptp(late) < 0.003
+    assert np.diff(clock.even) == pytest.approx(0.01, rel=1e-3)
+
+
+def test_readings_lost_between_two_fetches_are_a_gap_behind_the_last_that_came():
+    kept = np.ones(N, dtype=bool)
+    time = fetched("seldom")
+    row = int(np.flatnonzero(np.diff(time) > 0)[300])
+    kept[row + 1 : row + 301] = False
+    clock = read_clock(time[kept])
+    assert (clock.rate, clock.gaps.tolist()) == (pytest.approx(100, rel=1e-4), [row])
+    assert clock.missing.tolist() == [300]
+
+
 def test_a_gap_beside_the_beat_of_a_clock_stays():
     clock = read_clock(np.delete(np.floor(NUMBER / 0.99 + 1e-6) / 1e3, slice(7010, 7310)))
     assert (clock.rate, clock.missing.tolist()) == (pytest.approx(990, rel=1e-4), [300])

@@ -24,6 +24,7 @@ _LASTS = 0.5  # usual steps: what a gap moves all later stamps by, at least
 _MANY, _SHARE = 5, 0.001  # rows, and share of the rows, that share a stamp where stamps are coarse
 _FROZEN, _FEW_MORE = 3, 2  # times the usual number of rows at a stamp, and so many more: the clock stood still
 _FEWEST_MARKS = 3  # stamps that show a rate
+_ALIKE = 1.5  # readings: the numbers at two stamps that differ by less say nothing of which stamp is of which readings
 _UNEQUAL = 0.05  # scatter of the readings at a stamp, over their number, from which readings may be lost
 _SHORTEST_LOSS = 9  # steps: a long step exactly every so often, or less often, is a sample lost by a program
 _MILLISECOND = (
@@ -95,7 +96,7 @@ def read_clock(time: Array, same: NDArray[np.bool_] | None = None, *, lossy: boo
     """Return what time stamps, s, shape (n,), show.
 
     A step is a gap where it moves all later stamps by half a usual step or more: a late stamp, whose followers catch
-    up, is none. Readings that share stamps are spread evenly, with the rate from their number over time.
+    up, is none. Readings that share stamps are spread evenly, with the rate of a line of the stamps over their numbers.
 
     Parameters
     ----------
@@ -326,7 +327,7 @@ def _lasting(number: Rows, stamps: Array, usual: float, wide: Rows, guess: Rows,
 
 
 def _shared_stamps(time: Array) -> Clock:
-    """Return the clock of readings that share stamps: a number of samples between the first and the last change."""
+    """Return the clock of readings that share stamps: the line of stamps over the numbers of their readings."""
     step = np.diff(time)
     widest = float(step.max())
     still = np.flatnonzero(step == 0)
@@ -344,18 +345,23 @@ def _shared_stamps(time: Array) -> Clock:
             doubt=f"time stands still for {counts[longest]} rows",
             doubtful_row=row,
         )
-    stamps = time[marks]
-    tick = median(np.diff(stamps))
     lag = min(max(1, len(marks) // 10), 200, len(marks) - 1)
-    usual = median((stamps[lag:] - stamps[:-lag]) / (marks[lag:] - marks[:-lag]))
-    scatter = quantile(np.abs(np.diff(stamps) / usual - np.diff(marks)), 0.9)
-    usual, places, missing = _find_gaps(marks, stamps, usual, max(0.75, 1.5 * scatter), coarse=True)
-    lost = np.zeros(len(marks))
+    usual = median((time[marks[lag:]] - time[marks[:-lag]]) / (marks[lag:] - marks[:-lag]))
+    of_last = _are_of_last(time, marks, usual)
+    number = marks - 1 if of_last else marks
+    stamps = time[number]
+    tick = median(np.diff(stamps))
+    scatter = quantile(np.abs(np.diff(stamps) / usual - np.diff(number)), 0.9)
+    usual, places, missing = _find_gaps(number, stamps, usual, max(0.75, 1.5 * scatter), coarse=True)
+    lost = np.zeros(len(number))
     lost[places + 1] = missing
-    late = stamps / usual - marks - np.cumsum(lost)
+    place = number + np.cumsum(lost)
+    away = place - place.mean()
+    usual = float(away @ stamps) / float(away @ away)
+    late = stamps / usual - place
     uneven = float(np.diff(late).std())
     readings = float(np.mean(counts[1:-1]))
-    if max(1.0, uneven) > _SURE_RATE * (marks[-1] - marks[0]) or (
+    if max(1.0, uneven) > _SURE_RATE * (number[-1] - number[0]) or (
         uneven > max(1.0, _UNEQUAL * readings) and _wander(np.diff(late))
     ):
         return Clock(
@@ -365,26 +371,37 @@ def _shared_stamps(time: Array) -> Clock:
             doubt=f"{counts[1:-1].min()} to {counts[1:-1].max()} rows at each of the time stamps, which are coarse",
             doubtful_row=first,
         )
-    even = _spread(time, marks, stamps, usual, places)
-    regular = np.ones(len(marks) - 1, dtype=bool)
+    above = number[places] if of_last else number[places + 1] - 1
+    even = _spread(len(time), number, stamps, usual, above)
+    regular = np.ones(len(number) - 1, dtype=bool)
     regular[places] = False
-    jitter = float(np.sqrt(np.mean((np.diff(stamps) - usual * np.diff(marks))[regular] ** 2)))
-    return Clock(1 / usual, jitter, marks[places + 1] - 1, missing, widest, tick, None, even)
+    jitter = float(np.sqrt(np.mean((np.diff(stamps) - usual * np.diff(number))[regular] ** 2)))
+    return Clock(1 / usual, jitter, above, missing, widest, tick, None, even)
 
 
-def _spread(time: Array, marks: Rows, stamps: Array, usual: float, gaps: Rows) -> Array:
-    """Return evenly spaced times of all readings, s, in one line between gaps; or through each stamp if it drifts."""
-    part = np.zeros(len(time), dtype=np.int64)
-    part[marks[gaps + 1]] = 1
+def _are_of_last(time: Array, marks: Rows, usual: float) -> bool:
+    """Return whether a stamp tells when its last reading was taken, not its first: the program stamps what it fetches.
+
+    The readings since the stamp before are then those of this stamp, and not those of the one before.
+    """
+    counts = np.diff(np.concatenate([[0], marks, [len(time)]]))
+    steps = np.diff(time[np.concatenate([[0], marks])]) / usual
+    by_first, by_last = np.abs(steps - counts[:-1]), np.abs(steps - counts[1:])
+    better, worse = np.count_nonzero(by_first > by_last + _ALIKE), np.count_nonzero(by_last > by_first + _ALIKE)
+    return bool(better > 2 * worse)
+
+
+def _spread(count: int, number: Rows, stamps: Array, usual: float, above: Rows) -> Array:
+    """Return evenly spaced times of readings, s: one line between gaps, or through each stamp where they drift."""
+    part = np.zeros(count, dtype=np.int64)
+    part[above + 1] = 1
     part = np.cumsum(part)
-    number = np.arange(len(time))
-    offset = stamps - usual * marks
-    level = np.bincount(part[marks], offset) / np.bincount(part[marks])
-    even = np.asarray(usual * number + level[part])
-    furthest = float(np.abs(offset - level[part[marks]]).max())
+    rows = np.arange(count)
+    offset = stamps - usual * number
+    level = np.bincount(part[number], offset) / np.bincount(part[number])
+    even = np.asarray(usual * rows + level[part])
+    furthest = float(np.abs(offset - level[part[number]]).max())
     if furthest <= 2 * max(median(np.diff(stamps)), 2 * usual) and (np.diff(even) > 0).all():
         return even
-    before, behind = usual * marks[0], usual * (len(time) - marks[-1])
-    knots = np.concatenate([[0], marks, [len(time)]])
-    through = np.concatenate([[stamps[0] - before], stamps, [stamps[-1] + behind]])
-    return np.asarray(np.interp(number, knots, through))
+    ends = stamps[0] - usual * number[0], stamps[-1] + usual * (count - number[-1])
+    return np.asarray(np.interp(rows, np.concatenate([[0], number, [count]]), [ends[0], *stamps, ends[1]]))
