@@ -202,11 +202,7 @@ class Recording:
 
     def si(self, name: str) -> Array:
         """Return the samples of a column in SI (counts and volts as they are), shape (n,)."""
-        values = self.column(name)
-        converted = to_si(values, self.units[name])
-        if converted is not values:
-            release(values)
-        return converted
+        return converted(self.column(name), self.units[name])
 
     @property
     def time(self) -> Array | None:
@@ -555,6 +551,9 @@ LARGE = 1 << 28
 """Bytes of a file whose rows are not kept in memory."""
 
 
+_AT_ONCE = 1 << 18  # rows of a column in a temporary file that are converted together
+
+
 def is_large(file: str | PathLike[str] | None) -> bool:
     """Return whether the rows of a file are too many to be kept in memory."""
     if file is None or not (path := Path(file)).is_file():
@@ -607,6 +606,18 @@ def _map_of(values: Array) -> mmap.mmap | None:
     while base is not None and not isinstance(base, mmap.mmap):
         base = getattr(base, "base", None)
     return base
+
+
+def converted(values: Array, unit: str) -> Array:
+    """Return samples in SI, shape (n,); those in a temporary file part by part, so as not to be in memory twice."""
+    if _map_of(values) is None or to_si(first := values[:1], unit) is first:
+        return to_si(values, unit)
+    samples = np.empty(len(values))
+    for start in range(0, len(values), _AT_ONCE):
+        rows = slice(start, start + _AT_ONCE)
+        samples[rows] = to_si(values[rows], unit)
+        release(values)
+    return samples
 
 
 def stored_as(values: Array, like: Array) -> Array:

@@ -31,8 +31,8 @@ from imulab.estimation.noise_coefficients import (
 )
 from imulab.estimation.rows import Step, deviation_of_steps, find_step, leave_out
 from imulab.estimation.sampling import bridged, mend_stamps, sampling_rate, steady_part
-from imulab.recording import Array, Recording, check_not_resampled
-from imulab.units import from_si, parse_unit, si_unit
+from imulab.recording import Array, Recording, check_not_resampled, converted
+from imulab.units import from_si, parse_unit, si_unit, to_si
 
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 """How far the zero of a sensor at rest may drift, SI, and the unit in which messages state it."""
@@ -186,15 +186,16 @@ def _noises(
     """Return the noise of the columns `wanted`, with notes; a column of a sensor that moved has no coefficients."""
     notes: list[str] = []
     moved = moved_columns(recording, names, rate)
-    values = (recording.si(name) for name in wanted)  # one at a time: a long log is large
-    noises = dict(zip(wanted, columns_noise(values, rate, [moved.get(name, "") for name in wanted]), strict=True))
-    for name in wanted:
+    values = map(recording.column, wanted)  # one at a time: a long log is large
+    units, reasons = [recording.units[name] for name in wanted], [moved.get(name, "") for name in wanted]
+    noises = dict(zip(wanted, columns_noise(values, rate, reasons, units=units), strict=True))
+    for name, unit in zip(wanted, units, strict=True):
         samples = recording.si(name)
         if name not in moved and (step := find_step(samples)) is not None:
             notes.append(_step_line(recording, name, step))
-        if not isinstance(taus, str) or taus != "octave":
-            noises[name] = replace(noises[name], curve=allan_deviation(samples, rate, taus))
         del samples  # before the next is made
+        if not isinstance(taus, str) or taus != "octave":
+            noises[name] = replace(noises[name], curve=_curve(recording.column(name), unit, rate, taus))
     return noises, notes + [prefixed(recording.name, line) for line in noise_lines(noises)]
 
 
@@ -235,12 +236,16 @@ def _listed(values: Array | None) -> list[float | None] | None:
 
 
 def columns_noise(
-    columns: Iterable[Array], rate: float, moved: Sequence[str] = (), candidates: tuple[str, ...] = CANDIDATES
+    columns: Iterable[Array],
+    rate: float,
+    moved: Sequence[str] = (),
+    candidates: tuple[str, ...] = CANDIDATES,
+    units: Sequence[str] = (),
 ) -> list[ColumnNoise]:
     """Return the Allan curves of columns, shape (n,) each, at a rate, Hz, and the coefficients of the fitted models.
 
     Spikes and spectral lines stay in the curve and are removed before the model is fitted. `moved` gives for each
-    column the reason why it has no coefficients, or nothing.
+    column the reason why it has no coefficients, or nothing; `units` are those of the columns, which are in SI without.
 
     Raises
     ------
@@ -248,16 +253,16 @@ def columns_noise(
         As for `allan_deviation`; fewer than 50 samples.
     """
     curves, why, stretches = [], [], []
-    reasons = iter(moved or repeat(""))
+    of_columns = zip(moved or repeat(""), units or repeat("1"), strict=False)
     for samples in columns:
-        reason = next(reasons)
-        curves.append(allan_deviation(samples, rate))
+        reason, unit = next(of_columns)
+        curves.append(_curve(samples, unit, rate))
         if len(samples) < FEWEST:
             raise DataError(
                 f"noise coefficients: {len(samples)} samples are too few; expected some {FEWEST} samples or more"
             )
-        why.append(reason or _unfit(samples, float(curves[-1].deviation[0])))
-        stretches += [] if why[-1] else [[transformed(samples, 1 / rate)]]
+        why.append(reason or _unfit(samples, float(curves[-1].deviation[0]) / to_si(1.0, unit)))
+        stretches += [] if why[-1] else [[transformed(converted(samples, unit), 1 / rate)]]
         del samples  # before the next is made
     fit = [k for k, reason in enumerate(why) if not reason]
     analysed_columns = analyses(stretches, candidates) if fit else []
@@ -265,6 +270,12 @@ def columns_noise(
     return [
         ColumnNoise(curve, *(models[k] if k in models else (undetermined(why[k]),))) for k, curve in enumerate(curves)
     ]
+
+
+def _curve(samples: Array, unit: str, rate: float, taus: str | Array = "octave") -> DeviationCurve:
+    """Return the Allan curve, SI, of samples in a unit; only the curve is converted, since a long log is large."""
+    curve, factor = allan_deviation(samples, rate, taus), to_si(1.0, unit)
+    return replace(curve, deviation=curve.deviation * factor, standard_uncertainty=curve.standard_uncertainty * factor)
 
 
 def _unfit(samples: Array, noise: float) -> str:

@@ -330,11 +330,16 @@ def zero_rows(values: Sequence[Array], never_zero: bool = False) -> NDArray[np.b
     never_zero
         Whether no row of zeros can be a reading, as of accelerometers.
     """
-    zero = np.array([_released(column == 0, column) for column in values])
-    every = np.asarray(zero.all(axis=0))
-    if never_zero or len(values) < 2 or not every.any():
+    every, zeros_in_row = np.ones(len(values[0]), dtype=np.bool_), np.zeros(len(values[0]), dtype=np.int16)
+    for column in values:
+        zero = _released(column == 0, column)
+        every &= zero
+        if not every.any():
+            return every
+        zeros_in_row += zero
+    if never_zero or len(values) < 2:
         return every if len(values) > 1 else np.zeros_like(every)
-    count = np.concatenate([[0], np.cumsum(zero.sum(axis=0)[~every])])
+    count = np.concatenate([[0], np.cumsum(zeros_in_row[~every])])
     first = np.cumsum(~every)[every]
     before = np.maximum(first, min(HISTORY, len(count) - 1))  # near the start: of the rows after it, too
     rare = count[before] - count[np.maximum(before - HISTORY, 0)] <= _FEW_ZEROS * len(values) * HISTORY
@@ -351,10 +356,15 @@ def _released(rows: NDArray[np.bool_], column: Array) -> NDArray[np.bool_]:
 
 def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
     """Return the rows that repeat the row before in all columns, where the sensor itself does not repeat readings."""
-    same = [_released(np.concatenate([[False], column[1:] == column[:-1]]), column) for column in values]
-    every = np.logical_and.reduce(same)
-    count, n = int(np.count_nonzero(every)), len(every)
-    by_chance = n * float(np.prod([np.count_nonzero(each) / n for each in same]))
+    n = len(values[0])
+    every, by_chance = np.arange(n) > 0, float(n)
+    for column in values:
+        same = _released(column[1:] == column[:-1], column)
+        every[1:] &= same
+        if not every.any():
+            return every
+        by_chance *= np.count_nonzero(same) / n
+    count = int(np.count_nonzero(every))
     rare = (
         len(values) > 1
         and count > _BEYOND_CHANCE_ZEROS * by_chance + 2 * _BEYOND_CHANCE_ZEROS * np.sqrt(by_chance)

@@ -14,7 +14,7 @@ c_3 makes of its scale factor, ``c_3 <p^4> / <p^2>``, is in the uncertainties wh
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -31,6 +31,7 @@ from imulab.procedures.gyro_array.elements import Elements
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.mean_noise import mean_uncertainties
+from imulab.units import to_si
 
 # At rest: biases with their uncertainty, and noise.
 
@@ -65,8 +66,15 @@ def at_rest(still: Recording, rate: float, elements: Elements, record: Calibrati
     """
     n, duration = elements.count, len(still) / rate
     names = [name for row in elements.names for name in row]
-    bias = [float(still.si(name).mean()) for name in names]
-    each = columns_noise(map(still.si, names), rate, candidates=_CANDIDATES)
+    bias: list[float] = []
+
+    def columns() -> Iterator[Array]:
+        for name in names:
+            values = still.column(name)
+            bias.append(to_si(float(values.mean()), still.units[name]))
+            yield values
+
+    each = columns_noise(columns(), rate, candidates=_CANDIDATES, units=[still.units[name] for name in names])
     notes: list[str] = []
     if record is None:
         spread = np.array([gyro.mean_uncertainty(duration) for gyro in each])
