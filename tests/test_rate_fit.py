@@ -10,6 +10,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
+from imulab.display import Note
 from imulab.procedures.rate.schema import RateTest, Run, load_test, manifest_text
 from imulab.procedures.rate.simulate import RateRecordings
 from reference import rate as reference
@@ -531,6 +532,9 @@ def test_a_kink_at_zero_is_said_since_no_power_of_the_rate_compensates_it():
     assert found.linearity["z"].kink == pytest.approx(3e-4, rel=0.15)
     assert any("with a kink at 0 that no power" in w for w in found.calibration.warnings)
     assert found.calibration.verdict.state == "look"
+    # A table of 100 ppm hides the 24 ppm that are left.
+    coarse = il.fit_rate(kinked, table_uncertainty="100 ppm").calibration
+    assert [type(w) for w in coarse.warnings if "with a kink" in w] == [Note]
     bent = changed(made, gyro_z=made.column("gyro_z") + 1e-4 * SCALE[2] * rate**2)
     assert il.fit_rate(bent).linearity["z"].kink is None
 

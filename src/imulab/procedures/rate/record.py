@@ -164,7 +164,9 @@ def make_record(
             *_warn_other_unit(test, recordings),
             *_warn_output_unit(parameters, unit),
             *_warn_table(test, parameters, axes is not None, any("table_angle" in source for source in recordings)),
-            *_warn_line(linearity, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True)), order),
+            *_warn_line(
+                linearity, parameters, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True)), order
+            ),
             *_note_scatter(problem, solution),
             *(warn_faces(test, recordings, dwells) if axes is None else note_lean(axes, test)),
             *note_sweeps(test, dwells),
@@ -344,7 +346,9 @@ def _warn_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bo
     return messages
 
 
-def _warn_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], asked: str) -> list[str]:
+def _warn_line(
+    linearity: Mapping[str, Linearity], parameters: Mapping[str, Parameter], orders: Mapping[str, int], asked: str
+) -> list[str]:
     """Return warnings of what the chosen powers of the rate do not compensate: bends, kinks and hysteresis."""
     messages: list[str] = []
     for axis, line in linearity.items():
@@ -365,14 +369,15 @@ def _warn_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], as
                 )
             )
         if line.kink is not None:
-            messages.append(
-                Finding(
-                    f"gyro_{axis}: the slopes of positive and negative rates differ by {1e6 * line.kink:+.3g} ppm, "
-                    f"with a kink at 0 that no power of the rate compensates: at most {1e6 * line.by_polynomial:.3g} "
-                    "ppm of the largest rate are left",
-                    "use the calibration for one sign of the rate, or check the table at low rates",
-                )
+            text = (
+                f"gyro_{axis}: the slopes of positive and negative rates differ by {1e6 * line.kink:+.3g} ppm, with a "
+                f"kink at 0 that no power of the rate compensates: at most {1e6 * line.by_polynomial:.3g} ppm of the "
+                "largest rate are left"
             )
+            action = "use the calibration for one sign of the rate, or check the table at low rates"
+            scale = parameters[f"gyro_scale_factor_{axis}"]
+            known = (scale.standard_uncertainty or 0.0) / abs(scale.value)
+            messages.append(Note(text) if line.by_polynomial < known else Finding(text, action))
         if line.loop is not None and line.loop < HYSTERESIS.level and line.hysteresis is not None:
             messages.append(
                 Finding(
