@@ -325,11 +325,12 @@ def test_the_guess_of_an_unknown_stream_is_taken_and_the_session_goes_on(recordi
         assert watched.events[-1].text.startswith(f"{watched.session.source}: unknown format")
         watched.until(lambda: sender.sent > 2000)  # one looks at it for a while
         watched.events += watched.runner.take_guess()
-        assert watched.session.view().samples > 500  # those before the question
+        assert watched.session.view().samples > 0  # those before the question
         watched.hold(3)
         sender.stop()
         link.close()
     watched.runner.close()
     kept = il.read(watched.path)
     assert kept.units["accel_x"] == "g"
+    assert kept.si("time")[0] - time_[0] < 1  # from before the question
     assert kept.si("time")[-1] - kept.si("time")[0] > 20
