@@ -276,10 +276,11 @@ def _allan_covariance(
         readings = _readings_si(still, elements, slice(part[0], part[-1] + 2 * size)) - rest.bias
         if aligned is not None:
             readings = np.einsum("iab,mbi->mai", np.linalg.inv(aligned.sensing), readings)
-        total = np.concatenate([np.zeros((1, *readings.shape[1:])), np.cumsum(readings, axis=0)])
+        total = np.zeros((len(elements.axes), n, len(readings) + 1))
+        np.cumsum(np.moveaxis(readings, 0, 2), axis=2, out=total[:, :, 1:])  # of each gyro, whose readings lie together
         its = part - part[0]
-        difference = (total[its + 2 * size] - 2 * total[its + size] + total[its]) / size
-        covariance += np.einsum("kai,kaj->aij", difference, difference)
+        difference = (total[:, :, its + 2 * size] - 2 * total[:, :, its + size] + total[:, :, its]) / size
+        covariance += difference @ difference.transpose(0, 2, 1)
     # Equivalent number of independent differences for white noise: NIST SP 1065, table 5.
     freedom = max(2, round(1.5 * m / size))
     return covariance / (2 * len(starts)), size / rate, freedom
