@@ -143,7 +143,7 @@ def split_temperatures(solution: ThermalSolution, cluster: NDArray[np.int64]) ->
     whole[: len(solution.coefficients)] = solution.coefficients
     target = rows.jacobian @ whole - rows.residual
     at = np.where(rows.owner >= 0, cluster[rows.owner], -1)
-    white = whitener(rows, solution.excess**2, solution.scatter.tau)
+    white = solution.white
     covariance = row_covariance(rows, solution.excess**2, solution.scatter.tau)
     for number in range(1, int(cluster.max(initial=0))):
         jacobian, missing = _remove_knot(rows.jacobian, solution.laws, number)
@@ -569,7 +569,7 @@ def _explain_temperatures(temperature: Array, rate: Array) -> str | None:
 def _is_observable(solution: ThermalSolution, size: int, free: int, wanted: tuple[int, ...]) -> bool:
     """Return whether the columns of the wanted lag and loops are independent of the laws and of each other."""
     rows = solution.rows
-    white = whitener(rows, solution.excess**2, solution.scatter.tau)
+    white = solution.white
     rest = white(np.delete(rows.jacobian, np.s_[size : size + free], axis=1))
     columns = white(rows.drift[:, list(wanted)])
     length = np.linalg.norm(columns, axis=0)

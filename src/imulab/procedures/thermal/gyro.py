@@ -952,7 +952,7 @@ def block_diagonal(first: Array, second: Array) -> Array:
 def joint_covariance(gyros: ThermalGyroscopes, scale: ScaleLaws) -> Array:
     """Return the covariance of the coefficients of `gyros`, fitted to outputs over S(T), and of those of `scale`."""
     solution, held = gyros.solution, gyros.held
-    white = whitener(solution.rows, solution.excess**2, solution.scatter.tau)
+    white = solution.white
     inverse = np.linalg.pinv(white(solution.rows.jacobian), rcond=1e-13)
     # db / dS: each mean changes by -mean / S for a unit of S.
     functions, size = scale.functions(held.temperature), len(scale.coefficients) - 6

@@ -28,7 +28,6 @@ from imulab.procedures.thermal.model import GROUPS
 from imulab.procedures.thermal.solve import (
     ThermalProblem,
     ThermalSolution,
-    whitener,
 )
 from imulab.recording import Array
 
@@ -47,7 +46,7 @@ def bias_shift_from_unobserved(problem: ThermalProblem, solution: ThermalSolutio
     groups = [group for group in _USUAL_SLOPES if not laws.degrees[group]]
     if not groups:
         return []
-    white = whitener(rows, solution.excess**2, solution.scatter.tau)
+    white = solution.white
     jacobian = white(rows.jacobian)
     inverse = np.linalg.pinv(jacobian, rcond=1e-13)
     design = laws.design(np.linspace(laws.low, laws.high, _PLACES))[:, :3]
@@ -108,7 +107,7 @@ def cover_hidden(
     ``(J' V^-1 J)^-1 J' V^-1 c``; where the recordings show an effect, little of it remains.
     """
     rows, laws, size = solution.rows, solution.laws, solution.laws.size
-    white = whitener(rows, solution.excess**2, solution.scatter.tau)
+    white = solution.white
     jacobian = white(rows.jacobian)
     inverse = np.linalg.pinv(jacobian, rcond=1e-13)
     design = laws.design(np.linspace(laws.low, laws.high, _PLACES))

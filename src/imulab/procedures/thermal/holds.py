@@ -25,7 +25,7 @@ from imulab.display import Bad, Finding, Note, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import DIRECTION_WANDERS
 from imulab.estimation.noise.readings import no_gravity
-from imulab.estimation.rows import MAD_TO_SIGMA, median, medians, quantile
+from imulab.estimation.rows import MAD_TO_SIGMA, distinct, median, medians, quantile
 from imulab.procedures.thermal import LEAST_SPAN, SETTLE
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, TIME_DOUBTED, Attitudes, attitudes_and_samples
 from imulab.recording import Array, Recording, check_finite
@@ -403,8 +403,9 @@ def pool_covariance(cuts: Sequence[Cut]) -> Array:
 
 def reading_uncertainty(temperature: Array) -> float:
     """Return the standard uncertainty of a thermometer by the step of its readings, K: step / sqrt(12)."""
-    values = np.unique(np.round(temperature, 6))
-    digits = next((k for k in range(6) if np.array_equal(np.round(values, k), values)), 6)
+    values = distinct(np.round(temperature, 6))
+    few = values[:9]
+    digits = next((k for k in range(6) if all(np.array_equal(np.round(each, k), each) for each in (few, values))), 6)
     step = min(10.0**-digits, float(np.diff(values).min()) if len(values) > 1 else np.inf)
     return step / float(np.sqrt(12))
 
@@ -514,6 +515,8 @@ def _choose_temperature(recording: Recording, column: str | None) -> Recording:
 
 def _use_temperature(recording: Recording, column: str) -> Recording:
     """Return the recording with a column as its temperature."""
+    if column == "temperature":
+        return recording
     return recording.with_columns({"temperature": recording.column(column)}, {"temperature": recording.units[column]})
 
 
@@ -636,18 +639,18 @@ def _settles(before: Array, value: float) -> bool:
 
 def _note_constant(recordings: Sequence[Recording]) -> list[Recording]:
     """Return the recordings with a note on each whose temperature is constant while that of others changes."""
-    counts = [
-        0 if recording.time is None else len(np.unique(recording.column("temperature"))) for recording in recordings
-    ]
-    if max(counts) < _READINGS:
+    constant = [each.time is not None and not np.ptp(each.column("temperature")) for each in recordings]
+    if not any(constant) or not any(
+        len(distinct(each.column("temperature"))) >= _READINGS for each in recordings if each.time is not None
+    ):
         return list(recordings)
     note = Finding(
         "column temperature: the same value in every row, while it changes in other recordings: a thermometer stuck?",
         "check the thermometer, and record this file again",
     )
     return [
-        replace(recording, notes=(*recording.notes, prefixed(recording.name, note))) if count == 1 else recording
-        for recording, count in zip(recordings, counts, strict=True)
+        replace(recording, notes=(*recording.notes, prefixed(recording.name, note))) if is_constant else recording
+        for recording, is_constant in zip(recordings, constant, strict=True)
     ]
 
 

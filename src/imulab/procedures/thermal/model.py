@@ -83,7 +83,7 @@ class Laws:
     def design(self, temperature: Array) -> Array:
         """Return the matrices from the fit's coefficients to the parameters at temperatures, shape (n, 9, size)."""
         functions = np.asarray(chebyshev.chebvander(self.place(temperature), max(self.degrees)), np.float64)
-        return self._spread(functions, self.bias_functions(temperature))
+        return self._spread(functions, self.cardinal(temperature) if self.knots else functions)
 
     def bias_functions(self, temperature: Array) -> Array:
         """Return the functions of a bias's law in the fit, shape (n, terms)."""

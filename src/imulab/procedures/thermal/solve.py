@@ -93,9 +93,9 @@ class Rows:
     def members(self) -> list[NDArray[np.intp]]:
         """Rows of each recording, shape (r, m): an item for all r recordings of m rows."""
         order = np.argsort(self.recording, kind="stable")
-        count = np.unique(self.recording, return_counts=True)[1]
+        count = np.bincount(self.recording)
         first = np.cumsum(count) - count
-        return [order[first[count == m][:, None] + np.arange(m)] for m in np.unique(count).tolist()]
+        return [order[first[count == m][:, None] + np.arange(m)] for m in sorted({*count.tolist()} - {0})]
 
     def part(self, which: NDArray[Any]) -> Rows:
         """Return some of the rows, with every column."""
@@ -353,6 +353,7 @@ _BLOCK = 64  # rows that are substituted at once
 
 _PASSES, _STEPS = 4, 12  # passes until scatter and solution agree; Gauss-Newton steps in each
 _RESTS = 1e-10  # relative change of the coefficients that ends the steps
+_FAST = 0.1  # ratio of two steps below which the next one is taken to have it too
 _LOOSE = 0.01
 """Scatter that is assumed at the start, since the first fit has no laws of the temperature, g."""
 _SEEN = 1e-7
@@ -400,6 +401,11 @@ class ThermalSolution:
     freedom: int
     converged: bool
 
+    @cached_property
+    def white(self) -> Callable[[Array], Array]:
+        """What whitens the rows: the inverse of the Cholesky factor of V."""
+        return whitener(self.rows, self.excess**2, self.scatter.tau)
+
     def degrees_of_freedom(self, weights: Array) -> float:
         """Return Satterthwaite's degrees of freedom of ``weights . coefficients``, which may be the first ones only."""
         n = len(weights)
@@ -416,19 +422,19 @@ def solve(problem: ThermalProblem, laws: Laws, *, tau: float | None = None) -> T
 
     Gauss-Newton steps of ``r' V^-1 r`` alternate with estimates of excess and tau, which V depends on.
     """
-    still = replace(problem, free=())
+    still, at = replace(problem, free=()), LawsAtHolds.of(problem, laws)
     coefficients = _start(still, laws)
     if problem.free:  # the derivative by a lag is the slope of laws, which must be fitted first
-        begun = linearise(still, laws, coefficients)
-        coefficients = _iterate(still, laws, coefficients, begun, _LOOSE**2, np.zeros(2), 1e-6)[0]
+        begun = linearise(still, laws, coefficients, at)
+        coefficients = _iterate(still, laws, coefficients, at, begun, _LOOSE**2, np.zeros(2), 1e-6)[0]
         coefficients = np.append(coefficients, np.zeros(len(problem.free)))
-    rows = linearise(problem, laws, coefficients)
+    rows = linearise(problem, laws, coefficients, at)
     excess, excess_freedom, scatter, converged = 0.0, np.inf, Scatter(), False
     if tau is not None:
         scatter = Scatter(np.array([tau, 0.0]))
     for number in range(_PASSES):
         coefficients, rows, converged = _iterate(
-            problem, laws, coefficients, rows, excess, scatter.tau, _RESTS if number else 1e-6
+            problem, laws, coefficients, at, rows, excess, scatter.tau, _RESTS if number else 1e-6
         )
         if not converged:
             break
@@ -462,10 +468,9 @@ def conclude(
 def _start(problem: ThermalProblem, laws: Laws) -> Array:
     """Return the coefficients to start from: those of a fit with constant parameters."""
     flat = replace(laws, degrees=(0, 0, 0), knots=())
-    start = nominal(flat, problem.zero)
-    return laws.constant(
-        _iterate(problem, flat, start, linearise(problem, flat, start), _LOOSE**2, np.zeros(2), 1e-3)[0]
-    )
+    start, at = nominal(flat, problem.zero), LawsAtHolds.of(problem, flat)
+    rows = linearise(problem, flat, start, at)
+    return laws.constant(_iterate(problem, flat, start, at, rows, _LOOSE**2, np.zeros(2), 1e-3)[0])
 
 
 def nominal(laws: Laws, zero: Array) -> Array:
@@ -477,13 +482,17 @@ def _iterate(
     problem: ThermalProblem,
     laws: Laws,
     coefficients: Array,
+    at: LawsAtHolds,
     rows: Rows,
     excess: float,
     tau: Array,
     tolerance: float,
 ) -> tuple[Array, Rows, bool]:
-    """Return coefficients and rows after Gauss-Newton steps with fixed V, and whether they converged."""
-    at = LawsAtHolds.of(problem, laws)
+    """Return coefficients and rows after Gauss-Newton steps with fixed V, and whether they converged.
+
+    They have where a step is below the tolerance, or where steps shrink fast and the next one would be.
+    """
+    before = 0.0
     for _ in range(_STEPS):
         white = whitener(rows, excess, tau)
         jacobian = white(rows.jacobian)
@@ -491,8 +500,10 @@ def _iterate(
         step = -np.linalg.lstsq(jacobian / scale, white(rows.residual), rcond=1e-11)[0] / scale
         coefficients = coefficients + step[: len(coefficients)]
         rows = linearise(problem, laws, coefficients, at)
-        if np.abs(step[: laws.size]).max() < tolerance:
+        size = float(np.abs(step[: laws.size]).max())
+        if size < tolerance or size < before * min(_FAST, tolerance / size):
             return coefficients, rows, True
+        before = size
     return coefficients, rows, False
 
 
@@ -590,6 +601,11 @@ def _basis_beside(columns: Array, beside: Array) -> Array:
 
 def _is_independent(triangle: Array) -> bool:
     """Return whether the columns of a triangle, each of length 1, are independent."""
+    size = len(triangle)
+    if np.abs(triangle.diagonal()).min() > _SEEN:  # then often a bound of the smallest singular value tells
+        inverse = np.linalg.inv(triangle)
+        if np.einsum("ij,ij", inverse, inverse) * size * _SEEN**2 < 1:
+            return True
     values = np.linalg.svd(triangle, compute_uv=False)
     return bool(values[-1] > _SEEN * values[0])
 

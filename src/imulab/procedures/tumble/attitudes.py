@@ -366,6 +366,7 @@ SMALLEST_BLOCK = 4
 """Least number of samples in a block whose scatter is estimated."""
 _TREMOR_SECONDS = 0.125
 """A period of a hand's tremor: the magnitudes of shorter blocks rectify it, longer ones hide the motion of the hand."""
+_TOGETHER = 1 << 16  # samples of short stretches that are looked at together
 _BATCHES = 10
 """Batches per attitude: few, so that they are long against the correlation of the noise, but enough to tell it."""
 
@@ -397,7 +398,7 @@ class HeldStill(Struct, frozen=True):
         columns = tuple(np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)
         stop = np.cumsum(size)
         mean, scatter, unused = np.empty((stop[-1], 3)), np.empty((stop[-1], 3)), np.empty(stop[-1])
-        for (x, y, z), part in _stretches(columns, begin, stop - size, stop, length):
+        for (x, y, z), _, part in _stretches(columns, begin, stop - size, stop, length):
             _segment.blocks(x, y, z, x, length, mean[part], scatter[part], unused[part])
         first = np.unique(attitude, return_index=True)[1]
         total = np.add.reduceat(size, first)[:, None]
@@ -407,11 +408,21 @@ class HeldStill(Struct, frozen=True):
 
 def _stretches(
     columns: tuple[Array, ...], first: NDArray[np.int64], start: NDArray[np.int64], stop: NDArray[np.int64], length: int
-) -> Iterator[tuple[list[Array], slice]]:
-    """Yield the samples of each stretch, and which blocks they are; memory of temporary files is given back behind."""
-    for begin, a, b in zip(first.tolist(), start.tolist(), stop.tolist(), strict=True):
-        yield [column[begin : begin + (b - a) * length] for column in columns], slice(a, b)
+) -> Iterator[tuple[list[Array], slice, slice]]:
+    """Yield the samples of one stretch or of several short ones, and which stretches and which blocks they are.
+
+    Memory of temporary files is given back behind.
+    """
+    begin = 0
+    while begin < len(first):
+        end = max(begin + 1, int(np.searchsorted(stop, start[begin] + _TOGETHER // length, side="right")))
+        which, blocks = slice(begin, end), slice(int(start[begin]), int(stop[end - 1]))
+        ends = first[which] + (stop - start)[which] * length
+        parts = [slice(a, b) for a, b in zip(first[which].tolist(), ends.tolist(), strict=True)]
+        each = [[column[part] for part in parts] for column in columns]
+        yield [np.concatenate(its) if len(its) > 1 else its[0] for its in each], which, blocks
         release(*columns)
+        begin = end
 
 
 def _statistics(held: HeldStill) -> tuple[Array, Array, Array]:
@@ -446,13 +457,13 @@ def _shrink_covariance(covariance: Array, freedom: Array, share: Array) -> Array
 def _motion(held: HeldStill, moments: Array, freedom: Array, share: Array) -> Motion:
     """How the attitudes moved: ``D = cov(x_k) - C_w / B + [mean(e e') - C_w / 2B] / 12``, B samples in a block."""
     count, size = len(held.centre), held.stop - held.start
-    sums, its = np.zeros((3, count, 3, 3)), np.empty((3, 1, 3, 3))
-    stretches = _stretches(held.columns, held.first, held.start, held.stop, held.length)
-    zero = np.zeros(1, dtype=np.int64)
-    for number, ((x, y, z), part) in zip(held.attitude.tolist(), stretches, strict=True):
-        blocks, centre = held.mean[part], held.centre[number : number + 1]
-        _segment.motion(x, y, z, held.length, blocks, zero, zero + len(blocks), zero, centre, *its)
-        sums[:, number] += its[:, 0]
+    sums, its = np.zeros((3, count, 3, 3)), np.empty((3, count, 3, 3))
+    for (x, y, z), which, part in _stretches(held.columns, held.first, held.start, held.stop, held.length):
+        start, stop = held.start[which] - part.start, held.stop[which] - part.start
+        _segment.motion(
+            x, y, z, held.length, held.mean[part], start, stop, held.attitude[which], held.centre, *its
+        )  # fmt: skip
+        sums += its
     terms = size * held.length - 1, size, np.maximum(size - 2, 0)
     numbers = np.array([np.bincount(held.attitude, each, count) for each in terms])
     difference, spread, slope = sums / np.maximum(numbers, 1)[:, :, None, None]
@@ -817,7 +828,7 @@ def _drifts(recording: Recording) -> bool:
     column = recording.column("temperature")
     read = column[np.isfinite(column)]
     release(column)
-    return bool(read.size) and quantile(read, 0.95) - quantile(read, 0.05) > _DRIFT
+    return bool(read.size and np.ptp(read) > _DRIFT) and quantile(read, 0.95) - quantile(read, 0.05) > _DRIFT
 
 
 def _choose(candidates: list[_Pieces], *, drifting: bool = False) -> int:
