@@ -275,7 +275,7 @@ def _average_still(
     spread = [medians(np.abs(output[piece] - m), 0) for piece, m in zip(pieces, middle, strict=True)]
     steps = [np.diff(np.unique(column)) for column in output[rest].T]
     sigma = np.maximum(MAD_TO_SIGMA * medians(np.array(spread), 0), [step.min() for step in steps])
-    cuts: list[Cut | None] = []
+    kept: dict[int, NDArray[np.intp]] = {}
     notes: list[str] = []
     for index, piece, m in zip(members.tolist(), pieces, middle, strict=True):
         still = between_turns(np.all(np.abs(output[piece] - m) <= STILL_SIGMAS * sigma, axis=1))
@@ -286,12 +286,15 @@ def _average_still(
                     "record this hold again, with the unit at rest",
                 )
             )
-            cuts.append(None)
             continue
-        kept = np.flatnonzero(still) + piece.start
-        start = np.zeros(1, dtype=np.int64)
-        cuts += average_cuts(output[kept], temperature[kept], time[kept], start, start, start + index)
-    return rest, cuts, notes
+        kept[index] = np.flatnonzero(still) + piece.start
+    cuts: dict[int, Cut] = {}
+    if kept:
+        which, count = np.concatenate(list(kept.values())), np.array([len(each) for each in kept.values()])
+        begin, number = np.zeros_like(count), np.array(list(kept))
+        averages = average_cuts(output[which], temperature[which], time[which], np.cumsum(count) - count, begin, number)
+        cuts = dict(zip(kept, averages, strict=True))
+    return rest, [cuts.get(index) for index in members.tolist()], notes
 
 
 def between_turns(still: NDArray[np.bool_]) -> NDArray[np.bool_]:

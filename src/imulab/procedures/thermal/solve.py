@@ -90,12 +90,13 @@ class Rows:
     recording: NDArray[np.int64]
 
     @cached_property
-    def members(self) -> list[NDArray[np.intp]]:
-        """Rows of each recording, shape (r, m): an item for all r recordings of m rows."""
-        order = np.argsort(self.recording, kind="stable")
-        count = np.bincount(self.recording)
+    def blocks(self) -> tuple[list[Block], Array]:
+        """The blocks of V, one for all recordings of equally many rows, and the columns of `errors` that they share."""
+        order, count = np.argsort(self.recording, kind="stable"), np.bincount(self.recording)
         first = np.cumsum(count) - count
-        return [order[first[count == m][:, None] + np.arange(m)] for m in sorted({*count.tolist()} - {0})]
+        members = [order[first[count == m][:, None] + np.arange(m)] for m in sorted({*count.tolist()} - {0})]
+        shared = np.concatenate([self.errors[which].any(axis=1) for which in members]).sum(axis=0) > 1
+        return [Block.of(self, which, self.errors[:, ~shared]) for which in members], self.errors[:, shared]
 
     def part(self, which: NDArray[Any]) -> Rows:
         """Return some of the rows, with every column."""
@@ -131,6 +132,45 @@ class LawsAtHolds:
         number = np.where(problem.shared, problem.recording, problem.recording.max(initial=0) + 1 + np.arange(n))
         temperature = problem.temperature
         return cls(laws.design(temperature), laws.slope(temperature), owner, rows % 3, one_hot(number[owner]))
+
+
+@dataclass(frozen=True)
+class Block:
+    """What V is at any excess and scatter for r recordings of m rows each.
+
+    Attributes
+    ----------
+    which
+        The rows of each recording, shape (r, m).
+    fixed
+        Covariances by noise and errors of the temperature, shape (r, m, m).
+    held
+        1 for rows of holds, 0 for those of a prior, shape (r, m).
+    offsets
+        Columns of the offsets of bias and scale factor that these rows feel, shape (r, m, k) each.
+    """
+
+    which: NDArray[np.intp]
+    fixed: Array
+    held: Array
+    offsets: list[Array]
+
+    @classmethod
+    def of(cls, rows: Rows, which: NDArray[np.intp], errors: Array) -> Block:
+        """Return that of some of the rows, with these errors of the temperature, shape (N, e)."""
+        every = [columns[which] for columns in (errors, *rows.offsets)]
+        felt, *offsets = [columns[:, :, columns.any(axis=(0, 1))] for columns in every]
+        fixed = rows.noise[which[:, :, None], which[:, None, :]] + felt @ felt.swapaxes(1, 2)
+        return cls(which, fixed, np.where(rows.owner[which] >= 0, 1.0, 0.0), offsets)
+
+    def covariance(self, excess: float, tau: Array) -> Array:
+        """Return V of these rows, shape (r, m, m)."""
+        whole, diagonal = self.fixed.copy(), np.arange(self.which.shape[1])
+        whole[:, diagonal, diagonal] += excess * self.held
+        for size, columns in zip(tau.tolist(), self.offsets, strict=True):
+            if size > 0:
+                whole += size**2 * columns @ columns.swapaxes(1, 2)
+        return whole
 
 
 def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, at: LawsAtHolds | None = None) -> Rows:
@@ -277,20 +317,7 @@ def _add_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coeffi
 
 def row_covariance(rows: Rows, excess: float, tau: Array) -> Array:
     """Return V, shape (N, N)."""
-    whole: Array = _covariances(rows, np.arange(len(rows.residual))[None], rows.errors, excess, tau)[0]
-    return whole
-
-
-def _covariances(rows: Rows, which: NDArray[np.intp], errors: Array, excess: float, tau: Array) -> Array:
-    """Return V of some of the rows (r, m) by noise, offsets and these errors of the temperature, shape (r, m, m)."""
-    whole: Array = rows.noise[which[:, :, None], which[:, None, :]]
-    diagonal = np.arange(which.shape[1])
-    whole[:, diagonal, diagonal] += np.where(rows.owner[which] >= 0, excess, 0.0)
-    for size, columns in zip([1.0, *tau.tolist()], (errors, *rows.offsets), strict=True):
-        if size > 0:
-            felt = columns[which]
-            felt = size * felt[:, :, felt.any(axis=(0, 1))]
-            whole += felt @ felt.swapaxes(1, 2)
+    whole: Array = Block.of(rows, np.arange(len(rows.residual))[None], rows.errors).covariance(excess, tau)[0]
     return whole
 
 
@@ -301,10 +328,8 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
     share. What this adds, once whitened, has the factor of ``1 + c c'``: row i less ``c_i`` times the mean of the
     unknown as told by the rows before, over the root of its variance.
     """
-    felt = np.concatenate([rows.errors[which].any(axis=1) for which in rows.members])
-    shared = felt.sum(axis=0) > 1
-    its = rows.errors[:, ~shared]
-    blocks = [(which, whitener_of(_covariances(rows, which, its, excess, tau))) for which in rows.members]
+    parts, shared = rows.blocks
+    blocks = [(block.which, whitener_of(block.covariance(excess, tau))) for block in parts]
     common: list[Array] = []
 
     def white(columns: Array) -> Array:
@@ -319,7 +344,7 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
             whitened *= np.sqrt(known[:-1] / known[1:])[:, None]
         return whitened.reshape(np.shape(columns))
 
-    for column in rows.errors[:, shared].T:
+    for column in shared.T:
         common += [white(column)]  # by all before
     return white
 
