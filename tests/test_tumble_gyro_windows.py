@@ -22,7 +22,7 @@ def test_the_two_readings_between_samples_are_those_of_splines_through_samples_a
     through_samples = np.diff(CubicSpline(np.arange(120), values).antiderivative()(edges), axis=0) * pieces
     total = np.vstack([np.zeros(3), np.cumsum(values, axis=0)])
     through_sum = np.diff(CubicSpline(np.arange(121) - 0.5, total)(edges), axis=0) * pieces
-    readings = read_between(values, np.array([50]), 10, pieces)
+    readings = read_between(values, np.array([50]), np.array([60]), pieces)
     np.testing.assert_allclose(readings.middle[0] + readings.half[0], through_sum, atol=2e-5)
     np.testing.assert_allclose(readings.middle[0] - readings.half[0], through_samples, atol=2e-5)
 

@@ -128,11 +128,9 @@ def _describe_gyroscopes(record: Calibration, accelerometers: str) -> str:
     """Return the result of the gyroscopes' fit, without the accelerometers, whose record it uses."""
     from imulab.cli.show import verdict_lines
     from imulab.display import aligned
-    from imulab.procedures.tumble.figures import gyro_headline
-    from imulab.procedures.views import exhibits_of
-    from imulab.report.traces import ReportTable
+    from imulab.procedures.tumble.figures import gyro_headline, parameters_table
 
-    table = next(item for item in exhibits_of(record).items if isinstance(item, ReportTable))
+    table = parameters_table(record)
     rows = [row for row in table.rows if row[0].startswith("gyro_")]
     serial = record.sensor.get("serial", "unit without serial number")
     return "\n".join(

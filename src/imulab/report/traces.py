@@ -15,7 +15,7 @@ from msgspec import Struct, field
 from numpy.typing import ArrayLike, NDArray
 
 from imulab.estimation.clock import is_epoch, utc
-from imulab.estimation.rows import MAD_TO_SIGMA
+from imulab.estimation.rows import MAD_TO_SIGMA, median
 from imulab.recording import Array
 
 # Types.
@@ -305,8 +305,8 @@ def bulk(values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.
     if np.count_nonzero(finite) < _FEWEST:
         return None
     if usual is None:
-        distance = np.abs(values - np.median(values[finite]))
-        usual = distance <= _DEVIATIONS_OFF_AXIS * MAD_TO_SIGMA * float(np.median(distance[finite]))
+        distance = np.abs(values - median(values[finite]))
+        usual = distance <= _DEVIATIONS_OFF_AXIS * MAD_TO_SIGMA * median(distance[finite])
         if np.count_nonzero(finite & ~usual) > _MOST_OUT * len(values):
             return None
     inside = values[finite & usual]

@@ -1,4 +1,5 @@
-/* Turns: rotations composed step by step, and what they make of errors of the rate (rotation.py has the equations). */
+/* Turns: rotations composed step by step, and what they make of errors of the rate (rotation.py has the equations); and the
+ * rate between samples (windows.py). */
 #include "buffers.h"
 
 #include <math.h>
@@ -7,10 +8,16 @@ typedef struct {
     double w, x, y, z;
 } Quaternion;
 
-/* The rotation by a fraction of a rotation vector. */
-static Quaternion rotation_by(const double *vector, double fraction) {
-    const double x = fraction * vector[0], y = fraction * vector[1], z = fraction * vector[2];
-    const double half = 0.5 * sqrt(x * x + y * y + z * z), s = half == 0.0 ? 0.5 : 0.5 * sin(half) / half;
+/* The rotation by half a rotation vector, backwards; small ones by their series, to rounding. */
+static Quaternion half_back(const double *vector) {
+    const double x = -0.5 * vector[0], y = -0.5 * vector[1], z = -0.5 * vector[2];
+    const double q = 0.25 * (x * x + y * y + z * z); /* the square of half its angle */
+    if (q < 0.01) {
+        const double s = 1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (1.0 - q / 110.0))));
+        const double w = 1.0 - q / 2.0 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0 * (1.0 - q / 90.0 * (1.0 - q / 132.0)))));
+        return (Quaternion){w, 0.5 * s * x, 0.5 * s * y, 0.5 * s * z};
+    }
+    const double half = sqrt(q), s = 0.5 * sin(half) / half;
     return (Quaternion){cos(half), s * x, s * y, s * z};
 }
 
@@ -21,10 +28,9 @@ static Quaternion composed(Quaternion second, Quaternion first) {
                         a.w * b.y + b.w * a.y + (a.z * b.x - a.x * b.z), a.w * b.z + b.w * a.z + (a.x * b.y - a.y * b.x)};
 }
 
-/* Its matrix, row by row. */
+/* Its matrix, row by row; thousands of unit quaternions composed are one but for rounding. */
 static void matrix_of(Quaternion q, double *m) {
-    const double norm = sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z);
-    const double w = q.w / norm, x = q.x / norm, y = q.y / norm, z = q.z / norm;
+    const double w = q.w, x = q.x, y = q.y, z = q.z;
     m[0] = 1.0 - 2.0 * (y * y + z * z), m[1] = 2.0 * (x * y - w * z), m[2] = 2.0 * (x * z + w * y);
     m[3] = 2.0 * (x * y + w * z), m[4] = 1.0 - 2.0 * (x * x + z * z), m[5] = 2.0 * (y * z - w * x);
     m[6] = 2.0 * (x * z - w * y), m[7] = 2.0 * (y * z + w * x), m[8] = 1.0 - 2.0 * (x * x + y * y);
@@ -34,24 +40,27 @@ static void matrix_of(Quaternion q, double *m) {
    where `squares` is not NULL, the sum of (C' a)(C' a)' of the steps' own rotation vectors a. */
 static void turn(const double *angle, const double *weights, Py_ssize_t k, Py_ssize_t steps, double *matrix, double *sums, double *squares) {
     Quaternion whole = {1.0, 0.0, 0.0, 0.0};
-    double middle[9];
+    double middle[9]; /* C' */
     for (Py_ssize_t j = 0; j < 9 * k; j++) sums[j] = 0.0;
     for (int j = 0; squares && j < 9; j++) squares[j] = 0.0;
     for (Py_ssize_t i = 0; i < steps; i++, angle += 3, weights += k) {
-        if (k > 0 || squares) matrix_of(composed(rotation_by(angle, -0.5), whole), middle);
+        int moves = angle[0] != 0.0 || angle[1] != 0.0 || angle[2] != 0.0;
+        for (Py_ssize_t j = 0; j < k; j++) moves |= weights[j] != 0.0;
+        if (!moves) continue; /* beyond a turn's end */
+        const Quaternion half = half_back(angle), halfway = composed(half, whole);
+        whole = composed(half, halfway);
+        if (k > 0 || squares) matrix_of((Quaternion){halfway.w, -halfway.x, -halfway.y, -halfway.z}, middle);
         if (squares) {
             double moved[3];
-            for (int a = 0; a < 3; a++) moved[a] = middle[a] * angle[0] + middle[3 + a] * angle[1] + middle[6 + a] * angle[2];
+            for (int a = 0; a < 3; a++) moved[a] = middle[3 * a] * angle[0] + middle[3 * a + 1] * angle[1] + middle[3 * a + 2] * angle[2];
             for (int j = 0; j < 9; j++) squares[j] += moved[j / 3] * moved[j % 3];
         }
         for (Py_ssize_t j = 0; j < k; j++) {
-            for (int a = 0; a < 3; a++) {
-                for (int b = 0; b < 3; b++) sums[9 * j + 3 * a + b] += weights[j] * middle[3 * b + a];
-            }
+            for (int a = 0; a < 9; a++) sums[9 * j + a] += weights[j] * middle[a];
         }
-        whole = composed(rotation_by(angle, -1.0), whole);
     }
-    matrix_of(whole, matrix);
+    const double norm = sqrt(whole.w * whole.w + whole.x * whole.x + whole.y * whole.y + whole.z * whole.z);
+    matrix_of((Quaternion){whole.w / norm, whole.x / norm, whole.y / norm, whole.z / norm}, matrix);
 }
 
 PyDoc_STRVAR(turns_doc,
@@ -90,4 +99,49 @@ static PyObject *turns(PyObject *module, PyObject *args) {
     return released(v, BUFFERS, fits, wrong) ? Py_NewRef(Py_None) : NULL;
 }
 
-MODULE(_rotation, "Rotations composed step by step.", METHOD(turns))
+PyDoc_STRVAR(between_doc,
+             "between(values, c, kernels, start, stop, pieces, middle, half) -> None\n\n"
+             "values (n, c) at the samples, and kernels (taps, 2 pieces) of both kinds, to the pieces (m, steps * pieces, c) of\n"
+             "the steps from sample start[i] to stop[i] (int64, (m,)); those after are left as they are. The taps are centred on a step; beyond the ends of the values\n"
+             "the last ones count. float64 buffers without gaps.");
+
+static PyObject *between(PyObject *module, PyObject *args) {
+    enum { VALUES, KERNELS, START, STOP, MIDDLE, HALF, BUFFERS, MOST = 8, TAPS = 32 }; /* kinds; taps */
+    Py_buffer v[BUFFERS];
+    int pieces, columns;
+    (void)module;
+    if (!PyArg_ParseTuple(args, "y*iy*y*y*iw*w*", &v[VALUES], &columns, &v[KERNELS], &v[START], &v[STOP], &pieces, &v[MIDDLE],
+                          &v[HALF])) {
+        return NULL;
+    }
+    const Py_ssize_t kinds = 2 * (Py_ssize_t)pieces, m = v[START].len / INDEX_BYTES;
+    const int likely = columns > 0 && pieces > 0 && kinds <= MOST && m > 0;
+    const Py_ssize_t n = likely ? v[VALUES].len / DOUBLE_BYTES / columns : 0, taps = likely ? v[KERNELS].len / DOUBLE_BYTES / kinds : 0;
+    const Py_ssize_t steps = likely ? v[MIDDLE].len / DOUBLE_BYTES / (m * pieces * columns) : 0;
+    const int fits = n > 0 && v[VALUES].len == n * columns * DOUBLE_BYTES && v[KERNELS].len == taps * kinds * DOUBLE_BYTES && taps <= TAPS &&
+                     v[STOP].len == v[START].len && v[MIDDLE].len == m * steps * pieces * columns * DOUBLE_BYTES && v[HALF].len == v[MIDDLE].len;
+    if (fits) {
+        const double *values = v[VALUES].buf, *given = v[KERNELS].buf;
+        const int64_t *start = v[START].buf, *stop = v[STOP].buf;
+        double *middle = v[MIDDLE].buf, *half = v[HALF].buf, kernels[TAPS][MOST] = {{0.0}}; /* as many sums for any pieces */
+        for (Py_ssize_t i = 0; i < taps * kinds; i++) kernels[i / kinds][i % kinds] = given[i];
+        Py_BEGIN_ALLOW_THREADS
+        for (Py_ssize_t i = 0; i < m * steps; i++, middle += pieces * columns, half += pieces * columns) {
+            const Py_ssize_t step = (Py_ssize_t)start[i / steps] + i % steps, first = step + 1 - taps / 2;
+            if (step >= (Py_ssize_t)stop[i / steps]) continue;
+            for (int c = 0; c < columns; c++) {
+                double sums[MOST] = {0.0};
+                for (Py_ssize_t t = 0; t < taps; t++) {
+                    const Py_ssize_t at = first + t < 0 ? 0 : first + t < n ? first + t : n - 1;
+                    const double value = values[at * columns + c];
+                    for (int k = 0; k < MOST; k++) sums[k] += kernels[t][k] * value;
+                }
+                for (int k = 0; k < pieces; k++) middle[k * columns + c] = sums[k], half[k * columns + c] = sums[pieces + k];
+            }
+        }
+        Py_END_ALLOW_THREADS
+    }
+    return done(v, BUFFERS, fits);
+}
+
+MODULE(_rotation, "Rotations composed step by step, and the rate between samples.", METHOD(turns), METHOD(between))

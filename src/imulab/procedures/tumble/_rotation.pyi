@@ -11,3 +11,13 @@ def turns(
     sums: NDArray[Any],
     squares: NDArray[Any],
 ) -> None: ...
+def between(
+    values: NDArray[Any],
+    columns: int,
+    kernels: NDArray[Any],
+    start: NDArray[Any],
+    stop: NDArray[Any],
+    pieces: int,
+    middle: NDArray[Any],
+    half: NDArray[Any],
+) -> None: ...

@@ -29,6 +29,7 @@ import numpy as np
 from imulab.display import Note
 from imulab.estimation.decisions import SAMPLES_LOST, SCALE_CHANGE, SCALE_CHANGES_WITH_RATE
 from imulab.estimation.least_squares import chi_square_limit, f_test, restricted_log_likelihood
+from imulab.estimation.rows import median
 from imulab.procedures.tumble.gyro.rotation import weighted_turns
 from imulab.procedures.tumble.gyro.solve import TurnSolution
 from imulab.procedures.tumble.gyro.turns import body_rate, by_directions, directions_missed, misalignment, model
@@ -257,7 +258,7 @@ def noise_of_turns(solved: TurnSolution, theta: Array) -> tuple[float, float]:
     Neighbouring windows of a hold differ by both noises, once the gyroscopes have said how the unit moved in between.
     That bounds the density where the unit sways, by which neighbouring mean rates differ too.
     """
-    density, within = float(np.mean(solved.density / solved.scale**2)), solved.within
+    density, within = float(np.mean(solved.readings.density / solved.scale**2)), solved.readings.within(solved.rest)
     if not len(within.start):
         return density, 0.0
     left = directions_missed(within, solved.scale, theta).reshape(-1, 1, 3)
@@ -301,7 +302,7 @@ def _with_losses(estimate: TurnEstimate, matrix: Array, columns: Array, by_zero:
     if linearity is not None and linearity.probability < SCALE_CHANGES_WITH_RATE.level:
         jacobian = np.column_stack([jacobian, columns])
     residual = estimate.project(estimate.solution.residual[:, None])[:, 0]
-    size, n = float(np.median(np.diag(matrix))), len(matrix)
+    size, n = median(np.diag(matrix)), len(matrix)
     beyond = np.concatenate([size * _BEYOND, estimate.beyond * _AROUND])[:, None, None] * np.eye(n)
 
     def likelihoods(further: Array) -> Array:
@@ -347,7 +348,7 @@ def loss_covariance(estimate: TurnEstimate) -> Array:
     cross -= np.swapaxes(cross, 1, 2)
     arms = estimate.across @ turns.matrix @ cross
     # Pieces of one step are lost together.
-    each = solved.pieces * arms @ turns.squares @ np.swapaxes(arms, 1, 2)
+    each = solved.readings.span.pieces * arms @ turns.squares @ np.swapaxes(arms, 1, 2)
     m = len(each)
     whole = np.zeros((m, 2, m, 2))
     whole[range(m), :, range(m), :] = each
@@ -372,7 +373,8 @@ def rate_columns(estimate: TurnEstimate) -> tuple[Array, Array]:
     rate, t = body_rate(segments, scale, theta), misalignment(theta)
     sensed = np.where(segments.step[:, :, None] > 0, rate @ t.T, 0.0)
     largest = np.maximum(np.abs(sensed).max(axis=(0, 1)), 1e-12)
-    turns = weighted_turns(rate, segments.step, np.concatenate([sensed**3 / largest**2, sensed**2 / largest], axis=2))
+    square = sensed * sensed / largest
+    turns = weighted_turns(rate, segments.step, np.concatenate([square * sensed / largest, square], axis=2))
     inverse = np.linalg.inv(t)
     columns = [
         np.einsum("mij,mj->mi", turns.matrix, np.cross(segments.before, turns.weighted[:, k] @ -inverse[:, k % 3]))

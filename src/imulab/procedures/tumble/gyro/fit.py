@@ -26,7 +26,7 @@ from imulab.display import UNJUDGED, Bad, Finding, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
 from imulab.estimation.decisions import SCALE_OFF_UNIT, SCALES_OFF_ALIKE
 from imulab.estimation.least_squares import Observability, coverage_factor, observability
-from imulab.estimation.rows import LeftOut, leave_out
+from imulab.estimation.rows import LeftOut, leave_out, median
 from imulab.gravity import EARTH, EarthRate, at_latitude
 from imulab.options import PROGRAM, choice, measure
 from imulab.procedures.result import OWN_CLOCKS, Record, Result, as_record, as_recording
@@ -39,6 +39,7 @@ from imulab.procedures.tumble.gyro.solve import (
     CRYSTAL,
     ScaleClock,
     TurnProblem,
+    TurnReadings,
     TurnSolution,
     clock_of_scale,
     compare_clocks,
@@ -204,13 +205,13 @@ def fit_gyro_triad(
         *known.notes(apart=apart),
     ]
     if apart and clock_of == "gyro":
-        notes += clock_notes(find_holds(attitudes, stamps.time, output, recording.name), attitudes, stamps.time)
+        notes += _clock_notes(solved.readings)
     # Each turn fixes two angles: gravity does not show a rotation about its own direction.
     freedom = max(2 * len(solved.segments.start) - solved.theta.size, 1)
     conditioning = _observability_of_turns(solved, freedom, recording.name)
     directions = direction_covariance(record, means, case.force)
     estimate = estimate_turns(solved, directions, None if fit_bias else solved.rest.zero_uncertainty)
-    notes += estimate.notes(float(np.median(np.diff(stamps.time))))
+    notes += estimate.notes(median(np.diff(stamps.time)))
     fit = _triad_of_estimate(estimate, unit, fit_bias, conditioning, known, tuple(notes))
     return _on_earth(fit, case, earth)
 
@@ -223,6 +224,14 @@ def _outputs(recording: Recording) -> tuple[LeftOut, Array, Array]:
         column = triad("gyro")[int(np.argmax(dead))]
         raise DataError(f"{recording.name}: column {column}: the same output in every sample: a dead axis")
     return left_out, time, output
+
+
+def _clock_notes(readings: TurnReadings) -> list[str]:
+    """Say whether the gyroscopes, as they are stamped, move into one end of the holds."""
+    case, stamps, holds = readings.case, readings.stamps, readings.holds
+    if not np.array_equal(stamps.time, stamps.on_accel):
+        holds = find_holds(case.attitudes, stamps.time, case.output, case.smallest, case.name)
+    return clock_notes(holds, case.attitudes, stamps.time)
 
 
 def _on_accel_clock(case: TurnProblem, time: Array, sensitivity: str) -> Array:

@@ -18,7 +18,7 @@ from imulab.display import Finding
 from imulab.errors import DataError
 from imulab.estimation.decisions import BIAS_FOLLOWS_GRAVITY
 from imulab.estimation.least_squares import f_test
-from imulab.estimation.rows import MAD_TO_SIGMA
+from imulab.estimation.rows import MAD_TO_SIGMA, distinct, median, medians
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.device import specific_force
 from imulab.recording import Array
@@ -40,6 +40,7 @@ _TAPER = 0.25  # of the rest at each end, of the cosine that a tremor leaks thro
 _FLAT = 9 / 11  # 1 / int h^2 dt of such a window over its length: (1 - taper)^2 / (1 - 5 taper / 4)
 _HUBER = 2.5 * MAD_TO_SIGMA  # medians of the absolute deviation, 2.5 sigma: what is beyond pulls no stronger
 _REWEIGHTED = 20  # of Huber's fit
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # axes of a cross product
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,10 @@ class GyroRest:
     """Standard deviation of the zeros of the holds, (3,)."""
 
 
-def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> RestHolds:
+def find_holds(attitudes: Attitudes, time: Array, output: Array, smallest: Array, name: str) -> RestHolds:
     """Find when the gyroscopes are still: within five standard deviations of the hold's median, in all three.
+
+    `smallest` are the smallest steps between values of the output (`resolution`), (3,).
 
     Raises
     ------
@@ -95,9 +98,10 @@ def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> R
     if (stop <= start).any():
         label = attitudes.label(int(np.argmax(stop <= start)))
         raise DataError(f"{name}: no samples during {label}: do the two recordings share one clock?")
-    median = np.array([np.median(output[a:b], axis=0) for a, b in zip(start, stop, strict=True)])
-    spread = [np.median(np.abs(output[a:b] - m), axis=0) for a, b, m in zip(start, stop, median, strict=True)]
-    sigma = np.maximum(MAD_TO_SIGMA * np.median(spread, axis=0), _resolution(output))
+    held = [np.ascontiguousarray(output[a:b].T) for a, b in zip(start, stop, strict=True)]
+    usual = [medians(values) for values in held]
+    spread = [medians(np.abs(values - m[:, None])) for values, m in zip(held, usual, strict=True)]
+    sigma = np.maximum(MAD_TO_SIGMA * medians(np.array(spread), 0), smallest)
     first = np.searchsorted(time, attitudes.start - _EDGE)
     last = np.minimum(np.searchsorted(time, attitudes.stop + _EDGE), len(time) - 1)
     rate = float((stop - start).sum()) / max(float((time[stop - 1] - time[start]).sum()), 1e-9)
@@ -107,7 +111,7 @@ def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> R
     arrive, leave = first.copy(), last.copy()
     for k in range(len(start)):
         here = slice(first[k], last[k] + 1)
-        still[here] = (np.abs(output[here] - median[k]) <= STILL_SIGMAS * sigma).all(axis=1)
+        still[here] = (np.abs(output[here] - usual[k]) <= STILL_SIGMAS * sigma).all(axis=1)
         if not still[start[k] : stop[k]].any():
             still[here] = True  # it turns all the time: nothing tells rest from motion
         moved = first[k] + np.flatnonzero(~still[here])
@@ -121,7 +125,7 @@ def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> R
 
 def clock_notes(holds: RestHolds, attitudes: Attitudes, time: Array) -> list[str]:
     """Say if the gyroscopes, on another clock perhaps, move into one end of the holds and not into the other."""
-    into = np.median(time[holds.arrive] - attitudes.start), np.median(attitudes.stop - time[holds.leave])
+    into = median(time[holds.arrive] - attitudes.start), median(attitudes.stop - time[holds.leave])
     for late, other, when in ((*into, "stop turning {:.1f} s after"), (*into[::-1], "start turning {:.1f} s before")):
         if late > _LATE and other < late / 2:
             return [
@@ -133,17 +137,19 @@ def clock_notes(holds: RestHolds, attitudes: Attitudes, time: Array) -> list[str
     return []
 
 
-def beyond_range(output: Array) -> NDArray[np.bool_]:
+def beyond_range(output: Array, smallest: Array | None = None) -> NDArray[np.bool_]:
     """Return which samples lie in a flat top at the largest or smallest output of an axis, shape (n, 3).
+
+    `smallest` are the smallest steps between values of the output (`resolution`), where they are known.
 
     Four readings in a row, cut off where the output was still changing: the top of a slow turn in coarse steps is none,
     nor are readings that are each logged several times.
     """
     clipped = np.zeros(output.shape, dtype=np.bool_)
-    least = _CUT_OFF * _resolution(output)
+    least = _CUT_OFF * (resolution(output) if smallest is None else smallest)
     for axis, values in enumerate(output.T):
         repeats = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(values) != 0, [True]])))
-        flat = _FLAT_TOP * float(np.median(repeats))
+        flat = _FLAT_TOP * median(repeats)
         for extreme in (values.max(), values.min()):
             edges = np.flatnonzero(np.diff(np.concatenate([[False], values == extreme, [False]]).astype(np.int8)))
             for start, stop in edges.reshape(-1, 2).tolist():
@@ -154,9 +160,7 @@ def beyond_range(output: Array) -> NDArray[np.bool_]:
 
 
 def at_rest(
-    holds: RestHolds,
-    time: Array,
-    output: Array,
+    still: StillMeans,
     force: Array,
     sensitivity: str,
     density: Array,
@@ -166,17 +170,16 @@ def at_rest(
 ) -> GyroRest:
     """Return zero and g-sensitivity from the mean outputs of the quiet holds, robust least squares over the holds.
 
-    `density` is the noise of the outputs (`noise_density`), `scale` their output per rad/s where it is known. `earth`
-    is what is known of the Earth's rate in each hold, as output, (n, 3), which is taken off. Where that is nothing,
-    `vertical` is the output by all of it along up: what a part of that explains shows no g-sensitivity. Quiet is a hold
-    that is still for three quarters of its samples; where fewer than half are, that half.
+    `density` is the noise of the outputs (`noise_density`), `scale` their output per rad/s, where it is known: coning
+    is taken off then. `earth` is what is known of the Earth's rate in each hold, as output, (n, 3), which is taken off.
+    Where that is nothing, `vertical` is the output by all of it along up: what a part of that explains shows no
+    g-sensitivity. Quiet is a hold that is still for three quarters of its samples; of fewer than half, that half.
     """
-    means, fraction, length = _still_means(holds, time, output, scale)
-    quiet = fraction >= min(QUIET_SHARE, float(np.median(fraction)))
-    every = means - earth
+    quiet = still.fraction >= min(QUIET_SHARE, median(still.fraction))
+    every = still.mean - earth if scale is None else still.mean + still.coning * scale**2 / np.prod(scale) - earth
     mean, turned = every[quiet], force[quiet]
     n = len(mean)
-    middle = (holds.start + holds.stop)[quiet] / 2
+    middle = still.middle[quiet]
     when = (middle - middle.mean()) / max(float(np.ptp(middle)), 1.0)
     # A zero that drifts goes with some direction of f by chance: held against, and found beside, a slope in time.
     drift, whole = np.column_stack([np.ones(n), when]), np.column_stack([np.ones(n), turned, when])
@@ -197,8 +200,8 @@ def at_rest(
         rest = GyroRest(fit.values[0], fit.values[1:4].T, zero_uncertainty, fit.uncertainty[1:4])
         every = every - force @ fit.values[1:4]
     deviation = np.where(quiet[:, None], every - rest.zero, 0.0)
-    limit = _HUBER * np.median(np.abs(deviation[quiet]), axis=0)
-    alone = density / (_FLAT * float(np.median(length[quiet])))
+    limit = _HUBER * medians(np.abs(deviation[quiet]), 0)
+    alone = density / (_FLAT * median(still.length[quiet]))
     excess = np.maximum((MAD_TO_SIGMA * limit / _HUBER) ** 2 - alone, 0.0)
     share = excess / np.maximum(excess + alone / 2, 1e-300)
     return replace(
@@ -209,8 +212,31 @@ def at_rest(
     )
 
 
-def _still_means(holds: RestHolds, time: Array, output: Array, scale: Array | None) -> tuple[Array, Array, Array]:
-    """Return tapered means over the still samples of holds, (n, 3), the share of these, and their duration, s.
+@dataclass(frozen=True)
+class StillMeans:
+    """What the gyroscopes put out in each hold, over its still samples.
+
+    Attributes
+    ----------
+    mean
+        Tapered mean, (n, 3).
+    coning
+        What it lacks because the unit trembles, times ``s_x s_y s_z / s_i^2`` of the outputs per rad/s, (n, 3).
+    fraction
+        Share of still samples, (n,).
+    length, middle
+        Duration, s, and number of the sample in the middle, (n,).
+    """
+
+    mean: Array
+    coning: Array
+    fraction: Array
+    length: Array
+    middle: Array
+
+
+def still_means(holds: RestHolds, time: Array, output: Array) -> StillMeans:
+    """Return the mean outputs of holds.
 
     The ends are left out, where turns begin and end slowly. A unit that trembles about two axes turns about the third
     without getting anywhere (coning): 1/2 sum h (phi x w), phi the angle turned so far, is what the mean rate lacks.
@@ -218,7 +244,7 @@ def _still_means(holds: RestHolds, time: Array, output: Array, scale: Array | No
     first, last = time[holds.start], time[np.maximum(holds.stop - 1, holds.start)]
     edge = np.minimum(_ENDS[0], _ENDS[1] * (last - first))
     step = (last - first) / np.maximum(holds.stop - holds.start - 1, 1)
-    means, fraction = np.empty((len(first), 3)), np.empty(len(first))
+    means, coning, fraction = np.empty((len(first), 3)), np.empty((len(first), 3)), np.empty(len(first))
     length = last - first - 2 * edge + step
     for k, (a, b) in enumerate(np.searchsorted(time, [first + edge, last - edge + step / 2]).T.tolist()):
         a, b = (a, b) if b > a else (int(holds.start[k]), int(holds.stop[k]))
@@ -229,11 +255,11 @@ def _still_means(holds: RestHolds, time: Array, output: Array, scale: Array | No
         weight = np.where(still, weight, 0.0) if still.any() else weight
         weight = weight / weight.sum()
         means[k] = weight @ values
-        if scale is not None:
-            rate = np.where(still[:, None], (values - means[k]) / scale, 0.0)
-            angle = np.cumsum(rate, axis=0) * step[k] - 0.5 * rate * step[k]
-            means[k] += scale * (weight @ np.cross(angle - weight @ angle, rate)) / 2
-    return means, fraction, length
+        rate = np.where(still[:, None], values - means[k], 0.0)
+        angle = np.cumsum(rate, axis=0) * step[k] - 0.5 * rate * step[k]
+        turned = (angle - weight @ angle).T @ (weight[:, None] * rate)  # sum h phi_i w_j
+        coning[k] = (turned[_NEXT, _AFTER] - turned[_AFTER, _NEXT]) / 2
+    return StillMeans(means, coning, fraction, length, (holds.start + holds.stop) / 2)
 
 
 @dataclass(frozen=True)
@@ -259,8 +285,10 @@ def _robust_fit(design: Array, values: Array) -> _RobustFit:
         for _ in range(_REWEIGHTED):
             coefficients[:, k] = np.linalg.lstsq(design * weight[:, None], column * weight, rcond=None)[0]
             left = column - design @ coefficients[:, k]
-            limit = max(_HUBER * float(np.median(np.abs(left))), 1e-12 * float(np.abs(column).max()), 1e-300)
-            weight = np.sqrt(limit / np.maximum(np.abs(left), limit))
+            limit = max(_HUBER * median(np.abs(left)), 1e-12 * float(np.abs(column).max()), 1e-300)
+            before, weight = weight, np.sqrt(limit / np.maximum(np.abs(left), limit))
+            if np.array_equal(before, weight):
+                break
         inside = np.count_nonzero(np.abs(left) <= limit) / n
         scatter[k] = np.sqrt((np.clip(left, -limit, limit) ** 2).sum() / max(n - size, 1)) / inside
     return _RobustFit(coefficients, root[:, None] * scatter, scatter)
@@ -272,9 +300,9 @@ def _residuals(design: Array, values: Array) -> Array:
     return left
 
 
-def _resolution(output: Array) -> Array:
-    """Smallest step between the values of each axis, shape (3,)."""
-    values = [np.unique(column) for column in output.T]
+def resolution(output: Array) -> Array:
+    """Return the smallest step between the values of each axis, shape (3,)."""
+    values = [distinct(column) for column in output.T]
     return np.array([np.diff(v).min() if v.size > 1 else 0.0 for v in values])
 
 

@@ -99,7 +99,8 @@ def weighted_turns(rate: Array, step: Array, weights: Array, *, squares: bool = 
     """
     segments, n = step.shape
     start = n * np.arange(segments)
-    angle, scaled = rate * step[:, :, None], weights * step[:, :, None]
+    angle = rate * step[:, :, None]
+    scaled = angle if weights is rate else weights * step[:, :, None]
     return _turns(angle.reshape(-1, 3), scaled.reshape(segments * n, weights.shape[2]), start, start + n, squares)
 
 

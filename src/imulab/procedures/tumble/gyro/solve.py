@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -26,26 +27,38 @@ from imulab.estimation.decisions import (
     TURN_DISAGREEMENT,
 )
 from imulab.estimation.least_squares import Fit, covariance, f_test, least_squares
-from imulab.estimation.rows import MAD_TO_SIGMA
+from imulab.estimation.rows import MAD_TO_SIGMA, median
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.gyro.rest import GyroRest, at_rest, find_holds
+from imulab.procedures.tumble.gyro.rest import (
+    GyroRest,
+    RestHolds,
+    StillMeans,
+    at_rest,
+    beyond_range,
+    find_holds,
+    resolution,
+    still_means,
+)
 from imulab.procedures.tumble.gyro.rotation import frame_rotations
 from imulab.procedures.tumble.gyro.turns import (
     Segments,
+    Span,
     Stamps,
     choose_turns,
+    directions_missed,
     misalignment,
     model,
-    segments_between,
+    span_between,
     start_scale,
 )
 from imulab.procedures.tumble.gyro.windows import (
+    HoldEnds,
+    Readings,
     Windows,
     hann_means,
     hold_ends,
     neighbouring_pairs,
     noise_density,
-    pieces_of,
 )
 from imulab.recording import Array
 from imulab.units import parse_unit, to_si
@@ -172,8 +185,8 @@ def even_stamps(time: Array) -> tuple[Array, float] | None:
     replaced by a line through them, between gaps.
     """
     step = np.diff(time)
-    middle = float(np.median(step))
-    gap = step > 1.5 * float(step.mean()) + 8 * MAD_TO_SIGMA * float(np.median(np.abs(step - middle)))
+    middle = median(step)
+    gap = step > 1.5 * float(step.mean()) + 8 * MAD_TO_SIGMA * median(np.abs(step - middle))
     even = time.copy()
     edges = np.concatenate([[0], np.flatnonzero(gap) + 1, [len(time)]])
     for start, stop in pairwise(edges.tolist()):
@@ -201,7 +214,7 @@ def compare_clocks(
     search
         Whether delays up to two seconds are to be expected.
     """
-    step = max(_KNOT, 2 * float(np.median(np.diff(accel_time))))
+    step = max(_KNOT, 2 * median(np.diff(accel_time)))
     knots, carried = _carried_gravity(time, rate, segments, step)
     moved = np.gradient(carried, axis=1)
     spacing = np.gradient(knots, axis=1)
@@ -237,7 +250,7 @@ def _carried_gravity(time: Array, rate: Array, segments: Segments, step: float) 
     By how much a turn misses at its end is spread over it in proportion to the angle turned.
     """
     start, stop = np.searchsorted(time, segments.start), np.searchsorted(time, segments.stop)
-    samples = max(1, round(step / float(np.median(np.diff(time[start[0] : stop[0] + 1])))))
+    samples = max(1, round(step / median(np.diff(time[start[0] : stop[0] + 1]))))
     count = -(-int((stop - start).max()) // samples)
     index = np.minimum(start[:, None] + samples * np.arange(count + 1), stop[:, None])
     m = len(start)
@@ -256,10 +269,10 @@ def _fit_delay_line(when: Array, delay: Array) -> ClockComparison | None:
     if len(when) < _FEWEST:
         return None
     i, j = np.triu_indices(len(when), 1)
-    slope = float(np.median((delay[j] - delay[i]) / (when[j] - when[i])))
+    slope = median((delay[j] - delay[i]) / (when[j] - when[i]))
     left = delay - slope * when
-    left = left - np.median(left)
-    kept = np.abs(left) <= max(_OUTLIER * float(np.median(np.abs(left))), 1e-9)
+    left = left - median(left)
+    kept = np.abs(left) <= max(_OUTLIER * median(np.abs(left)), 1e-9)
     n = int(kept.sum())
     if n < _FEWEST:
         return None
@@ -301,6 +314,16 @@ class TurnProblem:
     vertical: Array | None = None
     """Output by the Earth's whole rate along up in each, shape (n, 3), where nobody knows which part of it is there."""
 
+    @cached_property
+    def beyond(self) -> NDArray[np.bool_]:
+        """Which samples are clipped, shape (n, 3)."""
+        return beyond_range(self.output, self.smallest)
+
+    @cached_property
+    def smallest(self) -> Array:
+        """The smallest steps of the output, shape (3,)."""
+        return resolution(self.output)
+
     def force_at(self, time: Array) -> Array:
         """Specific force at the gyroscopes' sample times, m/s^2, shape (n, 3)."""
         if len(self.own) == len(time) and np.array_equal(self.own, time):
@@ -315,18 +338,110 @@ class TurnProblem:
 
 
 @dataclass(frozen=True)
+class TurnReadings:
+    """What a time base makes of a problem's turns, before anything is fitted.
+
+    `density` is the noise of the outputs, (3,).
+    """
+
+    case: TurnProblem
+    stamps: Stamps
+    holds: RestHolds
+    density: Array
+    ends: HoldEnds
+    span: Span
+    notes: tuple[str, ...]
+
+    @cached_property
+    def up(self) -> tuple[Array, Array]:
+        """Upward directions before and after each turn, both (m, 3)."""
+        before = self.span.attitude
+        return self.case.up(self.ends.last)[before], self.case.up(self.ends.first)[before + 1]
+
+    @cached_property
+    def output(self) -> Readings:
+        """The output in the pieces of the turns."""
+        return self.span.read(self.case.output)
+
+    @cached_property
+    def force(self) -> Readings:
+        """The specific force there, m/s^2."""
+        return self.span.read(self.case.force_at(self.stamps.on_accel))
+
+    @cached_property
+    def still(self) -> StillMeans:
+        """What the gyroscopes put out in the holds."""
+        return still_means(self.holds, self.stamps.time, self.case.output)
+
+    @cached_property
+    def step_output(self) -> Array:
+        """The output in whole steps, for a first fit."""
+        return self.span.over_steps(self.output.middle)
+
+    @cached_property
+    def step_force(self) -> Array:
+        """The specific force in whole steps."""
+        return self.span.over_steps(self.force.middle)
+
+    def in_steps(self, rest: GyroRest) -> Segments:
+        """Return the turns with the pieces of each step taken as one, for a fit; without half differences."""
+        output = self.step_output if rest.slope is None else self.step_output - self.step_force @ rest.slope.T
+        output = output - self._zero(rest)
+        return self.span.whole_steps().segments(output, np.empty((len(output), 0, 3)), self.up)
+
+    def in_pieces(self, rest: GyroRest) -> Segments:
+        """Return the turns less zero and what acceleration adds."""
+        output, half = self.output.middle, self.output.half
+        if rest.slope is not None:
+            output, half = output - self.force.middle @ rest.slope.T, half - self.force.half @ rest.slope.T
+        return self.span.segments(output - self._zero(rest), half, self.up)
+
+    def within(self, rest: GyroRest) -> Segments:
+        """Return the turns from each window to the next in a hold."""
+        first, last, hold = neighbouring_pairs(self.ends)
+        output = self.case.output
+        if rest.slope is not None:
+            output = output - self.case.force_at(self.stamps.on_accel) @ rest.slope.T
+        span = span_between(self.stamps, (first, last), hold)
+        read, zero = span.read(output), rest.zero + (rest.moved * np.ones((len(self.case.force), 3)))[hold]
+        up = self.case.up(first, hold), self.case.up(last, hold)
+        return span.segments(read.middle - zero[:, None, :], read.half, up)
+
+    def _zero(self, rest: GyroRest) -> Array:
+        """Return the output at rest of each turn, (m, 1, 3)."""
+        moved, before = rest.moved * np.ones((len(self.case.force), 3)), self.span.attitude
+        return np.asarray((rest.zero + (moved[before] + moved[before + 1]) / 2)[:, None, :])
+
+
+def read_turns(case: TurnProblem, stamps: Stamps, *, rough: bool = False) -> TurnReadings:
+    """Return the turns on a time base; `rough` ones go from the middle of a hold to that of the next."""
+    holds = find_holds(case.attitudes, stamps.time if rough else stamps.on_accel, case.output, case.smallest, case.name)
+    step = median(np.diff(case.own))
+    ends = hold_ends(case.attitudes.start, case.attitudes.stop, step)
+    if rough:
+        middle = Windows((case.attitudes.start + case.attitudes.stop) / 2, np.full(len(case.force), step))
+        ends = replace(ends, first=middle, last=middle)
+    density = noise_density(stamps.on_accel, case.output, holds.still, ends)
+    chosen, notes = choose_turns(case.attitudes, stamps, case.beyond, case.name)
+    beside = case.knocked[chosen] | case.knocked[chosen + 1]
+    if beside.any():
+        numbers = " ".join(map(str, (np.flatnonzero(case.knocked) + 1).tolist()))
+        left_out = f"gyro: {int(beside.sum())} turns left out, beside attitudes that the record set aside ({numbers})"
+        chosen, notes = chosen[~beside], [*notes, Note(left_out)]
+    span = span_between(stamps, (ends.last.part(chosen), ends.first.part(chosen + 1)), chosen)
+    return TurnReadings(case, stamps, holds, density, ends, span, tuple(notes))
+
+
+@dataclass(frozen=True)
 class TurnSolution:
     """Scaled parameters (p,) that fit the turns, residuals (3 m,), Jacobian (3 m, p), and what was set aside.
 
-    `within` are the turns from each window to the next in a hold, `density` is the noise of the outputs, (3,), and a
-    step between samples is read in as many `pieces`.
+    `kept` are the turns that were not, among those of the readings.
     """
 
-    segments: Segments
-    within: Segments
+    readings: TurnReadings
+    kept: NDArray[np.bool_]
     rest: GyroRest
-    density: Array
-    pieces: int
     scale: Array
     theta: Array
     residual: Array
@@ -335,20 +450,30 @@ class TurnSolution:
     aside: Array
     notes: tuple[str, ...]
 
+    @cached_property
+    def segments(self) -> Segments:
+        """The turns that were kept."""
+        return self.readings.in_pieces(self.rest).part(self.kept)
+
+    @property
+    def scale_factor(self) -> Array:
+        """Output per rad/s, (3,)."""
+        return np.asarray(self.scale * (1 + self.theta[:3]))
+
     def rate(self, output: Array) -> Array:
         """Body rate of samples, rad/s, shape (n, 3); what acceleration adds is left in."""
         moved = self.scale * self.theta[9:12] if self.theta.size > 9 else 0.0
-        scaled = (output - self.rest.zero - moved) / (self.scale * (1 + self.theta[:3]))
-        return np.asarray(np.linalg.solve(misalignment(self.theta), scaled.T).T, dtype=np.float64)
+        per_output = np.linalg.inv(misalignment(self.theta)) / self.scale_factor
+        return np.asarray((output - self.rest.zero - moved) @ per_output.T)
 
     def output_of(self, rate: Array) -> Array:
         """Output that body rates, rad/s, shape (n, 3), add."""
-        return self.scale * (1 + self.theta[:3]) * (rate @ misalignment(self.theta).T)
+        return np.asarray(self.scale_factor * (rate @ misalignment(self.theta).T))
 
     @property
     def typical_miss(self) -> float:
         """Median angle by which the turns miss, rad."""
-        return float(np.median(np.linalg.norm(self.residual.reshape(-1, 3), axis=1)))
+        return median(np.linalg.norm(self.residual.reshape(-1, 3), axis=1))
 
     @property
     def cost(self) -> float:
@@ -361,89 +486,73 @@ def solve_turns(
 ) -> TurnSolution:
     """Return the fit of the turns with zero and g-sensitivity from rest; ``auto`` drops a slope that fits worse.
 
-    `near` is an earlier solution: outputs of unknown size need no fit of their own to find their scale factors then.
-    A `rough` one is for clocks that differ by unknown delays: its turns go from the middle of a hold to that of the
-    next.
+    `near` is an earlier solution, where the fit starts: outputs of unknown size need no fit of their own to find their
+    scale factors then. A `rough` one is for clocks that differ by unknown delays: its turns go from the middle of a
+    hold to that of the next.
     """
-    holds = find_holds(case.attitudes, stamps.time if rough else stamps.on_accel, case.output, case.name)
-    step = float(np.median(np.diff(case.own)))
-    ends = hold_ends(case.attitudes.start, case.attitudes.stop, step)
-    if rough:
-        middle = Windows((case.attitudes.start + case.attitudes.stop) / 2, np.full(len(case.force), step))
-        ends = replace(ends, first=middle, last=middle)
-    pieces = pieces_of(float(np.median(np.diff(stamps.time))))
-    density = noise_density(stamps.on_accel, case.output, holds.still, ends)
-    chosen, notes = choose_turns(case.attitudes, stamps, case.output, case.name)
-    beside = case.knocked[chosen] | case.knocked[chosen + 1]
-    if beside.any():
-        numbers = " ".join(map(str, (np.flatnonzero(case.knocked) + 1).tolist()))
-        left_out = f"gyro: {int(beside.sum())} turns left out, beside attitudes that the record set aside ({numbers})"
-        chosen, notes = chosen[~beside], [*notes, Note(left_out)]
+    same = near is not None and near.readings.stamps is stamps
+    if near is None:
+        readings = read_turns(case, stamps, rough=rough)
+    else:
+        readings = near.readings if same else read_turns(near.readings.case, stamps)
     known = parse_unit(case.unit)
-    nominal = None if near is None else near.scale * (1 + near.theta[:3])
+    theta = np.zeros(12 if case.fit_bias else 9)
+    nominal = None if near is None else near.scale_factor
     if known.quantity == "rate":
         nominal = np.full(3, 1 / to_si(1.0, known.symbol))
+    if near is not None and nominal is not None:
+        theta[:9] = np.concatenate([near.scale_factor / nominal - 1, near.theta[3:9]])
 
-    def solved(wanted: str, scale: Array | None) -> TurnSolution:
-        rest = at_rest(holds, stamps.time, case.output, case.force, wanted, density, scale, case.earth, case.vertical)
-        output = case.output if rest.slope is None else case.output - case.force_at(stamps.on_accel) @ rest.slope.T
-        first, last, inside = neighbouring_pairs(ends)
-        moved = rest.moved * np.ones((len(case.force), 3))
-        segments = segments_between(
-            stamps, output, (ends.last.part(chosen), ends.first.part(chosen + 1)),
-            rest.zero + (moved[chosen] + moved[chosen + 1]) / 2,
-            (case.up(ends.last)[chosen], case.up(ends.first)[chosen + 1]), chosen,
-        )  # fmt: skip
-        within = segments_between(
-            stamps, output, (first, last), rest.zero + moved[inside],
-            (case.up(first, inside), case.up(last, inside)), inside,
-        )  # fmt: skip
-        start = start_scale(segments) if scale is None else scale
-        answer = _solve(case, segments, within, rest, density, start, pieces, notes)
+    def solved(wanted: str, scale: Array | None, theta: Array) -> TurnSolution:
+        rest = at_rest(readings.still, case.force, wanted, readings.density, scale, case.earth, case.vertical)
+        segments = readings.in_steps(rest)
+        if scale is not None:
+            return _solve(readings, segments, rest, scale, theta)
         # Coning is taken off the zero once the scale is known.
-        return answer if scale is not None else solved(wanted, answer.scale * (1 + answer.theta[:3]))
+        first = _solve(readings, segments, rest, start_scale(segments), theta)
+        return solved(wanted, first.scale_factor, np.concatenate([np.zeros(3), first.theta[3:]]))
 
-    with_slope = solved(sensitivity, nominal)
+    with_slope = solved(sensitivity, nominal, theta)
     if sensitivity != "auto" or with_slope.rest.slope is None:
         return with_slope
-    without = solved("no", nominal)
+    # What is unknown of the Earth's rate changes nothing where no slope is fitted.
+    known_without = near is not None and same and case.vertical is not None and near.rest.slope is None
+    without = near if near is not None and known_without else solved("no", nominal, theta)
     return with_slope if with_slope.cost < without.cost else without
 
 
-def _solve(
-    case: TurnProblem,
-    segments: Segments,
-    within: Segments,
-    rest: GyroRest,
-    density: Array,
-    scale: Array,
-    pieces: int,
-    notes: list[str],
-) -> TurnSolution:
-    """Fit the turns; those that stand out from all others are set aside one by one."""
+def _solve(readings: TurnReadings, segments: Segments, rest: GyroRest, scale: Array, theta: Array) -> TurnSolution:
+    """Fit the turns from the parameters theta; those that stand out from all others are set aside one by one."""
+    case = readings.case
     known = parse_unit(case.unit)
-    fine, segments = segments, segments.whole_steps(pieces)
-    theta = np.zeros(12 if case.fit_bias else 9)
-    residual = model(segments, scale, theta, case.fit_bias)[0].reshape(-1, 3)
-    if known.quantity == "rate" and np.median(np.linalg.norm(residual, axis=1)) > _UNIT_DOUBTED:
-        scale = start_scale(segments)  # the stated unit may be wrong
+    if known.quantity == "rate":
+        miss = np.linalg.norm(directions_missed(segments, scale, np.zeros_like(theta)).reshape(-1, 3), axis=1)
+        if median(miss) > _UNIT_DOUBTED:  # the stated unit may be wrong
+            scale, theta = start_scale(segments), np.concatenate([np.zeros(3), theta[3:]])
     weights: Array = np.ones(len(segments.before))
     fit = _fitted(segments, scale, theta, weights)
     out, missed = _outliers(segments, scale, fit)
-    kept = segments
     if out.any():
-        kept = segments.part(~out)
-        fit = _fitted(kept, scale, fit.parameters[0], weights[~out])
-    theta, residual, jacobian = fit.parameters[0], fit.residuals[0], fit.jacobian[0]
-    miss = float(np.median(np.linalg.norm(residual.reshape(-1, 3), axis=1)))
-    if not miss < _WORST_TURN:
+        fit = _fitted(segments.part(~out), scale, fit.parameters[0], weights[~out])
+    residual = fit.residuals[0]
+    typical = median(np.linalg.norm(residual.reshape(-1, 3), axis=1))
+    if not typical < _WORST_TURN:
         raise DataError(
             f"{case.name}: columns gyro_x gyro_y gyro_z: the turns miss the change of gravity's direction by "
-            f"{np.degrees(miss):.0f} deg (median of {len(residual) // 3}): swapped or reversed axes, or a wrong unit?"
+            f"{np.degrees(typical):.0f} deg (median of {len(residual) // 3}): swapped or reversed axes, or a wrong "
+            "unit?"
         )
     others = float(np.sqrt((residual**2).sum() / (len(residual) // 3)))
     aside = np.column_stack([segments.start, segments.stop, missed])[out]
-    notes = notes + [
+    return TurnSolution(
+        readings, ~out, rest, scale, fit.parameters[0], residual, fit.jacobian[0], bool(fit.converged[0]), aside,
+        (*readings.notes, *_aside_notes(aside, others, len(out))),
+    )  # fmt: skip
+
+
+def _aside_notes(aside: Array, others: float, turns: int) -> list[str]:
+    """Name turns that were set aside, where the others miss by `others`, rad rms."""
+    notes: list[str] = [
         Finding(
             f"gyro: the turn at {start:.1f} to {stop:.1f} s set aside: it misses by {np.degrees(size):.3g} deg, the "
             f"others by {np.degrees(others):.3g} deg rms: knocked, or samples lost?",
@@ -451,17 +560,14 @@ def _solve(
         )
         for start, stop, size in aside.tolist()
     ]
-    if out.sum() * _TOO_MANY_OUT > len(out):
+    if len(aside) * _TOO_MANY_OUT > turns:
         notes.append(
             Bad(
-                f"gyro: {int(out.sum())} of {len(out)} turns stand out from the others: too many to tell which are "
+                f"gyro: {len(aside)} of {turns} turns stand out from the others: too many to tell which are "
                 "right; record again, without knocks and without lost samples"
             )
         )
-    return TurnSolution(
-        fine.part(~out), within, rest, density, pieces, scale, theta, residual, jacobian,
-        bool(fit.converged[0]), aside, tuple(notes),
-    )  # fmt: skip
+    return notes
 
 
 def _fitted(segments: Segments, scale: Array, theta: Array, weights: Array) -> Fit:
@@ -484,12 +590,12 @@ def _outliers(segments: Segments, scale: Array, fit: Fit) -> tuple[NDArray[np.bo
     m, size = len(segments.before), fit.parameters.shape[1]
     miss = np.linalg.norm(fit.residuals[0].reshape(m, 3), axis=1)
     nothing = np.zeros(m, dtype=np.bool_)
-    if miss.max() <= _STANDS_OUT * np.median(miss) or 2 * m < size + _FEWEST_LEFT:
+    if miss.max() <= _STANDS_OUT * median(miss) or 2 * m < size + _FEWEST_LEFT:
         return nothing, miss
     for _ in range(_REWEIGHTED):
-        fit = _fitted(segments, scale, fit.parameters[0], 1 / (1 + (miss / (2 * np.median(miss))) ** 2))
+        fit = _fitted(segments, scale, fit.parameters[0], 1 / (1 + (miss / (2 * median(miss))) ** 2))
         miss = np.linalg.norm(fit.residuals[0].reshape(m, 3), axis=1)
-    out = miss > _STANDS_OUT * np.median(miss)
+    out = miss > _STANDS_OUT * median(miss)
     left = 2 * int((~out).sum()) - size
     if not out.any() or left < _FEWEST_LEFT:
         return nothing, miss

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from imulab.display import Finding, Note
 from imulab.errors import SegmentError
+from imulab.estimation.rows import median, quantile
 from imulab.estimation.sampling import doubt_unit_of_time
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.gyro.rest import beyond_range
 from imulab.procedures.tumble.gyro.rotation import Turns, composed_turns, weighted_turns
-from imulab.procedures.tumble.gyro.windows import Windows, pieces_of, read_between
+from imulab.procedures.tumble.gyro.windows import Readings, Windows, pieces_of, read_between
 from imulab.recording import Array
 
 ROWS, COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)  # of the six misalignments in their matrix
@@ -56,17 +56,6 @@ class Segments:
         values = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
         return Segments(**values)
 
-    def whole_steps(self, pieces: int) -> Segments:
-        """Return them with the pieces of each step taken as one, for a first fit."""
-        shape = (len(self.step), -1, pieces)
-        step = self.step.reshape(shape).sum(axis=2)
-        size = np.maximum(step, 1e-300)[:, :, None]
-        output, half = (
-            (values * self.step[:, :, None]).reshape(*shape, 3).sum(axis=2) / size
-            for values in (self.output, self.half)
-        )
-        return replace(self, output=output, half=half, step=step)
-
 
 @dataclass(frozen=True)
 class Stamps:
@@ -76,32 +65,48 @@ class Stamps:
     on_accel: Array
 
 
-def segments_between(
-    stamps: Stamps,
-    output: Array,
-    windows: tuple[Windows, Windows],
-    zero: Array,
-    up: tuple[Array, Array],
-    attitude: NDArray[np.intp],
-) -> Segments:
-    """Return the turns from windows to later ones, (m,) each.
+@dataclass(frozen=True)
+class Span:
+    """Turns from windows to later ones, (m,), as pieces of steps between samples, whatever the output in them.
 
-    Parameters
-    ----------
-    output
-        Of the gyroscopes, less what acceleration adds, (n, 3).
-    zero
-        Output at rest of each turn, (m, 3).
-    up
-        Upward directions before and after, both (m, 3).
-    attitude
-        Index of the attitude before each turn, (m,).
+    `first` and `last` are their samples; the durations, (m, n), are weighted by the ramp. The other fields are those of
+    `Segments`.
     """
+
+    first: NDArray[np.intp]
+    last: NDArray[np.intp]
+    pieces: int
+    step: Array
+    squared: Array
+    start: Array
+    stop: Array
+    attitude: NDArray[np.intp]
+
+    def read(self, values: Array) -> Readings:
+        """Return columns of the recording's samples, (n, 3), in the pieces."""
+        return read_between(values, self.first, self.last, self.pieces)
+
+    def whole_steps(self) -> Span:
+        """Return it with the pieces of each step taken as one."""
+        return replace(self, pieces=1, step=self.step.reshape(len(self.step), -1, self.pieces).sum(axis=2))
+
+    def over_steps(self, values: Array) -> Array:
+        """Return the means of values in the pieces, (m, n, 3), over the steps."""
+        shape = (len(self.step), -1, self.pieces)
+        size = np.maximum(self.step.reshape(shape).sum(axis=2), 1e-300)[:, :, None]
+        return np.asarray(np.einsum("mnp,mnpc->mnc", self.step.reshape(shape) / size, values.reshape(*shape, 3)))
+
+    def segments(self, output: Array, half: Array, up: tuple[Array, Array]) -> Segments:
+        """Return the turns of an output and half the difference of its readings, with the directions at both ends."""
+        return Segments(output, half, self.step, self.squared, *up, self.start, self.stop, self.attitude)
+
+
+def span_between(stamps: Stamps, windows: tuple[Windows, Windows], attitude: NDArray[np.intp]) -> Span:
+    """Return the turns from windows to later ones, (m,) each; `attitude` are the indices of those before each turn."""
     (first, last), clock, final = windows, stamps.on_accel, len(stamps.time) - 1
     begin = np.maximum(np.searchsorted(clock, first.start) - 1, 0)
     end = np.minimum(np.searchsorted(clock, last.stop), final)
-    steps, pieces = max(int((end - begin).max()), 1), pieces_of(float(np.median(np.diff(stamps.time))))
-    readings = read_between(output, begin, steps, pieces)
+    steps, pieces = max(int((end - begin).max()), 1), pieces_of(median(np.diff(stamps.time)))
     index = begin[:, None] + np.arange(steps)
     here, there = np.minimum(index, final), np.minimum(index + 1, final)
     share, shape = (np.arange(pieces) + 0.5) / pieces, (len(begin), steps * pieces)
@@ -110,14 +115,15 @@ def segments_between(
     duration = np.where(index < end[:, None], stamps.time[there] - stamps.time[here], 0.0) / pieces
     duration = np.repeat(duration, pieces, axis=1)
     edges = [stamps.time[np.minimum(np.searchsorted(clock, at), final)] for at in (first.stop, last.start)]
-    return Segments(
-        readings.middle - zero[:, None, :], readings.half, ramp * duration, (ramp**2 * duration).sum(axis=1),
-        *up, edges[0], edges[1], attitude,
-    )  # fmt: skip
+    return Span(begin, end, pieces, ramp * duration, (ramp**2 * duration).sum(axis=1), edges[0], edges[1], attitude)
 
 
-def choose_turns(attitudes: Attitudes, stamps: Stamps, output: Array, name: str) -> tuple[NDArray[np.intp], list[str]]:
+def choose_turns(
+    attitudes: Attitudes, stamps: Stamps, beyond: NDArray[np.bool_], name: str
+) -> tuple[NDArray[np.intp], list[str]]:
     """Return the attitudes after which a turn can be used, and notes on turns that cannot: clipped ones, and gaps.
+
+    `beyond` says which samples are clipped (`beyond_range`), (n, 3).
 
     Raises
     ------
@@ -131,10 +137,10 @@ def choose_turns(attitudes: Attitudes, stamps: Stamps, output: Array, name: str)
     begin = np.minimum(begin, end)
     time = stamps.time
     turns = (end > begin) & (arrive - leave <= _LONGEST_TURN)
-    clipped = _any_during(beyond_range(output), begin, end) & turns[:, None]
+    clipped = _any_during(beyond, begin, end) & turns[:, None]
     step = np.diff(time)
     # What lies in a gap is taken as a straight line: no turn is known to a milliradian across a longer one.
-    usual = float(np.median(step)), float(np.quantile(step, 0.99))  # the second where stamps come in bursts
+    usual = median(step), quantile(step, 0.99)  # the second where stamps come in bursts
     wide = step > max(_GAP_SECONDS, _GAP_STEPS * usual[0], _GAP_BURSTS * usual[1])
     broken = _any_during(np.append(wide, False)[:, None], begin, np.maximum(end - 1, begin))[:, 0] & turns
     chosen = np.flatnonzero(turns & ~clipped.any(axis=1) & ~broken)
@@ -190,7 +196,7 @@ def start_scale(segments: Segments) -> Array:
     angle = np.arccos(np.clip(np.einsum("mi,mi->m", segments.before, segments.after), -1, 1))
     turned = np.linalg.norm((segments.output * segments.step[:, :, None]).sum(axis=1), axis=1)
     # A turn goes at least as far as the direction of gravity does.
-    guess = float(np.median((turned / np.maximum(angle, 1e-3))[angle > 0.3])) if (angle > 0.3).any() else 1.0
+    guess = median((turned / np.maximum(angle, 1e-3))[angle > 0.3]) if (angle > 0.3).any() else 1.0
     few = slice(None, 40)
     angle_steps = segments.output[few] * segments.step[few, :, None]
     missing = -angle_steps.shape[1] % _COARSE
@@ -201,7 +207,7 @@ def start_scale(segments: Segments) -> Array:
             np.einsum("mij,mj->mi", composed_turns(coarse / (guess * factor)), segments.before[few])
             - segments.after[few]
         )
-        costs.append(float(np.median(np.linalg.norm(miss, axis=1))))
+        costs.append(median(np.linalg.norm(miss, axis=1)))
     return np.full(3, guess * float(_START_FACTORS[int(np.argmin(costs))]))
 
 
@@ -228,8 +234,8 @@ def directions_missed(segments: Segments, scale: Array, theta: Array) -> Array:
 def body_rate(segments: Segments, scale: Array, theta: Array) -> Array:
     """Return the body rate under given parameters, rad/s, shape (m, n, 3)."""
     moved = scale * theta[9:12] if theta.size > 9 else 0.0
-    rate: Array = (segments.output - moved) / (scale * (1 + theta[:3])) @ np.linalg.inv(misalignment(theta)).T
-    return rate
+    per_output = np.linalg.inv(misalignment(theta)) / (scale * (1 + theta[:3]))
+    return np.asarray((segments.output - moved) @ per_output.T)
 
 
 def misalignment(theta: Array) -> Array:
@@ -243,21 +249,21 @@ def model(segments: Segments, scale: Array, theta: Array, fit_bias: bool) -> tup
     """Return the carried less the found direction of each turn, (3 m,), and derivatives, (3 m, p).
 
     An error ``dw`` of the rate changes a carried direction u by ``C (u x sum C' dw dt)``; dw is linear in the scaled
-    output, the rate and a constant, so that five sums per turn hold all derivatives.
+    output, the rate and a constant, so that four sums per turn hold all derivatives.
     """
     s = scale * (1 + theta[:3])
     inverse = np.linalg.inv(misalignment(theta))
-    scaled = (segments.output - (scale * theta[9:12] if fit_bias else 0.0)) / s
-    rate = scaled @ inverse.T
-    weights = np.concatenate([scaled, rate, np.ones((*rate.shape[:2], 1))], axis=2)
+    rate = body_rate(segments, scale, theta if fit_bias else theta[:9])
+    weights = np.concatenate([rate, np.ones((*rate.shape[:2], 1))], axis=2) if fit_bias else rate
     turns: Turns = weighted_turns(rate, segments.step, weights)
+    # The scaled output is T times the rate, and so are its sums.
+    of_rate = turns.weighted[:, :3]
+    of_scaled = np.tensordot(of_rate, misalignment(theta), (1, 1)).transpose(0, 3, 1, 2)
     carried_up = np.einsum("mij,mj->mi", turns.matrix, segments.before)
-    columns = [(k, -inverse[:, k] * (scale / s)[k]) for k in range(3)]
-    columns += [(3 + j, -inverse[:, i]) for i, j in zip(ROWS, COLUMNS, strict=True)]
+    columns = [of_scaled[:, k] @ inverse[:, k] * -(scale / s)[k] for k in range(3)]
+    columns += [of_rate[:, j] @ -inverse[:, i] for i, j in zip(ROWS, COLUMNS, strict=True)]
     if fit_bias:
-        columns += [(6, -inverse[:, k] * (scale / s)[k]) for k in range(3)]
-    jacobian = np.empty((len(carried_up), 3, len(columns)))
-    for column, (which, direction) in enumerate(columns):
-        moved = np.cross(segments.before, turns.weighted[:, which] @ direction)
-        jacobian[:, :, column] = np.einsum("mij,mj->mi", turns.matrix, moved)
+        columns += [turns.weighted[:, 3] @ inverse[:, k] * -(scale / s)[k] for k in range(3)]
+    moved = np.cross(segments.before[:, None, :], np.stack(columns, axis=1))
+    jacobian = turns.matrix @ np.swapaxes(moved, 1, 2)
     return (carried_up - segments.after).ravel(), jacobian.reshape(-1, len(columns))

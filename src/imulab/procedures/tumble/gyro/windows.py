@@ -25,6 +25,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+import imulab.procedures.tumble._rotation as _rotation
 from imulab.estimation.rows import medians
 from imulab.recording import Array
 
@@ -61,7 +62,9 @@ class Windows:
     def weight(self, time: Array) -> Array:
         """Return the integral of each window from its beginning to the times (n, k), shape (n, k)."""
         share = np.clip((time - self.start[:, None]) / self.length[:, None], 0.0, 1.0)
-        return np.asarray(share - np.sin(2 * np.pi * share) / (2 * np.pi), dtype=np.float64)
+        inside = (share > 0) & (share < 1)
+        share[inside] -= np.sin(2 * np.pi * share[inside]) / (2 * np.pi)
+        return np.asarray(share, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -171,20 +174,22 @@ def pieces_of(step: float) -> int:
     return int(np.clip(np.ceil(step / _FINEST - 1e-6), 1, _MOST_PIECES))
 
 
-def read_between(output: Array, start: NDArray[np.intp], steps: int, pieces: int) -> Readings:
-    """Return the mean output in the pieces of `steps` sampling intervals from sample `start`, (m,), on.
+def read_between(output: Array, start: NDArray[np.intp], stop: NDArray[np.intp], pieces: int) -> Readings:
+    """Return the mean output in the pieces of the sampling intervals from sample `start` to `stop`, (m,) each.
 
-    The splines run over the number of a sample, not over its time: stamps that come in bursts do not bend them.
+    Beyond the shorter ones it is 0. The splines run over the number of a sample, not over its time: stamps that come in
+    bursts do not bend them.
     """
     mean, point = _kernels(pieces)
-    kernels = np.hstack([(mean + point) / 2, (mean - point) / 2])
-    result = np.empty((2, len(start), steps * pieces, output.shape[1]))
-    for turn, first in enumerate(start.tolist()):
-        index = np.clip(np.arange(first + 1 - _REACH, first + steps + _REACH), 0, len(output) - 1)
-        around = np.lib.stride_tricks.sliding_window_view(output[index].T, 2 * _REACH, axis=1)  # (columns, steps, taps)
-        read = (around @ kernels).reshape(-1, steps, 2, pieces)
-        result[:, turn] = np.moveaxis(read, 2, 0).transpose(0, 2, 3, 1).reshape(2, steps * pieces, -1)
-    return Readings(result[0], result[1], pieces)
+    shape = (len(start), max(int((stop - start).max()), 1) * pieces, output.shape[1])
+    readings = Readings(np.zeros(shape), np.zeros(shape), pieces)
+    _rotation.between(
+        np.ascontiguousarray(output, dtype=np.float64), output.shape[1],
+        np.ascontiguousarray(np.hstack([(mean + point) / 2, (mean - point) / 2])),
+        np.ascontiguousarray(start, dtype=np.int64), np.ascontiguousarray(stop, dtype=np.int64), pieces,
+        readings.middle, readings.half,
+    )  # fmt: skip
+    return readings
 
 
 @cache
