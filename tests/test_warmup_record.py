@@ -12,7 +12,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.display import Bad
+from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError
 from imulab.exporters import export
 from imulab.procedures.registry import load_any
@@ -287,6 +287,19 @@ def test_a_stuck_gyro_a_pause_and_rows_of_zeros_are_said() -> None:
     off = evaluate(found.table, time, 3.0) - evaluate(clean.table, time, 3.0)
     assert np.abs(off).max() < 1.5 * HOUR  # with the zeros in: 3 deg/h
     assert not [w for w in clean.calibration.warnings if "stuck" in w or "never" in w or "zero" in w]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("every", "kind"), [(3000, Note), (500, Finding)])
+def test_few_rows_of_zeros_are_a_note(every: int, kind: type) -> None:
+    """Outputs in steps of a sixth of their noise read zero on all axes by chance, once in some thousand rows."""
+    rows = [np.arange(len(r)) % every == 7 for r in cycles()]
+    zeroed = [
+        changed(r, **{axis: np.where(row, 0.0, r.columns[axis]) for axis in AXES})
+        for r, row in zip(cycles(), rows, strict=True)
+    ]
+    (said,) = (w for w in fit(zeroed, model="exponential").calibration.warnings if "exactly zero were left out" in w)
+    assert type(said) is kind
 
 
 def test_a_knock_that_fills_whole_bins_is_left_out_and_an_odd_cycle_is_named() -> None:

@@ -371,6 +371,7 @@ _WIDE = 20.0  # K between knots from which one curve for the whole interval is d
 _AT_LIMIT = 1.02  # a time constant within 2 % of the limit of the search is at the limit
 _COUNTS = 0.05  # of a curve: smaller parts are not warned of
 _ROUNDING = 1e-12  # of the reference, relative
+_SHARE_NOTED = 1e-3  # of all rows: exact zeros up to which there is only a note
 _PAUSE, _MOSTLY = 5, 0.5
 """Seconds of exact repeats that are a stuck output; share of the time in which a column that is not coarse changes."""
 _MORE, _ODD = 1.2, 4.0  # times the error at temperatures left out that is reported; medians beyond which a cycle is odd
@@ -445,8 +446,11 @@ def _warn_dead_columns(curves: Curves) -> list[str]:
         )
     empty = [f"{cycle.name} ({cycle.zeros})" for cycle in curves.cycles if cycle.zeros]
     if empty:
+        zeros = sum(cycle.zeros for cycle in curves.cycles)
+        rows = zeros + int(sum(cycle.bins.count.sum() for cycle in curves.cycles))
+        kind = Note if zeros < _SHARE_NOTED * rows else Finding
         messages.append(
-            Finding(
+            kind(
                 f"rows in which every axis is exactly zero were left out: {_named(empty)}",
                 "check the link to the sensor, and record those cycles again",
             )
