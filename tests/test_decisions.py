@@ -114,7 +114,7 @@ def test_limit_and_level_agree(name):
         (("thermal",), 0.0189),
         (("thermal gyro",), 0.0148),
         (("thermal check",), 0.0500),
-        (("magnetometer",), 0.0066),
+        (("magnetometer",), 0.0086),
         (("magnetometer check",), 0.0500),
         (("rate",), 0.0388),
         (("rate turn",), 0.0148),

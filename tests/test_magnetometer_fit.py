@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from tests.reference.field_alone import Sensor, circle, sphere
+from tests.reference.field_alone import waved as by_hand
 from tests.test_tumble_mag_check import SAP5, G, sap5_recording
 
 import imulab as il
@@ -394,6 +395,75 @@ def test_a_phone_that_comes_to_the_unit_is_named_with_its_time(level):
     assert abs(begin - middle / 20.0) < 0.1 * len(outputs) / 20.0
     assert record.verdict.state == "look"
     assert any("nothing else near" in each for each in record.verdict.next)
+
+
+# What an ellipsoid leaves out, and what is noise.
+
+
+def bent(seed, size, count=3000, noise=0.4):
+    """Return the hard iron, uT, and the record of a sensor whose outputs have a square, uT at the field's size."""
+    rng, sensor = np.random.default_rng(seed), Sensor(seed)
+    sensor.hard[:] = rng.uniform(-5, 5, 3)
+    exact = sensor.outputs(by_hand(count, 50.0, rng), 0.0, rng)
+    outputs = exact + size * ((exact - sensor.hard) / sensor.field) ** 2 + noise * rng.standard_normal(exact.shape)
+    return sensor.hard, il.fit_magnetometer(recorded(outputs, rate=50.0), field="48uT").calibration
+
+
+def off(hard, record):
+    """Return errors of the hard iron over their stated uncertainties."""
+    stated = [record.parameters[f"mag_bias_{axis}"] for axis in "xyz"]
+    return [(1e6 * each.value - h) / (1e6 * each.standard_uncertainty) for each, h in zip(stated, hard, strict=True)]
+
+
+def test_outputs_that_bend_a_little_widen_the_hard_iron(reduced):
+    """A square of .2 % of the field hides .06 uT in the hard iron, five times its uncertainty by noise alone."""
+    trials = [bent(seed, 0.1) for seed in range(8 if reduced else 40)]
+    errors = np.array([off(*each) for each in trials])
+    assert np.sqrt(np.mean(errors**2)) < 2.2
+    assert np.mean(np.abs(errors) > 3) < 0.15
+    assert all("square of the field" in reason for _, record in trials for reason in record.verdict.reasons)
+    straight = np.array([off(*bent(seed, 0.0)) for seed in range(8 if reduced else 60)])
+    assert np.mean(np.abs(straight) < 2) > 0.88
+    assert np.sqrt(np.mean(straight**2)) > 0.7
+
+
+def test_outputs_that_bend_are_named_with_their_size():
+    (said,) = [text for text in bent(3, 0.2, noise=0.05)[1].warnings if "square of the field" in text]
+    sizes = [float(value) for value in re.findall(r"[xyz] ([+-][\d.]+)", said)]
+    assert sizes == pytest.approx([0.2] * 3, abs=0.04)
+    hard, record = bent(3, 0.8, noise=0.1)
+    assert record.verdict.state == "look"
+    assert "near the end of its range" in record.verdict.reasons[0]
+    assert np.abs(off(hard, record)).max() < 2
+
+
+@pytest.mark.parametrize("level", [False, True])
+def test_noise_alone_is_no_iron(level):
+    rng, sensor = np.random.default_rng(5), Sensor(5, axes=2 if level else 3, field=20.0)
+    directions = circle(3000, 2.0) if level else by_hand(3000, 50.0, rng)
+    outputs = sensor.outputs(directions, 0.6, rng)
+    if level:
+        outputs = np.column_stack([outputs, 40 + 0.6 * rng.standard_normal(3000)])
+    record = il.fit_magnetometer(recorded(outputs, rate=50.0)).calibration
+    assert record.verdict.state == "good"
+    assert any("noise of single readings" in text for text in record.warnings)
+    walk = np.repeat(rng.standard_normal((60, outputs.shape[1])), 50, axis=0)
+    record = il.fit_magnetometer(recorded(outputs + 0.8 * walk, rate=50.0)).calibration
+    assert any("no iron near that moved" in text for text in record.verdict.reasons)
+
+
+def test_a_slow_drift_is_noted_and_widens_the_hard_iron(reduced):
+    """A drift of .2 uT, .4 % of the field, is no phone."""
+    notes = 0
+    for seed in range(4 if reduced else 20):
+        rng, sensor = np.random.default_rng(seed), Sensor(seed)
+        drift = np.linspace(-0.1, 0.1, 3000)[:, None] * np.array([1.0, -0.6, 0.4])
+        outputs = sensor.outputs(by_hand(3000, 50.0, rng), 0.2, rng) + drift
+        record = il.fit_magnetometer(recorded(outputs, rate=50.0)).calibration
+        assert record.verdict.state == "good"
+        notes += sum("noise that is slow or a drift" in text for text in record.warnings)
+        assert np.abs(off(sensor.hard, record)).max() < 3.5
+    assert notes
 
 
 # Real instruments.

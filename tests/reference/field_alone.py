@@ -61,3 +61,12 @@ class Sensor:
             taken = by_turn @ np.linalg.solve(by_turn.T @ by_turn, by_turn.T)
             total = total + by_theta.T @ (np.eye(axes) - taken) @ by_theta
         return noise**2 * np.linalg.inv(total)
+
+
+def waved(count: int, rate: float, rng: np.random.Generator) -> np.ndarray:
+    """Return directions of the field in a unit that a hand turns about axes that wander, shape (n, 3)."""
+    time = np.arange(count) / rate
+    sway = [sum(rng.normal() * np.sin(w * time + rng.uniform(0, 6.28)) for w in (0.3, 0.7, 1.1)) for _ in range(2)]
+    polar = np.arccos(np.clip(np.sin(0.13 * time + 0.3 * sway[0]), -1, 1))
+    turn = 1.7 * time + sway[1]
+    return np.column_stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)])

@@ -154,7 +154,16 @@ ACCELEROMETERS_CONTRADICT_RECORD = Decision(
 
 # Magnetometer alone
 FIELD_ALONE_STEP = Decision(1e-3, "verdict", {"magnetometer": 1}, "|m| is another from some time on")
-HARD_IRON_STEP = Decision(1e-3, "verdict", {"magnetometer": 1}, "the hard iron is another from some time on")
+HARD_IRON_STEP = Decision(
+    1e-3, "verdict", {"magnetometer": 1}, "the hard iron is another from some time on; a small change is noted"
+)
+OUTPUTS_BEND = Decision(
+    0.05, "uncertainty", {"magnetometer": 1},
+    "|m| follows the direction as outputs with a third power of the field make it (F-test)",
+)  # fmt: skip
+OUTPUTS_BEND_CLEARLY = Decision(
+    1e-3, "verdict", {"magnetometer": 2}, "the same, or by a square: a large term is to be looked at, a small one noted"
+)
 READINGS_SET_ASIDE = Decision(
     5.7e-7, "verdict", {"magnetometer": 8000}, "readings, or their means over windows, lie off all others", limit=5.0
 )

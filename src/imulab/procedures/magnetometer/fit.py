@@ -9,12 +9,20 @@ import numpy as np
 
 from imulab.display import UNJUDGED
 from imulab.errors import DataError, ObservabilityError, OptionError
+from imulab.estimation.decisions import HARD_IRON_STEP, OUTPUTS_BEND
 from imulab.gravity import ModelField, Site, check_field_magnitude, field_note, field_of_test, site, stated_site
 from imulab.options import Group, measure, parsed, text
 from imulab.procedures.magnetometer import AXES, FEWEST, name_columns
 from imulab.procedures.magnetometer.model import FittedTurn, MagReadings, check_dead, read_readings
 from imulab.procedures.magnetometer.record import make_record
-from imulab.procedures.magnetometer.solve import find_disturbed, fit_sphere, uncertainties, widest_gap
+from imulab.procedures.magnetometer.solve import (
+    find_bend,
+    find_change,
+    find_disturbed,
+    fit_sphere,
+    uncertainties,
+    widest_gap,
+)
 from imulab.procedures.result import Result, as_recording
 from imulab.quantities import in_si
 from imulab.recording import Array, Data, Reading, Recording
@@ -112,7 +120,7 @@ def fit_readings(recording: Recording, field: float | None, where: Site | None, 
     """Calibrate a magnetometer triad; arguments in SI, else as for `fit_magnetometer`."""
     model_field = None if where is None else field_of_test(where, date, recording)
     readings = read_readings(recording)
-    turned = _find_surface(readings)
+    turned = _add_beyond(_find_surface(readings))
     if turned.upright and field is not None:
         raise OptionError(
             f"field: a level turn sees the level part of the field only, and {recording.name} is one; state the place "
@@ -192,6 +200,27 @@ def _find_surface(readings: MagReadings) -> FittedTurn:
             f"{_say_turned(turned.output)}; turn the unit once around or more, or through all directions"
         )
     return turned
+
+
+_POWERS = 2, 3  # of the field; what the square hides counts as far as it is real, without a threshold
+_LEAST_IN_ALL = 240  # readings that tell a change of the hard iron
+
+
+def _add_beyond(turned: FittedTurn) -> FittedTurn:
+    """Return a fit with the terms that its residuals tell beside the surface, in its uncertainties too."""
+    surface, output = turned.surface, turned.output[~turned.aside]
+    bends, change = {}, None
+    if len(output) >= 2 * (len(surface.theta) + len(turned.axes)):
+        every = {power: find_bend(surface.theta, output, power) for power in _POWERS}
+        bends = {power: bend for power, bend in every.items() if power == 2 or bend.probability < OUTPUTS_BEND.level}
+    if len(output) >= _LEAST_IN_ALL:
+        change = find_change(surface.theta, output)
+        change = change if change.probability < HARD_IRON_STEP.level else None
+    terms = [*bends.values(), *([change] if change else [])]
+    if not terms:
+        return turned
+    surface = replace(surface, beyond=np.sum([term.covariance for term in terms], axis=0))
+    return replace(turned, surface=surface, bends=bends, change=change)
 
 
 def _fit_level(readings: MagReadings, upright: str) -> FittedTurn | None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from imulab.columns import triad
 from imulab.display import Finding, Note
 from imulab.errors import DataError, UnitError
 from imulab.procedures.magnetometer import AXES, FEWEST
-from imulab.procedures.magnetometer.solve import Surface, evaluate, pairs, unpack
+from imulab.procedures.magnetometer.solve import Beyond, Surface, evaluate, pairs, unpack
 from imulab.recording import Array, Recording
 from imulab.units import parse_unit
 
@@ -20,6 +21,8 @@ _CLIPPED, _PILED, _NEXT = 0.01, 5.0, 5
 """An axis is clipped where this share of the readings, and so many times as many as at the next 5 values, are at one
 end."""
 _LEAST_PILED = 10
+_ALIKE, _MOSTLY = np.cos(0.3), 0.5
+"""Cosine of the angle between readings in a row that point alike, and the share of them by which noise is told."""
 _SPANS = 1e-30, 1e30  # of the outputs, in any unit; beyond them there are no squares
 
 
@@ -79,12 +82,18 @@ class FittedTurn:
         Which readings were disturbed and left out, shape (n,).
     axes
         Axes that the surface holds.
+    bends
+        By how much outputs bend with a power of the field, 2 or 3, where the residuals tell it.
+    change
+        A change of the hard iron at some time, where the residuals tell one.
     """
 
     readings: MagReadings
     surface: Surface
     aside: NDArray[np.bool_]
     axes: str
+    bends: Mapping[int, Beyond] = field(default_factory=dict)
+    change: Beyond | None = None
 
     @property
     def upright(self) -> str | None:
@@ -105,8 +114,26 @@ class FittedTurn:
     def field(self) -> Array:
         """The corrected field in units of its magnitude, shape (n, d)."""
         hard, soft = unpack(self.surface.theta, len(self.axes))
-        field: Array = (self.output - hard) @ np.linalg.inv(soft)
-        return field
+        corrected: Array = (self.output - hard) @ np.linalg.inv(soft)
+        return corrected
+
+    def white(self) -> float:
+        """Return the part of the scatter of |m| that differs from reading to reading, at most `scatter`.
+
+        By differences of readings in a row, where these point alike; 0 where most do not, as in a table of attitudes:
+        there noise cannot be told from iron.
+        """
+        field = self.field[~self.aside]
+        unit = field / np.linalg.norm(field, axis=1)[:, None]
+        near = (unit[1:] * unit[:-1]).sum(axis=1) > _ALIKE
+        if near.mean() < _MOSTLY:
+            return 0.0
+        change = np.diff(self.residual[~self.aside])[near]
+        return min(float(np.sqrt(np.mean(change**2) / 2)), self.scatter())
+
+    def scatter(self) -> float:
+        """Return the scatter of |m| as a part of the field, without readings that were set aside."""
+        return float(np.sqrt(np.mean(self.residual[~self.aside] ** 2)))
 
 
 def read_readings(recording: Recording) -> MagReadings:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab.display import UNJUDGED, Bad, Finding, Note
-from imulab.estimation.decisions import FIELD_ALONE_STEP, HARD_IRON_STEP
+from imulab.estimation.decisions import FIELD_ALONE_STEP, OUTPUTS_BEND_CLEARLY
 from imulab.estimation.distributions import f_tail
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.magnetometer import ALL_WAYS, GAUGE, LEVEL
 from imulab.procedures.magnetometer.model import FittedTurn, MagReadings, not_told, parameter_names
 from imulab.procedures.magnetometer.schema import FieldModel, FieldReadings, FieldSummary
-from imulab.procedures.magnetometer.solve import BLOCKS, find_change, uncertainties, widest_gap
+from imulab.procedures.magnetometer.solve import BLOCKS, uncertainties, widest_gap
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, entries
@@ -26,6 +27,7 @@ _POORLY, _POOR_DIRECTION = 0.01, np.radians(1.0)
 warning."""
 _LARGE_RMS, _HOPELESS = 0.02, 0.10
 """Scatter of |m| that readings in one field do not have, and that from which the record is bad."""
+_OF_NOISE = 0.5  # of the scatter: what is left of it without noise of single readings, up to which that is all
 _SHARE_NOTED, _SHARE_BAD = 1e-3, 0.3
 """Share of disturbed readings up to which there is only a note, and from which the record is bad."""
 _OF_THE_EARTH, _BUILDING = (22e-6, 67e-6), 1.4
@@ -34,6 +36,8 @@ _KEPT = 600  # readings that a record keeps for figures
 _MOST_NAMED = 3  # disturbed stretches
 _LEAST_IN_BLOCK = 8
 _LEAST_PART = 3  # blocks before and after a step
+_NOTICED = 0.005  # of the field: smaller terms beside the surface are noted, since the uncertainties hold them
+_POWER_NAMES = {2: "square", 3: "third power"}
 
 
 def make_record(turned: FittedTurn, known: float | None, origin: str, options: Mapping[str, Any]) -> Calibration:
@@ -69,8 +73,9 @@ def make_record(turned: FittedTurn, known: float | None, origin: str, options: M
             *_notes_on_turn(turned.upright),
             *_notes_on_field(turned.upright, known, origin, in_field=in_field),
             *_warn_disturbed(readings, residual, turned.aside),
-            *_warn_scatter(summary, turned.upright),
-            *_warn_coverage(summary, turned.upright),
+            *_warn_scatter(turned),
+            *_warn_coverage(turned, summary),
+            *_warn_bends(turned),
             *(_warn_step(readings, residual, turned.aside) or _warn_change(turned)),
         ),
         verdict=UNJUDGED,
@@ -106,7 +111,7 @@ def _summarize(turned: FittedTurn, residual: Array) -> FieldSummary:
     return FieldSummary(
         readings=len(residual),
         set_aside=int(turned.aside.sum()),
-        rms=float(np.sqrt(np.mean(residual[~turned.aside] ** 2))),
+        rms=turned.scatter(),
         noise=noise,
         inflation=surface.inflation,
         degrees_of_freedom=surface.freedom,
@@ -195,32 +200,42 @@ def _warn_disturbed(readings: MagReadings, r: Array, aside: NDArray[np.bool_]) -
     return [kind(text, "record again, away from steel, phones and vehicles")]
 
 
-def _warn_scatter(fit: FieldSummary, upright: str | None) -> list[str]:
-    """Return a warning where |m| scatters more than in one field."""
-    if fit.rms <= _LARGE_RMS:
+def _warn_scatter(turned: FittedTurn) -> list[str]:
+    """Return a warning where |m| scatters more than in one field, and more than the noise of single readings."""
+    scatter, white = turned.scatter(), turned.white()
+    slow = float(np.sqrt(scatter**2 - white**2))
+    if scatter <= _LARGE_RMS:
         return []
-    kind = Bad if fit.rms > _HOPELESS else Finding
-    level = "was the turn level, and was" if upright else "was"
+    if slow < _OF_NOISE * scatter and scatter <= _HOPELESS:
+        return [
+            Note(
+                f"mag: |m| scatters by {100 * scatter:.2g} % of the field, which is noise of single readings: "
+                f"{100 * white:.2g} % from each to the next. More readings make up for it"
+            )
+        ]
+    kind = Bad if scatter > _HOPELESS else Finding
+    level = "was the turn level, and was" if turned.upright else "was"
     return [
         kind(
-            f"mag: |m| scatters by {100 * fit.rms:.2g} % of the field: {level} no iron near that moved, or the unit "
+            f"mag: |m| scatters by {100 * scatter:.2g} % of the field: {level} no iron near that moved, or the unit "
             "carried through a field that changes from place to place?",
             "record again on one spot, away from iron",
         )
     ]
 
 
-def _warn_coverage(fit: FieldSummary, upright: str | None) -> list[str]:
+def _warn_coverage(turned: FittedTurn, fit: FieldSummary) -> list[str]:
     """Return a warning where the directions leave the corrected field poorly known."""
-    if fit.largest_magnitude <= _POORLY and fit.direction.value <= _POOR_DIRECTION:
+    _, largest, direction = uncertainties(replace(turned.surface, beyond=0.0))
+    if largest <= _POORLY and direction <= _POOR_DIRECTION:
         return []
     return [
         Finding(
             f"mag: the readings leave out directions {np.degrees(fit.widest_gap.value):.0f} deg off the nearest, where "
-            f"|m| is known to {100 * fit.largest_magnitude:.2g} %; the direction of the field is known to "
-            f"{np.degrees(fit.direction.value):.2g} deg",
+            f"|m| is known to {100 * largest:.2g} %; the direction of the field is known to "
+            f"{np.degrees(direction):.2g} deg",
             "turn the unit once around or more, evenly"
-            if upright
+            if turned.upright
             else "turn the unit through all directions, each axis up and down",
         )
     ]
@@ -260,20 +275,49 @@ def _warn_step(readings: MagReadings, r: Array, aside: NDArray[np.bool_]) -> lis
 
 
 def _warn_change(turned: FittedTurn) -> list[str]:
-    """Return a warning of another hard iron from some time on: a magnet or a current that turns with the unit."""
-    kept = np.flatnonzero(~turned.aside)
-    if len(kept) < _LEAST_IN_BLOCK * BLOCKS:
+    """Return what is said of another hard iron from some time on: a magnet or a current that turns with the unit."""
+    change, readings = turned.change, turned.readings
+    if change is None:
         return []
-    first, change, p = find_change(turned.surface.theta, turned.output[kept])
-    if p > HARD_IRON_STEP.level:
-        return []
-    readings, row = turned.readings, int(kept[first])
+    row = int(np.flatnonzero(~turned.aside)[change.first])
     where = f"row {readings.row[row] + 1}" if readings.time is None else f"{readings.time[row]:.1f} s"
-    share = float(np.linalg.norm(change)) / turned.surface.gain
+    share = float(np.linalg.norm(change.size)) / turned.surface.gain
+    shown = f"{100 * share:.2g} % of the field (p {change.probability:.1g})"
+    text = f"mag: from {where} on the hard iron is another by {shown}"
+    if share < _NOTICED:
+        return [Note(f"{text}, as by noise that is slow or a drift; its uncertainty holds both")]
     return [
         Finding(
-            f"mag: from {where} on the hard iron is another by {100 * share:.2g} % of the field (p {p:.1g}): did a "
-            "phone, a magnet or a current come to the unit?",
+            f"{text}: did a phone, a magnet or a current come to the unit?",
             "record again with all that belongs to the unit in place and switched on, and nothing else near",
         )
     ]
+
+
+def _warn_bends(turned: FittedTurn) -> list[str]:
+    """Return what is said of outputs that are not straight."""
+    said: list[str] = []
+    for power, bend in turned.bends.items():
+        if bend.probability > OUTPUTS_BEND_CLEARLY.level:
+            continue
+        unit = parse_unit(turned.readings.unit)
+        factor, symbol = (1e6 * unit.factor, "uT") if unit.quantity == "magnetic field" else (1.0, unit.symbol)
+        sizes = ", ".join(
+            f"{axis} {value:+.2g}" for axis, value in zip(turned.axes, (factor * bend.size).tolist(), strict=True)
+        )
+        text = (
+            f"mag: |m| follows the direction as no ellipsoid does: outputs with a {_POWER_NAMES[power]} of the field, "
+            f"at its full size {sizes} {symbol} (p {bend.probability:.1g}), explain it. What of it looks like hard and "
+            "soft iron is in the uncertainties"
+        )
+        if float(np.abs(bend.size).max()) < _NOTICED * turned.surface.gain:
+            said.append(Note(text))
+            continue
+        level = "was the turn level, and is" if turned.upright else "is"
+        said.append(
+            Finding(
+                f"{text}: {level} the sensor near the end of its range?",
+                "take magnets and steel off the unit, or set a wider range of the sensor, and record again",
+            )
+        )
+    return said

@@ -39,6 +39,7 @@ from imulab.recording import Array
 
 BLOCKS = 30
 """Blocks of consecutive readings, by which errors in common are seen."""
+_LONG_BLOCKS = 10  # by which errors that last longer are seen, where what they are taken for lasts long, too
 _LEAST_IN_BLOCKS = 8  # readings in a block; fewer readings in all are taken as independent
 _STEPS, _CLOSE = 60, 1e-10
 _FARTHEST = 1e3  # largest parameter of a fit, where the readings spread by about 1
@@ -75,6 +76,8 @@ class Surface:
         Factor f of the covariance by errors that readings in a row have in common.
     converged
         Whether the fit came to rest.
+    beyond
+        Covariance of theta by terms that the surface does not have, shape (p, p), or 0.
     """
 
     theta: Array
@@ -83,6 +86,7 @@ class Surface:
     sigma: float
     inflation: float
     converged: bool
+    beyond: Array | float = 0.0
 
     @property
     def dimension(self) -> int:
@@ -95,7 +99,7 @@ class Surface:
         size = np.linalg.norm(self.jacobian, axis=0)
         scaled = self.jacobian / size
         matrix: Array = self.inflation * self.sigma**2 * np.linalg.inv(scaled.T @ scaled) / np.outer(size, size)
-        return matrix
+        return matrix + self.beyond
 
     @property
     def freedom(self) -> float:
@@ -270,10 +274,10 @@ def orthonormal(rows: Array) -> Array:
     return np.linalg.qr(rows / np.linalg.norm(rows, axis=0))[0]
 
 
-def find_inflation(whitened: Array, q: Array, sigma: float) -> float:
+def find_inflation(whitened: Array, q: Array, sigma: float, blocks: int = BLOCKS) -> float:
     """Return by how much errors in common of readings in a row increase the covariance, 1 or more; q is orthonormal."""
-    count = min(BLOCKS, len(whitened) // _LEAST_IN_BLOCKS)
-    if count < BLOCKS // 2 or not sigma:
+    count = min(blocks, len(whitened) // _LEAST_IN_BLOCKS)
+    if count < blocks // 2 or not sigma:
         return 1.0
     edges = np.linspace(0, len(whitened), count + 1).astype(np.intp)[:-1]
     scores = np.add.reduceat(q * whitened[:, None], edges, axis=0)
@@ -282,40 +286,113 @@ def find_inflation(whitened: Array, q: Array, sigma: float) -> float:
     return float(np.maximum(1.0, (scores**2).sum() / (sigma**2 * max(free, 1.0))))
 
 
-_LEAST_PART = 3  # blocks before and after a change
+# What an ellipsoid leaves out: outputs that are not straight, and a hard iron that changed.
 
 
-def find_change(theta: Array, outputs: Array) -> tuple[int, Array, float]:
-    """Return the reading from which the hard iron is most probably another, by how much, (d,), and the probability.
+@dataclass(frozen=True)
+class Beyond:
+    """Terms that the residuals hold beside the parameters, tested together.
 
-    A change of the hard iron shows in no mean of |m|. For each split the residuals are fitted by a change of the hard
-    iron and of |m| after it, beside all parameters. The one that explains most is tested by F over what is left, with
-    the errors that readings in a row have in common, times the number of splits.
+    Attributes
+    ----------
+    size
+        Of each term, in outputs.
+    probability
+        Of terms as large where there are none.
+    covariance
+        What they leave open of theta, shape (p, p).
+    first
+        The reading from which they count.
     """
-    d = outputs.shape[1]
+
+    size: Array
+    probability: float
+    covariance: Array
+    first: int = 0
+
+
+def _test_beside(q: Array, left: Array, columns: Array, *blocks: int) -> tuple[Array, Array, float, float]:
+    """Return coefficients of columns beside orthonormal ones, their covariance, F, and its probability.
+
+    `left` is what q leaves. Errors that readings in a row have in common count, by the worst of some numbers of blocks.
+    """
+    there = columns - q @ (q.T @ columns)
+    size = np.linalg.norm(there, axis=0)
+    base, triangle = np.linalg.qr(there / size)
+    explained = base.T @ left
+    both = np.hstack([q, base])
+    remain = left - base @ explained
+    sigma = float(np.sqrt((remain**2).sum() / (len(left) - both.shape[1])))
+    inflation = max(find_inflation(remain, both, sigma, each) for each in blocks)
+    ratio = float((explained**2).sum()) / max(base.shape[1] * inflation * sigma**2, 1e-300)
+    back = np.linalg.inv(triangle) / size[:, None]
+    freedom = max(len(left) / inflation - both.shape[1], 1.0)
+    p = float(f_tail(ratio, float(base.shape[1]), freedom))
+    return back @ explained, inflation * sigma**2 * back @ back.T, ratio, p
+
+
+def _left_over(theta: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:
+    """Return rows over the noise, orthonormal columns that span them, what these leave of the residuals, and |v|."""
     r, jacobian, weight = evaluate(theta, outputs)
     rows = jacobian / weight[:, None]
     q = orthonormal(rows)
-    left = r / weight - q @ (q.T @ (r / weight))
+    return rows, q, r / weight - q @ (q.T @ (r / weight)), weight
+
+
+def find_bend(theta: Array, outputs: Array, power: int) -> Beyond:
+    """Return by how much outputs bend with a power of the field along each axis, 2 or 3, at its full size.
+
+    An output ``D m + h + k s^2``, s the field along its axis over the field, makes |m| follow ``k u^3``. Of this 3/5 u
+    is as a hard iron is, and shows in no residual; the rest is of the third degree, which no ellipsoid has. So k is
+    fitted by the rest, and what the surface took for its parameters is G k: it is uncertain by ``G (k k' + C) G'``.
+    How much of it is real the data say by the ratio F of what k explains to noise: with ``k ~ N(0, t C)`` the most
+    probable t is ``F - 1``, by which k is a part ``b = 1 - 1 / F`` of the one that was fitted, with covariance b C:
+    ``b^2 k k' + b C`` counts for ``k k' + C``, nothing where F is below 1.
+
+    With the third power ``u^4`` is divided between soft iron and the fourth degree.
+    """
+    d = outputs.shape[1]
+    rows, q, left, _ = _left_over(theta, outputs)
+    soft = unpack(theta, d)[1]
+    along = _directions(theta, outputs)[1] @ soft / np.abs(np.linalg.det(soft)) ** (1 / d)
+    columns = -rows[:, :d] * along**power
+    size, covariance, ratio, p = _test_beside(q, left, columns, BLOCKS)
+    taken = np.linalg.lstsq(rows, columns)[0]
+    real = 1 - 1 / max(ratio, 1.0)
+    square = real**2 * np.outer(size, size) + real * covariance
+    return Beyond(size, p, taken @ square @ taken.T)
+
+
+_LEAST_PART = 3  # blocks before and after a change
+
+
+def find_change(theta: Array, outputs: Array) -> Beyond:
+    """Return the most probable change of the hard iron from some reading on.
+
+    A change of the hard iron shows in no mean of |m|. For each split the residuals are fitted by a change of the hard
+    iron and of |m| after it, beside all parameters. The one that explains most is tested by F over what is left, with
+    the errors that readings in a row have in common, times the number of splits. The hard iron before, or after, is off
+    the fitted one by up to the greater part of the change.
+    """
+    d = outputs.shape[1]
+    rows, q, left, weight = _left_over(theta, outputs)
     edges = np.linspace(0, len(left), BLOCKS + 1).astype(np.intp)[_LEAST_PART : BLOCKS - _LEAST_PART + 1].tolist()
 
-    def beside(edge: int) -> Array:
-        after = np.zeros((len(left), d + 1))
-        after[edge:] = np.column_stack([rows[edge:, :d], 1 / weight[edge:]])
-        changed: Array = after - q @ (q.T @ after)
-        return changed
+    def after(edge: int) -> Array:
+        columns = np.zeros((len(left), d + 1))
+        columns[edge:] = np.column_stack([rows[edge:, :d], 1 / weight[edge:]])
+        return columns
 
-    explained = [float(((orthonormal(beside(edge)).T @ left) ** 2).sum()) for edge in edges]
-    best = int(np.argmax(explained))
-    columns = beside(edges[best])
-    change = np.asarray(np.linalg.lstsq(columns, left)[0], dtype=np.float64)
-    both = np.hstack([q, orthonormal(columns)])
-    remain = left - columns @ change
-    sigma = float(np.sqrt((remain**2).sum() / (len(left) - both.shape[1])))
-    inflation = find_inflation(remain, both, sigma)
-    ratio = explained[best] / max((d + 1) * inflation * sigma**2, 1e-300)
-    freedom = max(len(left) / inflation - both.shape[1], 1.0)
-    return edges[best], change[:d], min(float(f_tail(ratio, d + 1.0, freedom)) * len(edges), 1.0)
+    def explained(edge: int) -> float:
+        columns = after(edge)
+        return float(((orthonormal(columns - q @ (q.T @ columns)).T @ left) ** 2).sum())
+
+    first = max(edges, key=explained)
+    change, _, _, p = _test_beside(q, left, after(first), BLOCKS, _LONG_BLOCKS)
+    covariance = np.zeros((len(theta), len(theta)))
+    greater = max(first, len(left) - first) / len(left)
+    covariance[:d, :d] = np.outer(change[:d], change[:d]) * greater**2
+    return Beyond(change[:d], min(p * len(edges), 1.0), covariance, first)
 
 
 # What the parameters leave open of the corrected field, and directions without readings.
