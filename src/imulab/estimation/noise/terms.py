@@ -259,8 +259,9 @@ def _nodes(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[Array, Ar
     """Return the frequencies j at which bins are evaluated, their weights, shapes (b, 16), and the means of (-1)^j."""
     width = (last - first + 1).astype(np.float64)
     steps = np.arange(_NODES, dtype=np.float64)
-    near, far = (np.sqrt(3 / 7 + sign * 2 / 7 * np.sqrt(6 / 5)) for sign in (-1, 1))  # Gauss-Legendre, four points
-    points, weights = np.array([-far, -near, near, far]), (18 + np.array([-1, 1, 1, -1]) * np.sqrt(30)) / 36
+    # Gauss-Legendre of four points; NumPy's own load its package for polynomials.
+    points = np.array([-0.8611363115940526, -0.33998104358485626, 0.33998104358485626, 0.8611363115940526])
+    weights = np.array([0.34785484513745357, 0.6521451548625464, 0.6521451548625464, 0.34785484513745357])
     padding = np.zeros(_NODES - len(points))
     wide = (width > _NODES)[:, None]
     middle = (first + last)[:, None] / 2
