@@ -29,7 +29,7 @@ from imulab.fleet.statistics import (
 )
 from imulab.records.calibration import Parameter
 from imulab.report.parameters import reading_unit
-from imulab.report.traces import bulk, edge_marks, edge_note
+from imulab.report.traces import BAD, PANEL, PLOT, Figure, bulk, edge_marks, edge_note
 
 
 def summary(serial, value, *, u=0.1, when="2026-01-01T00:00:00Z", unit="m/s^2", freedom=None, sha="s", inputs=("f",)):
@@ -139,15 +139,72 @@ def test_capability_is_the_handbooks():
     """NIST/SEMATECH e-Handbook 6.1.6: USL 20, LSL 8, mean 16, standard deviation 2 gives Cpk 0.6667."""
     values = 16 + 2 * np.array([-1.0, 1.0]) / math.sqrt(2)
     assert values.std(ddof=1) == pytest.approx(2.0)
-    found = capability(values, ["a", "b"], Limits(8.0, 20.0))
-    assert found.cpk == pytest.approx(0.6667, abs=5e-5)
-    assert found.beyond == ()
-    many = capability(np.tile(values, 50) * 1.0, [str(i) for i in range(100)], Limits(15.0, math.inf))
+    assert capability(values, Limits(8.0, 20.0)).cpk == pytest.approx(0.6667, abs=5e-5)
+    many = capability(np.tile(values, 50) * 1.0, Limits(15.0, math.inf))
     s = np.tile(values, 50).std(ddof=1)
     assert many.cpk == pytest.approx((16 - 15) / (3 * s))
     assert many.at_least == pytest.approx(many.cpk - 1.645 * math.sqrt(1 / 900 + many.cpk**2 / 198), abs=1e-4)
-    assert len(many.beyond) == 50
-    assert capability(np.ones(5), list("abcde"), Limits(0.0, 2.0)) is None
+    assert capability(np.ones(5), Limits(0.0, 2.0)) is None
+
+
+def exhibits_with_limits(values, lower, upper):
+    known = {("tumble", "bias_x"): Limits(lower * 9.80665e-3, upper * 9.80665e-3)}
+    units = [summary(f"U{i}", v * 9.80665e-3, when=f"2026-01-{i + 1:02d}T00:00:00Z") for i, v in enumerate(values)]
+    return fleet_exhibits(FleetState("d", FleetManifest("m.csv", ".", ()), ()), line_statistics(units, known), [])
+
+
+@pytest.mark.parametrize("values", [[57.9], [57.9, 57.9], [1.0, -2.0, 57.9, 0.5], [*np.linspace(-4, 4, 11), 57.9]])
+def test_a_unit_beyond_its_limits_is_said_first_however_few_there_are(values):
+    exhibits = exhibits_with_limits(values, -40, 40)
+    broken = [f"U{i}" for i, value in enumerate(values) if value > 40]
+    named, verb = ", ".join(broken), "are" if len(broken) == 2 else "is"
+    assert (
+        f"have their record; {named} {verb} beyond the limits of bias_x; " in exhibits.headline.replace(".", ";") + " "
+    )
+    assert dict(exhibits.facts)["beyond the limits"] == str(len(broken))
+    first, *others = [item for item in exhibits.items if not hasattr(item, "traces")]
+    assert first.title == "Units beyond their limits"
+    assert [(row[0], row[4], row[5]) for row in first.rows] == [(name, "-40 to 40", "mg") for name in broken]
+    every = next(table for table in others if table.title.endswith("every parameter"))
+    assert every.columns.index("beyond limits") == 3  # in sight, however wide the table is
+    assert every.rows[0][3] == str(len(broken))
+    for figure in exhibits.figures[:1]:
+        assert figure.message.startswith(f"Beyond the limits of bias_x: {named}. ")
+
+
+def test_within_limits_and_without_limits():
+    exhibits = exhibits_with_limits(np.linspace(-4, 4, 12), -math.inf, 40)
+    assert "; none is beyond the limits; " in exhibits.headline
+    assert dict(exhibits.facts)["beyond the limits"] == "0"
+    bare = fleet_exhibits(
+        FleetState("d", FleetManifest("m.csv", ".", ()), ()), line_statistics([summary("A", 1.0)], {}), []
+    )
+    assert "limit" not in bare.headline
+    assert "beyond the limits" not in dict(bare.facts)
+    for ends, text in (((-math.inf, 40), "at most 40"), ((60, math.inf), "at least 60")):
+        tables = [item for item in exhibits_with_limits([50.0] * 3, *ends).items if not hasattr(item, "traces")]
+        assert tables[0].rows[0][4] == text
+
+
+def lines_of(figure, along):
+    """Return range of the axis of the values, and the places of the red lines across it."""
+    reds = [
+        shape for shape in figure.layout["shapes"] if shape["line"] == {"color": BAD, "width": 1.5, "dash": "solid"}
+    ]
+    return figure.layout[f"{along}axis"].get("range"), sorted(round(shape[f"{along}0"], 6) for shape in reds)
+
+
+def test_limits_are_drawn_within_the_axis_that_shows_them():
+    near = exhibits_with_limits(np.linspace(-6, 4, 12), -40, 40).figures  # 3.5 times the spread away
+    (low, high), drawn = lines_of(near[0], "x")
+    assert drawn == [-40, 40]
+    assert (low < -40, high > 40) == (True, True)
+    assert lines_of(near[1], "y")[1] == []  # over the date they would press the points together
+    broken = exhibits_with_limits([*np.linspace(-4, 4, 11), 57.9], -40, 40).figures
+    assert lines_of(broken[0], "x")[1] == [-40, 40]
+    (low, high), drawn = lines_of(broken[1], "y")
+    assert drawn == [40]
+    assert high > 40
 
 
 @pytest.mark.slow
@@ -155,9 +212,7 @@ def test_the_bound_of_cpk_holds_in_nineteen_of_twenty_lines(reduced):
     trials = 1000 if reduced else 10_000
     rng = np.random.default_rng(4)
     true = 4 / 3
-    below = [
-        capability(rng.standard_normal(60), [""] * 60, Limits(-4.0, math.inf)).at_least < true for _ in range(trials)
-    ]
+    below = [capability(rng.standard_normal(60), Limits(-4.0, math.inf)).at_least < true for _ in range(trials)]
     assert abs(np.mean(below) - 0.95) < 4 * math.sqrt(0.05 * 0.95 / trials) + 0.005  # Bissell's is an approximation
 
 
@@ -331,7 +386,7 @@ def test_the_report_says_what_is_there(line, capsys):
     assert 'class="verdict ' not in page  # a unit that stands out is no matter of one verdict on the line
     head = page[: page.index("<dl")]
     assert "16 of 16 units have their record" in head
-    assert "SN005 stands out; bias_z drifts over the date; " in head
+    assert "SN005 is beyond the limits of bias_x; SN005 stands out; bias_z drifts over the date; " in head
     assert "SN003 changed since the last calibration" in head
     assert "the smallest Cpk is" in head
     for title in ("distribution over the units", "every parameter", "over the date", "change since each unit"):
@@ -420,6 +475,24 @@ def test_marks_stand_at_the_edge_with_the_value(upright):
     assert (down[on], down[along], down["text"]) == ([found.low], [6], ["-80 µg"])
     assert (up[on], up[along], up["text"]) == ([found.high], [5], ["60 µg"])
     assert down["marker"]["symbol"] != up["marker"]["symbol"]
+
+
+@pytest.mark.parametrize("pixels", [PANEL, PLOT])
+def test_a_mark_with_its_value_stands_clear_of_the_points(pixels):
+    values = np.array([-1.0, 0.0, 1.0, 2.0, 60.0, -80.0])
+    found = bulk(values, np.abs(values) < 10, pixels=pixels)
+    a_pixel = (found.high - found.low) / pixels
+    assert (found.high - 2.0) / a_pixel > 24  # a triangle of 11 pixels, a line of 13
+    assert (-1.0 - found.low) / a_pixel > 24
+    above = bulk(values[:5], np.abs(values[:5]) < 10, pixels=pixels)
+    assert above.low == bulk(values[:5], np.abs(values[:5]) < 10).low
+
+
+def test_the_numbers_of_an_x_axis_stand_off_those_of_the_y_axis():
+    figure = Figure("", "", [], {"xaxis": {"title": {"text": "a"}}, "xaxis2": {"ticklen": 2}, "yaxis": {}})
+    assert figure.layout["xaxis"]["ticklen"] >= 6
+    assert figure.layout["xaxis2"]["ticklen"] == 2
+    assert figure.layout["yaxis"] == {}
 
 
 def test_the_value_of_one_mark_stands_above_the_bars():

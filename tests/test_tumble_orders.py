@@ -547,7 +547,9 @@ def test_the_demonstrations_recording_gives_the_truth(tmp_path):
     recording = il.simulate_tumble(order=2, gravity=9.81362, knock=7, seed=4)
     record = il.fit_tumble(il.find_attitudes(recording), gravity=9.81362).calibration
     assert record.fit["set_aside"] == [8]
-    assert any(w.startswith("attitude 8 (45.1 to 46.7 s) set aside") for w in record.warnings)
+    (named,) = (w for w in record.warnings if w.startswith("attitude 8 (45.1 to 46.7 s) set aside"))
+    (label,) = (mark["text"] for mark in exhibits_of(record).items[0].traces if "text" in mark.get("mode", ""))
+    assert f"set aside: +{label[0]} (" in named  # in 9.80665 m/s^2, as the figure; not in local gravity
     for axis in "xyz":
         bias = record.parameters[f"bias_{axis}"]
         half = record.fit["coverage_factor_95"] * bias.standard_uncertainty

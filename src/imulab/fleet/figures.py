@@ -34,6 +34,7 @@ from imulab.report.traces import (
     plain_number,
     rounded,
     scatter,
+    with_labels,
 )
 
 # Panels of the figures, one for each parameter.
@@ -49,14 +50,32 @@ def staggered(marked: NDArray[np.bool_], top: int) -> list[float]:
     return [round(top * (1.15 - 0.15 * (k % 7)), 3) for k in order.tolist()]
 
 
-def limits_in_view(item: ParameterStatistics, shown: ReadingUnit, values: Array) -> list[float]:
-    """Return the limits of a parameter that are close enough to the shown values to be drawn."""
-    if item.capability is None:
+_SPANS_DRAWN, _SPANS_OVER_DATE = 10.0, 1.0
+"""Limits so many times the spread of the values away from them are drawn; over the date only nearer ones."""
+
+
+def limits_in_view(
+    item: ParameterStatistics, shown: ReadingUnit, values: Array, spans: float = _SPANS_DRAWN
+) -> list[float]:
+    """Return the limits to draw: those at most `spans` spreads from the shown values, and any that a unit is beyond."""
+    if item.limits is None:
         return []
-    limits = item.capability.limits
-    ends = sorted(shown.of(end) for end in (limits.lower, limits.upper) if math.isfinite(end))
     span = max(float(np.ptp(values)), 1e-300)
-    return [end for end in ends if values.min() - 2 * span <= end <= values.max() + 2 * span]
+    ends = []
+    for end, broken in (
+        (item.limits.lower, item.values < item.limits.lower),
+        (item.limits.upper, item.values > item.limits.upper),
+    ):
+        reach = span * (_SPANS_DRAWN if broken.any() else spans)
+        if math.isfinite(end) and values.min() - reach <= shown.of(end) <= values.max() + reach:
+            ends.append(float(shown.of(end)))
+    return sorted(ends)
+
+
+def with_limits(low: float, high: float, limits: Sequence[float]) -> tuple[float, float]:
+    """Return the range of an axis that holds limits too, with room beyond them."""
+    room = 0.04 * (max(high, *limits) - min(low, *limits)) if limits else 0.0
+    return min([low, *(end - room for end in limits)]), max([high, *(end + room for end in limits)])
 
 
 def bin_edges(values: Array) -> Array:
@@ -123,15 +142,15 @@ def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Repo
         if item.drift is not None:
             slope, error = format_uncertain(item.drift.per_day * factor, item.drift.standard_uncertainty * factor)
             drift = f"{slope} ± {error}" + (" !" if item.drift.significant else "")
-        capable, beyond = "–", "–"
+        capable = "–"
         if item.capability is not None:
             capable = f"{item.capability.cpk:.2f} (≥ {item.capability.at_least:.2f})"
-            beyond = str(len(item.capability.beyond))
         rows.append(
             [
                 item.name,
                 shown.symbol,
                 str(len(item.values)),
+                "–" if item.limits is None else str(int(item.beyond.sum())),
                 f"{median:.{places}f}",
                 number(robust, 3) if several else "–",
                 number(item.deviation * factor, 3) if several else "–",
@@ -139,17 +158,16 @@ def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Repo
                 str(int(item.outliers.sum())) if item.enough else "–",
                 drift,
                 capable,
-                beyond,
             ]
         )
-    titles = ["parameter", "unit", "units", "median", "robust σ", "σ", "typical u", "stand out", "drift per day"]
+    titles = ["parameter", "unit", "units", "beyond limits", "median", "robust σ", "σ", "typical u", "stand out"]
     return ReportTable(
         f"{title}: every parameter",
         "Robust σ is 1.4826 times the median distance from the median; where σ is much larger, single units stand out. "
         "Where the typical standard uncertainty u is not well below σ, the spread is the calibration's, not the "
         "sensors'. Drift is a straight line over the date, ± one standard uncertainty, ! where chance would give it "
         "less than once in a thousand. Cpk = min(USL − mean, mean − LSL) / 3σ, with its one-sided 95 % bound.",
-        [*titles, "Cpk", "beyond"],
+        [*titles, "drift per day", "Cpk"],
         rows,
     )
 
@@ -159,6 +177,36 @@ def _places(scale: float) -> int:
     if not scale > 0 or not math.isfinite(scale):
         return 3
     return min(max(0, 2 - math.floor(math.log10(scale))), 9)
+
+
+def _limits_text(*ends: float) -> str:
+    """Return limits as text, either of which may be infinite."""
+    low, high = sorted(ends)
+    if math.isinf(low):
+        return f"at most {high:.6g}"
+    return f"at least {low:.6g}" if math.isinf(high) else f"{low:.6g} to {high:.6g}"
+
+
+def limits_table(statistics: Sequence[ParameterStatistics]) -> ReportTable | None:
+    """Return the table of the units that are beyond their limits."""
+    rows = []
+    for item in statistics:
+        shown = reading_unit(item.unit, item.name)
+        limits = "" if item.limits is None else _limits_text(shown.of(item.limits.lower), shown.of(item.limits.upper))
+        for i in np.flatnonzero(item.beyond).tolist():
+            value, error = format_uncertain(
+                float(shown.of(float(item.values[i]))), float(item.uncertainties[i]) * abs(shown.factor)
+            )
+            rows.append([item.serials[i], item.name, value, error, limits, shown.symbol])
+    if not rows:
+        return None
+    more = f" The first {_MOST_ROWS} of {len(rows)}." if len(rows) > _MOST_ROWS else ""
+    return ReportTable(
+        "Units beyond their limits",
+        "By their values alone; a certificate allows for the uncertainties." + more,
+        ["serial", "parameter", "value", "u", "limits", "unit"],
+        rows[:_MOST_ROWS],
+    )
 
 
 def outlier_table(statistics: Sequence[ParameterStatistics]) -> ReportTable | None:
@@ -258,10 +306,10 @@ def shown_first(statistics: Sequence[ParameterStatistics]) -> list[ParameterStat
     if len(statistics) <= MOST_PANELS:
         return list(statistics)
 
-    def weight(item: ParameterStatistics) -> tuple[float, float]:
+    def weight(item: ParameterStatistics) -> tuple[bool, float, float]:
         cpk = math.inf if item.capability is None else item.capability.cpk
         alarms = int(item.outliers.sum()) + (item.drift is not None and item.drift.significant)
-        return cpk, -float(alarms)
+        return not item.beyond.any(), cpk, -float(alarms)
 
     chosen = sorted(statistics, key=weight)[:MOST_PANELS]
     return [item for item in statistics if item in chosen]
@@ -308,7 +356,8 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
             traces.append(_outlier_marks(item.serials, values, out, x, y))
         grid.panel(layout, index, len(panels), f"{item.name}, {shown.symbol}", "units")
         if far is not None:
-            far = replace(far, low=min(far.low, *limits, far.high), high=max(far.high, *limits, far.low))
+            low, high = with_limits(far.low, far.high, limits)
+            far = replace(far, low=low, high=high)
             labels = [f"{s} {number(float(v))}" for s, v in zip(item.serials, values, strict=True)]
             traces += edge_marks(
                 far, values, staggered(far.beyond, int(counts.max())), labels, axes=(x, y), upright=False
@@ -316,25 +365,40 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
             layout[grid.axis_key(x)]["range"] = [far.low, far.high]
             layout[grid.axis_key(y)]["range"] = [0, 1.25 * int(counts.max())]
             beyond += int(far.beyond.sum())
+        elif limits:
+            layout[grid.axis_key(x)]["range"] = with_limits(float(edges[0]), float(edges[-1]), limits)
         below_labels = 1.0 if far is None else 0.8
         layout["shapes"] += [grid.line(x, y, float(shown.of(item.median)), "#22303a", "dot", below_labels)]
         layout["shapes"] += [grid.line(x, y, end, BAD, "solid") for end in limits]
         layout[grid.axis_key(y)]["rangemode"] = "tozero"
-    standing = sorted({s for item in panels for s, o in zip(item.serials, item.outliers, strict=True) if o})
     return Figure(
         title,
-        lead + "Bars count units. Dotted: median. Red lines: limits that lie near. Red diamonds: units whose "
+        lead + "Bars count units. Dotted: median. Red lines: limits. Red diamonds: units whose "
         "robust z is so large that a healthy line of this size shows such a unit in one of a hundred cases."
         + edge_note(beyond),
         traces,
         layout,
         height=grid.height(len(panels)),
-        message=f"{'Stands' if len(standing) == 1 else 'Stand'} out: {first_of(standing, 6)}."
-        if standing
-        else "No unit stands out."
-        if any(item.enough for item in panels)
-        else f"Fewer than {FEWEST_FOR_OUTLIERS} units: too few to tell which stands out.",
+        message=_named_units(panels),
     )
+
+
+def _named_units(panels: Sequence[ParameterStatistics]) -> str:
+    """Return sentences that name the units beyond their limits, if any, and those that stand out."""
+    units, parameters = beyond_limits(panels)
+    broken = f"Beyond the limits of {first_of(parameters, 6)}: {first_of(units, 6)}. " if units else ""
+    standing = sorted({s for item in panels for s, o in zip(item.serials, item.outliers, strict=True) if o})
+    if standing:
+        return f"{broken}{'Stands' if len(standing) == 1 else 'Stand'} out: {first_of(standing, 6)}."
+    if any(item.enough for item in panels):
+        return f"{broken}No unit stands out."
+    return f"{broken}Fewer than {FEWEST_FOR_OUTLIERS} units: too few to tell which stands out."
+
+
+def beyond_limits(statistics: Sequence[ParameterStatistics]) -> tuple[list[str], list[str]]:
+    """Return the serials of the units beyond their limits, sorted, and the parameters."""
+    units = {s for item in statistics for s, b in zip(item.serials, item.beyond, strict=True) if b}
+    return sorted(units), [item.name for item in statistics if item.beyond.any()]
 
 
 def _outlier_marks(serials: Sequence[str], values: Array, out: np.ndarray, x: str, y: str) -> dict[str, Any]:
@@ -384,11 +448,20 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, 
         grid.panel(layout, index, len(panels), f"{item.name}, {shown.symbol}")
         layout[grid.axis_key(x)] |= date_axis(places) if dated else {"nticks": 5}
         far = bulk(values)
+        inside = values if far is None else values[~far.beyond]
+        limits = limits_in_view(item, shown, inside, _SPANS_OVER_DATE)
+        layout["shapes"] += [grid.line(x, y, end, BAD, "solid", upright=False) for end in limits]
         if far is not None:
+            low, high = with_limits(far.low, far.high, limits)
+            far = with_labels(replace(far, low=low, high=high), values, grid.PANEL)
             labels = [f"{s} {number(float(v))}" for s, v in zip(item.serials, values, strict=True)]
             traces += edge_marks(far, values, where, labels, axes=(x, y))
             layout[grid.axis_key(y)]["range"] = [far.low, far.high]
             beyond += int(far.beyond.sum())
+        elif limits:
+            room = 0.06 * float(np.ptp(values))
+            ends = with_limits(float(values.min()) - room, float(values.max()) + room, limits)
+            layout[grid.axis_key(y)]["range"] = ends
     drifting = [item.name for item in panels if item.drift is not None and item.drift.significant]
     return Figure(
         title,
@@ -399,7 +472,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, 
             if dated
             else "The records are of one date: nothing can be said of drift."
         )
-        + " Red diamonds stand out."
+        + " Red diamonds stand out. Level red lines: limits that lie near."
         + edge_note(beyond),
         traces,
         layout,
@@ -449,7 +522,7 @@ def change_figure(title: str, changes: Sequence[FleetChange]) -> Figure | None:
     scale: dict[str, Any] = {}
     if far is not None:
         far = replace(far, low=min(far.low, -1.3 * limit), high=max(far.high, 1.3 * limit))
-        far = replace(far, beyond=(deviations < far.low) | (deviations > far.high))
+        far = with_labels(replace(far, beyond=(deviations < far.low) | (deviations > far.high)), deviations, grid.PLOT)
         traces += edge_marks(far, deviations, [x for x, *_ in every], [f"{what}: {z:+.3g}" for _, z, what in every])
         scale = {"range": [far.low, far.high]}
     many = int(np.count_nonzero(np.abs(deviations) > limit))

@@ -116,11 +116,13 @@ def fleet_exhibits(
     capable = [item for item in statistics if item.capability is not None]
     drifting = [item.name for item in statistics if item.drift is not None and item.drift.significant]
     fresh = [change for change in changes if not change.same_files]
+    limited = any(item.limits is not None for item in statistics)
     moved = {change.serial for change in fresh if abs(change.deviations or 0.0) > change_limit(len(fresh))}
     facts = [
         ("units done", f"{state.count('done')} of {len(state.rows)}"),
         ("failed", str(state.count("failed"))),
         ("records to look at first", str(len(state.doubtful))),
+        *([("beyond the limits", str(len(figures.beyond_limits(statistics)[0])))] if limited else []),
         ("units that stand out", str(len(out)) if any(item.enough for item in statistics) else "–"),
         ("parameters that drift", str(len(drifting))),
     ]
@@ -129,6 +131,7 @@ def fleet_exhibits(
     phrases[0] += (state.verdicts and f": {state.verdicts}") + (doubtful and f" ({doubtful})")
     if state.failures:
         phrases.append(f"{len(state.failures)} failed")
+    phrases += _beyond(statistics)
     phrases += _standing(statistics, out)
     if drifting:
         phrases.append(f"{first_of(drifting, _NAMED)} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
@@ -141,7 +144,7 @@ def fleet_exhibits(
         facts.append(("changed since last", str(len(moved))))
     if moved:
         phrases.append(f"{first_of(sorted(moved), _NAMED)} changed since the last calibration")
-    items: list[Figure | ReportTable | None] = [figures.failure_table(state.failures)]
+    items: list[Figure | ReportTable | None] = [figures.failure_table(state.failures), figures.limits_table(statistics)]
     verdicts = figures.verdict_table(state)
     items += [verdicts] if state.doubtful else []
     for procedure in dict.fromkeys(item.procedure for item in statistics):
@@ -157,6 +160,16 @@ def fleet_exhibits(
     items += [figures.outlier_table(statistics), figures.change_table(changes)]
     items += [] if state.doubtful else [verdicts]
     return Exhibits("; ".join(phrases) + ".", facts, [item for item in items if item is not None])
+
+
+def _beyond(statistics: Sequence[ParameterStatistics]) -> Iterator[str]:
+    """Return a sentence on the units beyond their limits, where there are limits."""
+    units, parameters = figures.beyond_limits(statistics)
+    if units:
+        verb = "is" if len(units) == 1 else "are"
+        yield f"{first_of(units, _NAMED)} {verb} beyond the limits of {first_of(parameters, _NAMED)}"
+    elif any(item.limits is not None for item in statistics):
+        yield "none is beyond the limits"
 
 
 def _standing(statistics: Sequence[ParameterStatistics], out: set[str]) -> Iterator[str]:

@@ -48,12 +48,10 @@ class FleetDrift:
 
 @dataclass(frozen=True)
 class Capability:
-    """``Cpk = min(USL - mean, mean - LSL) / 3 s``, its one-sided 95 % lower bound, and the units beyond the limits."""
+    """``Cpk = min(USL - mean, mean - LSL) / 3 s``, and its one-sided 95 % lower bound."""
 
-    limits: Limits
     cpk: float
     at_least: float
-    beyond: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -75,6 +73,8 @@ class ParameterStatistics:
     outlier_limit
         A healthy line of this size shows a unit beyond this z, either way, in one of a hundred cases; infinite for few
         units.
+    limits
+        None where there are none.
     drift, capability
         None where there are too few units, no span of dates, no limits.
     """
@@ -92,6 +92,7 @@ class ParameterStatistics:
     robust_deviation: float
     z: Array
     outlier_limit: float
+    limits: Limits | None
     drift: FleetDrift | None
     capability: Capability | None
 
@@ -104,6 +105,13 @@ class ParameterStatistics:
     def outliers(self) -> NDArray[np.bool_]:
         """Whether each unit stands out, shape (n,)."""
         return np.abs(self.z) > self.outlier_limit
+
+    @property
+    def beyond(self) -> NDArray[np.bool_]:
+        """Whether each unit is beyond the limits, shape (n,)."""
+        if self.limits is None:
+            return np.zeros(len(self.values), dtype=bool)
+        return ~((self.limits.lower <= self.values) & (self.values <= self.limits.upper))
 
 
 @dataclass(frozen=True)
@@ -240,8 +248,9 @@ def _statistics(
         robust_deviation=robust,
         z=z,
         outlier_limit=limit,
+        limits=limits,
         drift=line_drift(days, values, np.abs(z) <= limit),
-        capability=None if limits is None else capability(values, serials, limits),
+        capability=None if limits is None else capability(values, limits),
     )
 
 
@@ -280,21 +289,20 @@ def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> FleetDrif
     )
 
 
-def capability(values: Array, serials: Sequence[str], limits: Limits) -> Capability | None:
+def capability(values: Array, limits: Limits) -> Capability | None:
     """Return Cpk with the overall standard deviation; None for fewer than two units or no spread.
 
     Source: NIST/SEMATECH e-Handbook of Statistical Methods, 6.1.6; the bound is Bissell's,
     ``Cpk - 1.645 sqrt(1 / 9n + Cpk^2 / (2 (n - 1)))``.
     """
     count = len(values)
-    beyond = tuple(s for s, v in zip(serials, values.tolist(), strict=True) if not limits.lower <= v <= limits.upper)
     spread = float(values.std(ddof=1)) if count > 1 else 0.0
     if spread <= 0:
         return None
     mean = float(values.mean())
     cpk = min(limits.upper - mean, mean - limits.lower) / (3 * spread)
     at_least = cpk - _ONE_SIDED_95 * math.sqrt(1 / (9 * count) + cpk**2 / (2 * (count - 1)))
-    return Capability(limits, cpk, at_least, beyond)
+    return Capability(cpk, at_least)
 
 
 def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past]]) -> list[FleetChange]:

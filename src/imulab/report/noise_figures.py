@@ -277,7 +277,7 @@ def _samples_figure(analysis: dict[str, Any], recording: Recording, names: Seque
         panels.panel(layout, index, len(names), f"{name}, {unit}")
         layout[panels.axis_key(x)]["title"] = {"text": "time, s", "font": {"size": 11}, "standoff": 4}
         ends = np.concatenate([low, high])
-        far = bulk(ends)
+        far = bulk(ends, pixels=panels.PANEL)
         if far is not None:
             labels = [f"{value:.3g}" for value in ends.tolist()]
             traces += edge_marks(far, ends, [*time.tolist(), *time.tolist()], labels, axes=(x, y))

@@ -34,10 +34,14 @@ TIME = "time, s"
 """Title of an axis of a recording's times."""
 
 
+_TICKS = {"ticks": "outside", "ticklen": 6, "tickcolor": "rgba(0,0,0,0)"}
+
+
 class Figure(Struct, frozen=True):
     """A Plotly figure (traces and layout as plain JSON values), a title, how to read it, and what it shows.
 
     Times since 1970 are drawn from their first on, which the axis names: 1.656e9 s has no digits left for seconds.
+    The numbers of an x axis stand a little below it, off that of the y axis in the corner.
     """
 
     title: str
@@ -48,6 +52,9 @@ class Figure(Struct, frozen=True):
     message: str = ""
 
     def __post_init__(self) -> None:
+        for key in self.layout:
+            if key.startswith("xaxis"):
+                self.layout[key] = {**_TICKS, **self.layout[key]}
         axis = self.layout.get("xaxis", {})
         if axis.get("title") != {"text": TIME}:
             return
@@ -269,12 +276,15 @@ def strongest_pair(matrix: Array, names: Sequence[str]) -> str:
 # Axes that show the bulk of the points, and marks at their edge for the few that lie far beyond.
 
 
+PLOT, PANEL = 260.0, 155.0
+"""Usual height of a plot that fills a figure, and of a panel of several, pixels."""
 _DEVIATIONS_OFF_AXIS = 12.0  # robust standard deviations from the median, from which a point is far
 _MOST_OUT = 0.1  # share of far points from which all are shown
 _WORTH = 2.5  # times the usual range, from which the whole range is clipped
 _PAD = 0.08  # of the range, free at both ends
 _FEWEST = 5  # points that have a usual range
 _MOST_LABELS = 4  # points outside the range that are labelled
+_LABEL = 24.0  # height of a triangle and its label, pixels
 
 
 class Bulk(Struct, frozen=True):
@@ -285,7 +295,9 @@ class Bulk(Struct, frozen=True):
     beyond: NDArray[np.bool_]
 
 
-def bulk(values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.0) -> Bulk | None:
+def bulk(
+    values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.0, *, pixels: float | None = None
+) -> Bulk | None:
     """Return the range that shows the bulk of some values, or None where all of them fit on one axis.
 
     A value is far off where it is 12 robust standard deviations from the median. The axis is clipped only where at
@@ -299,6 +311,8 @@ def bulk(values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.
         Which values belong to the bulk, where that is known, shape (n,).
     room
         Added at both ends, for bars of uncertainty.
+    pixels
+        Height of the plot, where the values beyond the range are marked with labels, which need room.
     """
     values = np.asarray(values, dtype=np.float64)
     finite = np.isfinite(values)
@@ -317,7 +331,18 @@ def bulk(values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.
         return None
     pad = _PAD * (high - low)
     low, high = low - pad, high + pad
-    return Bulk(low, high, finite & ((values < low) | (values > high)))
+    shown = Bulk(low, high, finite & ((values < low) | (values > high)))
+    return shown if pixels is None else with_labels(shown, values, pixels)
+
+
+def with_labels(bulk: Bulk, values: Array, pixels: float) -> Bulk:
+    """Return a range with room for the labels of `edge_marks` at its ends, on a plot of this height."""
+    ends = [
+        np.count_nonzero(bulk.beyond & side) in range(1, _MOST_LABELS + 1)
+        for side in (values < bulk.low, values > bulk.high)
+    ]
+    room = (bulk.high - bulk.low) * _LABEL / (pixels - _LABEL * sum(ends))
+    return Bulk(bulk.low - ends[0] * room, bulk.high + ends[1] * room, bulk.beyond)
 
 
 def edge_marks(
@@ -461,16 +486,17 @@ def panel(layout: dict[str, Any], index: int, count: int, title: str, up: str = 
     )
 
 
-def line(x: str, y: str, place: float, colour: str, dash: str, height: float = 1) -> dict[str, Any]:
-    """Return an upright line through a panel, from its foot to a share of its height."""
+def line(
+    x: str, y: str, place: float, colour: str, dash: str, share: float = 1, *, upright: bool = True
+) -> dict[str, Any]:
+    """Return an upright line through a panel, from its foot to a share of its height, or a level one."""
+    along, across = ("y", "x") if upright else ("x", "y")
+    axes = {"x": x, "y": y}
     return {
         "type": "line",
-        "xref": x,
-        "yref": f"{y} domain",
-        "x0": place,
-        "x1": place,
-        "y0": 0,
-        "y1": height,
+        f"{across}ref": axes[across],
+        f"{along}ref": f"{axes[along]} domain",
+        **{f"{across}0": place, f"{across}1": place, f"{along}0": 0, f"{along}1": share},
         "line": {"color": colour, "width": 1.5, "dash": dash},
     }
 

@@ -32,6 +32,7 @@ from imulab.records.sections import StatedGravity, entries
 from imulab.report.parameters import micro_g, reading_unit, small_g
 from imulab.report.traces import (
     BAD,
+    PLOT,
     QUIET,
     Exhibits,
     Figure,
@@ -270,7 +271,7 @@ def _residuals(check: Check) -> Figure:
         bars = (
             " Bars: twice the standard uncertainty, from record and attitude; one in twenty lies farther off by chance."
         )
-    far = bulk(residual, room=room)
+    far = bulk(residual, room=room, pixels=PLOT)
     edges = [] if far is None else edge_marks(far, residual, number, [small_g(v) for v in check.residuals.tolist()])
     ends = [] if check.limit is None else [-micro_g(check.limit), micro_g(check.limit)]
     line = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "line": {"color": BAD, "dash": "dash", "width": 1.5}}

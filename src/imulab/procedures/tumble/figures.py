@@ -36,6 +36,7 @@ from imulab.report.traces import (
     GOOD,
     INK,
     LEGEND,
+    PLOT,
     QUIET,
     TIME,
     Exhibits,
@@ -451,7 +452,7 @@ def _residuals(record: Calibration) -> Figure:
     before = [micro_g(value) / 1e3 for value in data.residual_before]
     usual = np.array(data.down_weight) >= ALARM
     bad = len(number) - int(usual.sum())
-    beyond = bulk(np.array(after), usual if usual.any() else None, median(np.array(bars)) if bars else 0.0)
+    beyond = bulk(np.array(after), usual if usual.any() else None, median(np.array(bars)) if bars else 0.0, pixels=PLOT)
     marks = [] if beyond is None else edge_marks(beyond, np.array(after), number, [small_g(v) for v in data.residual])
     worst = int(np.argmax(np.where(usual, np.abs(after), -1.0)))
     scale = {} if beyond is None else {"range": [beyond.low, beyond.high]}
@@ -564,7 +565,7 @@ def _turns(data: TurnResiduals, aside: list[TurnAside]) -> Figure:
     number = list(range(1, len(angle) + 1))
     text = [f"{a:.1f} to {b:.1f} s" for a, b, *_ in turns]
     left = float(from_si(rms(data.residual), "deg"))
-    beyond = bulk(np.array(angle))
+    beyond = bulk(np.array(angle), pixels=PLOT)
     marks = [] if beyond is None else edge_marks(beyond, np.array(angle), number, [f"{v:.3g} deg" for v in angle])
     return Figure(
         title="What the gyroscopes miss in each turn",

@@ -59,7 +59,7 @@ from imulab.procedures.tumble.solve import CLOSEST, TumbleProblem, TumbleSolutio
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, StatedGravity, entries
-from imulab.report.parameters import Row, reading_unit, rows_of
+from imulab.report.parameters import Row, reading_unit, rows_of, small_g
 from imulab.report.traces import plain_number
 from imulab.units import conversion_factor, parse_unit
 
@@ -132,8 +132,13 @@ def aside_of(record: Calibration, attitudes: Attitudes) -> NDArray[np.bool_]:
     return aside
 
 
-def aside_warnings(complete: FittedAttitudes, options: Mapping[str, Any]) -> list[str]:
-    """Name the attitudes that were set aside, or say why a knocked one may not have been."""
+def _signed(residual: float) -> str:
+    """Return a residual |f| - g, m/s^2, as the figures label it, with its sign."""
+    return f"{'+' if residual > 0 else ''}{small_g(residual)}"
+
+
+def aside_warnings(complete: FittedAttitudes, options: Mapping[str, Any], gravity: float) -> list[str]:
+    """Name the attitudes that were set aside, or say why a knocked one may not have been; gravity in m/s^2."""
     if options["loss"] != "auto":
         return []
     if options["method"] != "norm":
@@ -144,10 +149,10 @@ def aside_warnings(complete: FittedAttitudes, options: Mapping[str, Any]) -> lis
                 "with cross terms every attitude is kept: a knocked one is not looked for (fit without --cross to see)"
             )
         ]
-    aside = complete.aside
+    aside, off = complete.aside, gravity * complete.solution.residuals[0]
     named: list[str] = [
         Finding(
-            f"{complete.attitudes.label(index)} set aside: {1e3 * complete.solution.residuals[0, index]:+.3f} mg "
+            f"{complete.attitudes.label(index)} set aside: {_signed(off[index])} "
             f"({abs(deviations):.0f} standard uncertainties) from what the others give, as if it had been knocked or "
             "had not settled; --loss square keeps it",
             "measure this attitude again",
@@ -360,7 +365,7 @@ def make_record(
             *shake_warnings(problem.motion, solution),
             *_pattern_warnings(attitudes, problem, solution, outliers, order_chosen=bool(estimate.orders)),
             *source_warnings(complete, str(options["method"])),
-            *aside_warnings(complete, options),
+            *aside_warnings(complete, options, g),
             *assumption_notes(estimate.stated),
             *estimate.notes,
         ),
@@ -582,7 +587,10 @@ def _warnings(
         *attitudes.recording.notes,
         *attitudes.notes,
         *gravity_findings(gravity, attitudes.recording),
-        *(_order_warnings(estimate) or _attitude_warnings(attitudes, problem, solution, options, outliers)),
+        *(
+            _order_warnings(estimate)
+            or _attitude_warnings(attitudes, problem, solution, options, outliers, gravity.value)
+        ),
         *_freedom_warnings(problem, solution, estimate.observability),
         *size_warnings(attitudes, solution),
     ]
@@ -662,14 +670,15 @@ def _attitude_warnings(
     solution: TumbleSolution,
     options: Mapping[str, Any],
     outliers: Mapping[int, float],
+    gravity: float,
 ) -> list[str]:
-    deviation = 1e3 * solution.deviations[0]
+    deviation = gravity * solution.deviations[0]
     if problem.robust:
         down = solution.down_weights[0]
         which = np.flatnonzero(down < _DOWN_WEIGHTED).tolist()
         single: list[str] = [
             Finding(
-                f"down-weighted to {down[i]:.2f}: {attitudes.label(i)}, residual {deviation[i]:+.3f} mg",
+                f"down-weighted to {down[i]:.2f}: {attitudes.label(i)}, residual {_signed(deviation[i])}",
                 "measure this attitude again",
             )
             for i in which
@@ -678,7 +687,7 @@ def _attitude_warnings(
         single = [
             Finding(
                 f"{attitudes.label(i)} stands out by {standard:.0f} standard deviations "
-                f"(residual {deviation[i]:+.3f} mg); {_REMEDIES[options['method'], options['loss']]}",
+                f"(residual {_signed(deviation[i])}); {_REMEDIES[options['method'], options['loss']]}",
                 "measure this attitude again",
             )
             for i, standard in outliers.items()
