@@ -206,6 +206,13 @@ CHANGED = {
 }
 
 
+def test_a_mean_temperature_has_no_digits_that_nobody_knows(sound, laboratory):
+    record = il.load(sound / "sound.json")
+    record = replace(record, model={**record.model, "temperature": {"value": 23.9999428, "unit": "degC"}})
+    conditions = dict(make_certificate(record, "0" * 64, laboratory).conditions("g", "T"))
+    assert (conditions["T"].value, conditions["T"].unit) == (24.0, "degC")
+
+
 @pytest.fixture(scope="module")
 def sound_xml(sound, laboratory):
     made = make_certificate(il.load(sound / "sound.json"), "0" * 64, laboratory)

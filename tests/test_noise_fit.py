@@ -109,7 +109,7 @@ def test_what_is_as_fast_as_the_end_of_the_band_is_white_noise():
     assert record.fit["filter_walk"]["gyro_x"]["value"] == pytest.approx(5e-4 * DEGREE, rel=0.35)
     assert walk.interval_95[0] < 5e-4 * DEGREE < walk.interval_95[1]
     (note,) = (line for line in record.warnings if "end of the band" in line)
-    assert note.startswith("gyro_x: the white noise, 0.00586 deg/s/√Hz at low frequencies, falls to 0.00503")
+    assert note.startswith("gyro_x: the white noise, 0.351 deg/sqrt(h) at low frequencies, falls to 0.302")
     drawn = {trace.get("name") for item in exhibits(record).items for trace in getattr(item, "traces", [])}
     assert {"white", "walk"} < drawn
     assert "Gauss-Markov" not in drawn

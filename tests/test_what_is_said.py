@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 import imulab as il
+from conftest import REPOSITORY
 from imulab.cli.app import commands
 from imulab.display import Finding, one_thing
 from imulab.errors import ObservabilityError, OptionError
 from imulab.live.formats import LineStream, UnknownFormatError
 from imulab.procedures.noise.wants import PROGRAMS
+from imulab.procedures.views import exhibits_of
 
 FITS = ("tumble fit", "tumble gyro", "tumble mag", "array calibrate", "warmup fit", "noise fit", "thermal fit")
 FITS = (*FITS, "rate fit", "rate turn")
@@ -33,6 +35,24 @@ def test_the_stated_serial_number_is_the_record_s(imulab, tmp_path):
         assert il.fit_tumble(data, gravity=9.81, order=1, serial="A").calibration.sensor["serial"] == "A"
     still = il.simulate_array(experiment="static", duration=60.0)
     assert il.calibrate_array(still, serial="B").calibration.sensor["serial"] == "B"
+
+
+def test_small_units_are_written_with_their_sign():
+    """A typed 20 ug is read; what is printed is 20 µg, in every sentence and title (a record's option is as typed)."""
+    sources = sorted((REPOSITORY / "src" / "imulab").rglob("*.py"))
+    printed = {path.name: re.findall(r"\} u[gs]\b|, u[gs]\"", path.read_text(encoding="utf-8")) for path in sources}
+    assert {name: places for name, places in printed.items() if places} == {"solve.py": ["} ug"]}
+
+
+def test_a_report_on_noise_says_white_noise_in_one_unit_and_what_programs_take_in_si():
+    fit = il.fit_noise(il.simulate_noise(white="0.3 deg/sqrt(h)", walk=None, duration="2 min", rate=50))
+    exhibits = exhibits_of(fit.calibration)
+    terms, filters, *_ = exhibits.items
+    (white,) = {row[-1] for row in terms.rows if row[1] == "angle random walk"}
+    assert white == "deg/sqrt(h)"
+    assert dict(exhibits.facts)["gyroscopes, white for filters"].endswith(f" {white}")
+    assert exhibits.headline.endswith(f"{white}.")
+    assert "in SI as programs take them" in filters.caption
 
 
 def test_dir_lists_public_names_alone():

@@ -80,9 +80,10 @@ class Certificate:
         for name, key in ((gravity, "gravity"), (temperature, "temperature")):
             if isinstance(known := self.record.model.get(key), Mapping):
                 k, u = NORMAL[0], float(known.get("standard_uncertainty") or 0.0)
-                condition = Condition(
-                    name=name, value=float(known["value"]), unit=known["unit"], expanded_uncertainty=k * u
-                )
+                value = float(known["value"])
+                if known["unit"] == "degC":
+                    value = round(value, 2)  # a mean of readings, whose further digits nobody knows
+                condition = Condition(name=name, value=value, unit=known["unit"], expanded_uncertainty=k * u)
                 stated.append((name, condition))
         return stated
 

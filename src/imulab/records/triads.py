@@ -187,4 +187,4 @@ def output_to_si(unit: str, si: str) -> tuple[float, str]:
 def text_in_g(force: float) -> str:
     """Return a specific force, m/s^2, in mg or ug, as text."""
     g = force / STANDARD_GRAVITY
-    return f"{1e3 * g:.3g} mg" if g >= 1e-3 else f"{1e6 * g:.3g} ug"
+    return f"{1e3 * g:.3g} mg" if g >= 1e-3 else f"{1e6 * g:.3g} µg"

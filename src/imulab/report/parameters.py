@@ -153,12 +153,6 @@ def sample_unit(unit: str) -> ReadingUnit:
     return ReadingUnit(*{"rad/s": ("deg/s", _DEG), "m/s^2": ("mg", _MG)}.get(unit, (unit, 1.0)))
 
 
-def density_unit(unit: str) -> ReadingUnit:
-    """Return the reading unit of the noise density of a quantity, as in data sheets."""
-    known = {"rad/s": ("deg/s/√Hz", _DEG), "m/s^2": ("µg/√Hz", 1e3 * _MG)}
-    return ReadingUnit(*known.get(unit, (f"{unit}/√Hz", 1.0)))
-
-
 def text_in(value: float, unit: str, digits: int = 3) -> str:
     """Return a value in SI as the text of its number in another unit, with so many significant digits."""
     return f"{from_si(value, unit):.{digits}g}"

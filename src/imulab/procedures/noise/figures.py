@@ -22,7 +22,7 @@ from imulab.procedures.noise.schema import (
 from imulab.records.calibration import Calibration
 from imulab.report import traces as panels
 from imulab.report.noise_figures import rates_of
-from imulab.report.parameters import density_unit, reading_unit, small_unit
+from imulab.report.parameters import reading_unit, small_unit
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -66,16 +66,16 @@ def exhibits(record: Calibration) -> Exhibits:
 
 def _largest(fit: NoiseSummary, unit: str) -> list[tuple[str, str]]:
     """Return the facts about the columns with a unit: the largest numbers that a filter needs."""
-    symbol, factor = density_unit(unit).scale
     its = [name for name, column in fit.columns.items() if column.unit == unit]
     white = max(fit.filter_white[name].value for name in its)
     walk = max(fit.filter_walk[name].value for name in its)
     kind = _NAMES.get(unit, unit)
     h = fit.horizon.value
-    return [
-        (f"{kind}, white", f"{plain_number(white * factor, 3)} {symbol}"),
-        (f"{kind}, walk at {h:g} s", f"{walk:.3g} {unit}/√s"),
-    ]
+    texts = []
+    for value, size in ((white, f"{unit}/sqrt(Hz)"), (walk, f"{unit}/sqrt(s)")):
+        symbol, factor = reading_unit(size).scale
+        texts.append(f"{plain_number(value * factor, 3)} {symbol}")
+    return [(f"{kind}, white for filters", texts[0]), (f"{kind}, walk for filters, {h:g} s", texts[1])]
 
 
 def _rates(fit: NoiseSummary) -> str:
@@ -153,9 +153,9 @@ def _for_filters(record: Calibration, fit: NoiseSummary) -> ReportTable:
     return ReportTable(
         "For filters, and means at rest",
         f"A filter knows white noise and a random walk alone. N_h and K_h are such that over "
-        f"{fit.horizon.value:g} s without aiding it predicts what the fitted noise does; the 95 % interval is that of "
-        "K_h. Then the standard uncertainty of a mean over so many seconds at rest as a measure of the bias. "
-        "Vibration is not in a log at rest.",
+        f"{fit.horizon.value:g} s without aiding it predicts what the fitted noise does, in SI as programs take them; "
+        "the 95 % interval is that of K_h. Then the standard uncertainty of a mean over so many seconds at rest as a "
+        "measure of the bias. Vibration is not in a log at rest.",
         ["column", "N_h", "unit", "K_h", "95 % of K_h", "unit", *(f"u, {t:.3g} s" for t in times), "unit of u"],
         rows,
     )

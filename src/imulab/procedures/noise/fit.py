@@ -69,7 +69,7 @@ from imulab.readers.streams import own_clock
 from imulab.recording import Array, Data, Reading, Recording, Source, check_not_resampled, is_large, on_disk
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
-from imulab.report.parameters import density_unit, small_unit
+from imulab.report.parameters import reading_unit, small_unit
 from imulab.report.traces import plain_number
 from imulab.units import parse_unit, si_unit
 
@@ -270,7 +270,7 @@ def _describe_column(column: ColumnModel) -> list[str]:
 def _describe_edge(column: ColumnModel) -> str:
     """Return the sentence about a Gauss-Markov term of the shortest time constant, and the white noise with it."""
     analysis = column.analysis
-    unit, factor = density_unit(column.unit).scale
+    unit, factor = reading_unit(f"{column.unit}/sqrt(Hz)").scale
     level = float(edge_as_white(analysis.values, analysis.covariance, analysis.limits[0])[0][0])
     return (
         f"the white noise, {plain_number(level * factor, 3)} {unit} at low frequencies, falls to "

@@ -154,7 +154,7 @@ class ThermalCheck(RecordCheck):
         lines = [
             f"{probability_text(self.probability)} over {len(self.holds)} holds (within recordings "
             f"{probability_text(self.within)}, common to each {probability_text(self.between)}), largest |f| - g "
-            f"{_micro_text(self.residuals[worst])} ug ({label(worst)})"
+            f"{_micro_text(self.residuals[worst])} µg ({label(worst)})"
         ]
         if (gyro := self.gyro) is not None:
             row, axis_number = gyro.worst
@@ -168,7 +168,7 @@ class ThermalCheck(RecordCheck):
             )
         for k, value in enumerate(self.residuals):
             beyond = "  beyond the limit" if self.limit is not None and abs(value) > self.limit else ""
-            lines.append(f"{label(k)}: {_micro_text(value)} ± {_micro_text(u[k], '')} ug{beyond}")
+            lines.append(f"{label(k)}: {_micro_text(value)} ± {_micro_text(u[k], '')} µg{beyond}")
         return lines
 
     def content(self) -> dict[str, Any]:

@@ -742,8 +742,8 @@ def warn_disagreement(holds: Holds, problem: ThermalProblem, solution: ThermalSo
     if scattered:
         messages.append(
             Finding(
-                f"{name}: within recordings |f| scatters by {1e6 * solution.excess:.0f} ug, of which noise explains "
-                f"{1e6 * noise:.0f} ug: is a recording of another unit, with axes swapped, or with a jump of its "
+                f"{name}: within recordings |f| scatters by {1e6 * solution.excess:.0f} µg, of which noise explains "
+                f"{1e6 * noise:.0f} µg: is a recording of another unit, with axes swapped, or with a jump of its "
                 f"outputs?{'' if differ else apart}",
                 "leave out the recording that is of another unit, or record it again",
             )
@@ -771,7 +771,7 @@ def _name_outlier(holds: Holds, problem: ThermalProblem, laws: Laws) -> str:
     best, second = (left[int(k)] for k in order[:2])
     if not best < min(_APART * second, _MOVES):
         return ""
-    return f" Without {holds.recordings[int(numbers[order[0]])].name} the others agree to {1e6 * best:.0f} ug"
+    return f" Without {holds.recordings[int(numbers[order[0]])].name} the others agree to {1e6 * best:.0f} µg"
 
 
 def _warn_offset(holds: Holds, problem: ThermalProblem, solution: ThermalSolution) -> list[str]:

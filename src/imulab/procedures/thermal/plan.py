@@ -438,7 +438,7 @@ class ThermalPlan(PlannedAttitudes):
         worst = int(np.argmax(self.deviation))
         free = 3 * (len(self.soaks) - self.degrees[0] - 1)  # beside laws of the biases
         forces = (self.noise, self.turn_on_scatter, self.mean, self.deviation[worst])
-        noise, turn_on, mean, largest = (f"{text_in(force, 'ug')} ug" for force in forces)
+        noise, turn_on, mean, largest = (f"{text_in(force, 'ug')} µg" for force in forces)
         return (
             f"{len(self.soaks)} soaks, a power cycle each, at {places} temperatures{back}, {each} attitudes in each "
             f"({sum(counts)} in all), {_hours_text(self.duration)} of {_hours_text(self.time)}. For degrees {spoken}, "
@@ -456,7 +456,7 @@ class ThermalPlan(PlannedAttitudes):
         places = np.linspace(0, len(self.temperature) - 1, _ROWS).round().astype(int).tolist()
         at = [f"at {self.temperature[k]:.0f} degC" for k in places]
         rows = [
-            (f"corrected force {place}", text_in(self.deviation[k], "ug"), "ug")
+            (f"corrected force {place}", text_in(self.deviation[k], "ug"), "µg")
             for place, k in zip(at, places, strict=True)
         ]
         if self.gyro is not None:
@@ -482,7 +482,7 @@ class ThermalPlan(PlannedAttitudes):
             for each in self.tried
         ]
         return [
-            (["soaks", "attitudes in each", "mean sd, ug", "worst sd, ug"], rows),
+            (["soaks", "attitudes in each", "mean sd, µg", "worst sd, µg"], rows),
             (["predicted sd of", "value", "unit"], [list(row) for row in self.predicted]),
         ]
 
@@ -563,7 +563,7 @@ class ThermalPlan(PlannedAttitudes):
         ]
         layout = {
             "xaxis": figure_axis("temperature, degC"),
-            "yaxis": figure_axis("sd of the corrected force, ug", rangemode="tozero"),
+            "yaxis": figure_axis("sd of the corrected force, µg", rangemode="tozero"),
             "legend": LEGEND,
         }
         if self.gyro is not None:

@@ -335,7 +335,7 @@ def _warn_fit(
     far = [each for each in fitted.left_out if each.chi_square > TEMPERATURE_MISSED.limit**2]
     messages += [
         Finding(
-            f"{each.temperature:.0f} degC, left out, is missed by {1e6 * each.rms:.0f} ug rms, more than its "
+            f"{each.temperature:.0f} degC, left out, is missed by {1e6 * each.rms:.0f} µg rms, more than its "
             "uncertainty explains: the unit's law has a bend between the temperatures; record one more there",
             f"record at one more temperature beside {each.temperature:.0f} degC",
         )

@@ -268,7 +268,7 @@ def _narrower(blended: OrderBlend | None) -> str:
     ]
     if not gains:
         return ""
-    return f"If k2 and k3 are known to 20 ug: {', '.join(gains)} (--nonlinearity 20ug,20ug)."
+    return f"If k2 and k3 are known to 20 µg/g² and 20 µg/g³: {', '.join(gains)} (--nonlinearity 20ug,20ug)."
 
 
 def propagated_table(record: Calibration, trials: Trials) -> ReportTable:

@@ -82,9 +82,9 @@ class ImusPlan(PlannedTest):
         head = (
             f"{self.attitudes} attitudes of {_STILL:g} s at rest, then {self.chosen.duration:g} s of turning by hand; "
             f"predicted standard uncertainties: positions {position} mm, rotations {rotation} mrad, latencies "
-            f"{accel} us (accelerometers) and {gyro} us (gyroscopes)"
+            f"{accel} µs (accelerometers) and {gyro} µs (gyroscopes)"
         )
-        titles = ["motion, s", "position, mm", "rotation, mrad", "accel latency, us", "gyro latency, us"]
+        titles = ["motion, s", "position, mm", "rotation, mrad", "accel latency, µs", "gyro latency, µs"]
         return head, titles, [[f"{each.duration:g}", *each.texts()] for each in self.others]
 
     def remarks(self) -> list[str]:
