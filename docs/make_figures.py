@@ -9,6 +9,8 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from msgspec import structs
+
 import imulab as il
 from imulab.cli import main as commands
 from imulab.cli.demo import run
@@ -91,7 +93,7 @@ def one_figure(folder: Path, record: str, picture: str, words: str = "") -> None
     exhibits = exhibits_of(il.load(folder / record))
     figure = next(item for item in exhibits.figures if words in item.title)
     heading = figure.message if words else exhibits.headline
-    card = Card(figure.title, "", [], replace(figure, title="", message="" if words else figure.message))
+    card = Card(figure.title, "", [], structs.replace(figure, title="", message="" if words else figure.message))
     page = folder / f"one_{picture}.html"
     page.write_text(render_index(heading, "", [card]))
     screenshot(page, FIGURES / f"{picture}.png", 1080, figure.height + 320)
@@ -131,7 +133,7 @@ def main() -> None:
         folder = Path(name).resolve()
         run(folder, commands)
         quickstart(folder)
-        screenshot(folder / "fleet.html", FIGURES / "fleet.png", 1080, 1075)
+        screenshot(folder / "fleet.html", FIGURES / "fleet.png", 1080, 905)
         one_figure(folder, "array.json", "gyro_array")
         one_figure(folder, "warmup.json", "warmup")
         one_figure(folder, "noise.json", "noise")
