@@ -320,8 +320,9 @@ def _weights(spectrum: Spectrum, m: np.ndarray) -> Array:
 
 
 CANDIDATES = ("N", "NK", "NB", "NG", "NBK", "NGK", "NGB", "NGG", "NGGK")
-PER_PARAMETER, _RIVAL, _QUANTISATION = 4.0, 4.0, 12.0
-"""Deviance that a parameter must gain; distance of a rival from the best; what quantisation noise must gain."""
+PER_PARAMETER, _RIVAL, _QUANTISATION = 4.0, 3.99, 12.0
+"""Deviance that a parameter must gain; distance of a rival from the best, less than that of the same model with a term
+that vanished, which rounding would decide; what quantisation noise must gain."""
 _LARGEST_VARIANCE = 2.0
 """Largest variance of the logarithm of a square: the expansion that it comes from holds no farther."""
 _HALVINGS = 60  # of a bracket that holds a quantile: to the last digit of a double
