@@ -442,7 +442,7 @@ def test_a_folder_with_a_manifest_is_named_by_it(tmp_path, monkeypatch, capsys):
     Path("test").mkdir()
     _written(tmp_path / "test")
     ran("rate", "fit", "test", "-o", "r.json", status=2)
-    assert capsys.readouterr().err.endswith(f"name its manifest: {Path('test') / 't.toml'}\n")
+    assert capsys.readouterr().err.endswith(f"found a folder; it holds {Path('test') / 't.toml'}\n")
     with pytest.raises(il.ImulabError, match="expected a manifest or one recording, found a folder"):
         il.fit_rate("test")
     ran("rate", "fit", "test/t.toml", "-o", "r.json")

@@ -399,7 +399,7 @@ def test_a_part_of_the_wrong_kind_is_refused_with_its_place(changes, message):
 def test_a_record_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(RecordError, match=r"absent\.json: no such file"):
         load(tmp_path / "absent.json")
-    with pytest.raises(RecordError, match="cannot be read: Is a directory"):
+    with pytest.raises(RecordError, match="expected a file, found a folder"):
         load(tmp_path)
 
 

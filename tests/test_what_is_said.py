@@ -2,6 +2,7 @@
 
 import math
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -231,3 +232,100 @@ def test_the_gravest_reason_stands_once_on_a_terminal(imulab, tmp_path, monkeypa
     monkeypatch.setattr("imulab.cli.show._on_terminal", lambda: True)
     together = imulab(*words)
     assert (together.stdout + together.stderr).count(reason) == 1
+
+
+FOREIGN = ("time [s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]")
+
+
+def _write_foreign(path):
+    """Write a Parquet file whose columns are no sensor's, which blocks are read from without a layout."""
+    columns = np.column_stack([np.arange(600) / 100, *np.full((3, 600), 9.8)])
+    pytest.importorskip("polars").DataFrame(dict(zip(FOREIGN, columns.T, strict=True))).write_parquet(path)
+
+
+PYTHON = re.compile(r"from_frame|\bdf\.|\bil\.|metadata=|reset_index|\w+=\{")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(f"{path} foreign.parquet" for path in (*FITS, "array fuse", "allan", "magnetometer fit")),
+        "warmup fit still.csv",
+        "warmup fit still.parquet",
+        "tumble gyro foreign.parquet --accel tumble.json",
+        "apply tumble.json foreign.parquet",
+        "tumble check tumble.json foreign.parquet",
+        "apply warm.json still.csv",
+        "apply warm.json still.parquet",
+    ],
+)
+@pytest.mark.usefixtures("home")
+def test_no_command_gives_advice_in_python(imulab, words):
+    done = imulab(*words.split())
+    assert done.returncode == 2
+    assert not PYTHON.search(done.stderr), done.stderr
+
+
+@pytest.fixture
+def home(tmp_path, shelf):
+    """Fill the folder that commands run in with the files of `shelf`."""
+    shutil.copytree(shelf, tmp_path, dirs_exist_ok=True)
+
+
+@pytest.fixture(scope="module")
+def shelf(tmp_path_factory):
+    """Return a folder with recordings of a unit at rest, of foreign titles, and two records."""
+    folder = tmp_path_factory.mktemp("said")
+    still = il.simulate_tumble(gravity=9.81, attitudes=12, order=1)
+    for name in ("still.csv", "still.parquet"):
+        il.write(still, folder / name)
+    il.fit_tumble(still, gravity=9.81, order=1).calibration.save(folder / "tumble.json")
+    cycles = il.simulate_warmup((-20.0, 0.0, 20.0), cycles=2, rate=5.0)
+    il.fit_warmup(cycles, temperatures=(-20.0, 0.0, 20.0), model="exponential").calibration.save(folder / "warm.json")
+    _write_foreign(folder / "foreign.parquet")
+    return folder
+
+
+@pytest.mark.usefixtures("home")
+def test_a_power_on_temperature_is_asked_for_in_the_file_or_its_column(imulab):
+    for words in ("warmup fit still.csv", "apply warm.json still.csv", "apply warm.json still.parquet"):
+        said = imulab(*words.split()).stderr
+        assert "expected a line such as '# power_on_temperature: " in said, words
+        assert "--temperature-column" in said, words
+
+
+@pytest.mark.parametrize("path", ["magnetometer fit", "noise fit", "allan", "warmup fit", "array fuse", "tumble fit"])
+@pytest.mark.usefixtures("home")
+def test_a_missing_column_is_said_with_what_is_there(imulab, path):
+    said = imulab(*path.split(), "foreign.parquet").stderr
+    assert "; found time ax ay az; a layout says where columns of other names are" in said
+    said = imulab("magnetometer", "fit", "still.csv").stderr
+    assert "no column mag_x mag_y mag_z; found time accel_x accel_y accel_z" in said
+
+
+def test_a_folder_in_place_of_a_file_is_refused_with_the_file_in_it(imulab, tmp_path):
+    il.simulate_fleet(tmp_path / "line", units=8, rate=20.0)
+    (tmp_path / "spin").mkdir()
+    (tmp_path / "spin" / "manifest.toml").write_text("")
+    (tmp_path / "spin" / "sn1.json").write_text("{}")
+    wanted = {
+        "centrifuge reduce spin": "spin: expected a manifest file, found a folder; it holds spin/manifest.toml",
+        "rate fit spin": "a manifest or one recording, found a folder; it holds spin/manifest.toml",
+        "fleet run line -o out": "a manifest, found a folder; it holds line/first.csv, line/second.csv",
+        "fleet run spin -o out": "spin: expected a manifest, found a folder",
+        "apply spin line/first_0001.csv": "spin: expected a file, found a folder; it holds spin/sn1.json",
+        "tumble fit line/first_0001.csv --layout spin": "a layout file, found a folder; it holds spin/manifest.toml",
+    }
+    for words, message in wanted.items():
+        done = imulab(*words.split())
+        assert (done.returncode, done.stderr.strip().endswith(message)) == (2, True), done.stderr
+
+
+@pytest.mark.parametrize("words", ["warmup simulate --temperatures 0 --cycles 1 --duration 60s", "thermal simulate"])
+def test_recordings_of_before_in_a_folder_are_named(imulab, tmp_path, words):
+    (tmp_path / "cycles").mkdir()
+    (tmp_path / "cycles" / "cycle_+99_1.csv").write_text("time [s]\n0\n")
+    said = imulab(*words.split(), "-o", "cycles").stderr
+    assert "cycles: 1 CSV files from before are still there (cycle_+99_1.csv): cycles/*.csv names them too" in said
+    again = imulab(*words.split(), "-o", "new").stderr + imulab(*words.split(), "-o", "new").stderr
+    assert "from before" not in again

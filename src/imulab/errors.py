@@ -128,12 +128,25 @@ class OptionError(ImulabError):
     """An option has a value that cannot be used; the message lists what can."""
 
 
+def folder_in_place(name: object, what: str = "a file", inside: Iterable[str] = ()) -> str:
+    """Return the refusal of a folder in place of a file, which names those files in it that may be meant."""
+    files = [os.path.join(str(name), each) for each in sorted(inside)]  # noqa: PTH118
+    inside_it = f"; it holds {first_of(files, 3)}" if files else ""
+    return f"{name}: expected {what}, found a folder{inside_it}"
+
+
 @contextmanager
-def readable(name: object, kind: type[ImulabError] = ReadError) -> Iterator[None]:
-    """Raise an error of the system on reading a file as one line that names the file."""
+def readable(name: object, kind: type[ImulabError] = ReadError, ending: str = "") -> Iterator[None]:
+    """Raise an error of the system on reading a file as one line that names the file.
+
+    `ending` is that of files to name where it is a folder, such as ``.json``.
+    """
     try:
         yield
     except FileNotFoundError:
         raise kind(f"{name}: no such file") from None
+    except IsADirectoryError:
+        inside = [each for each in os.listdir(str(name)) if ending and each.endswith(ending)]  # noqa: PTH208
+        raise kind(folder_in_place(name, inside=inside)) from None
     except OSError as error:
         raise kind(f"{name}: cannot be read: {error.strerror}") from None

@@ -16,7 +16,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from imulab.errors import OptionError, ReadError, UnitError, file_name, listed, quoted
+from imulab.errors import OptionError, ReadError, UnitError, file_name, folder_in_place, listed, quoted
 from imulab.quantities import LARGEST
 from imulab.units import Unit, parse_scale_factor, parse_unit
 
@@ -244,7 +244,8 @@ def _text(path: Path, name: str, what: str) -> str:
         check_within(path)
         mode = path.stat().st_mode  # before it is opened: opening a pipe waits for a writer
         if stat.S_ISDIR(mode):
-            raise ReadError(f"{name}: expected a {what} file, found a folder")
+            inside = [each.name for each in path.glob("*.toml")]
+            raise ReadError(folder_in_place(name, f"a {what} file", inside))
         if not stat.S_ISREG(mode):
             raise ReadError(f"{name}: expected a {what} file, found a device or a pipe")
         with open_file(path) as stream:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from imulab.arguments import checked, described
 from imulab.columns import check_unit, clocks_of, element_number, expected_quantities, kind_of, triad
 from imulab.display import Note, has_hidden, printable, reverses
-from imulab.errors import DataError, OptionError, UnitError
+from imulab.errors import DataError, OptionError, UnitError, several
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.options import PROGRAM, READING, choice, file, parsed, text
 from imulab.quantities import LARGEST, parse_units, span, whole, whole_number
@@ -86,6 +86,8 @@ class Recording:
         What the reader did to the data that a user should know.
     corrected_by
         The records that the samples were corrected by, ``NAME sha256:HASH`` each.
+    in_memory
+        Whether the samples came as arrays or as a data frame; messages then advise on these, not on files.
 
     Examples
     --------
@@ -105,6 +107,7 @@ class Recording:
     lines_before: int | None = None
     notes: tuple[str, ...] = ()
     corrected_by: tuple[str, ...] = ()
+    in_memory: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.metadata, Mapping) and any(isinstance(each, int | float) for each in self.metadata.values()):
@@ -180,25 +183,36 @@ class Recording:
         try:
             return self.columns[name]
         except KeyError:
-            foreign = all(expected_quantities(other) in (None, ("time",)) for other in self.columns)
-            several = sorted({number for other in self.columns if (number := element_number(other, name)) is not None})
-            if several:
+            numbers = sorted({number for other in self.columns if (number := element_number(other, name)) is not None})
+            if numbers:
                 raise DataError(
-                    f"{self.name}: no column {name}, but one of each of {len(several)} IMUs; choose one, from "
-                    f"{several[0]} to {several[-1]} (--element {several[0]})"
+                    f"{self.name}: no column {name}, but one of each of {len(numbers)} IMUs; choose one, from "
+                    f"{numbers[0]} to {numbers[-1]} (--element {numbers[0]})"
                 ) from None
-            advice = next((note for note in self.notes if "--layout" in note), None)
-            advice = advice or (
-                f"rename what is the sensor's, such as df.rename(columns={{{self._foreign()!r}: {name!r}}})"
-                if self.source is None
-                else "a layout says where columns of other names are (--layout; docs/recordings.md)"
-            )
-            hint = f"; {advice}" if foreign else f"; {state_rate(self.name)}" if name == "time" else ""
-            raise DataError(f"{self.name}: no column {name}; found {' '.join(self.columns)}{hint}") from None
+            raise self.lacking(f"column {name}", name) from None
 
-    def _foreign(self) -> str:
-        """Return the first column that is no sensor's, nor the time."""
-        return next((name for name in self.columns if expected_quantities(name) is None), "x")
+    def lacking(self, what: str, example: str, why: str = "") -> DataError:
+        """Return the error of a recording without what is needed: what there is, and how to read other names.
+
+        Parameters
+        ----------
+        what
+            What there is not, such as ``column gyro_x``.
+        example
+            The name of a column that would do.
+        why
+            What the column is needed for.
+        """
+        foreign = all(expected_quantities(other) in (None, ("time",)) for other in self.columns)
+        other = next((name for name in self.columns if expected_quantities(name) is None), "x")
+        advice = next((note for note in self.notes if "--layout" in note), None) or (
+            f"rename what is the sensor's, such as df.rename(columns={{{other!r}: {example!r}}})"
+            if self.in_memory
+            else "a layout says where columns of other names are (--layout; docs/recordings.md)"
+        )
+        hint = f"; {advice}" if foreign else f"; {state_rate(self.name)}" if example == "time" else ""
+        reason = f": {why}" if why else ""
+        return DataError(f"{self.name}: no {what}; found {several(self.columns)}{reason}{hint}")
 
     def si(self, name: str) -> Array:
         """Return the samples of a column in SI (counts and volts as they are), shape (n,)."""
@@ -352,7 +366,7 @@ class Recording:
         """
         arrays = {"time": time, "accel": accel, "gyro": gyro, "mag": mag, "temperature": temperature, **columns}
         converted, symbols = columns_of_arrays(arrays, rate=rate, unit=unit, units=units, name=name)
-        return cls(converted, symbols, metadata or {}, name)
+        return cls(converted, symbols, metadata or {}, name, in_memory=True)
 
     @classmethod
     @checked
@@ -397,7 +411,8 @@ class Recording:
         """
         converted, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
         before = tuple(map(str, getattr(frame, "attrs", {}).get("corrected_by", ())))
-        return cls(converted, symbols, {**(metadata or {})}, name, corrected_by=before)  # type: ignore[dict-item]
+        head = {**(metadata or {})}
+        return cls(converted, symbols, head, name, corrected_by=before, in_memory=True)  # type: ignore[arg-type]
 
     @overload
     def to_frame(self, library: Literal["pandas"] | None = None) -> pandas.DataFrame: ...
@@ -748,9 +763,13 @@ def with_power_on_temperature(blocks: Iterable[Recording]) -> Iterator[Recording
 
 def state_power_on(recording: Recording, example: str) -> str:
     """Return how to state the power-on temperature, degC, of a file or of a recording in memory, for a message."""
-    if recording.source is not None:
-        return f"expected a line such as '# power_on_temperature: {example}'"
-    return f"expected it in the metadata: Recording.from_frame(frame, metadata={{'power_on_temperature': {example}}})"
+    if recording.in_memory:
+        return (
+            f"expected it in the metadata: Recording.from_frame(frame, metadata={{'power_on_temperature': {example}}})"
+        )
+    column = " there, or --temperature-column: the first reading of the column temperature"
+    there = "" if first_reading(recording) is None else column
+    return f"expected a line such as '# power_on_temperature: {example}'{there}"
 
 
 def head_temperature(recording: Recording, key: str) -> float | None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO, TypeVar
 
 from imulab.cli.command import Argument, option
 from imulab.display import Note, printable
-from imulab.errors import ImulabError, OptionError
+from imulab.errors import ImulabError, OptionError, first_of
 from imulab.options import FLAG, OUTPUT, options_of, read_options
 from imulab.quantities import labelled
 from imulab.quantities import quantity as quantity
@@ -278,6 +278,14 @@ def check_outputs(outputs: list[str | None], inputs: list[str], *, paper: bool =
         if not target.parent.is_dir():
             raise OptionError(f"{name}: cannot be written: no such folder")
         taken[target] = name
+
+
+def warn_older(folder: str, written: Iterable[str]) -> None:
+    """Warn of recordings that were in a folder before, which a pattern such as ``FOLDER/*.csv`` names too."""
+    older = sorted({path.name for path in Path(folder).glob("*.csv")} - set(written))
+    if older:
+        names = first_of(older, 3)
+        warn(f"{folder}: {len(older)} CSV files from before are still there ({names}): {folder}/*.csv names them too")
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from imulab.cli.options import (
     check_outputs,
     read_recording,
     reading,
+    warn_older,
 )
 from imulab.options import OUTPUT
 
@@ -62,6 +63,7 @@ def simulate(
     made = call(il.simulate_thermal, **options)
     made.save(output)
     print(f"{output}: {len(made)} recordings, law {options['law']}, truth in truth.json")
+    warn_older(output, [recording.name for recording in made])
 
 
 def fit(

@@ -14,6 +14,7 @@ from imulab.cli.options import (
     call,
     check_outputs,
     naming,
+    warn_older,
 )
 from imulab.errors import OptionError
 from imulab.options import OUTPUT
@@ -47,8 +48,9 @@ def simulate(
     A file each, into a folder.
     """
     made = call(il.simulate_warmup, **options)
-    made.save(output)
+    files = made.save(output)
     print(f"{output}: {len(made)} recordings of {made.duration:g} s, law {options['law']}")
+    warn_older(output, [file.name for file in files])
 
 
 def fit(

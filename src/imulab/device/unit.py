@@ -178,8 +178,7 @@ def correct_gyroscopes(
     for axis in axes:
         name = f"gyro_{axis}"
         if name not in recording:
-            raise DataError(f"{recording.name}: no column {name}, which the record corrects; found "
-                            f"{' '.join(recording.columns)}")  # fmt: skip
+            raise recording.lacking(f"column {name}, which the record corrects", name)
         stated = parse_unit(recording.units[name])
         kept[name] = stated.symbol if stated.quantity == "rate" else "rad/s"
         of_unit = [name] if "axes" in columns else triad("gyro")

@@ -102,9 +102,7 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     """
     names = list(noise_columns(recording))
     if not names:
-        raise DataError(
-            f"{recording.name}: no sensor column ({' '.join(INERTIAL)}); found {' '.join(recording.columns)}"
-        )
+        raise recording.lacking(f"sensor column ({' '.join(INERTIAL)})", "gyro_x")
     clocks = {clock: [name for name in names if name in stamped] for clock, stamped in recording.clocks.items()}
     parts = [curves_and_noise(recording.stream(clock), stamped, taus) for clock, stamped in clocks.items() if stamped]
     columns: dict[str, Any] = {}

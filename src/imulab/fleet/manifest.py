@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from imulab.errors import ImulabError, OptionError, ReadError, install, listed, readable, several
+from imulab.errors import ImulabError, OptionError, ReadError, folder_in_place, install, listed, readable, several
 from imulab.procedures.registry import PROCEDURES
 from imulab.readers.formats import library
 
@@ -325,6 +325,8 @@ def load_fleet(path: str) -> FleetManifest:
         or there are no rows.
     """
     with local_file(path, path) as local, readable(path):
+        if local.is_dir():
+            raise ReadError(folder_in_place(path, "a manifest", _manifests_in(local)))
         data = local.read_bytes()
     rows = _parquet(data, path) if data.startswith(b"PAR1") else _csv(data, path)
     titles = rows[0][1]
@@ -344,6 +346,18 @@ def load_fleet(path: str) -> FleetManifest:
     if not units:
         raise OptionError(f"{path}: no rows below the titles; expected one row for each unit")
     return FleetManifest(path, parent_of(path), tuple(units))
+
+
+def _manifests_in(folder: Path) -> list[str]:
+    """Return the names of the CSV files in a folder whose titles are those of a manifest."""
+    titled = []
+    for file in folder.glob("*.csv"):
+        with file.open("rb") as stream:
+            if set(COLUMNS) <= {
+                title.strip().decode("utf-8", "replace") for title in stream.readline(1000).split(b",")
+            }:
+                titled.append(file.name)
+    return titled
 
 
 def _csv(data: bytes, name: str) -> list[tuple[str, list[str]]]:

@@ -103,7 +103,7 @@ def load(path: str | Path) -> Calibration:
 
 def load_sealed(path: str | Path) -> tuple[Calibration, str]:
     """Return a calibration record and its ``content_sha256``; errors as for `load`."""
-    with readable(path, RecordError), open_file(file_name(path)) as stream:
+    with readable(path, RecordError, ".json"), open_file(file_name(path)) as stream:
         data = stream.read(_LARGEST + 1)
     if len(data) > _LARGEST:
         raise RecordError(f"{path}: more than {_LARGEST >> 20} MiB; expected a record, of some kilobytes")

@@ -726,8 +726,9 @@ def on_clock_of(blocks: Iterable[Recording], sensor: str | None = None) -> Itera
     ):  # fmt: skip
         columns = {name: block.columns[name] for name in ("time", *kept)}
         yield replace(
-            block, columns=columns, units={name: block.units[name] for name in columns}, corrected_by=first.corrected_by
-        )
+            block, columns=columns, units={name: block.units[name] for name in columns},
+            corrected_by=first.corrected_by, in_memory=first.in_memory,
+        )  # fmt: skip
 
 
 def own_clock(recording: Recording, sensor: str) -> Recording:

@@ -9,7 +9,7 @@ import numpy as np
 
 from imulab.device.tables import DeviceTable, Field, field_of
 from imulab.device.unit import VECTORS, DeviceUnit
-from imulab.errors import DataError, RecordError, UnitError
+from imulab.errors import RecordError, UnitError
 from imulab.procedures.centrifuge.schema import highest_force
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
@@ -98,7 +98,7 @@ def apply_centrifuge(unit: DeviceUnit, columns: Mapping[str, Any], recording: Re
     """
     names = [name for name in ("dtg_x", "dtg_y") if name in recording]
     if not names:
-        raise DataError(f"{recording.name}: no column dtg_x or dtg_y; found {' '.join(recording.columns)}")
+        raise recording.lacking("column dtg_x or dtg_y", "dtg_x")
     for name in names:
         if name[-1] not in columns["axes"]:
             raise RecordError(f"the record has no curve for {name} (no {name[-1]}_K0)")
@@ -135,10 +135,8 @@ def beyond_message(record: Calibration, count: int, largest: float) -> str:
 
 def _force(recording: Recording, name: str) -> Array:
     if name not in recording:
-        raise DataError(
-            f"{recording.name}: no column {name}: the drift needs the level specific force accel_x and accel_y; "
-            f"found {' '.join(recording.columns)}"
-        )
+        why = "the drift needs the level specific force accel_x and accel_y"
+        raise recording.lacking(f"column {name}", name, why)
     unit = recording.units[name]
     if parse_unit(unit).quantity != "acceleration":
         raise UnitError(f"{recording.name}: column {name} is in {unit}, but the record needs specific force in m/s^2")

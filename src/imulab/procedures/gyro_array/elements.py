@@ -115,10 +115,7 @@ def find_elements(recording: Recording) -> Elements:
         elif _MISNUMBERED.fullmatch(name):
             raise DataError(f"{recording.name}: column {name}: expected elements numbered 1 2 3 ..")
     if not by_axis:
-        raise DataError(
-            f"{recording.name}: no columns gyro_1 gyro_2 .. (one axis) or gyro_x_1 .. gyro_z_n (three); "
-            f"found {' '.join(recording.columns)}"
-        )
+        raise recording.lacking("columns gyro_1 gyro_2 .. (one axis) or gyro_x_1 .. gyro_z_n (three)", "gyro_1")
     if "" in by_axis and len(by_axis) > 1:
         raise DataError(
             f"{recording.name}: both {by_axis[''][min(by_axis[''])]} and columns by axis; expected one form"

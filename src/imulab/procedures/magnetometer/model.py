@@ -149,7 +149,7 @@ def read_readings(recording: Recording) -> MagReadings:
     names = triad("mag")
     missing = [name for name in names if name not in recording]
     if missing:
-        raise DataError(f"{recording.name}: no column {' '.join(missing)}; expected mag_x mag_y mag_z")
+        raise recording.lacking(f"column {' '.join(missing)}", missing[0])
     unit = recording.triad_unit("mag")
     if parse_unit(unit).quantity not in ("magnetic field", "output", "number"):
         raise UnitError(

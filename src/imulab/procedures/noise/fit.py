@@ -818,9 +818,7 @@ def chosen_columns(recording: Recording, columns: Sequence[str] | None) -> list[
         return list(columns)
     sensors = list(noise_columns(recording))
     if not sensors:
-        raise DataError(
-            f"{recording.name}: no sensor column (gyro_.. accel_.. dtg_.. fog); found {several(recording.columns)}"
-        )
+        raise recording.lacking("sensor column (gyro_.. accel_.. dtg_.. fog)", "gyro_x")
     return sensors
 
 

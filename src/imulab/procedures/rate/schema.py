@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
-from imulab.errors import ReadError, RecordError, file_name, quoted
+from imulab.errors import ReadError, RecordError, file_name, folder_in_place, quoted
 from imulab.files import check_keys, load_toml, number_of, unit_of, value_and_unit
 from imulab.procedures.rate import AXES, MOUNTINGS
 from imulab.recording import Array
@@ -325,12 +325,9 @@ def refuse_folder(path: Path, name: str) -> None:
     ReadError
         It is one; the message names the manifest.
     """
-    manifests = sorted(path.glob("*.toml")) if path.is_dir() else []
+    manifests = [each.name for each in path.glob("*.toml")] if path.is_dir() else []
     if manifests:
-        raise ReadError(
-            f"{name}: expected a manifest or one recording, found a folder; name its manifest: "
-            f"{' or '.join(str(Path(name) / manifest.name) for manifest in manifests)}"
-        )
+        raise ReadError(folder_in_place(name, "a manifest or one recording", manifests))
 
 
 def _read_size(value: Any, place: str) -> float:

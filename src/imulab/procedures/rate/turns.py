@@ -121,7 +121,7 @@ def check_accel(accel: Calibration, recording: Recording) -> None:
         raise RecordError(f"accel: a {accel.procedure} record without accelerometers; expected one of tumble fit")
     for name in (f"accel_{axis}" for axis in AXES):
         if name not in recording:
-            raise DataError(f"{recording.name}: no column {name}; the axis of turns by accelerometers needs all three")
+            raise recording.lacking(f"column {name}", name, "the axis of turns by accelerometers needs all three")
 
 
 def add_misalignments(

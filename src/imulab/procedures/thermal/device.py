@@ -250,10 +250,8 @@ def _read_temperature(columns: Mapping[str, Any], recording: Recording) -> Array
     if name == "temperature" and name not in recording and len(others) == 1:
         (name,) = others
     if name not in recording:
-        raise DataError(
-            f"{recording.name}: no column {name}; found {' '.join(recording.columns)}: expected what the unit's own "
-            "thermometer says, which the record's laws follow"
-        )
+        own = "expected what the unit's own thermometer says, which the record's laws follow"
+        raise recording.lacking(f"column {name}", name, own)
     if parse_unit(recording.units[name]).quantity != "temperature":
         raise DataError(f"{recording.name}: column {name}: expected a temperature, found {recording.units[name]}")
     return to_si(recording.column(name), recording.units[name])

@@ -188,10 +188,8 @@ def check_gyroscopes(recordings: Sequence[Recording]) -> str:
     for recording in recordings:
         missing = [name for name in _COLUMNS if name not in recording]
         if missing:
-            raise DataError(
-                f"{recording.name}: no column {missing[0]}; found {' '.join(recording.columns)}: expected the "
-                "gyroscopes in every recording, or no --with gyro"
-            )
+            why = "expected the gyroscopes in every recording, or no --with gyro"
+            raise recording.lacking(f"column {missing[0]}", missing[0], why)
         if recording.time is None:
             raise DataError(
                 f"{recording.name}: a table of attitudes; expected a recording with a column time for --with gyro, "

@@ -507,10 +507,8 @@ def _choose_temperature(recording: Recording, column: str | None) -> Recording:
         )
     if candidates:
         return _use_temperature(recording, candidates[0])
-    raise DataError(
-        f"{recording.name}: no column temperature; found {' '.join(recording.columns)}: expected what the unit's own "
-        "thermometer says (--temperature-column NAME where it is called otherwise)"
-    )
+    own = "expected what the unit's own thermometer says (--temperature-column NAME where it is called otherwise)"
+    raise recording.lacking("column temperature", "temperature", own)
 
 
 def _use_temperature(recording: Recording, column: str) -> Recording:

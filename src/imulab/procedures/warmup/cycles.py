@@ -215,7 +215,7 @@ def find_power_cycle(
 def _axes(recording: Recording) -> tuple[str, ...]:
     axes = tuple(name for name in recording.columns if _AXIS.fullmatch(name))
     if not axes:
-        raise DataError(f"{recording.name}: no column gyro_* or accel_*; found {' '.join(recording.columns)}")
+        raise recording.lacking("column gyro_* or accel_*", "gyro_x")
     for kind in ("gyro", "accel"):
         units = {name: recording.units[name] for name in axes if name.startswith(kind)}
         if len({parse_unit(unit).symbol for unit in units.values()}) > 1:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from imulab.device.tables import DeviceTable, Field, field_of, whole
 from imulab.device.unit import DeviceUnit
 from imulab.display import Note
-from imulab.errors import DataError, RecordError, UnitError
+from imulab.errors import RecordError, UnitError
 from imulab.estimation.sampling import times_in_order
 from imulab.procedures.warmup import EXITS, MODELS
 from imulab.procedures.warmup.model import record_table
@@ -184,7 +184,7 @@ def apply_warmup(unit: DeviceUnit, columns: Mapping[str, Any], recording: Record
             ) from None
     time = recording.time
     if time is None:
-        raise DataError(f"{recording.name}: no column time; a warm-up record needs the time since power-on")
+        raise recording.lacking("column time", "time", "a warm-up record needs the time since power-on")
     time = _check_time(recording, columns.get("latest_start", LATEST_START))
     temperature = power_on_temperature(recording)
     if temperature is None or unchanged(columns, recording) is not None:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.errors import DataError, ObservabilityError, OptionError, RecordError
+from imulab.errors import ObservabilityError, OptionError, RecordError
 from imulab.procedures.tumble.mag.model import (
     ACCELEROMETERS,
     FEWEST,
@@ -224,7 +224,7 @@ def make_heading_function(record: Calibration, *, true: bool = False) -> Callabl
     def with_heading(recording: Recording) -> Recording:
         for name in (*triad("accel"), *triad("mag")):
             if name not in recording:
-                raise DataError(f"{recording.name}: no column {name}; heading needs accelerometers and magnetometers")
+                raise recording.lacking(f"column {name}", name, "heading needs accelerometers and magnetometers")
         force = np.column_stack([recording.si(name) for name in triad("accel")])
         field = np.column_stack([recording.si(name) for name in triad("mag")])
         # A table of attitudes has no time: its rows are means.

@@ -267,10 +267,8 @@ def average_outputs(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
     names = triad_of_columns("mag")
     missing = [name for name in names if name not in recording]
     if missing:
-        raise DataError(
-            f"{recording.name}: no column {' '.join(missing)}; expected mag_x mag_y mag_z beside accel_x accel_y "
-            "accel_z, in the same attitudes"
-        )
+        beside = "expected the magnetometers beside the accelerometers, in the same attitudes"
+        raise recording.lacking(f"column {' '.join(missing)}", missing[0], beside)
     unit = recording.triad_unit("mag")
     if parse_unit(unit).quantity not in ("magnetic field", "output", "number"):
         raise DataError(
