@@ -329,3 +329,36 @@ def test_recordings_of_before_in_a_folder_are_named(imulab, tmp_path, words):
     assert "cycles: 1 CSV files from before are still there (cycle_+99_1.csv): cycles/*.csv names them too" in said
     again = imulab(*words.split(), "-o", "new").stderr + imulab(*words.split(), "-o", "new").stderr
     assert "from before" not in again
+
+
+@pytest.mark.parametrize(
+    ("title", "advised"),
+    [
+        ("Accel X (m/s^2)", "accel_x [m/s^2]"),
+        ("accel_x_(g)", "accel_x [g]"),
+        ("Gyro X {deg/s}", "gyro_x [deg/s]"),
+        ("gyro-x (deg/s)", "gyro_x [deg/s]"),
+        ("accel_x/(m/s^2)", "accel_x [m/s^2]"),
+        ("accel_x in g", "accel_x [g]"),
+        ("Mag X (uT)", "mag_x [uT]"),
+        ("Temperature 1 (what)", "temperature_1 [degC]"),
+        ("accel_x (2)", "accel_x_2"),
+        ("Mag_X [uT]", "mag_x"),
+    ],
+)
+def test_the_title_that_is_advised_is_read(imulab, tmp_path, title, advised):
+    rows = "".join(f"{i / 100},{i % 3}\n" for i in range(50))
+    (tmp_path / "log.csv").write_text(f"time [s],{title}\n{rows}")
+    said = imulab("show", "log.csv").stderr
+    assert re.search(r"'([a-z0-9_]+(?: \[.*?\])?)'[^']*$", said.partition(";")[0])[1] == advised
+    advised += "" if "[" in advised else " [g]" if "accel" in advised else " [uT]"
+    (tmp_path / "log.csv").write_text(f"time [s],{advised}\n{rows}")
+    assert imulab("show", "log.csv").returncode == 0
+
+
+def test_titles_that_a_layout_would_read_are_answered_by_the_command_that_writes_it(imulab, tmp_path):
+    for axes, clock in (("Accel {} [m/s^2]", "time [s]"), ("Accel {} (m/s^2)", "time [s]"), ("acc{}", "Time (s)")):
+        rows = "".join(f"{i / 100},0.1,0.2,9.8\n" for i in range(600))
+        titles = ",".join([clock, *(axes.format(axis) for axis in "XYZ")])
+        (tmp_path / "log.csv").write_text(f"{titles}\n{rows}")
+        assert "imulab layout guess log.csv" in imulab("tumble", "fit", "log.csv").stderr

@@ -41,8 +41,10 @@ INERTIAL = tuple(name for name, kind in KINDS.items() if kind.quantity in ("acce
 _ELEMENT = re.compile(rf"(?:{'|'.join(TRIADS)})(?:_[xyz])?_(\d+)")
 _CLOCK = re.compile(r"(?:t|time|timestamp|seconds)(?:(?: ?\(|[ _.])(s|ms|us|ns|min|h)\)?)?")
 """Names of time columns in loggers, with their units."""
-_WRITTEN_UNIT = re.compile(r"(\w+?)[ _]*(?:\(([^()]*[^\d()][^()]*)\)| ([^\s()]*/[^\s()]*))")
-"""Names with a unit in round brackets, or behind a blank."""
+_WRITTEN_UNIT = re.compile(
+    r"([\w .-]+?)[ _/,]*(?:\(([^()]*[^\d()][^()]*)\)|\{([^{}]*)\}|[ _]in[ _]([^\s()]+)| ([^\s()]*/[^\s()]*))"
+)
+"""Names with a unit in round brackets or braces, or behind a blank or ``in``."""
 
 
 def kind_of(column: str) -> str | None:
@@ -125,13 +127,34 @@ def check_name(name: str, title: str, file: str) -> None:
     lower = name.lower()
     clock = _CLOCK.fullmatch(lower)
     written = None if clock else _WRITTEN_UNIT.fullmatch(name)
-    if written and expected_quantities(written[1].lower()) is not None:
-        example = f"{written[1].lower()} [{written[2] or written[3]}]"
+    meant = "time" if clock else _words_joined(lower)
+    if written and _is_sensor(stem := _words_joined(written[1].lower())):
+        example = f"{stem} [{_known_unit(next(filter(None, written.groups()[1:])), stem)}]"
         raise UnitError(f"{file}: column {name!r}: expected a title such as {example!r}")
-    meant = "time" if clock else lower.replace(" ", "_")
-    if meant != name and expected_quantities(meant) is not None:
+    if meant != name and _is_sensor(meant):
         example = f", in a title such as 'time [{clock[1]}]'" if clock and clock[1] else ""
         raise UnitError(f"{file}: column {name!r}: expected the name {meant!r}{example}")
+
+
+def _words_joined(name: str) -> str:
+    """Return a name with ``_`` between its words."""
+    return re.sub(r"[ .()-]+", "_", name).strip("_")
+
+
+def _is_sensor(name: str) -> bool:
+    """Return whether a column is of the vocabulary; other columns may begin with ``mag``, too."""
+    return (
+        expected_quantities(name) is not None or re.fullmatch(r"(?:truth_|std_)?mag_[xyz](?:_\d+)?", name) is not None
+    )
+
+
+def _known_unit(text: str, name: str) -> str:
+    """Return a unit as written, or an example of the column's where it is none of these."""
+    try:
+        parse_unit(text)
+    except UnitError:
+        return example_unit(name)
+    return text
 
 
 def expected_quantities(name: str) -> tuple[str, ...] | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from imulab.columns import kind_of
 from imulab.readers.layout import load_layout, shipped_file, shipped_names
 from imulab.readers.opened import holds
 from imulab.recording import Layout
@@ -98,9 +99,11 @@ def _separated(head: bytes) -> str:
 
 
 def is_titled(head: bytes) -> bool:
-    """Return whether the first line that is no comment has a unit in brackets, as in imulab's titles."""
+    """Return whether titles name a sensor with its unit in brackets, as imulab does."""
     lines = head.decode("utf-8", "replace").splitlines()
-    return "[" in next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    titles = next((line for line in lines if line.strip() and not line.startswith("#")), "").split(",")
+    names = [title.partition("[")[0].strip(' "') for title in titles if "[" in title]
+    return any(kind_of(name) not in (None, "time") for name in names)
 
 
 def table() -> tuple[list[str], list[list[str]]]:
