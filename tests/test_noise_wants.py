@@ -184,3 +184,37 @@ def test_the_table_for_filters_has_the_limit_of_a_walk_that_was_not_seen():
         limit = record.parameters[f"{name}_walk"].unseen_limit
         assert limit > 0
         assert (walk, interval) == (f"< {limit:.2g}", f"0 to {limit:.2g}")
+
+
+def test_the_keys_of_a_program_are_written_where_the_name_says_so(imulab, tmp_path):
+    yaml = pytest.importorskip("yaml")
+    imulab("noise", "simulate", "--duration", "300 s", "--white", "0.3 deg/sqrt(h)", "-o", "rest.csv")
+    done = imulab("noise", "fit", "rest.csv", "--for", "kalibr", "-o", "k.yaml")
+    printed = dict(line.split(": ") for line in done.stdout.splitlines() if not line.startswith("kalibr"))
+    assert done.stdout.endswith("kalibr: k.yaml\n")
+    written = yaml.safe_load((tmp_path / "k.yaml").read_text())
+    assert written == {key: float(value) for key, value in printed.items()}
+    assert all(isinstance(value, float) for value in written.values())
+    for program, name, row in (
+        ("px4", "p.params", "1\t1\tEKF2_GYR_NOISE\t0."),
+        ("ardupilot", "a.param", "EK3_GYRO_P_"),
+    ):
+        assert imulab("noise", "fit", "rest.csv", "--for", program, "-o", name).returncode == 0
+        assert f"\n{row}" in (tmp_path / name).read_text()
+    assert imulab("noise", "fit", "rest.csv", "--for", "px4", "-o", "r.json").stdout.endswith("record: r.json\n")
+    assert il.load(tmp_path / "r.json").procedure == "noise"
+
+
+@pytest.mark.parametrize("name", ["r.html", "r.csv", "r.yaml", "r.params"])
+def test_a_record_is_not_written_under_another_format_s_name(imulab, tmp_path, name):
+    recording = il.simulate_tumble(gravity=9.81, attitudes=12, order=1)
+    il.write(recording, tmp_path / "t.csv")
+    for words in ("noise fit t.csv", "noise fit t.csv --for kalibr", "tumble fit t.csv", "rate turn t.csv"):
+        if "--for" in words and name == "r.yaml":
+            continue
+        done = imulab(*words.split(), "-o", name)
+        assert (done.returncode, f"{name}: a record is JSON; expected a name such as r.json" in done.stderr) == (
+            2,
+            True,
+        )
+        assert not (tmp_path / name).exists()

@@ -362,3 +362,15 @@ def test_titles_that_a_layout_would_read_are_answered_by_the_command_that_writes
         titles = ",".join([clock, *(axes.format(axis) for axis in "XYZ")])
         (tmp_path / "log.csv").write_text(f"{titles}\n{rows}")
         assert "imulab layout guess log.csv" in imulab("tumble", "fit", "log.csv").stderr
+
+
+def test_the_gravity_to_leave_out_is_that_which_was_stated(imulab, tmp_path):
+    il.write(il.simulate_tumble(gravity=9.81362, attitudes=12, order=1), tmp_path / "f.csv")
+    correct = "next: correct the gravity in the head of the file, or leave "
+    place = f"{correct}the place (--latitude and --height, or --place) out"
+    for options, said in (
+        (("--latitude", "48.1", "--height", "520"), place),
+        (("--place", "48.1,11.6,520"), place),
+        (("--gravity", "9.80739"), f"{correct}--gravity out"),
+    ):
+        assert said in imulab("tumble", "fit", "f.csv", *options).stdout.splitlines()

@@ -57,6 +57,9 @@ _TO_MICRO = 1e6  # to ppm
 _EXACT = "argument, taken as exact"
 """Origin of a value that was typed without an uncertainty, to five decimals or more."""
 
+_NORMAL = "normal gravity"
+"""Beginning of the origin of a value that was computed from a place."""
+
 
 class Gravity(Struct, frozen=True):
     """Local gravity and its standard uncertainty, m/s^2, the origin of the value, and remarks."""
@@ -128,12 +131,15 @@ def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
     if head is not None:
         allowed = _TOLD_APART * head.value + 2 * gravity.standard_uncertainty
         if abs(gravity.value - head.value) > allowed:
+            stated = (
+                "the place (--latitude and --height, or --place)" if gravity.origin.startswith(_NORMAL) else "--gravity"
+            )
             return [
                 Finding(
                     f"gravity {gravity.value:.6g} m/s^2 was used, but the head of {recording.name} says "
                     f"{head.value:.6g} m/s^2: scale factors differ by "
                     f"{_TO_MICRO * (head.value / gravity.value - 1):+.0f} ppm between the two",
-                    "correct the gravity in the head of the file, or leave --gravity out",
+                    f"correct the gravity in the head of the file, or leave {stated} out",
                 )
             ]
     low, high = _ON_EARTH
@@ -209,7 +215,7 @@ def at_place(
     where = f"{above:g} m" if height is not None else f"not given: 0 m ± {_UNKNOWN_HEIGHT:g} m"
     return Gravity(
         value,
-        f"normal gravity at latitude {math.degrees(angle):.6g} deg, height {where} (WGS 84)",
+        f"{_NORMAL} at latitude {math.degrees(angle):.6g} deg, height {where} (WGS 84)",
         uncertainty,
         Note(
             f"gravity {value:.6g} m/s^2 is normal gravity, from which that of a place differs: "

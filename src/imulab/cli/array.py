@@ -18,6 +18,7 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    check_record_outputs,
     progress_bar,
     quantity,
     reading,
@@ -202,7 +203,9 @@ def calibrate(
     from imulab.procedures.registry import run_task
 
     moving = options.pop("moving")
-    check_outputs([output, report], [name for name in (still, moving, options["layout"], options["noise"]) if name])
+    check_record_outputs(
+        output, report, [name for name in (still, moving, options["layout"], options["noise"]) if name]
+    )
     files = [still] if moving is None else [still, moving]
     finish(run_task("array", files, options, GivenFiles()), output, report, json=json)
 
@@ -226,7 +229,7 @@ def calibrate_imus(
     from imulab.procedures.gyro_array.imus.logs import with_all_instances
     from imulab.readers.streams import one_clock
 
-    check_outputs([output, report], [name for name in (file, options["layout"]) if name])
+    check_record_outputs(output, report, [name for name in (file, options["layout"]) if name])
     recording = one_clock(read_recording(file, **with_all_instances(file, reading(options))))
     finish(call(il.calibrate_imus, recording, **options).calibration, output, report, json=json)
 

@@ -13,6 +13,7 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    check_record_outputs,
     progress_bar,
 )
 from imulab.errors import OptionError
@@ -91,7 +92,7 @@ def reduce(
 
     test = load_manifest(manifest)
     files = [str(Path(manifest).parent / run.file) for run in test.runs]
-    check_outputs([output, report], [manifest, *([options["layout"]] if options["layout"] else []), *files])
+    check_record_outputs(output, report, [manifest, *([options["layout"]] if options["layout"] else []), *files])
     with progress_bar("runs", len(test.runs)) as progress:
         record = run_task("centrifuge", [manifest], options, GivenFiles(), progress=progress)
     finish(record, output, report, json=json)

@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import imulab as il
 from imulab.cli.command import Argument, Command, option
-from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, reading, warn, whole_number
+from imulab.cli.options import (
+    GivenFiles,
+    OutputFile,
+    ReportFile,
+    check_record_outputs,
+    note,
+    reading,
+    warn,
+    whole_number,
+)
 from imulab.errors import ImulabError, OptionError
 from imulab.options import FLAG, OUTPUT, RARE
 
@@ -220,7 +229,7 @@ def live(
     layout, units = options["layout"], reading({"units": options.pop("units")})["units"]
     values = TASK.values({name: text for name, text in options.items() if text is not None}, FLAG)
     session = Session(values["order"], values["gravity"], read_targets(target), _number_of_attitudes(attitudes, target))
-    check_outputs([save, output, report], [name for name in (_source_name(source), layout) if name])
+    check_record_outputs(output, report, [name for name in (_source_name(source), layout) if name], save)
     fitted = {**options, "layout": None}
     opened = partial(open_source, source, layout, units=units, follow=follow)
     runner = Runner.open(opened, session, save, _layout(layout), resume=resume, units=units)

@@ -15,6 +15,7 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    check_record_outputs,
     read_recording,
     reading,
 )
@@ -57,7 +58,7 @@ def fit(
     from imulab.cli.show import finish
     from imulab.procedures.registry import run_task
 
-    check_outputs([output, report], [name for name in (file, options["layout"]) if name])
+    check_record_outputs(output, report, [name for name in (file, options["layout"]) if name])
     finish(run_task("magnetometer", [file], options, GivenFiles()), output, report, json=json)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import imulab as il
@@ -16,6 +18,7 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    check_record_outputs,
     is_json,
     naming,
     quantity,
@@ -28,7 +31,7 @@ from imulab.options import OUTPUT
 from imulab.quantities import labelled
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from imulab.estimation.noise.rest import Rest
     from imulab.recording import Recording
@@ -126,14 +129,20 @@ def fit(
     """Fit a model of the noise to logs at rest.
 
     Column by column; several logs of a unit add up. Prints the terms with their 95 % intervals, and what a filter
-    wants; -o writes the record, --report its figures. With --for, a noise record in place of the logs gives the same.
+    wants; -o writes the record, --report its figures. With --for, a noise record in place of the logs gives the same,
+    and -o FILE.yaml writes what is printed (px4 also .params, ardupilot .param).
     """
     from imulab.cli.show import finish
     from imulab.procedures.noise.schema import fit_of
     from imulab.procedures.noise.wants import check_program, noise_for
     from imulab.procedures.registry import load, run_task
 
-    check_outputs([output, report], [*files, *([options["layout"]] if options["layout"] else [])])
+    inputs = [*files, *([options["layout"]] if options["layout"] else [])]
+    keys_file = output if program is not None and _holds_keys(output, program) else None
+    if keys_file is None:
+        check_record_outputs(output, report, inputs)
+    else:
+        check_outputs([output, report], inputs)
     hertz = None if rate is None else quantity(rate, "--rate", "frequency", "Hz")
     seconds = None if step is None else quantity(step, "--step", "time", "s")
     if program is not None:
@@ -147,12 +156,43 @@ def fit(
         return
     with labelled("--{}", ["rate", "step"]), naming(files[0]) if saved else nullcontext():
         wanted = noise_for(record, program, rate=hertz, step=seconds)
-    finish(record, output, report, json=json, describe=lambda _: "\n".join(f"{k}: {v:.4g}" for k, v in wanted.items()))
+    printed = "\n".join(f"{key}: {value:.4g}" for key, value in wanted.items())
+    finish(record, None if keys_file else output, report, json=json, describe=lambda _: printed)
+    if keys_file:
+        _write_keys(wanted, keys_file, program, files)
+        print(f"{program}: {keys_file}")
     for key in [key for key, value in wanted.items() if value == 0]:
         warn(
             f"{key}: none was seen in {fit_of(record).length.value:.4g} s, and 0 makes a filter trust a bias for ever; "
             "record longer, or take a value below the limits that noise fit prints without --for"
         )
+
+
+_KEYS_FILES = {".yaml": "", ".yml": "", ".txt": "", ".params": "px4", ".param": "ardupilot"}
+"""Endings of files for the keys of a program, and the only program that reads them."""
+
+
+def _holds_keys(output: str | None, program: str) -> bool:
+    """Return whether a file is to hold the keys of a program, by its ending."""
+    return _KEYS_FILES.get(Path(output or "").suffix.lower()) in ("", program)
+
+
+def _write_keys(wanted: Mapping[str, float], output: str, program: str, files: Sequence[str]) -> None:
+    """Write the keys of a program as its parameter file, or as YAML."""
+    from imulab.exporters.model import single_precision, yaml_number
+    from imulab.exporters.texts import hash_comments
+    from imulab.files import write_text
+
+    ending = Path(output).suffix.lower()
+
+    def row(key: str, value: float) -> str:
+        if ending == ".params":
+            return f"1\t1\t{key}\t{single_precision(value)}\t9"
+        return f"{key},{single_precision(value)}" if ending == ".param" else f"{key}: {yaml_number(value)}"
+
+    rows = [row(key, float(f"{value:.4g}")) for key, value in wanted.items()]
+    origin = f"{program}: noise of {' '.join(files)}, the largest of the three axes (imulab {il.__version__})"
+    write_text(output, "\n".join([*hash_comments([origin]), *rows]) + "\n")
 
 
 def plan(

@@ -280,6 +280,24 @@ def check_outputs(outputs: list[str | None], inputs: list[str], *, paper: bool =
         taken[target] = name
 
 
+NO_RECORD = (".html", ".htm", ".csv", ".parquet", ".yaml", ".yml", ".toml", ".txt", ".params", ".param")
+"""Endings of files that a record, which is JSON, would be taken for."""
+
+
+def check_record_outputs(output: str | None, report: str | None, inputs: list[str], *others: str | None) -> None:
+    """Refuse, before the work, outputs of a fit; errors as for `check_outputs`, and a record's name of another format.
+
+    Raises
+    ------
+    OptionError
+        See above.
+    """
+    check_outputs([*others, output, report], inputs)
+    if output is not None and (path := Path(output)).suffix.lower() in NO_RECORD:
+        page = f"; --report {output} writes a page" if path.suffix.lower() in (".html", ".htm") else ""
+        raise OptionError(f"{output}: a record is JSON; expected a name such as {path.with_suffix('.json')}{page}")
+
+
 def warn_older(folder: str, written: Iterable[str]) -> None:
     """Warn of recordings that were in a folder before, which a pattern such as ``FOLDER/*.csv`` names too."""
     older = sorted({path.name for path in Path(folder).glob("*.csv")} - set(written))

@@ -13,6 +13,7 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    check_record_outputs,
     read_recording,
     reading,
 )
@@ -78,7 +79,7 @@ def fit(
     runs = load_test(file).runs if file.lower().endswith(".toml") and "://" not in file else ()
     inputs = [file, options["layout"], options["accel"], options["prior"]]
     inputs += [str(Path(file).parent / run.file) for run in runs]
-    check_outputs([output, report], [name for name in inputs if name])
+    check_record_outputs(output, report, [name for name in inputs if name])
     finish(run_task("rate", [file], options, GivenFiles()), output, report, json=json)
 
 
@@ -97,9 +98,8 @@ def turn(
     from imulab.cli.show import finish
 
     how = reading(options)
-    check_outputs(
-        [output, report], [name for name in (file, how["layout"], options["accel"], options["prior"]) if name]
-    )
+    inputs = [name for name in (file, how["layout"], options["accel"], options["prior"]) if name]
+    check_record_outputs(output, report, inputs)
     result = call(il.fit_turns, read_recording(file, **how), **options)
     finish(result.calibration, output, report, json=json)
 

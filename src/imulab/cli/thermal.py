@@ -15,6 +15,7 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    check_record_outputs,
     read_recording,
     reading,
     warn_older,
@@ -84,7 +85,7 @@ def fit(
     from imulab.procedures.registry import run_task
 
     inputs = [name for name in (options["layout"], options["prior"]) if name]
-    check_outputs([output, report], [*files, *inputs])
+    check_record_outputs(output, report, [*files, *inputs])
     finish(run_task("thermal", files, options, GivenFiles()), output, report, json=json)
 
 

@@ -15,6 +15,7 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    check_record_outputs,
     progress_bar,
     quantity,
     read_recording,
@@ -79,7 +80,7 @@ def fit(
     from imulab.cli.show import finish
     from imulab.procedures.registry import run_task
 
-    check_outputs([output, report], [name for name in (file, options["layout"], options["prior"]) if name])
+    check_record_outputs(output, report, [name for name in (file, options["layout"], options["prior"]) if name])
     trials = None if options["monte_carlo"] is None else whole_number(options["monte_carlo"], "--monte-carlo")
     with progress_bar("Monte Carlo", trials) as progress:
         record = run_task("tumble", [file], options, GivenFiles(), progress=progress)
@@ -105,7 +106,7 @@ def gyro(
 
     how, accel, noise = reading(options), options.pop("accel"), options["noise"]
     inputs = [name for name in (file, accel, accel_file, how["layout"], accel_layout, noise) if name]
-    check_outputs([output, report], inputs)
+    check_record_outputs(output, report, inputs)
     record = load(accel)
     units = how["units"]
     if accel_file is None:
@@ -160,7 +161,7 @@ def mag(
     from imulab.procedures.tumble.mag.solve import parse_place
 
     how, accel = reading(options), options.pop("accel")
-    check_outputs([output, report], [name for name in (file, accel, how["layout"]) if name])
+    check_record_outputs(output, report, [name for name in (file, accel, how["layout"]) if name])
     known = None if accel is None else load(accel)
     gravity, latitude, height = (options.pop(name) for name in ("gravity", "latitude", "height"))
     if options["place"] is not None and latitude is not None:

@@ -13,6 +13,7 @@ from imulab.cli.options import (
     ReportFile,
     call,
     check_outputs,
+    check_record_outputs,
     naming,
     warn_older,
 )
@@ -69,7 +70,7 @@ def fit(
     from imulab.cli.show import finish
     from imulab.procedures.registry import run_task
 
-    check_outputs([output, report], [*files, *([options["layout"]] if options["layout"] else [])])
+    check_record_outputs(output, report, [*files, *([options["layout"]] if options["layout"] else [])])
     finish(run_task("warmup", files, options, GivenFiles()), output, report, json=json)
 
 
