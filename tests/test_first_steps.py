@@ -13,7 +13,7 @@ import imulab as il
 from imulab.errors import DataError, ImulabError, OptionError, ReadError, UnitError
 from imulab.quantities import quantity
 from imulab.readers.layout import EXAMPLE, load_layout
-from imulab.recording import Recording, Source
+from imulab.recording import Recording
 from imulab.units import STANDARD_GRAVITY as G
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -53,7 +53,7 @@ def test_columns_of_other_names_call_for_a_layout():
     foreign = Recording(columns={"time": np.zeros(1), "ax": np.zeros(1)}, units={"time": "s", "ax": "1"}, name="f.csv")
     with pytest.raises(DataError, match=r"found time ax; rename .* df\.rename\(columns=\{'ax': 'accel_x'\}\)"):
         foreign.column("accel_x")
-    read = replace(foreign, source=Source("f.csv", "0" * 64))
+    read = replace(foreign, from_file=True)
     with pytest.raises(DataError, match=r"^f.csv: no column accel_x; found time ax; a layout says .*--layout"):
         read.column("accel_x")
     ours = replace(foreign, columns={"time": np.zeros(1), "accel_y": np.zeros(1)}, units={"time": "s", "accel_y": "g"})

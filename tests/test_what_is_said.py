@@ -2,6 +2,7 @@
 
 import math
 import re
+import shlex
 import shutil
 
 import numpy as np
@@ -374,3 +375,30 @@ def test_the_gravity_to_leave_out_is_that_which_was_stated(imulab, tmp_path):
         (("--gravity", "9.80739"), f"{correct}--gravity out"),
     ):
         assert said in imulab("tumble", "fit", "f.csv", *options).stdout.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("tumble plan --attitudes 20 --order 2 --noise 0.0002", "in ug, and less than any accelerometer has"),
+        ("noise plan --white 0.3", "in SI, and more than any gyroscope has; expected a unit, as in '0.3 deg/sqrt(h)'"),
+        ("noise plan --white 0.3 --walk '3 deg/h/sqrt(h)'", "more than any gyroscope has"),
+        ("noise simulate --flicker 5 -o n.csv", "more than any gyroscope has; expected a unit, as in '5 deg/h'"),
+        ("noise simulate --white 100 --columns accel_x -o n.csv", "more than any accelerometer has"),
+    ],
+)
+def test_a_number_that_was_meant_in_another_unit_is_refused(imulab, words, said):
+    done = imulab(*shlex.split(words))
+    assert done.returncode == 2
+    assert said in done.stderr
+
+
+def test_what_is_stated_with_its_unit_is_taken_at_any_size(imulab):
+    for words in (
+        "tumble plan --attitudes 20 --order 2 --noise '0.0002 ug'",
+        "tumble plan --attitudes 20 --order 2 --noise 20",
+        "noise plan --white '0.3 rad/s/sqrt(Hz)'",
+        "noise plan --white 1e-4",
+    ):
+        assert imulab(*shlex.split(words)).returncode == 0, words
+    assert il.plan_noise(white=0.3).needed > 0

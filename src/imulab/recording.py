@@ -86,8 +86,8 @@ class Recording:
         What the reader did to the data that a user should know.
     corrected_by
         The records that the samples were corrected by, ``NAME sha256:HASH`` each.
-    in_memory
-        Whether the samples came as arrays or as a data frame; messages then advise on these, not on files.
+    from_file
+        Whether a reader made it: messages then advise on files, not on data frames.
 
     Examples
     --------
@@ -107,7 +107,7 @@ class Recording:
     lines_before: int | None = None
     notes: tuple[str, ...] = ()
     corrected_by: tuple[str, ...] = ()
-    in_memory: bool = False
+    from_file: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.metadata, Mapping) and any(isinstance(each, int | float) for each in self.metadata.values()):
@@ -206,9 +206,9 @@ class Recording:
         foreign = all(expected_quantities(other) in (None, ("time",)) for other in self.columns)
         other = next((name for name in self.columns if expected_quantities(name) is None), "x")
         advice = next((note for note in self.notes if "--layout" in note), None) or (
-            f"rename what is the sensor's, such as df.rename(columns={{{other!r}: {example!r}}})"
-            if self.in_memory
-            else "a layout says where columns of other names are (--layout; docs/recordings.md)"
+            "a layout says where columns of other names are (--layout; docs/recordings.md)"
+            if self.from_file
+            else f"rename what is the sensor's, such as df.rename(columns={{{other!r}: {example!r}}})"
         )
         hint = f"; {advice}" if foreign else f"; {state_rate(self.name)}" if example == "time" else ""
         reason = f": {why}" if why else ""
@@ -366,7 +366,7 @@ class Recording:
         """
         arrays = {"time": time, "accel": accel, "gyro": gyro, "mag": mag, "temperature": temperature, **columns}
         converted, symbols = columns_of_arrays(arrays, rate=rate, unit=unit, units=units, name=name)
-        return cls(converted, symbols, metadata or {}, name, in_memory=True)
+        return cls(converted, symbols, metadata or {}, name)
 
     @classmethod
     @checked
@@ -411,8 +411,7 @@ class Recording:
         """
         converted, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
         before = tuple(map(str, getattr(frame, "attrs", {}).get("corrected_by", ())))
-        head = {**(metadata or {})}
-        return cls(converted, symbols, head, name, corrected_by=before, in_memory=True)  # type: ignore[arg-type]
+        return cls(converted, symbols, {**(metadata or {})}, name, corrected_by=before)  # type: ignore[dict-item]
 
     @overload
     def to_frame(self, library: Literal["pandas"] | None = None) -> pandas.DataFrame: ...
@@ -763,7 +762,7 @@ def with_power_on_temperature(blocks: Iterable[Recording]) -> Iterator[Recording
 
 def state_power_on(recording: Recording, example: str) -> str:
     """Return how to state the power-on temperature, degC, of a file or of a recording in memory, for a message."""
-    if recording.in_memory:
+    if not recording.from_file:
         return (
             f"expected it in the metadata: Recording.from_frame(frame, metadata={{'power_on_temperature': {example}}})"
         )

@@ -252,8 +252,7 @@ def _own_clocks(
         named = {"accel": samples} if columns is None else columns(samples)
     whole = {"rate": None, "unit": None, "units": None, **arrays, "name": "arrays"}
     return _select_part(
-        Recording(*columns_of_arrays({**_pick(stated, ("time",)), **named}, **whole), name="arrays", in_memory=True),
-        **part,
+        Recording(*columns_of_arrays({**_pick(stated, ("time",)), **named}, **whole), name="arrays"), **part
     )
 
 

@@ -141,4 +141,5 @@ def recordings(
             metadata={**(layout.metadata or {}), **readings.epoch},
             name=name,
             first_row=start + 1,
+            from_file=True,
         )

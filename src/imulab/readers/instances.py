@@ -110,7 +110,7 @@ def imus_on_one_clock(
         INSTANCES: logged,
         RESAMPLED: f"accel and gyro from {min(rates):.6g} to {max(rates):.6g} Hz to {1e6 / clock.step:.6g} Hz",
     }
-    return Recording(columns, units, head, name, notes=tuple(notes))
+    return Recording(columns, units, head, name, notes=tuple(notes), from_file=True)
 
 
 def _paired(

@@ -99,6 +99,7 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
         name=name,
         source=Source(name, hashlib.sha256(data).hexdigest()),
         notes=tuple(notes),
+        from_file=True,
     )
 
 

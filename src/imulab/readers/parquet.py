@@ -70,7 +70,9 @@ def blocks(
                 values = {key: _floats(arrow, batch.column(title), title, name) for key, title in columns.items()}
                 if readings is not None:
                     values = readings.of(values, row)
-                yield Recording(values, units, metadata, name, first_row=row, corrected_by=corrected, notes=notes)
+                yield Recording(
+                    values, units, metadata, name, first_row=row, corrected_by=corrected, notes=notes, from_file=True
+                )
                 row += batch.num_rows
     except (arrow.ArrowException, OSError, ValueError, MemoryError) as error:
         raise ReadError(f"{name}: not a whole Parquet file: {' '.join(str(error).split())[:160]}") from None

@@ -265,7 +265,7 @@ def _block(
                 notes.append(_note(buffer, clock, per_second))
         columns |= {key: np.ascontiguousarray(values[:, i]) for i, key in enumerate(buffer.stream.units)}
         units |= buffer.stream.units
-    return Recording(columns=columns, units=units, name=name, notes=tuple(notes))
+    return Recording(columns=columns, units=units, name=name, notes=tuple(notes), from_file=True)
 
 
 def _left_out(clock: _Buffer, others: list[_Buffer]) -> list[str]:
@@ -727,7 +727,7 @@ def on_clock_of(blocks: Iterable[Recording], sensor: str | None = None) -> Itera
         columns = {name: block.columns[name] for name in ("time", *kept)}
         yield replace(
             block, columns=columns, units={name: block.units[name] for name in columns},
-            corrected_by=first.corrected_by, in_memory=first.in_memory,
+            corrected_by=first.corrected_by, from_file=first.from_file,
         )  # fmt: skip
 
 

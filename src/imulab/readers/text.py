@@ -815,6 +815,7 @@ class TextFile:
             first_row=row,
             lines_before=before,
             corrected_by=tuple(self._corrected_by),
+            from_file=True,
         )
 
     def _refuse(self, job: _Job, row: int, index: int, problem: int, field: int) -> None:

@@ -253,6 +253,10 @@ class GivenTerms:
     unit: str
 
 
+_MOST = {"rad/s": 0.01, "m/s^2": 1.0}  # of a coefficient in SI: 34 deg/sqrt(h), 2063 deg/h; 0.1 g/sqrt(Hz)
+_SENSOR = {"rad/s": "gyroscope", "m/s^2": "accelerometer"}
+
+
 def given_terms(
     unit: str,
     *,
@@ -297,6 +301,12 @@ def given_terms(
     for name, level in levels.items():
         if level != common:
             raise OptionError(f"{name}: noise of an output in {level}; expected that of one in {common}")
+    for name, value in stated.items():
+        if isinstance(value, str) and name not in levels and values[NAMES.index(name)] > _MOST.get(common, math.inf):
+            raise OptionError(
+                f"{name} {value!r}: without a unit that is in SI, and more than any {_SENSOR[common]} has; expected a "
+                f"unit, as in '{EXAMPLES[name] if common == 'rad/s' else '100 ug/sqrt(Hz)'}'"
+            )
     if not values.any():
         options = " ".join(f"--{name}" for name in EXAMPLES)
         raise OptionError(f'no noise is given: expected one of {options}, such as --white "{EXAMPLES["white"]}"')

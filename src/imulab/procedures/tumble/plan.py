@@ -30,7 +30,7 @@ from imulab.procedures.tumble.model import parameter_count, parameter_names, par
 from imulab.procedures.tumble.record import freedom_finding, predicted_rows
 from imulab.procedures.tumble.schema import attitudes_of, data_of, fit_of, model_of
 from imulab.procedures.tumble.solve import CLOSEST, Search, information_rows, inverse, optimal_set, sphere_points
-from imulab.quantities import in_si, quantity, whole, whole_number
+from imulab.quantities import in_si, quantity, split_quantity, whole, whole_number
 from imulab.recording import Array, Data, Recording, check_finite
 from imulab.records import is_json
 from imulab.records.calibration import Calibration
@@ -580,6 +580,9 @@ def attitude_entry(number: str, up: Array, north: Array | None = None, facing: s
 # A plan from what people have: noise, candidates and earlier attitudes as numbers, texts, files, records or arrays.
 
 
+_TINY = 1e-8  # g: below it a noise without a unit, which is in ug, was meant in another
+
+
 Known: TypeAlias = Calibration | Data
 
 
@@ -606,8 +609,8 @@ def plan_tumble(
     attitudes
         Number of attitudes to choose.
     noise
-        Noise of ``|f|`` in one attitude, or a recording or record that has it. In m/s^2, or a text such as ``"20ug"``;
-        or the file of either.
+        Noise of ``|f|`` in one attitude, in ug without a unit, or a recording or record that has it. A number is in
+        m/s^2, a text such as ``"20ug"``; or the file of either.
     order
         Order of the model, 0 to 5; 3, or with method linearised 4, if not given. Attitudes for order 3 show what an
         order 2 would silently leave in scale factors.
@@ -697,6 +700,11 @@ def noise_of(source: Any) -> tuple[float, str]:
         sigma = from_si(in_si(source, "noise", "acceleration", "ug"), "g")
         if not sigma > 0:
             raise OptionError(f"noise {source!r}: expected more than 0")
+        if isinstance(source, str) and sigma < _TINY and not split_quantity(source, "noise", "20 ug")[1]:
+            raise OptionError(
+                f"noise {source!r}: without a unit that is in ug, and less than any accelerometer has; expected one, "
+                f"such as '{source.strip()} g'"
+            )
         return sigma, ""
     record = _record(source)
     if record is not None:
