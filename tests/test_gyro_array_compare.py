@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -282,6 +283,49 @@ def test_compare_measures_against_the_gyros_that_work():
     assert 0.99 < broken.figures["robust"][0].over_limit < 1.1
     assert "than the mean single gyro that works (gyro_3, gyro_5 did not)" in exhibits_of(broken.record).headline
     assert "than the mean single gyro;" in exhibits_of(whole.record).headline
+
+
+def test_a_record_of_another_array_is_warned_of_by_fuse_and_compare(tmp_path):
+    array = {"mounting": "alternate", "scale_spread": 0.01}
+    still, moving, run = (
+        simulate_array(experiment=name, duration=30.0, seed=1, **array) for name in ("static", "moving", "dynamic")
+    )
+    record = calibrate_array(still, moving).calibration
+    assert compare_methods(run, calibration=record).record.verdict.state == "good"
+    assert not il.fuse(run, calibration=record).notes
+    other = replace(simulate_array(duration=30.0, seed=8), name="other.csv")  # not mounted the same way
+    serial = "other.csv: serial ARRAY-0008, but the record was made for ARRAY-0001"
+    mounting = "other.csv: in motion gyro_2 gyro_4 gyro_6, corrected by the record, differ from gyro_1 by up to 20"
+    compared = compare_methods(other, calibration=record)
+    assert serial in compared.record.verdict.reasons
+    assert any("about the robust rate by 8.8" in reason for reason in compared.record.verdict.reasons)
+    assert serial in il.fuse(other, initial_bias=record).notes
+    il.export("blob", record, tmp_path)
+    assert il.fuse(other, calibration=tmp_path / "unit.blob").notes[0] == serial
+    nameless = replace(other, metadata={})
+    for lines in (compared.warnings, il.fuse(nameless, calibration=record).notes):
+        assert [line for line in lines if line.startswith(mounting)]
+    assert il.fuse(nameless, calibration=record).notes[0].startswith(mounting)
+
+
+def test_compare_asks_to_look_where_fuse_does():
+    run = simulate_array(duration=40.0, seed=3, fault=(Fault("stuck", 3, 10.0, 5.0), Fault("jump", 5, 20.0)))
+    compared = compare_methods(run)
+    assert compared.record.verdict.state == "look"
+    reasons = compared.record.verdict.reasons
+    assert [r.split(":")[0] for r in reasons if "excluded" in r] == ["gyro_3", "gyro_5"]
+    assert [line for line in fuse(run).health.lines() if line not in reasons] == []
+
+
+def test_compare_says_where_a_record_no_longer_holds():
+    still = simulate_array(experiment="static", duration=30.0, seed=1)
+    run = simulate_array(duration=30.0, seed=1)
+    gyro_2 = {"gyro_2": 1.2 * run.columns["gyro_2"], "gyro_4": 0.9 * run.columns["gyro_4"]}
+    changed = replace(run, columns={**run.columns, **gyro_2, "gyro_6": 1.1 * run.columns["gyro_6"]})
+    record = calibrate_array(still).calibration
+    for recording, count in ((run, 0), (changed, 1)):
+        lines = compare_methods(recording, calibration=record).record.verdict.reasons
+        assert len([line for line in lines if "the record does not hold for this recording" in line]) == count
 
 
 def test_compare_says_who_follows_a_dead_gyro(imulab, tmp_path):

@@ -96,6 +96,33 @@ def test_a_record_that_does_not_hold_is_said():
     assert "IMU 2 3" in said[0]
 
 
+def test_a_record_of_another_board_is_said_at_rest_too():
+    recording, _, _ = board_in_hand()
+    other = il.Recording(recording.columns, recording.units, {"serial": "B2"}, "hand.csv")
+    record, serial = true_record(recording), "hand.csv: serial B2, but the record was made for B1"
+    compared = il.compare_imus(other, calibration=record)
+    assert [note for note in compared.notes if not isinstance(note, Note)] == [serial]
+    assert serial in il.fuse_imus(other, calibration=record).notes
+    foreign = true_record(board_in_hand(seed=5)[0])
+    lines = [note for note in il.compare_imus(recording, calibration=foreign).notes if not isinstance(note, Note)]
+    assert any("slower than 30 deg/s, the mean of the others is nearer to the accelerometers" in line for line in lines)
+    assert any("slower than 30 deg/s, the gyroscopes of IMU 1 2 3 4 5 are" in line for line in lines)
+
+
+def test_a_stuck_sensor_is_said_as_fuse_says_it():
+    recording, _, _ = board_in_hand()
+    gyro = recording.columns["gyro_x_2"].copy()
+    stuck = {
+        f"gyro_{axis}_2": np.where(np.arange(1200) > 700, gyro[700], recording.columns[f"gyro_{axis}_2"])
+        for axis in "xyz"
+    }
+    spoilt = il.Recording({**recording.columns, **stuck}, recording.units, recording.metadata, "hand.csv")
+    compared = il.compare_imus(spoilt, calibration=true_record(recording))
+    (line,) = [note for note in compared.notes if "stuck" in note]
+    assert not isinstance(line, Note)
+    assert line in il.fuse_imus(spoilt, calibration=true_record(recording)).notes
+
+
 def test_slow_turning_accuses_no_record():
     """Fused others are noisier than their mean, since they extrapolate: no sign of a wrong calibration."""
     recording, _, _ = board_in_hand(PLACES[:4] * 0.3, turning=0.9)

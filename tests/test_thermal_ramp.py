@@ -3,6 +3,7 @@
 The simulator is `tests.reference.rest_ramp`, which shares nothing with the fit.
 """
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -155,7 +156,12 @@ def test_lag_of_a_ramp_up_and_down_is_named() -> None:
 
 
 def test_one_way_says_what_a_lag_would_cost() -> None:
-    assert any("usual lag of 20 s" in w for w in fitted().calibration.warnings)
+    """From four times the uncertainty on it asks to look, by the two figures that are said."""
+    page = il.simulate_thermal(attitudes=0, ramps=1, gyro=True)[0]
+    for record in (fitted().calibration, il.fit_thermal(page).calibration):
+        (text,) = [w for w in record.warnings if "usual lag of 20 s" in w]
+        shift, u = map(float, re.search(r"up to (\S+) deg/h, where their uncertainty is (\S+)$", text).groups())
+        assert (text in record.verdict.reasons) == (shift > 4 * u)
 
 
 def test_gap_is_noted_and_bridged() -> None:
@@ -292,12 +298,12 @@ def test_intervals_of_the_change_along_gravity_hold(reduced: bool) -> None:
     assert 0.90 < np.mean(inside) < 0.99
 
 
-def test_counts_and_a_missing_axis_tell_no_change_and_one_ramp_alone_is_good() -> None:
+def test_counts_and_a_missing_axis_tell_no_change_and_of_one_ramp_alone_a_lag_is_asked_about() -> None:
     recording, _ = with_accelerometers(Ramp(3), 3)
     columns = {f"accel_{a}": np.round(recording.column(f"accel_{a}") * 1000) for a in AXES}
     counts = recording.with_columns(columns, dict.fromkeys(columns, "count"))
     assert "accel_change" not in il.fit_thermal(counts).calibration.data
     assert "accel_change" not in fitted().calibration.data
     record = il.fit_thermal(recording).calibration
-    assert record.verdict.state == "good"
+    assert all("usual lag of 20 s" in reason for reason in record.verdict.reasons)
     assert any("one recording is one power cycle" in each for each in record.warnings)

@@ -852,3 +852,16 @@ def test_memory_of_a_column_on_disk_is_given_back_when_another_is_asked_for():
     assert mapped() - before > 7 * n
     assert recording.si("gyro_x").sum() == pytest.approx(np.radians(n))
     assert mapped() - before < 7 * n
+
+
+@pytest.mark.parametrize(("seconds", "kind"), [(40.0, "look"), (3.0, "good")])
+def test_a_gap_is_said_and_asks_to_look_where_it_is_long(seconds, kind):
+    recording = il.simulate_tumble(attitudes=24, seed=1)
+    time = recording.si("time")
+    kept = (time < 20.0) | (time >= 20.0 + seconds)
+    cut = replace(recording, columns={name: column[kept] for name, column in recording.columns.items()})
+    record = il.fit_tumble(cut, gravity=9.80665).calibration
+    text = f"1 gap in time, the longest {seconds + 0.01:.3g} s after row 2000: attitudes within it are lost"
+    assert [line for line in record.warnings if "gap" in line] == [text]
+    assert record.verdict.state == kind
+    assert not any("gap" in line for line in il.fit_tumble(recording, gravity=9.80665).calibration.warnings)

@@ -475,6 +475,12 @@ class Blob:
     data: bytes
     text: Mapping[str, Any]
 
+    @property
+    def sensor(self) -> Mapping[str, str]:
+        """What its records say of the unit, as `Calibration.sensor`."""
+        sensor: Mapping[str, str] = self.text["sensor"]
+        return sensor
+
 
 def make_blob(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> bytes:
     """Return the blob of these tables, float numbers, with what the desk needs to apply it.

@@ -23,7 +23,7 @@ from imulab.procedures.registry import joined_of, load_any, procedure_of, sectio
 from imulab.procedures.result import Record, as_read, as_record
 from imulab.quantities import in_si
 from imulab.recording import Data, Reading, Recording, with_power_on_temperature
-from imulab.records.calibration import Calibration
+from imulab.records.calibration import Calibration, warn_other_unit
 
 # The tables of a unit: the numbers of its records as the C core's structs, in the order of their application.
 
@@ -350,11 +350,7 @@ def warn_before_applying(record: Calibration | Blob, recording: Recording) -> li
     messages = []
     if isinstance(record, Calibration) and record.verdict.state == "bad":
         messages.append(f"the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
-    sensor = record.text["sensor"] if isinstance(record, Blob) else record.sensor
-    for key in ("serial", "element"):
-        mine, its = sensor.get(key), recording.metadata.get(key)
-        if mine and its and mine != its:
-            messages.append(f"{recording.name}: {key} {its}, but the record was made for {mine}")
+    messages += warn_other_unit(record.sensor, recording)
     parts = [(part, columns) for part, columns in _list_sections(record) if part is not None]
     triads = [part.triad for part, _ in parts if part.triad]
     absent = [triad for triad in triads if not _has_any(recording, triad)]

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from imulab._version import VERSION
 from imulab.arguments import checked
-from imulab.display import UNJUDGED, Verdict, first_hidden, has_hidden, printable, verdict_of
+from imulab.display import UNJUDGED, Finding, Verdict, first_hidden, has_hidden, printable, verdict_of
 from imulab.errors import OptionError, RecordError
 from imulab.files import write_text
 from imulab.frames import data_frame
-from imulab.recording import Source
+from imulab.recording import Recording, Source
 from imulab.views import AnyPlot, AnyPlots, views
 
 if TYPE_CHECKING:
@@ -459,6 +459,18 @@ class Calibration:
             value = f"< {p.unseen_limit:.2g}" if p.unseen_limit else f"= {p.value:.9g}"
             lines.append(f"  {name} {value}{uncertainty} {p.unit}")
         return "\n".join(lines)
+
+
+def warn_other_unit(sensor: Mapping[str, str], recording: Recording) -> list[str]:
+    """Return a warning for each of serial number and element in which a recording is of another unit than a record.
+
+    `sensor` is that of the record; what one of the two does not state is not compared.
+    """
+    return [
+        Finding(f"{recording.name}: {key} {its}, but the record was made for {mine}", "use the record of this unit")
+        for key in ("serial", "element")
+        if (mine := sensor.get(key)) and (its := recording.metadata.get(key)) and mine != its
+    ]
 
 
 def plain_values(value: Any, where: str) -> Any:

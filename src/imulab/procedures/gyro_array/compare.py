@@ -35,12 +35,12 @@ from imulab.procedures.gyro_array.elements import (
 )
 from imulab.procedures.gyro_array.figures import comparison_exhibits
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, memory_text, open_stream
+from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, memory_text, open_stream, warn_misaligned
 from imulab.procedures.gyro_array.schema import MethodRow
 from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording
-from imulab.records.calibration import Calibration, Covariance
+from imulab.records.calibration import Calibration, Covariance, warn_other_unit
 from imulab.report.traces import Exhibits
 
 # What a comparison is made against: the working gyros, and the least noise of any fixed weights.
@@ -259,6 +259,7 @@ _SHORTEST_QUIET = 5.0  # s of rest over which methods are compared where no trut
 _FILTERED = 0.9  # of half the sampling rate: a lower bandwidth is filtering
 _BEYOND_LIMIT = 0.97  # of the least noise that weights can reach: less noise is filtering
 _FOLLOWS, _FINEST = 0.95, 0.01  # share of a motion that a method must follow; least uncertainty of it that is shown
+_FAR = 3.0  # times the noise: gyros that scatter by more about the fused rate contradict their record
 _NOTHING = 1e-9  # of a gyro's noise: less is rounding
 _HALVES = 2 * FEWEST_ROBUST  # elements of which both halves can be fused robustly
 
@@ -320,14 +321,16 @@ def compare_methods(
     elements = find_elements(recording)
     rate, notes = sampling_rate(recording)
     warnings = [*(prefixed(recording.name, note) for note in recording.notes), *notes]
+    warnings += [] if calibration is None else warn_other_unit(calibration.sensor, recording)
     logged = elements.readings(recording)
-    readings, aligned = _correct_readings(logged, recording, elements, calibration)
+    readings, matrices = _correct_readings(logged, recording, elements, calibration)
     for a, row in enumerate(elements.names):
         if not np.isfinite(logged[:, a]).any():
             raise DataError(f"{recording.name}: columns {row[0]} to {row[-1]}: expected finite readings, found none")
     checks = Checks(elements.names)
     checks.watch(logged)
-    warnings += [prefixed(recording.name, line) for line in checks.lines(turned=not aligned)]
+    lines = [*checks.lines(turned=matrices is None), *warn_misaligned(checks, matrices)]
+    warnings += [prefixed(recording.name, line) for line in lines]
     truth = elements.truth(recording)
     start, stop = (0, len(recording)) if truth is not None else _longest_quiet(recording, readings, rate)
     if stop - start < len(recording):
@@ -338,6 +341,7 @@ def compare_methods(
     options = partial(FuseOptions, memory=memory, start=count_from, rate=rate)
     runs = _run_methods(recording, elements, logged, readings, options, calibration, slice(start, stop))
     figures, data = _evaluate(recording, elements, runs, readings, reference, rate, slice(start, stop))
+    warnings += _warn_robust(recording.name, readings, runs.rates.get("robust"), corrected=calibration is not None)
     warnings += _warn_filtering(figures, runs.response, rate)
     if not isinstance(figures["feedback"], str):
         warnings += [prefixed(recording.name, line) for line in feedback_notes(elements.count, rate)]
@@ -468,15 +472,15 @@ def _figures(error: Array, rate: float, single: Singles, bandwidth: float, split
 
 def _correct_readings(
     logged: Array, recording: Recording, elements: Elements, calibration: Calibration | None
-) -> tuple[Array, bool]:
-    """Return readings without a record's biases and through its matrices, (m, axes, n); whether there are matrices."""
+) -> tuple[Array, Array | None]:
+    """Return readings without a record's biases and through its matrices, (m, axes, n), and these."""
     if calibration is None:
-        return logged, False
+        return logged, None
     known = array_calibration(calibration, elements, recording.name)
     readings = logged - known.bias
     if known.matrices is None:
-        return readings, False
-    return np.einsum("nab,mbn->man", known.matrices, readings), True
+        return readings, None
+    return np.einsum("nab,mbn->man", known.matrices, readings), known.matrices
 
 
 def _longest_quiet(recording: Recording, readings: Array, rate: float) -> tuple[int, int]:
@@ -561,6 +565,34 @@ def _health(fused: Fused, recording: Recording) -> dict[str, Any]:
         "flags": np.bitwise_or.reduceat(flags, edges, axis=0).tolist(),
         "lines": fused.health.lines(),
     }
+
+
+def _warn_robust(name: str, readings: Array, robust: Fused | None, *, corrected: bool) -> list[str]:
+    """Return a line for each gyro that failed, and one where corrected readings scatter by far more than from noise."""
+    if robust is None or robust.flags is None:
+        return []
+    lines = robust.health.lines()
+    if not corrected:
+        return lines
+    used = np.isfinite(readings) & ((robust.flags & (NON_FINITE | EXCLUDED)) == 0)
+    off = np.where(used, readings - robust.rate[:, :, None], np.nan)
+    for names, unit, apart in zip(robust.elements.names, robust.elements.units, np.moveaxis(off, 1, 0), strict=True):
+        known = np.isfinite(apart).sum(axis=0) >= _IN_USE * len(apart)
+        if not known.any():
+            continue
+        scatter = np.nanstd(apart[:, known], axis=0)
+        noise = np.nanstd(np.diff(apart[:, known], axis=0), axis=0) / math.sqrt(2)
+        times = float(np.median(scatter / np.maximum(noise, 1e-300)))
+        if times > _FAR:
+            lines.append(
+                Finding(
+                    f"{name}: {names[0]} to {names[-1]}, corrected by the record, scatter about the robust rate by "
+                    f"{np.median(scatter):.3g} {unit}, {times:.3g} times their noise: the record does not hold for "
+                    "this recording",
+                    "calibrate the array again, with --moving",
+                )
+            )
+    return lines
 
 
 def _warn_filtering(

@@ -743,29 +743,36 @@ class Checks:
 
     def maps(self) -> list[Map]:
         """Return, for each element, the axes of the first element that its axes read, where motion shows it."""
-        if self.count < _FEWEST or not np.isfinite(self.moments[1]).all():
+        turns = self.regression()
+        if turns is None:
             return []
         axes, n = self.moments[0].shape
-        variance, cross = self._covariance()
-        inner = variance[:, 0]
-        weights = np.linalg.lstsq(_regular(cross[:, 0]), np.moveaxis(cross, 2, 0).reshape(axes, -1), rcond=None)[0]
-        weights = np.moveaxis(weights.reshape(axes, axes, n), 0, 2)
-        explained = np.einsum("aib,aib->ai", weights, cross)
-        shares = weights**2 * inner
+        weights, follows, variance = turns
+        shares = weights**2 * variance
         axis_maps: list[Map] = []
         for i in range(n):
             row: list[tuple[int, int] | None] = []
             for a in range(axes):
                 axis = int(np.argmax(shares[a, i]))
-                sure = (
-                    variance[a, i] > 0
-                    and explained[a, i] > _FOLLOWS * variance[a, i]
-                    and shares[a, i, axis] > _ONE_AXIS * shares[a, i].sum()
-                )
+                sure = follows[a, i] and shares[a, i, axis] > _ONE_AXIS * shares[a, i].sum()
                 row.append((axis, 1 if weights[a, i, axis] > 0 else -1) if sure else None)
             read = [pair[0] for pair in row if pair is not None]
             axis_maps.append(tuple(row) if len(set(read)) == len(read) else (None,) * axes)
         return axis_maps
+
+    def regression(self) -> tuple[Array, np.ndarray, Array] | None:
+        """Return weights of element 1's axes in each gyro, (axes, n, axes), and whether they explain it, (axes, n).
+
+        And the variance of element 1's axes, shape (axes,); None of too few samples.
+        """
+        if self.count < _FEWEST or not np.isfinite(self.moments[1]).all():
+            return None
+        axes, n = self.moments[0].shape
+        variance, cross = self._covariance()
+        weights = np.linalg.lstsq(_regular(cross[:, 0]), np.moveaxis(cross, 2, 0).reshape(axes, -1), rcond=None)[0]
+        weights = np.moveaxis(weights.reshape(axes, axes, n), 0, 2)
+        explained = np.einsum("aib,aib->ai", weights, cross)
+        return np.asarray(weights), (variance > 0) & (explained > _FOLLOWS * variance), variance[:, 0]
 
     def _covariance(self) -> tuple[Array, Array]:
         """Return the variance of each gyro, (axes, n), and the covariance with element 1's axes, (axes, n, axes)."""

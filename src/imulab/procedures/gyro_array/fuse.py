@@ -43,7 +43,7 @@ from imulab.procedures.gyro_array.figures import axis_suffix, curves
 from imulab.procedures.gyro_array.schema import model_of
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording
-from imulab.records.calibration import Calibration
+from imulab.records.calibration import Calibration, warn_other_unit
 from imulab.report.noise_figures import thinned
 from imulab.report.traces import (
     BAD,
@@ -419,6 +419,7 @@ def parse_memory(text: str, option: str = "--memory") -> tuple[str | float, int]
 
 
 _NEED_THREE = ("robust", "support", "least-squares")
+_MISALIGNED = 0.3  # of a reading: noise of the first element, which explains so much of the others, makes less
 _FOR_NOISE = 10_000  # samples that show the noise where none is stated
 _WITHOUT_UNIT = 16.0  # rad/s in a second, or times the noise: walk of an unknown motion
 
@@ -530,6 +531,8 @@ class Fuser:
     checks: Checks | None = None
     before: Array | None = None
     lost: int = 0
+    other: list[str] = field(default_factory=list)
+    matrices: Array | None = None
 
     def fuse(self, blocks: Iterable[Recording]) -> Iterator[Fused]:
         """Yield the fused rates of consecutive blocks; the result does not depend on where they are cut.
@@ -553,6 +556,9 @@ class Fuser:
             if elements is None:
                 elements = find_elements(block)
                 self._check(block, elements)
+                self._warn_other_unit(block)
+                if isinstance(self.options.calibration, Calibration):
+                    self.matrices = array_calibration(self.options.calibration, elements, block.name).matrices
                 self.health = Health(elements.names)
                 self.checks = Checks(elements.names)
             settled = stream is not None and self.clock.settled
@@ -586,12 +592,23 @@ class Fuser:
         if self.options.method == "feedback" and self.health is not None:
             more = feedback_notes(len(self.health.names[0]), self.clock.rate)
         known = self.health.stuck() if self.health is not None else ()
-        lines = self.checks.lines(turned=not self._aligns(), known=known) if self.checks is not None else []
+        lines = []
+        if self.checks is not None:
+            lines = self.checks.lines(turned=not self._aligns(), known=known)
+            lines += warn_misaligned(self.checks, self.matrices)
         if self.lost:
             rows = f"{self.lost} row{'s' * (self.lost > 1)}"
             text = f"{rows} left out: every gyro is exactly zero; the output is nan there"
             lines = [*lines, Finding(text, "check the link to the array, and record again")]
-        return [*self.clock.lines(self.name), *(prefixed(self.name, line) for line in [*lines, *more])]
+        return [*self.other, *self.clock.lines(self.name), *(prefixed(self.name, line) for line in [*lines, *more])]
+
+    def _warn_other_unit(self, block: Recording) -> None:
+        records = (self.options.calibration, self.options.initial_bias)
+        self.other = [
+            line for each in records if not isinstance(each, str | None) for line in warn_other_unit(each.sensor, block)
+        ]
+        for line in self.other:
+            self.tell(line)
 
     def _drop_zeros(self, readings: Array) -> None:
         """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to NaN."""
@@ -636,6 +653,27 @@ class Fuser:
 
     def _open(self, block: Recording, elements: Elements, first: Array) -> Any:
         return open_stream(self.options, elements, self.clock.rate, first[:_FOR_NOISE], block.name)
+
+
+def warn_misaligned(checks: Checks, matrices: Array | None) -> list[str]:
+    """Return a warning where elements turn otherwise than the matrices of a record say, (n, axes, axes), if any."""
+    turns = None if matrices is None else checks.regression()
+    if matrices is None or turns is None:
+        return []
+    weights, follows, _ = turns
+    gains = np.einsum("iab,bic,cd->iad", matrices, weights, np.linalg.inv(matrices[0]))
+    off = np.abs(gains - np.eye(len(gains[0]))).max(axis=(1, 2))
+    wrong = np.flatnonzero(follows.all(axis=0) & (off > _MISALIGNED)).tolist()
+    if not wrong:
+        return []
+    row = checks.names[0]
+    return [
+        Finding(
+            f"in motion {' '.join(row[i] for i in wrong)}, corrected by the record, differ from {row[0]} by up to "
+            f"{100 * off[wrong].max():.0f} %: the record does not hold for this recording",
+            "calibrate the array again, with --moving",
+        )
+    ]
 
 
 def open_stream(

@@ -285,12 +285,11 @@ def _say_untold(gyros: ThermalGyroscopes, name: str) -> list[str]:
     slope = laws.slope(gyros.held.temperature)[:, :3, :size] @ gyros.solution.coefficients[:size]
     design = laws.design(gyros.held.temperature)[:, :3, :size]
     covariance = gyros.solution.covariance[:size, :size]
-    u = np.sqrt(np.einsum("nac,cd,nad->na", design, covariance, design))
-    shift = np.abs(slope * gyros.held.rate[:, None]) * _LAG
+    u = float(np.sqrt(np.einsum("nac,cd,nad->na", design, covariance, design)).max())
+    shift = float(np.abs(slope * gyros.held.rate[:, None]).max()) * _LAG
     text = (
         f"gyro: {name}: {gyros.drift.reason}: a usual lag of {_LAG:g} s shifts biases by up to "
-        f"{text_in(float(shift.max()), 'deg/s')} deg/s, where their uncertainty is {text_in(float(u.max()), 'deg/s')}"
+        f"{text_in(shift, 'deg/h')} deg/h, where their uncertainty is {text_in(u, 'deg/h')}"
     )
-    fails = median((shift / u).max(axis=1)) > _FAILS
     action = "let the temperature change more slowly, or record the way back too"
-    return [*notes, Finding(text, action) if fails else Note(text)]
+    return [*notes, Finding(text, action) if shift > _FAILS * u else Note(text)]

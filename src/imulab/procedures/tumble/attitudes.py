@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import imulab.procedures.tumble._segment as _segment
 from imulab.columns import triad
-from imulab.display import Finding
+from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
 from imulab.estimation.sampling import bridged, doubt_unit_of_time
@@ -663,7 +663,7 @@ def attitudes_and_samples(
         notes=(
             *[*_corrected_notes(recording), *bridges],
             *left_out.notes(_at_rest(stretches, len(time))),
-            *_notes(blocks, variance),
+            *_notes(blocks, variance, recording, time),
         ),
     )
     return attitudes, recording
@@ -721,8 +721,8 @@ def _corrected_notes(recording: Recording) -> tuple[str, ...]:
     )
 
 
-def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
-    """What is odd about the clock of the recording."""
+def _notes(blocks: _Blocks, variance: Array, recording: Recording, time: Array) -> tuple[str, ...]:
+    """Return what is odd about the clock of the recording; the steps that are gaps lie in `blocks.broken`."""
     rate = blocks.length / blocks.duration
     lost = 1 - float(np.isfinite(variance).mean())
     notes: list[str] = []
@@ -733,10 +733,16 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
                 "correct the unit of the column time, or state it: --unit time=UNIT",
             )
         )
-    if lost > _MUCH_LOST:
+    if blocks.broken.any():
+        step = np.diff(time)
+        gaps = np.flatnonzero(step > max(_GAP_SECONDS, _GAP_STEPS / rate))
+        lost = max(lost, float(step[gaps].sum()) / float(time[-1] - time[0]))
+        worst = int(gaps[np.argmax(step[gaps])])
+        kind = Finding if lost > _MUCH_LOST else Note
         notes.append(
-            Finding(
-                f"gaps in time: {100 * lost:.0f} % of the windows reach across one and were not used",
+            kind(
+                f"{len(gaps)} gap{'s' * (len(gaps) > 1)} in time, the longest {step[worst]:.3g} s after "
+                f"{recording.place(worst)}: attitudes within it are lost",
                 "record again without lost samples, by a faster link or at a lower rate",
             )
         )

@@ -23,18 +23,21 @@ from imulab.estimation.clock import GAP
 from imulab.estimation.sampling import sampling_rate
 from imulab.options import RARE, READING, measure, parsed
 from imulab.procedures.gyro_array.imus.columns import readings_of
-from imulab.procedures.gyro_array.imus.fuse import board_of, ranges, read_all_late
+from imulab.procedures.gyro_array.imus.fuse import BoardFuser, board_of, ranges, read_all_late
 from imulab.procedures.gyro_array.imus.logs import with_all_instances
 from imulab.procedures.gyro_array.imus.prepare import MOVING, names_of
+from imulab.procedures.gyro_array.imus.schema import imus_of
 from imulab.procedures.result import Drawn, Record, amount, as_record, as_recording
 from imulab.quantities import span
 from imulab.recording import Array, Data, Part, Window
+from imulab.records.calibration import Calibration
 from imulab.report.traces import GOOD, LEGEND, MARGIN, SYMBOLS, Exhibits, Figure, ReportTable, figure_axis, scatter
 from imulab.report.traces import plain_number as number
 
 _FEWEST = 4  # IMUs: three others, not in one line, tell the angular acceleration
 _FEWEST_SAMPLES = 50  # of one IMU, turning or not, whose rms is worth a statement
-_FAR = 3.0  # times the stated uncertainty: beyond, what the fusion states does not hold in motion
+_FAR = 3.0  # times the stated uncertainty: beyond, what the fusion states does not hold
+_CONTRADICTED = 5.0  # times what the record scatters by in motion: beyond, it does not hold for the recording
 _COLOURS = (GOOD, "#8e6bbd", "#8a8a8a")
 
 
@@ -194,6 +197,9 @@ def compare_imus(
         raise RecordError(f"a board of {board.count} IMUs: expected {_FEWEST} or more, to predict each from the others")
     if len(names["accel"]) != board.count:
         raise RecordError(f"{recording.name}: {len(names['accel'])} IMUs; the record has {board.count}")
+    fuser = BoardFuser(board)
+    for _ in fuser.fuse([recording]):
+        pass
     time, logged = recording.si("time"), readings_of(recording, names)
     rate, notes = sampling_rate(recording)
     settings = replace(board.settings, rate=rate)
@@ -217,8 +223,10 @@ def compare_imus(
             gyro[part].append(_apart(turn, k, sound[:, 1], chosen, out.rate, out.rate_std, settings.gyro_noise[k]))
     if not any(row for rows in accel.values() for row in rows):
         raise DataError(f"{recording.name}: no IMU has {_FEWEST_SAMPLES} samples within its range")
-    messages = [*recording.notes, *notes, *_findings(accel, gyro)]
-    return BoardComparison(accel, gyro, tuple(prefixed(recording.name, line) for line in messages))
+    messages = [*recording.notes, *_findings(accel, gyro, _motion_scatter(record, turn[parts["turning"]]))]
+    notes += fuser.lines(failed=True)
+    named = [prefixed(recording.name, line) for line in messages]
+    return BoardComparison(accel, gyro, (*fuser.other, *notes, *named))
 
 
 def _corrected(logged: Array, settings: ImusSettings) -> tuple[Array, Array]:
@@ -275,35 +283,53 @@ def _middle(rows: list[ImuDifference | None], name: str) -> float | None:
     return float(np.median(values)) if values else None
 
 
+def _motion_scatter(record: Calibration, turn: Array) -> tuple[float, float]:
+    """Return how many times the noise at rest accelerometers and gyroscopes may scatter in motion, by the record.
+
+    That is what they scattered by when it was made, times the square of how much faster these rates, (n, K, 3), are:
+    readings of unlike age differ by the angular acceleration.
+    """
+    held = imus_of(record)
+    faster = max(_rms(turn) / _rms(np.array(held.fit.axis_rates.value)), 1.0) if len(turn) else 1.0
+    pairs = ((held.fit.accel_residual, held.accel_noise), (held.fit.gyro_residual, held.gyro_noise))
+    accel, gyro = (max(residual.value / float(np.median(noise)), 1.0) * faster**2 for residual, noise in pairs)
+    return accel, gyro
+
+
 def _is_worse(row: ImuDifference) -> bool:
     """Return whether the mean is nearer than the fused others, and noise, which these have more of, is not why."""
     return row.fused is not None and row.stated is not None and row.fused > max(row.mean, _FAR * row.stated)
 
 
-def _findings(accel: dict[str, list[ImuDifference | None]], gyro: dict[str, list[ImuDifference | None]]) -> list[str]:
-    """Return what speaks against the fusion in this recording."""
+def _findings(
+    accel: dict[str, list[ImuDifference | None]],
+    gyro: dict[str, list[ImuDifference | None]],
+    scatter: tuple[float, float],
+) -> list[str]:
+    """Return what speaks against the fusion in this recording; `scatter` is that in motion, times the noise at rest."""
     lines: list[str] = []
-    for word, rows in (("accelerometers", accel), ("gyroscopes", gyro)):
-        fused, stated = _middle(rows["turning"], "fused"), _middle(rows["turning"], "stated")
-        if fused is not None and stated is not None and fused > _FAR * stated:
-            lines.append(
-                Note(
-                    f"turning, the {word} are {number(fused / stated, 2)} times as far from the fused others as the "
-                    "noise at rest makes them; synchronised IMUs, or a time of each, lower that"
-                )
-            )
-    worse = [str(k + 1) for k, row in enumerate(accel["turning"]) if row is not None and _is_worse(row)]
-    if worse:
-        lines.append(
-            Finding(
-                f"turning, the mean of the others is nearer to the accelerometers of IMU {' '.join(worse)} than the "
-                "others fused: the calibration does not hold for this recording",
-                "calibrate the board again",
-            )
-        )
+    for part, where in (("turning", "turning"), ("slow", "slower than 30 deg/s")):
+        worse = " ".join(str(k + 1) for k, row in enumerate(accel[part]) if row is not None and _is_worse(row))
+        if worse:
+            nearer = f"{where}, the mean of the others is nearer to the accelerometers of IMU {worse}"
+            lines.append(_broken(f"{nearer} than the others fused"))
+        for word, rows, usual in (("accelerometers", accel[part], scatter[0]), ("gyroscopes", gyro[part], scatter[1])):
+            times = [0.0 if row is None or not row.fused or not row.stated else row.fused / row.stated for row in rows]
+            most = _CONTRADICTED * usual if part == "turning" else _FAR
+            off = " ".join(str(k + 1) for k, each in enumerate(times) if each > most)
+            text = "times as far from the fused others as the noise at rest makes them"
+            if off and not (worse and rows is accel[part]):
+                lines.append(_broken(f"{where}, the {word} of IMU {off} are {number(max(times), 2)} {text}"))
+            elif not off and part == "turning" and (middle := float(np.median(times))) > _FAR:
+                much = f"{where}, the {word} are {number(middle, 2)} {text}"
+                lines.append(Note(f"{much}; synchronised IMUs, or a time of each, lower that"))
     if not any(accel["turning"]):
         lines.append(Note("nothing turns faster than 30 deg/s: lever arms do not show"))
     return lines
+
+
+def _broken(text: str) -> Finding:
+    return Finding(f"{text}: the calibration does not hold for this recording", "calibrate the board again")
 
 
 _COLUMNS = ("the others fused", "their mean", "one of them", "stated")

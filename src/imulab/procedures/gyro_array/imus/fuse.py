@@ -29,7 +29,7 @@ from imulab.procedures.gyro_array.imus.schema import imus_of
 from imulab.procedures.result import Drawn, Record, as_record, as_recording
 from imulab.quantities import in_si, span
 from imulab.recording import Array, Data, Part, Recording, Window
-from imulab.records.calibration import Calibration
+from imulab.records.calibration import Calibration, warn_other_unit
 from imulab.report.noise_figures import thinned
 from imulab.report.traces import BAD, DASHES, GOOD, TIME, Exhibits, Figure, ReportTable, figure_axis, rounded, scatter
 from imulab.units import from_si
@@ -38,6 +38,7 @@ _NONE = 1e-7  # s: a latency below is none
 _OFF = "off the others"
 _RARE = 0.01  # share of samples off the others that chips without a common clock have in motion
 _KINDS = ((STUCK, "stuck"), (NOT_FINITE, "no number"), (BEYOND, "at the end of its range"), (GATED, _OFF))
+_FAILED = {"stuck", "no number"}
 _WORDS = {"accel": "accelerometer", "gyro": "gyroscope"}
 _COLOURS = (GOOD, BAD, "#8e6bbd")
 
@@ -54,6 +55,7 @@ class KnownBoard:
     blob: bytes | None
     latency: Array
     limits: Array
+    sensor: Mapping[str, str]
 
     @property
     def count(self) -> int:
@@ -83,7 +85,7 @@ def board_of(calibration: Calibration | Blob, at: str = "centroid", limits: Arra
             )
         latency = np.array([section["accel_latency"], section["gyro_latency"]])
         limits = np.array([[end or NO_LIMIT for end in section[name]] for name in ("accel_range", "gyro_range")])
-        return KnownBoard(calibration.name, None, calibration.data, latency, limits)
+        return KnownBoard(calibration.name, None, calibration.data, latency, limits, calibration.sensor)
     held = imus_of(calibration)
     board, noise = held.board, held.accel_noise
     ends = held.limits
@@ -94,7 +96,7 @@ def board_of(calibration: Calibration | Blob, at: str = "centroid", limits: Arra
         point_of(at, board.position, noise), ends[0], ends[1], float(held.fit.sample_rate.value),
     )  # fmt: skip
     latency = np.array([board.numbers[:, ACCEL_LATENCY], board.numbers[:, GYRO_LATENCY]])
-    return KnownBoard("the record", settings, None, latency, ends)
+    return KnownBoard("the record", settings, None, latency, ends, calibration.sensor)
 
 
 def point_of(at: str, position: Array, noise: Array) -> Array:
@@ -273,6 +275,7 @@ class BoardFuser:
     alone: int = 0
     left_out: dict[tuple[int, int], dict[str, Any]] = field(default_factory=dict)
     until: float = np.nan  # time of the last sample that was fused
+    other: list[str] = field(default_factory=list)
 
     def fuse(self, blocks: Iterable[Recording]) -> Iterator[FusedBoard]:
         """Yield what consecutive blocks give; the result does not depend on where they are cut.
@@ -294,6 +297,7 @@ class BoardFuser:
             self.name = block.name
             if held is None:
                 names = self._columns(block)
+                self.other = warn_other_unit(self.board.sensor, block)
                 held = _Readings(np.empty(0), np.empty(0), np.empty((0, 2, self.board.count, 3)))
             self.clock.watch(block)
             held.add(block.si("time"), block.columns["time"], readings_of(block, names))
@@ -304,9 +308,15 @@ class BoardFuser:
             yield from self._fused(stream or self._open(), held, block, names, last=True)
 
     def notes(self) -> list[str]:
-        """Return messages after the last block: gaps, what was bridged, and what was left out."""
+        """Return messages after the last block: another unit, gaps, and what was left out."""
+        return [*self.other, *self.clock.lines(self.name), *self.lines()]
+
+    def lines(self, *, failed: bool = False) -> list[str]:
+        """Return messages on sensors that were left out, a line each, and on too few; only `failed` ones if asked."""
         lines: list[str] = []
         for (sensor, k), lost in sorted(self.left_out.items()):
+            if failed and not _FAILED.intersection(lost["why"]):
+                continue
             why = " and ".join(dict.fromkeys(lost["why"])) or _OFF
             text = (
                 f"{_WORDS[SENSORS[sensor]]} {k + 1}: left out of {lost['samples']} of {self.samples} samples, first at "
@@ -319,7 +329,7 @@ class BoardFuser:
         if self.alone:
             text = f"fewer than three accelerometers left in {self.alone} samples: nothing to compare them with"
             lines.append(Finding(text, "do not trust the angular acceleration there"))
-        return [*self.clock.lines(self.name), *(prefixed(self.name, line) for line in lines)]
+        return [prefixed(self.name, line) for line in lines]
 
     def share(self) -> str:
         """Return how much was fused, and how much of it bridged."""
