@@ -355,11 +355,11 @@ def _figure(title: str, rows: list[ImuDifference | None], unit: str, factor: flo
     traces = [
         scatter(
             [k for k, _ in there], [None if (v := getattr(row, name)) is None else factor * v for _, row in there],
-            "markers", name=label, marker={"color": colour, "symbol": symbol, "size": 9},
+            "markers", name=label, marker={"color": colour, "symbol": symbol, "size": size, "line": {"width": 2}},
         )
-        for name, label, colour, symbol in zip(
-            ("fused", "mean", "single"), ("by the others fused", "by their mean", "by one of them"), _COLOURS, SYMBOLS,
-            strict=False,
+        for name, label, colour, symbol, size in zip(
+            ("fused", "mean", "single"), ("by the others fused", "by their mean", "by one of them"), _COLOURS,
+            ("circle-open", *SYMBOLS[1:3]), (15, 8, 8), strict=True,  # a ring, which an equal mean does not hide
         )
     ]  # fmt: skip
     layout = {

@@ -24,10 +24,10 @@ from imulab.report.traces import (
     ReportTable,
     figure_axis,
     format_uncertain,
-    log_axis,
     plain_number,
     rounded,
     scatter,
+    short_log_axis,
 )
 
 _CHI = math.sqrt(-2 * math.log(0.05))
@@ -164,7 +164,7 @@ def _residuals(record: ImusRecord, sensor: str) -> Figure:
     traces.append(
         scatter(ends, [noise, noise], "lines", name="at rest", line={"color": INK, "dash": "dot", "width": 1.2})
     )
-    layout = {"xaxis": figure_axis(TIME), "yaxis": log_axis(f"rms, {unit}"), "legend": LEGEND, "margin": MARGIN}
+    layout = {"xaxis": figure_axis(TIME), "yaxis": short_log_axis(f"rms, {unit}"), "legend": LEGEND, "margin": MARGIN}
     caption = (
         f"Readings of the {word} less those of the fitted board, rms of 20 stretches of the motion; dotted: noise at "
         "rest. Far above it, the IMUs are not read at one instant, or the board shakes faster than it is sampled."
