@@ -13,7 +13,7 @@ from scipy.stats import chi2, multivariate_normal, multivariate_t
 
 import imulab as il
 from imulab.certificate.dcc import dcc_xml
-from imulab.certificate.laboratory import load_laboratory
+from imulab.certificate.laboratory import TEMPLATE, load_laboratory
 from imulab.certificate.model import make_certificate
 from imulab.certificate.units import dsi_unit
 from imulab.cli import main
@@ -563,3 +563,44 @@ def test_the_template_is_that_of_the_guide_and_makes_a_valid_certificate(issue, 
 def test_what_is_missing_on_the_command_line_is_said(capsys):
     assert main(["certificate", "r.json", "-o", "c.xml"]) == 2
     assert capsys.readouterr().err == ("imulab: expected RECORD, --lab LAB.toml and -o CERT.pdf, or --template alone\n")
+
+
+def test_show_reads_a_certificate(issue, capsys):
+    assert issue() == 0
+    capsys.readouterr()
+    assert main(["show", "cert.xml"]) == 0
+    shown = capsys.readouterr().out
+    assert "Digital Calibration Certificate 3.3.0" in shown
+    assert re.search(r"^bias_x +-?\d\.\d+ +\d\S+ +\d\S+ +metre second\^-2$", shown, re.M)
+    assert "signature: none" in shown
+    assert main(["tumble", "fit", "cert.xml"]) == 2
+    assert "expected a recording, found an XML file (imulab show reads certificates)" in capsys.readouterr().err
+    Path("empty.pdf").write_bytes(b"%PDF-1.7\n")
+    assert main(["show", "empty.pdf"]) == 2
+    assert "empty.pdf: a PDF without a Digital Calibration Certificate" in capsys.readouterr().err
+    text = Path("cert.xml").read_text(encoding="utf-8")
+    for changed in (text[:3000], text.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1)):
+        Path("hostile.xml").write_text(changed, encoding="utf-8")
+        assert main(["show", "hostile.xml"]) == 2
+
+
+def test_what_is_still_the_template_s_is_warned_of(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    recording = il.simulate_tumble(gravity=9.81362, attitudes=12, order=1, gyro=True)
+    il.fit_tumble(recording, gravity="9.81362+-0.00002", order=1).calibration.save("a.json")
+    il.fit_tumble(recording, gravity="9.81362+-0.00002", order=1, with_="gyro").calibration.save("b.json")
+    text = TEMPLATE.replace("location =", 'reviewed = "seen"\nlocation =')
+    Path("lab.toml").write_text(text, encoding="utf-8")
+    assert main(["certificate", "a.json", "--lab", "lab.toml", "-o", "a.xml"]) == 0
+    said = capsys.readouterr().err
+    assert "which names nobody: certificate.number = 'EX-2026-0042', laboratory.name" in said
+    assert "tumbled" not in said
+    assert main(["certificate", "b.json", "--lab", "lab.toml", "-o", "b.xml"]) == 0
+    said = capsys.readouterr().err
+    assert "item.name = 'Accelerometer triad' and method.name = " in said
+    assert "the record holds bias_x, bias_y, bias_z and " in said
+    for name, other in (("EX-2026-0042", "7"), ("Example", "Real"), ("GRAV-2024-017", "G"), ("A. Real", "B. Real")):
+        text = text.replace(name, other)
+    Path("lab.toml").write_text(text.replace("Accelerometer triad", "IMU").replace("Multi-position t", "T"))
+    assert main(["certificate", "b.json", "--lab", "lab.toml", "-o", "c.xml"]) == 0
+    assert "template" not in capsys.readouterr().err

@@ -123,3 +123,18 @@ def test_what_cannot_sign_is_refused_and_nothing_is_written(sign, keys, capsys, 
     monkeypatch.setitem(sys.modules, "signxml", None)
     assert sign(pem_of(key) + certificate_of(key)) == 2
     assert "a signature needs signxml, which is not here: pip install '.[sign]'" in capsys.readouterr().err
+
+
+def test_show_says_whether_a_signature_holds(sign, keys, capsys, monkeypatch):
+    assert sign(pem_of(keys["ec"]) + certificate_of(keys["ec"])) == 0
+    assert main(["show", "cert.xml"]) == 0
+    assert "signature: holds, nothing was changed since CN=" in capsys.readouterr().out
+    signed = Path("cert.xml").read_bytes()
+    Path("changed.xml").write_bytes(
+        signed.replace(b"<si:value>1", b"<si:value>2", 1).replace(b"EX-2026", b"EX-2027", 1)
+    )
+    assert main(["show", "changed.xml"]) == 2
+    assert "changed.xml: the signature does not hold" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "signxml", None)
+    assert main(["show", "cert.xml"]) == 0
+    assert "signature: there is one, which was not verified: pip install '.[sign]'" in capsys.readouterr().out

@@ -6,15 +6,17 @@ Nothing of it is invented: what the certificate needs and the file lacks is refu
 from __future__ import annotations
 
 import re
+import tomllib
+from collections.abc import Iterable
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
 from imulab.display import first_hidden
-from imulab.errors import ReadError
+from imulab.errors import ReadError, first_of
 from imulab.files import load_toml
 from imulab.fleet.limits import Rule
 from imulab.quantities import LARGEST
@@ -211,6 +213,11 @@ expanded_uncertainty = 0.5
 # specification = "data sheet DS-0815 rev. C, table 2"
 """
 """A LAB.toml to start from."""
+_NAMES_SOMEBODY = (
+    *("certificate.number", "laboratory.name", "customer.name", "persons.0.name", "item.manufacturer"),
+    *("equipment.0.certificate", "equipment.0.issuer"),
+)
+_OF_TUMBLE = ("item.name", "method.name")
 _LARGEST_LOGO = 2_000_000
 _UNKNOWN = re.compile("^Object contains unknown field `(.*)`$")
 _MISSING = re.compile("^Object missing required field `(.*)`$")
@@ -251,6 +258,40 @@ def load_laboratory(path: str) -> Laboratory:
     if identity.received is not None and identity.received > first:
         raise ReadError(f"{path}: certificate: received {identity.received}, after the first day of work {first}")
     return lab
+
+
+def template_remarks(path: str, parameters: Iterable[str] = (), *, tumbled: bool = True) -> list[str]:
+    """Return warnings of what a LAB.toml still has from the template, which names nobody and a test by tumbling.
+
+    `parameters` are those of the record that is certified; `tumbled`: by the procedure of the template.
+    """
+    names = list(parameters)
+    lab, template = load_toml(path, path, "laboratory"), tomllib.loads(TEMPLATE)
+
+    def unchanged(places: Iterable[str]) -> list[str]:
+        values = ((place, _value(lab, place)) for place in places)
+        return [f"{place} = {value!r}" for place, value in values if value and value == _value(template, place)]
+
+    remarks = []
+    if same := unchanged(_NAMES_SOMEBODY):
+        remarks.append(f"{path}: still as the template has it, which names nobody: {first_of(same, 3)}")
+    of_tumble = tumbled and not any(name.startswith(("gyro_", "mag_")) for name in names)
+    if not of_tumble and (same := unchanged(_OF_TUMBLE)):
+        remarks.append(
+            f"{path}: {' and '.join(same)}: the template's, of accelerometers that were tumbled; the record holds "
+            f"{first_of(names, 3)}: say what was calibrated, and how"
+        )
+    return remarks
+
+
+def _value(table: Any, place: str) -> Any:
+    """Return the value at a place such as ``persons.0.name``, None where there is none."""
+    for key in place.split("."):
+        try:
+            table = table[int(key) if key.isdecimal() else key]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return table
 
 
 def _with_logo(laboratory: Party, path: str) -> Party:

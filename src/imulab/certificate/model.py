@@ -252,7 +252,7 @@ def _check_gravity(record: Calibration, standard: Equipment) -> None:
         found = "none" if stated is None else f"{stated:g} m/s^2"
         raise RecordError(
             f"uncertainty of gravity in the record: {found}, below {least:g} m/s^2 of {standard.name}; fit again with "
-            f"--gravity {gravity['value']!r}+-{least:g}"
+            f"--gravity {gravity['value']!r}+-{least:g} (a fleet: in the manifest's column gravity)"
         )
 
 

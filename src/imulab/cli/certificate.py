@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import imulab as il
 from imulab.cli.command import Argument, Command, option
-from imulab.cli.options import check_outputs
+from imulab.cli.options import check_outputs, warn
 from imulab.errors import OptionError
 from imulab.files import replacing
 from imulab.options import OUTPUT, choice
@@ -62,6 +62,12 @@ def certificate(
         record, output, lab=lab, limits=limits, before=before, language=language, fonts=fonts, sign=sign
     )
     print(f"certificate: {output}")
+    from imulab.certificate.laboratory import template_remarks
+    from imulab.procedures.registry import load
+
+    certified = load(record)
+    for remark in template_remarks(lab, certified.parameters, tumbled=certified.procedure == "tumble"):
+        warn(remark)
 
 
 COMMANDS = (Command("certificate", certificate),)

@@ -107,12 +107,16 @@ def certificate(
     SERIAL.pdf for people and SERIAL.xml for programs. Exit status 2 if a unit has none, with the reason; all others
     are written.
     """
+    from imulab.certificate.laboratory import template_remarks
+
     units = il.fleet_status(folder).rows
     with progress_bar("certificates", len(units)) as update:
         refused = il.write_fleet_certificates(
             folder, output, lab=lab, limits=limits, language=language, fonts=fonts, sign=sign, progress=update
         )
     print(f"certificates: {len(units) - len(refused)} in {output}")
+    for remark in template_remarks(lab):
+        warn(remark)
     if not refused:
         return 0
     print("".join(f"none: {serial}: {reason}\n" for serial, reason in refused.items()), end="")

@@ -29,6 +29,7 @@ from imulab.cli.options import (
     with_notes,
 )
 from imulab.errors import ImulabError, OptionError, RecordError
+from imulab.files import open_file
 from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
@@ -243,7 +244,7 @@ def show(
 ) -> None:
     """Say what is in a record or recording, or what changed.
 
-    Changes are those between two records of one unit.
+    Changes are those between two records of one unit. Of a certificate: what it says, and whether its signature holds.
     """
     if formats:
         _show_formats(files or [], json=json)
@@ -269,8 +270,27 @@ def show(
         record = load(file)
         print(record.to_json().rstrip("\n") if json else describe_record(record))
         return
+    if options["layout"] is None and _is_page(file):
+        from imulab.certificate.reading import certificate_in, describe_certificate
+
+        if (xml := certificate_in(file)) is not None:
+            if json:
+                raise OptionError(f"{file}: a certificate; its XML is what programs read, so show prints no JSON of it")
+            print(describe_certificate(xml, file))
+            return
     blocks = read_blocks(file, **reading(options))
     print(recording_json(blocks) if json else describe_recording(blocks))
+
+
+def _is_page(file: str) -> bool:
+    """Return whether a file begins as a PDF or as XML, in which certificates come."""
+    try:
+        if not Path(file).is_file():
+            return False  # a pipe can be read only once
+        with open_file(file) as stream:
+            return stream.read(5) in (b"%PDF-", b"<?xml")
+    except OSError:
+        return False
 
 
 def _show_formats(names: list[str], *, json: bool) -> None:

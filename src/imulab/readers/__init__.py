@@ -260,9 +260,13 @@ def _content_blocks(
         if not is_pipe(file) and not (layout is not None and layout.text and not layout.if_needed):
             with _open(file, name) as stream:
                 try:
-                    kind = recognised(stream.read(1024))
+                    begin = stream.read(1024)
+                    kind = recognised(begin)
                 except OSError as error:
                     raise ReadError(f"{name}: cannot be read: {error.strerror}") from None
+            if begin.startswith((b"%PDF-", b"<?xml")):
+                found = "a PDF" if begin.startswith(b"%") else "an XML file"
+                raise ReadError(f"{name}: expected a recording, found {found} (imulab show reads certificates)")
     chosen = {"layout": layout and layout.name, "topic": selection.topic, "instance": selection.instance}
     parts = "".join(f", {key} {value}" for key, value in chosen.items() if value is not None)
     _LOG.info("%s: a %s file%s", name, kind.name, parts)

@@ -1,0 +1,136 @@
+"""What a certificate says, from its file: the XML, or the PDF that it is attached to, and whether its signature holds.
+
+A small file of its own: nothing that writes certificates needs it. The summary is of any Digital Calibration
+Certificate, whoever wrote it; nothing in the XML is followed or expanded.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from hashlib import sha256
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from imulab.display import aligned, printable
+from imulab.errors import ReadError, install, readable
+from imulab.files import open_file
+
+_NAMES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si", "ds": "http://www.w3.org/2000/09/xmldsig#"}
+_LARGEST = 50_000_000
+_STREAM = re.compile(rb"/EmbeddedFile\b[^\n]*?>>\s*stream\r?\n")
+_LINES = (
+    ("certificate", "dcc:administrativeData/dcc:coreData/dcc:uniqueIdentifier"),
+    ("issued", "dcc:administrativeData/dcc:coreData/dcc:issueDate"),
+    ("laboratory", "dcc:administrativeData/dcc:calibrationLaboratory/dcc:contact/dcc:name/dcc:content"),
+    ("customer", "dcc:administrativeData/dcc:customer/dcc:name/dcc:content"),
+    ("item", "dcc:administrativeData/dcc:items/dcc:item/dcc:name/dcc:content"),
+    ("serial", "dcc:administrativeData/dcc:items/dcc:item/dcc:identifications/dcc:identification/dcc:value"),
+)
+
+
+def certificate_in(path: str) -> bytes | None:
+    """Return the XML of a certificate, of its own file or attached to a PDF; None where a file is neither.
+
+    Raises
+    ------
+    ReadError
+        It is a PDF without a certificate, or cannot be read.
+    """
+    if path == "-" or not Path(path).is_file():
+        return None
+    with readable(path), open_file(path) as stream:
+        begin = stream.read(4096)
+        if not begin.startswith(b"%PDF-") and b"digitalCalibrationCertificate" not in begin:
+            return None
+        data = begin + stream.read(_LARGEST)
+    if not data.startswith(b"%PDF-"):
+        return data
+    for match in _STREAM.finditer(data):
+        try:
+            text = zlib.decompressobj().decompress(data[match.end() :], _LARGEST)
+        except zlib.error:
+            text = data[match.end() : match.end() + _LARGEST].partition(b"endstream")[0]
+        if b"digitalCalibrationCertificate" in text[:4096]:
+            return text
+    raise ReadError(f"{path}: a PDF without a Digital Calibration Certificate in it; expected a record or recording")
+
+
+def describe_certificate(xml: bytes, path: str) -> str:
+    """Return number, laboratory, item and results of a certificate, and whether its signature holds.
+
+    Raises
+    ------
+    ReadError
+        It is no sound XML, or was changed after it was signed.
+    """
+    if b"<!DOCTYPE" in xml or b"<!ENTITY" in xml:
+        raise ReadError(f"{path}: a certificate with a document type of its own; expected none")
+    try:
+        root = ElementTree.fromstring(xml)
+    except ElementTree.ParseError as error:
+        raise ReadError(f"{path}: not a whole certificate: {error}") from None
+    version = f"Digital Calibration Certificate {root.get('schemaVersion', '')}".strip()
+    lines = [f"{printable(path)}: {version}"]
+    lines += [f"{title}: {text}" for title, place in _LINES if (text := _text(root, place))]
+    for section in root.iterfind("dcc:measurementResults/dcc:measurementResult", _NAMES):
+        rows = [_row(each) for each in section.iterfind(".//dcc:quantity[@refType='basic_calibrationValue']", _NAMES)]
+        lines += ["", _text(section, "dcc:name/dcc:content")]
+        lines += aligned(["parameter", "value", "U", "k", "unit"], rows) if rows else []
+    return "\n".join([*lines, "", f"signature: {_signature(root, xml, path)}"])
+
+
+def _text(parent: Any, place: str) -> str:
+    return printable(" ".join((parent.findtext(place, "", _NAMES) or "").split()))
+
+
+def _row(quantity: Any) -> list[str]:
+    uncertainty = ".//si:measurementUncertaintyUnivariate/si:expandedMU/si:"
+    places = ("dcc:name/dcc:content", ".//si:value", f"{uncertainty}valueExpandedMU", f"{uncertainty}coverageFactor")
+    name, *numbers = (_text(quantity, place) for place in places)
+    unit = _text(quantity, ".//si:unit").replace("\\tothe", "^").replace("\\", " ").strip()
+    unit = re.sub(r"\{([^{}]*)\}", r"\1", unit)
+    return [name, *(_short(number) for number in numbers), unit]
+
+
+def _short(number: str) -> str:
+    try:
+        return f"{float(number):.7g}"
+    except ValueError:
+        return number or "–"
+
+
+def _signature(root: Any, xml: bytes, path: str) -> str:
+    """Return whether a signature is there and holds.
+
+    Raises
+    ------
+    ReadError
+        It does not hold: the certificate was changed.
+    """
+    signature = root.find("ds:Signature", _NAMES)
+    if signature is None:
+        return "none, so a change would not show; imulab certificate --sign KEY.pem makes one"
+    try:
+        signxml, x509, serialization = map(
+            import_module, ("signxml", "cryptography.x509", "cryptography.hazmat.primitives.serialization")
+        )
+    except ImportError:
+        return f"there is one, which was not verified: {install('sign')}, and show it again"
+    encoded = "".join((signature.findtext(".//ds:X509Certificate", "", _NAMES) or "").split())
+    pem = f"-----BEGIN CERTIFICATE-----\n{encoded}\n-----END CERTIFICATE-----\n"
+    try:
+        signer = x509.load_pem_x509_certificate(pem.encode())
+        signed = signxml.XMLVerifier().verify(xml, x509_cert=pem).signed_xml
+        whole = signed is not None and signed.tag == root.tag
+    except Exception as error:  # of the libraries' own kinds
+        raise ReadError(f"{path}: the signature does not hold, so the certificate was changed: {error}") from None
+    if not whole:
+        raise ReadError(f"{path}: the signature is of a part of the certificate; expected one of the whole")
+    digest = sha256(signer.public_bytes(serialization.Encoding.DER)).hexdigest()
+    return (
+        f"holds, nothing was changed since {printable(signer.subject.rfc4514_string())} signed it; that this is the "
+        f"laboratory's key is not checked: compare the SHA-256 of its certificate, {digest}"
+    )
