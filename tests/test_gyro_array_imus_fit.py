@@ -254,6 +254,62 @@ def test_biases_that_drift_between_rests_are_said():
     assert any("accelerometers disagree by" in text for text in record.verdict.reasons)
 
 
+@pytest.mark.parametrize("attitudes", [1, 3])
+def test_few_attitudes_and_chance_repeats_at_rest_ask_for_no_look(attitudes):
+    """Biases of 0.2 m/s^2 and scale factors of 1 % that few attitudes do not tell are no drift."""
+    board = a_board(elements=4, attitudes=attitudes, age="0 ms", seed=5)
+    coarse = {name: np.round(values / 0.15) * 0.15 for name, values in board.columns.items() if name.startswith("gyro")}
+    for each in (board, with_columns(board, **coarse)):
+        record = il.calibrate_imus(each, gravity=G).calibration
+        assert record.verdict.state == "good", record.verdict.reasons
+        z = errors(record, each, ("position", "rotation", "accel_misalignment", "accel_latency"))
+        assert np.abs(z).max() < 4.0
+
+
+def test_uncertainties_grow_with_what_biases_drift():
+    """Drifts below what is said: 0.04 m/s^2 rms over a recording, differently in each accelerometer."""
+    z, biases = [], []
+    for seed in (2, 3, 4):
+        board = a_board(elements=4, attitudes=12, duration="20 s", age="0 ms", seed=seed)
+        rng, time = np.random.default_rng(seed), board.columns["time"]
+        ramp = (time - (time[-1] - 25) / 2) / time[-1]  # 0 in the middle of the rests
+        drift = {
+            name: values + 0.04 * rng.normal() * ramp
+            for name, values in board.columns.items()
+            if name.startswith("accel")
+        }
+        record = il.calibrate_imus(with_columns(board, **drift), gravity=G).calibration
+        biases += [*errors(record, board, "accel_bias")]
+        z += [*errors(record, board, ("position", "accel_scale", "rotation"))]
+    assert np.mean(np.abs(biases) < 1.96) > 0.85
+    assert np.mean(np.abs(z) < 1.96) > 0.85
+
+
+def shaken(board, size, frequency):
+    """Return a board whose motion, its last 25 s less 5, is shaken along and about its axes, m/s^2 and Hz."""
+    time, columns = board.columns["time"], dict(board.columns)
+    for k in range(1, sum(name.startswith("accel_x") for name in columns) + 1):
+        told = {what: np.array(board.metadata[f"truth_{what}_{k}"].split(), float) for what in ("accel", "position")}
+        late = float(board.metadata[f"truth_latency_{k}"].split()[0])
+        phase = 2 * np.pi * frequency * (time - late)[:, None] + np.array([0.3, 1.9, 4.0])
+        force = size * (np.sin(phase) + np.cross(3 * np.sin(phase + 1.0), told["position"]))
+        force[(time < time[-1] - 24) | (time > time[-1] - 6)] = 0
+        for axis, values in zip("xyz", (force @ told["accel"].reshape(3, 3).T).T, strict=True):
+            columns[f"accel_{axis}_{k}"] = columns[f"accel_{axis}_{k}"] + values
+    return with_columns(board, **{name: columns[name] for name in columns if name.startswith("accel")})
+
+
+@pytest.mark.parametrize(
+    ("size", "frequency", "reason"),
+    [(1.5, 37.3, "accelerometers shake in motion"), (0.3, 87.3, "accelerometers scatter"), (0.05, 37.3, None)],
+)
+def test_vibration_beyond_what_the_rate_follows_is_said(size, frequency, reason):
+    board = a_board(elements=4, attitudes=8, duration="20 s", rate="100 Hz", age="0 ms")
+    record = il.calibrate_imus(shaken(board, size, frequency), gravity=G).calibration
+    assert record.verdict.state == ("look" if reason else "good")
+    assert reason is None or any(reason in text for text in record.verdict.reasons)
+
+
 def shifted(board, number, by):
     """Return a board whose IMU reads as if it sat elsewhere, by lever arms from rates of the gyroscopes' derivative."""
     truth = {name: np.array(board.metadata[f"truth_{name}_1"].split(), float) for name in ("gyro", "gyro_bias")}

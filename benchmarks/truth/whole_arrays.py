@@ -89,6 +89,18 @@ def disturb(board: il.Recording, what: str, size: float, rng: np.random.Generato
         for row in rng.choice(np.arange(n - 2300, n - 700), 10, replace=False):
             for axis in "xyz":
                 columns[f"accel_{axis}_3"][row : row + 2] += size * rng.uniform(-1, 1)
+    elif what == "shaken":  # m/s^2 along and 3 times as many rad/s^2 about each axis in the motion, at 37.3 Hz
+        time = columns["time"]
+        for k in range(1, len(names) // 6 + 1):
+            late, place, matrix = (
+                np.array(board.metadata[f"truth_{name}_{k}"].split(), float)
+                for name in ("latency", "position", "accel")
+            )
+            phase = 2 * np.pi * 37.3 * (time - late[0])[:, None] + np.array([0.3, 1.9, 4.0])
+            force = size * (np.sin(phase) + np.cross(3 * np.sin(phase + 1.0), place))
+            force[(time < time[-1] - 24) | (time > time[-1] - 6)] = 0
+            for axis, values in zip("xyz", (force @ matrix.reshape(3, 3).T).T, strict=True):
+                columns[f"accel_{axis}_{k}"] += values
     elif what == "dropout":  # s without rows, in the motion
         keep = np.ones(n, bool)
         keep[middle : middle + int(100 * size)] = False
@@ -101,7 +113,10 @@ def fitted(
     seed: int, imus: int, duration: float, age: float, rate: float, what: str, size: float
 ) -> tuple[dict[str, tuple[Array, Array]] | None, bool]:
     """Return errors and standard uncertainties by name, or None where it is refused, and whether it is warned of."""
-    board = il.simulate_imus(elements=imus, duration=duration, age=age, rate=rate, seed=1000 + seed)
+    attitudes = int(size) if what == "attitudes" else 12
+    board = il.simulate_imus(
+        elements=imus, attitudes=attitudes, duration=duration, age=age, rate=rate, seed=1000 + seed
+    )
     board = disturb(board, what, size, np.random.default_rng(seed))
     try:
         record = il.calibrate_imus(board, gravity=G).calibration
@@ -144,6 +159,7 @@ def row(name: str, trials: int = 8, quantity: str = "positions", **options: obje
     return Scenario(GROUP, name, what, trials=trials, unit=QUANTITIES[quantity][2], **asked)  # type: ignore[arg-type]
 
 
+WIDE = (88.0, 100.0)
 SCENARIOS = [
     *(row(f"4 IMUs, nothing disturbed: {name}", 16, name, false_alarms=4.0) for name in QUANTITIES),
     row("8 IMUs, 40 s, nothing disturbed: positions", 4, imus=8, duration=40.0, false_alarms=4.0),
@@ -152,14 +168,35 @@ SCENARIOS = [
         row(f"readings up to 1 ms old, 62.5 Hz: {name}", 12, name, age=1e-3, rate=62.5, coverage=(92.0, 100.0))
         for name in ("positions", "latencies of gyroscopes")
     ),
+    *(
+        row(
+            f"attitudes at rest: {count}",
+            what="attitudes",
+            size=count,
+            coverage=WIDE,
+            false_alarms=4.0,
+        )
+        for count in (1, 3)
+    ),
+    row("the board shakes by 1.5 m/s^2 at 37 Hz in motion", what="shaken", size=1.5, coverage=None, warned=95.0),
     row("an IMU slips by 2.6 mm in the motion", what="loose", size=1.5e-3, coverage=None, warned=95.0),
-    row("gyroscopes' biases drift by up to 0.1 deg/s", what="gyro", size=0.1, coverage=(88.0, 100.0)),
-    row("accelerometers' biases drift by up to 0.02 m/s^2", what="accel", size=0.02, coverage=(88.0, 100.0)),
+    row("gyroscopes' biases drift by up to 0.1 deg/s", what="gyro", size=0.1, coverage=WIDE),
+    *(
+        row(
+            f"accelerometers' biases drift by up to 0.02 m/s^2: {name}",
+            8,
+            name,
+            what="accel",
+            size=0.02,
+            coverage=WIDE,
+        )
+        for name in ("positions", "biases of accelerometers")
+    ),
     row("accelerometers' biases drift by up to 0.2 m/s^2", what="accel", size=0.2, coverage=None, warned=95.0),
-    row("one IMU's clock is 2 ppm fast", what="clock", size=2e-6, coverage=(88.0, 100.0)),
+    row("one IMU's clock is 2 ppm fast", what="clock", size=2e-6, coverage=WIDE),
     row("one IMU's clock is 100 ppm fast", what="clock", size=1e-4, coverage=None, warned=95.0),
     row("one IMU is a sample late from the middle on", what="late", coverage=None, warned=95.0),
-    row("two rows repeated, ten times", what="repeated", size=10, coverage=(88.0, 100.0)),
-    row("one IMU is knocked by 20 m/s^2 ten times", what="knocks", size=20.0, coverage=(88.0, 100.0)),
-    row("0.5 s without rows in the motion", what="dropout", size=0.5, coverage=(88.0, 100.0)),
+    row("two rows repeated, ten times", what="repeated", size=10, coverage=WIDE),
+    row("one IMU is knocked by 20 m/s^2 ten times", what="knocks", size=20.0, coverage=WIDE),
+    row("0.5 s without rows in the motion", what="dropout", size=0.5, coverage=WIDE),
 ]

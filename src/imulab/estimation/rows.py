@@ -208,6 +208,7 @@ def _misfit(basis: Array, values: Array) -> float:
 
 
 FAR = "far from the rows on both sides"
+REPEATED = "exact repeats of the row before"
 MOST = 0.05
 """Largest share of a stretch at rest that may be left out; beyond it the rest is not trusted either."""
 _GLITCH_SIGMAS = 10.0
@@ -305,7 +306,7 @@ def leave_out(recording: Recording, names: Sequence[str]) -> LeftOut:
     zero = zero_rows(values, never_zero)
     if not never_zero:
         zero &= ~_long_runs(zero)
-    by_kind = {"exact zeros": zero, "exact repeats of the row before": repeated_rows(values) & ~zero}
+    by_kind = {"exact zeros": zero, REPEATED: repeated_rows(values) & ~zero}
     by_kind[FAR], by_kind["an exact zero of one column"] = far_rows(values, zero)
     kinds = {kind: rows for kind, rows in by_kind.items() if rows.any()}
     bad = np.logical_or.reduce(list(by_kind.values()))

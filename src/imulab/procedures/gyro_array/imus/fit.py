@@ -11,6 +11,7 @@ import numpy as np
 
 from imulab.display import Bad, Finding, Note
 from imulab.errors import OptionError
+from imulab.estimation.rows import quantile
 from imulab.gravity import Gravity, Height, Latitude, LocalGravity, at_place, gravity_findings, local_gravity
 from imulab.options import RARE, measure, text
 from imulab.procedures.gyro_array.imus.columns import readings_of
@@ -62,10 +63,13 @@ from imulab.records.sections import Above0, Length, Measured, StatedGravity
 
 _ATTITUDES = 6  # fewest that tell common scale factors and biases of the accelerometers
 _APART = math.cos(math.radians(20.0))  # between directions that count as two attitudes
-_HELD = (1e-4, 1e-3)  # common scale and bias, m/s^2, where they are not told
+_HELD = (0.01, 0.1)  # from nominal, of common scale and bias, m/s^2, where they are not told
 _UNTOLD = 0.5  # of a prior's standard deviation: what is less is told by the recording
 _SHORT, _CLIPPED, _BEYOND, _SIGMA = 5.0, 0.1, 0.5, 3.0  # s, share, m, standard deviations
-_UNLIKE_REST = 5.0  # times the noise at rest
+_UNLIKE_REST = 3.0  # times the noise at rest
+_UNEXPLAINED = 1.5  # the same of accelerometers, beyond what the age of readings explains
+_SHAKEN = 25.0  # times the noise at rest above a third of the sampling rate, where splines no longer follow
+_QUARTILE = 1.15  # standard deviations that three quarters of normal numbers stay within
 _BOARD = 2e-4  # m: uncertainty of a stated distance, unless stated
 _ONE_CHIP = 3e-4  # m: two chips are farther apart, on two sides of a board too
 _BENT, _SLIPPED = 2e-5, 1e-4  # m, s: differences of halves below these do no harm
@@ -205,10 +209,7 @@ def fit_board(
         raise OptionError(f"distance: expected IMUs 1 to {measured.count}, as {recording.name} has")
     row = mean_scale(measured)
     attitudes = count_attitudes(_directions(prepared))
-    held = []
-    if attitudes < _ATTITUDES:
-        rows = common_accel(measured)
-        held = [Held(rows[i], 1.0, _HELD[0]) for i in range(3)] + [Held(rows[3 + i], 0.0, _HELD[1]) for i in range(3)]
+    held = [] if attitudes >= _ATTITUDES else _held_nominal(prepared)
     nominal = Held(row, 1.0, tolerance)
     solution = solve(measured, prepared.start, prepared.motion, nominal, held)
     factors: dict[SizeFrom, Factor | None] = {
@@ -232,7 +233,8 @@ def fit_board(
         *warn_positions(solution, covariance),
         *warn_halves(solution, apart, deviation),
         *warn_rests(prepared, solution),
-        *warn_scatter(summary),
+        *warn_scatter(summary, _older(prepared, solution)),
+        *warn_shaking(prepared),
         *warn_size(factors, source),
     ]
     at_rest = measured.accel_noise / prepared.correlation[0], measured.gyro_noise / prepared.correlation[1]
@@ -251,6 +253,12 @@ def fit_board(
         },
     )  # fmt: skip
     return ImusFit(record)
+
+
+def _held_nominal(prepared: Prepared) -> list[Held]:
+    """Return common scale factors and biases as near to their nominal values as those of ordinary chips are."""
+    rows = common_accel(prepared.measured)
+    return [Held(row, 1.0, _HELD[0]) for row in rows[:3]] + [Held(row, 0.0, _HELD[1]) for row in rows[3:]]
 
 
 def _directions(prepared: Prepared) -> Array:
@@ -318,6 +326,13 @@ def _coherence(prepared: Prepared, solution: Solution) -> float:
     slope = (motion[2:, RATE] - motion[:-2, RATE])[inner] / (time[2:] - time[:-2])[inner, None]
     al = motion[1:-1, ACCELERATION][inner]
     return float((slope * al).sum() / max(math.sqrt((slope**2).sum() * (al**2).sum()), 1e-300))
+
+
+def _older(prepared: Prepared, solution: Solution) -> float:
+    """Return by what readings of that age make the accelerometers scatter more in motion than at rest."""
+    measured = prepared.measured
+    change = np.median([np.square(spline(measured.time, 1)).mean(axis=1) for spline in measured.accel])
+    return float(math.sqrt(1 + solution.weights.age**2 * change / np.square(measured.accel_noise).mean()))
 
 
 def _motion_data(prepared: Prepared, solution: Solution) -> MotionData:
@@ -497,8 +512,8 @@ def warn_rests(prepared: Prepared, solution: Solution) -> list[str]:
     ]
 
 
-def warn_scatter(summary: ImusSummary) -> list[str]:
-    """Return how much more the readings scatter in motion than at rest."""
+def warn_scatter(summary: ImusSummary, older: float = 1.0) -> list[str]:
+    """Return how much more the readings scatter in motion than at rest, of which their age explains `older` times."""
     findings: list[str] = []
     if summary.age.value:
         findings.append(
@@ -508,7 +523,7 @@ def warn_scatter(summary: ImusSummary) -> list[str]:
             )
         )
     factor = max(summary.accel_factor, summary.gyro_factor)
-    if factor > _UNLIKE_REST:
+    if factor > _UNLIKE_REST or summary.accel_factor > _UNEXPLAINED * older:
         what = "accelerometers" if summary.accel_factor >= summary.gyro_factor else "gyroscopes"
         findings.append(
             Finding(
@@ -518,6 +533,27 @@ def warn_scatter(summary: ImusSummary) -> list[str]:
             )
         )
     return findings
+
+
+def warn_shaking(prepared: Prepared) -> list[str]:
+    """Return by what the accelerometers shake in motion faster than they are read."""
+    measured = prepared.measured
+    run = np.searchsorted(measured.first, np.arange(len(measured.time)), side="right")
+    whole = run[6:] == run[:-6]
+    # Sixth differences leave 1e-3 of what a hand does below a tenth of the sampling rate, and half above a third.
+    # By their upper quartile, as knocks are few and a motor may run for a third of the motion only.
+    shaking = [quantile(np.abs(np.diff(each(measured.time), 6, axis=0)[whole]), 0.75) for each in measured.accel]
+    size = max(shaking) / _QUARTILE / 2**6
+    factor = size * 2**6 / math.sqrt(924 * float(np.square(measured.accel_noise).mean()))
+    if factor < _SHAKEN:
+        return []
+    return [
+        Finding(
+            f"the accelerometers shake in motion by {size:.2g} m/s^2 above a third of the sampling rate, {factor:.2g} "
+            "times their noise there: positions and latencies can be off by more than stated",
+            "record faster, with motors and fans off",
+        )
+    ]
 
 
 def warn_size(factors: dict[SizeFrom, Factor | None], source: SizeFrom) -> list[str]:

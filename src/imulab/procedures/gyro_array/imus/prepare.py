@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from imulab.display import Finding, Note
 from imulab.errors import DataError, ObservabilityError, UnitError
 from imulab.estimation.clock import GAP
-from imulab.estimation.rows import FAR, leave_out, medians
+from imulab.estimation.rows import FAR, REPEATED, LeftOut, leave_out, medians
 from imulab.procedures.gyro_array.alignment import align, nominal_orientation
 from imulab.procedures.gyro_array.imus.model import ACCEL, GYRO, GYRO_BIAS, NUMBERS, POSITION, RATE, Board, lever
 from imulab.procedures.gyro_array.imus.solve import Measured
@@ -28,6 +28,7 @@ _BESIDE = 4  # samples beside a reading at its limit, or a gap
 _FEWEST, _SHORTEST = 300, 6  # samples in motion, and of an unbroken run of them
 _FEW_LOST = 0.01  # share of rows without a reading up to which it is a note
 _STUCK, _CHANGING = 50, 0.5  # samples of one value, while in others so many of the steps are none of 0
+_RARER = 0.5  # times as often as throughout: repeats in motion, where those at rest are chance
 _UNLIKE_G, _UNLIKE_RATE, _SKEW = 0.2, 0.3, 3.0
 _NUMBERED = re.compile(r"(accel|gyro)_([xyz])_([1-9][0-9]*)")
 
@@ -131,12 +132,12 @@ def prepare(recording: Recording, gravity: float) -> Prepared:
     rests, still = _rests(accel, gyro, size)
     if not rests:
         raise DataError(f"{recording.name}: no rest of {_WINDOW:g} s; expected a board that lies still between motions")
-    bad, more = _no_readings(recording, [triad for sensor in names.values() for triad in sensor], rests)
     _check_units(recording, accel, rests, gravity)
     at_limit, gyro_limit = _at_limit(recording, flat), _at_limit(recording, flat[len(flat) // 2 :])
     gap = _after_gap(time, step)
     bias = np.concatenate([gyro[part] for part in rests]).mean(axis=0)
     turning = _moving(gyro - bias, size) & ~still
+    bad, more = _no_readings(recording, [triad for sensor in names.values() for triad in sensor], rests, turning)
     first, kept = _runs(turning & ~_spread(at_limit | gap | bad, _BESIDE))
     clipped = float((at_limit & turning).sum() / max(turning.sum(), 1))
     if len(kept) < _FEWEST:
@@ -176,15 +177,22 @@ def _finite(recording: Recording, names: list[str]) -> tuple[Recording, list[str
 
 
 def _no_readings(
-    recording: Recording, triads: list[list[str]], rests: list[slice]
+    recording: Recording, triads: list[list[str]], rests: list[slice], turning: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return the rows in which a triad repeats itself or reads zeros, and what to say of them."""
+    """Return the rows in which a triad repeats itself or reads zeros, and what to say of them.
+
+    Repeats that are rarer in motion are chance, as quiet and coarse sensors repeat themselves at rest.
+    """
     bad, notes = np.zeros(len(recording), dtype=bool), []
     at_rest = np.zeros(len(recording), dtype=bool)
     for part in rests:
         at_rest[part] = True
     for triad in triads:
         left_out = leave_out(recording, triad)
+        repeats = left_out.kinds.get(REPEATED)
+        if repeats is not None and repeats[turning].sum() < _RARER * turning.mean() * repeats.sum():
+            kinds = {kind: rows for kind, rows in left_out.kinds.items() if kind != REPEATED}
+            left_out = LeftOut(left_out.recording, left_out.names, kinds)
         for kind, rows in left_out.kinds.items():
             bad |= rows & (at_rest if kind == FAR else True)
         notes += left_out.notes(at_rest)

@@ -7,6 +7,9 @@ Readings are taken anew at t + latency after each step (quintic splines).
 Noise in motion is not noise at rest. A chip that samples by a clock of its own gives readings 0 to 1 ms old, which adds
 ``tau^2 d d'``, ``d = Tg al``, to the covariance of its gyroscopes; what else there is scales the readings of a sample,
 accelerometers and gyroscopes apart. The covariance is the larger of S^-1 and a sandwich over stretches of the motion.
+
+Biases of accelerometers drift. What the rests scatter beyond their noise is an error of each, however long it lasts; in
+each half of the motion every bias is off by an unknown, whose variance is what rests and halves disagree by.
 """
 
 from __future__ import annotations
@@ -100,12 +103,17 @@ class Measured:
 
 @dataclass(frozen=True)
 class Weights:
-    """By what the standard deviation of each sample is larger than at rest, and the age of readings, s."""
+    """By what the standard deviation of each sample is larger than at rest, and the age of readings, s.
+
+    `drift` and `offset`, m/s^2: standard deviations of the accelerometers' biases from rest to rest, and in motion.
+    """
 
     accel: Array
     gyro: Array
     rest: Array
     age: float = 0.0
+    drift: float = 0.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -153,9 +161,10 @@ class Solution:
     def covariance(self, size: Held) -> tuple[Array, float]:
         """Return the covariance with a size, shape (29 K, 29 K), and the median factor by which stretches widen it."""
         free = self.free
-        matrix = self.information.sum(0) + self.at_rest + self.prior + np.multiply.outer(size.row, size.row) / size.u**2
+        information, scores = _with_offsets(self.information, self.scores, self.weights.offset)
+        matrix = information.sum(0) + self.at_rest + self.prior + np.multiply.outer(size.row, size.row) / size.u**2
         inverse = np.linalg.inv(matrix[np.ix_(free, free)])
-        blocks = inverse @ self.scores[:, free].T
+        blocks = inverse @ scores[:, free].T
         blocks -= blocks.mean(axis=1, keepdims=True)
         spread = np.sqrt(np.square(blocks).sum(1) * STRETCHES / (STRETCHES - 1))
         wider = np.maximum(1.0, spread / np.sqrt(np.diag(inverse)))
@@ -168,10 +177,12 @@ class Solution:
 
         Without what a common factor on all positions explains; shape (K, 29) each.
         """
-        free, parts = self.free, np.array_split(self.scores, 2)
+        free = self.free
+        information, all_scores = _with_offsets(self.information, self.scores, self.weights.offset)
+        parts = np.split(all_scores, 2)
         steps, variance = [], np.zeros(int(free.sum()))
         more = self.at_rest + self.prior + np.multiply.outer(size.row, size.row) / _SAME_SIZE**2
-        for half, scores in zip(self.information, parts, strict=True):
+        for half, scores in zip(information, parts, strict=True):
             inverse = np.linalg.inv((half + more)[np.ix_(free, free)])
             steps.append(inverse @ (scores.sum(0) + self.score_at_rest + self.pull)[free])
             variance += np.diag(inverse)
@@ -338,8 +349,9 @@ class _Problem:
         motion[:, FORCE] = force
         by_accel, by_gyro = board_jacobian(board, motion, np.zeros_like(motion))
         _, its_accel, its_gyro = predicted(board, motion)
-        root = (np.sqrt(measured.rest_count) / weights.rest)[:, None, None]
-        accel, gyro = root / measured.accel_noise, root / measured.gyro_noise
+        factor, count_at_rest = weights.rest[:, None, None], measured.rest_count[:, None, None]
+        accel = 1 / (factor * np.sqrt(np.square(measured.accel_noise) / count_at_rest + weights.drift**2))
+        gyro = np.sqrt(count_at_rest) / (factor * measured.gyro_noise)
         e = np.concatenate([(measured.rest_accel - its_accel) * accel, (measured.rest_gyro - its_gyro) * gyro], axis=1)
         j = np.zeros((len(force), 2 * count, 3, count, NUMBERS))
         h = np.zeros((len(force), 2 * count, 3, 3))
@@ -390,8 +402,13 @@ class _Problem:
             for start in range(begin, end, size):
                 yield slice(start, min(start + size, end)), stretch
 
-    def weights(self, board: Board, motion: Array, readings: tuple[Array, Array], force: Array) -> Weights:
-        """Return how much noisier than at rest each sample is, after the age of the readings is accounted for."""
+    def weights(
+        self, board: Board, motion: Array, readings: tuple[Array, Array], left: Array, drift: float, offset: float
+    ) -> Weights:
+        """Return how much noisier than at rest each sample is, after the age of the readings is accounted for.
+
+        `left` are the accelerometers' residuals at rest, shape (rests, K, 3).
+        """
         count = self.measured.count
         _, its_accel, its_gyro = predicted(board, motion)
         # Only by what the IMUs differ: what they have in common is the motion, or the model. Their age moves them along
@@ -405,16 +422,78 @@ class _Problem:
         older = float((along / (count - 1) - usual * gyro**2).sum()) / float(acceleration.sum())
         age = math.sqrt(older) if older > 0 else 0.0
         square_accel = np.square((readings[0] - its_accel) / self.measured.accel_noise).sum((1, 2))
-        at_rest = np.zeros((len(force), 9))
-        at_rest[:, FORCE] = force
-        _, still_accel, _ = predicted(board, at_rest)
-        rest = np.square((self.measured.rest_accel - still_accel) / self.measured.accel_noise).sum((1, 2))
+        variance = np.square(self.measured.accel_noise) / self.measured.rest_count[:, None, None] + drift**2
         return Weights(
             _factors(square_accel, max(3 * count - 6, 0)),
             gyro,
-            _factors(rest * self.measured.rest_count, 3 * count - 3),
+            _factors((np.square(left) / variance).sum((1, 2)), 3 * count - 3),
             age,
+            drift,
+            offset,
         )
+
+    def left_at_rest(self, board: Board, force: Array) -> Array:
+        """Return the accelerometers' residuals at rest, shape (rests, K, 3)."""
+        at_rest = np.zeros((len(force), 9))
+        at_rest[:, FORCE] = force
+        return np.asarray(self.measured.rest_accel - predicted(board, at_rest)[1])
+
+    def drift(self, left: Array, matrix: Array, still: Array) -> float:
+        """Return the standard deviation of biases from rest to rest, m/s^2, by the median rest's residuals.
+
+        `matrix` and `still` are the information of all and of the rests, of the free numbers; what the board's numbers
+        take up of the residuals is in them.
+        """
+        of_accel = np.flatnonzero(np.nonzero(self.free)[1] < OF_ACCEL.stop)
+        absorbed = float(np.linalg.solve(matrix, still)[of_accel, of_accel].sum())
+        freedom = left[0].size - 2 - absorbed / len(left)  # of a rest
+        if freedom < 1:
+            return 0.0
+        usual = (np.square(self.measured.accel_noise) / self.measured.rest_count[:, None, None]).mean()
+        median = (1 - 2 / (9 * freedom)) ** 3  # of chi-square over its freedom (Wilson, Hilferty 1931)
+        square = float(np.median(np.square(left).sum((1, 2)))) / (freedom * median)
+        return math.sqrt(max(square - float(usual), 0.0))
+
+
+def _of_bias(size: int) -> NDArray[np.intp]:
+    """Return the places of the accelerometers' biases among so many numbers, shape (3 K,)."""
+    return np.arange(size).reshape(-1, NUMBERS)[:, ACCEL_BIAS].ravel()
+
+
+def _with_offsets(information: Array, scores: Array, offset: float) -> tuple[Array, Array]:
+    """Return S of halves and q of stretches where in each half every bias is off by an unknown, of `offset` m/s^2."""
+    if not offset:
+        return information, scores
+    of_bias = _of_bias(scores.shape[1])
+    halves, parts = [], []
+    for half, its_scores in zip(information, np.split(scores, 2), strict=True):
+        unknown = half[np.ix_(of_bias, of_bias)] + np.eye(len(of_bias)) / offset**2
+        gain = np.linalg.solve(unknown, half[of_bias])
+        halves.append(half - half[:, of_bias] @ gain)
+        parts.append(its_scores - its_scores[:, of_bias] @ gain)
+    return np.array(halves), np.concatenate(parts)
+
+
+def _offset(information: Array, scores: Array, rest: Array, slope: Array, free: NDArray[np.bool_]) -> float:
+    """Return the standard deviation of biases in halves of the motion from those at rest, m/s^2, by what they disagree.
+
+    `information`, `scores` are S of the halves and q of the stretches, `rest` and `slope` those of all else, of which
+    `free` are fitted.
+    """
+    of_bias = _of_bias(len(slope))
+    size = len(of_bias)
+    across = np.concatenate([half[np.ix_(free, of_bias)] for half in information], axis=1)
+    whole = (information.sum(0) + rest)[np.ix_(free, free)]
+    solved = np.linalg.solve(whole, np.column_stack([across, (scores.sum(0) + slope)[free]]))
+    told = -across.T @ solved[:, :-1]
+    for k, half in enumerate(information):
+        told[k * size : (k + 1) * size, k * size : (k + 1) * size] += half[np.ix_(of_bias, of_bias)]
+    by_half = np.concatenate([part.sum(0)[of_bias] for part in np.split(scores, 2)])
+    values, directions = np.linalg.eigh(told)
+    along = directions.T @ (by_half - across.T @ solved[:, -1])
+    known = values > 1e-6 * values[-1]
+    excess = float((np.square(along[known]) / values[known] - 1).sum())
+    return math.sqrt(max(excess / float(values[known].sum()), 0.0))
 
 
 def _assembled(across: list[Array], within: list[Array]) -> Array:
@@ -450,8 +529,6 @@ def solve(
     force = np.einsum("kji,nkj->ni", measured.nominal, measured.rest_accel) / measured.count
     free = problem.free.ravel()
     for stage in range(_REWEIGHTED + 1):
-        if stage:
-            weights = problem.weights(board, motion, measured.at(board), force)
         for _ in range(steps if stage == 0 else _LAST if stage == _REWEIGHTED else 1):
             readings = measured.at(board)
             if stage == 0:
@@ -464,12 +541,18 @@ def solve(
             still, score, force = problem.at_rest(board, force, weights)
             total, scores = problem.equations(board, motion, readings, weights)
             information, pull = problem.priors(board)
-            matrix = (total.sum(0) + still + information)[np.ix_(free, free)]
-            step, slope = np.zeros(len(free)), (scores.sum(0) + score + pull)[free]
+            moving, its_scores = _with_offsets(total, scores, weights.offset)
+            matrix = (moving.sum(0) + still + information)[np.ix_(free, free)]
+            step, slope = np.zeros(len(free)), (its_scores.sum(0) + score + pull)[free]
             step[free] = np.linalg.solve(matrix, slope)
             board = Board(board.numbers + step.reshape(board.numbers.shape))
             if float(slope @ step[free]) < _SMALL:
                 break
+        if stage < _REWEIGHTED:
+            left = problem.left_at_rest(board, force)
+            drift = problem.drift(left, matrix, still[np.ix_(free, free)])
+            offset = _offset(total, scores, still + information, score + pull, free)
+            weights = problem.weights(board, motion, measured.at(board), left, drift, max(drift, offset))
     readings = measured.at(board)
     motion = problem.samples(board, motion, readings, weights)
     _, accel, gyro = predicted(board, motion)
