@@ -100,10 +100,16 @@ def test_from_the_plug_to_the_record_with_a_knocked_attitude_dropped(live, new_p
     page.reload()
     page.wait_for_selector(".enough:not([hidden])")
     said = page.evaluate(
-        """() => import("/static/session.js").then(({ advice }) => [true, false].map(aside => advice(
-            { phase: "measuring", state: "accepted", enough: "enough", attitudes: [{ number: 5, aside }] })))"""
+        """() => import("/static/session.js").then(({ advice }) =>
+            [[true, []], [false, ["the model is too simple: fit"]], [false, []]].map(([aside, warnings]) => advice(
+                { phase: "measuring", state: "accepted", enough: "enough", warnings,
+                  attitudes: [{ number: 5, aside }] })))"""
     )
-    assert said == ["Enough, but attitude 5 looks knocked: drop it first.", "Enough: make the record."]
+    assert said == [
+        "Enough, but attitude 5 looks knocked: drop it first.",
+        "Enough attitudes, but the model is too simple: see the warning below.",
+        "Enough: make the record.",
+    ]
     numbers = page.locator("section:has(> h2:text-is('Attitudes')) tbody tr td:first-child").all_inner_texts()
     assert "5" not in numbers
     assert len(numbers) >= 14

@@ -419,7 +419,8 @@ class Session:
                     state = "accepted"
         if state != self.state:
             self.state = state
-            self._say("state", self._advice())
+            if state != "accepted":  # which, and what is next, is said already
+                self._say("state", self._advice())
 
     def _ended(self, hold: Hold) -> None:
         """Process a hold that has ended: a long enough one counts, and may lengthen the last attitude."""

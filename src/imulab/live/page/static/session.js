@@ -94,7 +94,7 @@ function view(now) {
   put(parts.outlook, measuring ? now.outlook : "");
   speak(parts.advice.textContent);
   parts.now.dataset.state = measuring ? now.state : now.phase;
-  parts.now.toggleAttribute("data-aside", measuring && Boolean(now.enough) && now.attitudes.some(each => each.aside));
+  parts.now.toggleAttribute("data-aside", measuring && Boolean(now.enough) && (tooSimple(now) || now.attitudes.some(each => each.aside)));
   for (const part of parts.later) show(part, now.samples > 0);
   document.title = `${measuring ? now.state : now.phase} · imulab`;
   put(parts.state, now.phase === "failed" ? "ended" : parts.now.dataset.state);
@@ -120,6 +120,8 @@ function view(now) {
   once("cause", [now.missing, now.attitudes.map(each => each.number)], () => page.forget());
 }
 
+const tooSimple = now => now.warnings.some(text => text.startsWith("the model is too simple"));
+
 export function advice(now) {
   if (now.phase === "computing") return "Computing the record.";
   if (now.phase === "done") return "Done: the record is made.";
@@ -127,6 +129,7 @@ export function advice(now) {
   if (now.outlook) return sentence(now.advice);
   const off = now.attitudes.find(each => each.aside);
   if (now.enough && off) return `Enough, but attitude ${off.number} looks knocked: drop it first.`;
+  if (now.enough && tooSimple(now)) return "Enough attitudes, but the model is too simple: see the warning below.";
   if (now.enough && now.state === "accepted") return "Enough: make the record.";
   return sentence(now.advice);
 }
