@@ -344,7 +344,7 @@ def test_px4_needs_all_of_a_sensor_and_says_how_it_reads_temperature(chamber, tm
     assert values["TC_A0_ID"] == values["CAL_ACC0_ID"] == 77
     assert [values[f"TC_A0_X0_{axis}"] for axis in range(3)] == [0, 0, 0]
     assert "more than 1 K" in file.read_text()
-    assert re.search(r"changes by up to \S+ [mu]g per K", file.read_text())
+    assert re.search(r"changes by up to \S+ [mµ]g per K", file.read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("target", TARGETS)

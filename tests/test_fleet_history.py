@@ -149,7 +149,8 @@ def server():
         return [first, *children(first)]
 
     def start() -> None:
-        (data / "postmaster.pid").unlink(missing_ok=True)  # a killed server that nobody has waited for counts as alive
+        for lock in (data / "postmaster.pid", folder / f".s.PGSQL.{port}.lock"):
+            lock.unlink(missing_ok=True)  # a killed server that nobody has waited for counts as alive
         subprocess.run([*pg_ctl, "-o", options, "start"], **run_as)
 
     start()

@@ -212,7 +212,7 @@ def test_what_cannot_tell_a_heading_is_refused_by_name(files, tmp_path, capsys):
     recording = il.read(files / "rec.csv")
     kept = {name: values for name, values in recording.columns.items() if not name.startswith("mag")}
     il.write(Recording(kept, recording.units), files / "bare.csv")
-    assert "no column mag_x; heading needs" in refused("nine.json", "bare.csv")
+    assert "bare.csv: no column mag_x; found " in refused("nine.json", "bare.csv")
     with pytest.raises(RecordError, match="heading needs magnetometers"):
         il.apply(il.load(files / "six.json"), recording, heading=True)
 
