@@ -30,6 +30,7 @@ NORMAL_95 = 1.96
 """Standard deviations of a normal distribution from its mean to the ends of its 95 %."""
 MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to the standard deviation of a normal distribution, as the literature rounds it."""
+_FEW = 256  # values that NumPy's vector instructions partition faster
 
 
 def median(values: NDArray[Any]) -> float:
@@ -52,7 +53,7 @@ def medians(values: NDArray[Any], axis: int = -1) -> Array:
     [2.0, 8.0]
     """
     middle = values.shape[axis] // 2
-    parted = np.partition(values, middle, axis)  # for one place, three times as fast as for two
+    parted = _partition(values, middle, axis)
     parted = np.moveaxis(parted, axis, 0) if values.ndim > 1 else parted
     low = parted[middle] if values.shape[axis] % 2 else parted[:middle].max(0)
     return np.where(np.isnan(values.max(axis)), np.nan, (low + parted[middle]) / 2)
@@ -68,9 +69,18 @@ def quantile(values: NDArray[Any], share: float) -> float:
     """
     place = share * (values.size - 1)
     below = int(place)
-    parted = np.partition(values, below, axis=None)
+    parted = _partition(values.ravel(), below)
     low, above = parted[below], parted[below + 1 :]
     return float(low + (place - below) * (above.min() - low)) if above.size else float(low)
+
+
+def _partition(values: NDArray[Any], place: int, axis: int = -1) -> NDArray[Any]:
+    """Return values with the smaller ones before a place and the larger ones behind it.
+
+    NumPy does so for a single place with vector instructions: five times as fast for few values as its way for two
+    places, but up to fifty times as slow for thousands, above all if many are equal, as steps of time are.
+    """
+    return np.partition(values, place if values.shape[axis] <= _FEW else (place - 1, place), axis)
 
 
 def distinct(values: NDArray[Any]) -> NDArray[Any]:
