@@ -427,6 +427,43 @@ def test_outputs_that_bend_a_little_widen_the_hard_iron(reduced):
     assert np.sqrt(np.mean(straight**2)) > 0.7
 
 
+def few(directions, seed, repeated=40, third=0.0, exact=False):
+    """Return the record of readings in few directions, with a third power of the x output, and its true soft iron."""
+    rng, sensor = np.random.default_rng(seed), Sensor(seed, axes=directions.shape[1], field=20.0)
+    kept = np.repeat(directions, 1 if exact else repeated, axis=0)
+    outputs = sensor.outputs(kept, 0.05, rng) + third * kept**3 * np.eye(directions.shape[1])[0]
+    outputs = np.tile(outputs, (repeated, 1)) if exact else outputs
+    if outputs.shape[1] == 2:
+        outputs = np.column_stack([outputs, np.full(len(outputs), 44.0)])
+    return sensor, il.fit_magnetometer(recorded(outputs, rate=50.0)).calibration
+
+
+@pytest.mark.parametrize(
+    ("count", "axes", "exact"), [(1200, 2, False), (7, 2, False), (12, 2, True), (10, 3, False), (600, 3, False)]
+)
+def test_bends_that_readings_cannot_tell_do_not_swell_the_uncertainties(count, axes, exact, reduced):
+    """Third powers of two axes are alike in a level turn, and few directions tell no bend: both cost thousands of u."""
+    for seed in range(5 if reduced else 25):
+        rng = np.random.default_rng(100 + seed)
+        directions = circle(count + 1, 1.0)[:-1] if axes == 2 else sphere(count, rng)
+        repeated = 1 if count > 100 else 40
+        sensor, record = few(directions, seed, repeated=repeated, exact=exact)
+        bound = sensor.bound(np.repeat(directions, 1 if exact else repeated, axis=0), 0.05)
+        least = np.sqrt(np.diag(bound)[axes:]).max()
+        stated = [record.parameters[f"mag_soft_{'xyz'[i]}{'xyz'[j]}"] for i, j in sensor.places]
+        assert max(each.standard_uncertainty for each in stated) < 12 * least
+
+
+def test_a_third_power_in_a_level_turn_is_named_without_an_axis_and_is_in_the_uncertainty(reduced):
+    for seed in range(2 if reduced else 6):
+        sensor, record = few(circle(1200, 2.0), seed, repeated=1, third=0.4)
+        (text,) = [text for text in record.verdict.reasons if "third power" in text]
+        assert 0.2 < float(re.findall(r"not told\) ([\d.]+) uT", text)[0]) < 0.4
+        ratio = sensor.soft[0, 0] / sensor.soft[1, 1]
+        xx, yy = (record.parameters[f"mag_soft_{name}"] for name in ("xx", "yy"))
+        assert abs(xx.value / yy.value - ratio) < 2.5 * np.hypot(xx.standard_uncertainty, yy.standard_uncertainty)
+
+
 def test_outputs_that_bend_are_named_with_their_size():
     (said,) = [text for text in bent(3, 0.2, noise=0.05)[1].warnings if "square of the field" in text]
     sizes = [float(value) for value in re.findall(r"[xyz] ([+-][\d.]+)", said)]

@@ -16,6 +16,8 @@ from imulab.procedures.magnetometer import AXES, FEWEST, name_columns
 from imulab.procedures.magnetometer.model import FittedTurn, MagReadings, check_dead, read_readings
 from imulab.procedures.magnetometer.record import make_record
 from imulab.procedures.magnetometer.solve import (
+    BLOCKS,
+    LEAST_IN_BLOCK,
     find_bend,
     find_change,
     find_disturbed,
@@ -120,7 +122,7 @@ def fit_readings(recording: Recording, field: float | None, where: Site | None, 
     """Calibrate a magnetometer triad; arguments in SI, else as for `fit_magnetometer`."""
     model_field = None if where is None else field_of_test(where, date, recording)
     readings = read_readings(recording)
-    turned = _add_beyond(_find_surface(readings))
+    turned = _with_unmodelled(_find_surface(readings))
     if turned.upright and field is not None:
         raise OptionError(
             f"field: a level turn sees the level part of the field only, and {recording.name} is one; state the place "
@@ -203,17 +205,16 @@ def _find_surface(readings: MagReadings) -> FittedTurn:
 
 
 _POWERS = 2, 3  # of the field; what the square hides counts as far as it is real, without a threshold
-_LEAST_IN_ALL = 240  # readings that tell a change of the hard iron
 
 
-def _add_beyond(turned: FittedTurn) -> FittedTurn:
-    """Return a fit with the terms that its residuals tell beside the surface, in its uncertainties too."""
+def _with_unmodelled(turned: FittedTurn) -> FittedTurn:
+    """Return a fit whose uncertainties hold the bends and the change of the hard iron that its residuals tell."""
     surface, output = turned.surface, turned.output[~turned.aside]
     bends, change = {}, None
     if len(output) >= 2 * (len(surface.theta) + len(turned.axes)):
         every = {power: find_bend(surface.theta, output, power) for power in _POWERS}
         bends = {power: bend for power, bend in every.items() if power == 2 or bend.probability < OUTPUTS_BEND.level}
-    if len(output) >= _LEAST_IN_ALL:
+    if len(output) >= LEAST_IN_BLOCK * BLOCKS:
         change = find_change(surface.theta, output)
         change = change if change.probability < HARD_IRON_STEP.level else None
     terms = [*bends.values(), *([change] if change else [])]

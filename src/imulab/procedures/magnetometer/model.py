@@ -12,7 +12,7 @@ from imulab.columns import triad
 from imulab.display import Finding, Note
 from imulab.errors import DataError, UnitError
 from imulab.procedures.magnetometer import AXES, FEWEST
-from imulab.procedures.magnetometer.solve import Beyond, Surface, evaluate, pairs, unpack
+from imulab.procedures.magnetometer.solve import Surface, Unmodelled, evaluate, pairs, unpack
 from imulab.recording import Array, Recording
 from imulab.units import parse_unit
 
@@ -92,8 +92,8 @@ class FittedTurn:
     surface: Surface
     aside: NDArray[np.bool_]
     axes: str
-    bends: Mapping[int, Beyond] = field(default_factory=dict)
-    change: Beyond | None = None
+    bends: Mapping[int, Unmodelled] = field(default_factory=dict)
+    change: Unmodelled | None = None
 
     @property
     def upright(self) -> str | None:

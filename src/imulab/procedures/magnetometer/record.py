@@ -16,7 +16,7 @@ from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.magnetometer import ALL_WAYS, GAUGE, LEVEL
 from imulab.procedures.magnetometer.model import FittedTurn, MagReadings, not_told, parameter_names
 from imulab.procedures.magnetometer.schema import FieldModel, FieldReadings, FieldSummary
-from imulab.procedures.magnetometer.solve import BLOCKS, uncertainties, widest_gap
+from imulab.procedures.magnetometer.solve import BLOCKS, LEAST_IN_BLOCK, uncertainties, widest_gap
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, entries
@@ -34,9 +34,8 @@ _OF_THE_EARTH, _BUILDING = (22e-6, 67e-6), 1.4
 """Least and largest magnitude of the Earth's field, T, and the factor by which iron of a building may change it."""
 _KEPT = 600  # readings that a record keeps for figures
 _MOST_NAMED = 3  # disturbed stretches
-_LEAST_IN_BLOCK = 8
 _LEAST_PART = 3  # blocks before and after a step
-_NOTICED = 0.005  # of the field: smaller terms beside the surface are noted, since the uncertainties hold them
+_NOTICED = 0.005  # of the field: smaller terms beside the surface, and steps of |m|, are notes
 _POWER_NAMES = {2: "square", 3: "third power"}
 
 
@@ -247,7 +246,7 @@ def _warn_step(readings: MagReadings, r: Array, aside: NDArray[np.bool_]) -> lis
     The step that explains most is tested by F(1, B - 2) over the scatter of the B means, times the number of splits.
     """
     kept = np.flatnonzero(~aside)
-    if len(kept) < _LEAST_IN_BLOCK * BLOCKS:
+    if len(kept) < LEAST_IN_BLOCK * BLOCKS:
         return []
     parts = np.array_split(kept, BLOCKS)
     means = np.array([r[part].mean() for part in parts])
@@ -265,10 +264,13 @@ def _warn_step(readings: MagReadings, r: Array, aside: NDArray[np.bool_]) -> lis
     time = readings.time
     row = int(parts[first][0])
     where = f"row {readings.row[row] + 1}" if time is None else f"{time[row]:.1f} s"
+    way = "higher" if size > 0 else "lower"
+    text = f"mag: from {where} on |m| is {100 * abs(size):.2g} % {way} than before (p {p:.1g})"
+    if abs(size) < _NOTICED:
+        return [Note(f"{text}, as by noise that is slow or a drift")]
     return [
         Finding(
-            f"mag: from {where} on |m| is {100 * abs(size):.2g} % {'higher' if size > 0 else 'lower'} than before "
-            f"(p {p:.1g}): did iron come near, or did the place change?",
+            f"{text}: did iron come near, or did the place change?",
             "record again at one place, away from phones and iron",
         )
     ]
@@ -296,28 +298,30 @@ def _warn_change(turned: FittedTurn) -> list[str]:
 
 def _warn_bends(turned: FittedTurn) -> list[str]:
     """Return what is said of outputs that are not straight."""
-    said: list[str] = []
+    warnings: list[str] = []
     for power, bend in turned.bends.items():
         if bend.probability > OUTPUTS_BEND_CLEARLY.level:
             continue
         unit = parse_unit(turned.readings.unit)
         factor, symbol = (1e6 * unit.factor, "uT") if unit.quantity == "magnetic field" else (1.0, unit.symbol)
-        sizes = ", ".join(
-            f"{axis} {value:+.2g}" for axis, value in zip(turned.axes, (factor * bend.size).tolist(), strict=True)
-        )
+        largest = float(np.linalg.norm(bend.size)) if not bend.told else float(np.abs(bend.size).max())
+        each = zip(turned.axes, (factor * bend.size).tolist(), strict=True)
+        sizes = ", ".join(f"{axis} {value:+.2g}" for axis, value in each)
+        if not bend.told:
+            sizes = f"(of an axis that is not told) {factor * largest:.2g}"
         text = (
             f"mag: |m| follows the direction as no ellipsoid does: outputs with a {_POWER_NAMES[power]} of the field, "
             f"at its full size {sizes} {symbol} (p {bend.probability:.1g}), explain it. What of it looks like hard and "
             "soft iron is in the uncertainties"
         )
-        if float(np.abs(bend.size).max()) < _NOTICED * turned.surface.gain:
-            said.append(Note(text))
+        if largest < _NOTICED * turned.surface.gain:
+            warnings.append(Note(text))
             continue
         level = "was the turn level, and is" if turned.upright else "is"
-        said.append(
+        warnings.append(
             Finding(
                 f"{text}: {level} the sensor near the end of its range?",
                 "take magnets and steel off the unit, or set a wider range of the sensor, and record again",
             )
         )
-    return said
+    return warnings

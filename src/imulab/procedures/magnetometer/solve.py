@@ -37,10 +37,10 @@ from imulab.estimation.distributions import f_tail
 from imulab.estimation.rows import MAD_TO_SIGMA, median
 from imulab.recording import Array
 
-BLOCKS = 30
-"""Blocks of consecutive readings, by which errors in common are seen."""
+BLOCKS, LEAST_IN_BLOCK = 30, 8
+"""Blocks of consecutive readings, by which errors in common are seen; fewest readings in one, else all are taken as
+independent."""
 _LONG_BLOCKS = 10  # by which errors that last longer are seen, where what they are taken for lasts long, too
-_LEAST_IN_BLOCKS = 8  # readings in a block; fewer readings in all are taken as independent
 _STEPS, _CLOSE = 60, 1e-10
 _FARTHEST = 1e3  # largest parameter of a fit, where the readings spread by about 1
 _HUBER = 2.0  # robust standard deviations, from which a reading pulls by its sign alone
@@ -276,7 +276,7 @@ def orthonormal(rows: Array) -> Array:
 
 def find_inflation(whitened: Array, q: Array, sigma: float, blocks: int = BLOCKS) -> float:
     """Return by how much errors in common of readings in a row increase the covariance, 1 or more; q is orthonormal."""
-    count = min(blocks, len(whitened) // _LEAST_IN_BLOCKS)
+    count = min(blocks, len(whitened) // LEAST_IN_BLOCK)
     if count < blocks // 2 or not sigma:
         return 1.0
     edges = np.linspace(0, len(whitened), count + 1).astype(np.intp)[:-1]
@@ -290,7 +290,7 @@ def find_inflation(whitened: Array, q: Array, sigma: float, blocks: int = BLOCKS
 
 
 @dataclass(frozen=True)
-class Beyond:
+class Unmodelled:
     """Terms that the residuals hold beside the parameters, tested together.
 
     Attributes
@@ -303,32 +303,54 @@ class Beyond:
         What they leave open of theta, shape (p, p).
     first
         The reading from which they count.
+    told
+        Whether the readings tell the size of each.
     """
 
     size: Array
     probability: float
     covariance: Array
     first: int = 0
+    told: bool = True
 
 
-def _test_beside(q: Array, left: Array, columns: Array, *blocks: int) -> tuple[Array, Array, float, float]:
-    """Return coefficients of columns beside orthonormal ones, their covariance, F, and its probability.
+_NO_PART = 1e-6
+_TOLD_APART = 0.1  # part of added terms, of length 1, beside the parameters and each other; less is not told
 
-    `left` is what q leaves. Errors that readings in a row have in common count, by the worst of some numbers of blocks.
+
+@dataclass(frozen=True)
+class _Added:
+    """Coefficients of added columns, and covariance, 0 where not told; projector on what is not; F, and probability."""
+
+    size: Array
+    covariance: Array
+    unknown: Array
+    ratio: float
+    probability: float
+
+
+def _test_added(q: Array, left: Array, columns: Array, *blocks: int) -> _Added:
+    """Return the fit of columns beside orthonormal ones to what these leave.
+
+    Errors that readings in a row have in common count, by the worst of some numbers of blocks.
     """
-    there = columns - q @ (q.T @ columns)
-    size = np.linalg.norm(there, axis=0)
-    base, triangle = np.linalg.qr(there / size)
+    norm = np.linalg.norm(columns, axis=0)
+    base, part, turn = np.linalg.svd((columns - q @ (q.T @ columns)) / norm, full_matrices=False)
+    kept = part > _TOLD_APART
+    base, back = base[:, kept], (turn[kept] / part[kept, None]).T / norm[:, None]
+    count = base.shape[1]
+    unknown = np.eye(len(norm)) - back @ np.linalg.pinv(back)
+    if not count:
+        return _Added(np.zeros(len(norm)), np.zeros_like(unknown), unknown, 0.0, 1.0)
     explained = base.T @ left
     both = np.hstack([q, base])
     remain = left - base @ explained
     sigma = float(np.sqrt((remain**2).sum() / (len(left) - both.shape[1])))
     inflation = max(find_inflation(remain, both, sigma, each) for each in blocks)
-    ratio = float((explained**2).sum()) / max(base.shape[1] * inflation * sigma**2, 1e-300)
-    back = np.linalg.inv(triangle) / size[:, None]
+    ratio = float((explained**2).sum()) / max(count * inflation * sigma**2, 1e-300)
     freedom = max(len(left) / inflation - both.shape[1], 1.0)
-    p = float(f_tail(ratio, float(base.shape[1]), freedom))
-    return back @ explained, inflation * sigma**2 * back @ back.T, ratio, p
+    p = float(f_tail(ratio, float(count), freedom))
+    return _Added(back @ explained, inflation * sigma**2 * back @ back.T, unknown, ratio, p)
 
 
 def _left_over(theta: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:
@@ -339,7 +361,7 @@ def _left_over(theta: Array, outputs: Array) -> tuple[Array, Array, Array, Array
     return rows, q, r / weight - q @ (q.T @ (r / weight)), weight
 
 
-def find_bend(theta: Array, outputs: Array, power: int) -> Beyond:
+def find_bend(theta: Array, outputs: Array, power: int) -> Unmodelled:
     """Return by how much outputs bend with a power of the field along each axis, 2 or 3, at its full size.
 
     An output ``D m + h + k s^2``, s the field along its axis over the field, makes |m| follow ``k u^3``. Of this 3/5 u
@@ -349,24 +371,26 @@ def find_bend(theta: Array, outputs: Array, power: int) -> Beyond:
     probable t is ``F - 1``, by which k is a part ``b = 1 - 1 / F`` of the one that was fitted, with covariance b C:
     ``b^2 k k' + b C`` counts for ``k k' + C``, nothing where F is below 1.
 
-    With the third power ``u^4`` is divided between soft iron and the fourth degree.
+    With the third power ``u^4`` is divided between soft iron and the fourth degree. In a level turn those of both axes
+    are alike: what readings do not tell of k is taken to be as large as what they do.
     """
     d = outputs.shape[1]
     rows, q, left, _ = _left_over(theta, outputs)
     soft = unpack(theta, d)[1]
     along = _directions(theta, outputs)[1] @ soft / np.abs(np.linalg.det(soft)) ** (1 / d)
     columns = -rows[:, :d] * along**power
-    size, covariance, ratio, p = _test_beside(q, left, columns, BLOCKS)
-    taken = np.linalg.lstsq(rows, columns)[0]
-    real = 1 - 1 / max(ratio, 1.0)
-    square = real**2 * np.outer(size, size) + real * covariance
-    return Beyond(size, p, taken @ square @ taken.T)
+    bend = _test_added(q, left, columns, BLOCKS)
+    absorbed = np.linalg.lstsq(rows, columns)[0]
+    real, size = 1 - 1 / max(bend.ratio, 1.0), bend.size
+    square = real**2 * (np.outer(size, size) + size @ size * bend.unknown) + real * bend.covariance
+    told = float(np.abs(bend.unknown).max()) < _NO_PART
+    return Unmodelled(size, bend.probability, absorbed @ square @ absorbed.T, told=told)
 
 
 _LEAST_PART = 3  # blocks before and after a change
 
 
-def find_change(theta: Array, outputs: Array) -> Beyond:
+def find_change(theta: Array, outputs: Array) -> Unmodelled:
     """Return the most probable change of the hard iron from some reading on.
 
     A change of the hard iron shows in no mean of |m|. For each split the residuals are fitted by a change of the hard
@@ -388,11 +412,11 @@ def find_change(theta: Array, outputs: Array) -> Beyond:
         return float(((orthonormal(columns - q @ (q.T @ columns)).T @ left) ** 2).sum())
 
     first = max(edges, key=explained)
-    change, _, _, p = _test_beside(q, left, after(first), BLOCKS, _LONG_BLOCKS)
+    added = _test_added(q, left, after(first), BLOCKS, _LONG_BLOCKS)
     covariance = np.zeros((len(theta), len(theta)))
     greater = max(first, len(left) - first) / len(left)
-    covariance[:d, :d] = np.outer(change[:d], change[:d]) * greater**2
-    return Beyond(change[:d], min(p * len(edges), 1.0), covariance, first)
+    covariance[:d, :d] = np.outer(added.size[:d], added.size[:d]) * greater**2
+    return Unmodelled(added.size[:d], min(added.probability * len(edges), 1.0), covariance, first)
 
 
 # What the parameters leave open of the corrected field, and directions without readings.
