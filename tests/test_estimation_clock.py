@@ -133,6 +133,26 @@ def test_a_stamp_is_of_the_last_reading_where_readings_are_stamped_as_they_are_f
     assert np.diff(clock.even) == pytest.approx(0.01, rel=1e-3)
 
 
+@pytest.mark.parametrize(("first", "last"), [(0, 0), (4, 0), (0, 7), (6, 3), (9, 9)])
+@pytest.mark.parametrize(("rate", "tick"), [(10, 1.0), (100, 1.0), (1000, 0.1)])
+def test_a_log_that_begins_or_ends_within_a_stamp_is_still_stamped_by_its_first_readings(first, last, rate, tick):
+    each = round(rate * tick)
+    number = np.arange(first * each // 10, 300 * each - last * each // 10)
+    clock = read_clock(np.floor(number / each) * tick)
+    assert clock.rate == pytest.approx(rate, rel=1e-9)
+    assert clock.even == pytest.approx(number / rate, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["seldom", "often"])
+@pytest.mark.parametrize("cut", [1, 2, 3, 7])
+def test_a_log_that_begins_or_ends_between_two_fetches_is_still_stamped_by_its_last_readings(kind, cut):
+    clock = read_clock(fetched(kind)[cut:-cut])
+    late = clock.even - NUMBER[cut:-cut] / 100
+    assert clock.rate == pytest.approx(100, rel=3e-5)
+    assert np.ptp(late) < 0.003
+    assert 0 < np.median(late) < {"seldom": 0.2, "often": 0.04}[kind]
+
+
 def test_readings_lost_between_two_fetches_are_a_gap_behind_the_last_that_came():
     kept = np.ones(N, dtype=bool)
     time = fetched("seldom")

@@ -387,8 +387,10 @@ def _are_of_last(time: Array, marks: Rows, usual: float) -> bool:
     counts = np.diff(np.concatenate([[0], marks, [len(time)]]))
     steps = np.diff(time[np.concatenate([[0], marks])]) / usual
     by_first, by_last = np.abs(steps - counts[:-1]), np.abs(steps - counts[1:])
-    better, worse = np.count_nonzero(by_first > by_last + _ALIKE), np.count_nonzero(by_last > by_first + _ALIKE)
-    return bool(better > 2 * worse)
+    # The log may begin or end within a stamp: the readings of the first and of the last may be fewer than it had.
+    better = int(np.count_nonzero((by_first > by_last + _ALIKE)[1:]))
+    worse = int(np.count_nonzero((by_last > by_first + _ALIKE)[:-1]))
+    return better > 2 * worse
 
 
 def _spread(count: int, number: Rows, stamps: Array, usual: float, above: Rows) -> Array:
