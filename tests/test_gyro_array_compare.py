@@ -150,6 +150,17 @@ def test_a_stream_tells_of_a_gyro_at_once_and_sums_up_at_its_end(imulab_process,
     assert sum(line.endswith("(of 2000 samples)") for line in lines) == 2
 
 
+def test_a_record_of_another_array_is_said_once_of_a_file_and_of_a_stream(imulab_process, tmp_path):
+    array = simulate_array(experiment="static", duration=60.0)
+    il.calibrate_array(replace(array, metadata={"serial": "A1"})).calibration.save(tmp_path / "a1.json")
+    il.write_csv(replace(array, metadata={"serial": "A2"}), tmp_path / "a2.csv")
+    text = (tmp_path / "a2.csv").read_text()
+    for name, pipe in ((str(tmp_path / "a2.csv"), None), ("-", text)):
+        words = ("--calibration", str(tmp_path / "a1.json"), "-o", str(tmp_path / "out.csv"))
+        done = imulab_process("array", "fuse", name, *words, stdin=pipe)
+        assert done.stderr.count("serial A2, but the record was made for A1") == 1, done.stderr
+
+
 def test_a_reader_that_goes_away_ends_it_quietly(run_file):
     shell = f"{sys.executable} -m imulab array fuse {run_file / 'run.csv'} | head -3"
     done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, check=False, timeout=60)

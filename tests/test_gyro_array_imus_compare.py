@@ -123,6 +123,17 @@ def test_a_stuck_sensor_is_said_as_fuse_says_it():
     assert line in il.fuse_imus(spoilt, calibration=true_record(recording)).notes
 
 
+def test_a_reading_that_is_no_number_hides_no_other():
+    recording, _, _ = board_in_hand()
+    columns = dict(recording.columns)
+    for axis in "xyz":
+        columns[f"gyro_{axis}_2"] = columns[f"gyro_{axis}_2"] * np.where(np.arange(1200) > 700, 1.2, 1.0)
+    columns["gyro_x_4"] = np.where(np.arange(1200) == 900, np.nan, columns["gyro_x_4"])
+    spoilt = il.Recording(columns, recording.units, recording.metadata, "hand.csv")
+    lines = il.compare_imus(spoilt, calibration=true_record(recording)).notes
+    assert any("turning, the gyroscopes of IMU 2 are" in line for line in lines if not isinstance(line, Note))
+
+
 def test_slow_turning_accuses_no_record():
     """Fused others are noisier than their mean, since they extrapolate: no sign of a wrong calibration."""
     recording, _, _ = board_in_hand(PLACES[:4] * 0.3, turning=0.9)

@@ -52,6 +52,7 @@ def test_joined_on_the_first_within_the_overlap_in_one_unit(imulab, tmp_path):
     np.testing.assert_allclose(array.columns["gyro_2"], motion(time), atol=1e-3)
     np.testing.assert_allclose(array.columns["gyro_3"], -motion(time), atol=1e-3)
     assert array.metadata["element_2"] == "g2.csv"
+    assert merge_recordings([il.read(tmp_path / file) for file in files]).recording.from_file
     assert imulab("array", "fuse", "array.csv", "-o", "rate.csv").returncode == 0
 
 

@@ -526,7 +526,7 @@ class Fuser:
     weights: bool = False
     clock: SampleClock = field(default_factory=SampleClock)
     health: Health | None = None
-    tell: Callable[[str], None] = lambda _: None
+    tell: Callable[[str], None] | None = None
     name: str = "recording"
     checks: Checks | None = None
     before: Array | None = None
@@ -604,10 +604,12 @@ class Fuser:
 
     def _warn_other_unit(self, block: Recording) -> None:
         records = (self.options.calibration, self.options.initial_bias)
-        self.other = [
-            line for each in records if not isinstance(each, str | None) for line in warn_other_unit(each.sensor, block)
-        ]
-        for line in self.other:
+        known = [each.sensor for each in records if not isinstance(each, str | None)]
+        lines = [*dict.fromkeys(line for sensor in known for line in warn_other_unit(sensor, block))]
+        if self.tell is None:
+            self.other = lines
+            return
+        for line in lines:  # said now, and not at the end again
             self.tell(line)
 
     def _drop_zeros(self, readings: Array) -> None:
@@ -632,7 +634,8 @@ class Fuser:
         flags = out.flags[fused_before:] if out.flags is not None else None
         if self.health is not None:
             for key in self.health.watch(time, flags, rate):
-                self.tell(self.health.first(key))
+                if self.tell is not None:
+                    self.tell(self.health.first(key))
         return Fused(
             time=time,
             rate=rate,

@@ -115,6 +115,7 @@ def merge_recordings(
         metadata=_head(recordings),
         name="the merged recording",
         corrected_by=tuple(dict.fromkeys(entry for recording in recordings for entry in recording.corrected_by)),
+        from_file=all(recording.from_file for recording in recordings),
     )
     return Merged(merged, tuple(notes))
 

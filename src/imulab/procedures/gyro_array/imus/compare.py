@@ -223,7 +223,8 @@ def compare_imus(
             gyro[part].append(_apart(turn, k, sound[:, 1], chosen, out.rate, out.rate_std, settings.gyro_noise[k]))
     if not any(row for rows in accel.values() for row in rows):
         raise DataError(f"{recording.name}: no IMU has {_FEWEST_SAMPLES} samples within its range")
-    messages = [*recording.notes, *_findings(accel, gyro, _motion_scatter(record, turn[parts["turning"]]))]
+    rates = turn[parts["turning"][:, None] & whole[:, 1]]
+    messages = [*recording.notes, *_findings(accel, gyro, _motion_scatter(record, rates))]
     notes += fuser.lines(failed=True)
     named = [prefixed(recording.name, line) for line in messages]
     return BoardComparison(accel, gyro, (*fuser.other, *notes, *named))
@@ -286,7 +287,7 @@ def _middle(rows: list[ImuDifference | None], name: str) -> float | None:
 def _motion_scatter(record: Calibration, turn: Array) -> tuple[float, float]:
     """Return how many times the noise at rest accelerometers and gyroscopes may scatter in motion, by the record.
 
-    That is what they scattered by when it was made, times the square of how much faster these rates, (n, K, 3), are:
+    That is what they scattered by when it was made, times the square of how much faster these rates, (n, 3), are:
     readings of unlike age differ by the angular acceleration.
     """
     held = imus_of(record)
@@ -314,13 +315,17 @@ def _findings(
             nearer = f"{where}, the mean of the others is nearer to the accelerometers of IMU {worse}"
             lines.append(_broken(f"{nearer} than the others fused"))
         for word, rows, usual in (("accelerometers", accel[part], scatter[0]), ("gyroscopes", gyro[part], scatter[1])):
-            times = [0.0 if row is None or not row.fused or not row.stated else row.fused / row.stated for row in rows]
+            times = {
+                k: row.fused / row.stated
+                for k, row in enumerate(rows, start=1)
+                if row is not None and row.fused and row.stated
+            }
             most = _CONTRADICTED * usual if part == "turning" else _FAR
-            off = " ".join(str(k + 1) for k, each in enumerate(times) if each > most)
+            off = " ".join(str(k) for k, each in times.items() if each > most)
             text = "times as far from the fused others as the noise at rest makes them"
             if off and not (worse and rows is accel[part]):
-                lines.append(_broken(f"{where}, the {word} of IMU {off} are {number(max(times), 2)} {text}"))
-            elif not off and part == "turning" and (middle := float(np.median(times))) > _FAR:
+                lines.append(_broken(f"{where}, the {word} of IMU {off} are {number(max(times.values()), 2)} {text}"))
+            elif not off and part == "turning" and times and (middle := float(np.median([*times.values()]))) > _FAR:
                 much = f"{where}, the {word} are {number(middle, 2)} {text}"
                 lines.append(Note(f"{much}; synchronised IMUs, or a time of each, lower that"))
     if not any(accel["turning"]):

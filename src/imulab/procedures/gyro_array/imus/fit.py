@@ -233,7 +233,7 @@ def fit_board(
         *warn_positions(solution, covariance),
         *warn_halves(solution, apart, deviation),
         *warn_rests(prepared, solution),
-        *warn_scatter(summary, _older(prepared, solution)),
+        *warn_scatter(summary, _scatter_by_age(prepared, solution)),
         *warn_shaking(prepared),
         *warn_size(factors, source),
     ]
@@ -328,8 +328,8 @@ def _coherence(prepared: Prepared, solution: Solution) -> float:
     return float((slope * al).sum() / max(math.sqrt((slope**2).sum() * (al**2).sum()), 1e-300))
 
 
-def _older(prepared: Prepared, solution: Solution) -> float:
-    """Return by what readings of that age make the accelerometers scatter more in motion than at rest."""
+def _scatter_by_age(prepared: Prepared, solution: Solution) -> float:
+    """Return the scatter of the accelerometers in motion over that at rest, as far as the age of readings makes it."""
     measured = prepared.measured
     change = np.median([np.square(spline(measured.time, 1)).mean(axis=1) for spline in measured.accel])
     return float(math.sqrt(1 + solution.weights.age**2 * change / np.square(measured.accel_noise).mean()))
@@ -512,8 +512,8 @@ def warn_rests(prepared: Prepared, solution: Solution) -> list[str]:
     ]
 
 
-def warn_scatter(summary: ImusSummary, older: float = 1.0) -> list[str]:
-    """Return how much more the readings scatter in motion than at rest, of which their age explains `older` times."""
+def warn_scatter(summary: ImusSummary, by_age: float = 1.0) -> list[str]:
+    """Return how much more the readings scatter in motion than at rest, of which their age explains `by_age` times."""
     findings: list[str] = []
     if summary.age.value:
         findings.append(
@@ -523,7 +523,7 @@ def warn_scatter(summary: ImusSummary, older: float = 1.0) -> list[str]:
             )
         )
     factor = max(summary.accel_factor, summary.gyro_factor)
-    if factor > _UNLIKE_REST or summary.accel_factor > _UNEXPLAINED * older:
+    if factor > _UNLIKE_REST or summary.accel_factor > _UNEXPLAINED * by_age:
         what = "accelerometers" if summary.accel_factor >= summary.gyro_factor else "gyroscopes"
         findings.append(
             Finding(
@@ -536,10 +536,12 @@ def warn_scatter(summary: ImusSummary, older: float = 1.0) -> list[str]:
 
 
 def warn_shaking(prepared: Prepared) -> list[str]:
-    """Return by what the accelerometers shake in motion faster than they are read."""
+    """Return a warning of vibration above a third of the sampling rate, where it is 25 times the noise or more."""
     measured = prepared.measured
     run = np.searchsorted(measured.first, np.arange(len(measured.time)), side="right")
     whole = run[6:] == run[:-6]
+    if not whole.any():
+        return []
     # Sixth differences leave 1e-3 of what a hand does below a tenth of the sampling rate, and half above a third.
     # By their upper quartile, as knocks are few and a motor may run for a third of the motion only.
     shaking = [quantile(np.abs(np.diff(each(measured.time), 6, axis=0)[whole]), 0.75) for each in measured.accel]

@@ -455,7 +455,7 @@ class _Problem:
         return math.sqrt(max(square - float(usual), 0.0))
 
 
-def _of_bias(size: int) -> NDArray[np.intp]:
+def _bias_places(size: int) -> NDArray[np.intp]:
     """Return the places of the accelerometers' biases among so many numbers, shape (3 K,)."""
     return np.arange(size).reshape(-1, NUMBERS)[:, ACCEL_BIAS].ravel()
 
@@ -464,13 +464,13 @@ def _with_offsets(information: Array, scores: Array, offset: float) -> tuple[Arr
     """Return S of halves and q of stretches where in each half every bias is off by an unknown, of `offset` m/s^2."""
     if not offset:
         return information, scores
-    of_bias = _of_bias(scores.shape[1])
+    biases = _bias_places(scores.shape[1])
     halves, parts = [], []
     for half, its_scores in zip(information, np.split(scores, 2), strict=True):
-        unknown = half[np.ix_(of_bias, of_bias)] + np.eye(len(of_bias)) / offset**2
-        gain = np.linalg.solve(unknown, half[of_bias])
-        halves.append(half - half[:, of_bias] @ gain)
-        parts.append(its_scores - its_scores[:, of_bias] @ gain)
+        unknown = half[np.ix_(biases, biases)] + np.eye(len(biases)) / offset**2
+        gain = np.linalg.solve(unknown, half[biases])
+        halves.append(half - half[:, biases] @ gain)
+        parts.append(its_scores - its_scores[:, biases] @ gain)
     return np.array(halves), np.concatenate(parts)
 
 
@@ -480,16 +480,16 @@ def _offset(information: Array, scores: Array, rest: Array, slope: Array, free: 
     `information`, `scores` are S of the halves and q of the stretches, `rest` and `slope` those of all else, of which
     `free` are fitted.
     """
-    of_bias = _of_bias(len(slope))
-    size = len(of_bias)
-    across = np.concatenate([half[np.ix_(free, of_bias)] for half in information], axis=1)
+    biases = _bias_places(len(slope))
+    size = len(biases)
+    across = np.concatenate([half[np.ix_(free, biases)] for half in information], axis=1)
     whole = (information.sum(0) + rest)[np.ix_(free, free)]
     solved = np.linalg.solve(whole, np.column_stack([across, (scores.sum(0) + slope)[free]]))
-    told = -across.T @ solved[:, :-1]
+    information_of_offsets = -across.T @ solved[:, :-1]
     for k, half in enumerate(information):
-        told[k * size : (k + 1) * size, k * size : (k + 1) * size] += half[np.ix_(of_bias, of_bias)]
-    by_half = np.concatenate([part.sum(0)[of_bias] for part in np.split(scores, 2)])
-    values, directions = np.linalg.eigh(told)
+        information_of_offsets[k * size : (k + 1) * size, k * size : (k + 1) * size] += half[np.ix_(biases, biases)]
+    by_half = np.concatenate([part.sum(0)[biases] for part in np.split(scores, 2)])
+    values, directions = np.linalg.eigh(information_of_offsets)
     along = directions.T @ (by_half - across.T @ solved[:, -1])
     known = values > 1e-6 * values[-1]
     excess = float((np.square(along[known]) / values[known] - 1).sum())
