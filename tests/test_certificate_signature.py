@@ -92,6 +92,28 @@ def test_one_digit_or_another_indent_breaks_it(sign, keys):
             verified(changed, keys["ec"])
 
 
+def test_a_signature_of_a_part_is_not_one_of_the_certificate(sign, keys, capsys):
+    """A genuine certificate within another, whose signature is of it alone, and beside a signature that is no more."""
+    key = keys["ec"]
+    assert sign(pem_of(key) + certificate_of(key)) == 0
+    assert main(["certificate", RECORD, "--lab", "lab.toml", "-o", "plain.xml"]) == 0
+    genuine, signed = etree.parse("plain.xml").getroot(), etree.parse("cert.xml").getroot()
+    genuine.set("Id", "part")
+    other = etree.fromstring(Path("plain.xml").read_bytes().replace(b"<si:value>2", b"<si:value>3", 1))
+    other.append(genuine)
+    signer = signxml.XMLSigner(method=signxml.methods.enveloped, signature_algorithm="ecdsa-sha256")
+    made = signer.sign(other, key=pem_of(key), cert=certificate_of(key).decode(), reference_uri="#part")
+    Path("other.xml").write_bytes(etree.tostring(made, xml_declaration=True, encoding="utf-8"))
+    made.insert(0, signed.find("{*}Signature"))
+    Path("both.xml").write_bytes(etree.tostring(made, xml_declaration=True, encoding="utf-8"))
+    assert verified(Path("other.xml").read_bytes(), key).tag == other.tag
+    capsys.readouterr()
+    for name in ("other.xml", "both.xml"):
+        assert main(["show", name]) == 2
+        assert capsys.readouterr().err.startswith(f"imulab: {name}: the signature ")
+    assert main(["show", "cert.xml"]) == 0
+
+
 def test_the_schema_holds(sign, keys, real_data):
     path = real_data / "dcc" / "dcc" / "v3.3.0.xsd"
     if not path.exists():

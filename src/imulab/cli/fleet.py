@@ -115,8 +115,11 @@ def certificate(
             folder, output, lab=lab, limits=limits, language=language, fonts=fonts, sign=sign, progress=update
         )
     print(f"certificates: {len(units) - len(refused)} in {output}")
-    for remark in template_remarks(lab):
-        warn(remark)
+    certified = next((row.summary for row in units if row.summary and row.unit.serial not in refused), None)
+    if certified is not None:
+        tumbled = certified.procedure == "tumble"
+        for remark in template_remarks(lab, certified.parameters, tumbled=tumbled):
+            warn(remark)
     if not refused:
         return 0
     print("".join(f"none: {serial}: {reason}\n" for serial, reason in refused.items()), end="")
