@@ -1,5 +1,7 @@
 """The noise of a unit by the command line: what each program's filter wants, and every refusal, one line each."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -203,6 +205,9 @@ def test_the_keys_of_a_program_are_written_where_the_name_says_so(imulab, tmp_pa
         assert f"\n{row}" in (tmp_path / name).read_text()
     assert imulab("noise", "fit", "rest.csv", "--for", "px4", "-o", "r.json").stdout.endswith("record: r.json\n")
     assert il.load(tmp_path / "r.json").procedure == "noise"
+    done = imulab("noise", "fit", "rest.csv", "--for", "kalibr", "--json", "-o", "j.yaml")
+    assert json.loads(done.stdout)["procedure"] == "noise"
+    assert yaml.safe_load((tmp_path / "j.yaml").read_text()) == written
 
 
 @pytest.mark.parametrize("name", ["r.html", "r.csv", "r.yaml", "r.params"])

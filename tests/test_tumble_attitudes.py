@@ -861,7 +861,7 @@ def test_a_gap_is_said_and_asks_to_look_where_it_is_long(seconds, kind):
     kept = (time < 20.0) | (time >= 20.0 + seconds)
     cut = replace(recording, columns={name: column[kept] for name, column in recording.columns.items()})
     record = il.fit_tumble(cut, gravity=9.80665).calibration
-    text = f"1 gap in time, the longest {seconds + 0.01:.3g} s after row 2000: attitudes within it are lost"
+    text = f"1 gap in time, the longest {seconds + 0.01:.3g} s after row 2000: an attitude within it is lost"
     assert [line for line in record.warnings if "gap" in line] == [text]
     assert record.verdict.state == kind
     assert not any("gap" in line for line in il.fit_tumble(recording, gravity=9.80665).calibration.warnings)

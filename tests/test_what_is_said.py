@@ -12,7 +12,7 @@ import imulab as il
 from conftest import REPOSITORY
 from imulab.cli.app import commands
 from imulab.display import Finding, one_thing
-from imulab.errors import ObservabilityError, OptionError
+from imulab.errors import ObservabilityError, OptionError, ReadError, readable
 from imulab.live.formats import LineStream, UnknownFormatError
 from imulab.procedures.noise.wants import PROGRAMS
 from imulab.procedures.views import exhibits_of
@@ -42,8 +42,13 @@ def test_the_stated_serial_number_is_the_record_s(imulab, tmp_path):
 def test_small_units_are_written_with_their_sign():
     """A typed 20 ug is read; what is printed is 20 µg, in every sentence and title (a record's option is as typed)."""
     sources = sorted((REPOSITORY / "src" / "imulab").rglob("*.py"))
-    printed = {path.name: re.findall(r"\} u[gs]\b|, u[gs]\"", path.read_text(encoding="utf-8")) for path in sources}
-    assert {name: places for name, places in printed.items() if places} == {"solve.py": ["} ug"]}
+    printed = {
+        path.relative_to(REPOSITORY).as_posix(): re.findall(r"\} u[gs]\b|, u[gs]\"", path.read_text(encoding="utf-8"))
+        for path in sources
+    }
+    assert {name: places for name, places in printed.items() if places} == {
+        "src/imulab/procedures/tumble/solve.py": ["} ug"]
+    }
 
 
 def test_a_report_on_noise_says_white_noise_in_one_unit_and_what_programs_take_in_si():
@@ -320,6 +325,11 @@ def test_a_folder_in_place_of_a_file_is_refused_with_the_file_in_it(imulab, tmp_
     for words, message in wanted.items():
         done = imulab(*words.split())
         assert (done.returncode, done.stderr.strip().endswith(message)) == (2, True), done.stderr
+    with (
+        pytest.raises(ReadError, match=r"^the manifest of the line: expected a file, found a folder$"),
+        readable("the manifest of the line", ending=".json"),
+    ):
+        (tmp_path / "spin").open()
 
 
 @pytest.mark.parametrize("words", ["warmup simulate --temperatures 0 --cycles 1 --duration 60s", "thermal simulate"])
@@ -327,7 +337,7 @@ def test_recordings_of_before_in_a_folder_are_named(imulab, tmp_path, words):
     (tmp_path / "cycles").mkdir()
     (tmp_path / "cycles" / "cycle_+99_1.csv").write_text("time [s]\n0\n")
     said = imulab(*words.split(), "-o", "cycles").stderr
-    assert "cycles: 1 CSV files from before are still there (cycle_+99_1.csv): cycles/*.csv names them too" in said
+    assert "cycles: 1 CSV file from before is still there (cycle_+99_1.csv): cycles/*.csv takes in" in said
     again = imulab(*words.split(), "-o", "new").stderr + imulab(*words.split(), "-o", "new").stderr
     assert "from before" not in again
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from imulab.display import one_thing, printable
 
@@ -146,7 +146,10 @@ def readable(name: object, kind: type[ImulabError] = ReadError, ending: str = ""
     except FileNotFoundError:
         raise kind(f"{name}: no such file") from None
     except IsADirectoryError:
-        inside = [each for each in os.listdir(str(name)) if ending and each.endswith(ending)]  # noqa: PTH208
+        inside: list[str] = []
+        if ending:
+            with suppress(OSError):  # the name need not be a path
+                inside = [each for each in os.listdir(str(name)) if each.endswith(ending)]  # noqa: PTH208
         raise kind(folder_in_place(name, inside=inside)) from None
     except OSError as error:
         raise kind(f"{name}: cannot be read: {error.strerror}") from None

@@ -157,10 +157,10 @@ def fit(
     with labelled("--{}", ["rate", "step"]), naming(files[0]) if saved else nullcontext():
         wanted = noise_for(record, program, rate=hertz, step=seconds)
     printed = "\n".join(f"{key}: {value:.4g}" for key, value in wanted.items())
-    finish(record, None if keys_file else output, report, json=json, describe=lambda _: printed)
     if keys_file:
         _write_keys(wanted, keys_file, program, files)
-        print(f"{program}: {keys_file}")
+        printed += f"\n{program}: {keys_file}"
+    finish(record, None if keys_file else output, report, json=json, describe=lambda _: printed)
     for key in [key for key, value in wanted.items() if value == 0]:
         warn(
             f"{key}: none was seen in {fit_of(record).length.value:.4g} s, and 0 makes a filter trust a bias for ever; "

@@ -303,7 +303,8 @@ def warn_older(folder: str, written: Iterable[str]) -> None:
     older = sorted({path.name for path in Path(folder).glob("*.csv")} - set(written))
     if older:
         names = first_of(older, 3)
-        warn(f"{folder}: {len(older)} CSV files from before are still there ({names}): {folder}/*.csv names them too")
+        many = "1 CSV file from before is" if len(older) == 1 else f"{len(older)} CSV files from before are"
+        warn(f"{folder}: {many} still there ({names}): {folder}/*.csv takes in what is not of this run")
 
 
 @contextmanager

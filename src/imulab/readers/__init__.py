@@ -265,8 +265,8 @@ def _content_blocks(
                 except OSError as error:
                     raise ReadError(f"{name}: cannot be read: {error.strerror}") from None
             if begin.startswith((b"%PDF-", b"<?xml")):
-                found = "a PDF" if begin.startswith(b"%") else "an XML file"
-                raise ReadError(f"{name}: expected a recording, found {found} (imulab show reads certificates)")
+                what = "a PDF" if begin.startswith(b"%") else "an XML file"
+                raise ReadError(f"{name}: expected a recording, found {what} (imulab show reads certificates)")
     chosen = {"layout": layout and layout.name, "topic": selection.topic, "instance": selection.instance}
     parts = "".join(f", {key} {value}" for key, value in chosen.items() if value is not None)
     _LOG.info("%s: a %s file%s", name, kind.name, parts)

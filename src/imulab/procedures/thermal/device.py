@@ -250,8 +250,8 @@ def _read_temperature(columns: Mapping[str, Any], recording: Recording) -> Array
     if name == "temperature" and name not in recording and len(others) == 1:
         (name,) = others
     if name not in recording:
-        own = "expected what the unit's own thermometer says, which the record's laws follow"
-        raise recording.lacking(f"column {name}", name, own)
+        advice = "expected what the unit's own thermometer says, which the record's laws follow"
+        raise recording.lacking(f"column {name}", name, advice)
     if parse_unit(recording.units[name]).quantity != "temperature":
         raise DataError(f"{recording.name}: column {name}: expected a temperature, found {recording.units[name]}")
     return to_si(recording.column(name), recording.units[name])

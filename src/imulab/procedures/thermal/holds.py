@@ -233,7 +233,7 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
     recording = np.array(owner)
     held = np.array([[number, cut.attitude] for number, cut in zip(owner, cuts, strict=True)])
     _, hold, parts = np.unique(held, axis=0, return_inverse=True, return_counts=True)
-    group = np.where(parts > 1, np.cumsum(parts > 1) - 1, -1)[hold]
+    group = np.where(parts > 1, np.cumsum(parts > 1) - 1, -1)[hold.reshape(-1)]  # (n, 1) in NumPy 2.0
     shared = group < 0
     wander, drift_notes = _wander_covariance(cuts, group, [recordings[number].name for number in owner])
     return Holds(
@@ -507,8 +507,8 @@ def _choose_temperature(recording: Recording, column: str | None) -> Recording:
         )
     if candidates:
         return _use_temperature(recording, candidates[0])
-    own = "expected what the unit's own thermometer says (--temperature-column NAME where it is called otherwise)"
-    raise recording.lacking("column temperature", "temperature", own)
+    advice = "expected what the unit's own thermometer says (--temperature-column NAME where it is called otherwise)"
+    raise recording.lacking("column temperature", "temperature", advice)
 
 
 def _use_temperature(recording: Recording, column: str) -> Recording:

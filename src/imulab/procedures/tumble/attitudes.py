@@ -742,7 +742,7 @@ def _notes(blocks: _Blocks, variance: Array, recording: Recording, time: Array) 
         notes.append(
             kind(
                 f"{len(gaps)} gap{'s' * (len(gaps) > 1)} in time, the longest {step[worst]:.3g} s after "
-                f"{recording.place(worst)}: attitudes within it are lost",
+                f"{recording.place(worst)}: an attitude within it is lost",
                 "record again without lost samples, by a faster link or at a lower rate",
             )
         )
