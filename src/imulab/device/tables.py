@@ -391,6 +391,8 @@ def polynomial(nonlinearity: Array) -> tuple[Field, Field, Field]:
 
 def monotone_range(nonlinearity: Array) -> tuple[float, float]:
     """Return the readings between the turning points of ``s + k2 s^2 + ...`` next to zero, infinite without any."""
+    if not nonlinearity.any():
+        return -np.inf, np.inf
     powers = np.concatenate([[0.0, 1.0], nonlinearity])
     slope = np.polynomial.polynomial.polyder(powers)
     try:
