@@ -338,11 +338,11 @@ def f_test(cost: float, size: int, larger_cost: float, larger_size: int, count: 
     return float(f_tail(max(gain / noise, 0.0), larger_size - size, count - larger_size))
 
 
-def restricted_log_likelihood(covariance: Array, design: Array, values: Array) -> Array:
-    """Return the restricted log likelihood of values under each of several covariances, up to a constant, shape (k,).
+def restricted_log_likelihood(covariance: Array, design: Array, values: Array, white: Array | float = 0.0) -> Array:
+    """Return the restricted log likelihood of values under each of several covariances, up to a constant.
 
-    ``-1/2 (ln|V| + ln|A' V^-1 A| + r' V^-1 r)``, r what the best fit of the design leaves: the likelihood of what no
-    parameters of the design can change.
+    ``-1/2 (ln|K' V K| + y' K (K' V K)^-1 K' y)``, K the directions across the design: the likelihood of what no
+    parameters of the design can change. White noise adds to each eigenvalue of ``K' V K`` the same.
 
     Source: Patterson and Thompson, Biometrika 58 (1971) 545; Harville, J. Am. Stat. Assoc. 72 (1977) 320.
 
@@ -353,16 +353,22 @@ def restricted_log_likelihood(covariance: Array, design: Array, values: Array) -
     design
         A, shape (n, p).
     values
-        Shape (n,).
+        y, shape (n,).
+    white
+        Variances of noise to be added to all values: one, or several, shape (j,).
+
+    Returns
+    -------
+    Array
+        Shape (k,), or (k, j).
     """
-    root = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(root, np.column_stack([design, values])[None])
-    columns, left = white[:, :, :-1], white[:, :, -1:]
-    normal, pulled = np.swapaxes(columns, 1, 2) @ columns, np.swapaxes(columns, 1, 2) @ left
-    square = (left**2).sum(axis=(1, 2)) - (pulled * np.linalg.solve(normal, pulled)).sum(axis=(1, 2))
-    spread = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    logs: Array = -spread - np.linalg.slogdet(normal)[1] / 2 - square / 2
-    return logs
+    across = np.linalg.qr(design, mode="complete")[0][:, design.shape[1] :]
+    eigenvalues, axes = np.linalg.eigh(across.T @ covariance @ across)
+    squares = (np.swapaxes(axes, 1, 2) @ (across.T @ values)) ** 2
+    rounding = np.finfo(float).eps * eigenvalues[:, -1:]
+    variances = np.maximum(eigenvalues, rounding)[:, None] + np.reshape(white, (-1, 1))
+    logs: Array = -(np.log(variances) + squares[:, None] / variances).sum(axis=2) / 2
+    return logs.reshape(len(covariance), *np.shape(white))
 
 
 def bayesian_information(cost: float, size: int, count: int) -> float:

@@ -302,16 +302,14 @@ def _with_losses(estimate: TurnEstimate, matrix: Array, columns: Array, by_zero:
     if linearity is not None and linearity.probability < SCALE_CHANGES_WITH_RATE.level:
         jacobian = np.column_stack([jacobian, columns])
     residual = estimate.project(estimate.solution.residual[:, None])[:, 0]
-    size, n = median(np.diag(matrix)), len(matrix)
-    beyond = np.concatenate([size * _BEYOND, estimate.beyond * _AROUND])[:, None, None] * np.eye(n)
+    beyond = np.concatenate([median(np.diag(matrix)) * _BEYOND, estimate.beyond * _AROUND])
 
-    def likelihoods(further: Array) -> Array:
-        return restricted_log_likelihood(matrix + further + beyond, jacobian, residual)
+    def likelihoods(shares: Array, further: Array) -> Array:
+        return restricted_log_likelihood(matrix + shares[:, None, None] * further, jacobian, residual, beyond)
 
-    wander = _own_rates(by_zero * estimate.solution.rest.scatter)
-    none = np.array([likelihoods(share * wander) for share in (0.0, *_WANDERS.tolist())])
+    none = likelihoods(np.append(0.0, _WANDERS), _own_rates(by_zero * estimate.solution.rest.scatter))
     by_loss = loss_covariance(estimate)
-    logs = np.array([likelihoods(share * by_loss) for share in _LOST.tolist()])
+    logs = likelihoods(_LOST, by_loss)
     top = max(none.max(), logs.max())
     lost, kept = np.exp(logs - top).mean(axis=1), float(np.exp(none - top).mean(axis=1).max())
     posterior = lost / len(_LOST) / (lost.mean() + kept)
@@ -324,7 +322,7 @@ def _with_losses(estimate: TurnEstimate, matrix: Array, columns: Array, by_zero:
         # No share lies below 0: by chance half of all gains are 0.
         samples_lost=gained > chi_square_limit(1, 2 * SAMPLES_LOST.level),
     )
-    return estimate, matrix + _LOST[best] * by_loss + beyond[scatter]
+    return estimate, matrix + _LOST[best] * by_loss + beyond[scatter] * np.eye(len(matrix))
 
 
 def _own_rates(by_rate: Array) -> Array:
