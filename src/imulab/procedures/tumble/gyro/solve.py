@@ -290,6 +290,7 @@ def _fit_delay_line(when: Array, delay: Array) -> ClockComparison | None:
 _WORST_TURN = np.radians(20.0)
 _UNIT_DOUBTED = np.radians(8.0)
 _STANDS_OUT = 3.0  # medians; of 30 turns whose misses are normal, none is so far out in 94 % of tests
+_TOLERANCE = 1e-6  # of the parameters: turns miss by mrad, so that a step leaves a hundredth of itself or less
 _REWEIGHTED = 6  # fits with bounded influence before turns are called out
 _TOO_MANY_OUT = 3  # one turn in so many
 _FEWEST_LEFT = 6  # degrees of freedom that the test of a turn must leave
@@ -576,7 +577,7 @@ def _fitted(segments: Segments, scale: Array, theta: Array, weights: Array) -> F
         lambda parameters: model(segments, scale, parameters, theta.size > 9),
         theta,
         np.repeat(weights, 3),
-        tolerance=1e-8,
+        tolerance=_TOLERANCE,
     )
 
 
