@@ -23,6 +23,8 @@ enum { DATE = 1 << 30, ORDER = 28, FLAGS = DATE | 3 << ORDER };
 static const double TENS[] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,  1e8,  1e9,  1e10, 1e11,
                               1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20, 1e21, 1e22};
 
+static const double SIGNS[] = {1.0, -1.0};
+
 enum { LOWEST_POWER = -342, HIGHEST_POWER = 308, POWERS = HIGHEST_POWER - LOWEST_POWER + 1 };
 
 /* 5^q, scaled to 128 bits with the highest one set: high and low half of each; filled by prepare(). */
@@ -31,7 +33,7 @@ static int prepared = 0;
 
 #ifdef __SIZEOF_INT128__
 /* The bits of w 10^q, rounded to nearest even; w > 0. */
-static double scaled(uint64_t w, int64_t q) {
+static inline double scaled(uint64_t w, int64_t q) {
     if (q < LOWEST_POWER) return 0.0;
     if (q > HIGHEST_POWER) return (double)INFINITY;
     const int lz = __builtin_clzll(w);
@@ -73,7 +75,7 @@ static double scaled(uint64_t w, int64_t q) {
 #endif
 
 /* w 10^q if that is known exactly rounded; returns 0 where it is not. */
-static int decimal(uint64_t w, int64_t q, double *value) {
+static inline int decimal(uint64_t w, int64_t q, double *value) {
     if (w == 0) {
         *value = 0.0;
     } else if (FLT_EVAL_METHOD == 0 && w <= (UINT64_C(1) << 53) && q >= -22 && q <= 22) {
@@ -156,7 +158,7 @@ static int number(const char *p, const char *end, double *value, PyThreadState *
 }
 
 /* Eight digits at p -> *w, or 0 if they are not eight digits. */
-static int eight_digits(const char *p, uint64_t *w) {
+static inline int eight_digits(const char *p, uint64_t *w) {
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
     uint64_t v;
     memcpy(&v, p, sizeof v);
@@ -174,14 +176,14 @@ static int eight_digits(const char *p, uint64_t *w) {
 #endif
 }
 
-static const char *digits(const char *p, const char *end, uint64_t *w) {
+static inline const char *digits(const char *p, const char *end, uint64_t *w) {
     while (end - p >= 8 && eight_digits(p, w)) p += 8;
     for (; p < end && *p >= '0' && *p <= '9'; p++) *w = 10u * *w + (uint64_t)(*p - '0');
     return p;
 }
 
 /* A plain decimal that begins at p: where it ends, or NULL if it needs the careful way. */
-static const char *plain_number(const char *p, const char *end, double *value) {
+static inline const char *plain_number(const char *p, const char *end, double *value) {
     const int negative = p < end && *p == '-';
     p += negative;
     uint64_t w = 0;
@@ -207,7 +209,7 @@ static const char *plain_number(const char *p, const char *end, double *value) {
     }
     double magnitude;
     if (!decimal(w, exponent, &magnitude)) return NULL;
-    *value = negative ? -magnitude : magnitude;
+    *value = SIGNS[negative] * magnitude; /* no processor foresees the sign of a sensor's noise */
     return p;
 }
 
