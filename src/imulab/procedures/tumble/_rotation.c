@@ -13,8 +13,8 @@ static Quaternion half_back(const double *vector) {
     const double x = -0.5 * vector[0], y = -0.5 * vector[1], z = -0.5 * vector[2];
     const double q = 0.25 * (x * x + y * y + z * z); /* the square of half its angle */
     if (q < 0.01) {
-        const double s = 1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (1.0 - q / 110.0))));
-        const double w = 1.0 - q / 2.0 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0 * (1.0 - q / 90.0 * (1.0 - q / 132.0)))));
+        const double s = 1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0 - q * (1.0 / 362880.0))));
+        const double w = 1.0 - q * (0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0 - q * (1.0 / 40320.0 - q * (1.0 / 3628800.0)))));
         return (Quaternion){w, 0.5 * s * x, 0.5 * s * y, 0.5 * s * z};
     }
     const double half = sqrt(q), s = 0.5 * sin(half) / half;
@@ -36,27 +36,31 @@ static void matrix_of(Quaternion q, double *m) {
     m[6] = 2.0 * (x * z - w * y), m[7] = 2.0 * (y * z + w * x), m[8] = 1.0 - 2.0 * (x * x + y * y);
 }
 
-/* One segment: its matrix; the sum of C' x over its steps for each of the k weights x, with C to a step's middle; and
+/* One segment: its matrix; the sum of C' x dt over its steps for each of the k weights x, with C to a step's middle; and
    where `squares` is not NULL, the sum of (C' a)(C' a)' of the steps' own rotation vectors a. */
-static void turn(const double *angle, const double *weights, Py_ssize_t k, Py_ssize_t steps, double *matrix, double *sums, double *squares) {
+static void turn(const double *rate, const double *step, const double *weights, Py_ssize_t k, Py_ssize_t steps, double *matrix,
+                 double *sums, double *squares) {
     Quaternion whole = {1.0, 0.0, 0.0, 0.0};
     double middle[9]; /* C' */
     for (Py_ssize_t j = 0; j < 9 * k; j++) sums[j] = 0.0;
     for (int j = 0; squares && j < 9; j++) squares[j] = 0.0;
-    for (Py_ssize_t i = 0; i < steps; i++, angle += 3, weights += k) {
-        int moves = angle[0] != 0.0 || angle[1] != 0.0 || angle[2] != 0.0;
-        for (Py_ssize_t j = 0; j < k; j++) moves |= weights[j] != 0.0;
-        if (!moves) continue; /* beyond a turn's end */
-        const Quaternion half = half_back(angle), halfway = composed(half, whole);
-        whole = composed(half, halfway);
-        if (k > 0 || squares) matrix_of((Quaternion){halfway.w, -halfway.x, -halfway.y, -halfway.z}, middle);
+    for (Py_ssize_t i = 0; i < steps; i++, rate += 3, weights += k) {
+        const double dt = step[i], angle[3] = {rate[0] * dt, rate[1] * dt, rate[2] * dt};
+        if (dt == 0.0) continue; /* beyond a turn's end */
+        const Quaternion half = half_back(angle), full = composed(half, half);
+        if (k > 0 || squares) {
+            const Quaternion halfway = composed(half, whole);
+            matrix_of((Quaternion){halfway.w, -halfway.x, -halfway.y, -halfway.z}, middle);
+        }
+        whole = composed(full, whole); /* not by halves: each step waits for the one before */
         if (squares) {
             double moved[3];
             for (int a = 0; a < 3; a++) moved[a] = middle[3 * a] * angle[0] + middle[3 * a + 1] * angle[1] + middle[3 * a + 2] * angle[2];
             for (int j = 0; j < 9; j++) squares[j] += moved[j / 3] * moved[j % 3];
         }
         for (Py_ssize_t j = 0; j < k; j++) {
-            for (int a = 0; a < 9; a++) sums[9 * j + a] += weights[j] * middle[a];
+            const double x = weights[j] * dt;
+            for (int a = 0; a < 9; a++) sums[9 * j + a] += x * middle[a];
         }
     }
     const double norm = sqrt(whole.w * whole.w + whole.x * whole.x + whole.y * whole.y + whole.z * whole.z);
@@ -64,34 +68,34 @@ static void turn(const double *angle, const double *weights, Py_ssize_t k, Py_ss
 }
 
 PyDoc_STRVAR(turns_doc,
-             "turns(angle, weights, start, stop, matrix, sums, squares) -> None\n\n"
-             "angle (n, 3), the body's rotation vector in each step, and weights (n, k) to the matrix (m, 3, 3) that carries\n"
-             "fixed directions through steps start[i] to stop[i] - 1 (int64, shape (m,)), and to the sum (m, k, 3, 3) of C' x\n"
-             "over them, C from the start to the middle of each step, and to the sum (m, 3, 3) of (C' angle)(C' angle)', which\n"
-             "is left out where `squares` is empty. float64 buffers without gaps.");
+             "turns(rate, step, weights, start, stop, matrix, sums, squares) -> None\n\n"
+             "rate (n, 3) and duration (n,) of each step, and weights (n, k), to the matrix (m, 3, 3) that carries fixed\n"
+             "directions through steps start[i] to stop[i] - 1 (int64, shape (m,)), and to the sum (m, k, 3, 3) of C' x dt\n"
+             "over them, C from the start to the middle of each step, and to the sum (m, 3, 3) of (C' w dt)(C' w dt)', which\n"
+             "is left out where `squares` is empty. Steps of no duration count for nothing. float64 buffers without gaps.");
 
 static PyObject *turns(PyObject *module, PyObject *args) {
-    enum { ANGLE, WEIGHTS, START, STOP, MATRIX, SUMS, SQUARES, BUFFERS };
+    enum { RATE, STEP, WEIGHTS, START, STOP, MATRIX, SUMS, SQUARES, BUFFERS };
     Py_buffer v[BUFFERS];
     (void)module;
-    if (!PyArg_ParseTuple(args, "y*y*y*y*w*w*w*", &v[ANGLE], &v[WEIGHTS], &v[START], &v[STOP], &v[MATRIX], &v[SUMS],
+    if (!PyArg_ParseTuple(args, "y*y*y*y*y*w*w*w*", &v[RATE], &v[STEP], &v[WEIGHTS], &v[START], &v[STOP], &v[MATRIX], &v[SUMS],
                           &v[SQUARES])) {
         return NULL;
     }
-    const Py_ssize_t n = v[ANGLE].len / DOUBLE_BYTES / 3, m = v[START].len / INDEX_BYTES, k = n > 0 ? v[WEIGHTS].len / DOUBLE_BYTES / n : 0;
+    const Py_ssize_t n = v[STEP].len / DOUBLE_BYTES, m = v[START].len / INDEX_BYTES, k = n > 0 ? v[WEIGHTS].len / DOUBLE_BYTES / n : 0;
     const int64_t *start = v[START].buf, *stop = v[STOP].buf;
-    int fits = v[ANGLE].len == 3 * n * DOUBLE_BYTES && v[WEIGHTS].len == n * k * DOUBLE_BYTES && v[STOP].len == v[START].len &&
+    int fits = v[RATE].len == 3 * n * DOUBLE_BYTES && v[WEIGHTS].len == n * k * DOUBLE_BYTES && v[STOP].len == v[START].len &&
                v[MATRIX].len == 9 * m * DOUBLE_BYTES && v[SUMS].len == 9 * m * k * DOUBLE_BYTES &&
                (v[SQUARES].len == 0 || v[SQUARES].len == v[MATRIX].len);
     for (Py_ssize_t i = 0; fits && i < m; i++) fits = 0 <= start[i] && start[i] <= stop[i] && stop[i] <= n;
     if (fits) {
-        const double *angle = v[ANGLE].buf, *weights = v[WEIGHTS].buf;
+        const double *rate = v[RATE].buf, *step = v[STEP].buf, *weights = v[WEIGHTS].buf;
         double *matrix = v[MATRIX].buf, *sums = v[SUMS].buf, *squares = v[SQUARES].len ? v[SQUARES].buf : NULL;
         Py_BEGIN_ALLOW_THREADS
         for (Py_ssize_t i = 0; i < m; i++) {
             const Py_ssize_t from = (Py_ssize_t)start[i];
-            turn(angle + 3 * from, weights + k * from, k, (Py_ssize_t)stop[i] - from, matrix + 9 * i, sums + 9 * k * i,
-                 squares ? squares + 9 * i : NULL);
+            turn(rate + 3 * from, step + from, weights + k * from, k, (Py_ssize_t)stop[i] - from, matrix + 9 * i,
+                 sums + 9 * k * i, squares ? squares + 9 * i : NULL);
         }
         Py_END_ALLOW_THREADS
     }

@@ -3,7 +3,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 def turns(
-    angle: NDArray[Any],
+    rate: NDArray[Any],
+    step: NDArray[Any],
     weights: NDArray[Any],
     start: NDArray[Any],
     stop: NDArray[Any],

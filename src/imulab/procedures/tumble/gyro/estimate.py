@@ -369,10 +369,15 @@ def rate_columns(estimate: TurnEstimate) -> tuple[Array, Array]:
     solved = estimate.solution
     segments, scale, theta = solved.segments, solved.scale, solved.theta
     rate, t = body_rate(segments, scale, theta), misalignment(theta)
-    sensed = np.where(segments.step[:, :, None] > 0, rate @ t.T, 0.0)
-    largest = np.maximum(np.abs(sensed).max(axis=(0, 1)), 1e-12)
-    square = sensed * sensed / largest
-    turns = weighted_turns(rate, segments.step, np.concatenate([square * sensed / largest, square], axis=2))
+    sensed, moving = rate @ t.T, segments.step > 0
+    largest, powers = np.empty(3), np.empty((*moving.shape, 6))
+    for axis in range(3):  # one by one: NumPy is slow along axes of three
+        each, cube, square = sensed[:, :, axis], powers[:, :, axis], powers[:, :, 3 + axis]
+        largest[axis] = max(np.abs(each).max(where=moving, initial=0.0), 1e-12)
+        share = each / largest[axis]
+        np.multiply(share, each, out=square)
+        np.multiply(share, square, out=cube)
+    turns = weighted_turns(rate, segments.step, powers)
     inverse = np.linalg.inv(t)
     columns = [
         np.einsum("mij,mj->mi", turns.matrix, np.cross(segments.before, turns.weighted[:, k] @ -inverse[:, k % 3]))

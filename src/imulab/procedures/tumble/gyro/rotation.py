@@ -65,8 +65,8 @@ def frame_rotations(rate: Array, time: Array, start: NDArray[np.int64], stop: ND
     Array
         Shape (m, 3, 3).
     """
-    angle = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
-    return _turns(angle, np.empty((len(angle), 0)), start, stop).matrix
+    mean = 0.5 * (rate[1:] + rate[:-1])
+    return _turns(mean, np.diff(time), np.empty((len(mean), 0)), start, stop).matrix
 
 
 def composed_turns(angle: Array) -> Array:
@@ -99,19 +99,19 @@ def weighted_turns(rate: Array, step: Array, weights: Array, *, squares: bool = 
     """
     segments, n = step.shape
     start = n * np.arange(segments)
-    angle = rate * step[:, :, None]
-    scaled = angle if weights is rate else weights * step[:, :, None]
-    return _turns(angle.reshape(-1, 3), scaled.reshape(segments * n, weights.shape[2]), start, start + n, squares)
+    return _turns(
+        rate.reshape(-1, 3), step.ravel(), weights.reshape(segments * n, weights.shape[2]), start, start + n, squares
+    )
 
 
 def _turns(
-    angle: Array, weights: Array, start: NDArray[np.int64], stop: NDArray[np.int64], squares: bool = False
+    rate: Array, step: Array, weights: Array, start: NDArray[np.int64], stop: NDArray[np.int64], squares: bool = False
 ) -> Turns:
-    """Return segments of one sequence of steps, (n, 3), with weights (n, k) that hold the durations of the steps."""
+    """Return segments of one sequence of steps of rates, (n, 3), and durations, (n,), with weights (n, k)."""
     m, k = len(start), weights.shape[1]
     turns = Turns(np.empty((m, 3, 3)), np.empty((m, k, 3, 3)), np.empty((m if squares else 0, 3, 3)))
     _rotation.turns(
-        np.ascontiguousarray(angle), np.ascontiguousarray(weights),
+        np.ascontiguousarray(rate), np.ascontiguousarray(step), np.ascontiguousarray(weights),
         np.ascontiguousarray(start, dtype=np.int64), np.ascontiguousarray(stop, dtype=np.int64),
         turns.matrix, turns.weighted, turns.squares,
     )  # fmt: skip

@@ -222,7 +222,8 @@ def by_directions(segments: Segments, scale: Array, theta: Array, holds: int) ->
 
 def carried(segments: Segments, scale: Array, theta: Array) -> Array:
     """Return the matrices of the turns under given parameters, shape (m, 3, 3)."""
-    return composed_turns(body_rate(segments, scale, theta) * segments.step[:, :, None])
+    rate = body_rate(segments, scale, theta)
+    return weighted_turns(rate, segments.step, rate[:, :, :0]).matrix
 
 
 def directions_missed(segments: Segments, scale: Array, theta: Array) -> Array:
