@@ -22,9 +22,9 @@ Source: Aitken, Proc. Roy. Soc. Edinburgh 55 (1935) 42 (generalised least square
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from imulab.display import Note
 from imulab.estimation.decisions import SAMPLES_LOST, SCALE_CHANGE, SCALE_CHANGES_WITH_RATE
@@ -47,8 +47,7 @@ _AROUND = np.geomspace(0.2, 5.0, 5)  # the same in that which was found
 _WANDERS = np.geomspace(0.1, 4.0, 6)  # variance of a rate that each turn has to itself, in that of the zeros of holds
 
 
-@dataclass(frozen=True)
-class Nonlinearity:
+class Nonlinearity(Struct, frozen=True):
     """Probability of the residuals if nothing changes with the rate, and what changes by how much.
 
     Attributes
@@ -92,8 +91,7 @@ class Nonlinearity:
         ]
 
 
-@dataclass(frozen=True)
-class TurnEstimate:
+class TurnEstimate(Struct, frozen=True):
     """What the turns say of the scaled parameters.
 
     Attributes

@@ -18,6 +18,7 @@ from os import PathLike
 from typing import Annotated, Any, Unpack
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from imulab.columns import triad, units_without
@@ -66,7 +67,6 @@ from imulab.readers.streams import own_clock
 from imulab.recording import Array, Data, Reading, Recording, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
-from imulab.records.mean_noise import mean_uncertainties
 from imulab.records.sections import Length, Measured, entries
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
@@ -261,9 +261,9 @@ def _solve_with_earth(
     first = solve_turns(case, stamps, "no" if sensitivity == "auto" and earth is None else sensitivity)
     up = case.force / np.linalg.norm(case.force, axis=1, keepdims=True)
     if earth is not None:
-        case = replace(case, earth=first.output_of(earth.vertical * up))
+        case = structs.replace(case, earth=first.output_of(earth.vertical * up))
     elif sensitivity == "auto":
-        case = replace(case, vertical=first.output_of(EARTH * up))
+        case = structs.replace(case, vertical=first.output_of(EARTH * up))
     else:
         return case, first
     return case, solve_turns(case, stamps, sensitivity, near=first)
@@ -296,13 +296,15 @@ def _with_noise_record(
     solved: TurnSolution, noise: Calibration, attitudes: Attitudes, recording: Recording
 ) -> tuple[TurnSolution, list[str]]:
     """Return the solution, its zero at least as uncertain as a noise record predicts for that time, and notes."""
+    from imulab.records.mean_noise import mean_uncertainties
+
     unit = recording.triad_unit("gyro")
     rate = parse_unit(unit).quantity == "rate"
     duration = float((attitudes.stop - attitudes.start).sum())
     u, noise_notes = mean_uncertainties(noise, triad("gyro"), duration, "rad/s" if rate else unit, recording.metadata)
     least = from_si(u, unit) if rate else u
-    rest = replace(solved.rest, zero_uncertainty=np.maximum(solved.rest.zero_uncertainty, least))
-    return replace(solved, rest=rest), noise_notes
+    rest = structs.replace(solved.rest, zero_uncertainty=np.maximum(solved.rest.zero_uncertainty, least))
+    return structs.replace(solved, rest=rest), noise_notes
 
 
 def _with_even_stamps(

@@ -9,9 +9,10 @@ accelerometers' parameters. The two are independent to first order: those parame
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
+from msgspec import Struct, structs
 from numpy.typing import NDArray
 
 from imulab.display import Finding
@@ -43,8 +44,7 @@ _REWEIGHTED = 20  # of Huber's fit
 _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # axes of a cross product
 
 
-@dataclass(frozen=True)
-class RestHolds:
+class RestHolds(Struct, frozen=True):
     """Attitudes as samples of the gyroscopes; all of shape (n,).
 
     Attributes
@@ -65,8 +65,7 @@ class RestHolds:
     still: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class GyroRest:
+class GyroRest(Struct, frozen=True):
     """Output at rest: zero (3,), change with specific force (3, 3) or None, and their standard uncertainties.
 
     The zero is that of all holds; a turn has that of its two holds (`zero_between`).
@@ -204,7 +203,7 @@ def at_rest(
     alone = density / (_FLAT * median(still.length[quiet]))
     excess = np.maximum((MAD_TO_SIGMA * limit / _HUBER) ** 2 - alone, 0.0)
     share = excess / np.maximum(excess + alone / 2, 1e-300)
-    return replace(
+    return structs.replace(
         rest,
         moved=share * np.clip(deviation, -limit, limit),
         moved_variance=share * alone,
@@ -212,8 +211,7 @@ def at_rest(
     )
 
 
-@dataclass(frozen=True)
-class StillMeans:
+class StillMeans(Struct, frozen=True):
     """What the gyroscopes put out in each hold, over its still samples.
 
     Attributes
@@ -262,8 +260,7 @@ def still_means(holds: RestHolds, time: Array, output: Array) -> StillMeans:
     return StillMeans(means, coning, fraction, length, (holds.start + holds.stop) / 2)
 
 
-@dataclass(frozen=True)
-class _RobustFit:
+class _RobustFit(Struct, frozen=True):
     """Coefficients (p, 3) of each column, their standard uncertainties, and its scatter, (3,)."""
 
     values: Array

@@ -12,11 +12,12 @@ turn, the speed even: it does not move the delay to first order.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from imulab.display import Bad, Finding, Note
@@ -78,8 +79,7 @@ _JITTER, _COUNTED = 0.02, 1e-6  # of a step
 _FEWEST_STAMPS = 100  # between gaps, through which a line is drawn
 
 
-@dataclass(frozen=True)
-class ClockComparison:
+class ClockComparison(Struct, frozen=True):
     """The accelerometers' time less the gyroscopes', ``delay + rate (t - middle)``, with standard uncertainties; s."""
 
     delay: float
@@ -102,8 +102,7 @@ class ClockComparison:
         return bool(abs(self.rate) > CLOCKS_DISAGREE.limit * math.sqrt(self.variance(clock)))
 
 
-@dataclass(frozen=True)
-class ScaleClock:
+class ScaleClock(Struct, frozen=True):
     """Clock that the scale factors of the gyroscopes refer to.
 
     Attributes
@@ -296,8 +295,7 @@ _TOO_MANY_OUT = 3  # one turn in so many
 _FEWEST_LEFT = 6  # degrees of freedom that the test of a turn must leave
 
 
-@dataclass(frozen=True)
-class TurnProblem:
+class TurnProblem(Struct, frozen=True, dict=True):
     """Data of the fit that depend neither on the time base nor on the choice of the sensitivity."""
 
     name: str
@@ -338,8 +336,7 @@ class TurnProblem:
         return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True), dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class TurnReadings:
+class TurnReadings(Struct, frozen=True, dict=True):
     """What a time base makes of a problem's turns, before anything is fitted.
 
     `density` is the noise of the outputs, (3,).
@@ -433,8 +430,7 @@ def read_turns(case: TurnProblem, stamps: Stamps, *, rough: bool = False) -> Tur
     return TurnReadings(case, stamps, holds, density, ends, span, tuple(notes))
 
 
-@dataclass(frozen=True)
-class TurnSolution:
+class TurnSolution(Struct, frozen=True, dict=True):
     """Scaled parameters (p,) that fit the turns, residuals (3 m,), Jacobian (3 m, p), and what was set aside.
 
     `kept` are the turns that were not, among those of the readings.

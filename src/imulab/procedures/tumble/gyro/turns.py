@@ -5,9 +5,9 @@ Source of the change of a turn with the rate: Bortz, IEEE Trans. AES-7 (1971) 61
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import asdict, replace
 from numpy.typing import NDArray
 
 from imulab.display import Finding, Note
@@ -30,8 +30,7 @@ _COARSE = 8  # pieces of steps taken as one where a scale factor is only to be f
 _START_FACTORS = np.geomspace(0.4, 1.25, 24)
 
 
-@dataclass(frozen=True)
-class Segments:
+class Segments(Struct, frozen=True):
     """Turns as pieces of steps between samples: output less what acceleration adds, (m, n, 3), and durations, (m, n).
 
     The durations are weighted by the ramp of each turn (`windows`). `before` and `after` are the upward directions at
@@ -53,20 +52,17 @@ class Segments:
 
     def part(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Segments:
         """Return some of the turns."""
-        values = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
-        return Segments(**values)
+        return Segments(**{name: values[chosen] for name, values in asdict(self).items()})
 
 
-@dataclass(frozen=True)
-class Stamps:
+class Stamps(Struct, frozen=True):
     """Times of the gyroscopes' samples, s, (n,): by the clock that measures the turns, and on the accelerometers'."""
 
     time: Array
     on_accel: Array
 
 
-@dataclass(frozen=True)
-class Span:
+class Span(Struct, frozen=True):
     """Turns from windows to later ones, (m,), as pieces of steps between samples, whatever the output in them.
 
     `first` and `last` are their samples; the durations, (m, n), are weighted by the ramp. The other fields are those of

@@ -19,10 +19,10 @@ to splines, 1978, chapters IX to XI; Savage, J. Guidance Control Dynamics 21 (19
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 import imulab.procedures.tumble._rotation as _rotation
@@ -43,8 +43,7 @@ _ALL_STILL = 0.999  # of a window's weight
 _KNOCKED = 6.0  # medians over the holds: with three differences in each, none of 100 is beyond by chance
 
 
-@dataclass(frozen=True)
-class Windows:
+class Windows(Struct, frozen=True):
     """Windows by their beginnings and lengths, s, both of shape (n,)."""
 
     start: Array
@@ -67,8 +66,7 @@ class Windows:
         return np.asarray(share, dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class HoldEnds:
+class HoldEnds(Struct, frozen=True):
     """The windows at the beginning (`first`) and at the end (`last`) of each hold, and all its `neighbours`.
 
     `hold` says to which hold each of the neighbouring windows belongs.
@@ -157,8 +155,7 @@ def _pairs(ends: HoldEnds) -> NDArray[np.bool_]:
 # The rate between samples.
 
 
-@dataclass(frozen=True)
-class Readings:
+class Readings(Struct, frozen=True):
     """The output between samples: shape (m, n, 3), n pieces of equal length for each step of `pieces` of them.
 
     `middle` of the two readings, and `half` their difference.
