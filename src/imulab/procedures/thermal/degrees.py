@@ -41,7 +41,7 @@ from imulab.procedures.thermal.solve import (
     Rows,
     ThermalProblem,
     ThermalSolution,
-    fit_excess,
+    fit_excesses,
     fit_turn_on_scatter,
     offset_modes,
     row_covariance,
@@ -785,20 +785,26 @@ def _warn_offset(holds: Holds, problem: ThermalProblem, solution: ThermalSolutio
     numbers, attitudes = np.unique(problem.recording, return_counts=True)
     if len(numbers) < _FEWEST_TO_COMPARE:
         return []
-    whose = np.where(rows.owner >= 0, problem.recording[rows.owner], -1)
+    tested = [
+        number
+        for number in numbers[attitudes >= _ATTITUDES].tolist()
+        if problem.shared[problem.recording == number].all()
+    ]
+    if not tested:
+        return []
+    others = [rows.recording != number for number in tested]
     asked = []
-    for number in numbers[attitudes >= _ATTITUDES].tolist():
-        if not problem.shared[problem.recording == number].all():
-            continue
-        others = rows.part(whose != number)
-        excess, freedom = fit_excess(others, solution.excess**2)
-        scatter = fit_turn_on_scatter(others, excess)
+    for number, part, excess, freedom in zip(
+        tested, others, *fit_excesses(rows, solution.excess**2, others), strict=True
+    ):
+        scatter = fit_turn_on_scatter(rows, excess, part)
         of_recording = np.s_[3 * number : 3 * number + 3]
         stretch, rank = max(float(scatter.tau[1]), _USUAL), freedom
         if stretch > _USUAL:  # determined by few recordings
-            white = whitener(others, excess, np.zeros(2))
-            bias, scale = (white(columns) for columns in others.offsets)
-            rank = float(len(offset_modes(np.hstack([white(others.jacobian), bias]), scale, white(others.residual))[0]))
+            white = whitener(rows, excess, np.zeros(2))
+            columns = white(np.column_stack([rows.jacobian, *rows.offsets, rows.residual]))[part]
+            laws, scale, residual = np.hsplit(columns, [-1 - rows.offsets[1].shape[1], -1])
+            rank = float(len(offset_modes(laws, scale, residual[:, 0])[0]))
         tests = [(1, np.array([_BENDS, stretch]), rank, _OFF_SCALE)]
         if scatter.rank:
             tests.append((0, scatter.tau, float(scatter.rank), _OFF_BIAS))

@@ -13,10 +13,9 @@ the rank that free offsets add: the method of moments of Mandel and Paule, Anal.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,14 +96,6 @@ class Rows:
         members = [order[first[count == m][:, None] + np.arange(m)] for m in sorted({*count.tolist()} - {0})]
         shared = np.concatenate([self.errors[which].any(axis=1) for which in members]).sum(axis=0) > 1
         return [Block.of(self, which, self.errors[:, ~shared]) for which in members], self.errors[:, shared]
-
-    def part(self, which: NDArray[Any]) -> Rows:
-        """Return some of the rows, with every column."""
-        return Rows(
-            self.residual[which], self.jacobian[which], self.noise[np.ix_(which, which)],
-            (self.offsets[0][which], self.offsets[1][which]), self.errors[which], self.drift[which],
-            self.owner[which], self.magnitude[which], self.recording[which],
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -386,6 +377,7 @@ _SEEN = 1e-7
 
 _TELLS = 0.1
 """Least part of an offset's column beside the laws, over its length, from which it counts for the scatter."""
+_ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -519,10 +511,10 @@ def _iterate(
     """
     before = 0.0
     for _ in range(_STEPS):
-        white = whitener(rows, excess, tau)
-        jacobian = white(rows.jacobian)
+        columns = whitener(rows, excess, tau)(np.column_stack([rows.jacobian, rows.residual]))
+        jacobian = columns[:, :-1]
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-        step = -np.linalg.lstsq(jacobian / scale, white(rows.residual), rcond=1e-11)[0] / scale
+        step = -np.linalg.lstsq(jacobian / scale, columns[:, -1], rcond=1e-11)[0] / scale
         coefficients = coefficients + step[: len(coefficients)]
         rows = linearise(problem, laws, coefficients, at)
         size = float(np.abs(step[: laws.size]).max())
@@ -534,27 +526,35 @@ def _iterate(
 
 def fit_excess(rows: Rows, excess: float) -> tuple[float, float]:
     """Return the variance of magnitudes beyond noise, with free offsets of power cycles, and degrees of freedom."""
-    white = whitener(rows, excess, np.zeros(2))
-    columns = white(np.column_stack([rows.jacobian, rows.offsets[0], rows.residual]))
-    laws = _basis(columns[:, : rows.jacobian.shape[1]])
-    beside = columns[:, rows.jacobian.shape[1] :]
-    u = np.hstack([laws, _basis_beside(beside[:, :-1], beside[:, :-1] - laws @ (laws.T @ beside[:, :-1]))])
-    left = columns[:, -1] - u @ (u.T @ columns[:, -1])
-    noise = np.diag(rows.noise)
-    spare = 1 - (u**2).sum(axis=1)
-    used = rows.magnitude & (rows.owner >= 0)
-    residual = left[used] * np.sqrt(noise[used] + excess)
-    variance, freedom = plausible_excess(residual[None], noise[used][None], spare[used][None])
+    variance, freedom = fit_excesses(rows, excess, [np.ones(len(rows.residual), dtype=np.bool_)])
     return float(variance[0]), float(freedom[0])
 
 
-def fit_turn_on_scatter(rows: Rows, excess: float) -> Scatter:
+def fit_excesses(rows: Rows, excess: float, parts: Sequence[NDArray[np.bool_]]) -> tuple[Array, Array]:
+    """Return `fit_excess` of several parts of the rows, whole recordings that share no error with the others."""
+    white = whitener(rows, excess, np.zeros(2))
+    columns = white(np.column_stack([rows.jacobian, rows.offsets[0], rows.residual]))
+    noise, held = np.diag(rows.noise), rows.magnitude & (rows.owner >= 0)
+    terms = []
+    for part in parts:
+        laws, beside, residual = np.hsplit(columns[part], [rows.jacobian.shape[1], -1])
+        basis = _basis(laws)
+        u = np.hstack([basis, _basis_beside(beside, beside - basis @ (basis.T @ beside))])
+        left, used, variance = (residual - u @ (u.T @ residual))[:, 0], held[part], noise[part & held]
+        terms.append((left[used] * np.sqrt(variance + excess), variance, (1 - (u**2).sum(axis=1))[used]))
+    if len({len(residual) for residual, _, _ in terms}) == 1:
+        return plausible_excess(*(np.array(each) for each in zip(*terms, strict=True)))
+    excesses = [plausible_excess(*(each[None] for each in values)) for values in terms]
+    return np.concatenate([each for each, _ in excesses]), np.concatenate([freedom for _, freedom in excesses])
+
+
+def fit_turn_on_scatter(rows: Rows, excess: float, part: NDArray[np.bool_] | slice = _ALL) -> Scatter:
     """Return the scatter of biases between power cycles, and of scale factors where that is significant.
 
     tau is the root of ``sum c_k^2 / (1 + s_k^2 tau^2) = q``: c_k the components of the whitened residual along the q
-    modes of offsets beside the laws, s_k their singular values.
+    modes of offsets beside the laws, s_k their singular values. A `part` of the rows is as for `fit_excesses`.
     """
-    bias, scale, columns, beside = _offsets_beside_laws(rows, excess, np.zeros(2))
+    bias, scale, columns, beside = _offsets_beside_laws(rows, excess, np.zeros(2), part)
     s, force, second, probability = np.empty(0), np.empty(0), 0.0, None
     if rows.offsets[1].any():  # gyroscopes have none
         u = _basis_beside(columns[:, bias], beside[:, bias])
@@ -564,7 +564,7 @@ def fit_turn_on_scatter(rows: Rows, excess: float) -> Scatter:
         probability = chi_square_probability(float((force**2).sum()), len(s))
         if probability < SCALES_SCATTER_BETWEEN_CYCLES.level:
             second = _moments(s, force)
-            bias, _, columns, beside = _offsets_beside_laws(rows, excess, np.array([0.0, second]))
+            bias, _, columns, beside = _offsets_beside_laws(rows, excess, np.array([0.0, second]), part)
     s, force = _modes(columns[:, bias], beside[:, bias], beside[:, -1])
     if not len(s):
         return Scatter(np.array([0.0, second]), 0, np.zeros(2), probability)
@@ -579,13 +579,15 @@ def offset_modes(laws: Array, offsets: Array, residual: Array) -> tuple[Array, A
     return _modes(offsets, beside[:, :-1], beside[:, -1])
 
 
-def _offsets_beside_laws(rows: Rows, excess: float, tau: Array) -> tuple[slice, slice, Array, Array]:
+def _offsets_beside_laws(
+    rows: Rows, excess: float, tau: Array, part: NDArray[np.bool_] | slice
+) -> tuple[slice, slice, Array, Array]:
     """Return the whitened offsets of biases and scale factors, and the residual as last column, beside the laws.
 
     Returned are the places of both among these columns, the whole columns, and their parts beside the laws.
     """
     bias, scale = (offsets.shape[1] for offsets in rows.offsets)
-    columns = whitener(rows, excess, tau)(np.column_stack([rows.jacobian, *rows.offsets, rows.residual]))
+    columns = whitener(rows, excess, tau)(np.column_stack([rows.jacobian, *rows.offsets, rows.residual]))[part]
     laws, others = columns[:, : rows.jacobian.shape[1]], columns[:, rows.jacobian.shape[1] :]
     return slice(0, bias), slice(bias, bias + scale), others, _beside(laws, others)
 
@@ -684,9 +686,10 @@ def own_calibrations(problem: ThermalProblem, solution: ThermalSolution) -> list
             continue
         matrix = columns[members] * weight[members, None]
         size = np.linalg.norm(matrix, axis=0)
-        if np.linalg.cond(matrix / size) > _CONDITION:
+        u, spread, v = np.linalg.svd(matrix / size, full_matrices=False)
+        if not spread[0] <= _CONDITION * spread[-1]:
             continue
-        inverse = np.linalg.pinv(matrix)
+        inverse = v.T / spread @ u.T / size[:, None]
         values = parameters[members].mean(axis=0) - inverse @ (weight[members] * residual[members])
         by_heat = (slope[members] * problem.step[members, None]).mean(axis=0)
         u = np.sqrt((inverse**2).sum(axis=1) + by_heat**2)
