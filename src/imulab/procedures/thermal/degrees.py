@@ -143,15 +143,17 @@ def split_temperatures(solution: ThermalSolution, cluster: NDArray[np.int64]) ->
     whole[: len(solution.coefficients)] = solution.coefficients
     target = rows.jacobian @ whole - rows.residual
     at = np.where(rows.owner >= 0, cluster[rows.owner], -1)
-    white = solution.white
+    count = len(at)
+    whitened = solution.white(np.column_stack([np.eye(count), rows.jacobian, target]))
     covariance = row_covariance(rows, solution.excess**2, solution.scatter.tau)
     for number in range(1, int(cluster.max(initial=0))):
-        jacobian, missing = _remove_knot(rows.jacobian, solution.laws, number)
+        both, missing = _remove_knot(np.vstack([rows.jacobian, whitened[:, count:-1]]), solution.laws, number)
+        jacobian, white = both[:count], both[count:]
         out, test = np.flatnonzero(at == number), (at == number) & rows.magnitude
         test_weight = covariance[np.ix_(test, test)]
         # A row is left out by an unknown of its own: the triangle below these unknowns is that of the other rows.
-        columns = np.column_stack([np.eye(len(at))[:, out], jacobian, target])
-        rest = np.asarray(np.linalg.qr(white(columns), mode="r"))[len(out) :, len(out) :]
+        columns = np.column_stack([whitened[:, out], white, whitened[:, -1]])
+        rest = np.asarray(np.linalg.qr(columns, mode="r"))[len(out) :, len(out) :]
         parts.append(Split(number, jacobian[test], target[test], test_weight, rest[:, :-1], rest[:, -1], missing))
     return parts
 
@@ -183,10 +185,11 @@ def predict_left_out(splits: Sequence[Split], kept: NDArray[np.bool_]) -> list[L
         columns[: len(kept)] = kept
         columns[list(split.untold)] = False
         rest, jacobian = split.rest[:, columns], split.jacobian[:, columns]
-        values = np.linalg.svd(rest / np.maximum(np.linalg.norm(rest, axis=0), 1e-300), compute_uv=False)
+        size = np.maximum(np.linalg.norm(rest, axis=0), 1e-300)
+        u, values, v = np.linalg.svd(rest / size, full_matrices=False)
         if not values[-1] > values[0] / _TOLD or len(rest) < rest.shape[1]:
             continue  # the other temperatures do not determine the laws: the only tumble is here
-        inverse = np.linalg.pinv(rest, rcond=1e-13)
+        inverse = v.T / values @ u.T / size[:, None]
         error = split.target - jacobian @ (inverse @ split.rest_target)
         carried = jacobian @ inverse
         scatter = split.covariance + carried @ carried.T

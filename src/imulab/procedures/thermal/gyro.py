@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ from imulab.display import Bad, Finding, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, SegmentError, UnitError
 from imulab.estimation.decisions import BIAS_FOLLOWS_GRAVITY, SCALE_LAW_SCATTERS, SCALE_OFF_UNIT, TURNED_IN_HOLD
 from imulab.estimation.least_squares import chi_square_probability
-from imulab.estimation.rows import MAD_TO_SIGMA, leave_out, median, medians
+from imulab.estimation.rows import MAD_TO_SIGMA, distinct, leave_out, median, medians
 from imulab.gravity import EARTH, EarthRate
 from imulab.procedures.thermal import DEGREES, FOLLOWED, LEAST_KNOTS, STRETCHES, TURNED
 from imulab.procedures.thermal.degrees import (
@@ -36,6 +37,7 @@ from imulab.procedures.thermal.degrees import (
     Degrees,
     LagAndLoops,
     LeftOutCluster,
+    Split,
     bound_scatter,
     drift_rates,
     explain_unobservable_lag,
@@ -165,6 +167,32 @@ class RatesAtRest:
     def __len__(self) -> int:
         return len(self.mean)
 
+    @cached_property
+    def noise(self) -> Array:
+        """Covariance of the means of all axes by noise, shape (3 n, 3 n)."""
+        n = len(self)
+        noise = np.zeros((n, 3, n, 3))
+        noise[range(n), :, range(n), :] = self.covariance
+        if self.slow is not None:
+            noise[:, range(3), :, range(3)] += self.slow
+        return noise.reshape(3 * n, 3 * n)
+
+    @cached_property
+    def offsets(self) -> Array:
+        """A column for each axis of each of r recordings, 1 in its rows, shape (3 n, 3 r)."""
+        return np.asarray(np.kron(one_hot(self.recording), np.eye(3)), dtype=np.float64)
+
+    @cached_property
+    def errors(self) -> Array:
+        """A column for each of k errors of the temperature, 1 in the rows that have it, shape (3 n, k)."""
+        number = np.where(self.shared, self.recording, int(self.recording.max()) + 1 + np.arange(len(self)))
+        return np.repeat(one_hot(number), 3, axis=0)
+
+    @cached_property
+    def earth_rate(self) -> tuple[Array, Array]:
+        """The known part of the Earth's rate and the columns of the unknown one, as by `model_earth_rate`."""
+        return model_earth_rate(self.force, self.attitude, self.earth)
+
     def part(self, kept: NDArray[np.bool_]) -> RatesAtRest:
         """Return some of the holds."""
         return RatesAtRest(
@@ -266,12 +294,14 @@ def _average_still(
     pieces = [slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
     for piece in pieces:
         rest[piece] = True
-    if (np.ptp(output[rest], axis=0) == 0).any():
-        name = _COLUMNS[int(np.argmin(np.ptp(output[rest], axis=0)))]
+    at_rest = np.ascontiguousarray(output[rest].T)
+    swing = np.ptp(at_rest, axis=1)
+    if (swing == 0).any():
+        name = _COLUMNS[int(np.argmin(swing))]
         raise DataError(f"{recording.name}: column {name}: the same output in every sample at rest: a dead axis")
     middle = [medians(output[piece], 0) for piece in pieces]
     spread = [medians(np.abs(output[piece] - m), 0) for piece, m in zip(pieces, middle, strict=True)]
-    steps = [np.diff(np.unique(column)) for column in output[rest].T]
+    steps = [np.diff(distinct(column)) for column in at_rest]
     sigma = np.maximum(MAD_TO_SIGMA * medians(np.array(spread), 0), [step.min() for step in steps])
     kept: dict[int, NDArray[np.intp]] = {}
     notes: list[str] = []
@@ -407,20 +437,32 @@ def fit_gyroscopes(
         solution = solve(held, solution.laws, tau, sensitivity=choice.sensitivity, free=drift.free) or solution
         if choice.solution.scatter.bound:
             solution = replace(solution, scatter=choice.solution.scatter)
+        choice = replace(choice, solution=solution)
     places = [
         replace(e, temperature=float(held.temperature[cluster == e.temperature].mean()), holds=e.holds // 3)
-        for e in _predict_left_out(solution, cluster)
+        for e in choice.left_out
     ]
     return ThermalGyroscopes(held, solution, choice.sensitivity, choice.probability, tuple(places), aside, drift)
 
 
 @dataclass(frozen=True)
 class _Solved:
-    """A solution, whether G is in it, and the probability of such G by chance."""
+    """A solution, the number of each hold's temperature, whether G is in it, and how probable such G is by chance."""
 
     solution: ThermalSolution
+    cluster: NDArray[np.int64]
     sensitivity: bool
     probability: float | None
+
+    @cached_property
+    def splits(self) -> list[Split]:
+        """What remains of the rows without each interior temperature."""
+        return split_temperatures(self.solution, self.cluster)
+
+    @cached_property
+    def left_out(self) -> list[LeftOutCluster]:
+        """The errors at each interior temperature, left out."""
+        return predict_left_out(self.splits, np.ones(len(self.solution.coefficients), dtype=np.bool_))
 
 
 @dataclass(frozen=True)
@@ -436,23 +478,34 @@ class _Search:
         knots = place_knots(self.held.temperature, self.cluster, laws)
         bent = replace(laws, degrees=(DEGREES[0], 0, 0), knots=knots)
         if spline:
-            return self._bound(_solved(self.held, bent, self.tau))
-        straight = _solved(self.held, laws, self.tau)
+            return self._bound(self._solved(bent))
+        straight = self._solved(laws)
         while auto and straight.solution.laws.degrees[0]:
-            lower = _lower_degree(straight.solution, self.cluster)
-            if lower is None:
+            step = step_down(straight.solution, 0, straight.splits)
+            if not may_be_taken(step, rms_left_out(straight.left_out)):
                 break
-            straight = _solved(self.held, lower, self.tau)
+            straight = self._solved(replace(straight.solution.laws, degrees=step.degrees))
         if not auto or len(knots) < LEAST_KNOTS:
             return straight
         try:
-            by_knots = _solved(self.held, bent, self.tau)
+            by_knots = self._solved(bent)
         except ObservabilityError:
             return straight  # the holds do not determine so many values of the bias
-        errors = (_predict_left_out(each.solution, self.cluster) for each in (by_knots, straight))
-        return (
-            self._bound(by_knots) if law_bends(by_knots.solution, self.tau) and spline_predicts(*errors) else straight
-        )
+        bends = law_bends(by_knots.solution, self.tau) and spline_predicts(by_knots.left_out, straight.left_out)
+        return self._bound(by_knots) if bends else straight
+
+    def _solved(self, laws: Laws) -> _Solved:
+        """Return the solution with the g-sensitivity where it is observable and significant, else without."""
+        whole = solve(self.held, laws, self.tau, sensitivity=True)
+        probability = None
+        if whole is not None:
+            probability = wald_probability(whole, np.eye(len(whole.coefficients))[-9:])
+            if probability < BIAS_FOLLOWS_GRAVITY.level:
+                return _Solved(whole, self.cluster, True, probability)
+        plain = solve(self.held, laws, self.tau, sensitivity=False)
+        if plain is None:
+            raise ObservabilityError(f"{len(self.held)} holds do not determine the biases of the gyroscopes")
+        return _Solved(plain, self.cluster, False, probability)
 
     def _bound(self, solved_laws: _Solved) -> _Solved:
         def solved(laws: Laws, tau: float | None) -> ThermalSolution:
@@ -461,32 +514,6 @@ class _Search:
             return solution
 
         return replace(solved_laws, solution=bound_scatter(solved_laws.solution, self.tau, solved))
-
-
-def _predict_left_out(solution: ThermalSolution, cluster: NDArray[np.int64]) -> list[LeftOutCluster]:
-    return predict_left_out(split_temperatures(solution, cluster), np.ones(len(solution.coefficients), dtype=np.bool_))
-
-
-def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> _Solved:
-    """Return the solution with the g-sensitivity where it is observable and significant, else without."""
-    whole = solve(held, laws, tau, sensitivity=True)
-    probability = None
-    if whole is not None:
-        probability = wald_probability(whole, np.eye(len(whole.coefficients))[-9:])
-        if probability < BIAS_FOLLOWS_GRAVITY.level:
-            return _Solved(whole, True, probability)
-    plain = solve(held, laws, tau, sensitivity=False)
-    if plain is None:
-        raise ObservabilityError(f"{len(held)} holds do not determine the biases of the gyroscopes")
-    return _Solved(plain, False, probability)
-
-
-def _lower_degree(solution: ThermalSolution, cluster: NDArray[np.int64]) -> Laws | None:
-    """Return laws of one degree less, or None where that step may not be taken."""
-    parts = split_temperatures(solution, cluster)
-    before = rms_left_out(predict_left_out(parts, np.ones(len(solution.coefficients), dtype=np.bool_)))
-    step = step_down(solution, 0, parts)
-    return replace(solution.laws, degrees=step.degrees) if may_be_taken(step, before) else None
 
 
 def _fit_lag_and_loops(
@@ -549,35 +576,19 @@ def linearise_rates(held: RatesAtRest, laws: Laws, coefficients: Array, free: tu
     turn = np.sign(held.rate) * (1 - laws.place(held.temperature) ** 2)
     drift[:, range(3), range(1, 4)] = turn[:, None]
     jacobian = np.hstack([jacobian, drift.reshape(3 * n, 4)[:, list(free)]])
-    noise = np.zeros((n, 3, n, 3))
-    noise[range(n), :, range(n), :] = held.covariance
-    if held.slow is not None:
-        noise[:, range(3), :, range(3)] += held.slow
-    number = np.where(held.shared, held.recording, int(held.recording.max()) + 1 + np.arange(n))
-    heat = _columns_by_row(number) * (slope * held.step[:, None]).ravel()[:, None]
-    known, earth = model_earth_rate(held.force, held.attitude, held.earth)
+    heat = held.errors * (slope * held.step[:, None]).ravel()[:, None]
+    known, earth = held.earth_rate
     return Rows(
         residual=jacobian @ coefficients + known - held.mean.ravel(),
         jacobian=jacobian,
-        noise=noise.reshape(3 * n, 3 * n),
-        offsets=(_columns_by_axis(held.recording), np.zeros((3 * n, 3))),
+        noise=held.noise,
+        offsets=(held.offsets, np.zeros((3 * n, 3))),
         errors=np.hstack([heat, earth]),
         drift=drift.reshape(3 * n, 4),
         owner=np.repeat(np.arange(n), 3),
         magnitude=np.ones(3 * n, dtype=np.bool_),
         recording=np.repeat(held.recording, 3),
     )
-
-
-def _columns_by_axis(number: NDArray[np.int64]) -> Array:
-    """Return a column for each axis of each of k different numbers (n,), shape (3 n, 3 k)."""
-    columns: Array = np.asarray(np.kron(one_hot(number), np.eye(3)), dtype=np.float64)
-    return columns
-
-
-def _columns_by_row(number: NDArray[np.int64]) -> Array:
-    """Return a column for each of k different numbers (n,), shape (3 n, k)."""
-    return np.repeat(one_hot(number), 3, axis=0)
 
 
 def leave_out_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[np.int64]]:
@@ -588,7 +599,7 @@ def leave_out_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray
     n, size = len(held), 3 * laws.terms[0]
     columns = np.hstack([
         laws.design(held.temperature)[:, :3, :size].reshape(3 * n, size),
-        _columns_by_axis(held.recording),
+        held.offsets,
     ])  # fmt: skip
     weight: Array = np.ones(n)
     for _ in range(_PASSES):

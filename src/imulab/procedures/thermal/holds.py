@@ -50,7 +50,7 @@ def find_stretches_at_rest(outputs: Array, time: Array) -> NDArray[np.int64] | N
     """Return the stretches between knocks of a unit at rest, rows (first, last + 1); None where it is turned."""
     columns = np.ascontiguousarray(outputs.T)
     still = _exclude_knocks(columns, time)
-    at_rest = columns if still.all() else columns[:, still]
+    at_rest = columns if still.all() else columns.compress(still, axis=1)
     if _clearly_turns(at_rest):
         return None
     ends = np.quantile(at_rest, [_SHARE_IN_TAILS, 1 - _SHARE_IN_TAILS], axis=1)
@@ -81,9 +81,9 @@ def _exclude_knocks(columns: Array, time: Array) -> NDArray[np.bool_]:
     mean, scatter = np.empty((count, 3)), np.empty((count, 3))
     x, y, z = columns
     _segment.blocks(x, y, z, time, size, mean, scatter, np.empty(count))
-    padded = np.pad(mean, ((_BESIDE, _BESIDE), (0, 0)), "reflect")
-    beside = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
-    off = np.abs(mean - medians(beside, -1))
+    beside = np.arange(count)[:, None] + np.arange(-_BESIDE, _BESIDE + 1)
+    beside = count - 1 - np.abs(count - 1 - np.abs(beside))  # reflected at both ends
+    off = np.abs(mean - medians(mean.T[:, beside]).T)
     usual = np.maximum(medians(scatter, 0), np.finfo(float).tiny)
     far = _OFF * np.maximum(MAD_TO_SIGMA * medians(off, 0), np.sqrt(usual / size))
     bad = ((scatter / usual).mean(axis=1) > _SHAKEN) | (off > far).any(axis=1)
@@ -441,7 +441,7 @@ _LATER = (1.5, 1.25)
 """Ratios of the last steps' durations from which readings settle exponentially."""
 _SHARED, _DISTINCT = 0.3, 0.9
 """Two recordings overlap if they share more than this share of rows, and that share of rows is unique in both."""
-_MIX = np.uint64(0x9E3779B97F4A7C15)
+_MIX, _LAST_BITS = np.uint64(0x9E3779B97F4A7C15), np.uint64(47)
 
 
 def prepare_recordings(
@@ -532,8 +532,10 @@ def _check_together(recordings: Sequence[Recording], sensor: str) -> None:
                 "expected one unit"
             )
         hashes.append(_hash_rows(recording, sensor))
-    every = np.sort(np.concatenate(hashes))
-    if (every[1:] == every[:-1]).any():  # else no row is there twice
+    every = np.concatenate(hashes)
+    place = (every >> _LAST_BITS).astype(np.intp)
+    crowded = np.sort(every[(np.bincount(place) > 1)[place]])  # a hash with first bits of its own is there once
+    if (crowded[1:] == crowded[:-1]).any():  # else no row is there twice
         _check_overlap(recordings, [np.sort(each) for each in hashes])
 
 

@@ -103,7 +103,8 @@ class LawsAtHolds:
     """What the rows keep at any coefficients: the laws' `design` and `slope` at the holds, shape (n, 9, size) each.
 
     `owner` and `kind`, shape (N,), are each row's hold and its direction, 0 along the force, 1 and 2 across; `error`
-    marks the column of its temperature's error.
+    marks the column of its temperature's error; `together` are the pairs of rows of one hold, and `wander` the
+    covariance of rows by that of directions, shape (N, N), if there is any.
     """
 
     design: Array
@@ -111,6 +112,8 @@ class LawsAtHolds:
     owner: NDArray[np.int64]
     kind: NDArray[np.int64]
     error: Array
+    together: tuple[NDArray[np.intp], ...]
+    wander: Array | None
 
     @classmethod
     def of(cls, problem: ThermalProblem, laws: Laws) -> LawsAtHolds:
@@ -118,11 +121,14 @@ class LawsAtHolds:
         n = len(problem.reading)
         member = np.flatnonzero(problem.group >= 0)
         rows = np.concatenate([np.arange(n) * 3, (member[:, None] * 3 + np.array([1, 2])).ravel()])
-        owner = rows // 3
+        owner, kind = rows // 3, rows % 3
         # One error for a recording, or for each hold of one that drifts.
         number = np.where(problem.shared, problem.recording, problem.recording.max(initial=0) + 1 + np.arange(n))
-        temperature = problem.temperature
-        return cls(laws.design(temperature), laws.slope(temperature), owner, rows % 3, one_hot(number[owner]))
+        design, slope = laws.design(problem.temperature), laws.slope(problem.temperature)
+        together, wander = np.nonzero(owner[:, None] == owner), None
+        if problem.wander is not None and problem.wander.any():
+            wander = np.where((kind[:, None] == kind) & (kind > 0), problem.wander[owner[:, None], owner], 0.0)
+        return cls(design, slope, owner, kind, one_hot(number[owner]), together, wander)
 
 
 @dataclass(frozen=True)
@@ -151,7 +157,7 @@ class Block:
         """Return that of some of the rows, with these errors of the temperature, shape (N, e)."""
         every = [columns[which] for columns in (errors, *rows.offsets)]
         felt, *offsets = [columns[:, :, columns.any(axis=(0, 1))] for columns in every]
-        fixed = rows.noise[which[:, :, None], which[:, None, :]] + felt @ felt.swapaxes(1, 2)
+        fixed = rows.noise.take(which[:, :, None] * len(rows.noise) + which[:, None, :]) + felt @ felt.swapaxes(1, 2)
         return cls(which, fixed, np.where(rows.owner[which] >= 0, 1.0, 0.0), offsets)
 
     def covariance(self, excess: float, tau: Array) -> Array:
@@ -189,7 +195,7 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, at: Laws
     by_drift = (felt[:, None, :] @ drift[owner])[:, 0]
     jacobian = np.hstack([(felt[:, None, :] @ design[owner])[:, 0], by_drift[:, list(problem.free)], turns])
     linearised = Rows(
-        residual, jacobian, _row_noise(problem, full, owner, kind), (offsets[0], offsets[1]), at.error * heat[:, None],
+        residual, jacobian, _row_noise(problem, full, at), (offsets[0], offsets[1]), at.error * heat[:, None],
         by_drift, owner, ~side, problem.recording[owner],
     )  # fmt: skip
     return (
@@ -199,17 +205,16 @@ def linearise(problem: ThermalProblem, laws: Laws, coefficients: Array, at: Laws
     )
 
 
-def _row_noise(problem: ThermalProblem, full: Array, owner: NDArray[np.int64], kind: NDArray[np.int64]) -> Array:
+def _row_noise(problem: ThermalProblem, full: Array, at: LawsAtHolds) -> Array:
     """Return the covariance of the rows by the noise of each hold along and across, shape (n, 3, 3), and by tilts."""
+    owner, kind = at.owner, at.kind
     if not kind.any():
         return np.diag(full[owner, 0, 0])
     full[:, 1, 1] += problem.tilt**2
     full[:, 2, 2] += problem.tilt**2
-    first, second = np.nonzero(owner[:, None] == owner)
-    noise = np.zeros((len(owner), len(owner)))
-    noise[first, second] = full[owner[first], kind[first], kind[second]]
-    if problem.wander is not None and problem.wander.any():
-        noise += np.where((kind[:, None] == kind) & (kind > 0), problem.wander[owner[:, None], owner], 0.0)
+    first, second = at.together
+    noise = np.zeros((len(owner), len(owner))) if at.wander is None else at.wander.copy()
+    noise[at.together] += full[owner[first], kind[first], kind[second]]
     return noise
 
 
@@ -361,7 +366,7 @@ def whitener_of(covariance: Array) -> Callable[[Array], Array]:
     return white
 
 
-_BLOCK = 64  # rows that are substituted at once
+_BLOCK = 24  # rows that are substituted at once: more take longer to invert than fewer to substitute
 
 
 # The fit.

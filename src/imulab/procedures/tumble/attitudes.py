@@ -535,7 +535,7 @@ _SAME_ATTITUDE = 2e-3
 shortens the vector by less than 0.5 ug."""
 _TRACE_POINTS = 2000  # of the drawing of the scatter over time
 _AT_ONCE = 1 << 20  # samples of which blocks are formed at once
-_A_PART = 2000  # samples by which the resolution of an output is told
+_A_PART = 250  # samples by which the resolution of an output is told
 
 
 class _Blocks(Struct, frozen=True):
@@ -658,7 +658,7 @@ def attitudes_and_samples(
         as_read=as_read,
         trace=trace,
         pieces=stretches,
-        swing=np.ptp(blocks.mean, axis=0),
+        swing=np.ptp(np.ascontiguousarray(blocks.mean.T), axis=1),
         motion=motion,
         notes=(
             *[*_corrected_notes(recording), *bridges],
