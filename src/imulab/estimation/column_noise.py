@@ -278,7 +278,7 @@ def _curve(samples: Array, unit: str, rate: float, taus: str | Array = "octave")
 
 def _unfit(samples: Array, noise: float) -> str:
     """Return why no noise model can be fitted to samples with `noise` as their Allan deviation from one to the next."""
-    if not np.ptp(samples):
+    if samples[0] == samples[-1] and not np.ptp(samples):
         return "all samples are the same: a dead sensor"
     if not noise:
         return "the samples differ by too little to be squared"

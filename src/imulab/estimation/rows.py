@@ -321,9 +321,11 @@ def leave_out(recording: Recording, names: Sequence[str]) -> LeftOut:
     by_kind = {"exact zeros": zero, REPEATED: repeated_rows(values) & ~zero}
     by_kind[FAR], by_kind["an exact zero of one column"] = far_rows(values, zero)
     kinds = {kind: rows for kind, rows in by_kind.items() if rows.any()}
-    bad = np.logical_or.reduce(list(by_kind.values()))
+    if not kinds:
+        return LeftOut(recording, tuple(names), kinds)
+    bad = np.logical_or.reduce(list(kinds.values()))
     index, good = np.flatnonzero(bad), np.flatnonzero(~bad)
-    if not index.size or not good.size:
+    if not good.size:
         return LeftOut(recording, tuple(names), kinds)
     columns = {}
     for name, column in zip(names, values, strict=True):
@@ -370,7 +372,8 @@ def _released(rows: NDArray[np.bool_], column: Array) -> NDArray[np.bool_]:
 def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
     """Return the rows that repeat the row before in all columns, where the sensor itself does not repeat readings."""
     n = len(values[0])
-    every, by_chance = np.arange(n) > 0, float(n)
+    every, by_chance = np.ones(n, dtype=np.bool_), float(n)
+    every[:1] = False
     for column in values:
         same = _released(column[1:] == column[:-1], column)
         every[1:] &= same
@@ -417,7 +420,10 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     for first, steps in _steps(x):
         parts = steps[: len(steps) // _AROUND * _AROUND].reshape(-1, _AROUND)
         local[first // _AROUND :][: len(parts)] = np.partition(parts[:, : _AROUND // 2], _UPPER, axis=1)[:, _UPPER]
-        resolution = min(resolution, float(np.min(steps, where=steps > 0, initial=np.inf)))
+        smallest = float(steps.min())
+        if not smallest > 0:
+            smallest = float(np.min(steps, where=steps > 0, initial=np.inf))
+        resolution = min(resolution, smallest)
     # Next to a motion there is no rest: the largest of a part's steps and its neighbours' counts.
     wide = np.maximum(local, np.maximum(np.append(local[1:], 0.0), np.concatenate([[0.0], local[:-1]])))
     if resolution == np.inf:
@@ -433,9 +439,11 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     far_steps = []
     for first, steps in _steps(x):
         its = limits[first // _AROUND :][: -(-len(steps) // _AROUND)]
+        if its.size and steps.max() <= its.min():  # as most are
+            continue
         its = np.append(its, limits[-1:]) if len(its) * _AROUND < len(steps) else its
         far_steps.append(np.flatnonzero(steps > np.repeat(its, _AROUND)[: len(steps)]) + first)
-    suspect = np.concatenate(far_steps)
+    suspect = np.concatenate([np.empty(0, dtype=np.intp), *far_steps])
     suspect = suspect[~moving[part(suspect)]]
     index = distinct(np.minimum(suspect[:, None] + np.arange(3), len(x) - 1))
     middle = np.clip(index, _BESIDE, len(x) - 1 - _BESIDE)

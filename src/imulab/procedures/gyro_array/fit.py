@@ -114,11 +114,10 @@ def calibrate_array(
     left_out = _bridge_rows(still, elements)
     warnings = [prefixed(still.name, note) for note in still.notes]
     warnings += [prefixed(still.name, note) for note in left_out.notes()]
-    still, cut = _still_part(left_out, elements)
+    still, cut, (rate, timing) = _still_part(left_out, elements)
     warnings += cut
     if cut or left_out.kinds:
         checks = _check_readings(still, elements)
-    rate, timing = sampling_rate(still)
     rest, notes = at_rest(still, rate, elements, noise)
     warnings += [*(prefixed(still.name, line) for line in notes), *timing]
     aligned = None
@@ -171,7 +170,7 @@ def _check_readings(recording: Recording, elements: Elements) -> Checks:
     check_finite(recording, names)
     for name in names:
         values = recording.column(name)
-        if len(values) and np.ptp(values) == 0:
+        if len(values) and values[0] == values[-1] and np.ptp(values) == 0:
             raise DataError(f"{recording.name}: column {name}: all samples are {values[0]:g}: a dead gyro")
     checks = Checks(elements.names)
     for rows in _blocks_of_rows(len(recording)):
@@ -181,16 +180,16 @@ def _check_readings(recording: Recording, elements: Elements) -> Checks:
     return checks
 
 
-def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[str]]:
-    """Return the longest stretch at rest, and a message where that is not the whole recording."""
+def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[str], tuple[float, list[str]]]:
+    """Return the longest stretch at rest, a message where that is not the whole recording, and its `sampling_rate`."""
     still = left_out.recording
     if len(still) < _FEWEST_SAMPLES:
         raise DataError(f"{still.name}: {len(still)} samples at rest are too few; expected {_FEWEST_SAMPLES} or more")
-    rate, _ = sampling_rate(still)
+    rate, timing = sampling_rate(still)
     rest = find_rest(partial(_readings_si, still, elements), len(still), rate, elements.names, still.name)
     left_out.check(rest.start, rest.stop, "the recording at rest")
     if not rest.moved:
-        return still, []
+        return still, [], (rate, timing)
     time = still.si("time")
     columns = {name: values[rest.start : rest.stop] for name, values in still.columns.items()}
     part = replace(still, columns=columns, first_row=still.first_row + rest.start)
@@ -200,13 +199,12 @@ def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[
             f"samples; expected {_FEWEST_SAMPLES} or more"
         )
     first, last = time[rest.start], time[rest.stop - 1]
-    return part, [
-        Finding(
-            f"{still.name}: not at rest throughout ({rest.moved}): used is the longest stretch at rest, {first:.6g} to "
-            f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval FROM:TO chooses another",
-            "record again at rest, or state the part at rest (--interval)",
-        )
-    ]
+    shortened = Finding(
+        f"{still.name}: not at rest throughout ({rest.moved}): used is the longest stretch at rest, {first:.6g} to "
+        f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval FROM:TO chooses another",
+        "record again at rest, or state the part at rest (--interval)",
+    )
+    return part, [shortened], sampling_rate(part)
 
 
 def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tuple[Alignment, list[str]]:
