@@ -1,6 +1,7 @@
 """New readings against a record of a magnetometer alone: false alarms, changes that are found, and the command."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -24,6 +25,12 @@ def pair(seed, axes, shift=0.0, field=1.0, count=300):
         outputs.append(made)
     outputs[1][:, 0] += shift
     return il.fit_magnetometer(recorded(outputs[0])).calibration, recorded(outputs[1])
+
+
+def level(dip=63.3, turns=2, count=1500):
+    """Return directions of the field in a unit that is turned level, shape (n, 3)."""
+    angle, dip = np.linspace(0, 2 * np.pi * turns, count), np.radians(dip)
+    return np.column_stack([np.cos(dip) * np.cos(angle), np.cos(dip) * np.sin(angle), np.full(count, -np.sin(dip))])
 
 
 @pytest.mark.parametrize("axes", [3, 2])
@@ -56,6 +63,40 @@ def test_steel_that_passes_is_set_aside_and_said():
     check = il.check_magnetometer(record, il.Recording(columns, fresh.units))
     assert check.passed
     assert "set aside" in check.notes[-1]
+
+
+@pytest.mark.parametrize("shift", [(-40.0, -8.0), (-8.0, 3.0)])
+def test_level_readings_of_a_record_of_all_directions_name_no_change_upwards(shift, reduced):
+    """In a level turn a change upwards is one of the field's size: it reached 600 uT with nothing said of it."""
+    named, errors = [], []
+    for seed in range(5 if reduced else 40):
+        sensor, outputs = waved(seed)
+        record = il.fit_magnetometer(recorded(outputs)).calibration
+        fresh = sensor.outputs(level(), 0.05, np.random.default_rng([seed, 4])) + np.array([*shift, 0.0])
+        check = il.check_magnetometer(record, recorded(fresh))
+        assert not check.passed
+        text = r"changed by x -\d.*, y [-+]\d.* uT explains .*; along z they tell no change"
+        named.append(re.search(text, check.meaning()) is not None)
+        errors.append((1e6 * check.hard_iron[:2] - shift) / (1e6 * check.hard_iron_std[:2]))
+        assert (1e6 * check.hard_iron_std[:2] < 3).all()
+    assert np.mean(named) > 0.75  # a change that explains them is not thought to in 1 of 20
+    assert 0.3 < np.sqrt(np.mean(np.square(errors))) < 1.2
+    assert np.abs(errors).max() < 4
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.4])
+def test_level_readings_of_a_record_of_all_directions_that_holds_pass(noise, reduced):
+    """Derivatives share the noise of the readings where they are evaluated: 3 of 4 records that held had failed."""
+    failed, explained = [], []
+    for seed in range(30 if reduced else 200):
+        sensor, outputs = waved(seed)
+        fresh = sensor.outputs(level(), noise, np.random.default_rng([seed, 9]))
+        check = il.check_magnetometer(il.fit_magnetometer(recorded(outputs)).calibration, recorded(fresh))
+        failed.append(not check.passed)
+        explained.append(check.explained < 0.05)
+    slack = 3.3 * np.sqrt(0.05 * 0.95 / len(failed))
+    assert abs(np.mean(failed) - 0.05) < slack
+    assert np.mean(explained) < 0.05 + slack
 
 
 def test_other_records_and_units_are_refused():

@@ -8,11 +8,16 @@ do to the readings is in
 
 C the record's covariance, f the inflation of the new readings' noise, and s the change of the field. What is left of y
 beside s is tested by F(p - 1, nu). With d more columns, the derivatives by the hard iron, the same test shows whether a
-change of hard iron alone explains it, and which.
+change of hard iron alone explains it, and which, where the size of the field and the hard iron change by a third of it
+as a rule: what readings do not tell, as a change upwards in a level turn, is then taken for none.
+
+J is taken at the points of the ellipsoid nearest to the readings, and without the directions that noise alone makes:
+at the readings themselves J would share their noise, and a record that holds would not pass.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -30,16 +35,19 @@ from imulab.estimation.distributions import f_tail
 from imulab.procedures.magnetometer import AXES, name_columns
 from imulab.procedures.magnetometer.device import output_unit, surface_of
 from imulab.procedures.magnetometer.model import read_readings
-from imulab.procedures.magnetometer.schema import FieldSummary, fit_of, model_of
-from imulab.procedures.magnetometer.solve import evaluate, find_inflation, mark_far
+from imulab.procedures.magnetometer.schema import fit_of, model_of
+from imulab.procedures.magnetometer.solve import evaluate, find_inflation, mark_far, unpack
 from imulab.procedures.result import RecordCheck, as_record, as_recording, probability_fact, probability_text
 from imulab.recording import Array, Data, Reading
 from imulab.records.calibration import Calibration
 from imulab.report.traces import Exhibits, Figure, figure_axis, marker, rounded, scatter
 
 _SPARE = 4  # readings beyond the parameters
-_PASSES = 5  # Gauss-Newton steps for a change of hard iron
-_SINGULAR = 1e-9
+_PASSES = 10  # Gauss-Newton steps for the size of the field and a change of hard iron
+_CLOSE = 1e-7  # of the field: the last step
+_ABOVE_NOISE = 3.0  # times what the noise of readings makes of the derivatives: less tells nothing of a parameter
+_USUAL = 0.3  # of the field: changes of hard iron that are likely without readings
+_TOLD = _USUAL / 2  # a change along an axis that is known to less is not said
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,7 +65,10 @@ class MagnetometerCheck(RecordCheck):
     probability
         Probability of such readings if the record holds.
     hard_iron
-        Change of hard iron that explains them best, in the unit of the record's biases, shape (d,).
+        Change of hard iron that explains them best, in the unit of the record's biases, shape (d,); nan along an axis
+        of which the readings do not tell it.
+    hard_iron_std
+        Its standard uncertainty, shape (d,).
     explained
         Probability of what is left after such a change.
     unit, axes
@@ -71,6 +82,7 @@ class MagnetometerCheck(RecordCheck):
     field: float
     probability: float
     hard_iron: Array
+    hard_iron_std: Array
     explained: float
     unit: str
     axes: str
@@ -96,10 +108,15 @@ class MagnetometerCheck(RecordCheck):
         if self.explained < MAGNETOMETER_CHECK.level:
             return "the readings are not those of the record: hard and soft iron, or the sensor, have changed"
         factor, unit = (1e6, "uT") if self.unit == "T" else (1.0, self.unit)
+        told = np.isfinite(self.hard_iron_std)
         change = ", ".join(
-            f"{axis} {factor * value:+.3g}" for axis, value in zip(self.axes, self.hard_iron, strict=True)
+            f"{axis} {factor * value:+.3g}"
+            for axis, value, known in zip(self.axes, self.hard_iron, told, strict=True)
+            if known
         )
-        return f"a hard iron that changed by {change} {unit} explains the readings (p = {self.explained:.1g})"
+        others = " ".join(axis for axis, known in zip(self.axes, told, strict=True) if not known)
+        rest = f"; along {others} they tell no change" if others else ""
+        return f"a hard iron that changed by {change} {unit} explains the readings (p = {self.explained:.1g}){rest}"
 
     def next_step(self, record: str, files: Sequence[str]) -> str:
         """Return what to do after a failed test."""
@@ -120,7 +137,12 @@ class MagnetometerCheck(RecordCheck):
             "readings": int(self.used.sum()),
             "rms": self.rms,
             "field": self.field,
-            "hard_iron_change": {"value": self.hard_iron.tolist(), "unit": self.unit, "p": self.explained},
+            "hard_iron_change": {
+                "value": [_number(value) for value in self.hard_iron.tolist()],
+                "standard_uncertainty": [_number(u) for u in self.hard_iron_std.tolist()],
+                "unit": self.unit,
+                "p": self.explained,
+            },
         }
 
     def exhibits(self) -> Exhibits:
@@ -147,6 +169,10 @@ class MagnetometerCheck(RecordCheck):
             },
         )  # fmt: skip
         return self.exhibits_with(facts, [figure], f"; {probability_text(self.probability)}")
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def check_magnetometer(
@@ -192,28 +218,32 @@ def check_magnetometer(
             "directions"
         )
     used = _find_used(theta, output)
-    size, d = len(theta), output.shape[1]
-    first, of_field = _test(theta, output[used], covariance, theta, size - 1, hard=False, summary=fit_of(held))
-    moved, after = np.zeros(d), first
-    for _ in range(_PASSES):  # |m| is not linear in a large change of hard iron
-        there = theta + np.concatenate([moved, np.zeros(size - d)])
-        after, change = _test(there, output[used], covariance, theta, size - 1 - d, hard=True, summary=fit_of(held))
-        moved = moved + change[1:]
+    d, spare = output.shape[1], fit_of(held).degrees_of_freedom
+    first, ratio, _, _ = _explain(theta, output[used], covariance, spare, hard=False)
+    after, _, moved, u = _explain(theta, output[used], covariance, spare, hard=True)
+    moved, u = np.where(u < _TOLD * _field(theta, d), [moved, u], np.nan)
     magnitude = evaluate(theta, output)[0]
     notes = list(readings.notes)
     if not used.all():
         where = ", ".join(readings.stretches(~used)[:3])
         notes.append(Note(f"{int((~used).sum())} of {len(used)} readings set aside ({where}): was steel near?"))
     unit = next(iter(held.parameters.values())).unit
-    ratio = 1.0 + float(of_field[0])
     return MagnetometerCheck(
-        (1 + magnitude) / ratio - 1, used, ratio, first, moved, after, unit, model.axes, tuple(notes)
+        (1 + magnitude) / ratio - 1, used, ratio, first, moved, u, after, unit, model.axes, tuple(notes)
     )
 
 
 def _whitened(theta: Array, output: Array) -> tuple[Array, Array]:
+    """Return the readings' distances from the ellipsoid, (n,), and their derivatives at its nearest points, (n, p)."""
     r, jacobian, weight = evaluate(theta, output)
-    return r / weight, jacobian / weight[:, None]
+    nearest = output + (r / weight**2)[:, None] * jacobian[:, : output.shape[1]]
+    _, there, normal = evaluate(theta, nearest)
+    return r / weight, there / normal[:, None]
+
+
+def _field(theta: Array, d: int) -> float:
+    """Return the field in the unit of the outputs."""
+    return float(abs(np.linalg.det(unpack(theta, d)[1])) ** (1 / d))
 
 
 def _find_used(theta: Array, output: Array) -> NDArray[np.bool_]:
@@ -228,31 +258,58 @@ def _find_used(theta: Array, output: Array) -> NDArray[np.bool_]:
     return ~aside
 
 
-def _test(
-    at: Array, output: Array, covariance: Array, theta: Array, freedom: int, *, hard: bool, summary: FieldSummary
-) -> tuple[float, Array]:
-    """Return the probability of readings under a record, and the change of the field's size, and of hard iron.
+def _explain(
+    theta: Array, output: Array, covariance: Array, freedom: float, *, hard: bool
+) -> tuple[float, float, Array, Array]:
+    """Return the probability of readings, the field over the record's, the change of hard iron, and its u, shape (d,).
 
-    `at` are the parameters where the readings are evaluated: those of the record, with another hard iron.
+    `freedom` are the degrees of freedom of the record; without `hard` the hard iron does not change.
     """
-    x, rows = _whitened(at, output)
-    u, size, v = np.linalg.svd(rows, full_matrices=False)
-    kept = size > _SINGULAR * size[0]
-    u, slopes = u[:, kept], (size[:, None] * v)[kept]
+    d, field = output.shape[1], _field(theta, output.shape[1])
+    p, ratio, moved, u = 0.0, 1.0, np.zeros(d), np.zeros(d)
+    for _ in range(_PASSES):
+        p, change, u = _test(theta, output, covariance, freedom, ratio, moved if hard else None)
+        change = change / max(1.0, abs(change[0]) / _USUAL, np.abs(change[1:]).max(initial=0) / (_USUAL * field))
+        ratio *= 1 + float(change[0])
+        moved = moved + change[1:] if hard else moved
+        if abs(change[0]) < _CLOSE and (np.abs(change[1:]) < _CLOSE * field).all():
+            break
+    return p, ratio, moved, u
+
+
+def _test(
+    theta: Array, output: Array, covariance: Array, freedom: float, ratio: float, moved: Array | None
+) -> tuple[float, Array, Array]:
+    """Return the probability of readings, and how the size of the field and the hard iron change, and u of the latter.
+
+    `ratio` and `moved` are where the readings are evaluated: the size of the field over that of the record, and the
+    change of hard iron, None where it does not change.
+    """
+    d, size = output.shape[1], len(theta)
+    scale = np.concatenate([np.ones(d), np.full(size - d, ratio)])
+    x, rows = _whitened(scale * theta + np.pad(np.zeros(d) if moved is None else moved, (0, size - d)), output)
+    u, sizes, v = np.linalg.svd(rows, full_matrices=False)
     left = x - u @ (u.T @ x)
-    nu = max(len(x) - int(kept.sum()), 1)
-    sigma = float(np.sqrt((left**2).sum() / nu))
-    if not sigma:
-        sigma = 1e-12
+    sigma = float(np.sqrt((left**2).sum() / max(len(x) - size, 1))) or 1e-12
+    field = _field(theta, d)
+    kept = sizes > _ABOVE_NOISE * math.sqrt(len(x)) * sigma / (ratio * field)
+    u, slopes = u[:, kept], (sizes[:, None] * v)[kept]
+    left, nu = x - u @ (u.T @ x), max(len(x) - int(kept.sum()), 1)
     inflation = find_inflation(left, u, sigma)
-    total = sigma**2 * inflation * np.eye(len(slopes)) + slopes @ covariance @ slopes.T
+    total = sigma**2 * inflation * np.eye(len(slopes)) + slopes * scale @ covariance @ (slopes * scale).T
     root = np.linalg.cholesky(total)
-    d = output.shape[1]
-    field = np.concatenate([np.zeros(d), theta[d:]])
-    design = slopes @ np.column_stack([field, np.eye(len(theta))[:, :d]] if hard else [field])
-    y, columns = np.linalg.solve(root, u.T @ x), np.linalg.solve(root, design)
-    coefficients = np.linalg.lstsq(columns, y)[0]
+    changes = [np.concatenate([np.zeros(d), scale[d:] * theta[d:]])[:, None]]
+    before, aim = np.zeros((0, 1)), np.zeros(0)
+    if moved is not None:
+        changes.append(np.eye(size)[:, :d])
+        usual = _USUAL * np.concatenate([[1.0], np.full(d, field)])
+        before = np.diag(np.concatenate([[ratio], np.ones(d)]) / usual)
+        aim = np.concatenate([[ratio - 1], moved]) / usual
+    y, columns = np.linalg.solve(root, u.T @ x), np.linalg.solve(root, slopes @ np.hstack(changes))
+    joint = np.vstack([columns, before])
+    coefficients = np.linalg.lstsq(joint, np.concatenate([y, aim]))[0]
+    spread = np.linalg.inv(joint.T @ joint)
     value = float(((y - columns @ coefficients) ** 2).sum())
-    tested = max(freedom - int((~kept).sum()), 1)
-    spare = min(nu / inflation, summary.degrees_of_freedom)
-    return float(f_tail(value / tested, float(tested), max(spare, 1.0))), -coefficients
+    tested = max(int(kept.sum()) - float(np.trace(columns @ spread @ columns.T)), 1.0)
+    after = min(nu / inflation, freedom)
+    return float(f_tail(value / tested, tested, max(after, 1.0))), -coefficients, np.sqrt(np.diag(spread)[1:])
