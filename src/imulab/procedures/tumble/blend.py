@@ -39,7 +39,8 @@ _UNSEEN = 10.0
 _LEAST_FREEDOM = 2  # degrees of freedom that an order must leave where the noise is estimated
 _TOLERANCE, _STEPS = 1e-9, 40  # of a fit in scaled parameters, and its most steps
 _BLEND_PASSES = 8  # in which noise, weights and order agree
-_AT_REST = 1e-13  # change of scaled parameters, and relative one of their noise, below which they do
+_AT_REST, _NOISE_AT_REST = 1e-10, 1e-8
+"""Change of scaled parameters, and relative one of their noise, below which they do: a pass leaves a hundredth."""
 _LEAST_VARIANCE = 1e-40  # g^2, far below that of rounding: stands for a variance of 0
 _SIZES = (np.geomspace(5e-6, 5e-3, 7), 40e-6)
 """Sizes of k2 and k3 before the data, in units of g: the grid and the half width of a half-Cauchy distribution."""
@@ -317,7 +318,7 @@ def with_known_spread(
         if problem.covariance is None and not problem.robust:
             freedom = max(n - float(np.trace(inverse @ information)), 1.0)
             scale = max(float((weights * (norm[0] - 1 - lengthening) ** 2).sum()) / freedom, _LEAST_VARIANCE)
-        if np.abs(step).max() < _AT_REST and abs(scale - before) <= _AT_REST * scale:
+        if np.abs(step).max() < _AT_REST and abs(scale - before) <= _NOISE_AT_REST * scale:
             break
     root = np.sqrt(scale * start.variance[0])
     rows = np.hstack([jacobian[0], _asymmetry_columns(problem, theta, top)]) / root[:, None]
