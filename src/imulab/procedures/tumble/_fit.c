@@ -35,11 +35,11 @@ static void lay_out(Work *w, double *room) {
     }
 }
 
-/* Residuals |f| - 1 - lengthening and their derivatives; returns the weighted sum of squares. */
+/* Residuals |f| - 1 - lengthening and, where `jacobian` is not NULL, their derivatives; returns the weighted sum of squares. */
 static double evaluate(const Work *w, const double *theta, double *residuals, double *jacobian) {
     double cost = 0.0, force[3];
     for (Py_ssize_t i = 0; i < w->n; i++) {
-        residuals[i] = model_length(theta, w->reading + 3 * i, w->order, jacobian + i * w->p, force) - 1.0 - w->lengthening[i];
+        residuals[i] = model_length(theta, w->reading + 3 * i, w->order, jacobian == NULL ? NULL : jacobian + i * w->p, force) - 1.0 - w->lengthening[i];
         cost += w->weights[i] * residuals[i] * residuals[i];
     }
     return cost;
@@ -116,8 +116,8 @@ static void swap(double **a, double **b) {
 }
 
 /* Levenberg-Marquardt on one problem, from a start with this cost where residuals, Jacobian and normal equations are known;
- * returns the number of steps tried. */
-static int minimise(Work *w, double *theta, double cost, double tolerance, int most, char *converged) {
+ * returns the number of steps tried. The Jacobian at a solution is left out where it is not `wanted`. */
+static int minimise(Work *w, double *theta, double cost, double tolerance, int most, int wanted, char *converged) {
     double damping = 0.0;
     *converged = 0;
     for (int number = 1; number <= most; number++) {
@@ -128,7 +128,7 @@ static int minimise(Work *w, double *theta, double cost, double tolerance, int m
             if (!(fabs(w->step[a]) <= largest)) largest = fabs(w->step[a]);
         }
         const int small = largest <= tolerance;
-        const double found = evaluate(w, w->trial, w->new_residuals, w->new_jacobian);
+        const double found = evaluate(w, w->trial, w->new_residuals, small && !wanted ? NULL : w->new_jacobian);
         const int better = found <= cost * (largest <= NEAR * tolerance ? 1.0 + 1e-12 : 1.0);
         if (better) {
             swap(&w->residuals, &w->new_residuals);
@@ -182,7 +182,7 @@ PyObject *model_fit(PyObject *module, PyObject *args) {
         for (Py_ssize_t b = 0; b < problems; b++) {
             const double cost = evaluate(&w, theta, w.residuals, w.jacobian);
             normal_equations(&w);
-            iterations[b] = minimise(&w, theta, cost, tolerance, most, converged + b);
+            iterations[b] = minimise(&w, theta, cost, tolerance, most, 1, converged + b);
             memcpy(residuals, w.residuals, sizeof(double) * (size_t)n);
             memcpy(jacobian, w.jacobian, sizeof(double) * (size_t)(n * p));
             theta += p, residuals += n, jacobian += n * p;
@@ -215,7 +215,7 @@ static void leave_out_each(Work *w, Work *all, const double *theta, double toler
             solution[a] = theta[a];
         }
         weights[i] = 0.0;
-        minimise(w, solution, cost - weight * residual * residual, tolerance, most, &converged);
+        minimise(w, solution, cost - weight * residual * residual, tolerance, most, 0, &converged);
         weights[i] = weight;
         errors[i] = w->residuals[i];
     }

@@ -17,6 +17,7 @@ double model_length(const double *theta, const double *reading, int order, doubl
     f[2] = s[2] - m[1] * f[0] - m[2] * f[1];
     double norm = sqrt(f[0] * f[0] + f[1] * f[1] + f[2] * f[2]);
     if (norm < DBL_MIN) norm = DBL_MIN;
+    if (derivative == NULL) return norm;
     const double per_norm = 1.0 / norm;
     double v[3]; /* T' v = f / |f|, so that d|f| = v . (ds - dT f) */
     v[2] = f[2] * per_norm;
