@@ -211,9 +211,32 @@ def observability(jacobian: Array, weights: Array) -> Observability:
     )
 
 
-def column_space(jacobian: Array, weights: Array) -> Array:
-    """Return an orthonormal basis of the columns of ``sqrt(W) J`` of each problem, shape (b, n, p)."""
-    return np.asarray(np.linalg.qr(_scaled_columns(jacobian, weights)[0])[0])
+class Factors(Struct, frozen=True):
+    """``sqrt(W) J`` of each problem as ``basis triangle diag(scale)``.
+
+    Attributes
+    ----------
+    basis
+        Orthonormal basis of the columns, shape (b, n, p).
+    triangle
+        Upper triangular, with columns of length 1, shape (b, p, p).
+    scale
+        Lengths of the columns, shape (b, p).
+    """
+
+    basis: Array
+    triangle: Array
+    scale: Array
+
+    def inverse_root(self) -> Array:
+        """Return what `inverse_root` does."""
+        return np.asarray(np.linalg.inv(self.triangle) / self.scale[:, :, None])
+
+
+def factorise(jacobian: Array, weights: Array) -> Factors:
+    """Return the factors of ``sqrt(W) J`` of each problem, of more observations than parameters."""
+    scaled, scale = _scaled_columns(jacobian, weights)
+    return Factors(*np.linalg.qr(scaled), scale)
 
 
 def _scaled_columns(jacobian: Array, weights: Array) -> tuple[Array, Array]:
@@ -225,7 +248,7 @@ def _scaled_columns(jacobian: Array, weights: Array) -> tuple[Array, Array]:
 
 def leverage(jacobian: Array, weights: Array) -> Array:
     """Return the leverage of each observation, the diagonal of the hat matrix, shape (b, n)."""
-    basis = column_space(jacobian, weights)
+    basis = factorise(jacobian, weights).basis
     result: Array = np.einsum("bnp,bnp->bn", basis, basis)
     return result
 

@@ -50,6 +50,7 @@ from imulab.estimation.least_squares import (
     bayesian_information,
     chi_square_limit,
     f_test,
+    factorise,
     inverse_root,
     observability,
 )
@@ -268,7 +269,7 @@ def find_patterns(groups: Mapping[str, Array], solution: TumbleSolution) -> dict
     are left out.
     """
     used, size = solution.weights[0] > 0, solution.jacobian.shape[2]
-    root, basis = np.sqrt(solution.weights[0, used]), solution.basis[0, used]
+    root, basis = np.sqrt(solution.weights[0, used]), solution.factors.basis[0, used]
     weighted = np.column_stack([solution.residuals[0], *groups.values()])[used] * root[:, None]
     left, scale = weighted - basis @ (basis.T @ weighted), np.sqrt((weighted**2).sum(axis=0))
     y, n, patterns, start = left[:, 0], len(root), dict[str, Pattern](), 1
@@ -517,15 +518,16 @@ def _tested(solutions: Mapping[int, TumbleSolution]) -> list[int]:
 
 def _whitened(solution: TumbleSolution, excess: float) -> _Whitened | None:
     """Return None where the attitudes do not determine the parameters."""
-    root = np.sqrt(solution.own_variance[0] + excess**2)
-    rows = solution.jacobian[0] / root[:, None]
-    length = np.linalg.norm(rows, axis=0)
-    if rows.shape[0] < rows.shape[1] + FREEDOM[True] or not (np.isfinite(rows).all() and length.all()):
+    variance = solution.own_variance + excess**2
+    rows = solution.jacobian[0] / np.sqrt(variance[0, :, None])
+    if rows.shape[0] < rows.shape[1] + FREEDOM[True] or not (np.isfinite(rows).all() and rows.any(axis=0).all()):
         return None
-    basis, values, _ = np.linalg.svd(rows / length, full_matrices=False)
+    same = np.array_equal(solution.weights, 1 / variance)
+    factors = solution.factors if same else factorise(solution.jacobian, 1 / variance)
+    values, basis = np.linalg.svd(factors.triangle[0], compute_uv=False), factors.basis[0]
     if values[-1] * _DETERMINED < values[0]:
         return None
-    y = solution.residuals[0] / root
+    y = solution.residuals[0] / np.sqrt(variance[0])
     return _Whitened(y - basis @ (basis.T @ y), basis)
 
 

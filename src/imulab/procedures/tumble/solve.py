@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from imulab.errors import DataError
 from imulab.estimation.least_squares import (
+    Factors,
     Fit,
-    column_space,
+    factorise,
     huber_weights,
     inverse_root,
     leverage,
@@ -179,18 +180,20 @@ class TumbleSolution:
         return self.down_weights / self.variance
 
     @cached_property
-    def basis(self) -> Array:
-        """Orthonormal basis of what the model explains, in units of the weights, shape (b, n, p)."""
-        return column_space(self.jacobian, self.weights)
+    def factors(self) -> Factors:
+        """Of the Jacobian under the weights; their basis is what the model explains, in units of the weights."""
+        return factorise(self.jacobian, self.weights)
 
     @cached_property
     def leverage(self) -> Array:
         """Leverage of each attitude under the weights, shape (b, n)."""
-        return np.asarray(np.einsum("bnp,bnp->bn", self.basis, self.basis))
+        return np.asarray(np.einsum("bnp,bnp->bn", self.factors.basis, self.factors.basis))
 
     @cached_property
     def inverse_root(self) -> Array:
         """``U U' = (J' W J)^-1`` without down-weights, upper triangular, shape (b, p, p)."""
+        if (self.down_weights == 1).all():
+            return self.factors.inverse_root()
         return inverse_root(self.jacobian, 1 / self.variance)
 
     def covariance(self, size: int | None = None) -> Array:
