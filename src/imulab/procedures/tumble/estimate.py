@@ -5,11 +5,12 @@ With the options of a fit checked before there is data.
 
 from __future__ import annotations
 
+import dataclasses
 import numbers
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from imulab.display import Note
 from imulab.errors import DataError, ObservabilityError, OptionError, first_of, listed
@@ -226,7 +227,7 @@ def with_assumed_alignment(record: Calibration) -> Calibration:
         "order 0 takes every misalignment as 0: each mrad that there is puts 1 mg per g of one axis into another; "
         "order 1 and nine or more attitudes over the sphere determine it"
     )
-    return replace(
+    return dataclasses.replace(
         record, parameters={**record.parameters, **assumed}, warnings=(*record.warnings, note), verdict=record.verdict
     )
 
@@ -288,7 +289,7 @@ def estimate_triad(
     )  # fmt: skip
     if prior is None or known is None or aged is None:
         return estimate
-    return replace(
+    return dataclasses.replace(
         estimate,
         with_gravity=aged.with_gravity,
         prior=prior_shares(prior, known, aged, scaling, gravity),

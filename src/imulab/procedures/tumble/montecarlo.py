@@ -8,9 +8,10 @@ parameters' distribution a Student t with nu degrees of freedom (JCGM 101, 6.4.9
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec.structs import replace
 
 from imulab.errors import OptionError
 from imulab.procedures.tumble.solve import TumbleProblem, TumbleSolution, solve_norm

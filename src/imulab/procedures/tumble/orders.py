@@ -26,12 +26,12 @@ Sources: Belsley, Kuh and Welsch, Regression Diagnostics (1980), ch. 2; Schwarz,
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from functools import cache, cached_property
 from math import comb, lgamma, log
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 import imulab.procedures.tumble._model as _model

@@ -9,10 +9,11 @@ widening after a test that failed would leave what the test missed uncovered.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from msgspec.structs import replace
 
 from imulab.display import Bad, Finding
 from imulab.errors import RecordError

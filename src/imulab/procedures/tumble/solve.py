@@ -18,12 +18,12 @@ because a triad is as good as its worst axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from imulab.errors import DataError
@@ -70,8 +70,7 @@ class Prior(Struct, frozen=True):
     rows: Array
 
 
-@dataclass(frozen=True)
-class TumbleProblem:
+class TumbleProblem(Struct, frozen=True):
     """Attitudes of a batch of units, scaled: outputs less a nominal zero, over a nominal scale, in units of g.
 
     Attributes
@@ -128,8 +127,7 @@ class TumbleProblem:
         )
 
 
-@dataclass(frozen=True)
-class TumbleSolution:
+class TumbleSolution(Struct, frozen=True, dict=True):
     """Solutions of a batch of problems, in units of g.
 
     Attributes
