@@ -397,6 +397,7 @@ def test_only_what_a_file_is_for_is_offered_and_of_the_rest_it_is_said_why(workb
     paths = offered(page)
     assert paths[0] == "rate fit"
     assert not {"tumble fit", "tumble mag", "array calibrate", "warmup fit", "apply", "certificate"} & set(paths)
+    assert not any(path.startswith("array") for path in paths)
     page.get_by_text("Not with this").click()
     card = page.locator("[data-path='tumble fit']")
     assert card.is_disabled()
@@ -414,6 +415,18 @@ def test_only_what_a_file_is_for_is_offered_and_of_the_rest_it_is_said_why(workb
     cards = page.locator(".procedure > .cards .card").evaluate_all("all => all.map(each => each.dataset.path)")
     assert {"certificate", "report", "export"} <= set(cards)
     assert "noise fit" not in cards
+
+
+def test_a_board_of_whole_imus_is_offered_its_calibration(workbench, new_page, folder):
+    page = new_page(workbench.address)
+    il.write_csv(il.simulate_imus(elements=4, attitudes=6, duration="5 s", rate="50 Hz"), "board_log.csv")
+    drop(page, "board.csv", Path("board_log.csv").read_text())
+    page.locator("svg.plot").first.wait_for()
+    paths = offered(page)
+    assert paths[0] == "array calibrate --imus"
+    assert not {"array fuse --imus", "array compare --imus"} & set(paths)  # these need the record of the board
+    assert "--imus" not in page.locator(".formplace .form .caption").first.inner_text()
+    assert page.locator(".formplace [name=imus], .formplace [id$=imus]").count() == 0
 
 
 def test_a_channel_can_be_read_out_and_hidden_and_a_window_taken(workbench, new_page):

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
@@ -150,16 +150,21 @@ def _wrong_gravity(typed: Mapping[str, str]) -> dict[str, str]:
 
 def forms(commands: Iterable[Any]) -> dict[str, Form]:
     """Return the forms of commands of the command line, by their paths."""
-    return {command.path: _form(command) for command in commands}
+    all_commands = {command.path: command for command in commands}
+    return {path: _form(command, all_commands) for path, command in all_commands.items()}
 
 
-def _form(command: Any) -> Form:
+def _form(command: Any, all_commands: Container[str]) -> Form:
+    """Return the form of a command; a switch that makes another command of it is that command's form."""
+    name = " ".join(command.name)
     drawn = any(option.keyword == "report" for option in command.options)
     arguments = [
         FormField(each.keyword, "", "files" if each.many else "file", each.shows, "", "", (), False, each.required)
         for each in command.arguments
     ]
-    options = [_field(option, drawn=drawn) for option in command.options]
+    options = [
+        _field(option, drawn=drawn) for option in command.options if f"{name} {option.flags[-1]}" not in all_commands
+    ]
     known = {option.keyword: option for option in command.options}
     text = " ".join(command.help.split())
     return Form(command.path, command.summary.rstrip("."), text, (*arguments, *options), known)

@@ -11,6 +11,7 @@ const rates = facts => (some(facts, /^(gyro|fog|dtg)/) ? "" : "there is no gyros
 const inertial = facts => (some(facts, /^(accel|gyro|fog|dtg)/) ? "" : "there is no accelerometer and no gyroscope in it");
 const several = facts => (facts.count > 1 ? "" : "it takes several files: choose them in the list");
 const array = facts => (some(facts, ELEMENTS) ? "" : "there are no several gyroscopes in it (gyro_1, gyro_2 ..)");
+const imus = facts => (some(facts, /^accel_[xyz]_\d+$/) ? "" : "there are no several IMUs in it (accel_x_1, accel_x_2 ..)");
 const warm = facts => (some(facts, /^temperature/) ? "" : "there is no temperature in it");
 const record = (...procedures) => facts => (facts.records.some(each => !procedures.length || procedures.includes(each)) ? ""
   : `it needs a record${procedures.length ? ` of ${procedures.join(" or ")}` : ""}, and there is none here yet`);
@@ -32,11 +33,14 @@ const NEEDS = {
   "rate fit": [rates, timed],
   "rate turn": [holds("gyro"), timed],
   "array calibrate": [array, timed], "array fuse": [array, timed], "array compare": [array, timed],
+  "array calibrate --imus": [imus, timed],
+  "array fuse --imus": [imus, timed, record("gyro_array")],
+  "array compare --imus": [imus, timed, record("gyro_array")],
   "array merge": [rates, several],
   apply: [record()],
 };
 const RECORDS = { report: [], certificate: [], export: [], "warmup table": ["warmup"], "tumble check": ["tumble", "thermal"], "thermal check": ["thermal"], "noise check": ["noise"], "magnetometer check": ["magnetometer"], apply: [], show: [] };
-const ONE = new Set(["tumble fit", "tumble gyro", "tumble mag", "magnetometer fit", "magnetometer check", "tumble check", "rate fit", "rate turn", "array calibrate", "array fuse", "array compare", "allan", "convert", "apply", "show"]);
+const ONE = new Set(["tumble fit", "tumble gyro", "tumble mag", "magnetometer fit", "magnetometer check", "tumble check", "rate fit", "rate turn", "array calibrate", "array fuse", "array compare", "array calibrate --imus", "array fuse --imus", "array compare --imus", "allan", "convert", "apply", "show"]);
 const LATER = ["show", "convert", "layout guess"]; // what the page does by itself, or what is rarely wanted
 
 // The sentence that says why a procedure is not for what is chosen; none where it is. Nothing is known of a recording
@@ -64,7 +68,10 @@ export function likely(one, other, facts) {
     if (LATER.includes(path)) return 90;
     if (path === "warmup fit" && facts.count > 1) return 0;
     if (path === "magnetometer fit" && has(facts, "mag") && !has(facts, "accel")) return 0;
-    if (path.startsWith("array") && some(facts, ELEMENTS)) return / calibrate$/.test(path) ? 1 : 5;
+    if (path.startsWith("array") && some(facts, ELEMENTS)) {
+      const board = !imus(facts) && path.endsWith("--imus");
+      return (path.includes("calibrate") ? 2 : 5) - (board ? 1 : 0);
+    }
     const order = ["tumble fit", "rate fit", "centrifuge reduce", "thermal fit", "noise fit", "tumble mag", "rate turn", "tumble gyro", "allan", "tumble check", "apply", "thermal check", "noise check"];
     return order.includes(path) ? 10 + order.indexOf(path) : 50;
   };
