@@ -702,11 +702,10 @@ def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
     if parse_unit(unit).quantity == "rate":
         return np.ones(3)
     scales, why = [], "no recording has nine attitudes"
-    for number, attitudes in enumerate(holds.attitudes):
-        if not _has_turns(attitudes):
-            continue
+    accelerometers = DeviceUnit.of(tables_of(record)[0])
+    for number in _find_turned(holds):
         try:
-            solved = solve_turns(*_turn_problem(holds, number, record, np.ones(3), None, unit), "auto")
+            solved = solve_turns(*_turn_problem(holds, number, record, accelerometers, np.ones(3), None, unit), "auto")
         except SegmentError as error:
             why = str(error)
             continue
@@ -719,9 +718,10 @@ def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
     return np.asarray(np.mean(scales, axis=0), dtype=np.float64)
 
 
-def _has_turns(attitudes: Attitudes) -> bool:
-    """Return whether a recording has enough attitudes for scale factors from turns; a rest ramp has one."""
-    return attitudes.pieces is not None and len(np.unique(attitudes.pieces[:, 2])) >= TURNED
+def _find_turned(holds: Holds) -> list[int]:
+    """Return the numbers of the recordings with attitudes enough for scale factors from turns; a rest ramp has one."""
+    pieces = [each.pieces for each in holds.attitudes]
+    return [k for k, its in enumerate(pieces) if its is not None and len(np.unique(its[:, 2])) >= TURNED]
 
 
 def scale_from_turns(
@@ -750,10 +750,13 @@ def scale_from_turns(
     """
     turned: list[Turned] = []
     notes: list[str] = []
-    for number, attitudes in enumerate(holds.attitudes):
-        if not _has_turns(attitudes):
-            continue
-        case, stamps = _turn_problem(holds, number, record, gyros.held.size, gyros, "rad/s")
+    numbers = _find_turned(holds)
+    if not numbers:
+        return None
+    accelerometers = DeviceUnit.of(tables_of(record)[0])
+    for number in numbers:
+        attitudes = holds.attitudes[number]
+        case, stamps = _turn_problem(holds, number, record, accelerometers, gyros.held.size, gyros, "rad/s")
         try:
             solved = solve_turns(case, stamps, "no")
         except SegmentError as error:
@@ -895,15 +898,21 @@ def _mean_temperatures(holds: Holds, number: int, attitudes: Attitudes) -> Array
 
 
 def _turn_problem(
-    holds: Holds, number: int, record: Calibration, size: Array, gyros: ThermalGyroscopes | None, unit: str
+    holds: Holds,
+    number: int,
+    record: Calibration,
+    accelerometers: DeviceUnit,
+    size: Array,
+    gyros: ThermalGyroscopes | None,
+    unit: str,
 ) -> tuple[TurnProblem, Stamps]:
     """Return the turns of one recording, less biases and g-sensitivities, and the times of its samples."""
     recording, gyroscopes, attitudes = holds.recordings[number], holds.gyroscopes[number], holds.attitudes[number]
     kept = leave_out(gyroscopes, triad("gyro")).recording
     accel_time, time = recording.si("time"), gyroscopes.si("time")
-    unit_of = DeviceUnit.of(tables_of(record)[0])
-    force = np.column_stack(unit_of.thermal(_mean_temperatures(holds, number, attitudes), list(attitudes.mean.T))[0])
-    accel_force = np.column_stack(unit_of.thermal(recording.si("temperature"), list(recording.triad("accel").T))[0])
+    mean = accelerometers.thermal(_mean_temperatures(holds, number, attitudes), list(attitudes.mean.T))[0]
+    each = accelerometers.thermal(recording.si("temperature"), list(recording.triad("accel").T))[0]
+    force, accel_force = np.column_stack(mean), np.column_stack(each)
     output = scale_output(kept, size)
     if gyros is not None:
         clipped = beyond_range(output)

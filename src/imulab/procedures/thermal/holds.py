@@ -53,8 +53,10 @@ def find_stretches_at_rest(outputs: Array, time: Array) -> NDArray[np.int64] | N
     at_rest = columns if still.all() else columns.compress(still, axis=1)
     if _clearly_turns(at_rest):
         return None
-    ends = np.quantile(at_rest, [_SHARE_IN_TAILS, 1 - _SHARE_IN_TAILS], axis=1)
-    if np.ptp(ends, axis=0).max() > _TURNED * np.linalg.norm(ends.mean(axis=0)):
+    low, high = (
+        np.array([quantile(column, share) for column in at_rest]) for share in (_SHARE_IN_TAILS, 1 - _SHARE_IN_TAILS)
+    )
+    if (high - low).max() > _TURNED * np.linalg.norm((low + high) / 2):
         return None
     return np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
 
