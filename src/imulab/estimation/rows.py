@@ -425,7 +425,9 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
             smallest = float(np.min(steps, where=steps > 0, initial=np.inf))
         resolution = min(resolution, smallest)
     # Next to a motion there is no rest: the largest of a part's steps and its neighbours' counts.
-    wide = np.maximum(local, np.maximum(np.append(local[1:], 0.0), np.concatenate([[0.0], local[:-1]])))
+    wide = local.copy()
+    np.maximum(wide[:-1], local[1:], out=wide[:-1])
+    np.maximum(wide[1:], local[:-1], out=wide[1:])
     if resolution == np.inf:
         return far, alone
     moving = wide > _QUIET * max(quantile(local, 0.2), resolution)
@@ -446,7 +448,7 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     suspect = np.concatenate([np.empty(0, dtype=np.intp), *far_steps])
     suspect = suspect[~moving[part(suspect)]]
     index = distinct(np.minimum(suspect[:, None] + np.arange(3), len(x) - 1))
-    middle = np.clip(index, _BESIDE, len(x) - 1 - _BESIDE)
+    middle = np.minimum(np.maximum(index, _BESIDE), len(x) - 1 - _BESIDE)
     window = x[middle[:, None] + np.arange(-_BESIDE, _BESIDE + 1)]
     level = np.sort(window, axis=1)[:, _BESIDE]
     # A knock, or a turn that begins, moves more than two samples.
@@ -454,9 +456,10 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     still = np.sort(np.abs(window - level[:, None]), axis=1)[:, -3] < limit / 2
     far[index] = still & (np.abs(x[index] - level) > limit)
     zero = np.flatnonzero(x[1:-1] == 0) + 1
-    before, after = x[zero - 1], x[zero + 1]
-    away = np.minimum(np.abs(before), np.abs(after)) > np.maximum(_FAR_ZERO * wide[part(zero)], least)
-    alone[zero[away & (before * after > 0)]] = True
+    if zero.size:
+        before, after = x[zero - 1], x[zero + 1]
+        away = np.minimum(np.abs(before), np.abs(after)) > np.maximum(_FAR_ZERO * wide[part(zero)], least)
+        alone[zero[away & (before * after > 0)]] = True
     return far, alone
 
 

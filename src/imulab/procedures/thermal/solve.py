@@ -125,7 +125,7 @@ class LawsAtHolds:
         # One error for a recording, or for each hold of one that drifts.
         number = np.where(problem.shared, problem.recording, problem.recording.max(initial=0) + 1 + np.arange(n))
         design, slope = laws.design(problem.temperature), laws.slope(problem.temperature)
-        together, wander = np.nonzero(owner[:, None] == owner), None
+        together, wander = np.nonzero(owner[:, None] == owner) if member.size else (), None
         if problem.wander is not None and problem.wander.any():
             wander = np.where((kind[:, None] == kind) & (kind > 0), problem.wander[owner[:, None], owner], 0.0)
         return cls(design, slope, owner, kind, one_hot(number[owner]), together, wander)
@@ -636,7 +636,7 @@ def _is_independent(triangle: Array) -> bool:
     size = len(triangle)
     if np.abs(triangle.diagonal()).min() > _SEEN:  # then often a bound of the smallest singular value tells
         inverse = np.linalg.inv(triangle)
-        if np.einsum("ij,ij", inverse, inverse) * size * _SEEN**2 < 1:
+        if np.vdot(inverse, inverse) * size * _SEEN**2 < 1:
             return True
     values = np.linalg.svd(triangle, compute_uv=False)
     return bool(values[-1] > _SEEN * values[0])
