@@ -566,8 +566,9 @@ class Checks:
         flat = readings.reshape(rows, axes * n)
         self._watch_still(flat)
         self._watch_twins(flat, n)
-        number = np.arange(self.row_count, self.row_count + rows)
-        chosen = np.flatnonzero((number < _EVERY_ROW) | (number % _THINNED == 0))
+        every = min(max(_EVERY_ROW - self.row_count, 0), rows)
+        thinned = np.arange(every + -(self.row_count + every) % _THINNED, rows, _THINNED)
+        chosen = np.concatenate([np.arange(every), thinned])
         self.row_count += rows
         if not chosen.size:
             self.last = flat[-1]
