@@ -118,6 +118,13 @@ def test_the_parser_writes_wanted_fields_into_their_columns():
     assert _text.parse(b"", ",", slots, out, 3) == (0, 0, 0)
 
 
+@pytest.mark.parametrize("size", [0, 1, 254, 255, 256, 5000])
+def test_line_ends_are_counted(size):
+    block = np.random.default_rng(size).choice(np.frombuffer(b"\n\r0,\xff", np.uint8), size).tobytes()
+    assert _text.line_ends(block) == block.count(b"\n")
+    assert _text.line_ends(b"\n" * size) == size
+
+
 @pytest.mark.parametrize(("slot", "rows", "delimiter"), [(2, 3, ","), (0, 2, ","), (0, 3, "é")])
 def test_the_parser_never_writes_beyond_its_buffer(slot, rows, delimiter):
     with pytest.raises(ValueError, match="output buffer is too small"):
