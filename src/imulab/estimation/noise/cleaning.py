@@ -28,6 +28,8 @@ _STRONG_SLOW, _SLOW = 1e5, 200
 _NOISE = 3.0
 """Noise beside a line, over the median of its squares: their mean is 2.2 medians, and scatters over 100 of them."""
 _MOST_STEPS = 5  # of a stretch: with more, the steps are noise
+_LOWEST, _SURE = (1 << 16) - 1, 4.0
+"""Coefficients that show whether there may be a step, and for how many standard deviations of what others add."""
 # Blocks whose median is the usual level around one; fewest blocks; largest share of knocked blocks
 _AROUND, _FEWEST_BLOCKS, _MOST_KNOCKED = 21, 64, 0.05
 _KNOCK_OFF, _FIFTH, _LOUD = 6.0, 10, 3.0
@@ -149,10 +151,11 @@ def line_groups(
     limit = float(chi_square_upper_quantile(SPECTRAL_LINE.level, averages) / chi_square_upper_quantile(0.5, averages))
     noise = averages / float(chi_square_upper_quantile(0.5, averages))  # the mean of chi-square over its median
     fine = np.ones(len(squares), dtype=np.bool_)
-    level = _levels(squares, first, last)
+    level = _levels(squares, first, last, limit)
     out = np.flatnonzero((squares > limit * level) & (level > 0))
     if not out.size:
         return fine, ()
+    level = _levels(squares, first, last)  # beside lines too
     lines = []
     for group in np.split(out, np.flatnonzero(np.diff(out) > 2 * _SKIRT + 1) + 1):
         reach = max(_SKIRT, int(group[-1] - group[0]))
@@ -165,13 +168,18 @@ def line_groups(
     return fine, tuple(sorted(lines, key=lambda line: -line.amplitude))
 
 
-def _levels(squares: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -> Array:
-    """Return the median around each coefficient, bin by bin, shape (J,); 0 where too few are around it."""
+def _levels(squares: Array, first: NDArray[np.int64], last: NDArray[np.int64], limit: float | None = None) -> Array:
+    """Return the median around each coefficient, bin by bin, shape (J,); 0 where too few are around it.
+
+    With a limit, inf where half of them exceed the largest over the limit: there none is beyond limit times the median.
+    """
     width = last - first + 1
     level = np.zeros(len(width))
     for k in np.flatnonzero(width >= _FEWEST).tolist():
         beside = max(0, (_LEAST - int(width[k]) + 1) // 2)
-        level[k] = median(squares[max(int(first[k]) - 1 - beside, 0) : int(last[k]) + beside])
+        around = squares[max(int(first[k]) - 1 - beside, 0) : int(last[k]) + beside]
+        clear = limit and 2 * np.count_nonzero(around > around.max() / limit) > len(around)
+        level[k] = np.inf if clear else median(around)
     # Narrow bins take as many neighbours on both sides, or noise that falls with frequency would shift the median.
     centre = (first + last) // 2 - 1
     for half, most in ((_LEAST // 4, _LEAST // 2), (_LEAST // 2, len(squares) - _LEAST // 2)):
@@ -252,8 +260,9 @@ def find_steps(
         Limit of ``|z|``.
     """
     steps: list[LevelChange] = []
-    c, places = slow, _places_of_steps(variances, count)
-    while len(steps) < _MOST_STEPS:
+    c, lowest, places = slow, _lowest_places(variances, count), None
+    while len(steps) < _MOST_STEPS and _perhaps_a_step(c, *lowest, count, limit):
+        places = places or _places_of_steps(variances, count)
         place, size, u = _largest_step(c, places, count)
         if not abs(size) > limit * u:
             break
@@ -278,19 +287,44 @@ def _places_of_steps(variances: Array, count: int) -> tuple[int, Array, Array]:
     return grid, weight, (np.sum(weight / s) - _cosines(weight / s, grid)) / count
 
 
+def _lowest_places(variances: Array, count: int) -> tuple[tuple[int, Array, Array], float]:
+    """Return the places that the lowest coefficients tell apart, and the most that all others add to ``1/u^2``."""
+    x = (np.pi / count * np.arange(_LOWEST + 1, len(variances) + 1)) ** 2
+    s_squared = x * (1 - x / 12)  # no more than s_j^2
+    return _places_of_steps(variances[:_LOWEST], count), float(np.sum(2 / (variances[_LOWEST:] * s_squared))) / count
+
+
+def _perhaps_a_step(c: Array, places: tuple[int, Array, Array], more: float, count: int, limit: float) -> bool:
+    """Return whether the z of all coefficients may exceed a limit somewhere, from the lowest ones and what others add.
+
+    Where the others hold a share of ``1/u^2`` and the z of all is at the limit, that of the lowest is normal about
+    ``limit sqrt(1 - share)``, with the variance `share`.
+    """
+    score, information = _scores(c, places, count)
+    least = np.maximum(information, 1e-300)
+    share = more / (least + more)
+    z = limit * np.sqrt(1 - share) - _SURE * np.sqrt(share)
+    return bool((np.abs(score) > np.maximum(z, 0.0) * np.sqrt(least)).any())
+
+
 def _largest_step(c: Array, places: tuple[int, Array, Array], count: int) -> tuple[float, float, float]:
     """Return place, size and uncertainty of the step with the largest z, with all places tried by a transform."""
+    score, information = _scores(c, places, count)
+    best = int(np.argmax(np.abs(score) / np.sqrt(np.maximum(information, 1e-300))))
+    size, u = float(score[best] / information[best]), float(1 / np.sqrt(information[best]))
+    return (best + 1) * count / places[0], size, u
+
+
+def _scores(c: Array, places: tuple[int, Array, Array], count: int) -> tuple[Array, Array]:
+    """Return size over squared uncertainty of a step, and ``1/u^2``, at each place, shapes (grid - 1,)."""
     grid, weight, information = places
     padded = np.zeros(2 * grid)
     padded[1 : 1 + len(weight)] = c[: len(weight)] * weight
     score = np.sqrt(2 / count) * np.fft.rfft(padded).imag[1:grid]  # minus the sums of sines
-    z = np.abs(score) / np.sqrt(np.maximum(information, 1e-300))
     beside = math.ceil(_BLOCK * grid / count)  # places as near to an end as a spike or knock is long are no level
-    if 2 * beside < len(z):
-        z[:beside] = z[len(z) - beside :] = 0.0
-    best = int(np.argmax(z))
-    size, u = float(score[best] / information[best]), float(1 / np.sqrt(information[best]))
-    return (best + 1) * count / grid, size, u
+    if 2 * beside < len(score):
+        score[:beside] = score[len(score) - beside :] = 0.0
+    return score, information
 
 
 def _cosines(weight: Array, grid: int) -> Array:
