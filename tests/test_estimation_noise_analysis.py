@@ -9,8 +9,9 @@ from scipy.signal import butter, cheby1, lfilter
 
 import imulab as il
 from imulab.errors import DataError, OptionError
+from imulab.estimation.noise import analysis, cleaning
 from imulab.estimation.noise import spectrum as cosine
-from imulab.estimation.noise.analysis import ramp_coefficients, regress, without
+from imulab.estimation.noise.analysis import analysed, analyses, ramp_coefficients, regress, without
 from imulab.estimation.noise.analysis import test_of_fit as hold
 from imulab.estimation.noise.cleaning import block_medians, find_steps, spikes_removed, step_coefficients
 from imulab.estimation.noise.likelihood import allow, fit, time_limits, usable_band, within
@@ -152,7 +153,7 @@ def test_a_step_has_its_time_and_size():
     x = samples(60_000, 0.1, 5, white=1.0, walk=0.01)
     clean = transformed(x, 0.1)
     _, variances, _ = fitted(clean.spectra, "NK")
-    lam = variances_of_coefficients(variances, clean)
+    lam = variances_of_coefficients(variances, clean, len(clean.slow))
     assert find_steps(clean.slow, lam, clean.count, 0.1) == ()
     x[25_000:] += 2.0
     stepped = transformed(x, 0.1)
@@ -162,6 +163,63 @@ def test_a_step_has_its_time_and_size():
     unit = np.zeros(600)
     unit[77:] = 1
     np.testing.assert_allclose(step_coefficients(599, 77, 600), dct(unit, norm="ortho")[1:], atol=1e-12)
+
+
+@pytest.mark.parametrize("model", ["N", "NB", "NK", "NQ"])
+def test_steps_are_those_of_all_coefficients_though_the_lowest_are_looked_at_first(model, monkeypatch):
+    count, steps = 200_000, 0
+    s = 2 * np.sin(np.pi * np.arange(1, count) / (2 * count))
+    variances = {"N": s**0, "NB": 1 + 0.01 / s, "NK": 1 + 1e-3 / s**2, "NQ": 0.01 + s**2}[model]
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        place = int(rng.uniform(60, count - 60)) if seed % 2 else count - int(60 + 10 ** rng.uniform(0, 3))
+        step = step_coefficients(count - 1, place, count)
+        c = np.sqrt(variances) * rng.standard_normal(count - 1)
+        c += rng.uniform(3, 7) / np.sqrt(np.sum(step**2 / variances)) * step
+        with monkeypatch.context() as all_at_once:
+            all_at_once.setattr(cleaning, "_LOWEST", count)
+            expected = find_steps(c, variances, count, 0.01)
+        assert find_steps(c, variances, count, 0.01) == expected
+        steps += bool(expected)
+    assert 2 < steps < 11
+
+
+def test_no_place_is_tried_by_all_coefficients_where_noise_has_no_step(monkeypatch):
+    monkeypatch.setattr(cleaning, "_largest_step", None)
+    for seed in range(3):
+        c = np.random.default_rng(seed).standard_normal(199_999)
+        assert find_steps(c, np.ones(len(c)), len(c) + 1, 0.01) == ()
+
+
+def test_lines_are_those_by_the_medians_of_all_bins(monkeypatch):
+    t = 0.01 * np.arange(100_000)
+    for size in (0.0, 0.02, 0.03, 0.1, 1.0):
+        x = np.random.default_rng(3).standard_normal(len(t)) + size * np.sin(2 * np.pi * 17.3 * t)
+        found = transformed(x, 0.01)
+        with monkeypatch.context() as all_medians:
+            levels = cleaning._levels
+            all_medians.setattr(
+                cleaning, "_levels", lambda squares, first, last, *_, its=levels: its(squares, first, last)
+            )
+            expected = transformed(x, 0.01)
+        assert found.lines == expected.lines
+        np.testing.assert_array_equal(found.used, expected.used)
+        np.testing.assert_array_equal(found.spectra[0].power, expected.spectra[0].power)
+    assert found.lines
+
+
+def test_columns_are_fitted_together_as_alone():
+    b, a = butter(6, 0.7)
+    noises = [lfilter(b, a, np.random.default_rng(seed).standard_normal(2000)) for seed in (1, 2, 3, 4)]
+    columns = [[transformed(x, 0.01)] for x in (*noises, samples(2000, 0.01, 5, white=0.1, walk=0.1))]
+    for together, column in zip(analyses(columns), columns, strict=True):
+        alone = analysed(column)
+        assert (together.letters, together.limits, together.band) == (alone.letters, alone.limits, alone.band)
+        assert together.band.roll_off == alone.band.roll_off
+        np.testing.assert_allclose(together.values, alone.values, rtol=1e-6)
+    bands = [analysed(each).band for each in columns[:4]]
+    assert len(set(bands)) == 1
+    assert len({band.roll_off for band in bands}) > 1
 
 
 def test_a_step_that_is_taken_out_leaves_the_record_as_it_was():
@@ -240,6 +298,22 @@ def test_ripple_is_allowed_for_and_holes_are_named():
 def test_coefficients_of_time_are_those_of_its_samples():
     found = transformed(np.random.default_rng(9).standard_normal(720), 0.25)
     np.testing.assert_allclose(ramp_coefficients(found), cosine_coefficients(0.25 * np.arange(720)), atol=1e-9)
+
+
+def test_a_ramp_is_told_by_the_lowest_coefficients(monkeypatch):
+    found = transformed(samples(200_000, 0.01, 4, white=0.1, walk=0.01) + 1e-4 * np.arange(200_000), 0.01)
+
+    def refit(spectra):
+        return fitted(spectra, "NK")[1:]
+
+    few = regress([found], [ramp_coefficients(found)], refit)
+    monkeypatch.setattr(analysis, "_RAMP_COEFFICIENTS", 1 << 30)
+    ramp = ramp_coefficients(found)
+    assert len(ramp) == 199_999
+    every = regress([found], [ramp], refit)
+    assert abs(few.slope - every.slope) < 1e-3 * every.standard_uncertainty
+    assert few.standard_uncertainty == pytest.approx(every.standard_uncertainty, rel=1e-4)
+    np.testing.assert_allclose(few.residual[0].spectra[0].power, every.residual[0].spectra[0].power, rtol=1e-3)
 
 
 def trials_of_regression(seeds):

@@ -71,7 +71,7 @@ def test_the_terms_are_chosen_and_all_candidates_speak(name, expected):
     np.testing.assert_allclose(choice.weights.sum(axis=1), 1)
     tau = np.array([100.0])
     found = average(choice, lambda models: allan_variance(models, tau, 0.1))
-    low, middle, high = (found.quantile(level) for level in (0.025, 0.5, 0.975))
+    low, middle, high = found.quantiles(0.025, 0.5, 0.975)
     true = allan_variance(AUTO[name], tau, 0.1)
     assert ((low < middle) & (middle < high)).all()
     assert np.mean((low < true) & (true < high)) >= 0.85
@@ -116,11 +116,11 @@ def test_quantiles_of_a_mixture_are_those_of_its_draws():
     which = rng.choice(3, 400_000, p=weights)
     draws = np.exp(centre[which] + np.sqrt(spread[which]) * rng.standard_normal(len(which)))
     for level in (0.025, 0.5, 0.975):
-        assert mixture.quantile(level)[0, 0] == pytest.approx(np.quantile(draws, level), rel=0.01)
+        assert mixture.quantiles(level)[0, 0, 0] == pytest.approx(np.quantile(draws, level), rel=0.01)
     assert mixture.expected[0, 0] == pytest.approx(draws.mean(), rel=0.01)
     nothing = Averaged(np.array([[[0.0], [1.0]]]), np.array([[[0.0], [0.1]]]), np.array([[0.1, 0.9]]))
-    assert nothing.quantile(0.025)[0, 0] == 0
-    assert nothing.quantile(0.5)[0, 0] == pytest.approx(np.exp(np.sqrt(0.1) * normal_quantile(0.4 / 0.9)), rel=1e-6)
+    assert nothing.quantiles(0.025)[0, 0, 0] == 0
+    assert nothing.quantiles(0.5)[0, 0, 0] == pytest.approx(np.exp(np.sqrt(0.1) * normal_quantile(0.4 / 0.9)), rel=1e-6)
 
 
 def test_a_filter_gets_white_noise_for_what_is_fast_to_it():
@@ -202,7 +202,8 @@ def test_chosen_terms_and_averages_over_many_records(name, expected, share, requ
     right = chosen.count(expected) / trials
     tau = np.array([length / 100, length / 10])
     found, true = average(choice, lambda models: allan_variance(models, tau, dt)), allan_variance(truth, tau, dt)
-    cover = ((found.quantile(0.025) <= true) & (true <= found.quantile(0.975))).mean(axis=0)
+    low, high = found.quantiles(0.025, 0.975)
+    cover = ((low <= true) & (true <= high)).mean(axis=0)
     mean = np.array([length / 10])
     ratio = np.sqrt(
         average(choice, lambda models: bias_square(models, mean, dt)).expected / bias_square(truth, mean, dt)

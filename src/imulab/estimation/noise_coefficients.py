@@ -247,7 +247,7 @@ def _white(analysis: Analysis) -> Coefficient:
         return np.asarray(values[..., :1] ** 2 + density.sum(axis=-1, keepdims=True))
 
     white = average(analysis.choice, square)
-    return _coefficient(*(math.sqrt(float(white.quantile(level)[0, 0])) for level in (0.5, 0.025, 0.975)))
+    return _coefficient(*np.sqrt(white.quantiles(0.5, 0.025, 0.975)[:, 0, 0]).tolist())
 
 
 def _read(

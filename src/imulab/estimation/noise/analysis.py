@@ -44,6 +44,7 @@ Refit = Callable[[Sequence[Spectrum]], tuple[Sequence[Array], float]]
 # uncertainties, that ends it
 _REGRESSION_ROUNDS, _MOST_ROUNDS, _SETTLED = 3, 12, 0.01
 _STANDS = 1e-9  # such a change that ends it at once: the rounds to come would change no more
+_RAMP_COEFFICIENTS = 1 << 16  # lowest coefficients of a ramp that are used: they fall with the square of the frequency
 _HIDES = 0.1
 """Variance of a coefficient by what a covariate's rounding hides, over its noise, from which it is left out."""
 # Price of a covariate in deviance, as of a term of the model; further fall of the deviance that is asked for
@@ -77,9 +78,9 @@ class Regression:
 
 
 def ramp_coefficients(stretch: Stretch) -> Array:
-    """Return the slow cosine coefficients of time, s, over a stretch, shape (J,)."""
+    """Return the lowest cosine coefficients of time, s, over a stretch, shape (J,), J <= 65536."""
     n = stretch.count
-    ramp = np.zeros(len(stretch.slow))
+    ramp = np.zeros(min(len(stretch.slow), _RAMP_COEFFICIENTS))
     j = np.arange(1, len(ramp) + 1, 2)  # a ramp has no even ones
     # sum_i i cos(pi j (i + 1/2)/n) = -(1 - (-1)^j)/(4 sin^2(pi j/2n)) cos(pi j/2n)
     half = np.pi * j / (2 * n)
@@ -106,7 +107,7 @@ def regress(
     stretches
         One or more stretches of the same column.
     covariates
-        For each stretch the slow coefficients of each covariate, shape (k, J); all k are fitted together.
+        For each stretch the lowest coefficients of each covariate, shape (k, J); all k are fitted together.
     refit
         Fits the noise model to spectra.
     rounds
@@ -142,11 +143,12 @@ def _slopes(
     normal, right = np.zeros((size, size)), np.zeros(size)
     for stretch, covariate, rows in zip(stretches, covariates, hidden, strict=True):
         stop = start + len(stretch.spectra)
-        weight = counted(stretch) / variances_of_coefficients(variances[start:stop], stretch)
         x = np.atleast_2d(covariate)
+        many = x.shape[1]
+        weight = counted(stretch, many) / variances_of_coefficients(variances[start:stop], stretch, many)
         by_weight = x * weight
         normal += by_weight @ x.T
-        right += by_weight @ stretch.slow
+        right += by_weight @ stretch.slow[:many]
         if rows.any():
             lowest = np.s_[: rows.shape[1]]
             weighted = rows * weight[lowest]
@@ -171,29 +173,29 @@ def _without_hidden(stretch: Stretch, rows: Array) -> Stretch:
     hidden = np.flatnonzero(moved > _HIDES * noise)
     used = stretch.used.copy()
     used[: hidden.max(initial=-1) + 1] = False
-    return without(replace(stretch, used=used), np.zeros(1))
+    return without(replace(stretch, used=used), np.zeros(len(stretch.slow)))
 
 
-def counted(stretch: Stretch) -> Array:
-    """Return the weight of each slow coefficient, shape (J,): the share of its bin's coefficients that count."""
-    counts = np.zeros(len(stretch.slow))
+def counted(stretch: Stretch, many: int) -> Array:
+    """Return the weights of the lowest coefficients, shape (many,): the shares of their bins' that count."""
+    counts = np.zeros(many)
     for spectrum in stretch.spectra:
         share = np.minimum(spectrum.freedom / (spectrum.last - spectrum.first + 1), 1.0)
         scale, near = stretch.count / spectrum.count, 1e-12 * stretch.count
         start, stop = np.ceil(spectrum.first * scale - near), np.floor(spectrum.last[-1] * scale + near)
         edge = np.minimum(np.append(start, stop + 1).astype(np.int64) - 1, len(counts))
         counts[edge[0] : edge[-1]] = np.repeat(share, np.diff(edge))
-    return np.where(stretch.used, counts, 0.0)
+    return np.where(stretch.used[:many], counts, 0.0)
 
 
 def without(stretch: Stretch, taken: Array) -> Stretch:
-    """Return a stretch with `taken`, shape (J,), subtracted from its slow coefficients and so from its spectra."""
-    slow = stretch.slow - taken
+    """Return a stretch with `taken`, shape (J,), subtracted from its J lowest coefficients and so from its spectra."""
+    slow = np.concatenate([stretch.slow[: len(taken)] - taken, stretch.slow[len(taken) :]])
     spectrum = stretch.spectra[0]
-    low = spectrum.last <= len(slow)
+    low = spectrum.last <= len(taken)
     edges = (spectrum.first[low], spectrum.last[low])
     power, freedom = spectrum.power.copy(), spectrum.freedom.copy()
-    again = binned(slow**2, stretch.used, edges, spectrum.interval, spectrum.count)
+    again = binned(slow[: len(taken)] ** 2, stretch.used, edges, spectrum.interval, spectrum.count)
     power[low], freedom[low] = again.power, np.minimum(freedom[low], again.freedom)
     return replace(stretch, slow=slow, spectra=(replace(spectrum, power=power, freedom=freedom), *stretch.spectra[1:]))
 
@@ -453,20 +455,20 @@ class Averaged:
         """Weighted mean of the expected variances ``square exp(spread/2)``, shape (c, t)."""
         return np.asarray(np.einsum("cm,cmt->ct", self.weights, self.squares * np.exp(self.spread / 2)))
 
-    def quantile(self, probability: float) -> Array:
-        """Return the value below which the variance lies with a probability, shape (c, t); 0 if none is likely."""
+    def quantiles(self, *probabilities: float) -> Array:
+        """Return the values below which the variance lies with probabilities, (p, c, t); 0 where none is as likely."""
+        share = np.array(probabilities)[:, None, None]
         with np.errstate(divide="ignore"):
             centre = np.log(self.squares)
         width = np.sqrt(self.spread) + 1e-9
         finite = np.isfinite(centre)
-        low = np.where(finite, centre - 9 * width, np.inf).min(axis=1)
-        high = np.where(finite, centre + 9 * width, -np.inf).max(axis=1)
-        nothing = (self.weights[:, :, None] * ~finite).sum(axis=1) >= probability
-        low, high = np.where(nothing, 0.0, low), np.where(nothing, 0.0, high)
+        nothing = (self.weights[:, :, None] * ~finite).sum(axis=1) >= share
+        low = np.where(nothing, 0.0, np.where(finite, centre - 9 * width, np.inf).min(axis=1))
+        high = np.where(nothing, 0.0, np.where(finite, centre + 9 * width, -np.inf).max(axis=1))
         for _ in range(_HALVINGS):
             middle = (low + high) / 2
-            below = np.einsum("cm,cmt->ct", self.weights, normal_cdf((middle[:, None] - centre) / width))
-            low, high = np.where(below < probability, middle, low), np.where(below < probability, high, middle)
+            below = np.einsum("cm,pcmt->pct", self.weights, normal_cdf((middle[:, :, None] - centre) / width))
+            low, high = np.where(below < share, middle, low), np.where(below < share, high, middle)
         return np.where(nothing, 0.0, np.exp(high))
 
 
@@ -594,9 +596,10 @@ class Analysis:
         variances = self.variances()
         for each in stretches:
             stop = start + len(each.spectra)
-            level = variances_of_coefficients(variances[start:stop], each)
+            many = len(each.slow)
+            level = variances_of_coefficients(variances[start:stop], each, many)
             # Vibration beyond the band, and bins off the model, would show as steps at the ends of the stretch.
-            share = counted(replace(each, spectra=self.spectra[start:stop]))
+            share = counted(replace(each, spectra=self.spectra[start:stop]), many)
             level = np.where(share > 0, level / np.maximum(share, 1e-300), np.inf)
             steps.append(find_steps(each.slow, level, each.count, each.interval, limit))
             start = stop
@@ -645,28 +648,33 @@ def analyses(
     bands = [
         usable_band(each) if highest is None else Band(min(highest, nyquist), highest >= nyquist) for each in spectra
     ]
+    inside = [[within(each, band.highest) for each in its] for its, band in zip(spectra, bands, strict=True)]
+    alike: dict[tuple[Band, tuple[float, float]], list[int]] = {}
+    for k, (its, band) in enumerate(zip(inside, bands, strict=True)):
+        alike.setdefault((band, time_limits(its)), []).append(k)
     by_column: dict[int, Analysis] = {}
-    for band in dict.fromkeys(bands):
-        alike = [k for k, its in enumerate(bands) if its == band]
-        fitted = _fit_in_band([spectra[k] for k in alike], band, candidates)
-        by_column |= {k: Analysis(tuple(columns[k]), band, *its) for k, its in zip(alike, fitted, strict=True)}
+    for (band, limits), members in alike.items():
+        fitted = _fit_in_band([inside[k] for k in members], band, limits, candidates)
+        by_column |= {
+            k: Analysis(tuple(columns[k]), bands[k], allowance, limits, choice)
+            for k, (allowance, choice) in zip(members, fitted, strict=True)
+        }
     return [by_column[k] for k in range(len(columns))]
 
 
 def _fit_in_band(
-    columns: Sequence[Sequence[Spectrum]], band: Band, candidates: tuple[str, ...]
-) -> list[tuple[Allowance, tuple[float, float], Choice]]:
-    inside = [[within(each, band.highest) for each in spectra] for spectra in columns]
-    bins, limits = prepare(inside[0]), time_limits(inside[0])
-    power = np.array([np.concatenate([each.power for each in spectra]) for spectra in inside])
-    freedom = np.array([np.concatenate([each.freedom for each in spectra]) for spectra in inside])
+    columns: Sequence[Sequence[Spectrum]], band: Band, limits: tuple[float, float], candidates: tuple[str, ...]
+) -> list[tuple[Allowance, Choice]]:
+    bins = prepare(columns[0])
+    power = np.array([np.concatenate([each.power for each in spectra]) for spectra in columns])
+    freedom = np.array([np.concatenate([each.freedom for each in spectra]) for spectra in columns])
     richest = terms(_RICHEST + "Q" * band.full)[None]
     variances = bins.variances(fit(bins, richest, limits, power, freedom).values)
-    allowances = [allow(spectra, _split(each, spectra)) for spectra, each in zip(inside, variances, strict=True)]
+    allowances = [allow(spectra, _split(each, spectra)) for spectra, each in zip(columns, variances, strict=True)]
     freedom = np.array([np.concatenate([each.freedom for each in allowance.spectra]) for allowance in allowances])
     choice = choose(bins, limits, power, freedom, candidates, full_band=band.full and band.flat)
     parts = [Choice(*(getattr(choice, name)[k : k + 1] for name in Choice.__annotations__)) for k in range(len(power))]
-    return [(allowance, limits, part) for allowance, part in zip(allowances, parts, strict=True)]
+    return list(zip(allowances, parts, strict=True))
 
 
 def intervals_of(analysed_columns: Sequence[Analysis], index: Sequence[int]) -> list[tuple[Array, Array]]:

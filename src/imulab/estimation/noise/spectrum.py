@@ -361,12 +361,12 @@ def frequencies(spectrum: Spectrum) -> Array:
     return np.asarray((spectrum.first + spectrum.last) / (4 * spectrum.length))
 
 
-def variances_of_coefficients(variances: Sequence[Array], stretch: Stretch) -> Array:
-    """Return the variance of each slow coefficient, shape (J,), from the variances in the bins of each spectrum, (b,).
+def variances_of_coefficients(variances: Sequence[Array], stretch: Stretch, many: int) -> Array:
+    """Return the variances of the lowest coefficients, shape (many,), from those in the bins of each spectrum, (b,).
 
     Between the bins it is interpolated linearly in the logarithms of frequency and variance.
     """
     f = np.concatenate([frequencies(each) for each in stretch.spectra])
-    j = np.arange(1, len(stretch.slow) + 1)
+    j = np.arange(1, many + 1)
     wanted = np.log(j / (2 * stretch.count * stretch.interval))
     return np.asarray(np.exp(np.interp(wanted, np.log(f), np.log(np.concatenate(variances)))))

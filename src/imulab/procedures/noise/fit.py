@@ -28,6 +28,7 @@ from imulab.estimation.noise.analysis import (
     Regression,
     allan_of_bins,
     analysed,
+    analyses,
     ramp_coefficients,
     without_steps,
 )
@@ -395,7 +396,7 @@ def _parameters(
         values, covariance = edge_as_white(analysis.values, analysis.covariance, analysis.limits[0])
         low, high = _intervals(analysis, more, values, covariance)
         white = analysis.average(lambda each, t=analysis.limits[0]: white_square(each, np.zeros(1), t))  # type: ignore[misc]
-        ends_of_all = [float(np.sqrt(white.quantile(tail)[0, 0])) for tail in _TAILS]
+        ends_of_all = np.sqrt(white.quantiles(*_TAILS)[:, 0, 0]).tolist()
         low[0], high[0] = min(float(low[0]), ends_of_all[0]), max(float(high[0]), ends_of_all[1])
         if analysis.band.filtered(analysis.interval):  # the model has no term for the rest of the filter's roll-off
             covariance, more_of_white = covariance.copy(), analysis.band.roll_off * values[0]
@@ -441,7 +442,10 @@ def _widen_white(analysis: Analysis, white: float, covariance: Array, low: Array
         lambda each: np.square(each[..., :1]) + sum(2 * each[..., s, None] ** 2 * each[..., t, None] for s, t in _PAIRS)
     )
     least = analysis.values[0] * np.exp(-NORMAL_95 * np.sqrt(analysis.covariance[0, 0]))
-    low[0], high[0] = min(float(low[0]), least), max(float(high[0]), float(np.sqrt(below.quantile(_TAILS[1])[0, 0])))
+    low[0], high[0] = (
+        min(float(low[0]), least),
+        max(float(high[0]), float(np.sqrt(below.quantiles(_TAILS[1])[0, 0, 0]))),
+    )
     covariance = covariance.copy()
     if white > 0:
         covariance[0, 0] = (max(high[0] - white, white - low[0]) / NORMAL_95 / white) ** 2
@@ -488,7 +492,7 @@ def durations(length: float) -> Array:
 
 
 def _ends(averaged: Any) -> dict[str, Any]:
-    return {"interval_95": [_number(np.sqrt(averaged.quantile(tail)[0, 0])) for tail in _TAILS]}
+    return {"interval_95": _numbers(np.sqrt(averaged.quantiles(*_TAILS)[:, 0, 0]))}
 
 
 def _column_section(column: ColumnModel) -> dict[str, Any]:
@@ -566,7 +570,7 @@ def _data(column: ColumnModel) -> dict[str, Any]:
     analysis = column.analysis
     tau, measured = allan_of_bins([stretch.spectra for stretch in analysis.stretches])
     fitted = analysis.average(lambda values: allan_variance(values, tau, analysis.interval))
-    low, high = (np.sqrt(fitted.quantile(tail)[0]) for tail in _TAILS)
+    low, high = np.sqrt(fitted.quantiles(*_TAILS)[:, 0])
     spectra = [each for stretch in analysis.stretches for each in stretch.spectra]
     return {
         "spectra": [
@@ -791,8 +795,12 @@ def fit_recordings(
                 f"{where}: regress temperature: expected a column temperature that changes, by more than one step of "
                 "its readings, found none"
             )
-        for name in _columns_there(rests[0].recording, columns):
-            models[name] = _fit_column(name, rests, temperatures, candidates, band, regress, steps == "remove")
+        names = _columns_there(rests[0].recording, columns)
+        stretches = [[each for rest in rests for each in rest.stretches(name)] for name in names]
+        for name, analysis in zip(names, analyses(stretches, candidates, band), strict=True):
+            models[name] = _fit_column(
+                name, rests, analysis, temperatures, candidates, band, regress, steps == "remove"
+            )
     options = {"terms": terms, "horizon": horizon, "band": band, "regress": regress, "steps": steps}
     options["columns"] = None if columns is None else list(models)
     return NoiseFit(make_record(models, groups, options, tuple(sources)), models)
@@ -874,15 +882,15 @@ def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> Non
 def _fit_column(
     name: str,
     rests: Sequence[Rest],
+    analysis: Analysis,
     temperatures: Sequence[list[Array] | None],
     candidates: tuple[str, ...],
     band: float | None,
     regress: str | None,
     flat: bool,
 ) -> ColumnModel:
-    stretches = [each for rest in rests for each in rest.stretches(name)]
+    stretches = analysis.stretches
     spikes, lines = sum(each.spikes for each in stretches), _longest(stretches).lines
-    analysis = analysed(stretches, candidates, band)
     steps = _steps_for_slow_noise(stretches, analysis, candidates)
     perhaps = [] if steps else analysis.steps(stretches, LEVEL_STEP_PERHAPS.limit)
     if any(perhaps):  # with the steps in the data, the model takes some of them for random walk
