@@ -9,6 +9,7 @@ import pytest
 import imulab as il
 from imulab.cli.show import recording_json
 from imulab.errors import DataError
+from imulab.estimation import clock
 from imulab.estimation.clock import read_clock, same_rows
 from imulab.estimation.column_noise import analyse
 from imulab.estimation.sampling import mend_blocks, mend_stamps, sampling_rate
@@ -30,6 +31,21 @@ def log(time, values=None, unit="s", name="r.csv"):
 
 def lose(keep, rate):
     return NUMBER[keep] / rate
+
+
+@pytest.mark.parametrize("far", [0.01, 1.4, 1.6, 40.0, np.nan, -3.0])
+@pytest.mark.parametrize("place", [99, 100, 101, 250])
+def test_a_clock_is_read_part_by_part_as_at_once(far, place, monkeypatch):
+    time = 0.01 * (NUMBER[:300] + 0.1 * noise(300))
+    time[place:] = time[place - 1] + 0.01 * (far + NUMBER[: 300 - place])
+    expected = read_clock(time)
+    monkeypatch.setattr(clock, "_AT_ONCE", 100)
+    found = read_clock(time)
+    assert found.doubt == expected.doubt
+    assert [found.rate, found.jitter, found.widest] == pytest.approx(
+        [expected.rate, expected.jitter, expected.widest], rel=1e-12, nan_ok=True
+    )
+    np.testing.assert_array_equal(found.gaps, expected.gaps)
 
 
 @pytest.mark.parametrize("jitter", [0.02, 0.1, 0.2])

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.rows import median, medians, quantile, standard_deviation
+from imulab.estimation.rows import median, medians, quantile
 from imulab.recording import Array, Recording
 
 Rows = NDArray[np.int64]
 
 GAP = 1.5  # usual steps: a longer step may be a gap
+_AT_ONCE = 1 << 16  # steps that are looked at together
 _COARSE = 0.2  # share of steps beyond the limit from which time stamps are coarse and the steps are no gaps
 _BEAT = 0.3  # scatter of the distances between long steps, over their mean, below which they are a beat and no losses
 _SHORT = 0.5  # usual steps: a shorter one may catch up with a late one
@@ -106,12 +108,14 @@ def read_clock(time: Array, same: NDArray[np.bool_] | None = None, *, lossy: boo
     lossy
         Whether samples are known to be missing, so that steps of several usual ones are gaps and no coarse stamps.
     """
-    step = np.diff(time)
-    if not step.size:
+    if len(time) <= 1:
         return Clock(np.nan, doubt="a single sample" if len(time) else "no samples")
+    least, widest = step_range(time)
+    if least > 0 and widest <= GAP * least < np.inf:  # no gap, whatever the usual step is
+        return Clock((len(time) - 1) / float(time[-1] - time[0]), _jitter(time), widest=widest)
+    step = np.diff(time)
     if not np.isfinite(step).all():
         return Clock(np.nan, doubt="a time that is no number", doubtful_row=int(np.argmin(np.isfinite(time))))
-    widest, least = float(step.max()), float(step.min())
     if least < 0:
         row = int(np.argmax(step < 0)) + 1
         return Clock(
@@ -214,15 +218,31 @@ def _replaced(time: Array, kept: NDArray[np.bool_]) -> bool:
     return bool(before.size) and float(np.mean(step[before] > GAP * median(step))) > 1 - _OTHERWISE_UNIQUE
 
 
+def step_range(time: Array) -> tuple[float, float]:
+    """Return the shortest and the longest step between stamps, s, shape (n,), n >= 2; NaN where one is no number."""
+    ends = [(part.min(), part.max()) for part in _steps(time)]
+    return float(np.min(ends)), float(np.max(ends))
+
+
+def _jitter(time: Array) -> float:
+    """Return the standard deviation of the steps between stamps, s."""
+    usual = float(time[-1] - time[0]) / (len(time) - 1)
+    squares = (float(np.einsum("i,i", part, part)) for part in (step - usual for step in _steps(time)))
+    return math.sqrt(math.fsum(squares) / (len(time) - 1))
+
+
+def _steps(time: Array) -> Iterator[Array]:
+    """Yield the steps between stamps part by part, so that those of a long log are never all in memory."""
+    return (np.diff(time[start : start + _AT_ONCE + 1]) for start in range(0, len(time) - 1, _AT_ONCE))
+
+
 def _unique_stamps(time: Array, step: Array, *, lossy: bool) -> Clock:
-    widest = float(step.max())
-    if widest <= GAP * step.min():  # no gap, whatever the usual step is
-        return Clock(len(step) / float(time[-1] - time[0]), standard_deviation(step), widest=widest)
     usual, coarse = _usual(time, step, lossy=lossy)
     usual, rows, missing = _find_gaps(np.arange(len(time)), time, usual, coarse=coarse)
     regular = np.ones(len(step), dtype=bool)
     regular[rows] = False
-    return Clock(1 / usual, float(np.sqrt(np.mean((step[regular] - usual) ** 2))), rows, missing, widest)
+    jitter = float(np.sqrt(np.mean((step[regular] - usual) ** 2)))
+    return Clock(1 / usual, jitter, rows, missing, float(step.max()))
 
 
 def _usual(time: Array, step: Array, *, lossy: bool) -> tuple[float, bool]:

@@ -28,6 +28,7 @@ from imulab.recording import Array, release
 
 _DENSE_PER_DECADE = 24  # averaging times in a decade of a dense curve, 10 % apart
 _FEWEST = 3  # samples: an Allan variance needs two neighbouring means, and one more for a second pair
+_AT_ONCE = 1 << 18  # samples that are taken from disk together
 
 
 @dataclass(frozen=True, repr=False)
@@ -91,8 +92,11 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
         raise OptionError(f"sampling rate {rate:g}: expected a positive number of Hz")
     integral = np.empty(len(data) + 1)
     integral[0] = 0.0
-    centred = np.subtract(data, data[0], out=integral[1:])  # a constant becomes exactly 0
-    release(data)
+    centred, first = integral[1:], data[0]
+    for start in range(0, len(data), _AT_ONCE):  # samples on disk come into memory part by part
+        rows = slice(start, start + _AT_ONCE)
+        np.subtract(data[rows], first, out=centred[rows])  # a constant becomes exactly 0
+        release(data)
     mean = centred.mean()
     if not math.isfinite(mean):
         raise DataError("Allan deviation: expected finite samples")

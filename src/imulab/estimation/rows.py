@@ -97,19 +97,6 @@ def distinct(values: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]])
 
 
-def standard_deviation(values: Array) -> float:
-    """Return the standard deviation of values, shape (n,), without a copy of them.
-
-    Examples
-    --------
-    >>> standard_deviation(np.array([1.0, 3.0]))
-    1.0
-    """
-    mean = float(values.mean())
-    parts = (values[start : start + _AT_ONCE] - mean for start in range(0, len(values), _AT_ONCE))
-    return math.sqrt(math.fsum(float(np.einsum("i,i", part, part)) for part in parts) / len(values))
-
-
 def rms(values: ArrayLike) -> float:
     """Return the root mean square of values.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from imulab.display import Finding, Note
 from imulab.errors import DataError
-from imulab.estimation.clock import GAP, Clock, read_clock, same_rows
+from imulab.estimation.clock import GAP, Clock, read_clock, same_rows, step_range
 from imulab.estimation.rows import median, quantile
 from imulab.recording import (
     EVEN_SAMPLES,
@@ -231,9 +231,11 @@ def steady_rows(time: Array, *, lossy: bool = False) -> tuple[int, int]:
     Blocks of at least a hundred samples have different rates where their usual steps differ by more than 5 %; a single
     block that differs is passed over. `lossy` is as for `read_clock`.
     """
+    if len(time) > 1:
+        least, widest = step_range(time)
+        if widest < (1 + SAME_RATE / 2) * least:  # as most are
+            return 0, len(time)
     step = np.diff(time)
-    if step.size and step.max() < (1 + SAME_RATE / 2) * step.min():  # as most are
-        return 0, len(time)
     size = max(_SMALLEST_BLOCK, -(-len(step) // _BLOCKS))
     if step.size and median(step) < float(step.mean()) / 2:  # in bursts: a block holds many of them
         size *= _MORE_IN_BURSTS
