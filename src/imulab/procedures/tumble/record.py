@@ -168,8 +168,8 @@ def aside_warnings(complete: FittedAttitudes, options: Mapping[str, Any], gravit
     elif n - parameter_count(highest) < _SELDOM_MISSED:
         named.append(
             Note(
-                f"a knocked attitude among only {n} may stay unseen: of those that are off by more than 8 standard "
-                "uncertainties 18 attitudes show 60 to 97 %, 24 show 97 % or more"
+                f"a knocked attitude among only {n} may stay unseen: one that is off by 8 standard uncertainties is "
+                "found in 60 to 97 of 100 tests of 18 attitudes, and in 97 or more of 24"
             )
         )
     return named

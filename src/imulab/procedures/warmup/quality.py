@@ -472,8 +472,8 @@ def _warn_ends(curves: Curves, settled: bool) -> list[str]:
     messages: list[str] = []
     if not settled:
         messages.append(
-            f"not settled: the curves still change when the recordings end; T_M = {curves.settling_time:g} s leaves "
-            f"{SETTLED:g} s for the reference: record longer"
+            "not settled: the curves still change when the recordings end; the settling time of "
+            f"{curves.settling_time:g} s leaves {SETTLED:g} s for the reference: record longer"
         )
     reached = np.array([curves.end[curves.group == k].max() for k in range(len(curves.temperatures))])
     beyond = [f"{t:g}" for t, e in zip(curves.temperatures, reached, strict=True) if e < curves.settling_time - 1]
@@ -554,9 +554,9 @@ def _warn_drifts(curves: Curves, chosen: Judged) -> list[str]:
                 Finding(
                     f"not settled: {kind} still drifts in the settled part of {int(share.any(axis=1).sum())} of "
                     f"{len(curves.cycles)} cycles, most in {curves.cycles[row].name} ({curves.axes[axis]}, "
-                    f"{small_text(curves.drift[row, axis], curves.units[axis])} from T_M to its end); the "
-                    "curve is counted from the mean of that part, which is not yet the settled zero",
-                    "record longer, and state a later T_M (--settling-time)",
+                    f"{small_text(curves.drift[row, axis], curves.units[axis])} from the settling time to its "
+                    "end); the curve is counted from the mean of that part, which is not yet the settled zero",
+                    "record longer, and state a later --settling-time",
                 )
             )
     return messages
