@@ -95,7 +95,8 @@ class Rows:
         first = np.cumsum(count) - count
         members = [order[first[count == m][:, None] + np.arange(m)] for m in sorted({*count.tolist()} - {0})]
         shared = np.concatenate([self.errors[which].any(axis=1) for which in members]).sum(axis=0) > 1
-        return [Block.of(self, which, self.errors[:, ~shared]) for which in members], self.errors[:, shared]
+        alone, common = (self.errors.compress(each, axis=1) for each in (~shared, shared))
+        return [Block.of(self, which, alone) for which in members], common
 
 
 @dataclass(frozen=True)
