@@ -499,6 +499,14 @@ def test_the_restricted_likelihood_is_that_of_what_the_design_cannot_change():
     ]
     logs = restricted_log_likelihood(matrices, design, values)
     np.testing.assert_allclose(np.diff(logs), np.diff(expected), rtol=1e-9)
+    # Turns of many revolutions lie along the design, a million times as far as what tells the noise.
+    far = restricted_log_likelihood(matrices, design, values + 1e6 * design @ [1.0, -2.0, 3.0])
+    np.testing.assert_allclose(far, logs, rtol=1e-8)
+    # White noise is as if it were in the covariance. Without any noise there is a number still.
+    white = restricted_log_likelihood(matrices, design, values, np.array([0.0, 0.7]))
+    alike = restricted_log_likelihood(matrices + 0.7 * np.eye(9), design, values)
+    np.testing.assert_allclose(white, np.column_stack([logs, alike]), rtol=1e-9)
+    assert np.isfinite(restricted_log_likelihood(np.zeros((1, 9, 9)), design, values)).all()
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -388,8 +388,8 @@ def restricted_log_likelihood(covariance: Array, design: Array, values: Array, w
     across = np.linalg.qr(design, mode="complete")[0][:, design.shape[1] :]
     eigenvalues, axes = np.linalg.eigh(across.T @ covariance @ across)
     squares = (np.swapaxes(axes, 1, 2) @ (across.T @ values)) ** 2
-    rounding = np.finfo(float).eps * eigenvalues[:, -1:]
-    variances = np.maximum(eigenvalues, rounding)[:, None] + np.reshape(white, (-1, 1))
+    least = np.maximum(np.finfo(float).eps * eigenvalues[:, -1:], np.sqrt(np.finfo(float).tiny))  # rounding, or none
+    variances = np.maximum(eigenvalues, least)[:, None] + np.reshape(white, (-1, 1))
     logs: Array = -(np.log(variances) + squares[:, None] / variances).sum(axis=2) / 2
     return logs.reshape(len(covariance), *np.shape(white))
 
