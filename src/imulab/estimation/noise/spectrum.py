@@ -172,8 +172,11 @@ def cosine_coefficients(samples: Array, most: int | None = None) -> Array:
     fine, coarse = np.arange(_FINE), _FINE * np.arange(len(low) // _FINE + 1)
     turn = np.multiply.outer(np.exp(-0.5j * np.pi / n * coarse), np.exp(-0.5j * np.pi / n * fine))
     low *= turn.ravel()[: len(low)]
-    c = low.real[1:] if low is not turned else np.concatenate([low.real[1:], -low.imag[n - len(low) : 0 : -1]])[:most]
-    return np.asarray(c * np.sqrt(2 / n))
+    if low is not turned:
+        return np.asarray(low.real[1:] * np.sqrt(2 / n))
+    c = np.concatenate([low.real[1:], -low.imag[n - len(low) : 0 : -1]])[:most]
+    c *= np.sqrt(2 / n)
+    return np.asarray(c)
 
 
 class Accumulator:
@@ -233,7 +236,7 @@ class Accumulator:
         held = self._all()
         self._waiting = np.empty(0)
         if not self._stretches:
-            return self._whole(held)
+            return self.whole(held)
         if len(held):
             held = self._cleaned(held)
             self._add_means(held)
@@ -263,14 +266,16 @@ class Accumulator:
         edges = np.concatenate([np.empty((0, 2), dtype=np.int64), *self._knocks])
         return tuple((start * self._interval, (stop - start) * self._interval) for start, stop in edges.tolist())
 
-    def _whole(self, samples: Array) -> Stretch:
+    def whole(self, samples: Array) -> Stretch:
+        """Return the spectrum of a log that is in memory as a whole, shape (n,)."""
         count = smooth_count(len(samples))
         c = cosine_coefficients(self._cleaned(samples)[:count])
         first, last = bins(count)
-        fine, lines = line_groups(c * c, first, last, 1, count, self._interval)
-        c, strong = strong_lines_removed(c, lines, self._interval)
         squares = c * c
+        fine, lines = line_groups(squares, first, last, 1, count, self._interval)
+        c, strong = strong_lines_removed(c, lines, self._interval)
         if strong:
+            squares = c * c
             fine, weak = line_groups(squares, first, last, 1, count, self._interval)
             lines = tuple(sorted([*strong, *weak], key=lambda line: -line.amplitude))
         spectrum = binned(squares, fine, (first, last), self._interval, count)
@@ -345,6 +350,8 @@ def binned(
 def transformed(samples: Array, interval: float, despike: bool = True) -> Stretch:
     """Return the spectra of samples in memory, finite, shape (n,): see `Accumulator`."""
     gathered = Accumulator(interval, despike)
+    if len(samples) <= WHOLE:
+        return gathered.whole(np.asarray(samples, dtype=np.float64))
     gathered.add(samples)
     return gathered.stretch()
 

@@ -198,12 +198,13 @@ class Bins:
         t = time[:, None]
         a, ratio = self.interval / t, t / self.length
         body = 2 * np.sinh(a) / (4 * np.sinh(a / 2) ** 2 + self.sine)
-        left, square = np.exp(-1 / ratio), self.angular * t**2
-        known = 2 * ratio * (1 - self.sign * left) / (1 + square)
-        slope = 2 * (ratio * (1 - self.sign * left) - self.sign * left) / (1 + square) - 2 * known * square / (
-            1 + square
-        )
-        return body * (1 - known), body * (-a * (1 / np.tanh(a) - body) * (1 - known) - slope)
+        square = self.angular * t**2
+        end, over = self.sign * np.exp(-1 / ratio), 1 + square
+        share = ratio * (1 - end)
+        known = 2 * share / over
+        rest = 1 - known
+        slope = 2 * (share - end) / over - 2 * known * square / over
+        return body * rest, body * (-a * (1 / np.tanh(a) - body) * rest - slope)
 
     def variances(self, values: Array) -> Array:
         """Return the variance of the coefficients of models, shape (r, 8), in each bin, shape (r, b)."""
