@@ -417,6 +417,31 @@ def test_only_what_a_file_is_for_is_offered_and_of_the_rest_it_is_said_why(workb
     assert "noise fit" not in cards
 
 
+def test_what_was_said_of_one_file_s_columns_is_not_said_of_the_next(workbench, new_page):
+    page = new_page(workbench.address)
+    text = tumble("own.csv")
+    held: list[Any] = []  # the answer to what is said comes when the next file is shown
+
+    def hold(route: Any) -> None:
+        if "sample_rate" in route.request.post_data:
+            held.append(route)
+        else:
+            route.continue_()
+
+    page.route("**/columns*", hold, times=2)
+    drop(page, "unknown.csv", "t;p;q;r\n" + text.partition("\n")[2].replace(",", ";"))
+    page.locator(".assistant").wait_for()
+    while not held:
+        page.wait_for_timeout(50)
+    drop(page, "rec.csv", text)
+    read(page)
+    for each in held:
+        each.continue_()
+    page.wait_for_timeout(1500)
+    assert page.locator(".assistant").count() == 0
+    assert page.locator("h2", has_text="rec.csv").count() == 1
+
+
 def test_a_board_of_whole_imus_is_offered_its_calibration(workbench, new_page, folder):
     page = new_page(workbench.address)
     il.write_csv(il.simulate_imus(elements=4, attitudes=6, duration="5 s", rate="50 Hz"), "board_log.csv")

@@ -294,8 +294,9 @@ async function state(asked) {
     const told = await ask("columns", { file: file.name });
     if (chosen !== file && chosen?.name !== file.name) return;
     const table = columnTable(file, told, {
-      preview: layout => readSo({ ...reading, layout }, true),
-      saved: layout => { readSo({ ...reading, layout }); ui.file.scrollIntoView({ block: "start" }); },
+      // An answer may come when another file is looked at, which it must not be read by.
+      preview: layout => { if (table.element.isConnected) readSo({ ...reading, layout }, true); },
+      saved: layout => { if (table.element.isConnected) { readSo({ ...reading, layout }); ui.file.scrollIntoView({ block: "start" }); } },
     });
     ui.columns.replaceChildren(table.element);
     put(ui.summary, "This file does not say itself what is in it.");
