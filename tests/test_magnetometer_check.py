@@ -99,6 +99,29 @@ def test_level_readings_of_a_record_of_all_directions_that_holds_pass(noise, red
     assert np.mean(explained) < 0.05 + slack
 
 
+@pytest.mark.parametrize("axes", [3, 2])
+def test_readings_of_another_kind_fail(axes):
+    """Waved readings of the record of a level turn, another range, and noise: nothing of them may tell a parameter."""
+    record, fresh = pair(1, axes)
+    rng = np.random.default_rng(1)
+    outputs = fresh.triad("mag")
+    hard = 1e6 * np.array([record.value(f"mag_bias_{axis}") for axis in "xyz"[:axes]])
+    waved_about = np.zeros((300, 3))
+    waved_about[:, :axes] = hard + 20 * sphere(300, rng)[:, :axes]
+    noise = rng.standard_normal((300, 3))
+    kinds = {
+        "a quarter": outputs / 4, "tenfold": 10 * outputs, "far": outputs + 1e6, "noise": 40 * noise,
+        "noisy": outputs + 25 * noise, "still": outputs[:1] + 0.3 * noise,
+    }  # fmt: skip
+    if axes == 2:
+        kinds |= {"waved": waved_about, "few": waved_about[:12]}
+    for kind, values in kinds.items():
+        check = il.check_magnetometer(record, recorded(values))
+        assert kind == "still" or not check.passed, kind
+        assert "changed by  uT" not in check.meaning(), kind
+        assert all(value is None or np.isfinite(value) for value in check.content()["hard_iron_change"]["value"])
+
+
 def test_other_records_and_units_are_refused():
     _, outputs = waved(2)
     record = il.fit_magnetometer(recorded(outputs)).calibration

@@ -12,7 +12,8 @@ change of hard iron alone explains it, and which, where the size of the field an
 as a rule: what readings do not tell, as a change upwards in a level turn, is then taken for none.
 
 J is taken at the points of the ellipsoid nearest to the readings, and without the directions that noise alone makes:
-at the readings themselves J would share their noise, and a record that holds would not pass.
+at the readings themselves J would share their noise, and a record that holds would not pass. Readings that scatter by
+far more than those of the record are not its sensor's, or not in its unit or range, and fail by that.
 """
 
 from __future__ import annotations
@@ -32,10 +33,11 @@ from imulab.display import Note
 from imulab.errors import DataError, RecordError
 from imulab.estimation.decisions import MAGNETOMETER_CHECK
 from imulab.estimation.distributions import f_tail
+from imulab.estimation.rows import median
 from imulab.procedures.magnetometer import AXES, name_columns
 from imulab.procedures.magnetometer.device import output_unit, surface_of
 from imulab.procedures.magnetometer.model import read_readings
-from imulab.procedures.magnetometer.schema import fit_of, model_of
+from imulab.procedures.magnetometer.schema import FieldSummary, fit_of, model_of
 from imulab.procedures.magnetometer.solve import evaluate, find_inflation, mark_far, unpack
 from imulab.procedures.result import RecordCheck, as_record, as_recording, probability_fact, probability_text
 from imulab.recording import Array, Data, Reading
@@ -45,6 +47,8 @@ from imulab.report.traces import Exhibits, Figure, figure_axis, marker, rounded,
 _SPARE = 4  # readings beyond the parameters
 _PASSES = 10  # Gauss-Newton steps for the size of the field and a change of hard iron
 _CLOSE = 1e-7  # of the field: the last step
+_NOISIER = 3.0  # times the scatter of the record's readings, which another filter or room may make
+_LEAST_NOISE, _MOST_NOISE = 0.002, 0.05  # of the field
 _ABOVE_NOISE = 3.0  # times what the noise of readings makes of the derivatives: less tells nothing of a parameter
 _USUAL = 0.3  # of the field: changes of hard iron that are likely without readings
 _TOLD = _USUAL / 2  # a change along an axis that is known to less is not said
@@ -105,10 +109,10 @@ class MagnetometerCheck(RecordCheck):
         """Return the outcome in a sentence."""
         if self.passed:
             return "the readings agree with the record"
-        if self.explained < MAGNETOMETER_CHECK.level:
+        told = np.isfinite(self.hard_iron_std)
+        if self.explained < MAGNETOMETER_CHECK.level or not told.any():
             return "the readings are not those of the record: hard and soft iron, or the sensor, have changed"
         factor, unit = (1e6, "uT") if self.unit == "T" else (1.0, self.unit)
-        told = np.isfinite(self.hard_iron_std)
         change = ", ".join(
             f"{axis} {factor * value:+.3g}"
             for axis, value, known in zip(self.axes, self.hard_iron, told, strict=True)
@@ -218,9 +222,9 @@ def check_magnetometer(
             "directions"
         )
     used = _find_used(theta, output)
-    d, spare = output.shape[1], fit_of(held).degrees_of_freedom
-    first, ratio, _, _ = _explain(theta, output[used], covariance, spare, hard=False)
-    after, _, moved, u = _explain(theta, output[used], covariance, spare, hard=True)
+    d, fit = output.shape[1], fit_of(held)
+    first, ratio, _, _ = _explain(theta, output[used], covariance, fit, hard=False)
+    after, _, moved, u = _explain(theta, output[used], covariance, fit, hard=True)
     moved, u = np.where(u < _TOLD * _field(theta, d), [moved, u], np.nan)
     magnitude = evaluate(theta, output)[0]
     notes = list(readings.notes)
@@ -259,16 +263,16 @@ def _find_used(theta: Array, output: Array) -> NDArray[np.bool_]:
 
 
 def _explain(
-    theta: Array, output: Array, covariance: Array, freedom: float, *, hard: bool
+    theta: Array, output: Array, covariance: Array, fit: FieldSummary, *, hard: bool
 ) -> tuple[float, float, Array, Array]:
     """Return the probability of readings, the field over the record's, the change of hard iron, and its u, shape (d,).
 
-    `freedom` are the degrees of freedom of the record; without `hard` the hard iron does not change.
+    Without `hard` the hard iron does not change.
     """
     d, field = output.shape[1], _field(theta, output.shape[1])
-    p, ratio, moved, u = 0.0, 1.0, np.zeros(d), np.zeros(d)
+    p, ratio, moved, u = 0.0, 1.0 + median(evaluate(theta, output)[0]), np.zeros(d), np.zeros(d)
     for _ in range(_PASSES):
-        p, change, u = _test(theta, output, covariance, freedom, ratio, moved if hard else None)
+        p, change, u = _test(theta, output, covariance, fit, ratio, moved if hard else None)
         change = change / max(1.0, abs(change[0]) / _USUAL, np.abs(change[1:]).max(initial=0) / (_USUAL * field))
         ratio *= 1 + float(change[0])
         moved = moved + change[1:] if hard else moved
@@ -278,7 +282,7 @@ def _explain(
 
 
 def _test(
-    theta: Array, output: Array, covariance: Array, freedom: float, ratio: float, moved: Array | None
+    theta: Array, output: Array, covariance: Array, fit: FieldSummary, ratio: float, moved: Array | None
 ) -> tuple[float, Array, Array]:
     """Return the probability of readings, and how the size of the field and the hard iron change, and u of the latter.
 
@@ -292,7 +296,7 @@ def _test(
     left = x - u @ (u.T @ x)
     sigma = float(np.sqrt((left**2).sum() / max(len(x) - size, 1))) or 1e-12
     field = _field(theta, d)
-    kept = sizes > _ABOVE_NOISE * math.sqrt(len(x)) * sigma / (ratio * field)
+    kept = sizes > _ABOVE_NOISE * math.sqrt(len(x)) * min(sigma / (ratio * field), _MOST_NOISE)
     u, slopes = u[:, kept], (sizes[:, None] * v)[kept]
     left, nu = x - u @ (u.T @ x), max(len(x) - int(kept.sum()), 1)
     inflation = find_inflation(left, u, sigma)
@@ -302,14 +306,17 @@ def _test(
     before, aim = np.zeros((0, 1)), np.zeros(0)
     if moved is not None:
         changes.append(np.eye(size)[:, :d])
-        usual = _USUAL * np.concatenate([[1.0], np.full(d, field)])
-        before = np.diag(np.concatenate([[ratio], np.ones(d)]) / usual)
-        aim = np.concatenate([[ratio - 1], moved]) / usual
+        likely = _USUAL * np.concatenate([[1.0], np.full(d, field)])
+        before = np.diag(np.concatenate([[ratio], np.ones(d)]) / likely)
+        aim = np.concatenate([[ratio - 1], moved]) / likely
     y, columns = np.linalg.solve(root, u.T @ x), np.linalg.solve(root, slopes @ np.hstack(changes))
     joint = np.vstack([columns, before])
     coefficients = np.linalg.lstsq(joint, np.concatenate([y, aim]))[0]
-    spread = np.linalg.inv(joint.T @ joint)
+    spread = np.linalg.pinv(joint.T @ joint)
     value = float(((y - columns @ coefficients) ** 2).sum())
     tested = max(int(kept.sum()) - float(np.trace(columns @ spread @ columns.T)), 1.0)
-    after = min(nu / inflation, freedom)
-    return float(f_tail(value / tested, tested, max(after, 1.0))), -coefficients, np.sqrt(np.diag(spread)[1:])
+    after = max(min(nu / inflation, fit.degrees_of_freedom), 1.0)
+    usual = _NOISIER * max(fit.rms, _LEAST_NOISE) * field
+    scatter = float(f_tail((sigma / usual) ** 2, nu / inflation, after))
+    p = min(float(f_tail(value / tested, tested, after)), scatter)
+    return p, -coefficients, np.sqrt(np.diag(spread)[1:])
