@@ -232,6 +232,8 @@ def test_the_real_array_is_calibrated(real_data):
     [
         (lambda c: c | {"gyro_2": np.full(12_000, 0.25)}, DataError,
          r"still.csv: column gyro_2: all samples are 0.25: a dead"),
+        (lambda c: c | {"gyro_2": np.where(np.arange(12_000) == 11_999, 0.3, 0.25)}, DataError,
+         r"still.csv: column gyro_2: its means over .* s do not differ: a dead gyro"),
         (
             lambda c: c | {"gyro_2": np.where(np.arange(12_000) == 5, np.nan, c["gyro_2"])},
             DataError, r"still.csv: row 6 \(line 7\), column gyro_2: expected a finite number, found nan",

@@ -281,6 +281,13 @@ def _allan_covariance(
         covariance += difference @ difference.transpose(0, 2, 1)
     # Equivalent number of independent differences for white noise: NIST SP 1065, table 5.
     freedom = max(2, round(1.5 * m / size))
+    for names, variances in zip(elements.names, np.einsum("aii->ai", covariance).tolist(), strict=True):
+        for name, variance in zip(names, variances, strict=True):
+            if not variance > 0:
+                raise DataError(
+                    f"{still.name}: column {name}: its means over {size / rate:.3g} s do not differ: a dead gyro, or a "
+                    "unit in which its readings are as good as zero"
+                )
     return covariance / (2 * len(starts)), size / rate, freedom
 
 
