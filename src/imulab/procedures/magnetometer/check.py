@@ -109,16 +109,16 @@ class MagnetometerCheck(RecordCheck):
         """Return the outcome in a sentence."""
         if self.passed:
             return "the readings agree with the record"
-        told = np.isfinite(self.hard_iron_std)
-        if self.explained < MAGNETOMETER_CHECK.level or not told.any():
+        determined = np.isfinite(self.hard_iron_std)
+        if self.explained < MAGNETOMETER_CHECK.level or not determined.any():
             return "the readings are not those of the record: hard and soft iron, or the sensor, have changed"
         factor, unit = (1e6, "uT") if self.unit == "T" else (1.0, self.unit)
         change = ", ".join(
             f"{axis} {factor * value:+.3g}"
-            for axis, value, known in zip(self.axes, self.hard_iron, told, strict=True)
+            for axis, value, known in zip(self.axes, self.hard_iron, determined, strict=True)
             if known
         )
-        others = " ".join(axis for axis, known in zip(self.axes, told, strict=True) if not known)
+        others = " ".join(axis for axis, known in zip(self.axes, determined, strict=True) if not known)
         rest = f"; along {others} they tell no change" if others else ""
         return f"a hard iron that changed by {change} {unit} explains the readings (p = {self.explained:.1g}){rest}"
 

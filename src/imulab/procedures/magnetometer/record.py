@@ -304,10 +304,10 @@ def _warn_bends(turned: FittedTurn) -> list[str]:
             continue
         unit = parse_unit(turned.readings.unit)
         factor, symbol = (1e6 * unit.factor, "uT") if unit.quantity == "magnetic field" else (1.0, unit.symbol)
-        largest = float(np.linalg.norm(bend.size)) if not bend.told else float(np.abs(bend.size).max())
+        largest = float(np.linalg.norm(bend.size)) if not bend.determined else float(np.abs(bend.size).max())
         each = zip(turned.axes, (factor * bend.size).tolist(), strict=True)
         sizes = ", ".join(f"{axis} {value:+.2g}" for axis, value in each)
-        if not bend.told:
+        if not bend.determined:
             sizes = f"(of an axis that is not told) {factor * largest:.2g}"
         text = (
             f"mag: |m| follows the direction as no ellipsoid does: outputs with a {_POWER_NAMES[power]} of the field, "

@@ -303,7 +303,7 @@ class Unmodelled:
         What they leave open of theta, shape (p, p).
     first
         The reading from which they count.
-    told
+    determined
         Whether the readings tell the size of each.
     """
 
@@ -311,7 +311,7 @@ class Unmodelled:
     probability: float
     covariance: Array
     first: int = 0
-    told: bool = True
+    determined: bool = True
 
 
 @dataclass(frozen=True)
@@ -395,8 +395,8 @@ def find_bend(theta: Array, outputs: Array, power: int) -> Unmodelled:
     absorbed = np.linalg.lstsq(rows, columns)[0]
     real, size = 1 - 1 / max(bend.ratio, 1.0), bend.size
     square = real**2 * (np.outer(size, size) + size @ size * bend.unknown) + real * bend.covariance
-    told = float(np.trace(bend.unknown)) < 0.5  # its eigenvalues are 0 and 1
-    return Unmodelled(size, bend.probability, absorbed @ square @ absorbed.T, told=told)
+    determined = float(np.trace(bend.unknown)) < 0.5  # its eigenvalues are 0 and 1
+    return Unmodelled(size, bend.probability, absorbed @ square @ absorbed.T, determined=determined)
 
 
 _LEAST_PART = 3  # blocks before and after a change
