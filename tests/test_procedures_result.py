@@ -1,6 +1,7 @@
 """Results that show themselves: text, HTML, figures in notebooks and files, data frames, and what is done next."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -266,6 +267,29 @@ def test_a_figure_is_saved_as_a_picture(fit, chromium, tmp_path, kind, begin):
     fit.plot("sphere").save(path)
     assert path.read_bytes().startswith(begin)
     assert path.stat().st_size > 4000
+
+
+@pytest.mark.slow
+def test_a_browser_that_does_not_answer_is_ended(tmp_path):
+    pytest.importorskip("kaleido")
+    browser = tmp_path / "browser"
+    browser.write_text("#!/bin/sh\nexec sleep 100\n")
+    browser.chmod(0o755)
+    script = (
+        "import imulab as il, imulab.report.plots as plots\n"
+        "plots._PATIENCE = 2.0\n"
+        "try:\n"
+        "    il.simulate_tumble(gravity=9.81).plot('accel').save('x.png')\n"
+        "except il.errors.OptionError as error:\n"
+        "    print(error)\n"
+    )
+    command = [sys.executable, "-c", script]
+    environment = os.environ | {"BROWSER_PATH": str(browser)}
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == "x.png: Chromium did not draw the picture: no answer within 2 s\n"
+    assert not (tmp_path / "x.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import os
+import signal
 import sys
 from base64 import b64encode
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,13 +13,17 @@ from functools import cache
 from html import escape
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any, overload
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, overload
 from uuid import uuid4
 
 from imulab.errors import OptionError, file_name, install, listed, quoted
 from imulab.files import replacing, write_text
 from imulab.report import json_for_script, render_page
 from imulab.report.traces import INK, Exhibits, Figure
+
+if TYPE_CHECKING:
+    import subprocess
 
 PICTURES = ("png", "svg", "pdf")
 _WIDTH = 900  # pixels
@@ -30,6 +36,7 @@ _BASE = {
     "plot_bgcolor": "#ffffff",
 }
 _TITLE_HEIGHT = 40  # pixels
+_PATIENCE = 120.0  # s, until a Chromium that has not drawn a picture is ended
 _TITLE = {"x": 0, "xanchor": "left", "yref": "container", "y": 1, "yanchor": "top", "pad": {"l": 10, "t": 14}}
 
 
@@ -172,6 +179,9 @@ def _write_page(path: str | Path, subject: str, plots: Sequence[Plot]) -> None:
 
 def _picture(plot: Plot, kind: str, path: str | Path) -> bytes:
     """Return a figure as a picture, drawn by the machine's own Chromium."""
+    import asyncio
+    from concurrent.futures import ThreadPoolExecutor
+
     try:
         import kaleido
         from kaleido.errors import ChromeNotFoundError
@@ -183,13 +193,40 @@ def _picture(plot: Plot, kind: str, path: str | Path) -> bytes:
     options = {"format": kind, "width": _WIDTH, "height": height, "scale": scale}
     with as_file(files("imulab.report").joinpath(*_LIBRARY)) as library:
         try:
-            drawn = kaleido.calc_fig_sync(figure, opts=options, kopts={"plotlyjs": library.as_uri(), "mathjax": False})
+            browser = kaleido.Kaleido(plotlyjs=library.as_uri(), mathjax=False)
+            with ThreadPoolExecutor(1) as pool:  # a notebook runs an event loop in this thread
+                drawn = pool.submit(asyncio.run, _drawn(browser, figure, options)).result()
         except ChromeNotFoundError:
             needed = "Chromium or Chrome on this machine"
             raise OptionError(f"{path}: a picture needs {needed}; .html needs nothing") from None
         except Exception as error:  # whatever goes wrong in another program
             raise OptionError(f"{path}: Chromium did not draw the picture: {error}") from None
-    return bytes(drawn)
+    return drawn
+
+
+async def _drawn(browser: Any, figure: dict[str, Any], options: dict[str, Any]) -> bytes:
+    """Return what a Chromium draws; kaleido waits for ever for one that does not answer, so it is ended here."""
+    import asyncio
+
+    begin = perf_counter()
+    end = asyncio.get_running_loop().call_later(_PATIENCE, lambda: _end(browser.subprocess))
+    try:
+        async with browser:
+            return bytes(await browser.calc_fig(figure, opts=options))
+    except Exception as error:
+        if perf_counter() - begin < _PATIENCE:
+            raise
+        raise TimeoutError(f"no answer within {_PATIENCE:g} s") from error
+    finally:
+        end.cancel()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a process and those that it started."""
+    if hasattr(os, "killpg"):
+        os.killpg(process.pid, signal.SIGKILL)  # kaleido starts a session for it
+    else:
+        process.kill()
 
 
 def _untitled(figure: Figure) -> dict[str, Any]:
