@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import imulab as il
 from imulab.cli import main
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
-from imulab.procedures.gyro_array.imus.fit import count_attitudes, parse_distance
+from imulab.procedures.gyro_array.imus.fit import count_attitudes, parse_distance, warn_shaking
 from imulab.procedures.gyro_array.imus.model import (
     ACCEL,
     ACCEL_BIAS,
@@ -308,6 +308,17 @@ def test_vibration_beyond_what_the_rate_follows_is_said(size, frequency, reason)
     record = il.calibrate_imus(shaken(board, size, frequency), gravity=G).calibration
     assert record.verdict.state == ("look" if reason else "good")
     assert reason is None or any(reason in text for text in record.verdict.reasons)
+
+
+@pytest.mark.parametrize(("rows", "shakes", "said"), [(6, True, False), (12, False, False), (12, True, True)])
+def test_vibration_is_told_within_runs_of_motion_alone(rows, shakes, said):
+    rng = np.random.default_rng(5)
+    first = rows * np.arange(30)  # runs from other places of the recording, with other readings
+    time = np.arange(30.0 * rows) / 100
+    levels = np.repeat(rng.normal(0, 5, (30, 3)), rows, axis=0)
+    force = levels + 0.01 * rng.standard_normal(levels.shape) + 2.0 * shakes * np.sin(2 * np.pi * 37.3 * time)[:, None]
+    measured = SimpleNamespace(time=time, first=first, accel=[lambda _: force], accel_noise=np.full((1, 3), 0.01))
+    assert bool(warn_shaking(SimpleNamespace(measured=measured))) is said
 
 
 def shifted(board, number, by):
