@@ -575,6 +575,11 @@ def test_show_reads_a_certificate(issue, capsys):
     assert "signature: none" in shown
     assert main(["tumble", "fit", "cert.xml"]) == 2
     assert "expected a recording, found an XML file (imulab show reads certificates)" in capsys.readouterr().err
+    text = Path("cert.xml").read_text(encoding="utf-8")
+    Path("bare.xml").write_text("\ufeff\n" + text.partition("?>")[2], encoding="utf-8")
+    capsys.readouterr()
+    assert main(["show", "bare.xml"]) == 0
+    assert capsys.readouterr().out == shown.replace("cert.xml", "bare.xml")
     Path("empty.pdf").write_bytes(b"%PDF-1.7\n")
     assert main(["show", "empty.pdf"]) == 2
     assert "empty.pdf: a PDF without a Digital Calibration Certificate" in capsys.readouterr().err

@@ -485,6 +485,22 @@ def test_a_record_in_the_place_of_a_recording_is_recognised(file):
         read(file(b'{\n "format": "imulab.calibration"\n}\n'))
 
 
+@pytest.mark.parametrize(
+    ("head", "kind"),
+    [
+        ("<!DOCTYPE html>\n<html>", "a web page"),
+        ("\ufeff<HTML>", "a web page"),
+        ("\n<gpx><trk/>\n</gpx>\n", r"an XML file \(imulab show reads certificates\)"),
+        ("<!-- made by hand -->\n<a/>\n", "an XML file"),
+    ],
+)
+def test_pages_are_no_recordings(tmp_path, head, kind):
+    path = tmp_path / "page.csv"
+    path.write_text(head, encoding="utf-8")
+    with pytest.raises(ReadError, match=f"page.csv: expected a recording, found {kind}"):
+        il.read(path)
+
+
 def test_a_line_without_an_end_is_refused_in_few_words(file):
     with pytest.raises(ReadError, match="line 1: expected a line of text, found more than 1048576 bytes") as met:
         read(file(b"a" * 3_000_000))

@@ -284,11 +284,13 @@ def show(
 
 def _is_page(file: str) -> bool:
     """Return whether a file begins as a PDF or as XML, in which certificates come."""
+    from imulab.readers.formats import page
+
     try:
         if not Path(file).is_file():
             return False  # a pipe can be read only once
         with open_file(file) as stream:
-            return stream.read(5) in (b"%PDF-", b"<?xml")
+            return page(stream.read(1024)) is not None
     except OSError:
         return False
 

@@ -23,7 +23,7 @@ from imulab.columns import kind_of
 from imulab.display import Note
 from imulab.errors import ImulabError, ReadError, UnitError, file_name
 from imulab.files import open_file
-from imulab.readers.formats import FORMATS, TEXT, is_packed, recognised, unpacked
+from imulab.readers.formats import FORMATS, TEXT, is_packed, page, recognised, unpacked
 from imulab.readers.layout import IfNeeded, load_layout, spread_packets
 from imulab.readers.selection import Selection
 from imulab.readers.text import TextFile, without_stray_times
@@ -264,9 +264,9 @@ def _content_blocks(
                     kind = recognised(begin)
                 except OSError as error:
                     raise ReadError(f"{name}: cannot be read: {error.strerror}") from None
-            if begin.startswith((b"%PDF-", b"<?xml")):
-                what = "a PDF" if begin.startswith(b"%") else "an XML file"
-                raise ReadError(f"{name}: expected a recording, found {what} (imulab show reads certificates)")
+            if what := page(begin):
+                what += "" if what == "a web page" else " (imulab show reads certificates)"
+                raise ReadError(f"{name}: expected a recording, found {what}")
     chosen = {"layout": layout and layout.name, "topic": selection.topic, "instance": selection.instance}
     parts = "".join(f", {key} {value}" for key, value in chosen.items() if value is not None)
     _LOG.info("%s: a %s file%s", name, kind.name, parts)

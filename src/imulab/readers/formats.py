@@ -9,6 +9,7 @@ sensors compress by less than 20. `raise_limit` (``--unpack-limit``) allows more
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -178,6 +179,7 @@ def _content(stream: IO[bytes], name: str) -> IO[bytes]:
 # Kinds of file: recognition and needed libraries.
 
 
+_MARKUP = re.compile(rb"<[?!a-zA-Z]")
 _JSON = re.compile(rb"(\xef\xbb\xbf)?\s*(\{|\[\s*[\[{\]])")  # a line of text may begin with [12.5]
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MAT = b"MATLAB 5.0 MAT-file"
@@ -245,6 +247,16 @@ def _is_mimu(head: bytes) -> bool:
 def recognised(head: bytes) -> Format:
     """Return the kind of a file from its first bytes; text where nothing else fits."""
     return next((kind for kind in FORMATS if kind.matches(head)), TEXT)
+
+
+def page(head: bytes) -> str | None:
+    """Return what a file is whose first bytes are those of a page, such as ``an XML file``; None for others."""
+    text = head.removeprefix(BOM_UTF8).lstrip()
+    if text.startswith(b"%PDF-"):
+        return "a PDF"
+    if text[:9].lower() == b"<!doctype" or text[:5].lower() == b"<html":
+        return "a web page"
+    return "an XML file" if _MARKUP.match(text) else None
 
 
 def library(module: str, kind: str, extra: str, name: str) -> Any:
