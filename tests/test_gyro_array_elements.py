@@ -70,6 +70,13 @@ def test_the_longest_stretch_at_rest_is_used_and_said(kind):
     found = np.array([e["bias"]["value"] for e in record.sections["elements"]]).T
     np.testing.assert_allclose(found, DEG * readings[3000:7000].mean(axis=0), atol=1e-12)
     assert record.verdict.state == "look"
+    assert record.verdict.next == ("record again at rest, or state the part at rest (--interval)",)
+
+
+def test_a_board_of_whole_imus_that_moved_is_sent_to_their_calibration():
+    record = il.calibrate_array(il.simulate_imus(elements=3, attitudes=8, duration="12 s", seed=3)).calibration
+    action = record.verdict.next[0]
+    assert action.startswith("calibrate the whole IMUs (array calibrate --imus), or record again at rest")
 
 
 @pytest.mark.parametrize("fault", ["drift", "shared", "steps", "loud", "knock"])

@@ -199,10 +199,12 @@ def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[
             f"samples; expected {_FEWEST_SAMPLES} or more"
         )
     first, last = time[rest.start], time[rest.stop - 1]
+    whole = all(f"accel_{axis}_{k}" in still.columns for axis in "xyz" for k in range(1, elements.count + 1))
     shortened = Finding(
         f"{still.name}: not at rest throughout ({rest.moved}): used is the longest stretch at rest, {first:.6g} to "
         f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval FROM:TO chooses another",
-        "record again at rest, or state the part at rest (--interval)",
+        ("calibrate the whole IMUs (array calibrate --imus), or " if whole else "")
+        + "record again at rest, or state the part at rest (--interval)",
     )
     return part, [shortened], sampling_rate(part)
 
