@@ -13,7 +13,7 @@ from imulab.estimation.noise import analysis, cleaning
 from imulab.estimation.noise import spectrum as cosine
 from imulab.estimation.noise.analysis import analysed, analyses, ramp_coefficients, regress, without
 from imulab.estimation.noise.analysis import test_of_fit as hold
-from imulab.estimation.noise.cleaning import block_medians, find_steps, spikes_removed, step_coefficients
+from imulab.estimation.noise.cleaning import find_steps, ordered_blocks, spikes_removed, step_coefficients
 from imulab.estimation.noise.likelihood import allow, fit, time_limits, usable_band, within
 from imulab.estimation.noise.rest import at_rest
 from imulab.estimation.noise.simulate import flicker_sum, simulated
@@ -91,15 +91,15 @@ def test_a_long_log_in_pieces_has_the_spectrum_of_the_whole(monkeypatch):
 def test_spikes_become_the_line_and_noise_stays():
     rng = np.random.default_rng(4)
     x = rng.standard_normal(100_000) + np.linspace(0, 40, 100_000)
-    assert spikes_removed(x, block_medians(x))[1] == 0
+    assert spikes_removed(x, ordered_blocks(x))[1] == 0
     where = rng.choice(len(x), 100, replace=False)
     y = x.copy()
     y[where] += 20
-    cleaned, count = spikes_removed(y, block_medians(y))
+    cleaned, count = spikes_removed(y, ordered_blocks(y))
     assert count == 100
     np.testing.assert_array_equal(np.flatnonzero(cleaned != x), np.sort(where))
     z = np.r_[np.zeros(5000), 1.0, np.zeros(5000)]
-    assert spikes_removed(z, block_medians(z))[1] == 0  # a sensor that shows no noise
+    assert spikes_removed(z, ordered_blocks(z))[1] == 0  # a sensor that shows no noise
 
 
 def test_spikes_and_lines_leave_the_noise_as_it_is(reduced):

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 import imulab as il
 from imulab.errors import DataError
-from imulab.estimation.noise.cleaning import block_medians, knocks_removed
+from imulab.estimation.noise.cleaning import knocks_removed, ordered_blocks
 from imulab.estimation.noise.readings import doubtful_units, dropouts, own_readings
 from imulab.estimation.noise.rest import at_rest, long_rest
 from imulab.estimation.noise.simulate import simulated
@@ -210,7 +210,7 @@ def test_no_noise_has_knocks(sizes, step):
         for seed in range(3):
             x = np.concatenate(list(simulated({"white": 0.3, **sizes}, 0.01, count, seed)))
             read = step * np.round(x / step) if step else x
-            assert not len(knocks_removed(read, block_medians(read))[1])
+            assert not len(knocks_removed(read, ordered_blocks(read))[1])
 
 
 @pytest.mark.slow

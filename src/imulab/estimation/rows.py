@@ -390,8 +390,12 @@ def far_rows(values: Sequence[Array], known: NDArray[np.bool_]) -> tuple[NDArray
 def _steps(x: Array) -> Iterator[tuple[int, Array]]:
     """Yield the sizes of the steps from sample to sample in blocks of whole parts, and where each block begins."""
     for first in range(0, len(x) - 1, _AT_ONCE):
-        steps = np.diff(x[first : first + _AT_ONCE + 1])
-        yield first, np.abs(steps, out=steps)
+        yield first, _steps_from(x, first)
+
+
+def _steps_from(x: Array, first: int) -> Array:
+    steps = np.diff(x[first : first + _AT_ONCE + 1])
+    return np.abs(steps, out=steps)
 
 
 def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -403,8 +407,9 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     far, alone = np.zeros((2, len(x)), dtype=np.bool_)
     count = (len(x) - 1) // _AROUND
     local = np.empty(count)
-    resolution = np.inf
+    resolution, largest = np.inf, []
     for first, steps in _steps(x):
+        largest.append(steps.max())
         parts = steps[: len(steps) // _AROUND * _AROUND].reshape(-1, _AROUND)
         local[first // _AROUND :][: len(parts)] = np.partition(parts[:, : _AROUND // 2], _UPPER, axis=1)[:, _UPPER]
         smallest = float(steps.min())
@@ -426,10 +431,11 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
 
     # A sample far from its surroundings is a large step away from them, or from the sample before.
     far_steps = []
-    for first, steps in _steps(x):
-        its = limits[first // _AROUND :][: -(-len(steps) // _AROUND)]
-        if its.size and steps.max() <= its.min():  # as most are
+    for first, most in zip(range(0, len(x) - 1, _AT_ONCE), largest, strict=True):
+        its = limits[first // _AROUND :][: _AT_ONCE // _AROUND]
+        if its.size and most <= its.min():  # as most are
             continue
+        steps = _steps_from(x, first)
         its = np.append(its, limits[-1:]) if len(its) * _AROUND < len(steps) else its
         far_steps.append(np.flatnonzero(steps > np.repeat(its, _AROUND)[: len(steps)]) + first)
     suspect = np.concatenate([np.empty(0, dtype=np.intp), *far_steps])

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from imulab.estimation.noise.cleaning import (
     Line,
-    block_medians,
     knocks_removed,
     line_groups,
+    ordered_blocks,
     spikes_removed,
     strong_lines_removed,
 )
@@ -162,6 +162,17 @@ def cosine_coefficients(samples: Array, most: int | None = None) -> Array:
     ['1.9598', '0.5000', '0.8118']
     """
     n = len(samples)
+    turned = _turned(samples, most)
+    if most is not None and most <= n // 2:
+        return np.asarray(turned.real[1:] * np.sqrt(2 / n))
+    c = np.concatenate([turned.real[1:], -turned.imag[n - len(turned) : 0 : -1]])[:most]
+    c *= np.sqrt(2 / n)
+    return np.asarray(c)
+
+
+def _turned(samples: Array, most: int | None = None) -> NDArray[np.complex128]:
+    """Return ``sqrt(n/2) (c_j - i c_{n-j})`` of samples of shape (n,), j = 0 .. n // 2, or up to `most`."""
+    n = len(samples)
     # The Fourier transform of the even samples, then the odd ones backwards, turned, is the cosine transform.
     ordered = np.concatenate([samples[::2], samples[1::2][::-1]])
     ordered -= samples.mean()
@@ -172,11 +183,7 @@ def cosine_coefficients(samples: Array, most: int | None = None) -> Array:
     fine, coarse = np.arange(_FINE), _FINE * np.arange(len(low) // _FINE + 1)
     turn = np.multiply.outer(np.exp(-0.5j * np.pi / n * coarse), np.exp(-0.5j * np.pi / n * fine))
     low *= turn.ravel()[: len(low)]
-    if low is not turned:
-        return np.asarray(low.real[1:] * np.sqrt(2 / n))
-    c = np.concatenate([low.real[1:], -low.imag[n - len(low) : 0 : -1]])[:most]
-    c *= np.sqrt(2 / n)
-    return np.asarray(c)
+    return low
 
 
 class Accumulator:
@@ -255,10 +262,10 @@ class Accumulator:
     def _cleaned(self, samples: Array) -> Array:
         if not self._despike:
             return samples
-        level = block_medians(samples)
-        without, knocks = knocks_removed(samples, level)
+        ordered = ordered_blocks(samples)
+        without, knocks = knocks_removed(samples, ordered)
         self._knocks.append(knocks + self._stretches * STRETCH)
-        samples, count = spikes_removed(without, level if without is samples else block_medians(without))
+        samples, count = spikes_removed(without, ordered if without is samples else ordered_blocks(without))
         self._spikes += count
         return samples
 
@@ -284,8 +291,11 @@ class Accumulator:
     def _transform(self, samples: Array) -> None:
         samples = self._cleaned(samples)
         self._add_means(samples)
-        c = cosine_coefficients(samples)
-        self._squares = c * c if not self._stretches else self._squares + c * c
+        squares = _turned(samples).view(np.float64)
+        squares *= squares
+        if self._stretches:
+            squares += self._squares
+        self._squares = squares
         self._stretches += 1
 
     def _add_means(self, samples: Array) -> None:
@@ -316,7 +326,8 @@ class Accumulator:
         fine, lines = line_groups(slow**2, *kept, 1, count, self._interval)
         parts = [binned(slow**2, fine, kept, self._interval, count)]
         first, last = bins(STRETCH)
-        squares = self._squares / self._stretches
+        low_and_high = self._squares.reshape(-1, 2) * (2 / (STRETCH * self._stretches))
+        squares = np.concatenate([low_and_high[1:, 0], low_and_high[STRETCH // 2 - 1 : 0 : -1, 1]])
         high = first > (kept[1][-1] + 0.5) * STRETCH / count  # half a bin between the two parts is lost
         fine_above, more = line_groups(squares, first, last, self._stretches, STRETCH, self._interval)
         above = binned(squares, fine_above, (first[high], last[high]), self._interval, STRETCH)

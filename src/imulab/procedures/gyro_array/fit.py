@@ -158,8 +158,10 @@ def _blocks_of_rows(count: int) -> Iterator[slice]:
 def _readings_si(recording: Recording, elements: Elements, rows: slice = slice(None)) -> Array:
     """Return the readings of all rows or some, rad/s, shape (m, axes, n), with those of a gyro side by side."""
     columns = dict(recording.columns)  # which gives back the memory of columns on disk below, for all at once
-    by_unit = zip(elements.names, elements.units, strict=True)
-    readings = np.array([[to_si(columns[name][rows], unit) for name in row] for row, unit in by_unit])
+    readings = np.empty((len(elements.axes), elements.count, len(range(*rows.indices(len(recording))))))
+    for a, (row, unit) in enumerate(zip(elements.names, elements.units, strict=True)):
+        for i, name in enumerate(row):
+            np.multiply(columns[name][rows], to_si(1.0, unit), out=readings[a, i])
     release(*columns.values())
     return np.moveaxis(readings, 2, 0)
 
@@ -273,13 +275,14 @@ def _allan_covariance(
     starts = np.arange(0, m - 2 * size + 1, max(1, size // _OVERLAP))
     covariance = np.zeros((len(elements.axes), n, n))
     for part in np.array_split(starts, -(-m // max(ROWS_AT_ONCE, 4 * size))):
-        readings = _readings_si(still, elements, slice(part[0], part[-1] + 2 * size)) - rest.bias
-        if aligned is not None:
-            readings = np.einsum("iab,mbi->mai", np.linalg.inv(aligned.sensing), readings)
+        readings = _readings_si(still, elements, slice(part[0], part[-1] + 2 * size))
+        readings -= rest.bias
         total = np.zeros((len(elements.axes), n, len(readings) + 1))
         np.cumsum(np.moveaxis(readings, 0, 2), axis=2, out=total[:, :, 1:])  # of each gyro, whose readings lie together
         its = part - part[0]
         difference = (total[:, :, its + 2 * size] - 2 * total[:, :, its + size] + total[:, :, its]) / size
+        if aligned is not None:
+            difference = np.einsum("iab,bim->aim", np.linalg.inv(aligned.sensing), difference)
         covariance += difference @ difference.transpose(0, 2, 1)
     # Equivalent number of independent differences for white noise: NIST SP 1065, table 5.
     freedom = max(2, round(1.5 * m / size))
