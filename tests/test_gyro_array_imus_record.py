@@ -141,6 +141,16 @@ def test_show_lists_the_imus(tmp_path, capsys):
     assert float(row.split()[1]) == pytest.approx(1e3 * board.position[1, 0], abs=0.02)
 
 
+def test_imus_one_above_the_other_share_a_label_on_the_board():
+    record = il.calibrate_imus(il.simulate_imus(elements=8, attitudes=8, duration="12 s", seed=3)).calibration
+    (points,) = [trace for trace in record.plot("x and y").figure.traces if trace["mode"] == "markers+text"]
+    place = np.round(np.transpose([points["x"], points["y"]]), -1)  # corners of a square of 40 mm, two IMUs at each
+    assert sorted(filter(None, points["text"])) == sorted(
+        {", ".join(str(j + 1) for j in np.flatnonzero((place == corner).all(axis=1))) for corner in place}
+    )
+    assert len(set(points["hovertext"])) == 4
+
+
 @pytest.mark.parametrize(
     "words",
     [

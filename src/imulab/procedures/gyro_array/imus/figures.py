@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from imulab.report.traces import (
     scatter,
     short_log_axis,
 )
+from imulab.units import STANDARD_GRAVITY
 
 _CHI = math.sqrt(-2 * math.log(0.05))
 """Axes of an ellipse that holds two normal variates with 95 %, in standard deviations."""
@@ -52,7 +54,7 @@ def exhibits(calibration: Calibration) -> Exhibits:
         ("size from", record.size_from),
         ("age of readings", f"{plain_number(1e3 * fit.age.value, 2)} ms"),
     ]
-    if fit.bridged is not None:
+    if fit.bridged:
         facts.append(("samples that fusion bridges", f"{plain_number(100 * fit.bridged, 2)} %"))
     return Exhibits(
         headline=f"{record.model.imus} IMUs: positions known to {plain_number(1e3 * largest, 2)} mm or better, the "
@@ -63,7 +65,7 @@ def exhibits(calibration: Calibration) -> Exhibits:
 
 
 def _items(record: ImusRecord, calibration: Calibration) -> list[Figure | ReportTable]:
-    items: list[Figure | ReportTable] = [_imus_table(record), _biases_table(record), _size_table(record)]
+    items: list[Figure | ReportTable] = [*_imus_tables(record), _size_table(record)]
     if (record.limits < NO_LIMIT).any():
         items.append(_ranges_table(record))
     if record.not_determined:
@@ -97,11 +99,15 @@ def _board(record: ImusRecord, calibration: Calibration, across: int, up: int) -
         )
         for k, ellipse in ellipses.items()
     ]  # fmt: skip
+    # IMUs that lie one above the other have one label.
+    near = np.hypot(x[:, None] - x, y[:, None] - y) < room / 4
+    names_there = [", ".join(record.imus[j].name for j in np.flatnonzero(row)) for row in near]
+    labels = [text if near[k].argmax() == k else "" for k, text in enumerate(names_there)]
     traces.append(
         scatter(
             rounded(x), rounded(y), "markers+text", marker={"color": INK, "size": 7},
-            text=[imu.name for imu in record.imus], textposition="top right", showlegend=False,
-            hovertemplate=f"IMU %{{text}}<br>{names[0]} %{{x:.3f}} mm, {names[1]} %{{y:.3f}} mm<extra></extra>",
+            text=labels, hovertext=names_there, textposition="top right", showlegend=False,
+            hovertemplate=f"IMU %{{hovertext}}<br>{names[0]} %{{x:.3f}} mm, {names[1]} %{{y:.3f}} mm<extra></extra>",
         )
     )  # fmt: skip
     layout = {
@@ -177,38 +183,44 @@ def _cell(value: float, uncertainty: float | None, factor: float) -> str:
     return f"{text} ± {u}" if uncertainty else text
 
 
-def _three(values: Three, factor: float) -> list[str]:
-    return [_cell(v, u, factor) for v, u in zip(values.value, values.standard_uncertainty, strict=True)]
+def _three(values: Three, factor: float, nominal: float = 0.0) -> list[str]:
+    return [_cell(v - nominal, u, factor) for v, u in zip(values.value, values.standard_uncertainty, strict=True)]
 
 
-def _imus_table(record: ImusRecord) -> ReportTable:
-    def row(imu: Imu) -> list[str]:
-        late = [_cell(each.value, each.standard_uncertainty, 1e3) for each in (imu.accel_latency, imu.gyro_latency)]
-        return [imu.name, *_three(imu.position, 1e3), *_three(imu.rotation, math.degrees(1)), *late]
+def _imus_tables(record: ImusRecord) -> list[ReportTable]:
+    """Return where each IMU sits, how late it answers, and its errors; misalignments are in the record."""
 
-    titles = ["IMU", *(f"{axis} mm" for axis in "xyz"), *(f"rotation {axis} deg" for axis in "xyz")]
-    return ReportTable(
-        "Where each IMU sits, and how late it answers",
-        "Positions of the sensing elements from IMU 1, rotation vectors from its frame, latencies against the "
-        "gyroscopes of IMU 1; standard uncertainties.",
-        [*titles, "accel latency ms", "gyro latency ms"],
-        [row(imu) for imu in record.imus],
-    )
+    def table(title: str, caption: str, titles: Iterable[str], cells: Callable[[Imu], list[str]]) -> ReportTable:
+        return ReportTable(title, caption, ["IMU", *titles], [[imu.name, *cells(imu)] for imu in record.imus])
 
-
-def _biases_table(record: ImusRecord) -> ReportTable:
-    def row(imu: Imu) -> list[str]:
-        scales = [*_three(imu.accel.scale_factor, 1.0), *_three(imu.gyro.scale_factor, 1.0)]
-        return [imu.name, *_three(imu.accel.bias, 1.0), *_three(imu.gyro.bias, math.degrees(1)), *scales]
-
-    titles = [
-        *(f"accel bias {axis} m/s²" for axis in "xyz"),
-        *(f"gyro bias {axis} deg/s" for axis in "xyz"),
-        *(f"accel scale {axis}" for axis in "xyz"),
-        *(f"gyro scale {axis}" for axis in "xyz"),
+    return [
+        table(
+            "Where each IMU sits",
+            "Positions of the sensing elements from IMU 1, rotation vectors from its frame; standard uncertainties.",
+            [f"{axis} mm" for axis in "xyz"] + [f"rotation {axis} deg" for axis in "xyz"],
+            lambda imu: [*_three(imu.position, 1e3), *_three(imu.rotation, math.degrees(1))],
+        ),
+        table(
+            "Latencies",
+            "How much later each triad answers than the gyroscopes of IMU 1.",
+            ["accelerometers ms", "gyroscopes ms"],
+            lambda imu: [
+                _cell(each.value, each.standard_uncertainty, 1e3) for each in (imu.accel_latency, imu.gyro_latency)
+            ],
+        ),
+        table(
+            "Biases",
+            "Of each IMU, along its own axes.",
+            [f"accel {axis} mg" for axis in "xyz"] + [f"gyro {axis} deg/s" for axis in "xyz"],
+            lambda imu: [*_three(imu.accel.bias, 1e3 / STANDARD_GRAVITY), *_three(imu.gyro.bias, math.degrees(1))],
+        ),
+        table(
+            "Scale factors",
+            "Of each IMU, along its own axes, off nominal; misalignments are in the record.",
+            [f"{sensor} {axis} ppm" for sensor in ("accel", "gyro") for axis in "xyz"],
+            lambda imu: [*_three(imu.accel.scale_factor, 1e6, 1.0), *_three(imu.gyro.scale_factor, 1e6, 1.0)],
+        ),
     ]
-    caption = "Biases and scale factors of each IMU along its own axes; misalignments are in the record."
-    return ReportTable("Biases and scale factors", caption, ["IMU", *titles], [row(imu) for imu in record.imus])
 
 
 def _ranges_table(record: ImusRecord) -> ReportTable:
