@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import queue
 import signal
 import socket
@@ -202,8 +203,9 @@ def work(unit: FleetUnit, job: Job) -> Outcome:
         return outcome
 
 
-def _work_all(units: Sequence[FleetUnit], job: Job) -> list[Outcome]:
-    return [work(unit, job) for unit in units]
+def _work_all(units: Sequence[FleetUnit], job: Job) -> bytes:
+    """Return the outcomes of units, pickled: Dask would measure, pickle and pass on each value within them."""
+    return pickle.dumps([work(unit, job) for unit in units])
 
 
 def kept(unit: FleetUnit, base: str, store: Store) -> Outcome | None:
@@ -296,8 +298,14 @@ _CONNECT = 10.0
 """Seconds to wait for a scheduler, and as many for its first worker: both must be over within 45 s."""
 _AHEAD = 3
 """Batches at the scheduler for each thread of the cluster, so that none waits for the driver."""
-_ROUNDS, _LARGEST_BATCH = 4, 8
+_ROUNDS, _LARGEST_BATCH = 4, 16
 """A task costs some 15 ms of processor time: few units come one by one, many in batches, some for each thread."""
+_UNWATCHED = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "5s",
+}
+"""Settings of a cluster of this run alone: nobody looks at what Dask measures, by default 50 times a second."""
 _LOST = 30.0
 """Seconds without scheduler, without workers, or with nothing left of what was submitted, before giving up."""
 
@@ -375,7 +383,7 @@ class DaskEngine:
         first = list(islice(waiting, ahead))
         running = as_completed(first, loop=self._client.loop, with_results=True)  # type: ignore[no-untyped-call]
         for _, outcomes in running:
-            yield from outcomes
+            yield from pickle.loads(outcomes)
             running.update(list(islice(waiting, 1)))  # type: ignore[no-untyped-call]
 
     def run_alone(self, unit: FleetUnit, job: Job) -> Iterator[Outcome]:
@@ -456,7 +464,7 @@ def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskE
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # `_Watch` reports what a person must know
     if scheduler is None:
         count = workers or available()
-        stack.enter_context(config.set({"distributed.worker.profile.enabled": False}))
+        stack.enter_context(config.set(_UNWATCHED))
         cluster = stack.enter_context(
             LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=count,
