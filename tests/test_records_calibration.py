@@ -505,7 +505,7 @@ def test_the_hash_is_of_the_compact_text_and_the_last_key_of_the_file(content):
     plain = {**content, "format": "imulab.calibration"}
     sha256, text = sealed_text(plain)
     whole = {**plain, "content_sha256": sha256}
-    assert text == json_text(whole)
+    assert text == json_text(whole) == json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
     assert list(json.loads(text))[-1] == "content_sha256"
     assert json.loads(text) == json.loads(json.dumps(whole))
     compact = json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)

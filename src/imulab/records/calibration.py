@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 from msgspec import Raw
 from msgspec.json import Decoder
+from msgspec.json import format as indented
 from numpy.typing import NDArray
 
 from imulab._version import VERSION
 from imulab.arguments import checked
-from imulab.display import UNJUDGED, Finding, Verdict, first_hidden, has_hidden, printable, verdict_of
+from imulab.display import UNJUDGED, Finding, Verdict, first_hidden, has_hidden, may_hide, printable, verdict_of
 from imulab.errors import OptionError, RecordError
 from imulab.files import write_text
 from imulab.frames import data_frame
@@ -56,9 +57,9 @@ def json_text(content: Mapping[str, Any]) -> str:
     TypeError
         A value is not of JSON's kinds (NumPy's are not).
     ValueError
-        A number is not finite.
+        A number is not finite, or a text is no Unicode.
     """
-    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return _indented(_compact(content))
 
 
 def sealed_text(content: Mapping[str, Any]) -> tuple[str, str]:
@@ -71,8 +72,20 @@ def sealed_text(content: Mapping[str, Any]) -> tuple[str, str]:
     ValueError
         A number is not finite, or a text is no Unicode.
     """
-    sha256 = content_sha256(content)
-    return sha256, json_text({**content, "content_sha256": sha256})
+    plain = {key: value for key, value in content.items() if key != _SEAL}
+    text = _compact({**plain, _SEAL: ""})  # numbers are written once, for the hash and for the file
+    hashed = sealed_bytes(text.encode("utf-8"))
+    sha256 = content_sha256(plain) if hashed is None else hashlib.sha256(hashed).hexdigest()
+    return sha256, _indented(text[: -len('"}')] + sha256 + '"}')
+
+
+def _compact(content: Mapping[str, Any]) -> str:
+    return json.dumps(content, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
+def _indented(text: str) -> str:
+    """Return JSON as the standard library indents it, which does so in Python, value by value."""
+    return indented(text, indent=1) + "\n"
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:
@@ -292,7 +305,9 @@ class Calibration:
         except (TypeError, ValueError):  # arrays, or a number that is not finite, which gets its name here
             content = plain_values(content, "")
             sealed = sealed_text(content)
-        return sealed if first_hidden(content) is None else sealed_text(plain_values(content, ""))
+        if not may_hide(sealed[1].encode("utf-8")) or first_hidden(content) is None:
+            return sealed
+        return sealed_text(plain_values(content, ""))
 
     def _content(self) -> dict[str, Any]:
         """Return the record as it stands in its file, without ``content_sha256``."""
