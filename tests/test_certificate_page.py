@@ -12,7 +12,7 @@ import pytest
 import imulab as il
 from imulab.certificate.dcc import dcc_xml
 from imulab.certificate.digits import printed_unit, rounded, significant, smaller_units
-from imulab.certificate.laboratory import load_laboratory
+from imulab.certificate.laboratory import TEMPLATE, load_laboratory
 from imulab.certificate.model import make_certificate, with_before
 from imulab.certificate.texts import _TEXTS
 from imulab.cli import main
@@ -347,3 +347,25 @@ def test_a_unit_whose_pdf_is_refused_has_no_xml_either(issue_all, capsys):
     assert issue_all(number="漢-{serial}") == 2
     assert "3 of 3 units have no certificate" in capsys.readouterr().err
     assert list(Path("out").iterdir()) == []
+
+
+def test_a_fleet_is_warned_of_the_template_by_what_its_records_hold(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    il.write(il.simulate_tumble(attitudes=12, order=1, gyro=True), "tumble.csv")
+    il.simulate_thermal("-20,0,25,45,60", attitudes=10).save("thermal")
+    lab = TEMPLATE.replace("EX-2026-0042", "EX-{serial}").replace("location =", 'reviewed = "seen"\nlocation =')
+    tumble = "tumble,tumble.csv,9.80665+-0.00002,1"
+    thermal = ";".join(map(str, sorted(Path("thermal").glob("*.csv"))))
+    Path("lab.toml").write_text(lab, encoding="utf-8")
+    for row, holds in (
+        (f"{tumble},", None),
+        (f"{tumble},gyro", "bias_x, bias_y, bias_z and "),
+        (f"thermal,{thermal},9.80665+-0.00002,,", "bias_x, bias_x_t1, "),
+    ):
+        Path("fleet.csv").write_text(f"serial,procedure,file,gravity,order,with\nA1,{row}\n", encoding="utf-8")
+        il.run_fleet("fleet.csv", "records", workers=1)
+        capsys.readouterr()
+        assert main(["fleet", "certificate", "records", "--lab", "lab.toml", "-o", "out"]) == 0
+        said = capsys.readouterr().err
+        assert ("'Multi-position tumble calibration in the local gravity field'" in said) == (holds is not None)
+        assert holds is None or f"that were tumbled; the record holds {holds}" in said
