@@ -185,6 +185,19 @@ def test_an_order_that_is_too_low_for_the_target_is_said_and_is_no_last_attitude
         assert not any(text.startswith("over ") for text in to_go)
 
 
+@pytest.mark.parametrize("seed", [1, 5])
+def test_the_last_attitude_is_not_announced_again_and_again_under_the_order_auto(seed):
+    unit, guide, left = Unit(seed), Guide("auto", Gravity(G, "test"), (BIAS,)), []
+    for number in range(1, 71):
+        up = guide.next_direction()
+        if up is None:
+            break
+        left.append(guide.wanted() - len(guide.kept))
+        guide.accept(unit.at(up, number))
+    runs = "".join("1" if each <= 1 else " " for each in left).split()
+    assert max(map(len, runs), default=0) <= 4
+
+
 def test_a_hold_is_needed_until_twice_its_length_would_help_little():
     rng = np.random.default_rng(3)
     unit, guide, now = Unit(5), Guide(1, Gravity(G, "test"), (), 12), 1.5

@@ -160,8 +160,6 @@ class Guide:
         Unit of the outputs.
     metadata
         Head of the stream.
-    beyond
-        Whether the target needs more attitudes than are planned ahead.
     """
 
     order: int | str = "auto"
@@ -172,9 +170,9 @@ class Guide:
     metadata: Mapping[str, str] = field(default_factory=dict)
     attitudes: list[Attitude] = field(default_factory=list)
     fit: TumbleFit | None = None
-    beyond: bool = False
     _outstanding: Array = field(default_factory=lambda: np.empty((0, 3)))
     _known: bool = False
+    _beyond: bool = False
 
     @property
     def kept(self) -> list[Attitude]:
@@ -217,9 +215,15 @@ class Guide:
         """Whether the plan has far fewer or more attitudes than the scatter, beyond noise, asks for."""
         if not self.targets or self.met or not self.scatter():
             return False
+        least, most = len(self._outstanding) / _OFF - 2, len(self._outstanding) * _OFF + 2
+        return not least <= min(self._need(), _HORIZON) <= most
+
+    def _need(self) -> float:
+        """Return how many more attitudes the uncertainties of the fit ask for, once it is reliable; 0 before."""
+        if not self.targets or self.met or self.fit is None or len(self.kept) < self._fewest_reliable:
+            return 0.0
         # Variances fall in inverse proportion to the number of attitudes.
-        need = min(len(self.kept) * (max(self.shares()) ** 2 - 1), _HORIZON)
-        return not len(self._outstanding) / _OFF - 2 <= need <= len(self._outstanding) * _OFF + 2
+        return len(self.kept) * (max(self.shares()) ** 2 - 1)
 
     @property
     def _fewest_reliable(self) -> int:
@@ -368,11 +372,18 @@ class Guide:
         by_target = [target_shares(target, self.fit.calibration, self.local_gravity) for target in self.targets]
         return {name: share for shares in by_target for name, share in shares.items()}
 
+    @property
+    def beyond(self) -> bool:
+        """Whether the targets need more attitudes than are planned ahead."""
+        return self._beyond or self._need() > _HORIZON
+
     def wanted(self) -> int:
         """Return how many attitudes the session will need in all, as far as known."""
         if self.planned is not None or not self.targets:
             return self.planned or int(np.ceil(_MORE * parameter_count(self.model_order)))
-        return len(self.kept) + max(len(self.outstanding()), int(not self.met))
+        left = max(len(self.outstanding()), int(not self.met))
+        need = int(np.ceil(min(self._need(), _HORIZON)))
+        return len(self.kept) + (need if need > left * _OFF + 2 else left)
 
     def outstanding(self) -> Array:
         """Return the planned attitudes, shape (k, 3)."""
@@ -389,7 +400,7 @@ class Guide:
             left = self.wanted() - len(there)
             return self._planned(max(min(left, _HORIZON), least), there) if left > 0 or least > 1 else np.empty((0, 3))
         noise = self._noise_as_fitted() if self._plan_is_off() else self.noise()
-        count, self.beyond = max(least, 3), False
+        count, self._beyond = max(least, 3), False
         tried: list[int] = []
         for _ in range(_ROUNDS):
             tried.append(count)
@@ -397,7 +408,7 @@ class Guide:
             share = self._predicted(covariance, noise)
             # Variances fall as the number of attitudes rises, in proportion.
             need = int(np.ceil((count + len(there)) * share**2)) - len(there)
-            count, self.beyond = max(min(need, _HORIZON), least), need > _HORIZON
+            count, self._beyond = max(min(need, _HORIZON), least), need > _HORIZON
             if count in tried:
                 break
         return self._planned(count, there)
