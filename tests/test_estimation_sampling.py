@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.display import Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.column_noise import analyse
 from imulab.estimation.sampling import bridged, sampling_rate, steady_part
@@ -20,18 +21,28 @@ def noise(time, unit="s", seed=1):
     [
         (10.0, "s", "10 s from row to row (0.1 Hz): is the unit of time right: 100 Hz if it is in ms?"),
         (1e4, "s", "1e+04 s from row to row (0.0001 Hz): is the unit of time right: 100 Hz if it is in us?"),
+        (2.0, "s", "500 Hz if it is in ms"),
         (1.0, "s", "1000 Hz if it is in ms"),
         (0.005, "ms", "200 Hz if it is in s"),
         (0.01, "s", ""),
         (10.0, "ms", ""),
         (100.0, "us", ""),
         (0.1, "s", ""),
+        (0.2, "s", ""),
     ],
 )
 def test_a_unit_of_time_that_cannot_be_right_is_said(step, unit, said):
     _, notes = sampling_rate(noise(np.arange(1000) * step, unit))
     assert len(notes) == bool(said)
     assert said in "".join(notes)
+
+
+@pytest.mark.parametrize(
+    ("start", "step", "kind"), [(0, 1.0, Note), (1.7e9, 1.0, Note), (1.7e12, 1.0, Finding), (0, 2.0, Finding)]
+)
+def test_a_slow_log_is_only_asked_for_its_unit_of_time_unless_its_dates_are_to_come(start, step, kind):
+    _, (line,) = sampling_rate(noise(start + np.arange(1000) * step))
+    assert type(line) is kind
 
 
 @pytest.mark.parametrize("split", [0.3, 0.5, 0.8])

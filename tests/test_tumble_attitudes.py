@@ -14,6 +14,7 @@ from scipy.stats import chi2
 import imulab as il
 from conftest import some_of
 from imulab.cli import main
+from imulab.display import Finding, Note
 from imulab.errors import DataError, ImulabError, SegmentError, UnitError
 from imulab.procedures.tumble import _segment
 from imulab.procedures.tumble import attitudes as held
@@ -82,6 +83,13 @@ def test_every_hold_is_found_at_any_rate_and_noise(rate, noise):
     inside(attitudes, time, holds, block=4 / rate)
     np.testing.assert_allclose(attitudes.mean, G * DIRECTIONS, rtol=0, atol=6 * noise / np.sqrt(3.5 * rate))
     assert attitudes.unit == "m/s^2"
+
+
+@pytest.mark.parametrize(("rate", "doubted"), [(4.0, []), (1.5, [Note]), (0.4, [Finding])])
+def test_the_unit_of_time_is_doubted_by_the_rule_of_every_log(rate, doubted):
+    samples, time, _ = tumble(DIRECTIONS, rate=rate, hold=60.0, move=8.0)
+    notes = find_attitudes(recording(samples, time), window=5.0).notes
+    assert [type(line) for line in notes if "unit of time" in line] == doubted
 
 
 def test_the_settling_edges_are_dropped():

@@ -164,7 +164,6 @@ _MOST_ROWS = 1 << 21  # whose times are held at once
 _LEAST_JITTER = 1e-6  # s: a smaller one is that of rounding
 _SHOWN = 0.1  # s: times are shown to this
 _MANY_ATTITUDES = 100  # rows of a table from which it may be a recording that lacks its time
-_SLOWEST = 0.5  # Hz: at a lower rate the unit of time is doubted
 
 
 def describe_record(record: Calibration, *, provenance: bool = True) -> str:
@@ -457,7 +456,7 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
         text = summary.text()
         if len(last.clocks) > 1:
             text[:1] = [f"{clock} ({' '.join(names)}): {contents.columns[clock].finite} samples, {text[0]}"]
-        doubt = doubt_unit_of_time(last.units[clock], summary.rate, _SLOWEST) if summary.rate > 0 else ""
+        doubt = doubt_unit_of_time(last.units[clock], summary.rate) if summary.rate > 0 else ""
         lines += [*text, *([f"{doubt} --unit time=UNIT states it"] if doubt else [])]
     if "time" not in last:
         lines.append("no time column: a table of attitudes, a row each")

@@ -153,12 +153,12 @@ def same_rows(columns: Mapping[str, Array], above: Mapping[str, float] | None = 
     return same
 
 
-_EPOCHS = 946_684_800.0, 4_102_444_800.0  # s since 1970: the years 2000 to 2099
+EPOCHS = 946_684_800.0, 4_102_444_800.0  # s since 1970: the years 2000 to 2099
 
 
 def is_epoch(seconds: float) -> bool:
     """Return whether a time, s, counts from 1970: a date of this century."""
-    return _EPOCHS[0] <= seconds < _EPOCHS[1]
+    return EPOCHS[0] <= seconds < EPOCHS[1]
 
 
 def epoch_of(metadata: Mapping[str, str], first: float) -> float | None:

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from imulab.display import Finding, Note
+from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError
-from imulab.estimation.clock import GAP, Clock, read_clock, same_rows, step_range
+from imulab.estimation.clock import EPOCHS, GAP, Clock, read_clock, same_rows, step_range
 from imulab.estimation.rows import median, quantile
 from imulab.recording import (
     EVEN_SAMPLES,
@@ -31,7 +31,11 @@ _COARSE = 0.2  # share of steps beyond the limit from which time stamps are coar
 _BLOCKS, _SMALLEST_BLOCK = 100, 100  # blocks whose usual steps show a change of rate; fewest steps of a block
 _MORE_IN_BURSTS = 10  # times as many steps of a block where stamps come in bursts
 SAME_RATE = 0.05  # relative: parts of a recording whose steps are this close have one rate
-_SLOWEST, _FASTEST = 5.0, 20_000.0  # Hz: rates at which inertial sensors are logged
+_SLOWEST, _FASTEST = 0.5, 20_000.0  # Hz: at rates beyond, the unit of time is doubted
+_SLOW = 2.0  # Hz: only noted, for long logs are as slow as 1 or 2 kHz in ms titled as s
+TOO_SLOW = 5.0
+"""Rate, Hz, up to which the unit of time is doubted where there are too few samples to go on."""
+TIME_DOUBTED = "is the unit of time right"
 _USUAL = (10.0, 10_000.0)  # Hz: likely rates, for the guess at the right unit of time
 BRIDGED, FEW = 0.01, 0.001
 """Largest share of rows without numbers; share of the rows below which what is bridged or left out is only noted."""
@@ -207,7 +211,7 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     lossy = is_lossy(recording)
     start, stop = steady_rows(time, lossy=lossy)
     clock = read_clock(time[start:stop], lossy=lossy)
-    odd = mislabelled(recording, clock.rate)
+    odd = [prefixed(recording.name, line) for line in mislabelled(recording, clock.rate)]
     if (start, stop) != (0, len(time)):
         return clock.rate, [_change(recording, time, start, stop), *odd]
     count = len(clock.gaps)
@@ -334,13 +338,19 @@ def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
 
 
 def mislabelled(recording: Recording, rate: float) -> list[str]:
-    """Return a warning where no sensor is logged at this rate, with the unit of time that would make it a usual one."""
-    doubt = doubt_unit_of_time(recording.units["time"], rate)
+    """Return whether the unit of time is right: a finding if the rate, Hz, is no sensor's, a note if it is rare.
+
+    A rate that is only rare is a finding where the stamps since 1970 would be later than 2099.
+    """
+    unit = recording.units["time"]
+    late = to_si(float(recording.column("time")[0]), unit) > EPOCHS[1]
+    doubt = doubt_unit_of_time(unit, rate, TOO_SLOW if late else _SLOW)
     if not doubt:
         return []
+    kind = Finding if late or not _SLOWEST < rate < _FASTEST else Note
     return [
-        Finding(
-            f"{recording.name}: {doubt} If not, every figure that depends on time is wrong",
+        kind(
+            f"{doubt} If not, every figure that depends on time is wrong",
             "correct the unit of the column time, or state it: --unit time=UNIT",
         )
     ]
@@ -355,4 +365,4 @@ def doubt_unit_of_time(unit: str, rate: float, slowest: float = _SLOWEST) -> str
         f"{value:.4g} Hz if it is in {other}" for other, value in others.items() if _USUAL[0] <= value < _USUAL[1]
     ]
     guess = f": {' or '.join(likely)}" if likely else ""
-    return f"column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): is the unit of time right{guess}?"
+    return f"column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): {TIME_DOUBTED}{guess}?"

@@ -26,7 +26,7 @@ from imulab.columns import triad
 from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
-from imulab.estimation.sampling import bridged, doubt_unit_of_time
+from imulab.estimation.sampling import TOO_SLOW, bridged, doubt_unit_of_time, mislabelled
 from imulab.procedures.result import OWN_CLOCKS, as_recording
 from imulab.readers.streams import one_clock
 from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time, release, state_rate
@@ -523,8 +523,6 @@ _BLOCK_SECONDS = 0.1  # s over which the scatter of samples is computed
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap; no window reaches across it."""
 _LONGEST_BRIDGE = 3  # rows without numbers that a line may stand for
-TIME_DOUBTED = "is the unit of time right?"
-_SLOW = 5.0  # Hz: of slower samples too few fall into a hold
 _MUCH_LOST = 0.05  # share of the time that gaps may take without a warning
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)
 _DRIFT, _AS_GOOD = 1.0, 1.1
@@ -725,14 +723,7 @@ def _notes(blocks: _Blocks, variance: Array, recording: Recording, time: Array) 
     """Return what is odd about the clock of the recording; the steps that are gaps lie in `blocks.broken`."""
     rate = blocks.length / blocks.duration
     lost = 1 - float(np.isfinite(variance).mean())
-    notes: list[str] = []
-    if rate < _SLOW:
-        notes.append(
-            Finding(
-                f"about {rate:.3g} samples per second: {TIME_DOUBTED}",
-                "correct the unit of the column time, or state it: --unit time=UNIT",
-            )
-        )
+    notes = mislabelled(recording, rate)
     if blocks.broken.any():
         step = np.diff(time)
         gaps = np.flatnonzero(step > max(_GAP_SECONDS, _GAP_STEPS / rate))
@@ -775,7 +766,7 @@ def _window_width(blocks: _Blocks, recording: Recording, time: Array, window: fl
     width = max(3, round(window / blocks.duration))
     if len(blocks.mean) < 2 * width:
         duration = float(time[-1] - time[0])
-        doubt = doubt_unit_of_time(recording.units["time"], len(time) / duration) if duration else ""
+        doubt = doubt_unit_of_time(recording.units["time"], len(time) / duration, TOO_SLOW) if duration else ""
         raise SegmentError(
             f"{recording.name}: {len(recording)} samples over {duration:.3g} s are too few to find static attitudes "
             f"with a window of {window:g} s{f'; {doubt} --unit time=UNIT states it' if doubt else ''}"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from imulab.display import Finding, Note
 from imulab.errors import SegmentError
 from imulab.estimation.rows import median, quantile
-from imulab.estimation.sampling import doubt_unit_of_time
+from imulab.estimation.sampling import TOO_SLOW, doubt_unit_of_time
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.gyro.rotation import Turns, composed_turns, weighted_turns
 from imulab.procedures.tumble.gyro.windows import Readings, Windows, pieces_of, read_between
@@ -169,7 +169,7 @@ def choose_turns(
         )
         notes.append(Note(sentence) if broken.sum() <= _FEW_BROKEN * turns.sum() else sentence)
     if len(chosen) < _FEWEST_TURNS:
-        if doubt := doubt_unit_of_time(attitudes.recording.units["time"], 1 / usual[0]):
+        if doubt := doubt_unit_of_time(attitudes.recording.units["time"], 1 / usual[0], TOO_SLOW):
             raise SegmentError(f"{name}: {doubt} --unit time=UNIT states it")
         aside = f" ({int(clipped.any(axis=1).sum())} more are clipped)" if clipped.any() else ""
         aside += f" ({int(broken.sum())} more have gaps)" if broken.any() else ""
