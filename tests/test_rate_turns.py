@@ -132,6 +132,13 @@ def test_stated_turns_are_taken():
     assert found.scale == pytest.approx(1.04, rel=1e-4)
 
 
+def test_turns_stated_the_other_way_round_are_said_with_those_to_state():
+    verdict = il.fit_turns(turned([-1, -2, 1], 1.02), turns="1,2,-1").calibration.verdict
+    assert verdict.state == "bad"
+    assert verdict.reasons == ("gyro_z turned the other way round than stated: its scale factor is -1.02",)
+    assert verdict.next == ("state its turns as --turns -1,-2,1, positive by the right-hand rule about its own axis",)
+
+
 def test_the_uncertainty_of_the_clock_is_common_to_all(session):
     record = il.fit_turns(of(session, 102.4), clock="1%").calibration
     scale = record.parameters["gyro_scale_factor_x"]

@@ -411,7 +411,15 @@ def _warn_turns(axis_turns: Mapping[str, AxisTurns], clock: float | None) -> lis
     """Return warnings and notes about scale factors: off the unit, scattered, turned one way, or per clock."""
     messages: list[str] = []
     for a, turned_axis in axis_turns.items():
-        if abs(turned_axis.scale - 1) > SCALE_OFF_UNIT:
+        if turned_axis.scale < 0:
+            opposite = ",".join(f"{-count:.0f}" for count in turned_axis.count)
+            messages.append(
+                Bad(
+                    f"gyro_{a} turned the other way round than stated: its scale factor is {turned_axis.scale:.3g}",
+                    f"state its turns as --turns {opposite}, positive by the right-hand rule about its own axis",
+                )
+            )
+        elif abs(turned_axis.scale - 1) > SCALE_OFF_UNIT:
             messages.append(
                 Bad(
                     f"gyro_{a}: the scale factor is off by {100 * (turned_axis.scale - 1):+.3g} %: is the unit right?",
