@@ -377,6 +377,17 @@ def test_days_of_work_are_those_of_the_recordings(issue, capsys, sound, measured
     assert (f"t.csv says that it was measured {measured}" in capsys.readouterr().err) == bool(status)
 
 
+def test_a_laboratory_file_that_is_not_there_is_refused_with_how_to_write_one(sound, capsys):
+    assert main(["certificate", str(sound / "sound.json"), "--lab", "no.toml", "-o", "cert.xml"]) == 2
+    expected = "no.toml: no such laboratory file; imulab certificate --template -o LAB.toml writes one"
+    assert capsys.readouterr().err == f"imulab: {expected}\n"
+
+
+def test_a_record_that_takes_gravity_as_exact_is_sent_to_no_option_that_it_lacks(issue, capsys):
+    assert issue(REVIEWED + STANDARD, WRITTEN / "centrifuge.json") == 2
+    assert "a centrifuge record takes gravity as exact; leave this equipment out" in capsys.readouterr().err
+
+
 def test_an_altered_or_bad_record_is_refused(issue, capsys, sound):
     text = (sound / "sound.json").read_text(encoding="utf-8")
     Path("altered.json").write_text(re.sub(r'"value": (-?)0\.', r'"value": \g<1>1.', text, count=1), encoding="utf-8")

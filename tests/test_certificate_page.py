@@ -309,10 +309,10 @@ def issue_all(line, tmp_path, monkeypatch):
     """A function that certifies the fleet by a LAB.toml, and returns the exit status."""
     monkeypatch.chdir(tmp_path)
 
-    def run(number="EX-{serial}", days="[2026-03-01, 2026-03-31]"):
-        lab = REVIEWED.replace("EX-2026-0042", number).replace("[2026-11-24, 2026-11-24]", days)
+    def run(number="EX-{serial}", days="[2026-03-01, 2026-03-31]", change=("x", "x"), options=()):
+        lab = REVIEWED.replace("EX-2026-0042", number).replace("[2026-11-24, 2026-11-24]", days).replace(*change)
         Path("lab.toml").write_text(lab.replace("received = 2026-11-20\n", ""), encoding="utf-8")
-        return main(["fleet", "certificate", str(line / "records"), "--lab", "lab.toml", "-o", "out"])
+        return main(["fleet", "certificate", str(line / "records"), "--lab", "lab.toml", *options, "-o", "out"])
 
     return run
 
@@ -341,6 +341,32 @@ def test_a_fleet_needs_numbers_of_their_own_and_days_that_hold(issue_all, capsys
     assert issue_all(days="[2026-03-03, 2026-03-31]") == 2
     assert "LINE-0001" in capsys.readouterr().err
     assert [path.name for path in sorted(Path("out").glob("*.pdf"))] == ["LINE-0002.pdf"]
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "expected"),
+    [
+        (
+            ('"degC"', '"furlong"'),
+            [],
+            "conditions Ambient temperature: unit furlong: the D-SI of certificates has no name",
+        ),
+        (
+            ("condition =", 'serial = "S1"\ncondition ='),
+            [],
+            "item.serial 'S1': each unit of a fleet has its own; leave it",
+        ),
+        (("x", "x"), ["--limits", "limits.toml"], "limits.toml: limits need a rule that the customer agreed to"),
+        (("x", "x"), ["--fonts", "nowhere"], "fonts 'nowhere': expected a folder of fonts"),
+        (("x", "x"), ["--sign", "nothing.pem"], "nothing.pem"),
+    ],
+)
+def test_what_is_wrong_for_every_unit_is_said_once_and_nothing_is_written(issue_all, capsys, change, options, expected):
+    assert issue_all(change=change, options=options) == 2
+    said = capsys.readouterr()
+    assert expected in said.err
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert not Path("out").exists()
 
 
 def test_a_unit_whose_pdf_is_refused_has_no_xml_either(issue_all, capsys):

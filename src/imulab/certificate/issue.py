@@ -14,7 +14,14 @@ from msgspec.structs import replace
 from imulab.arguments import Folder, checked
 from imulab.certificate.dcc import dcc_xml
 from imulab.certificate.laboratory import Laboratory, Language, load_laboratory
-from imulab.certificate.model import SERIAL, Certificate, make_certificate, with_before, with_days_of_recordings
+from imulab.certificate.model import (
+    SERIAL,
+    Certificate,
+    make_certificate,
+    rule_of_conformity,
+    with_before,
+    with_days_of_recordings,
+)
 from imulab.certificate.texts import LANGUAGES
 from imulab.errors import ImulabError, OptionError, RecordError, listed
 from imulab.files import replacing
@@ -78,7 +85,7 @@ def write_certificate(
     >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81)
     >>> il.write_certificate(fit, "sn42.pdf", lab="LAB.toml")
     Traceback (most recent call last):
-    imulab.errors.ReadError: LAB.toml: no such laboratory file
+    imulab.errors.ReadError: LAB.toml: no such laboratory file; imulab certificate --template -o LAB.toml writes one
     """
     if Path(path).suffix not in (".xml", ".pdf"):
         raise OptionError(f"output {str(path)!r}: expected a name that ends with .xml or .pdf")
@@ -118,14 +125,15 @@ def write_fleet_certificates(
     Raises
     ------
     ReadError, OptionError
-        The folder is none of a fleet, a folder cannot be made, the laboratory's file cannot be used.
+        The folder is none of a fleet, a folder cannot be made; the laboratory's file, the limits' rule, the fonts or
+        the key cannot be used.
 
     Examples
     --------
     >>> import imulab as il
     >>> il.write_fleet_certificates("line", "certificates", lab="LAB.toml")
     Traceback (most recent call last):
-    imulab.errors.ReadError: LAB.toml: no such laboratory file
+    imulab.errors.ReadError: LAB.toml: no such laboratory file; imulab certificate --template -o LAB.toml writes one
     """
     stated = _laboratory(lab, language)
     if SERIAL not in stated.certificate.number:
@@ -135,6 +143,9 @@ def write_fleet_certificates(
         )
     store, refused = Store(Path(folder)), {}
     units = store.manifest().units
+    if stated.item.serial is not None and len(units) > 1:
+        raise OptionError(f"{lab}: item.serial {stated.item.serial!r}: each unit of a fleet has its own; leave it out")
+    _check_common(stated, limits, fonts, sign)
     try:
         Path(output).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -151,6 +162,21 @@ def write_fleet_certificates(
         if progress is not None:
             progress(count)
     return refused
+
+
+def _check_common(
+    lab: Laboratory, limits: str | Path | None, fonts: str | Path | None, sign: str | Path | None
+) -> None:
+    """Refuse once what would be refused for every unit of a fleet."""
+    from imulab.certificate.page import load_typst
+
+    load_typst(None if fonts is None else str(fonts))
+    if limits is not None:
+        rule_of_conformity(lab, str(limits))
+    if sign is not None:
+        from imulab.certificate.signature import signed
+
+        signed(b"<trial/>", str(sign), lab.certificate.issued)
 
 
 def _write(certificate: Certificate, paths: list[Path], fonts: str | Path | None, sign: str | Path | None) -> None:

@@ -5,6 +5,7 @@ Nothing of it is invented: what the certificate needs and the file lacks is refu
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from collections.abc import Iterable
@@ -15,9 +16,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from imulab.certificate.units import dsi_unit
 from imulab.display import first_hidden
-from imulab.errors import ReadError, first_of
-from imulab.files import load_toml
+from imulab.errors import ReadError, UnitError, first_of
+from imulab.files import load_toml, unit_of
 from imulab.fleet.limits import Rule
 from imulab.quantities import LARGEST
 
@@ -230,8 +232,13 @@ def load_laboratory(path: str) -> Laboratory:
     ------
     ReadError
         It cannot be read; a table or key is unknown, missing or of another kind; a text is empty, begins or ends with
-        a space, or has a control character; nobody signs; days are out of order.
+        a space, or has a control character; nobody signs; days are out of order; a standard of gravity has no
+        uncertainty.
+    UnitError
+        A unit is none of acceleration where one is expected, or has no name in the D-SI.
     """
+    if not os.path.lexists(path):
+        raise ReadError(f"{path}: no such laboratory file; imulab certificate --template -o LAB.toml writes one")
     table = load_toml(path, path, "laboratory")
     if hidden := first_hidden(table):
         raise ReadError(f"{path}: {hidden}: a control or bidirectional character; expected text alone")
@@ -257,6 +264,16 @@ def load_laboratory(path: str) -> Laboratory:
         )
     if identity.received is not None and identity.received > first:
         raise ReadError(f"{path}: certificate: received {identity.received}, after the first day of work {first}")
+    for standard in lab.equipment:
+        if standard.quantity is not None:
+            if standard.standard_uncertainty is None:
+                raise ReadError(f"{path}: equipment {standard.name}: expected standard_uncertainty of gravity")
+            unit_of(standard.standard_uncertainty.unit, "acceleration", f"{path}: equipment {standard.name}")
+    for condition in lab.conditions:
+        try:
+            dsi_unit(condition.unit)
+        except UnitError as error:
+            raise UnitError(f"{path}: conditions {condition.name}: {error}") from None
     return lab
 
 

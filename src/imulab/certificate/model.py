@@ -9,11 +9,10 @@ from datetime import date, datetime, timedelta
 import msgspec
 import numpy as np
 
-from imulab.certificate.laboratory import Condition, Equipment, Laboratory
+from imulab.certificate.laboratory import Condition, Laboratory, Stated
 from imulab.certificate.units import dsi_unit
 from imulab.errors import OptionError, RecordError
-from imulab.files import unit_of
-from imulab.fleet.limits import Conformity, Limits, decide, load_limits, probability_of_all, worst
+from imulab.fleet.limits import Conformity, Limits, Rule, decide, load_limits, probability_of_all, worst
 from imulab.records.calibration import Calibration, Parameter
 from imulab.units import to_si
 
@@ -126,16 +125,14 @@ def make_certificate(record: Calibration, sha256: str, lab: Laboratory, limits: 
         if stated is not None and stated != record.sensor.get(key, stated):
             raise OptionError(f"item.{key} {stated!r}: the record says {record.sensor[key]!r}")
     for standard in lab.equipment:
-        if standard.quantity is not None:
-            _check_gravity(record, standard)
+        if standard.quantity is not None and standard.standard_uncertainty is not None:
+            _check_gravity(record, standard.name, standard.standard_uncertainty)
     if len(record.model.get("serials", ())) > 1:
         raise RecordError("the record is of several units; a certificate is of one item")
     _check_days(record, lab)
     results = tuple(_results(record))
     if not results:
         raise RecordError("no parameter of the record has an uncertainty: there is nothing to certify")
-    for condition in lab.conditions:
-        dsi_unit(condition.unit)
     model = record.sensor.get("model", lab.item.model)
     together = None
     if limits is not None:
@@ -178,15 +175,21 @@ def with_days_of_recordings(certificate: Certificate) -> Certificate:
     return replace(certificate, lab=msgspec.structs.replace(certificate.lab, certificate=identity))
 
 
-def _decide(
-    record: Calibration, results: tuple[Result, ...], lab: Laboratory, limits: str
-) -> tuple[tuple[Result, ...], float]:
-    """Return the results with their decisions, and the probability that all conform."""
+def rule_of_conformity(lab: Laboratory, limits: str) -> Rule:
+    """Return the rule by which values conform to limits; raise an OptionError where LAB.toml has none."""
     if lab.conformity is None:
         raise OptionError(
             f"{limits}: limits need a rule that the customer agreed to; expected [conformity] in LAB.toml with rule, "
             "agreed, specification"
         )
+    return lab.conformity.rule
+
+
+def _decide(
+    record: Calibration, results: tuple[Result, ...], lab: Laboratory, limits: str
+) -> tuple[tuple[Result, ...], float]:
+    """Return the results with their decisions, and the probability that all conform."""
+    rule = rule_of_conformity(lab, limits)
     units = {(record.procedure, name): parameter.unit for name, parameter in record.parameters.items()}
     known = {name: each for (_, name), each in load_limits(limits, units, only=record.procedure).items()}
     freedom = record.fit.get("effective_degrees_of_freedom")
@@ -196,7 +199,7 @@ def _decide(
             decided.append(result)
             continue
         u, k = result.standard_uncertainty, result.coverage_factor
-        decision = decide(result.value, u, k, ends, lab.conformity.rule, freedom)
+        decision = decide(result.value, u, k, ends, rule, freedom)
         decided.append(replace(result, limits=ends, decision=decision))
     if known:
         raise OptionError(f"{limits}: {', '.join(sorted(known))}: no uncertainty in the record, nothing can be decided")
@@ -238,20 +241,24 @@ def _check_days(record: Calibration, lab: Laboratory) -> None:
             )
 
 
-def _check_gravity(record: Calibration, standard: Equipment) -> None:
+def _check_gravity(record: Calibration, standard: str, uncertainty: Stated) -> None:
     """Refuse a record whose gravity is stated better than that of the standard it is traced to."""
     gravity = record.model.get("gravity")
     if not isinstance(gravity, Mapping):
-        raise RecordError(f"{standard.name}: equipment of gravity, but the record is made without gravity")
-    if standard.standard_uncertainty is None:
-        raise OptionError(f"equipment {standard.name}: expected standard_uncertainty of gravity")
+        raise RecordError(
+            f"{standard}: equipment of gravity, but the record is made without gravity; leave this equipment out"
+        )
+    if str(gravity.get("from")).startswith("manifest"):  # a centrifuge: no result depends on how well it is known
+        raise RecordError(
+            f"{standard}: equipment of gravity, but a {record.procedure} record takes gravity as exact; leave this "
+            "equipment out"
+        )
     stated = gravity.get("standard_uncertainty")
-    unit = unit_of(standard.standard_uncertainty.unit, "acceleration", f"equipment {standard.name}")
-    least = to_si(standard.standard_uncertainty.value, unit)
+    least = to_si(uncertainty.value, uncertainty.unit)
     if stated is None or stated < least * (1 - 1e-9):
         found = "none" if stated is None else f"{stated:g} m/s^2"
         raise RecordError(
-            f"uncertainty of gravity in the record: {found}, below {least:g} m/s^2 of {standard.name}; fit again with "
+            f"uncertainty of gravity in the record: {found}, below {least:g} m/s^2 of {standard}; fit again with "
             f"--gravity {gravity['value']!r}+-{least:g} (a fleet: in the manifest's column gravity)"
         )
 

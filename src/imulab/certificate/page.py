@@ -57,12 +57,7 @@ def pdf(certificate: Certificate, xml: bytes, fonts: str | None = None) -> bytes
     OptionError
         Typst is not installed, or its fonts lack a letter.
     """
-    try:
-        typst: Any = import_module("typst")
-    except ImportError:
-        raise OptionError(f"a PDF needs typst, which is not here: {install('certificate')}") from None
-    if fonts is not None and not Path(fonts).is_dir():
-        raise OptionError(f"fonts {fonts!r}: expected a folder of fonts")
+    typst = load_typst(fonts)
     folders = [] if fonts is None else [fonts]
     families = {font.family for font in typst.Fonts(False, False, folders).fonts()} if folders else set()
     page = _page(certificate) | {"fonts": sorted(families)}
@@ -81,6 +76,17 @@ def pdf(certificate: Certificate, xml: bytes, fonts: str | None = None) -> bytes
         place = "laboratory.logo: " if "decode image" in str(error) else ""
         raise OptionError(f"{place}the PDF cannot be laid out: {str(error).splitlines()[0]}") from None
     return made
+
+
+def load_typst(fonts: str | None) -> Any:
+    """Return Typst; raise an OptionError where it is not installed, or `fonts` is no folder."""
+    try:
+        typst = import_module("typst")
+    except ImportError:
+        raise OptionError(f"a PDF needs typst, which is not here: {install('certificate')}") from None
+    if fonts is not None and not Path(fonts).is_dir():
+        raise OptionError(f"fonts {fonts!r}: expected a folder of fonts")
+    return typst
 
 
 def _no_letter(letters: str, certificate: Certificate) -> OptionError:
