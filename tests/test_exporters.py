@@ -119,6 +119,14 @@ def test_autopilots_correct_as_apply_does(tmp_path, target, unit):
         assert "device id 0" in text
 
 
+@pytest.mark.parametrize(("device", "warned"), [((), True), (("--device-id", "1246218"), False)])
+def test_a_file_that_px4_would_ignore_is_said(folder, capsys, device, warned):
+    record(9, misalignment=0.0).save("one.json")
+    assert main(["export", "--to", "px4", "one.json", "-o", "out", *device]) == 0
+    line = "px4: no device number is given (--device-id), and 0 is written: PX4 ignores the calibration until it is the"
+    assert (f"imulab: warning: {line} sensor's\n" in capsys.readouterr().err) == warned
+
+
 @pytest.mark.parametrize("gyro", ["rad/s", "deg/s", None])
 @pytest.mark.parametrize("target", ["kalibr", "openvins"])
 def test_toolboxes_correct_as_apply_does(tmp_path, target, gyro):

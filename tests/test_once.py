@@ -53,7 +53,8 @@ def test_a_last_line_without_an_end_is_said(tmp_path, capsys, rows):
     assert "the last line has no line end: if the file was cut there" in capsys.readouterr().err
 
 
-def test_a_command_that_is_terminated_leaves_nothing(tmp_path):
+@pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGHUP])
+def test_a_command_that_is_terminated_or_loses_its_terminal_leaves_nothing(tmp_path, kind):
     command = [sys.executable, "-m", "imulab", "convert", "-", "-o", "out.csv"]
     with subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
@@ -63,7 +64,7 @@ def test_a_command_that_is_terminated_leaves_nothing(tmp_path):
         while not list(tmp_path.iterdir()) and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.02)
         there = [path.suffix for path in tmp_path.iterdir()]
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(kind)
         said = process.communicate(timeout=120)[1]
     assert (there, process.returncode, said) == ([".part"], 143, b"")
     assert list(tmp_path.iterdir()) == []

@@ -105,6 +105,8 @@ def _stop_writing(error: OSError) -> int:
 def run() -> None:
     """Entry point of the installed command; a termination unwinds it, so that no part of a file stays behind."""
     signal.signal(signal.SIGTERM, _terminate)
+    if os.name != "nt" and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # a closed terminal; nohup goes on
+        signal.signal(signal.SIGHUP, _terminate)
     if not sys.warnoptions and not os.environ.get("IMULAB_DEBUG"):
         warnings.simplefilter("ignore")  # they name lines of sources, not what a person can mend
     closed = _open_closed()

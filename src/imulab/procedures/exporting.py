@@ -61,7 +61,7 @@ def export(
     lossy
         Leave out what the target cannot hold, and fit the rest anew.
     device_id
-        PX4: number of the sensor.
+        PX4: number of the sensor, without which PX4 ignores the file.
     noise
         Noise record, or what 'allan --json' printed. Or the file of either, for noise keys.
     method
@@ -77,7 +77,8 @@ def export(
         ``external`` where the autopilot turns the magnetometers by a rotation of their own, which then holds their
         mounting exactly; ``internal`` where it does not.
     tell
-        Called with a sentence on each loss that was allowed, and on each record that is not good.
+        Called with a sentence on each loss that was allowed, on each record that is not good, and on PX4's device
+        number where it is not given.
 
     Returns
     -------
@@ -132,7 +133,13 @@ def export(
     if noise and not isinstance(noise, Calibration):
         noise_keys = noise if isinstance(noise, Mapping) else _read_noise(file)
     options = ExportOptions(lossy, number, noise_keys, file if noise else "", fusions, mag_mount, tell)
-    return exporters.export(to, loaded, Path(folder), options)
+    files = exporters.export(to, loaded, Path(folder), options)
+    if to == "px4" and number == 0:
+        tell(
+            "px4: no device number is given (--device-id), and 0 is written: PX4 ignores the calibration until it is "
+            "the sensor's"
+        )
+    return files
 
 
 def _choose_fusions(to: str, stated: Mapping[str, Any], records: Sequence[Calibration]) -> list[Fusion | None]:
