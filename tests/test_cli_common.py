@@ -67,6 +67,8 @@ def test_the_short_help_leaves_out_what_few_runs_need(capsys):
         (["tumble", "fitt"], "; did you mean 'fit'?"),
         (["tumble", "fit", "x.csv", "--gravty", "9.8"], "'imulab tumble fit --help'; did you mean '--gravity'?"),
         (["tumble", "fit", "x.csv", "--zzz"], "No such option: --zzz; see 'imulab tumble fit --help'"),
+        (["report", "x.json", "--unit", "g"], "No such option: --unit; see 'imulab report --help'"),
+        (["tumble", "fit", "x.csv", "--uint", "accel=g"], "; did you mean '--unit'?"),
         (["tumble", "fit", "x.csv", "--loss", "Huber"], "square huber auto; did you mean 'huber'?"),
         (["tumble", "fit", "x.csv", "--method", "linearized"], "did you mean 'linearised'?"),
         (["tumble", "simulate", "-o", "x.csv", "--unit", "m/s^3"], "; did you mean 'm/s^2'?"),
@@ -88,6 +90,8 @@ def test_a_slip_of_the_pen_is_told_what_was_meant(capsys, tmp_path, monkeypatch,
 
 def test_only_what_is_near_is_suggested():
     assert meant(["huber", "square"], "HUBER") == "; did you mean 'huber'?"
+    assert meant(["+z", "-z"], "z") == ""
+    assert meant(["+z", "-z"], "+Z") == "; did you mean '+z'?"
     assert meant(["huber", "square"], "median") == ""
     assert listed(iter(["auto", "0"]), 7) == "auto 0"
 

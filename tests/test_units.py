@@ -168,6 +168,13 @@ def test_an_unknown_unit_is_refused_with_the_known_ones(text):
     assert {*ONE, "K"} <= set(message.split("known units: ")[1].partition(";")[0].split())
 
 
+@pytest.mark.parametrize("text", ["rpm", "rev/s", "mm/s^2", "ft/s^2", "urad/s", "kg", "pT", "mV/g"])
+def test_another_unit_is_no_slip_of_a_known_one(text):
+    with pytest.raises(UnitError) as caught:
+        parse_unit(text)
+    assert "did you mean" not in str(caught.value)
+
+
 @pytest.mark.parametrize("convert", [lambda unit: to_si(1.0, unit), lambda unit: from_si(1.0, unit)])
 def test_conversion_in_an_unknown_unit_is_refused(convert):
     with pytest.raises(UnitError, match="unknown unit 'parsec'"):

@@ -41,15 +41,16 @@ def first_of(names: Sequence[str], most: int, between: str = ", ") -> str:
 
 
 def meant(known: Iterable[str], word: object, alike: float = 0.6) -> str:
-    """Return ``; did you mean 'huber'?`` if a word is nearly one of the known ones, else nothing.
+    """Return ``; did you mean 'huber'?`` if a word is nearly one of the known ones, and of no second as much.
 
     `alike` is how much of two words must agree, from 0 to 1.
     """
-    from difflib import get_close_matches
+    from difflib import SequenceMatcher, get_close_matches
 
-    names = {name.lower(): name for name in known}
-    close = get_close_matches(str(word).lower(), names, n=1, cutoff=alike)
-    return f"; did you mean {names[close[0]]!r}?" if close else ""
+    names, text = {name.lower(): name for name in known}, str(word).lower()
+    close = get_close_matches(text, names, n=2, cutoff=alike)
+    tied = len(close) == 2 and len({SequenceMatcher(None, name, text).ratio() for name in close}) == 1
+    return f"; did you mean {names[close[0]]!r}?" if close and not tied else ""
 
 
 def install(extra: str) -> str:

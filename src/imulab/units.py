@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, overload
 
-from imulab.errors import UnitError, listed
+from imulab.errors import UnitError, meant
 
 if TYPE_CHECKING:  # the command line parses units before it needs NumPy
     import numpy as np
@@ -147,7 +147,10 @@ def parse_unit(text: str, quantities: Iterable[str] = ()) -> Unit:
     if unit is None:
         wanted = set(quantities)
         known = [other.symbol for other in _UNITS.values() if not wanted or other.quantity in wanted]
-        raise UnitError(f"unknown unit {text!r}; known units: {listed(known, symbol)}")
+        # Another prefix or quantity is no slip: rpm is not ppm, mm/s^2 not m/s^2.
+        begin, parts = symbol[:2].lower(), symbol.count("/")
+        alike = [name for name in known if name[:2].lower() == begin and name.count("/") == parts]
+        raise UnitError(f"unknown unit {text!r}; known units: {' '.join(known)}{meant(alike, symbol)}")
     return unit
 
 

@@ -16,7 +16,7 @@ from imulab.options import COMMON, READING, Option, Reads, options_of
 NAME = "imulab.toml"
 KEYS = ("gravity", "latitude", "height", "layout", "limits", "limit")
 """The project file, and the options that it may state."""
-ALIKE = 0.75  # least likeness of a misspelt word: --threshold is no misspelt --hold
+ALIKE = 0.82  # least likeness of a misspelt word: --unit is no misspelt --quiet
 
 
 class Argument(NamedTuple):
