@@ -144,6 +144,7 @@ def test_a_rate_at_rest_has_no_unit_and_is_refused(imulab, tmp_path):
     refused = imulab("show", "f.csv")
     assert refused.returncode == 2
     assert refused.stderr.endswith(
+        "; neither titles nor readings say the unit of gyro, deg/s is a guess"
         "; imulab layout guess f.csv --unit gyro=deg/s -o L.toml writes a layout for it (--layout L.toml)\n"
     )
     assert imulab("layout", "guess", "f.csv", "--unit", "gyro=deg/s", "-o", "L.toml").returncode == 0

@@ -379,6 +379,14 @@ def test_a_name_that_is_none_lists_those_that_are(tmp_path):
         il.read(tmp_path / "f.csv", "phypox")
 
 
+@pytest.mark.parametrize(("layout", "near"), [("im.toml", ""), ("l/phypox.toml", "; did you mean 'phyphox'?")])
+def test_a_file_that_is_none_is_refused_without_the_list_of_names(tmp_path, layout, near):
+    (tmp_path / "f.csv").write_text(FILES["phyphox"]())
+    known = "imulab show --formats lists those that come with imulab"
+    with pytest.raises(ReadError, match=f"^{layout}: no such layout file; {known}{re.escape(near)}$"):
+        il.read(tmp_path / "f.csv", layout)
+
+
 def test_titles_that_nothing_fits_call_for_a_layout(imulab, tmp_path):
     (tmp_path / "f.csv").write_text("Time (s),Ax,Ay,Az\n0,1,2,3\n")
     done = imulab("show", "f.csv")

@@ -240,14 +240,16 @@ def _is_native(titles: str) -> bool:
 
 def advice_on_guess(head: bytes, name: str) -> str:
     """Return the command that writes a layout for a text file, from its first bytes; empty where none would."""
-    needs = ""
+    needs = supposed = ""
     try:
         guess_of_head(head, name)
     except GuessError as error:
         if not error.needs:
             return ""
         needs = f" {error.needs}"
-    return f"imulab layout guess {quote(name)}{needs} -o L.toml writes a layout for it (--layout L.toml)"
+        if unit := re.match(r"--unit (\w+)=(\S+)$", error.needs):
+            supposed = f"neither titles nor readings say the unit of {unit[1]}, {unit[2]} is a guess; "
+    return f"{supposed}imulab layout guess {quote(name)}{needs} -o L.toml writes a layout for it (--layout L.toml)"
 
 
 class Table(Struct):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from imulab.columns import check_unit, expected_quantities
-from imulab.errors import ReadError, UnitError, listed, quoted
+from imulab.errors import ReadError, UnitError, listed, meant, quoted
 from imulab.files import check_keys, load_toml, number_of, scale_factor_of, unit_of, value_and_unit
 from imulab.recording import Array, Layout, LayoutColumn, Recording
 from imulab.units import Unit, conversion_factor, parse_unit, to_si
@@ -117,6 +117,11 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
     shipped = shipped_file(path) if isinstance(path, str) else None
     if shipped is None and not os.path.lexists(path):  # a link in a circle says so when it is opened
         known = shipped_names()
+        if Path(path).name != str(path) or Path(path).suffix == ".toml":  # a file, and no choice among names
+            near = meant(known, Path(path).stem)
+            raise ReadError(
+                f"{name}: no such layout file; imulab show --formats lists those that come with imulab{near}"
+            )
         raise ReadError(f"{name}: no such layout file; those that come with imulab: {listed(known, name)}")
     table = load_toml(shipped or path, name, "layout")
     return layout_of(table, name)
