@@ -424,6 +424,7 @@ def folder(tmp_path, monkeypatch):
     madeup.tumble(2).save("accel.json")
     madeup.tumble(1).save("again.json")
     madeup.warmup().save("warmup.json")
+    replace(madeup.warmup(), sensor={"serial": "SN7"}).save("other.json")
     (tmp_path / "cut.json").write_text((tmp_path / "accel.json").read_text()[:500])
     (tmp_path / "file").write_text("x")
     return tmp_path
@@ -436,7 +437,8 @@ def folder(tmp_path, monkeypatch):
         ("missing.json -o out", "missing.json: no such file"),
         ("cut.json -o out", "cut.json: not a calibration record"),
         ("file -o out", "file: not a calibration record"),
-        ("accel.json again.json -o out", "two records give a tumble table"),
+        ("accel.json again.json -o out", "two records give a tumble table; a unit has one: give one of them"),
+        ("accel.json other.json -o out", "imulab: records of different units: SN42 SN7; expected those of one"),
         ("accel.json -o file", "expected a folder to write to, found a file"),
         ("accel.json -o file/out", "the folder cannot be made"),
         ("accel.json", "Missing option"),

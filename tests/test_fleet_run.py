@@ -290,6 +290,8 @@ BAD_MANIFESTS = {
     "empty": ("", ["m.csv: the file is empty", "serial,procedure,file"]),
     "no column": ("serial,file\nA,a.csv\n", ["m.csv: no column procedure; found serial file"]),
     "unknown column": ("serial,procedure,file,gravitiy\n" + ROW, ["unknown column 'gravitiy'", "gravity"]),
+    "semicolons": ("serial;procedure;file\n", ["columns are separated by ';'; expected commas"]),
+    "tabs": ("serial\tprocedure\tfile\n", ["columns are separated by '\\t'; expected commas"]),
     "column twice": ("serial,procedure,file,file\n" + ROW, ["column file appears twice"]),
     "unknown procedure": ("serial,procedure,file\nA,tumbel,a.csv\n", ["row 1 (line 2)", "'tumbel'", "tumble array"]),
     "duplicate": (

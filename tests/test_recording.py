@@ -131,7 +131,7 @@ def test_a_triad_is_its_three_columns_side_by_side_in_one_unit():
     with pytest.raises(UnitError) as caught:
         recording.triad_unit("accel")
     assert "unit 7.csv: the axes of a triad must share one unit" in str(caught.value)
-    assert "accel_x [mg], accel_y [mg], accel_z [g]" in str(caught.value)
+    assert "accel_x [mg], accel_y [mg], accel_z [g]; if a title is wrong, --unit accel=UNIT" in str(caught.value)
 
 
 def test_spellings_of_one_unit_are_one_unit():

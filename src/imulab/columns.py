@@ -57,6 +57,23 @@ def triad(sensor: str) -> list[str]:
     return [f"{sensor}_{axis}" for axis in "xyz"]
 
 
+def shared_unit(units: Mapping[str, str], what: str, file: str) -> str:
+    """Return the unit that columns of one kind share; `what` they are for the message.
+
+    Raises
+    ------
+    UnitError
+        They have different units.
+    """
+    symbols = {name: parse_unit(unit).symbol for name, unit in units.items()}
+    if len({*symbols.values()}) > 1:
+        found = ", ".join(f"{name} [{unit}]" for name, unit in symbols.items())
+        kind = kind_of(next(iter(units))) or next(iter(units))
+        stated = f"if a title is wrong, --unit {kind}=UNIT states it for all"
+        raise UnitError(f"{file}: {what} must share one unit, found {found}; {stated}")
+    return next(iter(symbols.values()))
+
+
 def element_number(column: str, stem: str = "") -> int | None:
     """Return the number of the IMU of a column such as ``accel_x_7`` (with the stem ``accel_x``), None for others."""
     match = _ELEMENT.fullmatch(column)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imulab.arguments import checked, described
-from imulab.columns import check_unit, clocks_of, element_number, expected_quantities, kind_of, triad
+from imulab.columns import check_unit, clocks_of, element_number, expected_quantities, kind_of, shared_unit, triad
 from imulab.display import Note, has_hidden, printable, reverses
 from imulab.errors import DataError, OptionError, UnitError, several
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
@@ -280,11 +280,7 @@ class Recording:
         names = triad(sensor)
         for name in names:
             self.column(name)
-        units = {name: parse_unit(self.units[name]).symbol for name in names}
-        if len(set(units.values())) > 1:
-            described_units = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
-            raise UnitError(f"{self.name}: the axes of a triad must share one unit, found {described_units}")
-        return units[names[0]]
+        return shared_unit({name: self.units[name] for name in names}, "the axes of a triad", self.name)
 
     def mean_temperature(self) -> float | None:
         """Return the mean temperature, degC: of the column, or else as the head of the file states it."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from json import dumps
 from pathlib import Path
@@ -121,7 +122,8 @@ def export(
     if not output:
         raise OptionError("-o '': expected a folder to write to")
     to = options.pop("to")
-    files = call(il.export, to=to, records=records, folder=output, tell=warn, **options)
+    write = partial(il.export, records=records, folder=output, tell=warn)
+    files = call(write, to=to, **options)
     for file in files:
         print(f"{to}: {file}")
 
@@ -339,7 +341,7 @@ def _show_changes(first: str, second: str, *, json: bool) -> None:
     from imulab.records.comparison import different_units
 
     if other := different_units((first, records[0].sensor), (second, records[1].sensor)):
-        warn(f"records of different units: {other}")
+        warn(f"records of different units: {other}; give two of one unit to see what changed in it")
     print(describe_changes(first, second, comparison, records[0]))
 
 

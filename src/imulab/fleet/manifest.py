@@ -404,6 +404,10 @@ def _check_columns(titles: Sequence[str], procedures: Set[str], name: str) -> No
     """Refuse titles that are missing, unknown or there twice; the options of unused procedures are seldom imported."""
     for title in COLUMNS:
         if title not in titles:
+            if separator := next((mark for mark in ";\t|" if len(titles) == 1 and mark in titles[0]), ""):
+                raise OptionError(
+                    f"{name}: columns are separated by {separator!r}; expected commas (';' only between a unit's files)"
+                )
             raise OptionError(f"{name}: no column {title}; found {several(titles)}")
     usual = {*COLUMNS, *_options_of(PROCEDURES[key] for key in procedures & PROCEDURES.keys())}
     for index, title in enumerate(titles):

@@ -63,7 +63,7 @@ def tables_of_all(records: Sequence[Calibration], fusions: Sequence[Fusion | Non
     kinds = [table.kind for table in tables]
     twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
     if twice:
-        raise RecordError(f"two records give a {twice[0]} table; a unit has one")
+        raise RecordError(f"two records give a {twice[0]} table; a unit has one: give one of them")
     check_order(kinds)
     check_after((table.kind, table.columns, (table.columns["record"],)) for table in tables)
     return tables

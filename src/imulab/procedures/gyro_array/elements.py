@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from imulab.columns import shared_unit
 from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.estimation.clock import GAP, read_clock
@@ -133,14 +134,11 @@ def find_elements(recording: Recording) -> Elements:
                     "numbered from 1"
                 )
     names = tuple(tuple(by_axis[axis][i] for i in range(1, count + 1)) for axis in axes)
-    units = []
-    for row in names:
-        of_column = {name: parse_unit(recording.units[name]).symbol for name in row}
-        if len(set(of_column.values())) > 1:
-            listed = ", ".join(f"{name} [{unit}]" for name, unit in of_column.items())
-            raise UnitError(f"{recording.name}: the elements of an axis must share one unit, found {listed}")
-        units.append(of_column[row[0]])
-    return Elements(names, tuple(units), axes)
+    units = tuple(
+        shared_unit({name: recording.units[name] for name in row}, "the elements of an axis", recording.name)
+        for row in names
+    )
+    return Elements(names, units, axes)
 
 
 @dataclass(frozen=True)

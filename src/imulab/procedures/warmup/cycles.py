@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.columns import shared_unit
 from imulab.errors import DataError, UnitError
 from imulab.estimation.rows import median, medians, quantile
 from imulab.estimation.sampling import mend_blocks
@@ -218,9 +219,8 @@ def _axes(recording: Recording) -> tuple[str, ...]:
         raise recording.lacking("column gyro_* or accel_*", "gyro_x")
     for kind in ("gyro", "accel"):
         units = {name: recording.units[name] for name in axes if name.startswith(kind)}
-        if len({parse_unit(unit).symbol for unit in units.values()}) > 1:
-            described = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
-            raise UnitError(f"{recording.name}: the axes of one kind must share one unit, found {described}")
+        if units:
+            shared_unit(units, "the axes of one kind", recording.name)
     return axes
 
 
@@ -379,7 +379,7 @@ def common_axes(cycles: list[Cycle]) -> tuple[str, ...]:
             if cycle_unit != unit:
                 raise UnitError(
                     f"{cycle.name}: column {axis} is in {cycle_unit}, but in {unit} in {first.name}: "
-                    "all files must share one unit"
+                    f"all files must share one unit; if a title is wrong, --unit {axis}=UNIT states it for all"
                 )
     hashes: dict[str, str] = {}
     for cycle in cycles:
