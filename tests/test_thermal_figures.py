@@ -152,5 +152,5 @@ def test_degrees_compared_say_of_what_error_and_probability_are():
         "probability that the power left out is chance",
     ]
     told = [row[2] for row in table.rows]
-    assert "< 0.001" in told
+    assert "below 1e-12" in told
     assert "0.000" not in told

@@ -221,11 +221,12 @@ def _joined(value: object) -> str:
 
 def describe_changes(first: str, second: str, comparison: RecordComparison, record: Calibration) -> str:
     """Return the changes from one record to the other; `record` gives the procedure and units."""
+    from imulab.estimation.distributions import probability_fact
     from imulab.procedures.views import TITLES, change_rows, verdict
 
     lines = [f"{second} less {first}: {verdict(comparison)}", "", *aligned(TITLES, change_rows(comparison))]
     if comparison.probability is not None:
-        lines += ["", f"all together: probability {comparison.probability:.2g} if nothing had changed"]
+        lines += ["", f"all together: probability {probability_fact(comparison.probability)} if nothing had changed"]
     if comparison.models:
         lines += ["", f"the records differ in {', '.join(comparison.models)}: a change may come from that"]
     if comparison.left_out:

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 from imulab.estimation import _distributions
 from imulab.recording import Array
 
+_SMALL = 1e-3  # probabilities below are known to a digit
+
 
 def normal_cdf(value: ArrayLike) -> Array:
     """Return the probability that a standard normal variable is below `value` (DLMF 7.18.1: ``erfc(-z/sqrt 2)/2``)."""
@@ -69,6 +71,19 @@ def t_quantile(probability: ArrayLike, freedom: ArrayLike) -> Array:
 def sine_integral(value: ArrayLike) -> Array:
     """Return ``Si(value)``, the integral of ``sin(t)/t`` from 0 (DLMF 6.2.9)."""
     return _elementwise(_distributions.fill_sine_integral, value)
+
+
+def probability_text(probability: float | None, least: float = 1e-12) -> str:
+    """Return a probability for a sentence: ``p = 0.031``, ``p = 3e-05``, or ``p below 1e-12``."""
+    if probability is None:
+        return "not tested"
+    digits = 2 if probability >= _SMALL else 1
+    return f"p = {probability:.{digits}g}" if probability >= least else f"p below {least:g}"
+
+
+def probability_fact(probability: float | None, least: float = 1e-12) -> str:
+    """Return a probability as a value beside its label: ``0.031``."""
+    return probability_text(probability, least).removeprefix("p ").removeprefix("= ")
 
 
 def _elementwise(fill: Callable[..., None], *arguments: ArrayLike) -> Array:

@@ -17,6 +17,7 @@ from imulab.errors import DataError, OptionError
 from imulab.estimation import TAUS
 from imulab.estimation._allan import fill_squares
 from imulab.estimation.decisions import NOISE_MODEL_REJECTED
+from imulab.estimation.distributions import probability_text
 from imulab.estimation.noise.analysis import Analysis, average, intervals_of
 from imulab.estimation.noise.spectrum import frequencies
 from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, bias_square, letters
@@ -261,7 +262,7 @@ def _read(
     # Half of the band is given up where nothing is filtered.
     filtered = band.highest * analysis.interval < 0.24
     if not fits(analysis):
-        reason = f"the noise is not that of the model (test of fit: p = {analysis.test.probability:.1g})"
+        reason = f"the noise is not that of the model (test of fit: {probability_text(analysis.test.probability)})"
         none = undetermined(reason, band.highest, filtered)
         return replace(none, angle_random_walk=_level(analysis)) if band.flat else none
 

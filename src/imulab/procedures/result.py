@@ -452,18 +452,6 @@ class PlannedAttitudes(PlannedTest):
 # Checks of a record by new data.
 
 
-def probability_text(probability: float | None, least: float = 1e-12) -> str:
-    """Return a probability for a sentence: ``p = 0.031``, or ``p below 1e-12``."""
-    if probability is None:
-        return "not tested"
-    return f"p = {probability:.2g}" if probability >= least else f"p below {least:g}"
-
-
-def probability_fact(probability: float | None, least: float = 1e-12) -> str:
-    """Return a probability as a value beside its label: ``0.031``."""
-    return probability_text(probability, least).removeprefix("p ").removeprefix("= ")
-
-
 def columns_as_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:
     """Return columns of equal length as rows of plain values, for JSON."""
     plain = [np.asarray(list(values)).tolist() for values in columns.values()]

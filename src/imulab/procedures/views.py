@@ -17,6 +17,7 @@ import numpy as np
 from imulab import report
 from imulab.display import LINES, SENTENCES, WIDTH, aligned, html_table
 from imulab.errors import OptionError, RecordError, listed
+from imulab.estimation.distributions import probability_text
 from imulab.files import write_page
 from imulab.frames import foreign_of, frame_library, is_frame, name_of
 from imulab.procedures.registry import joined_of, procedure_of
@@ -128,7 +129,8 @@ class Changes(Drawn, RecordComparison):
 
     def exhibits(self) -> Exhibits:
         """Return each change in units of its uncertainty, and as a table."""
-        together = "" if self.probability is None else f"; all together: p = {self.probability:.2g} if nothing changed"
+        p = self.probability
+        together = "" if p is None else f"; all together: {probability_text(p)} if nothing changed"
         models = f"; the records differ in {', '.join(self.models)}" if self.models else ""
         headline = f"{verdict(self)}{together}{models}."
         table = ReportTable("Changes", "", TITLES, change_rows(self))

@@ -32,14 +32,14 @@ from imulab.device.unit import output_factor
 from imulab.display import Note
 from imulab.errors import DataError, RecordError
 from imulab.estimation.decisions import MAGNETOMETER_CHECK
-from imulab.estimation.distributions import f_tail
+from imulab.estimation.distributions import f_tail, probability_fact, probability_text
 from imulab.estimation.rows import median
 from imulab.procedures.magnetometer import AXES, name_columns
 from imulab.procedures.magnetometer.device import output_unit, surface_of
 from imulab.procedures.magnetometer.model import read_readings
 from imulab.procedures.magnetometer.schema import FieldSummary, fit_of, model_of
 from imulab.procedures.magnetometer.solve import evaluate, find_inflation, mark_far, unpack
-from imulab.procedures.result import RecordCheck, as_record, as_recording, probability_fact, probability_text
+from imulab.procedures.result import RecordCheck, as_record, as_recording
 from imulab.recording import Array, Data, Reading
 from imulab.records.calibration import Calibration
 from imulab.report.traces import Exhibits, Figure, figure_axis, marker, rounded, scatter
@@ -120,7 +120,8 @@ class MagnetometerCheck(RecordCheck):
         )
         others = " ".join(axis for axis, known in zip(self.axes, determined, strict=True) if not known)
         rest = f"; along {others} they tell no change" if others else ""
-        return f"a hard iron that changed by {change} {unit} explains the readings (p = {self.explained:.1g}){rest}"
+        chance = probability_text(self.explained)
+        return f"a hard iron that changed by {change} {unit} explains the readings ({chance}){rest}"
 
     def next_step(self, record: str, files: Sequence[str]) -> str:
         """Return what to do after a failed test."""

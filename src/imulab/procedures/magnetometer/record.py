@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imulab.display import UNJUDGED, Bad, Finding, Note
 from imulab.estimation.decisions import FIELD_ALONE_STEP, OUTPUTS_BEND_CLEARLY
-from imulab.estimation.distributions import f_tail
+from imulab.estimation.distributions import f_tail, probability_text
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.magnetometer import ALL_WAYS, GAUGE, LEVEL
 from imulab.procedures.magnetometer.model import FittedTurn, MagReadings, not_told, parameter_names
@@ -265,7 +265,7 @@ def _warn_step(readings: MagReadings, r: Array, aside: NDArray[np.bool_]) -> lis
     row = int(parts[first][0])
     where = f"row {readings.row[row] + 1}" if time is None else f"{time[row]:.1f} s"
     way = "higher" if size > 0 else "lower"
-    text = f"mag: from {where} on |m| is {100 * abs(size):.2g} % {way} than before (p {p:.1g})"
+    text = f"mag: from {where} on |m| is {100 * abs(size):.2g} % {way} than before ({probability_text(p)})"
     if abs(size) < _NOTICED:
         return [Note(f"{text}, as by noise that is slow or a drift")]
     return [
@@ -284,7 +284,7 @@ def _warn_change(turned: FittedTurn) -> list[str]:
     row = int(np.flatnonzero(~turned.aside)[change.first])
     where = f"row {readings.row[row] + 1}" if readings.time is None else f"{readings.time[row]:.1f} s"
     share = float(np.linalg.norm(change.size)) / turned.surface.gain
-    shown = f"{100 * share:.2g} % of the field (p {change.probability:.1g})"
+    shown = f"{100 * share:.2g} % of the field ({probability_text(change.probability)})"
     text = f"mag: from {where} on the hard iron is another by {shown}"
     if share < _NOTICED:
         return [Note(f"{text}, as by noise that is slow or a drift; its uncertainty holds both")]
@@ -311,8 +311,8 @@ def _warn_bends(turned: FittedTurn) -> list[str]:
             sizes = f"(of an axis that is not told) {factor * largest:.2g}"
         text = (
             f"mag: |m| follows the direction as no ellipsoid does: outputs with a {_POWER_NAMES[power]} of the field, "
-            f"at its full size {sizes} {symbol} (p {bend.probability:.1g}), explain it. What of it looks like hard and "
-            "soft iron is in the uncertainties"
+            f"at its full size {sizes} {symbol} ({probability_text(bend.probability)}), explain it. "
+            "What of it looks like hard and soft iron is in the uncertainties"
         )
         if largest < _NOTICED * turned.surface.gain:
             warnings.append(Note(text))

@@ -16,6 +16,7 @@ import numpy as np
 from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.decisions import NOISE_CHECK
+from imulab.estimation.distributions import probability_fact, probability_text
 from imulab.estimation.noise.agreement import Agreement, agreement
 from imulab.estimation.noise.analysis import CANDIDATES
 from imulab.estimation.noise.likelihood import fit, time_limits, within
@@ -26,7 +27,7 @@ from imulab.estimation.rows import NORMAL_95
 from imulab.options import text
 from imulab.procedures.noise.fit import fit_recordings, given_log
 from imulab.procedures.noise.schema import Column, NoiseSummary, drawn_of, fit_of, label
-from imulab.procedures.result import RecordCheck, as_record, probability_fact, probability_text
+from imulab.procedures.result import RecordCheck, as_record
 from imulab.quantities import fraction
 from imulab.recording import Array, Data, Reading, Recording
 from imulab.records.calibration import Calibration

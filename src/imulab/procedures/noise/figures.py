@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.estimation.distributions import probability_fact, probability_text
 from imulab.estimation.noise.analysis import PER_PARAMETER
 from imulab.estimation.noise.terms import LINEAR, allan_terms, at_band_edge, terms
 from imulab.procedures.noise import rejected
@@ -174,7 +175,7 @@ def _models(fit: NoiseSummary) -> ReportTable:
                 column.chosen,
                 f"{others[0]} +{max(price[others[0]] - price[column.chosen], 0.0):.1f}" if others else "–",
                 ", ".join(f"{each} {weight[each]:.0%}" for each in dict.fromkeys([column.chosen, heavy])),
-                f"{column.test.probability:.2g}" if column.test.degrees_of_freedom else "–",
+                probability_fact(column.test.probability) if column.test.degrees_of_freedom else "–",
                 f"{fit.band[name].value:.4g}",
                 f"{100 * column.ripple:.2g}",
                 str(column.spikes),
@@ -225,7 +226,7 @@ def _curve(record: Calibration, fit: NoiseSummary, name: str) -> Figure:
         title=f"Allan deviation, {name}",
         message=f"The fitted deviation is least, {plain_number(float(factor * fitted[at]), 2)} {unit}, at "
         f"{plain_number(float(tau[at]), 2)} s; "
-        + (f"the model does not fit (p = {p:.1g})." if rejected(p, len(fit.test)) else "the model fits."),
+        + (f"the model does not fit ({probability_text(p)})." if rejected(p, len(fit.test)) else "the model fits."),
         caption="Deviation between neighbouring means over the averaging time. Circles: the record without its lines. "
         "Line: the chosen model, N white, B 1/f, K walk, G Gauss-Markov, Q quantisation; dashed and dotted: its parts. "
         "Shaded: the 95 % band of all models that the record "

@@ -22,6 +22,7 @@ from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed, several
 from imulab.estimation.column_noise import noise_columns
 from imulab.estimation.decisions import LEVEL_STEP_PERHAPS
+from imulab.estimation.distributions import probability_text
 from imulab.estimation.noise.analysis import (
     CANDIDATES,
     Analysis,
@@ -196,7 +197,7 @@ def findings(columns: Mapping[str, ColumnModel], rests: Sequence[Rest], horizon:
     columns_by_finding: dict[str, list[str]] = {}
     for name, column in columns.items():
         if rejected(p := column.analysis.test.probability, len(columns)):
-            text = f"no model of these terms fits (p = {p:.1g}); the numbers tell the size of the noise alone"
+            text = f"no model of these terms fits ({probability_text(p)}); the numbers tell the size of the noise alone"
             columns_by_finding[Finding(text, "take the white noise alone, or fit a quieter part (--window)")] = [name]
         for finding in _describe_column(column):
             columns_by_finding.setdefault(finding, []).append(name)

@@ -22,6 +22,7 @@ import numpy as np
 from imulab.display import UNJUDGED, Finding, Note
 from imulab.errors import DataError, RecordError
 from imulab.estimation.decisions import LENGTH_AT_REST_OFF, RATE_PRIOR_CONTRADICTED
+from imulab.estimation.distributions import probability_fact
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.rate import AXES, GAINS
 from imulab.procedures.rate.dwells import Dwells, recorded_rate
@@ -521,7 +522,7 @@ def _as_measured(parameter: Parameter) -> Measured:
 
 def _state_agreement(probability: float | None, changes: Any) -> str:
     """Return the note or warning that says whether prior and test agree, and which parameter differs most."""
-    chance = "" if probability is None else f" (probability {probability:.2g})"
+    chance = "" if probability is None else f" (probability {probability_fact(probability)})"
     differing = [change for change in changes if change.significant]
     if not differing and probability is not None and probability < RATE_PRIOR_CONTRADICTED.level:
         return Finding(

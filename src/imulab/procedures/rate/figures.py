@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from imulab.estimation.distributions import probability_fact
 from imulab.procedures.rate.schema import (
     AxisFit,
     DwellResiduals,
@@ -128,14 +129,14 @@ def _linearity_table(record: Calibration, rate_record: RateRecord) -> ReportTabl
             "gyro": str,
             "nonlinearity": size("nonlinearity"),
             "95 % by noise": lambda a: number_text(fits[a].by_noise, _PPM),
-            "p of noise": lambda a: f"{fits[a].probability:.3f}",
+            "p of noise": lambda a: probability_fact(fits[a].probability),
             "order": lambda a: _order_and_residual(record, fits[a], a)[0],
             "powers leave": lambda a: _order_and_residual(record, fits[a], a)[1],
             "asymmetry": size("asymmetry"),
             "hysteresis": size("hysteresis"),
             "loop": lambda a: _loop_texts(record, fits[a], a)[0],
             "u": lambda a: _loop_texts(record, fits[a], a)[1],
-            "p of loop": lambda a: "–" if (loop := fits[a].loop) is None else f"{loop:.3f}",
+            "p of loop": lambda a: "–" if (loop := fits[a].loop) is None else probability_fact(loop),
             "repeatability": lambda a: number_text(fits[a].repeatability, _PPM),
             "by noise": lambda a: number_text(fits[a].repeatability_by_noise, _PPM),
         },
@@ -211,7 +212,9 @@ def _prior_table(prior: RatePrior, record: Calibration) -> ReportTable:
         read = reading_unit(parameter.test.unit, name)
         estimates = (parameter.prior, parameter.test, record.parameter(name))
         rows.append([name, *(" ± ".join(read.texts(p.value, p.standard_uncertainty)) for p in estimates), read.symbol])
-    chance = "" if prior.probability is None else f" Probability of such differences: {prior.probability:.2g}."
+    chance = (
+        "" if prior.probability is None else f" Probability of such differences: {probability_fact(prior.probability)}."
+    )
     return ReportTable(
         "The earlier record and this test",
         "Each alone, and both as one fit, the result, ± standard uncertainties. What all rates of one table, or "

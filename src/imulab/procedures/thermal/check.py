@@ -16,6 +16,7 @@ from imulab.columns import triad
 from imulab.display import Note
 from imulab.errors import OptionError, RecordError, UnitError
 from imulab.estimation.decisions import THERMAL_CHECK
+from imulab.estimation.distributions import probability_fact, probability_text
 from imulab.gravity import (
     Gravity,
     Height,
@@ -34,8 +35,6 @@ from imulab.procedures.result import (
     as_record,
     as_recording,
     columns_as_rows,
-    probability_fact,
-    probability_text,
 )
 from imulab.procedures.thermal.check_gyro import GyroCheck, check_gyros, gyro_figure, select_in_range, warn_known
 from imulab.procedures.thermal.check_ramp import RampCheck, check_ramp
@@ -105,8 +104,8 @@ class ThermalCheck(RecordCheck):
 
     def __repr__(self) -> str:
         return (
-            f"ThermalCheck({'pass' if self.passed else 'fail'}, p = {self.probability:.2g}, {len(self.holds)} holds, "
-            f"the farthest off by {text_in(float(self.residuals[self.worst]), 'ug')} µg)"
+            f"ThermalCheck({'pass' if self.passed else 'fail'}, {probability_text(self.probability)}, "
+            f"{len(self.holds)} holds, the farthest off by {text_in(float(self.residuals[self.worst]), 'ug')} µg)"
         )
 
     @property

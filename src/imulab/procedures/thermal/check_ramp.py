@@ -10,7 +10,8 @@ import numpy as np
 
 from imulab.errors import DataError
 from imulab.estimation.decisions import THERMAL_CHECK
-from imulab.procedures.result import RecordCheck, columns_as_rows, probability_fact, probability_text
+from imulab.estimation.distributions import probability_fact, probability_text
+from imulab.procedures.result import RecordCheck, columns_as_rows
 from imulab.procedures.thermal.check_gyro import GyroCheck, check_gyros, gyro_figure, select_in_range, warn_known
 from imulab.procedures.thermal.holds import Holds, prepare_recordings
 from imulab.procedures.thermal.model import AXES
@@ -44,9 +45,8 @@ class RampCheck(RecordCheck):
     data: ClassVar[str] = "recording"
 
     def __repr__(self) -> str:
-        return (
-            f"RampCheck({'pass' if self.passed else 'fail'}, p = {self.probability:.2g}, {len(self.gyro.holds)} parts)"
-        )
+        state, chance = "pass" if self.passed else "fail", probability_text(self.probability)
+        return f"RampCheck({state}, {chance}, {len(self.gyro.holds)} parts)"
 
     @property
     def probability(self) -> float:

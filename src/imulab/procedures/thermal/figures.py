@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
+from imulab.estimation.distributions import probability_fact
 from imulab.procedures.thermal.degrees import describe_degrees, mask_drift_rates
 from imulab.procedures.thermal.model import AXES, GROUPS
 from imulab.procedures.thermal.record import (
@@ -526,7 +527,7 @@ def _degrees_table(thermal: ThermalRecord) -> ReportTable:
 
     def chance(row: DegreesTried) -> str:
         p = row.probability
-        return "–" if p is None else f"{p:.3f}" if round(p, 3) else "< 0.001"
+        return "–" if p is None else probability_fact(p)
 
     columns: dict[str, Callable[[DegreesTried], str]] = {
         "degrees": name,

@@ -10,6 +10,7 @@ import numpy as np
 
 from imulab.display import UNJUDGED, Finding, Note
 from imulab.estimation.decisions import HOLD_DISAGREEMENT, TEMPERATURE_MISSED
+from imulab.estimation.distributions import probability_fact
 from imulab.estimation.least_squares import coverage_factor
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.thermal.degrees import (
@@ -318,8 +319,8 @@ def _warn_fit(
         higher, probability = fitted.missed
         messages.append(
             f"{name}: degrees {solution.laws.spelled} are too low: what {','.join(map(str, higher))} add has a "
-            f"probability of {probability:.1g} by chance, and the stated uncertainties do not cover what is missing: "
-            "state higher ones, or leave --degrees out"
+            f"probability of {probability_fact(probability)} by chance, and the stated "
+            "uncertainties do not cover what is missing: state higher ones, or leave --degrees out"
         )
     else:
         messages += warn_disagreement(holds, problem, solution, name)

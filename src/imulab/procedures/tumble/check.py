@@ -14,12 +14,12 @@ from imulab.device.unit import output_factor
 from imulab.display import Finding, Note
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.decisions import ATTITUDES_DISTURBED, TUMBLE_CHECK
-from imulab.estimation.distributions import f_tail
+from imulab.estimation.distributions import f_tail, probability_fact, probability_text
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import median
 from imulab.gravity import Gravity, Height, Latitude, LocalGravity, StatedSite, at_place, local_gravity, of_place
 from imulab.options import measure
-from imulab.procedures.result import Record, RecordCheck, as_record, columns_as_rows, probability_fact, probability_text
+from imulab.procedures.result import Record, RecordCheck, as_record, columns_as_rows
 from imulab.procedures.tumble.attitudes import Attitudes, TumbleData, as_attitudes
 from imulab.procedures.tumble.checks import check_fresh, check_uncorrected, made_from
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
@@ -105,7 +105,7 @@ class Check(RecordCheck):
     data: ClassVar[str] = "file"
 
     def __repr__(self) -> str:
-        p = "" if self.probability is None else f", p = {self.probability:.2g}"
+        p = "" if self.probability is None else f", {probability_text(self.probability)}"
         worst = small_g(abs(float(self.residuals[self.worst])))
         return (
             f"Check({'pass' if self.passed else 'fail'}{p}, {len(self.residuals)} attitudes, the farthest off is "
@@ -209,7 +209,9 @@ class Check(RecordCheck):
             read = reading_unit(mag.unit, "mag_bias_x")
             places = 2 if mag.unit == "T" else 4
             change = ", ".join(f"{value * read.factor:+.{places}f}" for value in mag.hard_iron.tolist())
-            lines.append(f"a hard iron that changed by ({change}) {read.symbol} explains it (p = {mag.explained:.2g})")
+            lines.append(
+                f"a hard iron that changed by ({change}) {read.symbol} explains it ({probability_text(mag.explained)})"
+            )
         return lines
 
     def content(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.estimation.distributions import probability_fact
 from imulab.estimation.rows import median, quantile, rms
 from imulab.procedures.tumble import record as engineering
 from imulab.procedures.tumble.model import AXES
@@ -325,7 +326,7 @@ def orders_table(record: Calibration) -> ReportTable:
                 str(row.parameters),
                 plain_number(micro_g(row.rms), 4),
                 plain_number(micro_g(row.leave_one_out), 4) if row.leave_one_out is not None else "–",
-                f"{row.f_probability:.2g}" if row.f_probability is not None else "–",
+                probability_fact(row.f_probability) if row.f_probability is not None else "–",
                 f"{row.bic:.1f}" if row.bic is not None else "–",
                 plain_number(micro_g(row.largest_uncertainty), 3) if row.largest_uncertainty is not None else "–",
                 plain_number(row.condition_number, 3),

@@ -44,7 +44,7 @@ from imulab.estimation.decisions import (
     TUMBLE_ORDER_ABOVE_TWO,
     TUMBLE_ORDER_TWO,
 )
-from imulab.estimation.distributions import f_tail, normal_cdf, t_cdf
+from imulab.estimation.distributions import f_tail, normal_cdf, probability_fact, t_cdf
 from imulab.estimation.least_squares import (
     Observability,
     bayesian_information,
@@ -352,8 +352,8 @@ def direction_findings(problem: TumbleProblem, solution: TumbleSolution, *, orde
     return [
         Finding(
             f"the residuals are a function of the direction of gravity, {_MICRO * pattern.size:.3g} µg rms "
-            f"(probability by chance {_chance(pattern.probability)}): {looks}, which the uncertainties do not hold; "
-            f"{remedy}",
+            f"(probability by chance {probability_fact(pattern.probability)}): {looks}, which the "
+            f"uncertainties do not hold; {remedy}",
             action,
         )
     ]
@@ -375,12 +375,9 @@ def time_findings(attitudes: Attitudes, problem: TumbleProblem, solution: Tumble
     )
     return [
         f"the zeros drift over the test: the residuals show {sizes} from its beginning to its end (probability by "
-        f"chance {_chance(pattern.probability)}); let the unit warm up, and put the attitudes in no particular order"
+        f"chance {probability_fact(pattern.probability)}); let the unit warm up, and put the attitudes in no "
+        "particular order"
     ]
-
-
-def _chance(probability: float) -> str:
-    return f"{probability:.1g}" if probability >= 1e-6 else "below 1e-6"
 
 
 # Which attitudes were knocked: those that no order up to 3 explains, found before the order is chosen.

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from imulab.display import Bad, Finding
 from imulab.errors import RecordError
 from imulab.estimation.decisions import ATTITUDES_DISTURBED, PRIOR_CONTRADICTED, PRIOR_EXPLAINS_NOTHING
+from imulab.estimation.distributions import probability_text
 from imulab.estimation.least_squares import chi_square_probability, plausible_excess
 from imulab.gravity import Gravity
 from imulab.procedures.tumble.checks import check_prior
@@ -319,9 +320,9 @@ def prior_warnings(record: Calibration, aged: AgedPrior, recording: Recording, c
         )
         messages.append(
             Finding(
-                f"prior and attitudes contradict each other (p = {aged.probability:.2g}): the unit has changed since "
-                "the prior was made, or attitudes were disturbed; the prior was widened as far as they ask (bias, "
-                f"scale factor{', misalignment' if len(sizes) > 2 else ''}: "
+                f"prior and attitudes contradict each other ({probability_text(aged.probability)}): the unit has "
+                "changed since the prior was made, or attitudes were disturbed; the prior was widened as far as they "
+                f"ask (bias, scale factor{', misalignment' if len(sizes) > 2 else ''}: "
                 f"{', '.join(sizes)}){few if count < _ASKED else ''}",
                 "fit without the prior (leave --prior out), or record the attitudes again",
             )

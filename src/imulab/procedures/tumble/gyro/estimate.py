@@ -28,6 +28,7 @@ from msgspec.structs import replace
 
 from imulab.display import Note
 from imulab.estimation.decisions import SAMPLES_LOST, SCALE_CHANGE, SCALE_CHANGES_WITH_RATE
+from imulab.estimation.distributions import probability_text
 from imulab.estimation.least_squares import chi_square_limit, f_test, restricted_log_likelihood
 from imulab.estimation.rows import median
 from imulab.procedures.tumble.gyro.rotation import weighted_turns
@@ -86,8 +87,9 @@ class Nonlinearity(Struct, frozen=True):
                     phrases.append(f"of {axis} by {100 * value:+.2g} % (u {100 * u:.1g} %) {what} {rate:.0f} deg/s")
         changes = "; ".join(phrases) or "of which axis, they do not tell"
         return [
-            f"gyro: what the turns miss depends on the rate (p {self.probability:.1g}): the scale factor changes "
-            f"{changes}: the record holds for turns as fast as these; measure at the rates of use, or on a rate table"
+            f"gyro: what the turns miss depends on the rate ({probability_text(self.probability)}): the scale factor "
+            f"changes {changes}: the record holds for turns as fast as these; "
+            "measure at the rates of use, or on a rate table"
         ]
 
 

@@ -21,6 +21,7 @@ from imulab.estimation.decisions import (
     FIELD_STEP,
     FIELD_STEP_BESIDE_POSE,
 )
+from imulab.estimation.distributions import probability_text
 from imulab.estimation.least_squares import coverage_factor, f_test
 from imulab.estimation.rows import rms
 from imulab.gravity import (
@@ -296,7 +297,7 @@ def _warn_step(joint: Joint, labels: Sequence[str]) -> list[str]:
     what = (
         f"mag: from {labels[step.first]} on |m| is {100 * abs(step.magnitude):.2g} % "
         f"{'higher' if step.magnitude > 0 else 'lower'} and the dip {np.degrees(abs(step.dip)):.2g} deg "
-        f"{'higher' if step.dip > 0 else 'lower'} than before (p {step.probability:.1g})"
+        f"{'higher' if step.dip > 0 else 'lower'} than before ({probability_text(step.probability)})"
     )
     if step.beside_pose > FIELD_STEP_BESIDE_POSE.level:
         return [
@@ -336,7 +337,8 @@ def _note_set_aside(label: str, off: Disturbed) -> str:
     return kind(
         f"mag: {label} set aside: |m| {100 * abs(off.magnitude):.2g} % "
         f"{'high' if off.magnitude > 0 else 'low'}, dip {np.degrees(abs(off.dip)):.2g} deg "
-        f"{'high' if off.dip > 0 else 'low'} against the others (p {off.probability:.1g}): iron or a vehicle near?",
+        f"{'high' if off.dip > 0 else 'low'} against the others ({probability_text(off.probability)}): "
+        "iron or a vehicle near?",
         "measure this attitude again, away from iron and vehicles",
     )
 

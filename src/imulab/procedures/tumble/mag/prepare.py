@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from imulab.display import Finding
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, quoted
 from imulab.estimation.decisions import ACCELEROMETERS_CONTRADICT_RECORD
-from imulab.estimation.distributions import f_tail
+from imulab.estimation.distributions import f_tail, probability_text
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.gravity import Gravity, check_field_magnitude, local_gravity
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -393,8 +393,9 @@ def _read_prior(
             gyroscopes = "; its gyroscopes were left out" if "gyro_output_unit" in known.model else ""
             return None, [
                 Finding(
-                    f"mag: the accelerometers of {attitudes.recording.name} contradict their record (p = {p:.2g}): it "
-                    f"was not used; they were calibrated anew from these attitudes{gyroscopes}",
+                    f"mag: the accelerometers of {attitudes.recording.name} contradict their record "
+                    f"({probability_text(p)}): it was not used; they were calibrated anew from "
+                    f"these attitudes{gyroscopes}",
                     "calibrate the accelerometers again (imulab tumble fit)",
                 )
             ]
