@@ -211,7 +211,7 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     lossy = is_lossy(recording)
     start, stop = steady_rows(time, lossy=lossy)
     clock = read_clock(time[start:stop], lossy=lossy)
-    odd = [prefixed(recording.name, line) for line in mislabelled(recording, clock.rate)]
+    odd = [prefixed(recording.name, line) for line in mislabelled(recording.units["time"], clock.rate, time[0])]
     if (start, stop) != (0, len(time)):
         return clock.rate, [_change(recording, time, start, stop), *odd]
     count = len(clock.gaps)
@@ -337,13 +337,12 @@ def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
     )
 
 
-def mislabelled(recording: Recording, rate: float) -> list[str]:
+def mislabelled(unit: str, rate: float, time: float) -> list[str]:
     """Return whether the unit of time is right: a finding if the rate, Hz, is no sensor's, a note if it is rare.
 
-    A rate that is only rare is a finding where the stamps since 1970 would be later than 2099.
+    A rate that is only rare is a finding where `time`, a stamp in s, would be later than 2099 if it counts from 1970.
     """
-    unit = recording.units["time"]
-    late = to_si(float(recording.column("time")[0]), unit) > EPOCHS[1]
+    late = time > EPOCHS[1]
     doubt = doubt_unit_of_time(unit, rate, TOO_SLOW if late else _SLOW)
     if not doubt:
         return []

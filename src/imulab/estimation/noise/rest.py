@@ -560,7 +560,7 @@ class _Log:
             (
                 *(prefixed(head.name, note) for note in self._notes),
                 *bad,
-                *(prefixed(head.name, note) for note in mislabelled(head, 1 / interval)),
+                *(prefixed(head.name, note) for note in mislabelled(head.units["time"], 1 / interval, self._time[0])),
                 *self._coarse,
                 *notes_of_gaps(head.name, interval, lengths, filled, self._rows + filled - kept, self._rows),
             ),
