@@ -196,12 +196,12 @@ def test_blocks_are_corrected_as_the_whole(size, order):
 def test_records_are_applied_in_the_order_given():
     first, forces, outputs = simulated(2, "g")
     second = reference.random_truth(np.random.default_rng(9), 1, 1.0)
-    chain = [record(first, 2, "g"), record(second, 1, "m/s^2")]
+    chain = [loaded(record(first, 2, "g"), again=True), loaded(record(second, 1, "m/s^2"), again=True)]
     (corrected,) = apply_blocks(chain, [recording(outputs, "g")])
     expected = np.array([reference.inverse(force, second, 1) for force in forces])
     np.testing.assert_allclose(corrected.triad("accel"), expected, rtol=0, atol=2e-12 * 2 * G)
     with pytest.raises(UnitError, match=r"are in m/s\^2,"):
-        list(apply_blocks([chain[1], record(first, 2, "count")], [recording(outputs, "g")]))
+        list(apply_blocks([chain[1], loaded(record(first, 2, "count"), again=True)], [recording(outputs, "g")]))
 
 
 # --- temperature -----------------------------------------------------------------------------------------------
@@ -299,7 +299,7 @@ def test_a_corrected_file_names_every_record_and_its_hash(tmp_path, kind, monkey
     first.save("a.json")
     second.save("b.json")
     write(flight(), "raw.csv")
-    assert main(["apply", "a.json", "b.json", "raw.csv", "-o", f"out.{kind}"]) == 0
+    assert main(["apply", "a.json", "b.json", "raw.csv", "--again", "-o", f"out.{kind}"]) == 0
     expected = tuple(f"{name}.json sha256:{r.to_dict()['content_sha256']}" for name, r in (("a", first), ("b", second)))
     assert il.read(f"out.{kind}").corrected_by == expected
     if kind == "csv":
@@ -313,6 +313,80 @@ def test_a_corrected_file_names_every_record_and_its_hash(tmp_path, kind, monkey
     assert il.read("again.csv").corrected_by == (*expected, expected[1])
     assert main(["convert", f"out.{kind}", "-o", "converted.csv"]) == 0
     assert il.read("converted.csv").corrected_by == expected
+
+
+TURNED = Recording(
+    {"time": np.arange(4.0), **{f"{s}_{a}": np.full(4, 0.1) for s in ("accel", "gyro", "mag", "dtg") for a in "xyz"}},
+    {"time": "s", **{f"{s}_{a}": "rad/s" for s in ("gyro", "dtg") for a in "xyz"},
+     **{f"accel_{a}": "m/s^2" for a in "xyz"}, **{f"mag_{a}": "uT" for a in "xyz"}},
+    {"power_on_temperature": "25", "serial": "SN42"}, name="flight.csv",
+)  # fmt: skip
+
+
+def in_si(made, **model):
+    """A made-up record for outputs in m/s^2 and rad/s."""
+    parameters = {name: replace(p, unit=p.unit.replace("count", "m/s^2")) for name, p in made.parameters.items()}
+    for name in [name for name in parameters if name.startswith("gyro_scale")]:
+        parameters[name] = replace(parameters[name], unit="rad/s/(rad/s)")
+    return replace(made, parameters=parameters, model={**made.model, "output_unit": "m/s^2", **model})
+
+
+def mag_records():
+    waved = il.simulate_magnetometer(field="48 uT", duration="30 s")
+    return [il.fit_magnetometer(waved, field=f"{field} uT").calibration for field in (48, 49)]
+
+
+@pytest.mark.parametrize(
+    ("records", "message"),
+    [
+        (lambda: [in_si(madeup.tumble(1)), in_si(madeup.tumble(2))],
+         "bias and scale factor of accel_x accel_y accel_z"),
+        (lambda: [in_si(madeup.tumble(1, gyro=True), gyro_output_unit="rad/s"),
+                  il.fit_rate(il.simulate_rate()).calibration],
+         "bias and scale factor of gyro_x gyro_y gyro_z"),
+        (lambda: [madeup.warmup(), madeup.warmup("knot-cubic")], "the change after power-on of gyro_x gyro_z"),
+        (lambda: [madeup.centrifuge(), replace(madeup.centrifuge(), created="2001-01-01T00:00:00Z")],
+         "drift under acceleration of dtg_x dtg_y"),
+        (mag_records, "hard and soft iron of mag_x mag_y mag_z"),
+    ],
+    ids=["tumble", "gyroscopes", "warm-up", "centrifuge", "magnetometers"],
+)  # fmt: skip
+def test_two_records_that_take_off_the_same_error_are_refused(records, message, tmp_path, monkeypatch, capsys):
+    """By `apply` on the command line and in Python, from a blob, and by `export`; unless they are to be so."""
+    monkeypatch.chdir(tmp_path)
+    first, second = (replace(each, sensor={"serial": "SN42"}) for each in records())
+    first.save("a.json")
+    second.save("b.json")
+    write(TURNED, "flight.csv")
+    assert main(["apply", "a.json", "b.json", "flight.csv", "-o", "out.csv"], project=False) == 2
+    said = f"a.json and b.json both take off {message}: expected one of them, or --again (again=True)"
+    assert f"imulab: {said} if the second was made of what the first left\n" == capsys.readouterr().err
+    assert not (tmp_path / "out.csv").exists()
+    assert main(["apply", "a.json", "b.json", "flight.csv", "--again", "-o", "out.csv"], project=False) == 0
+    (blob,) = il.export("blob", first, "blob")
+    for once in (il.apply(first, TURNED), il.apply(blob, TURNED)):
+        with pytest.raises(RecordError, match=f"both take off {message}: expected one of them"):
+            il.apply(second, once)
+    for target in ("c", "blob"):
+        with pytest.raises(RecordError, match=f"both take off {message}: expected one of them"):
+            il.export(target, [first, second], "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_records_of_other_errors_or_other_axes_are_applied_together(tmp_path):
+    """A frame of pandas remembers what was taken off; tables for other temperatures do not touch each other."""
+    nine = in_si(madeup.tumble(1, gyro=True), gyro_output_unit="rad/s")
+    chain = [nine, madeup.centrifuge(), madeup.warmup()]
+    for pick in (chain, chain[:2], chain[1:]):
+        (corrected,) = apply_blocks(pick, [TURNED])
+        assert len(corrected.corrected_by) == len(pick)
+    frame = nine.apply(TURNED.to_frame())
+    with pytest.raises(RecordError, match="both take off bias and scale factor"):
+        il.apply(in_si(madeup.tumble(2)), frame.iloc[:2])
+    hot = madeup.warmup("knot-cubic")
+    table = {**hot.sections["table"], "temperatures": [t + 100 for t in madeup.EDGES]}
+    (corrected,) = apply_blocks([madeup.warmup(), replace(hot, sections={"table": table})], [TURNED])
+    assert len(corrected.corrected_by) == 1
 
 
 def test_a_blob_is_known_by_the_records_that_it_was_made_from(tmp_path):

@@ -406,7 +406,8 @@ class Recording:
         'm/s^2'
         """
         converted, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
-        before = tuple(map(str, getattr(frame, "attrs", {}).get("corrected_by", ())))
+        lines = getattr(frame, "attrs", {}).get("corrected_by", ())
+        before = tuple(line if isinstance(line, str) else str(line) for line in lines)
         return cls(converted, symbols, {**(metadata or {})}, name, corrected_by=before)  # type: ignore[dict-item]
 
     @overload

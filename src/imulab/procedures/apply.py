@@ -17,7 +17,14 @@ from imulab.display import SENTENCES, Note
 from imulab.errors import DataError, OptionError, RecordError, listed
 from imulab.estimation.sampling import whole_where_shared
 from imulab.options import choice, measure
-from imulab.procedures.correction_order import check_after, check_order, name_correction, parse_thermals
+from imulab.procedures.correction_order import (
+    Correction,
+    check_after,
+    check_once,
+    check_order,
+    name_correction,
+    parse_thermals,
+)
 from imulab.procedures.procedure import Procedure, Section
 from imulab.procedures.registry import joined_of, load_any, procedure_of, section
 from imulab.procedures.result import Record, as_read, as_record
@@ -54,17 +61,19 @@ def tables_of_all(records: Sequence[Calibration], fusions: Sequence[Fusion | Non
     """
     serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
     if len(serials) > 1:
-        raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
-    tables = [
-        replace(table, columns={**table.columns, "record": record.sealed()[0]})
+        raise RecordError(f"found records of different units: {' '.join(serials)}; expected those of one")
+    given = [
+        (record, table)
         for record, fusion in zip(records, fusions or [None] * len(records), strict=True)
         for table in tables_of(record, fusion)
     ]
+    tables = [replace(table, columns={**table.columns, "record": record.sealed()[0]}) for record, table in given]
     kinds = [table.kind for table in tables]
+    check_order(kinds)
+    check_once((_name(record), table.kind, table.columns) for record, table in given)
     twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
     if twice:
         raise RecordError(f"two records give a {twice[0]} table; a unit has one: give one of them")
-    check_order(kinds)
     check_after((table.kind, table.columns, (table.columns["record"],)) for table in tables)
     return tables
 
@@ -90,7 +99,7 @@ class Loaded:
     holds
         SHA-256 of the record; for a blob its own, then those of the records it was made from.
     again
-        Whether it may be applied to a recording that it corrected before.
+        Whether it may be applied to a recording that it, or another of the same errors, corrected before.
     further
         Function that adds columns to the corrected recording; None where there is none.
     """
@@ -144,9 +153,12 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
     if made_by.not_applied:
         raise RecordError(f"a {record.procedure} record cannot be applied: {made_by.not_applied}")
     tables = tables_of(record)
-    called = name or f"{record.procedure} {record.sensor.get('serial', '')}".rstrip()
     chain = tuple((made_by.section(table.kind), {**table.columns, **columns}) for table in tables)
-    return Loaded(DeviceUnit.of(*tables), chain, called, (record.sealed()[0],), again)
+    return Loaded(DeviceUnit.of(*tables), chain, name or _name(record), (record.sealed()[0],), again)
+
+
+def _name(record: Calibration) -> str:
+    return f"{record.procedure} {record.sensor.get('serial', '')}".rstrip()
 
 
 HEADINGS = ("no", "magnetic", "true")
@@ -207,7 +219,7 @@ def apply(
     data
         What is corrected: a file, recording, data frame or arrays.
     again
-        Correct a recording that a record corrected before. The same record.
+        Correct a recording that a record corrected before. The same record, or another of the same errors.
     latest_start
         Refuse a recording that starts later after power-on (warm-up). In s.
     temperature_column
@@ -225,8 +237,9 @@ def apply(
     Raises
     ------
     RecordError
-        The record's procedure has nothing to apply here, it is a warm-up record of cycles that another thermal record
-        had corrected than the recording, or `heading` is asked of one without magnetometers.
+        The record's procedure has nothing to apply here, another record took off the same errors before, it is a
+        warm-up record of cycles that another thermal record had corrected than the recording, or `heading` is asked of
+        one without magnetometers.
     UnitError
         The recording's unit cannot be converted to the record's.
     DataError
@@ -268,8 +281,13 @@ def apply(
     check_after(
         ((part.kind, columns, ready.holds) for part, columns in ready.sections), parse_thermals(recording.corrected_by)
     )
+    chosen = select_sections(ready.sections, recording)
+    active = [(part.kind, columns) for part, columns in chosen if part.unchanged(columns, recording) is None]
+    if not ready.again:
+        instead = ", or --again (again=True) if the second was made of what the first left"
+        check_once(((ready.name, *each) for each in active), recording.corrected_by, instead)
     corrected = recording
-    for part, columns in select_sections(ready.sections, recording):
+    for part, columns in chosen:
         corrected = part.apply(ready.unit, columns, corrected)
     if ready.further is not None:
         corrected = ready.further(corrected)
@@ -278,14 +296,18 @@ def apply(
             why = next(iter(_explain_unchanged([ready], recording)), f"{recording.name}: nothing to correct in it")
             raise DataError(why)
         return recording
-    return replace(corrected, corrected_by=(*recording.corrected_by, *_name_corrections(ready)))
+    return replace(corrected, corrected_by=(*recording.corrected_by, *_name_corrections(ready, active)))
 
 
-def _name_corrections(ready: Loaded) -> Iterator[str]:
-    """Yield a line of `corrected_by` for each record; for a blob one for itself, then one for each record in it."""
+def _name_corrections(ready: Loaded, active: Sequence[tuple[str, Mapping[str, Any]]]) -> Iterator[Correction]:
+    """Yield a line of `corrected_by` for each record; for a blob one for itself, then one for each record in it.
+
+    `active` are the sections that corrected something: kind and columns.
+    """
     made = [(columns.get("record", ready.holds[0]), part.kind) for part, columns in ready.sections]
     for digest in dict.fromkeys((ready.holds[0], *(digest for digest, _ in made))):
-        yield name_correction(ready.name, digest, [kind for source, kind in made if source == digest])
+        line = name_correction(ready.name, digest, [kind for source, kind in made if source == digest])
+        yield Correction(line, active)
 
 
 def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterable[Recording]) -> Iterator[Recording]:

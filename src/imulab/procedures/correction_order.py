@@ -1,17 +1,31 @@
-"""The order of corrections: a warm-up table comes after the thermal record by which its cycles were corrected."""
+"""The order of corrections: no error is taken off twice, and a warm-up table comes after the thermal record.
+
+Namely after that by which its cycles were corrected.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 from imulab.errors import RecordError
 
 SENSORS = {"thermal": "accel", "thermal_gyro": "gyro"}
 """The triad that each section of a thermal record corrects."""
 _ENTRY = re.compile(r" \(thermal: ([a-z ]+)\) sha256:([0-9a-f]{64})$")
+_LINEAR = "bias and scale factor"
+_ERRORS = {
+    "tumble": (_LINEAR, "accel"),
+    "thermal": (_LINEAR, "accel"),
+    "gyro": (_LINEAR, "gyro"),
+    "thermal_gyro": (_LINEAR, "gyro"),
+    "mag": ("hard and soft iron", "mag"),
+    "centrifuge": ("drift under acceleration", "dtg"),
+    "warmup": ("the change after power-on", ""),
+}
+"""What each kind of section takes off, and the sensor; the columns of a warm-up table name theirs."""
 
 
 @dataclass(frozen=True)
@@ -22,10 +36,59 @@ class Thermal:
     sensor: str
 
 
+class Correction(str):
+    """A line of `corrected_by` that knows what was taken off: the kind and columns of sections. A file does not."""
+
+    __slots__ = ("sections",)
+    sections: Sequence[tuple[str, Mapping[str, Any]]]
+
+    def __new__(cls, line: str, sections: Sequence[tuple[str, Mapping[str, Any]]] = ()) -> Self:
+        """Return a line with its sections."""
+        correction = super().__new__(cls, line)
+        correction.sections = sections
+        return correction
+
+
 def name_correction(name: str, digest: str, kinds: Iterable[str]) -> str:
     """Return the line of `corrected_by` for a record: ``thermal.json (thermal: accel) sha256:...``."""
     over = " ".join(SENSORS[kind] for kind in kinds if kind in SENSORS)
     return f"{name} (thermal: {over}) sha256:{digest}" if over else f"{name} sha256:{digest}"
+
+
+def _list_errors(kind: str, columns: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return what a section takes off, once for each column."""
+    error, sensor = _ERRORS.get(kind, ("", ""))
+    axes = columns.get("axes", "xyz") if error else ()
+    return [(error, f"{sensor}_{axis}" if sensor else str(axis)) for axis in axes]
+
+
+def check_once(
+    sections: Iterable[tuple[str, str, Mapping[str, Any]]], corrected_by: Iterable[str] = (), instead: str = ""
+) -> None:
+    """Refuse sections that take off an error a second time: name of their record, kind, and columns.
+
+    `corrected_by` are the lines of a recording that was corrected before; `instead` is what else may be done.
+
+    Raises
+    ------
+    RecordError
+        Two of them take off the same error of one column.
+    """
+    before = {
+        error: line.rpartition(" sha256:")[0]
+        for line in corrected_by
+        if isinstance(line, Correction)
+        for section in line.sections
+        for error in _list_errors(*section)
+    }
+    for name, kind, columns in sections:
+        errors = _list_errors(kind, columns)
+        if twice := [error for error in errors if error in before]:
+            names = " ".join(column for _, column in twice)
+            raise RecordError(
+                f"{before[twice[0]]} and {name} both take off {twice[0][0]} of {names}: expected one of them{instead}"
+            )
+        before |= dict.fromkeys(errors, name)
 
 
 def parse_thermals(corrected_by: Iterable[str]) -> list[Thermal]:
@@ -43,9 +106,9 @@ def check_order(kinds: Sequence[str]) -> None:
         A tumble is beside a thermal record, which contains it, or gyroscopes beside one that holds them; or a warm-up
         table comes before the thermal record.
     """
-    if "thermal" not in kinds:
+    if not SENSORS.keys() & set(kinds):
         return
-    if "tumble" in kinds:
+    if "tumble" in kinds and "thermal" in kinds:
         raise RecordError(
             "a tumble and a thermal record together: both take off bias, scale factor and misalignment; expected the "
             "thermal record alone (thermal fit --prior takes the tumble's knowledge in)"
@@ -55,7 +118,7 @@ def check_order(kinds: Sequence[str]) -> None:
             "a gyroscope record beside a thermal one that holds gyroscopes too: both take off their biases; expected "
             "the thermal record alone, or one fitted without --with gyro"
         )
-    if "warmup" in kinds[: list(kinds).index("thermal")]:
+    if "warmup" in kinds[: max(place for place, kind in enumerate(kinds) if kind in SENSORS)]:
         raise RecordError(
             "a warm-up record before a thermal one: expected the thermal record first, since the warm-up is what is "
             "left after the laws over temperature"
