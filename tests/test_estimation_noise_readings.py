@@ -171,6 +171,14 @@ def test_accelerometers_at_rest_show_gravity(unit, size, words):
     notes = doubtful_units(log, ["accel_x", "accel_y", "accel_z"], 100.0)
     assert len(notes) == bool(words)
     assert all(words in note for note in notes)
+    what = (
+        "set the range"
+        if "times g" in words or "1/2 of g" in words
+        else "record the"
+        if "taken off" in words
+        else "state the right"
+    )
+    assert all(note.action.startswith(what) for note in notes)
 
 
 def one_sided(t):

@@ -11,8 +11,9 @@ import imulab as il
 import madeup
 from imulab.cli import main
 from imulab.device.unit import load_blob
+from imulab.display import Note
 from imulab.errors import DataError, RecordError, UnitError
-from imulab.procedures.apply import apply, apply_blocks, loaded, warn_before_applying
+from imulab.procedures.apply import apply, apply_blocks, loaded, warn_before_applying, warn_of_unit
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.writers import write
@@ -429,3 +430,93 @@ def test_gyroscopes_whose_g_sensitivity_needs_the_accelerometers_are_refused_wit
 def test_a_record_of_one_triad_is_not_applied_to_the_other():
     with pytest.raises(DataError, match="no column accel_x; found gyro_x"):
         il.apply(madeup.tumble(1), flight(**GYRO))
+
+
+# --- the unit of the recording ------------------------------------------------------------------------------------
+
+
+def logged(forces, unit="m/s^2", rate=50.0):
+    """What a unit with biases of 30 mg makes of specific forces, m/s^2, and its record."""
+    bias = np.array([0.3, -0.2, 0.25])
+    values = {n: bias["xyz".index(n[-1])] if n[0] == "b" else float(n[0] == "s") for n in reference.names(1)}
+    outputs = forces + bias + np.random.default_rng(1).normal(0.0, 0.02, np.shape(forces))
+    columns = {name: outputs[:, i] / (1.0 if unit == "m/s^2" else G) for i, name in enumerate(AXES)}
+    units = {"time": "s", **dict.fromkeys(AXES, unit)}
+    return record(values, 1, "m/s^2"), Recording(
+        {"time": np.arange(len(outputs)) / rate, **columns}, units, name="f.csv"
+    )
+
+
+def turned_over(count=3000):
+    angle = np.repeat(np.linspace(0.0, 6.0, 12), count // 12)
+    return G * np.column_stack([np.sin(angle), np.cos(angle) * np.sin(3 * angle), np.cos(angle) * np.cos(3 * angle)])
+
+
+def under_way(size=1.0):
+    """A car that brakes and turns with some m/s^2 for seconds."""
+    level = size * np.repeat(np.random.default_rng(5).normal(0, 1, (60, 3)), 50, axis=0)
+    return level * [1, 1, 0] + [0, 0, G]
+
+
+@pytest.mark.parametrize("forces", [turned_over(), under_way()], ids=["turned", "under way"])
+@pytest.mark.parametrize(
+    ("true", "stated"), [("m/s^2", "g"), ("m/s^2", "mg"), ("g", "m/s^2"), ("g", "mg"), ("mg", "g")]
+)
+def test_a_unit_in_which_there_is_no_gravity_is_warned_of(true, stated, forces, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made, log = logged(forces, "m/s^2" if true == "m/s^2" else "g")
+    if true == "mg":
+        log = log.with_columns({name: 1000 * log.column(name) for name in AXES}, {})
+    made.save("r.json")
+    for unit, lines in ((stated, 1), (true, 0)):
+        write(log.with_columns({}, dict.fromkeys(AXES, unit)), "f.csv")
+        assert main(["apply", "r.json", "f.csv", "-q", "-o", "out.csv"], project=False) == 0
+        said = capsys.readouterr().err
+        assert said.count("\n") == lines
+    write(log.with_columns({}, dict.fromkeys(AXES, stated)), "f.csv")
+    assert main(["apply", "r.json", "f.csv", "-q", "-o", "out.csv"], project=False) == 0
+    said = capsys.readouterr().err
+    assert f"which is no gravity, as {true} would be; is their unit, {stated}, right? --unit accel={true}" in said
+    assert said.startswith("imulab: warning: f.csv: accel_x .. accel_z: |f| is ")
+
+
+def centrifuge_at(levels):
+    return np.repeat([[level * G, 0.0, G] for level in levels], 3000 // len(levels), axis=0)
+
+
+HEALTHY = {
+    "turned over": turned_over(),
+    "under way": under_way(30.0),
+    "vibrating": np.random.default_rng(3).normal([0, 0, G], 30, (3000, 3)),
+    "in free fall": np.zeros((3000, 3)),
+    "at 10 g": centrifuge_at([10]),
+    "at 100 g": centrifuge_at([100]),
+    "at many g": centrifuge_at([1, 2, 4, 6, 8, 9, 9.8, 10, 12, 15]),
+    "swung up": np.linspace(0, 20 * G, 3000)[:, None] * [1, 0, 0] + [0, 0, G],
+}
+
+
+def test_a_still_log_of_10_g_is_no_warning_since_a_centrifuge_shows_it_too():
+    """With biases of 30 mg, 10 g are as near to 9.81 m/s^2 as a unit at rest; in one position a note says so."""
+    at_rest, log = logged(np.full((3000, 3), [0.0, 0.0, G]))
+    (note,) = warn_of_unit(loaded(at_rest), log.with_columns({}, dict.fromkeys(AXES, "g")))
+    assert isinstance(note, Note)
+    assert "if the unit is at rest, theirs is m/s^2, not g: --unit accel=m/s^2" in note
+
+
+@pytest.mark.parametrize("unit", ["m/s^2", "g"])
+@pytest.mark.parametrize("forces", HEALTHY.values(), ids=HEALTHY)
+def test_a_healthy_log_is_not_asked_for_its_unit(forces, unit):
+    made, log = logged(forces, unit)
+    assert [said for said in warn_of_unit(loaded(made), log) if not isinstance(said, Note)] == []
+
+
+def test_the_unit_of_a_few_rows_or_of_gaps_is_judged_without_them():
+    """Without a time every row is an attitude; rows that are no numbers count for nothing; none is no unit."""
+    made, log = logged(turned_over())
+    stated = log.with_columns({"accel_y": np.where(np.arange(len(log)) % 3, log.column("accel_y"), np.nan)}, {})
+    stated = replace(stated, units={"time": "s", **dict.fromkeys(AXES, "g")})
+    table = replace(stated, columns={name: stated.column(name)[:4] for name in AXES})
+    nothing = replace(stated, columns={name: np.full(4, np.nan) for name in AXES})
+    ready = loaded(made)
+    assert [len(warn_of_unit(ready, each)) for each in (stated, table, nothing)] == [1, 1, 0]

@@ -178,6 +178,29 @@ def test_wild_parameters_are_warned_of():
     assert record.verdict.state == "bad"
 
 
+@pytest.mark.parametrize(
+    ("factor", "reason", "action"),
+    [
+        (0.5, "twice the one that its driver assumes", "set the range that the driver assumes to that of the sensor"),
+        (2.0, "half the one that its driver assumes", "set the range that the driver assumes to that of the sensor"),
+        (0.7, "outputs of a sensor are never so far off m/s^2", "state the unit that the outputs have"),
+    ],
+)
+def test_what_to_do_about_outputs_far_off_follows_from_what_explains_them(factor, reason, action):
+    u = factor * G * reference.random_attitudes(np.random.default_rng(9), 30)
+    verdict = il.fit_tumble(il.find_attitudes(table(u)), order=1, gravity=G).calibration.verdict
+    assert verdict.state == "bad"
+    assert reason in verdict.reasons[0]
+    assert verdict.next[0].startswith(action)
+
+
+@pytest.mark.parametrize(("size", "unit"), [(1.05, "g"), (1000.0, "mg"), (1.2, "UNIT"), (50.0, "UNIT")])
+def test_a_refused_unit_comes_with_the_one_that_would_be_right(size, unit):
+    u = size * reference.random_attitudes(np.random.default_rng(9), 30)
+    with pytest.raises(DataError, match=rf"is the unit wrong\? --unit accel={unit} states another"):
+        il.fit_tumble(il.find_attitudes(table(u)), order=1, gravity=G)
+
+
 def test_an_attitude_without_gravity_is_named():
     u = G * reference.random_attitudes(np.random.default_rng(9), 30)
     u[11] = 0.0

@@ -35,6 +35,7 @@ from imulab.options import OUTPUT
 
 if TYPE_CHECKING:
     from imulab.device.unit import Blob
+    from imulab.procedures.apply import Loaded
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
 
@@ -180,7 +181,7 @@ def apply(
     if options["temperature_column"] and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)
     rows = _Rows()
-    write_out(rows.counted(apply_blocks(chain, _with_warnings(records, blocks))), output)
+    write_out(rows.counted(apply_blocks(chain, _with_warnings(records, chain, blocks))), output)
     by = " and ".join(dict.fromkeys(Path(name).name for name in names))
     what = "standard input" if file == "-" else file
     note(f"{rows.count} rows of {what} corrected by {by}: {output or 'standard output'}")
@@ -209,10 +210,12 @@ class _Rows:
             yield block
 
 
-def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
+def _with_warnings(
+    records: list[Calibration | Blob], chain: Sequence[Loaded], blocks: Iterable[Recording]
+) -> Iterator[Recording]:
     """Yield blocks; print warnings after the first, and at the end what lay beyond the test."""
     from imulab.display import Note
-    from imulab.procedures.apply import list_results, warn_before_applying
+    from imulab.procedures.apply import list_results, warn_before_applying, warn_of_unit
     from imulab.recording import TAKEN_FROM
 
     tests = list_results(records)
@@ -227,6 +230,7 @@ def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording
         yield block
         if number == 0:  # after it was corrected: where it is refused, the refusal is the one line there is
             messages = [message for record in records for message in warn_before_applying(record, block)]
+            messages += [message for ready in chain for message in warn_of_unit(ready, block)]
             if power_on := block.metadata.get(TAKEN_FROM):
                 messages.append(Note(f"{block.name}: the power-on temperature was taken from {power_on}"))
             messages += [f"{block.name}: was corrected before, by {entry}" for entry in block.corrected_by]

@@ -13,8 +13,9 @@ from typing import Annotated, Any, Unpack
 from imulab.columns import KINDS, triad
 from imulab.device.tables import DeviceTable, Fusion
 from imulab.device.unit import Blob, DeviceUnit
-from imulab.display import SENTENCES, Note
+from imulab.display import SENTENCES, Note, prefixed
 from imulab.errors import DataError, OptionError, RecordError, listed
+from imulab.estimation.likely_unit import doubt_by_correction
 from imulab.estimation.sampling import whole_where_shared
 from imulab.options import choice, measure
 from imulab.procedures.correction_order import (
@@ -391,6 +392,16 @@ def warn_before_applying(record: Calibration | Blob, recording: Recording) -> li
         f"{recording.name}: temperature {here:.1f} degC is {abs(here - made['value']):.0f} K away from the "
         f"{made['value']:.1f} degC at which the record was made",
     ]
+
+
+def warn_of_unit(ready: Loaded, recording: Recording) -> list[str]:
+    """Return a warning where accelerometers that a record corrects are probably in another unit than stated."""
+    parts = [each for each in ready.sections if each[0].triad == "accel"]
+    if not parts or not len(recording) or not all(name in recording for name in triad("accel")):
+        return []
+    (part, columns), *_ = parts
+    doubt = doubt_by_correction(recording, lambda scaled: part.apply(ready.unit, columns, scaled))
+    return [prefixed(recording.name, doubt)] if doubt else []
 
 
 def list_results(records: Iterable[Calibration | Blob]) -> list[tuple[Calibration, Procedure]]:

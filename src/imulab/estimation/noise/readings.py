@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from imulab.columns import kind_of, triad
 from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError
+from imulab.estimation.likely_unit import STATE_UNIT, no_gravity
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.rows import deviation_of_steps, distinct, median
 from imulab.estimation.sampling import FEW
 from imulab.recording import Array, Recording, stored_as
-from imulab.units import STANDARD_GRAVITY, parse_unit, to_si
+from imulab.units import to_si
 
 # Whether the unit of samples at rest can be right: by the steps of known sensors, gravity and the Earth's rate.
 
@@ -34,11 +35,6 @@ _LOUDEST_GYRO, _QUIET = 0.3, 0.035
 _EARTH, _PLAIN_OFFSET = (4.0, 100.0), 10.0
 """deg/h that three such gyroscopes show at rest: the Earth's 15 and their offsets. Zeroed ones, whose mean is within
 ten standard uncertainties of 0, are passed over."""
-_STATE_UNIT = "state the right unit by --unit, in the column's title or in a layout, and fit again"
-_NO_GRAVITY = 0.2  # relative: |f| at rest farther than this off g is no gravity, whatever the zeros of the sensor
-_NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit or range makes that the likely one
-_OTHERS = {**{unit: to_si(1.0, unit) for unit in ("m/s^2", "g", "mg")}, "ft/s^2": 0.3048}
-"""Units that accelerometers are logged in, in m/s^2."""
 
 
 def doubtful_units(recording: Recording, names: Sequence[str], rate: float) -> list[str]:
@@ -50,7 +46,7 @@ def doubtful_units(recording: Recording, names: Sequence[str], rate: float) -> l
             named = its[0] if len(its) == 1 else f"{its[0]} .. {its[-1]}"
             unit = recording.units[its[0]]
             text = f"{recording.name}: {named}: {reason}; is their unit, {unit}, right?"
-            notes.append(Bad(text, _STATE_UNIT))
+            notes.append(Bad(text, reason.action if isinstance(reason, Finding) else STATE_UNIT))
     return notes
 
 
@@ -90,24 +86,6 @@ def _doubt_accelerometers(recording: Recording, names: Sequence[str], rate: floa
     size = max(1, min(round(rate), len(samples[0])))
     means = [each[: len(each) // size * size].reshape(-1, size).mean(axis=1) for each in samples]
     return no_gravity(median(np.sqrt(sum(np.square(each) for each in means))), recording.units[names[0]])
-
-
-def no_gravity(force: float, unit: str) -> str:
-    """Return why |f| at rest, SI, is no gravity, and what would make it one; nothing of gravity, counts and volts."""
-    if parse_unit(unit).quantity != "acceleration" or abs(force / STANDARD_GRAVITY - 1) <= _NO_GRAVITY:
-        return ""
-    shown = f"|f| at rest is {force / to_si(1.0, unit):.4g} {unit}, which is no gravity"
-    ratio = force / STANDARD_GRAVITY
-    for other, size in _OTHERS.items():
-        if other != unit and abs(ratio / to_si(1.0, unit) * size - 1) < _NEAR_STEP:
-            return f"{shown}, as {other} would be"
-    if ratio < _NEAR_STEP:
-        return f"{shown}: was it taken off, as of a linear acceleration?"
-    power = round(math.log2(ratio))
-    if abs(ratio / 2.0**power - 1) < _NEAR_STEP:
-        factor = f"{2**power} times" if power > 0 else f"1/{2**-power} of"
-        return f"{shown}, but {factor} g, as counts or another range of the sensor would be"
-    return shown
 
 
 def _first(recording: Recording, name: str) -> Array:

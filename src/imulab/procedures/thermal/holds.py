@@ -24,7 +24,7 @@ from imulab.columns import triad
 from imulab.display import Bad, Finding, Note, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import DIRECTION_WANDERS
-from imulab.estimation.noise.readings import no_gravity
+from imulab.estimation.likely_unit import no_gravity
 from imulab.estimation.rows import MAD_TO_SIGMA, distinct, median, medians, quantile
 from imulab.estimation.sampling import TIME_DOUBTED
 from imulab.procedures.thermal import LEAST_SPAN, SETTLE
@@ -703,7 +703,7 @@ def check_holds(holds: Holds, gravity: float, nominal: float | None) -> list[str
         doubts.append(
             Bad(
                 f"{holds.recordings[0].name}: columns accel_x accel_y accel_z: {reason}",
-                "state the unit that the columns have, as by --unit accel=UNIT, and fit again",
+                reason.action,
             )
         )
     span = np.ptp(holds.mean, axis=0)

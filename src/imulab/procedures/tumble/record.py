@@ -26,6 +26,7 @@ from imulab.estimation.decisions import (
     SCALE_OFF_UNIT,
 )
 from imulab.estimation.least_squares import Observability, chi_square_probability, coverage_factor
+from imulab.estimation.likely_unit import ANOTHER_RANGE
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.blend import Blended
@@ -62,7 +63,7 @@ from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, StatedGravity, entries
 from imulab.report.parameters import Row, reading_unit, rows_of, small_g
 from imulab.report.traces import plain_number
-from imulab.units import conversion_factor, parse_unit
+from imulab.units import parse_unit
 
 if TYPE_CHECKING:
     from imulab.procedures.tumble.montecarlo import MonteCarlo
@@ -77,7 +78,7 @@ _NEGLIGIBLE = 0.01  # µg or ppm: an order that is left out and moves less is no
 FEW_DEGREES, _ENOUGH_DEGREES = 5, 9
 _WORST_MISALIGNMENT = 0.1  # rad: a larger misalignment is an axis with another name or sign
 _MOST_NAMED = 8  # attitudes that a warning names
-_UNITS = ("m/s^2", "g", "mg")
+_STATE_UNIT = "state the unit that the outputs have (count, if none of m/s^2 g mg fits)"
 _RANGES = {0.25: "four times", 0.5: "twice", 2.0: "half", 4.0: "a quarter of"}
 """How outputs shrink or grow where a sensor is set to another range than its driver assumes."""
 
@@ -229,11 +230,15 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
         ]
         if other := {axis: value for axis, value in off if abs(value - 1) > SCALE_OF_ANOTHER_UNIT}:
             scale = float(np.median(list(other.values())))
+            ranges = (words for factor, words in _RANGES.items() if abs(scale / factor - 1) < SCALE_OFF_UNIT)
+            words, action = f"outputs of a sensor are never so far off {attitudes.unit}", _STATE_UNIT
+            if times := next(ranges, ""):
+                words, action = f"as if the sensor's range were {times} the one that its driver assumes", ANOTHER_RANGE
             messages.append(
                 Bad(
                     f"the scale factor of {' '.join(other)} is off by more than {100 * SCALE_OF_ANOTHER_UNIT:.0f} %, "
-                    f"it is {scale:.3g} (median): {_likely_unit(scale, attitudes.unit)}",
-                    f"state the unit that the outputs have (count, if none of {' '.join(_UNITS)} fits)",
+                    f"it is {scale:.3g} (median): {words}",
+                    action,
                 )
             )
     messages += [
@@ -245,17 +250,6 @@ def size_warnings(attitudes: Attitudes, solution: TumbleSolution) -> list[str]:
         if abs(value) > _WORST_MISALIGNMENT
     ]
     return messages
-
-
-def _likely_unit(scale: float, unit: str) -> str:
-    """Return what would explain a median scale factor in a stated unit: another unit, or a range set wrong."""
-    for other in _UNITS:
-        if other != unit and abs(scale / conversion_factor(other, unit) - 1) < SCALE_OFF_UNIT:
-            return f"the outputs look like {other}, not {unit}"
-    for factor, words in _RANGES.items():
-        if abs(scale / factor - 1) < SCALE_OFF_UNIT:
-            return f"as if the sensor's range were {words} the one that its driver assumes"
-    return f"outputs of a sensor are never so far off {unit}"
 
 
 def assumption_notes(stated: StatedUncertainty | None) -> list[str]:

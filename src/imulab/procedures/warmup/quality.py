@@ -17,7 +17,7 @@ from imulab.columns import triad
 from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, first_of
 from imulab.estimation.decisions import STILL_DRIFTS
-from imulab.estimation.noise.readings import no_gravity
+from imulab.estimation.likely_unit import no_gravity
 from imulab.estimation.rows import median, medians
 from imulab.procedures.correction_order import parse_thermals
 from imulab.procedures.warmup.cycles import SETTLED, Curves, Cycle
@@ -525,8 +525,7 @@ def _warn_gravity(curves: Curves) -> list[str]:
         return []
     unit = curves.cycles[0].file_units[places[0]]
     reason = no_gravity(median(np.linalg.norm(curves.reference[:, places], axis=1)), unit)
-    action = "correct the unit in the titles of accel_x accel_y accel_z, or state it: --unit accel=UNIT"
-    return [Bad(f"accel_x .. accel_z: {reason}; is their unit, {unit}, right?", action)] if reason else []
+    return [Bad(f"accel_x .. accel_z: {reason}; is their unit, {unit}, right?", reason.action)] if reason else []
 
 
 def _warn_motion(curves: Curves) -> list[str]:

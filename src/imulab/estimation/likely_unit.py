@@ -1,0 +1,99 @@
+"""Whether accelerometers can be in the unit that is stated for them, by gravity; and the unit that would explain it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from imulab.columns import kind_of, triad
+from imulab.display import Finding, Note
+from imulab.estimation.rows import median
+from imulab.recording import Array, Recording
+from imulab.units import STANDARD_GRAVITY, parse_unit, to_si
+
+STATE_UNIT = "state the right unit by --unit, in the column's title or in a layout, and fit again"
+ANOTHER_RANGE = "set the range that the driver assumes to that of the sensor, or state counts: --unit accel=count"
+"""What to do where outputs are a simple fraction or multiple of what they should be."""
+_NO_GRAVITY = 0.2  # relative: |f| at rest farther than this off g is no gravity, whatever the zeros of the sensor
+_NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit or range makes that the likely one
+_NEAR_GRAVITY = 0.015  # relative: corrected |f| in most seconds this near to g in another unit makes that the right one
+_ONE_DIRECTION = 3.0  # deg: a unit that rests, or is on a centrifuge, turns by less
+_MOST_SAMPLES, _FEWEST_TIMES = 100_000, 3  # samples that are used; of a log with a rate
+_UNITS = {unit: to_si(1.0, unit) for unit in ("m/s^2", "g", "mg")}
+_OTHERS = {**_UNITS, "ft/s^2": 0.3048}
+"""Units that accelerometers are logged in, in m/s^2; the last one must be converted before."""
+
+
+def no_gravity(force: float, unit: str) -> Finding:
+    """Return why |f| at rest, SI, is no gravity, and what would make it one; empty of gravity, counts and volts."""
+    if parse_unit(unit).quantity != "acceleration" or abs(force / STANDARD_GRAVITY - 1) <= _NO_GRAVITY:
+        return Finding("")
+    shown = f"|f| at rest is {force / to_si(1.0, unit):.4g} {unit}, which is no gravity"
+    ratio = force / STANDARD_GRAVITY
+    if other := unit_instead(ratio, unit, _NEAR_STEP, _OTHERS):
+        return Finding(f"{shown}, as {other} would be", STATE_UNIT)
+    if ratio < _NEAR_STEP:
+        action = "record the acceleration with gravity in it"
+        return Finding(f"{shown}: was it taken off, as of a linear acceleration?", action)
+    power = round(math.log2(ratio))
+    if abs(ratio / 2.0**power - 1) < _NEAR_STEP:
+        factor = f"{2**power} times" if power > 0 else f"1/{2**-power} of"
+        return Finding(f"{shown}, but {factor} g, as counts or another range of the sensor would be", ANOTHER_RANGE)
+    return Finding(shown, STATE_UNIT)
+
+
+def unit_instead(ratio: float, unit: str, near: float, units: Mapping[str, float] = _UNITS) -> str:
+    """Return the unit in which outputs that are `ratio` times g in a stated one are g within `near`; else nothing."""
+    others = (other for other in units if other != unit)
+    return next((other for other in others if abs(ratio * units[other] / to_si(1.0, unit) - 1) < near), "")
+
+
+def doubt_by_correction(recording: Recording, correct: Callable[[Recording], Recording]) -> str:
+    """Return why the unit of accelerometers is doubtful: corrected, most seconds would show gravity in another; or "".
+
+    So it is of a unit that rests, turns or is under way. A log at many g or in free fall, in its own unit, shows g in
+    another by chance only, but for a centrifuge's 10 g, which differ from 9.81 m/s^2 by as much as biases do: a log of
+    one direction gives a note. Its 100 g are too near to 1000 m/s^2 for mg to be told from m/s^2.
+    """
+    unit = recording.triad_unit("accel")
+    seconds = _means_of_seconds(recording)
+    if parse_unit(unit).quantity != "acceleration" or not len(seconds):
+        return ""
+    force = seconds.triad("accel")
+    shown = f"accel_x .. accel_z: |f| is {median(np.linalg.norm(force, axis=1)):.4g} {unit}"
+    for other in (other for other in _UNITS if other != unit and (unit, other) != ("m/s^2", "mg")):
+        scaled = force * _UNITS[other] / to_si(1.0, unit)
+        known = correct(seconds.with_columns(dict(zip(triad("accel"), scaled.T, strict=True)), {})).triad("accel")
+        size = np.linalg.norm(known, axis=1)
+        if not median(np.abs(size / STANDARD_GRAVITY - 1)) < _NEAR_GRAVITY:
+            continue
+        if (unit, other) == ("g", "m/s^2") and _widest_angle(known / size[:, None]) < _ONE_DIRECTION:
+            return Note(f"{shown}; if the unit is at rest, theirs is {other}, not {unit}: --unit accel={other}")
+        return (
+            f"{shown}, which is no gravity, as {other} would be; is their unit, {unit}, right? "
+            f"--unit accel={other} states another"
+        )
+    return ""
+
+
+def _widest_angle(directions: Array) -> float:
+    """Return the angle that one in ten directions, shape (n, 3), are farther off their mean, deg."""
+    mean = directions.mean(axis=0)
+    cosine = directions @ mean / max(float(np.linalg.norm(mean)), 1e-9)
+    return float(np.degrees(np.arccos(np.clip(np.percentile(cosine, 10), -1, 1))))
+
+
+def _means_of_seconds(recording: Recording) -> Recording:
+    """Return the means of accelerometers and temperatures over each second, without rows that are no numbers."""
+    kept = [name for name in recording.columns if kind_of(name) == "accel" or name.startswith("temperature")]
+    rows = np.column_stack([recording.column(name)[:_MOST_SAMPLES] for name in kept])
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    time = recording.time
+    step = 0.0 if time is None or len(time) < _FEWEST_TIMES else median(np.diff(time))
+    size = max(1, min(round(1 / step), len(rows))) if step > 0 else 1
+    means = rows[: len(rows) // size * size].reshape(-1, size, len(kept)).mean(axis=1)
+    columns = dict(zip(kept, means.T, strict=True))
+    return replace(recording, columns=columns, units={name: recording.units[name] for name in kept})
