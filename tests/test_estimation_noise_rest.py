@@ -172,7 +172,7 @@ def test_functions_and_check_read_a_large_file_in_blocks(tmp_path, monkeypatch, 
     found = il.check_noise(large, later)
     for name, column in small.columns.items():
         assert found.columns[name].probability == pytest.approx(column.probability, rel=0.05, abs=0.01)
-    assert any("made from this log" in note for note in il.check_noise(large, file).notes)
+    assert any("made from this recording" in note for note in il.check_noise(large, file).notes)
     large.save(tmp_path / "record.json")
     monkeypatch.setattr(GivenFiles, "recording", None)
     assert main(["noise", "check", str(tmp_path / "record.json"), str(later), "--json"]) == 0

@@ -149,6 +149,19 @@ def test_the_command_says_pass_and_fail(tmp_path, monkeypatch, capsys):
     assert json.loads(capsys.readouterr().out)["hard_iron_change"]["value"][0] == pytest.approx(4e-6, abs=1e-7)
 
 
+def test_the_records_own_recording_is_warned_of(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name, seed in (("a.csv", 1), ("b.csv", 2)):
+        il.write_csv(recorded(waved(seed)[1]), name)
+    assert main(["magnetometer", "fit", "a.csv", "-o", "r.json"]) == 0
+    warnings = []
+    for name in ("a.csv", "b.csv"):
+        capsys.readouterr()
+        main(["magnetometer", "check", "r.json", name])
+        warnings.append("warning: a.csv: the record was made from this recording, which" in capsys.readouterr().err)
+    assert warnings == [True, False]
+
+
 def test_units_of_a_line_are_fitted_by_a_fleet(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for k in (1, 2):

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imulab._version import VERSION
 from imulab.arguments import check, checked, described, types_of, unknown_options
-from imulab.display import Bad, Note, Shown, Verdict, aligned, verdict_of
+from imulab.display import Bad, Finding, Note, Shown, Verdict, aligned, verdict_of
 from imulab.errors import DataError, OptionError
 from imulab.estimation.sampling import mend_stamps
 from imulab.files import open_file, write_page
@@ -530,3 +530,16 @@ class RecordCheck(Drawn):
                 ("software", f"imulab {VERSION}"),
             ],
         )
+
+
+def warn_made_from(record: Calibration, recordings: Iterable[Recording]) -> list[str]:
+    """Return a warning for each recording from which a record that is tested was made."""
+    sources = {source.sha256 for source in record.sources}
+    return [
+        Finding(
+            f"{each.name}: the record was made from this recording, which says nothing of whether it still holds",
+            "check with a fresh recording",
+        )
+        for each in recordings
+        if each.source is not None and each.source.sha256 in sources
+    ]

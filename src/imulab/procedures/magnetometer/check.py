@@ -39,7 +39,7 @@ from imulab.procedures.magnetometer.device import output_unit, surface_of
 from imulab.procedures.magnetometer.model import read_readings
 from imulab.procedures.magnetometer.schema import FieldSummary, fit_of, model_of
 from imulab.procedures.magnetometer.solve import evaluate, find_inflation, mark_far, unpack
-from imulab.procedures.result import RecordCheck, as_record, as_recording
+from imulab.procedures.result import RecordCheck, as_record, as_recording, warn_made_from
 from imulab.recording import Array, Data, Reading
 from imulab.records.calibration import Calibration
 from imulab.report.traces import Exhibits, Figure, figure_axis, marker, rounded, scatter
@@ -228,7 +228,7 @@ def check_magnetometer(
     after, _, moved, u = _explain(theta, output[used], covariance, fit, hard=True)
     moved, u = np.where(u < _TOLD * _field(theta, d), [moved, u], np.nan)
     magnitude = evaluate(theta, output)[0]
-    notes = list(readings.notes)
+    notes = [*readings.notes, *warn_made_from(held, [recording])]
     if not used.all():
         where = ", ".join(readings.stretches(~used)[:3])
         notes.append(Note(f"{int((~used).sum())} of {len(used)} readings set aside ({where}): was steel near?"))

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, TypeAlias, Unpack
 
 import numpy as np
 
-from imulab.display import Finding, Note
+from imulab.display import Note
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.decisions import NOISE_CHECK
 from imulab.estimation.distributions import probability_fact, probability_text
@@ -27,7 +27,7 @@ from imulab.estimation.rows import NORMAL_95
 from imulab.options import text
 from imulab.procedures.noise.fit import fit_recordings, given_log
 from imulab.procedures.noise.schema import Column, NoiseSummary, drawn_of, fit_of, label
-from imulab.procedures.result import RecordCheck, as_record
+from imulab.procedures.result import RecordCheck, as_record, warn_made_from
 from imulab.quantities import fraction
 from imulab.recording import Array, Data, Reading, Recording
 from imulab.records.calibration import Calibration
@@ -394,13 +394,7 @@ def _shared_columns(
                 )
         if other := different_units((recording.name, recording.metadata), ("the record", record.sensor)):
             notes.append(other)
-        if recording.source is not None and recording.source.sha256 in [each.sha256 for each in record.sources]:
-            notes.append(
-                Finding(
-                    f"{recording.name}: the record was made from this log, which says nothing of a change",
-                    "check with a fresh log",
-                )
-            )
+        notes += warn_made_from(record, [recording])
     if missing := [name for name in fit.columns if name not in names]:
         notes.append(Note(f"not in the log, and not checked: {' '.join(missing)}"))
     return names, notes

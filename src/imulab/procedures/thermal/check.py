@@ -35,8 +35,9 @@ from imulab.procedures.result import (
     as_record,
     as_recording,
     columns_as_rows,
+    warn_made_from,
 )
-from imulab.procedures.thermal.check_gyro import GyroCheck, check_gyros, gyro_figure, select_in_range, warn_known
+from imulab.procedures.thermal.check_gyro import GyroCheck, check_gyros, gyro_figure, select_in_range
 from imulab.procedures.thermal.check_ramp import RampCheck, check_ramp
 from imulab.procedures.thermal.degrees import within_and_between
 from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepare_recordings
@@ -350,7 +351,7 @@ def check_thermal(
         )
     gyro, gyro_notes = check_gyros(held, holds, force, gyro_turn_on_scatter, earth)
     notes += gyro_notes
-    notes += [*([local.note] if local.note else []), *warn_known(held, recordings)]
+    notes += [*([local.note] if local.note else []), *warn_made_from(held, recordings)]
     return ThermalCheck(holds, *tested, local, largest, tuple(notes), gyro)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +21,7 @@ from imulab.procedures.thermal.record import names_and_units, predict_gyro_scale
 from imulab.procedures.thermal.schema import gyros_of, is_ramp
 from imulab.procedures.thermal.solve import row_covariance
 from imulab.quantities import in_si
-from imulab.recording import Array, Recording
+from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.traces import Figure, figure_axis, points
 from imulab.units import from_si, parse_unit, to_si
@@ -206,16 +205,3 @@ def select_in_range(record: Calibration, holds: Holds) -> tuple[Holds, list[str]
         "record holds within the range of the record",
     )
     return replace(holds, **chosen), [note]
-
-
-def warn_known(record: Calibration, recordings: Sequence[Recording]) -> list[str]:
-    """Return a warning for each recording from which the record was made."""
-    sources = {source.sha256 for source in record.sources}
-    return [
-        Finding(
-            f"{each.name}: the record was made from this recording, which says nothing of whether it still holds",
-            "check with a fresh recording",
-        )
-        for each in recordings
-        if each.source is not None and each.source.sha256 in sources
-    ]

@@ -11,8 +11,8 @@ import numpy as np
 from imulab.errors import DataError
 from imulab.estimation.decisions import THERMAL_CHECK
 from imulab.estimation.distributions import probability_fact, probability_text
-from imulab.procedures.result import RecordCheck, columns_as_rows
-from imulab.procedures.thermal.check_gyro import GyroCheck, check_gyros, gyro_figure, select_in_range, warn_known
+from imulab.procedures.result import RecordCheck, columns_as_rows, warn_made_from
+from imulab.procedures.thermal.check_gyro import GyroCheck, check_gyros, gyro_figure, select_in_range
 from imulab.procedures.thermal.holds import Holds, prepare_recordings
 from imulab.procedures.thermal.model import AXES
 from imulab.procedures.thermal.ramp import find_parts
@@ -128,4 +128,4 @@ def check_ramp(
     gyro, more = check_gyros(record, holds, np.tile([0.0, 0.0, 1.0], (len(holds), 1)), turn_on_scatter)
     if gyro is None:
         raise DataError(f"{recordings[0].name}: {'; '.join(map(str, more))}")
-    return RampCheck(holds, gyro, (*gaps, *notes, *more, *warn_known(record, prepared)))
+    return RampCheck(holds, gyro, (*gaps, *notes, *more, *warn_made_from(record, prepared)))
