@@ -599,7 +599,7 @@ def test_two_records_of_one_unit_are_compared_by_what_belongs_to_the_unit(tmp_pa
     for name, fit in (("a.json", one), ("b.json", other)):
         fit.save(tmp_path / name)
     assert main(["show", str(tmp_path / "a.json"), str(tmp_path / "b.json")]) == 0
-    assert "not compared (in one record alone, or of another meaning there): dip" in capsys.readouterr().out
+    assert "not compared (in one record alone, of the place, or of another meaning): dip" in capsys.readouterr().out
 
 
 def test_the_report_shows_heading_over_the_attitudes_and_names_the_disturbed():

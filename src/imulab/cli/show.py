@@ -232,7 +232,7 @@ def describe_changes(first: str, second: str, comparison: RecordComparison, reco
     if comparison.left_out:
         lines += [
             "",
-            f"not compared (in one record alone, or of another meaning there): {' '.join(comparison.left_out)}",
+            f"not compared (in one record alone, of the place, or of another meaning): {' '.join(comparison.left_out)}",
         ]
     if "table" in record.sections:
         lines += ["", "the tables themselves are not compared"]
