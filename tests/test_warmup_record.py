@@ -337,8 +337,9 @@ def test_the_worst_temperature_is_what_the_gap_makes_of_a_bent_law() -> None:
     rng = np.random.default_rng(3)
     recordings = [
         il.Recording(
-            {"time": time, "gyro_x": size * t**2 * np.exp(-time / 40.0) + 1e-3 * rng.standard_normal(len(time))},
-            {"time": "s", "gyro_x": "deg/h"}, {"power_on_temperature": f"{t:g}"}, name=f"{t:g} {k}",
+            {"time": time, "gyro_x": size * t**2 * np.exp(-time / 40.0) + 1e-3 * rng.standard_normal(len(time)),
+             "gyro_y": 1e-3 * rng.standard_normal(len(time))},
+            {"time": "s", "gyro_x": "deg/h", "gyro_y": "deg/h"}, {"power_on_temperature": f"{t:g}"}, name=f"{t:g} {k}",
         )
         for t in at for k in range(2)
     ]  # fmt: skip
@@ -353,7 +354,12 @@ def test_the_worst_temperature_is_what_the_gap_makes_of_a_bent_law() -> None:
     misfit = record.fit["curve_misfit"]["rms"]["gyro_x"]
     assert misfit["unit"] == "rad/s"
     assert misfit["value"][0] / HOUR > 0.01  # a cubic is no exponential, most of all at first
-    assert exhibits_of(record).facts[2][0] == "at worst, near 15 °C"
+    worst = record.value("worst_temperature_error_gyro_x") / HOUR
+    (note,) = [each for each in record.warnings if "at the worst power-on temperature" in each]
+    assert f"near 15 degC, expect {worst:.3g} deg/h (gyro_x) rms in the worst axis" in note
+    label, shown = exhibits_of(record).facts[2]
+    assert label == "at worst, near 15 °C"
+    assert float(shown.removesuffix(" deg/h, rms of axes")) == pytest.approx(worst / np.sqrt(2), rel=0.06)
 
 
 @pytest.mark.parametrize("kind", ["whole seconds", "twice"])

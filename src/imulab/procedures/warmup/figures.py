@@ -343,7 +343,7 @@ def _worst(
     names = [f"worst_temperature_error_{table.axes[i]}" for i in index]
     if at is None or not all(name in record.parameters for name in names):
         return []
-    error = rms_text([record.value(name) for name in names], list(range(len(names))), factor, f" {label}")
+    error = rms_text([record.value(name) for name in names], list(range(len(names))), factor, f" {label}, rms of axes")
     return [(f"at worst, near {at.value:.3g} °C", error)]
 
 

@@ -404,14 +404,12 @@ def expectations(curves: Curves, chosen: Judged, worst: Worst | None) -> list[st
     messages: list[str] = []
     stated = chosen.left_temperature
     if worst is not None and stated is not None and (worst.error > _MORE * stated + _ROUNDING).any():
-        sizes = [
-            f"{small_text(max(worst.error[i] for i in index), curves.units[index[0]])} ({kind})"
-            for kind, index in curves.kinds().items()
-        ]
+        axes = [max(index, key=lambda i: worst.error[i]) for index in curves.kinds().values()]
+        sizes = [f"{small_text(worst.error[i], curves.units[i])} ({curves.axes[i]})" for i in axes]
         messages.append(
             Note(
                 f"at the worst power-on temperature, near {worst.temperature:.3g} degC, expect {' and '.join(sizes)} "
-                "rms, more than the temperatures left out of the fit show: measure there"
+                "rms in the worst axis, more than the temperatures left out of the fit show: measure there"
             )
         )
     return messages
