@@ -13,6 +13,7 @@ from imulab.cli import main
 from imulab.display import Note
 from imulab.procedures.rate.schema import RateTest, Run, load_test, manifest_text
 from imulab.procedures.rate.simulate import RateRecordings
+from imulab.procedures.views import parameter_rows
 from reference import rate as reference
 
 DEGREE = reference.DEGREE
@@ -226,6 +227,14 @@ def test_outputs_in_counts_need_no_nominal():
     record = il.fit_rate(one, rates=np.array(WAY) * DEGREE).calibration
     assert record.value("gyro_scale_factor_z") == pytest.approx(factor * SCALE[2], rel=1e-9)
     assert record.parameters["gyro_scale_factor_z"].unit == "count/(rad/s)"
+    rows = [row for row in parameter_rows(record) if row.name == "gyro_zero_output_z"]
+    b, s = record.parameters["gyro_bias_z"], record.parameters["gyro_scale_factor_z"]
+    assert [(row.value, row.unit) for row in rows] == [(pytest.approx(b.value * s.value, rel=1e-12), "count")]
+    jacobian = np.array([s.value, b.value])
+    variance = jacobian @ record.cov("gyro_bias_z", "gyro_scale_factor_z") @ jacobian
+    assert rows[0].standard_uncertainty == pytest.approx(np.sqrt(variance))
+    known = il.fit_rate(recording("+z", column=False), rates=np.array(WAY) * DEGREE).calibration
+    assert not any("zero_output" in row.name for row in parameter_rows(known))
 
 
 def test_an_angle_of_the_table_serves_as_its_rate():

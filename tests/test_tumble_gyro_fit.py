@@ -14,7 +14,7 @@ from imulab.errors import DataError, OptionError, SegmentError
 from imulab.gravity import EarthRate
 from imulab.procedures.tumble.gyro.fit import PAIRS, fit_gyro_triad, gyro_names, with_gyro
 from imulab.procedures.tumble.gyro.rotation import frame_rotations, weighted_turns
-from imulab.procedures.views import exhibits_of
+from imulab.procedures.views import exhibits_of, parameter_rows
 from reference import tumble as reference
 
 G = 9.80665
@@ -157,6 +157,24 @@ def test_counts_need_no_nominal_scale_factor(case, scale):
     fit = fit_gyro_triad(record, attitudes, counts)
     expected = truth_of(recording)
     np.testing.assert_allclose(fit.scale_factor, np.radians(expected[:3]) * scale * 1e3, rtol=2e-3)
+
+
+def test_counts_show_what_the_gyroscopes_put_out_at_zero_rate(case):
+    """Beside the bias, as for accelerometers."""
+    recording, _, record = case
+    outputs = {f"gyro_{a}": 100 * recording.columns[f"gyro_{a}"] for a in "xyz"}
+    both = il.fit_gyro(record, recording.with_columns(outputs, dict.fromkeys(outputs, "count"))).calibration
+    rows = {row.name: row for row in parameter_rows(both)}
+    names = list(rows)
+    assert names[names.index("gyro_bias_z") + 1 :][:3] == [f"gyro_zero_output_{a}" for a in "xyz"]
+    for axis in "xyz":
+        b, s = both.value(f"gyro_bias_{axis}"), both.value(f"gyro_scale_factor_{axis}")
+        row = rows[f"gyro_zero_output_{axis}"]
+        assert (row.value, row.unit) == (pytest.approx(b * s, rel=1e-12), "count")
+        assert row.standard_uncertainty == pytest.approx(
+            s * both.parameters[f"gyro_bias_{axis}"].standard_uncertainty, rel=0.1
+        )
+    assert "zero_output" not in " ".join(row.name for row in parameter_rows(il.fit_gyro(record, recording).calibration))
 
 
 def test_sensitivity_to_acceleration_is_found_from_rest(case):

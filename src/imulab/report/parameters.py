@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from functools import cache
 from typing import overload
 
+import numpy as np
 from msgspec import Struct
 
 from imulab.recording import Array
@@ -197,6 +198,27 @@ def rows_of(record: Calibration) -> list[Row]:
             )
         )
     return rows
+
+
+def with_zero_outputs(record: Calibration, table: list[Row], prefix: str, output: str) -> list[Row]:
+    """Return the rows with what each axis puts out at zero input, ``S b``, after the biases: of counts and volts.
+
+    `prefix` is that of the parameters' names, such as ``gyro_``, `output` the unit of the outputs.
+    """
+    if parse_unit(output).quantity != "output":
+        return table
+    zeros, place = [], 0
+    for number, row in enumerate(table, start=1):
+        if not row.name.startswith(f"{prefix}bias_"):
+            continue
+        names, place = [row.name, row.name.replace("bias", "scale_factor")], number
+        b, s = (record.value(name) for name in names)
+        uncertainty = None
+        if set(names) <= set(record.covariance.names):
+            gradient = np.array([s, b])
+            uncertainty = float(np.sqrt(max(gradient @ record.covariance.block(names) @ gradient, 0.0)))
+        zeros.append(Row(row.name.replace("bias", "zero_output"), s * b, uncertainty, output))
+    return table[:place] + zeros + table[place:]
 
 
 def parameters_table(rows: Iterable[Row], caption: str, title: str = "Parameters") -> ReportTable:

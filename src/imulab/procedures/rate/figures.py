@@ -16,11 +16,12 @@ from imulab.procedures.rate.schema import (
     RateRecord,
     SweptRun,
     WholeTurns,
+    model_of,
     rate_of,
     turns_of,
 )
 from imulab.records.calibration import Calibration
-from imulab.report.parameters import parameters_table, reading_unit, rows_of, text_in
+from imulab.report.parameters import Row, parameters_table, reading_unit, rows_of, text_in, with_zero_outputs
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -64,7 +65,7 @@ def exhibits(record: Calibration) -> Exhibits:
     ]
     items: list[Figure | ReportTable] = [
         parameters_table(
-            rows_of(record),
+            rows(record),
             "Bias, scale factor and misalignment in the frame of the faces on which the unit was mounted; nonlinearity "
             "and hysteresis as parts of the largest rate.",
         ),
@@ -75,6 +76,11 @@ def exhibits(record: Calibration) -> Exhibits:
         _budget(record, rate_record),
     ]
     return Exhibits(headline, facts, items)
+
+
+def rows(record: Calibration) -> list[Row]:
+    """Return the parameters as they are read, with what counts and volts are at zero rate."""
+    return with_zero_outputs(record, rows_of(record), "gyro_", model_of(record).gyro_output_unit)
 
 
 def exhibit_gyroscopes(record: Calibration) -> Exhibits:
@@ -236,7 +242,7 @@ def _turns_exhibits(record: Calibration) -> Exhibits:
     )
     fence = f"{plain_number(from_si(fit.fence.value, 'deg'), 2)} deg"
     items: list[Figure | ReportTable] = [
-        parameters_table(rows_of(record), "Per clock where no uncertainty of it was stated."),
+        parameters_table(rows(record), "Per clock where no uncertainty of it was stated."),
         *([] if fit.prior is None else [_prior_table(fit.prior, record)]),
         _turns_table(turns),
     ]

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from imulab.procedures.rate.fit import RateFit
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
+    from imulab.report.parameters import Row
     from imulab.report.traces import Exhibits
 
 
@@ -97,6 +98,11 @@ class RateProcedure(Procedure):
         from imulab.procedures.rate.figures import exhibit_gyroscopes
 
         return exhibit_gyroscopes(record)
+
+    def rows(self, record: Calibration) -> Sequence[Row]:
+        from imulab.procedures.rate.figures import rows
+
+        return rows(record)
 
     def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
         from imulab.procedures.rate.device import tables_of

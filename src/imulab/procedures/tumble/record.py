@@ -55,13 +55,14 @@ from imulab.procedures.tumble.schema import (
     TumbleSummary,
     data_of,
     fit_of,
+    gyro_model_of,
     model_of,
 )
 from imulab.procedures.tumble.solve import CLOSEST, TumbleProblem, TumbleSolution, data_freedom, forces, near_vertical
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, StatedGravity, entries
-from imulab.report.parameters import Row, reading_unit, rows_of, small_g
+from imulab.report.parameters import Row, reading_unit, rows_of, small_g, with_zero_outputs
 from imulab.report.traces import plain_number
 from imulab.units import parse_unit
 
@@ -458,20 +459,6 @@ def _blend(stated: StatedUncertainty | None) -> OrderBlend | None:
     )
 
 
-def zero_outputs(record: Calibration) -> dict[str, Parameter]:
-    """Return what each axis puts out at zero specific force, S b, with its uncertainty, in the output's unit."""
-    outputs = {}
-    for axis in AXES:
-        b, s = record.parameter(f"bias_{axis}"), record.parameter(f"scale_factor_{axis}")
-        uncertainty = None
-        if record.covariance.names:
-            block = record.covariance.block([f"bias_{axis}", f"scale_factor_{axis}"])
-            gradient = np.array([s.value, b.value])
-            uncertainty = float(np.sqrt(max(gradient @ block @ gradient, 0.0)))
-        outputs[axis] = Parameter(s.value * b.value, uncertainty, model_of(record).output_unit)
-    return outputs
-
-
 def _propagated(trials: MonteCarlo, scaling: Scaling, gravity: Gravity, order: int) -> Trials:
     """Return mean, standard deviation and 95 % interval of every parameter over the trials, in SI."""
     drawn = np.random.default_rng(2).standard_normal((len(trials.theta), 1))
@@ -778,11 +765,8 @@ def predicted_rows(uncertainties: dict[str, float]) -> list[tuple[str, str, str]
 
 
 def rows(record: Calibration) -> list[Row]:
-    """Return the parameters as they are read, the outputs at zero specific force included for counts and volts."""
-    output = model_of(record).output_unit
-    table = rows_of(record)
-    if parse_unit(output).quantity == "acceleration":
+    """Return the parameters as they are read, with what counts and volts are at zero specific force and rate."""
+    table = with_zero_outputs(record, rows_of(record), "", model_of(record).output_unit)
+    if "gyro_bias_x" not in record.parameters:
         return table
-    zeros = [Row(f"zero_output_{a}", z.value, z.standard_uncertainty, output) for a, z in zero_outputs(record).items()]
-    after = next((number for number, row in enumerate(table, start=1) if row.name == "bias_z"), len(table))
-    return table[:after] + zeros + table[after:]
+    return with_zero_outputs(record, table, "gyro_", gyro_model_of(record).gyro_output_unit)
