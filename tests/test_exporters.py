@@ -123,8 +123,8 @@ def test_autopilots_correct_as_apply_does(tmp_path, target, unit):
 def test_a_file_that_px4_would_ignore_is_said(folder, capsys, device, warned):
     record(9, misalignment=0.0).save("one.json")
     assert main(["export", "--to", "px4", "one.json", "-o", "out", *device]) == 0
-    line = "px4: no device number is given (--device-id), and 0 is written: PX4 ignores the calibration until it is the"
-    assert (f"imulab: warning: {line} sensor's\n" in capsys.readouterr().err) == warned
+    line = "px4: CAL_ACC0_ID is 0: PX4 ignores this calibration until it is the sensor's number (--device-id)"
+    assert (f"imulab: warning: {line}\n" in capsys.readouterr().err) == warned
 
 
 @pytest.mark.parametrize("gyro", ["rad/s", "deg/s", None])
@@ -437,7 +437,10 @@ def folder(tmp_path, monkeypatch):
         ("missing.json -o out", "missing.json: no such file"),
         ("cut.json -o out", "cut.json: not a calibration record"),
         ("file -o out", "file: not a calibration record"),
-        ("accel.json again.json -o out", "two records give a tumble table; a unit has one: give one of them"),
+        (
+            "accel.json again.json -o out",
+            "both take off bias and scale factor of accel_x accel_y accel_z: expected one",
+        ),
         ("accel.json other.json -o out", "imulab: records of different units: SN42 SN7; expected those of one"),
         ("accel.json -o file", "expected a folder to write to, found a file"),
         ("accel.json -o file/out", "the folder cannot be made"),

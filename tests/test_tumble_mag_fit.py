@@ -431,6 +431,26 @@ def test_autopilots_correct_the_field_as_apply_does(target, file, corrects, per_
     np.testing.assert_allclose(np.linalg.norm(inside, axis=1), np.linalg.norm(expected, axis=1), rtol=1e-5)
 
 
+def test_px4_knows_magnetometers_by_a_number_of_their_own(tmp_path):
+    rng = np.random.default_rng(7)
+    truth = reference.random_unit(rng, NORTH, reference.random_rotation(rng), size=48.0)
+    outputs, mag = reference.simulate(truth, attitudes(rng), rng, accel=5e-4, field=3e-3, dip=SWAY)
+    record = il.fit_mag(table(outputs, mag, unit="uT"), gravity=G, order=1, field="48 uT").calibration
+
+    def numbers(**ids):
+        told = []
+        (file,) = il.export("px4", record, tmp_path, lossy=True, tell=told.append, **ids)
+        values = parameters_of(file)
+        return values["CAL_ACC0_ID"], values["CAL_MAG0_ID"], [each for each in told if "_ID is 0" in each]
+
+    assert numbers(device_id=77, mag_device_id=88) == (77, 88, [])
+    accel, magnetometer, told = numbers(device_id=77)
+    assert (accel, magnetometer) == (77, 0)
+    assert told == [
+        "px4: CAL_MAG0_ID is 0: PX4 ignores this calibration until it is the sensor's number (--mag-device-id)"
+    ]
+
+
 def verdict_or_refusal(recording):
     """The warnings of a bad record, or why there is none."""
     try:

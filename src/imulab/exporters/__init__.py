@@ -45,7 +45,9 @@ class ExportOptions:
     lossy
         Whether parameters that the target cannot hold may be left out; what it can hold is then fitted anew.
     device_id
-        PX4's number of the sensor; 0 where it is not known.
+        PX4's number of the accelerometers and gyroscopes; 0 where it is not known.
+    mag_device_id
+        PX4's number of the magnetometers; 0 where it is not known.
     noise
         What ``allan --json`` found, for targets with noise keys.
     noise_file
@@ -65,6 +67,7 @@ class ExportOptions:
     fusions: Sequence[Fusion | None] = ()
     mag_mount: str = "external"
     tell: Callable[[str], object] = _nothing
+    mag_device_id: int = 0
 
 
 def export(

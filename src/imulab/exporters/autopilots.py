@@ -18,7 +18,7 @@ October 2015, pull request 3029: Copter 3.4, Plane 3.5); over temperature AP_Ine
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -274,15 +274,14 @@ def export_px4(records: Sequence[Calibration], folder: Path, options: ExportOpti
     OptionError
         PX4 cannot hold the record.
     """
-    if options.device_id > _LARGEST_ID:
-        raise OptionError(f"px4: device id {options.device_id}; expected at most {_LARGEST_ID}")
+    if (largest := max(options.device_id, options.mag_device_id)) > _LARGEST_ID:
+        raise OptionError(f"px4: device id {largest}; expected at most {_LARGEST_ID}")
     alone = magnetometers_alone(records, "px4")
     if alone is not None:
+        options = replace(options, mag_device_id=options.mag_device_id or options.device_id)
         held_mag, lost = symmetric(alone[1], "px4", options, turned=True)
         rows = px4_rows(held_mag, options, turned=False)
-        return _write_px4(
-            folder, origin_of(alone[0]), rows, [_PX4_MAG, ROTATION_NOT_TOLD, *lost], options, "CAL_MAG0_ID"
-        )
+        return _write_px4(folder, origin_of(alone[0]), rows, [_PX4_MAG, ROTATION_NOT_TOLD, *lost], options)
     law = offset_law(records, "px4", options)
     if law is not None:
         return _write_px4(
@@ -295,7 +294,6 @@ def export_px4(records: Sequence[Calibration], folder: Path, options: ExportOpti
                 *law.lost,
             ],
             options,
-            "CAL_GYRO0_ID" if law.offset is None else "CAL_ACC0_ID",
         )
     held = corrections(records, "px4", options, _check_px4)
     device = str(options.device_id)
@@ -347,22 +345,24 @@ def _write_px4(
     values: Sequence[tuple[str, float | str]],
     remarks: Sequence[str],
     options: ExportOptions,
-    key: str = "CAL_ACC0_ID",
 ) -> list[Path]:
-    """Write rows of name and value, texts as whole numbers, after comments on what they are.
-
-    `key` is the parameter by which PX4 knows the sensor.
-    """
+    """Write rows of name and value, texts as whole numbers, after comments on what they are."""
     rows = [
         (name, value, _INT32) if isinstance(value, str) else (name, single_precision(value), _FLOAT)
         for name, value in values
     ]
-    unknown = f"device id 0: not known; PX4 ignores the calibration until {key} is that of the sensor (--device-id)"
+    unknown = [name for name, value in values if name.startswith("CAL_") and name.endswith("_ID") and value == "0"]
+    for name in unknown:
+        option = "--mag-device-id" if name == "CAL_MAG0_ID" else "--device-id"
+        options.tell(f"px4: {name} is 0: PX4 ignores this calibration until it is the sensor's number ({option})")
     comments = [
         "PX4 parameters, " + origin[0],
         origin[1],
         "no axes are turned: the record's axes are taken as the sensor's; PX4's body frame is FRD (-g on z at rest)",
-        *([unknown] if options.device_id == 0 else []),
+        *(
+            f"device id 0: not known; PX4 ignores the calibration until {name} is that of the sensor"
+            for name in unknown
+        ),
         *remarks,
         "",
         "Vehicle-Id Component-Id Name Value Type",

@@ -186,7 +186,7 @@ def px4_rows(mag: FieldCorrection, options: ExportOptions, *, turned: bool = Tru
         if not 0.1 <= value <= 3:
             raise OptionError(f"px4: magnetometer scale of axis {axis} is {value:.4g}; PX4 takes 0.1 to 3")
     offset = mag.in_unit("gauss")
-    rows: list[tuple[str, float | str]] = [("CAL_MAG0_ID", str(options.device_id))]
+    rows: list[tuple[str, float | str]] = [("CAL_MAG0_ID", str(options.mag_device_id))]
     rows += [(f"CAL_MAG0_{a}OFF", float(offset[i])) for i, a in enumerate("XYZ")]
     rows += [(f"CAL_MAG0_{a}SCALE", float(matrix[i, i])) for i, a in enumerate("XYZ")]
     pairs = (("X", 0, 1), ("Y", 0, 2), ("Z", 1, 2))

@@ -62,7 +62,7 @@ def tables_of_all(records: Sequence[Calibration], fusions: Sequence[Fusion | Non
     """
     serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
     if len(serials) > 1:
-        raise RecordError(f"found records of different units: {' '.join(serials)}; expected those of one")
+        raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
     given = [
         (record, table)
         for record, fusion in zip(records, fusions or [None] * len(records), strict=True)

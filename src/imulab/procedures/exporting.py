@@ -39,6 +39,7 @@ def export(
     *,
     lossy: bool = False,
     device_id: int | str = 0,
+    mag_device_id: int | str = 0,
     noise: Annotated[str | PathLike[str] | Mapping[str, Any] | Calibration | None, file()] = None,
     method: Annotated[str | None, text("METHOD", METHODS)] = None,
     memory: Annotated[str | float | None, text("growing|growing:N|GAIN", ("growing",))] = None,
@@ -62,6 +63,8 @@ def export(
         Leave out what the target cannot hold, and fit the rest anew.
     device_id
         PX4: number of the sensor, without which PX4 ignores the file.
+    mag_device_id
+        PX4: number of the magnetometers, which are another chip to it.
     noise
         Noise record, or what 'allan --json' printed. Or the file of either, for noise keys.
     method
@@ -103,9 +106,10 @@ def export(
         raise OptionError(f"to {to!r}: unknown target; known targets: {listed(EXPORTERS, to)}")
     if mag_mount not in MAG_MOUNTS:
         raise OptionError(f"mag_mount {mag_mount!r}: expected one of {listed(MAG_MOUNTS, str(mag_mount))}")
-    number = whole(device_id, "device_id")
-    if not 0 <= number < _DEVICE_IDS:
-        raise OptionError(f"device_id {number}: expected a number from 0 to {_DEVICE_IDS - 1}")
+    number, mag_number = whole(device_id, "device_id"), whole(mag_device_id, "mag_device_id")
+    for name, each in (("device_id", number), ("mag_device_id", mag_number)):
+        if not 0 <= each < _DEVICE_IDS:
+            raise OptionError(f"{name} {each}: expected a number from 0 to {_DEVICE_IDS - 1}")
     if Path(folder).exists() and not Path(folder).is_dir():
         raise OptionError(f"{os.fspath(folder)}: expected a folder to write to, found a file")
     listed_records = list(records) if isinstance(records, Sequence) and not isinstance(records, str) else [records]
@@ -132,14 +136,8 @@ def export(
     noise_keys: Mapping[str, Any] = _state_noise(noise, file) if isinstance(noise, Calibration) else {}
     if noise and not isinstance(noise, Calibration):
         noise_keys = noise if isinstance(noise, Mapping) else _read_noise(file)
-    options = ExportOptions(lossy, number, noise_keys, file if noise else "", fusions, mag_mount, tell)
-    files = exporters.export(to, loaded, Path(folder), options)
-    if to == "px4" and number == 0:
-        tell(
-            "px4: no device number is given (--device-id), and 0 is written: PX4 ignores the calibration until it is "
-            "the sensor's"
-        )
-    return files
+    options = ExportOptions(lossy, number, noise_keys, file if noise else "", fusions, mag_mount, tell, mag_number)
+    return exporters.export(to, loaded, Path(folder), options)
 
 
 def _choose_fusions(to: str, stated: Mapping[str, Any], records: Sequence[Calibration]) -> list[Fusion | None]:
