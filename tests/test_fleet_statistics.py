@@ -96,6 +96,13 @@ def test_nobody_is_said_to_stand_out_or_not_where_there_are_too_few_units(count,
     assert table.rows[0][table.columns.index("stand out")] == ("0" if count == 8 else "–")
 
 
+@pytest.mark.parametrize(("count", "step"), [(8, 1), (16, 2)])
+def test_units_are_counted_in_whole_numbers(count, step):
+    items = line_statistics([summary(str(i), float(i % 2)) for i in range(count)], {})
+    exhibits = fleet_exhibits(FleetState("d", FleetManifest("m.csv", ".", ()), ()), items, [])
+    assert exhibits.figures[0].layout["yaxis"]["dtick"] == step
+
+
 def test_one_unit_is_shown_to_its_uncertainty_and_has_no_spread():
     table = summary_table("Tumble", line_statistics([summary("A", 9.80665e-3 * 1.23456, u=9.80665e-6)], {}))
     row = dict(zip(table.columns, table.rows[0], strict=True))

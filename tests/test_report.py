@@ -13,7 +13,7 @@ from conftest import table
 from imulab.errors import RecordError
 from imulab.procedures.views import exhibits_of
 from imulab.report import render_page
-from imulab.report.traces import Exhibits, Figure, ReportTable, format_uncertain, narrow
+from imulab.report.traces import Exhibits, Figure, ReportTable, correlation_map, format_uncertain, narrow
 from reference import tumble as reference
 
 G = 9.80665
@@ -235,6 +235,36 @@ def test_a_table_wider_than_its_card_says_that_it_scrolls(record, chromium, tmp_
 
 
 @pytest.mark.slow
+def test_tiles_break_no_word_and_units_stay_in_view(browser, tmp_path):
+    facts = [(f"walk {n}", "272.5 deg/h/sqrt(h)") for n in range(4)]
+    facts += [("not told", "scale factors, misalignments, sensitivities; accelerometers")]
+    columns = ["parameter", "value", "standard uncertainty", "95 % interval", "unit"]
+    wide = ReportTable("Wide", "", columns, [["mag_misalignment_xy", "-92.168", "0.095", "-92.354 to -91.982", "mrad"]])
+    (tmp_path / "r.html").write_text(render_page("T", "S", Exhibits("", facts, [wide])), encoding="utf-8")
+    for width in (390, 768, 1280):
+        page = browser.new_page(viewport={"width": width, "height": 900})
+        page.goto((tmp_path / "r.html").as_uri())
+        lines = page.evaluate(
+            """() => [...document.querySelectorAll('.facts dd')].flatMap(({ firstChild }) =>
+            [...firstChild.data.matchAll(/\\S+/g)].map(word => {
+              const range = document.createRange();
+              range.setStart(firstChild, word.index);
+              range.setEnd(firstChild, word.index + word[0].length);
+              return range.getClientRects().length;
+            }))"""
+        )
+        assert set(lines) == {1}
+        assert page.evaluate("document.querySelector('td.unit').getBoundingClientRect().right") < width
+        page.close()
+
+
+def test_a_map_of_many_parameters_keeps_the_width_of_a_phone_for_its_cells():
+    found = narrow(correlation_map("T", "", np.eye(37), [f"mag_misalignment_{n}" for n in range(37)], height=1092))
+    assert found["layout"]["coloraxis"]["colorbar"]["orientation"] == "h"
+    assert found["layout"]["yaxis"]["tickfont"]["size"] < 11
+    assert found["height"] < 800
+
+
 def test_a_print_hides_buttons_and_is_a4(record, chromium, tmp_path):
     il.write_report(record, tmp_path / "r.html")
     style = (tmp_path / "r.html").read_text()

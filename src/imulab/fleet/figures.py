@@ -44,6 +44,10 @@ _DAYS = 4.0
 """Dates that span at most so many days are shown with their time."""
 
 
+_FEW_UNITS = 10
+"""An axis up to so many units is numbered in steps of 1 or 2, where Plotly would take halves."""
+
+
 def staggered(marked: NDArray[np.bool_], top: int) -> list[float]:
     """Return heights for marks at the side of a histogram, one below the other from above the highest bar down."""
     order = np.cumsum(marked) - 1
@@ -371,6 +375,8 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
         layout["shapes"] += [grid.line(x, y, float(shown.of(item.median)), "#22303a", "dot", below_labels)]
         layout["shapes"] += [grid.line(x, y, end, BAD, "solid") for end in limits]
         layout[grid.axis_key(y)]["rangemode"] = "tozero"
+        if counts.max() <= _FEW_UNITS:
+            layout[grid.axis_key(y)]["dtick"] = 1 if counts.max() <= _FEW_UNITS / 2 else 2
     return Figure(
         title,
         lead + "Bars count units. Dotted: median. Red lines: limits. Red diamonds: units whose "

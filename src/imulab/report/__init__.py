@@ -66,7 +66,7 @@ def _column_kinds(table: ReportTable) -> list[str]:
     for number, title in enumerate(table.columns[1:], start=1):
         cells = [row[number] for row in table.rows if row[number] not in ("", "–")]
         if cells and not any(_NUMBER.match(cell) for cell in cells):
-            kinds[number] = "unit" if title == "unit" else "text"
+            kinds[number] = "unit" if title.split()[0] == "unit" else "text"
     return kinds
 
 

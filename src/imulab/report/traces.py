@@ -133,6 +133,7 @@ def format_uncertain(value: float, uncertainty: float | None, digits: int = 2) -
 _LEAST, _MOST = 150, 300  # height of a panel on a phone, pixels
 _GAP = 74  # pixels between panels, for ticks and titles
 _KEY_LINE = 21  # height of a line of the legend, pixels
+_ROW = 14  # height of a row of a map, pixels
 _MOST_NUMBERS = 8  # along an axis of a narrow panel
 
 
@@ -142,6 +143,8 @@ def narrow(figure: Figure) -> dict[str, Any] | None:
     keys = _legend_lines(figure)
     panels = [key[5:] for key in layout if key.startswith("xaxis") and "yaxis" + key[5:] in layout]
     if len({tuple(layout["xaxis" + panel].get("domain", (0, 1))) for panel in panels}) < 2:
+        if "coloraxis" in layout:
+            return _narrow_map(figure, layout)
         if not keys and layout == figure.layout:
             return None
         return {"layout": layout, "height": figure.height + keys * _KEY_LINE}
@@ -168,6 +171,16 @@ def narrow(figure: Figure) -> dict[str, Any] | None:
         "layout": {**layout, **changed, "annotations": notes, "legend": legend, "margin": margin},
         "height": round(plot + margin["t"] + margin["b"] + keys * _KEY_LINE),
     }
+
+
+def _narrow_map(figure: Figure, layout: dict[str, Any]) -> dict[str, Any]:
+    """Return layout and height of a map: small names, and the colours along its top, leave the width to its cells."""
+    small = {"tickfont": {"size": 9}}
+    bar = {"orientation": "h", "thickness": 10, "y": 1, "yanchor": "bottom", "ypad": 6, **small}
+    colours = {**layout["coloraxis"], "colorbar": bar}
+    axes = {"xaxis": {**layout["xaxis"], **small, "tickangle": -90}, "yaxis": {**layout["yaxis"], **small}}
+    height = min(figure.height, _ROW * len(figure.traces[0]["y"]) + 200)
+    return {"layout": {**layout, **axes, "coloraxis": colours, "margin": {"l": 10, "r": 6, "t": 46}}, "height": height}
 
 
 def _with_fewer_numbers(axis: Any) -> Any:
@@ -258,13 +271,23 @@ def rounded(values: Any, digits: int = 7) -> list[float | None]:
     return [float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in numbers.tolist()]
 
 
-def correlation_map(matrix: Array, names: Sequence[str], **more: Any) -> dict[str, Any]:
-    """Return a map of correlations from -1 to 1, shape (n, n)."""
-    return {
-        "type": "heatmap", "z": matrix.round(3).tolist(), "x": names, "y": names, "zmin": -1, "zmax": 1,
-        "colorscale": [[0, GOOD], [0.5, "#ffffff"], [1, BAD]], "xgap": 1, "ygap": 1, "colorbar": {"thickness": 12},
-        "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>", **more,
+def correlation_map(
+    title: str, caption: str, matrix: Array, names: Sequence[str], *, numbered: bool = False, **more: Any
+) -> Figure:
+    """Return the figure of correlations from -1 to 1, shape (n, n), with the numbers in it or on hovering alone."""
+    trace = {
+        "type": "heatmap", "z": matrix.round(3).tolist(), "x": names, "y": names, "coloraxis": "coloraxis",
+        "xgap": 1, "ygap": 1, "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>",
+        "texttemplate": "%{z:.2f}" if numbered else "",
     }  # fmt: skip
+    layout = {
+        "xaxis": {"tickangle": -45, "automargin": True},
+        "yaxis": {"autorange": "reversed", "automargin": True},
+        "coloraxis": {
+            "cmin": -1, "cmax": 1, "colorscale": [[0, GOOD], [0.5, "#ffffff"], [1, BAD]], "colorbar": {"thickness": 12}
+        },
+    }  # fmt: skip
+    return Figure(title, caption, [trace], layout, **more)
 
 
 def strongest_pair(matrix: Array, names: Sequence[str]) -> str:

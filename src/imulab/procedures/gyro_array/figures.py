@@ -414,14 +414,14 @@ def _correlation(record: ArrayRecord, a: int) -> Figure:
     shared = record.correlation
     names = [f"{record.model.axes[a]} {element.name}".strip() for element in record.elements]
     matrix = np.array(shared.matrix[a])
-    text = [[f"{value:.2f}" for value in row] for row in matrix]
     noise = float(np.median(shared.standard_uncertainty[a]))
-    return Figure(
+    return correlation_map(
         message=f"The pair that goes together most: {strongest_pair(matrix, names)}." if len(names) > 1 else "",
         title=f"Correlation of the noise{axis_suffix(record.model.axes[a])}",
         caption=f"At {shared.averaging_time.value:g} s, ± {noise:.2f} each. What all share, no weights remove; "
         "a pair that goes together counts for less than two.",
-        traces=[correlation_map(matrix, names, text=text, texttemplate="%{text}" if len(names) <= 12 else "")],
-        layout={"xaxis": {"automargin": True}, "yaxis": {"autorange": "reversed", "automargin": True}},
+        matrix=matrix,
+        names=names,
+        numbered=len(names) <= 12,
         height=max(360, 28 * len(names) + 120),
     )

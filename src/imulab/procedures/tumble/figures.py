@@ -608,16 +608,13 @@ def _correlation(record: Calibration) -> Figure:
     shown = together if together.any() else ~together  # those that go with no other would only take room
     correlation = correlation[np.ix_(shown, shown)]
     names = [name for name, is_shown in zip(record.covariance.names, shown.tolist(), strict=True) if is_shown]
-    return Figure(
+    return correlation_map(
         title="Correlation of the parameters",
         message=f"The pair that is told apart least: {strongest_pair(correlation, names)}." if len(names) > 1 else "",
         caption="From −1 to +1, with numbers on hovering. Near 1 or −1 off the diagonal: two parameters that the data "
         "hardly tell apart, or whose uncertainty has a source in common (a table, a clock): their difference, or sum, "
         "is known better than either.",
-        traces=[correlation_map(correlation, names)],
-        layout={
-            "xaxis": {"tickangle": -45, "automargin": True},
-            "yaxis": {"autorange": "reversed", "automargin": True},
-        },
+        matrix=correlation,
+        names=names,
         height=max(420, 26 * len(names) + 130),
     )
