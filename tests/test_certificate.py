@@ -90,7 +90,7 @@ OTHERS = ("nine_axes", "thermal", "thermal_gyro", "rate", "turns", "warmup", "ce
 
 
 @pytest.mark.parametrize("name", [*OTHERS, "magnetometer"])
-def test_certificates_of_other_procedures_are_valid(issue, schemas, name):
+def test_certificates_of_other_procedures_are_valid_and_shown(issue, schemas, capsys, name):
     if name == "magnetometer":
         record = il.fit_magnetometer(il.simulate_magnetometer()).calibration
     else:
@@ -98,7 +98,18 @@ def test_certificates_of_other_procedures_are_valid(issue, schemas, name):
     replace(record, sensor={**record.sensor, "serial": "SN-1"}).save("unit.json")
     assert issue(REVIEWED, "unit.json") == 0
     assert schemas("cert.xml") == []
-    assert len(_single("cert.xml")) == len([p for p in record.parameters.values() if p.standard_uncertainty])
+    stated = {name: p for name, p in record.parameters.items() if p.standard_uncertainty}
+    assert len(_single("cert.xml")) == len(stated)
+    capsys.readouterr()
+    assert main(["show", "cert.xml"]) == 0
+    rows = re.findall(r"^(\w+) +(\S+) +(\S+(?: … \S+)?) +(\S+) +(×10\S+)? ?", capsys.readouterr().out, re.M)
+    superscripts = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+    for parameter, value, expanded, _, power in rows:
+        if parameter in stated:
+            ten = 10.0 ** int(power[3:].translate(superscripts)) if power else 1.0
+            u = stated[parameter].standard_uncertainty if "…" in expanded else ten * float(expanded)
+            assert ten * float(value) == pytest.approx(stated[parameter].value, abs=0.0501 * u)
+    assert len([row for row in rows if row[0] in stated]) == len(stated)
 
 
 @pytest.mark.parametrize("name", ["tumble", "thermal_gyro", "centrifuge", "noise"])
@@ -518,7 +529,7 @@ def test_the_probability_of_all_is_that_of_scipy(freedom):
     assert 1 - sum(1 - p for p in each) <= found <= min(each) + 5e-4
 
 
-def test_decisions_stand_in_a_valid_certificate(issue, schemas, sound):
+def test_decisions_stand_in_a_valid_certificate_and_are_shown(issue, schemas, sound, capsys):
     values = {n: p["value"] for n, p in json.loads((sound / "sound.json").read_text())["parameters"].items()}
     limits = (
         '[tumble]\n"bias_*" = { lower = -0.5, upper = 0.5, unit = "m/s^2" }\n'
@@ -537,6 +548,13 @@ def test_decisions_stand_in_a_valid_certificate(issue, schemas, sound):
     assert tree.findall(".//dcc:statement/dcc:conformity", NAMES)[0].text == "conditionalFail"
     upper = tree.findall(".//dcc:quantity[@refType='basic_toleranceLimitUpper']//si:value", NAMES)
     assert float(upper[-1].text) == values["scale_factor_x"] - 1e-9
+    capsys.readouterr()
+    assert main(["show", "cert.xml"]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"^conformity: conditionalFail, Conformity with .* bands .*$", shown, re.M)
+    assert re.search(r"^bias_x .* -0\.5 … 0\.5 +pass$", shown, re.M)
+    assert re.search(r"^scale_factor_x .* … \S+ +conditionalFail$", shown, re.M)
+    assert re.search(r"^misalignment_yx .* radian +– +–$", shown, re.M)
 
 
 @pytest.mark.parametrize(
@@ -582,7 +600,8 @@ def test_show_reads_a_certificate(issue, capsys):
     assert main(["show", "cert.xml"]) == 0
     shown = capsys.readouterr().out
     assert "Digital Calibration Certificate 3.3.0" in shown
-    assert re.search(r"^bias_x +-?\d\.\d+ +\d\S+ +\d\S+ +metre second\^-2$", shown, re.M)
+    value, u = re.search(r"^bias_x +(-?\d\.\d+) +(0\.0*[1-9]\d) +\d\S+ +metre second\^-2$", shown, re.M).groups()
+    assert len(value.lstrip("-")) == len(u)  # both end at the same place
     assert "signature: none" in shown
     assert main(["tumble", "fit", "cert.xml"]) == 2
     assert "expected a recording, found an XML file (imulab show reads certificates)" in capsys.readouterr().err
@@ -595,6 +614,9 @@ def test_show_reads_a_certificate(issue, capsys):
     assert main(["show", "empty.pdf"]) == 2
     assert "empty.pdf: a PDF without a Digital Calibration Certificate" in capsys.readouterr().err
     text = Path("cert.xml").read_text(encoding="utf-8")
+    unstated = text.replace("<si:value>", "<si:value>n", 3)
+    Path("unstated.xml").write_text(unstated, encoding="utf-8")
+    assert main(["show", "unstated.xml"]) == 0
     for changed in (text[:3000], text.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1)):
         Path("hostile.xml").write_text(changed, encoding="utf-8")
         assert main(["show", "hostile.xml"]) == 2

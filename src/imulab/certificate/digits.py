@@ -5,6 +5,7 @@ Sources: ILAC-P14:09/2020; JCGM 100:2008, 7.2.6. By decimals: rounding of double
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from decimal import ROUND_HALF_UP, Context, Decimal
@@ -51,6 +52,18 @@ def _to_place(number: Decimal, place: int) -> Decimal:
 def _text(number: Decimal, power: int) -> str:
     text = f"{number.scaleb(-power, _EXACT):f}"
     return text.removeprefix("-") if not number else text
+
+
+def limits_text(lower: float, upper: float, power: int = 0) -> str:
+    """Return limits as they were agreed, without the noise of conversions; nothing for one that is not finite."""
+    return " … ".join(_limit(end, power) for end in (lower, upper))
+
+
+def _limit(end: float, power: int) -> str:
+    if not math.isfinite(end):
+        return ""
+    text = f"{Decimal(f'{end:.9g}').scaleb(-power):f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def significant(number: float, digits: int = 3) -> str:

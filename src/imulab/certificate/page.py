@@ -9,7 +9,6 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, time
-from decimal import Decimal
 from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from msgspec import to_builtins
 
 from imulab.certificate.dcc import SCHEMA
-from imulab.certificate.digits import printed_unit, rounded, significant, smaller_units, times_power
+from imulab.certificate.digits import limits_text, printed_unit, rounded, significant, smaller_units, times_power
 from imulab.certificate.laboratory import Party
 from imulab.certificate.model import Certificate, Result
 from imulab.certificate.texts import (
@@ -283,18 +282,10 @@ def _row(number: int, result: Result, units: Mapping[str, tuple[str, int]], word
         return row
     if result.decision is None or result.limits is None:
         return [*row, "–", "–", "–"]
-    ends = [_limit(end, power + common) for end in (result.limits.lower, result.limits.upper)]
+    ends = limits_text(result.limits.lower, result.limits.upper, power + common)
     state = {"text": words(result.decision.state), "pad": 0, "sign": False, "state": result.decision.state}
     shown = probability_text(result.decision.probability)
-    return [*row, words.number(" … ".join(ends)), state, words.number(shown)]
-
-
-def _limit(end: float, power: int) -> str:
-    """Return a limit as it was agreed, without the noise of conversions; nothing for one that is not there."""
-    if not np.isfinite(end):
-        return ""
-    text = f"{Decimal(f'{end:.9g}').scaleb(-power):f}"
-    return text.rstrip("0").rstrip(".") if "." in text else text
+    return [*row, words.number(ends), state, words.number(shown)]
 
 
 def _align_decimals(rows: Sequence[list[Any]], column: int, sign: str) -> None:

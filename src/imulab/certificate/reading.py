@@ -6,6 +6,7 @@ Certificate, whoever wrote it; nothing in the XML is followed or expanded.
 
 from __future__ import annotations
 
+import math
 import re
 import zlib
 from hashlib import sha256
@@ -14,11 +15,13 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from imulab.certificate.digits import limits_text, rounded, times_power
 from imulab.display import aligned, printable
 from imulab.errors import ReadError, install, readable
 from imulab.files import open_file
 
 _NAMES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si", "ds": "http://www.w3.org/2000/09/xmldsig#"}
+_TITLES = ["parameter", "value", "U", "k", "unit", "limits", "conformity"]
 _LARGEST = 50_000_000
 _STREAM = re.compile(rb"/EmbeddedFile\b[^\n]*?>>\s*stream\r?\n")
 _LINES = (
@@ -75,10 +78,14 @@ def describe_certificate(xml: bytes, path: str) -> str:
     version = f"Digital Calibration Certificate {root.get('schemaVersion', '')}".strip()
     lines = [f"{printable(path)}: {version}"]
     lines += [f"{title}: {text}" for title, place in _LINES if (text := _text(root, place))]
+    for statement in root.iterfind("dcc:administrativeData/dcc:statements/dcc:statement[dcc:conformity]", _NAMES):
+        texts = _text(statement, "dcc:conformity"), _text(statement, "dcc:declaration/dcc:content")
+        lines.append(f"conformity: {', '.join(filter(None, texts))}")
     for section in root.iterfind("dcc:measurementResults/dcc:measurementResult", _NAMES):
         rows = [_row(each) for each in section.iterfind(".//dcc:quantity[@refType='basic_calibrationValue']", _NAMES)]
         lines += ["", _text(section, "dcc:name/dcc:content")]
-        lines += aligned(["parameter", "value", "U", "k", "unit"], rows) if rows else []
+        shown = 7 if any(row[-1] != "–" for row in rows) else 5
+        lines += aligned(_TITLES[:shown], [row[:shown] for row in rows]) if rows else []
     return "\n".join([*lines, "", f"signature: {_signature(root, xml, path)}"])
 
 
@@ -87,19 +94,37 @@ def _text(parent: Any, place: str) -> str:
 
 
 def _row(quantity: Any) -> list[str]:
-    uncertainty = ".//si:measurementUncertaintyUnivariate/si:expandedMU/si:"
-    places = ("dcc:name/dcc:content", ".//si:value", f"{uncertainty}valueExpandedMU", f"{uncertainty}coverageFactor")
-    name, *numbers = (_text(quantity, place) for place in places)
+    """Return name, value, U, k, unit, limits and decision of a quantity as texts; a dash for what is not there."""
+    value, name = _text(quantity, ".//si:value"), _text(quantity, "dcc:name/dcc:content")
     unit = _text(quantity, ".//si:unit").replace("\\tothe", "^").replace("\\", " ").strip()
     unit = re.sub(r"\{([^{}]*)\}", r"\1", unit)
-    return [name, *(_short(number) for number in numbers), unit]
+    univariate = ".//si:measurementUncertaintyUnivariate//si:"
+    expanded, standard, low, high, k = (
+        _text(quantity, univariate + place)
+        for place in ("valueExpandedMU", "valueStandardMU", "intervalMin", "intervalMax", "coverageFactor")
+    )
+    spread, power = expanded or standard or "–", 0
+    known = [_number(value), *(_number(text) for text in (low, high) if text)]
+    if (u := _number(spread)) > 0 and all(map(math.isfinite, [*known, u])):
+        (value, *ends), spread, power = rounded(known, u)
+        spread = " … ".join(ends) if ends else spread
+    lower, upper = (
+        _number(_text(quantity, f".//dcc:quantity[@refType='basic_toleranceLimit{end}']//si:value"))
+        for end in ("Lower", "Upper")
+    )
+    limits = limits_text(lower, upper, power).strip() if math.isfinite(lower) or math.isfinite(upper) else "–"
+    factor = f"{_number(k):.4g}" if k else "–" if low or not standard else "1"
+    unit = "1" if unit == "one" else unit
+    unit = f"×{times_power(unit, power)}" if power else unit
+    return [name, value or "–", spread, factor, unit, limits, _text(quantity, ".//dcc:conformity") or "–"]
 
 
-def _short(number: str) -> str:
+def _number(text: str) -> float:
+    """Return the number of a text; not a number where there is none."""
     try:
-        return f"{float(number):.7g}"
+        return float(text)
     except ValueError:
-        return number or "–"
+        return math.nan
 
 
 def _signature(root: Any, xml: bytes, path: str) -> str:
