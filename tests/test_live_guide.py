@@ -143,6 +143,8 @@ def test_a_dropped_attitude_is_out_of_the_fit():
         ("bais 100 ug", "did you mean 'bias'"),
         ("bias 100 ppm", "acceleration"),
         ("scale_factor -5 ppm", "above 0"),
+        ("bias 0.1", "0.1 without a unit: expected one of m/s.2 g mg ug after it, as in bias 100 ug"),
+        ("bias 100 ug, scale_factor 2e-4", "2e-4 without a unit: expected one of 1 ppm after it"),
     ],
 )
 def test_targets_that_cannot_be_are_refused(text, said):

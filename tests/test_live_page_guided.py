@@ -113,6 +113,7 @@ def test_from_the_plug_to_the_record_with_a_knocked_attitude_dropped(live, new_p
     numbers = page.locator("section:has(> h2:text-is('Attitudes')) tbody tr td:first-child").all_inner_texts()
     assert "5" not in numbers
     assert len(numbers) >= 14
+    page.wait_for_selector(".facts dt:text-is('|f| now, uncorrected')")
     page.get_by_role("button", name="Make the record").click()
     for each in (page, other):
         each.wait_for_selector(".result")

@@ -155,6 +155,7 @@ def test_a_recording_that_is_there_is_not_overwritten(tmp_path, monkeypatch, cap
         (["simulate", "--save", "rec.parquet"], "expected a name that ends in .csv"),
         (["simulate", "--save", "rec.csv", "--attitudes", "3"], "expected 4 to 200"),
         (["simulate", "--save", "rec.csv", "--attitudes", "9", "--target", "bias 1 mg"], "one or the other"),
+        (["simulate", "--save", "rec.csv", "--target", "bias 0.1"], "'bias 0.1': 0.1 without a unit: expected one of"),
         (["simulate", "--save", "rec.csv", "--order", "7"], "--order '7'"),
         (["tcp:no.such.host.invalid:9", "--save", "rec.csv"], "no machine of this name"),
         (["replay:none.csv", "--save", "rec.csv", "--plain"], "none.csv: no such file"),

@@ -145,13 +145,17 @@ def parse_unit(text: str, quantities: Iterable[str] = ()) -> Unit:
     if unit is None and "@" in symbol:
         unit = _increment(symbol)
     if unit is None:
-        wanted = set(quantities)
-        known = [other.symbol for other in _UNITS.values() if not wanted or other.quantity in wanted]
+        known = known_units(*quantities)
         # Another prefix or quantity is no slip: rpm is not ppm, mm/s^2 not m/s^2.
         begin, parts = symbol[:2].lower(), symbol.count("/")
         alike = [name for name in known if name[:2].lower() == begin and name.count("/") == parts]
         raise UnitError(f"unknown unit {text!r}; known units: {' '.join(known)}{meant(alike, symbol)}")
     return unit
+
+
+def known_units(*quantities: str) -> list[str]:
+    """Return the symbols of the units of some quantities; without any, of all."""
+    return [unit.symbol for unit in _UNITS.values() if not quantities or unit.quantity in quantities]
 
 
 _GAINED = {"angle": "rate", "velocity": "acceleration"}

@@ -22,10 +22,10 @@ from imulab.procedures.tumble.plan import sphere_candidates
 from imulab.procedures.tumble.record import FEW_DEGREES
 from imulab.procedures.tumble.schema import attitudes_of, fit_of, model_of
 from imulab.procedures.tumble.solve import Search, information_rows, quick_set
-from imulab.quantities import quantity
+from imulab.quantities import quantity, split_quantity
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
-from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+from imulab.units import STANDARD_GRAVITY, from_si, known_units, parse_unit
 
 # Targets, such as ``bias 100 ug, scale_factor 200 ppm``.
 
@@ -65,7 +65,11 @@ def read_targets(text: str | None) -> tuple[Target, ...]:
         stem = match[1]
         if stem not in _KINDS:
             raise OptionError(f"--target {text!r}: unknown parameter {stem!r}; known: {listed(_KINDS, stem)}")
-        value = quantity(match[2], "--target", *_KINDS[stem])
+        kind, unit = _KINDS[stem]
+        if not split_quantity(match[2], "--target", f"{stem} 100 {unit}")[1]:
+            expected = f"expected one of {' '.join(known_units(kind))} after it, as in {stem} 100 {unit}"
+            raise OptionError(f"--target {text!r}: {match[2]} without a unit: {expected}")
+        value = quantity(match[2], "--target", kind, unit)
         if not 0 < value < float("inf"):
             raise OptionError(f"--target {text!r}: expected standard uncertainties above 0")
         targets.append(Target(stem, value, match[2]))

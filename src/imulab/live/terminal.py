@@ -88,7 +88,7 @@ def _facts(view: View) -> Text:
     parts = [
         f"{view.seconds:.0f} s",
         f"{view.rate:.4g} Hz",
-        "" if view.length is None else f"|f| {view.length:.5g} {view.unit}",
+        "" if view.length is None else f"|f| {view.length:.5g} {view.unit} uncorrected",
         "" if view.temperature is None else f"{view.temperature:.1f} °C",
         *(f"{number} {name}" for name, number in counts.items()),
         f"{100 * share:.2g} % of bytes lost" if share else "",

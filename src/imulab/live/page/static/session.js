@@ -243,7 +243,7 @@ function placeForm() {
 function facts(now) {
   const { gaps, unread_share: unread, ...wrong } = now.counts;
   const rows = [
-    ["|f| now", now.length === null ? "–" : `${now.length.toPrecision(5)} ${now.unit.replace("^2", "²")}`],
+    ["|f| now, uncorrected", now.length === null ? "–" : `${now.length.toPrecision(5)} ${now.unit.replace("^2", "²")}`],
     ["stream", now.rate ? `${now.rate.toPrecision(3)} Hz` : "–"],
     ["recorded", duration(now.seconds)],
     ...(now.gravity === null ? [] : [["gravity here", `${now.gravity.toFixed(4)} m/s²`]]),
