@@ -219,3 +219,11 @@ def test_what_one_command_said_is_not_said_by_the_next(capsys):
         assert speech.explained("f.csv: no") == "f.csv: no (truncated)"
         speech.note("something")
     assert capsys.readouterr().err == "imulab: note: something\n"
+
+
+def test_a_warning_is_no_note_as_well(capsys):
+    with speech.begin(project=True):
+        speech.hold("f.csv", "truncated")
+        for message in ("truncated", "f.csv: truncated", "cut"):
+            speech.note(message)
+    assert capsys.readouterr().err == "imulab: warning: f.csv: truncated\nimulab: note: cut\n"

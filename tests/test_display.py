@@ -10,7 +10,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.display import Bad, Finding, Note, Verdict, action_of, verdict_of
+from imulab.display import Bad, Finding, Note, Verdict, action_of, join_alike, verdict_of
 from imulab.errors import RecordError
 from imulab.procedures.registry import loads
 from imulab.procedures.tumble.simulate import simulate_tumble
@@ -273,3 +273,19 @@ def test_every_finding_asks_for_something():
         if len(text.split()) > 3 and not action_of(text)
     }
     assert not silent
+
+
+def test_findings_on_more_than_three_sensors_that_differ_by_numbers_alone_are_one():
+    def off(count):
+        return Finding(f"excluded {count} samples (p = {count}e-07), Hz: 1/f", "check its supply")
+
+    pairs = [(f"gyro_x_{n}", off(n)) for n in (12, 1, 7)]
+    apart = join_alike([*pairs, ("gyro_y_1", Note(off(3)))])  # a note is no finding
+    assert [names for names, _ in apart] == [["gyro_x_12"], ["gyro_x_1"], ["gyro_x_7"], ["gyro_y_1"]]
+    assert apart[1][1] == "excluded 1 sample (p = 1e-07), Hz: 1/f"
+    ((names, text),) = join_alike([*pairs, ("gyro_x_3", off(7)), ("gyro_x_3", off(8))])
+    assert names == ["gyro_x_12", "gyro_x_1", "gyro_x_7", "gyro_x_3"]
+    assert text == "excluded 1…12 samples (p = 1e-07…12e-07), Hz: 1/f"
+    assert (type(text), text.action) == (Finding, "check its supply")
+    assert join_alike((name, "dead") for name in ("a", "b")) == [(["a", "b"], "dead")]
+    assert join_alike([]) == []

@@ -148,9 +148,8 @@ _IMPERATIVE = re.compile(
 )
 
 
-_ONE = re.compile(
-    r"(?<![\w.,:/-])1 (attitude|spike|sample|row|turn|hold|soak|log|cycle|column|line|field|run|gyro|dwell|stop)s\b"
-)
+_THINGS = "(attitude|spike|sample|row|turn|hold|soak|log|cycle|column|line|field|run|gyro|dwell|stop)"
+_ONE = re.compile(rf"(?<![\w.,:/-])1 {_THINGS}s\b")
 
 
 def one_thing(text: str) -> str:
@@ -185,8 +184,45 @@ class Bad(Finding):
 
 def prefixed(prefix: str, finding: str) -> str:
     """Return a finding as ``prefix: finding``, of the same class and with the same action."""
-    text = f"{prefix}: {finding}"
+    return _reworded(finding, f"{prefix}: {finding}")
+
+
+def _reworded(finding: str, text: str) -> str:
     return type(finding)(text, finding.action) if isinstance(finding, Finding) else text
+
+
+_NUMBER = re.compile(r"(?<![\w^.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?\b")
+_APART = 3  # sensors, of which each may have numbers of its own: the axes of a triad
+
+
+def join_alike(findings: Iterable[tuple[str, str]]) -> list[tuple[list[str], str]]:
+    """Return findings on sensors, from pairs of name and finding, each with the names of those that share it.
+
+    Those of more than three sensors that differ in their numbers alone are one, with the range of each number.
+
+    Examples
+    --------
+    >>> join_alike((f"gyro_{n}", f"stuck from {n}.5 s") for n in range(1, 6))
+    [(['gyro_1', 'gyro_2', 'gyro_3', 'gyro_4', 'gyro_5'], 'stuck from 1.5…5.5 s')]
+    """
+    alike: dict[tuple[type, str], list[tuple[str, str]]] = {}
+    for name, finding in findings:
+        text = re.sub(rf"# {_THINGS}\b", r"# \1s", _NUMBER.sub("#", finding))
+        alike.setdefault((type(finding), text), []).append((name, finding))
+    result: list[tuple[list[str], str]] = []
+    for (_, text), members in alike.items():
+        same: dict[str, list[str]] = {}
+        for name, finding in members:
+            same.setdefault(finding, []).append(name)
+        names = list(dict.fromkeys(name for name, _ in members))
+        if len(names) <= _APART or len(same) == 1:
+            result += [(those, finding) for finding, those in same.items()]
+            continue
+        columns = zip(*(_NUMBER.findall(finding) for finding in same), strict=True)
+        ranges = ["…".join(dict.fromkeys((min(texts, key=float), max(texts, key=float)))) for texts in columns]
+        whole = "".join(part + number for part, number in zip(text.split("#"), [*ranges, ""], strict=True))
+        result.append((names, _reworded(members[0][1], whole)))
+    return result
 
 
 @dataclass(frozen=True, slots=True)

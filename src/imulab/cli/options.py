@@ -105,9 +105,10 @@ def tell(message: str) -> None:
 
 
 def note(message: str) -> None:
-    """Print one line on standard error that is no warning; nothing with ``--quiet``."""
+    """Print one line on standard error that is no warning; nothing with ``--quiet``, and no warning a second time."""
     release()
-    if not speech().quiet:
+    warned = any(text == message or text.endswith(f": {message}") for text in speech().released)
+    if not warned and not speech().quiet:
         print(printable(f"imulab: note: {message}"), file=sys.stderr)
 
 

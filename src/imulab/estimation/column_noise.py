@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from imulab.columns import INERTIAL, kind_of
-from imulab.display import Finding, Note, prefixed
+from imulab.display import Finding, Note, join_alike, prefixed
 from imulab.errors import DataError, OptionError
 from imulab.estimation.noise.analysis import CANDIDATES, Analysis, analyses, average
 from imulab.estimation.noise.readings import doubtful_units, own_readings
@@ -304,18 +304,15 @@ def _step_line(recording: Recording, name: str, step: Step) -> str:
 
 def noise_lines(noises: Mapping[str, ColumnNoise]) -> list[str]:
     """Return notes on columns by name: filters, spectral lines, and coefficients that are not determined."""
-    by_reason: dict[str, list[str]] = {}
+    undetermined_ones: list[tuple[str, str]] = []
     for name, noise in noises.items():
-        its = noise.coefficients
-        reason = its.angle_random_walk.reason or its.bias_instability.reason
-        if reason:
-            by_reason.setdefault(reason, []).append(name)
-    messages: list[str] = []
-    for reason, names in by_reason.items():
-        alone = not noises[names[0]].coefficients.angle_random_walk.reason
-        which = "bias instability and random walk of the zero" if alone else "noise coefficients"
-        text = f"{_columns(names)}: {which} not determined: {reason}"
-        messages.append((Note if alone else Finding)(text, "check the sensor, and the resolution of its log"))
+        its, action = noise.coefficients, "check the sensor, and the resolution of its log"
+        if reason := its.angle_random_walk.reason:
+            undetermined_ones.append((name, Finding(f"noise coefficients not determined: {reason}", action)))
+        elif reason := its.bias_instability.reason:
+            text = f"bias instability and random walk of the zero not determined: {reason}"
+            undetermined_ones.append((name, Note(text, action)))
+    messages = [prefixed(_columns(names), finding) for names, finding in join_alike(undetermined_ones)]
     filtered = {n: f.coefficients for n, f in noises.items() if f.coefficients.filtered}
     if filtered:
         highest = min(f.highest for f in filtered.values())

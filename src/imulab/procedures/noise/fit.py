@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from imulab.arguments import checked
 from imulab.columns import kind_of
-from imulab.display import Finding, Note, prefixed
+from imulab.display import Finding, Note, join_alike, prefixed
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed, several
 from imulab.estimation.column_noise import noise_columns
 from imulab.estimation.decisions import LEVEL_STEP_PERHAPS
@@ -194,18 +194,17 @@ _SLOW_FACTOR, _LEANS = 10.0, 0.005
 
 def findings(columns: Mapping[str, ColumnModel], rests: Sequence[Rest], horizon: float) -> tuple[str, ...]:
     """Return the findings on all columns; columns with the same finding share a sentence."""
-    columns_by_finding: dict[str, list[str]] = {}
+    on_columns: list[tuple[str, str]] = []
     for name, column in columns.items():
         if rejected(p := column.analysis.test.probability, len(columns)):
             text = f"no model of these terms fits ({probability_text(p)}); the numbers tell the size of the noise alone"
-            columns_by_finding[Finding(text, "take the white noise alone, or fit a quieter part (--window)")] = [name]
-        for finding in _describe_column(column):
-            columns_by_finding.setdefault(finding, []).append(name)
+            on_columns.append((name, Finding(text, "take the white noise alone, or fit a quieter part (--window)")))
+        on_columns += [(name, finding) for finding in _describe_column(column)]
     messages = [note for rest in rests for note in rest.notes]
     left = [name for name in rests[0].recording.columns if kind_of(name) == "mag" and name not in columns]
     if left and len(left) == sum(kind_of(name) == "mag" for name in rests[0].recording.columns):
         messages.append(Note(f"{_named(left)}: magnetometers are not fitted unless --columns names them"))
-    messages += [prefixed(_named(names), finding) for finding, names in columns_by_finding.items()]
+    messages += [prefixed(_named(names), finding) for names, finding in join_alike(on_columns)]
     longest = max(column.analysis.length for column in columns.values())
     if horizon > longest / _SLOW_FACTOR:
         messages.append(
@@ -286,7 +285,7 @@ def _describe_lines(column: ColumnModel) -> str:
         f"{line.frequency:.4g} Hz of {_sized(line.amplitude, column.unit)}" for line in column.lines[:_MOST_NAMED]
     )
     many = len(column.lines)
-    return f"{many} line{'s' if many > 1 else ''} of the spectrum left out, the largest {named}"
+    return f"{many} lines of the spectrum left out, the largest {named}"
 
 
 def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> str | None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from imulab.device.imus import NO_LIMIT, FusedImus, ImusSettings, ImusStream
 from imulab.device.unit import ALONE, BEYOND, EXCLUDED, GATED, NOT_FINITE, STUCK, Blob, is_blob, load_blob
-from imulab.display import Finding, Note, prefixed
+from imulab.display import Finding, Note, join_alike, prefixed
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.estimation.clock import GAP
 from imulab.options import RARE, READING, measure, parsed, text
@@ -313,19 +313,22 @@ class BoardFuser:
 
     def lines(self, *, failed: bool = False) -> list[str]:
         """Return messages on sensors that were left out, a line each, and on too few; only `failed` ones if asked."""
-        lines: list[str] = []
+        by_sensor: dict[str, list[tuple[str, str]]] = {}
         for (sensor, k), lost in sorted(self.left_out.items()):
             if failed and not _FAILED.intersection(lost["why"]):
                 continue
             why = " and ".join(dict.fromkeys(lost["why"])) or _OFF
-            text = (
-                f"{_WORDS[SENSORS[sensor]]} {k + 1}: left out of {lost['samples']} of {self.samples} samples, first at "
-                f"{lost['first']:.6g} s: {why}"
-            )
+            text = f"left out of {lost['samples']} of {self.samples} samples, first at {lost['first']:.6g} s: {why}"
             scattered = why == _OFF and lost["samples"] < _RARE * self.samples
-            lines.append(
+            finding = (
                 Note(text) if scattered else Finding(text, "look at this sensor; the others were fused without it")
             )
+            by_sensor.setdefault(_WORDS[SENSORS[sensor]], []).append((str(k + 1), finding))
+        lines = [
+            prefixed(f"{word}{'s' * (len(which) > 1)} {' '.join(which)}", finding)
+            for word, findings in by_sensor.items()
+            for which, finding in join_alike(findings)
+        ]
         if self.alone:
             text = f"fewer than three accelerometers left in {self.alone} samples: nothing to compare them with"
             lines.append(Finding(text, "do not trust the angular acceleration there"))
