@@ -129,6 +129,29 @@ def test_units_that_titles_lack_are_told_by_the_readings_and_it_is_said(tmp_path
             assert found.toml.count("no unit in the title") == 7
 
 
+def turned_by_hand(real_data):
+    """Specific force and rates of real recordings with hands in them, at 100 Hz or so, and the unit of the rates."""
+    imucal = np.genfromtxt(real_data / "imucal" / "example_ferraris_session.csv", delimiter=",", skip_header=1)
+    yield imucal[:, 4:7], imucal[:, 1:4], "deg/s"
+    for name in ("imu0.log", "imu1.log"):
+        rows = np.loadtxt(real_data / "mpu9150" / name, max_rows=8000)
+        yield rows[:, :3], rows[:, 3:6], "rad/s"
+
+
+def test_a_hand_s_turns_tell_the_unit_of_rates_and_other_columns_do_not(real_data, tmp_path):
+    titles = "ax,ay,az,gx,gy,gz"
+    per = {"rad/s": 1.0, "deg/s": np.pi / 180}
+    for f, w, unit in turned_by_hand(real_data):
+        for wanted in per:
+            scaled = w * per[unit] / per[wanted]
+            found = il.guess_layout(written(tmp_path / "f.csv", titles, [*f.T, *scaled.T]), sample_rate=100)
+            assert il.read(tmp_path / "f.csv", found.layout).units["gyro_z"] == wanted
+        for wrong in (-w, w[::-1], w[:, [1, 2, 0]]):
+            path = written(tmp_path / "f.csv", titles, [*f.T, *wrong.T])
+            with pytest.raises(ReadError, match="neither the title nor the readings say its unit"):
+                il.guess_layout(path, sample_rate=100)
+
+
 def test_a_rate_at_rest_has_no_unit_and_is_refused(imulab, tmp_path):
     rng = np.random.default_rng(4)
     t = np.arange(3000) / 100
