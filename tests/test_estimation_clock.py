@@ -329,10 +329,10 @@ def test_a_window_that_misses_times_since_1970_says_how_to_type_one(imulab, tmp_
 
 def test_times_since_1970_are_drawn_from_the_start():
     figure = log(1655928838.5 + NUMBER[:400] / 100).plot("gyro").figure
-    assert figure.layout["xaxis"]["title"] == {"text": "time from 2022-06-22 20:13:58 UTC on, s"}
+    assert figure.layout["xaxis"]["title"]["text"] == "time from 2022-06-22 20:13:58 UTC on, s"
     assert figure.traces[0]["x"][:2] == pytest.approx([0.0, 0.01], abs=1e-6)
     figure = log(500 + NUMBER[:400] / 100).plot("gyro").figure
-    assert figure.layout["xaxis"]["title"] == {"text": "time, s"}
+    assert figure.layout["xaxis"]["title"]["text"] == "time, s"
     assert figure.traces[0]["x"][0] == 500
     report = il.fit_tumble(
         il.simulate_tumble(gravity=9.81).with_columns(

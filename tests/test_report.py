@@ -13,7 +13,7 @@ from conftest import table
 from imulab.errors import RecordError
 from imulab.procedures.views import exhibits_of
 from imulab.report import render_page
-from imulab.report.traces import Exhibits, Figure, ReportTable, correlation_map, format_uncertain, narrow
+from imulab.report.traces import Exhibits, Figure, ReportTable, correlation_map, format_uncertain, log_axis, narrow
 from reference import tumble as reference
 
 G = 9.80665
@@ -143,6 +143,9 @@ def test_words_stand_at_the_left():
     shown = ReportTable("T", "", ["run", "file", "p", "reason", "none"], rows)
     page = re.sub(r"<script>.*?</script>", "", render_page("T", "", Exhibits("", [], [shown])), flags=re.DOTALL)
     assert re.findall("<td(.*?)>", page)[:5] == ["", ' class="text"', "", ' class="text"', ""]
+    shown = ReportTable("T", "", ["name", "value", "unit"], [["soft_xx", "1.2", "1"]])  # the number 1 is a unit, too
+    page = re.sub(r"<script>.*?</script>", "", render_page("T", "", Exhibits("", [], [shown])), flags=re.DOTALL)
+    assert re.findall("<td(.*?)>", page) == ["", "", ' class="unit"']
 
 
 def test_every_figure_has_a_text_alternative_and_a_tied_caption(record):
@@ -256,6 +259,19 @@ def test_tiles_break_no_word_and_units_stay_in_view(browser, tmp_path):
         assert set(lines) == {1}
         assert page.evaluate("document.querySelector('td.unit').getBoundingClientRect().right") < width
         page.close()
+
+
+@pytest.mark.parametrize(
+    ("values", "numbered"), [([1e-3, 0.2], 1), ([5.0, 41.0], "D2"), ([0.02, None, 0.035], None), ([0.0, 3.0, 40], "D2")]
+)
+def test_a_logarithmic_axis_of_less_than_two_decades_is_numbered_between_its_powers(values, numbered):
+    traces = [{"type": "scatter", "x": [1, 10, 1e4], "y": [1, 1, 1e4]}]
+    traces.append({"type": "scatter", "x": [1], "y": values, "yaxis": "y2"})
+    layout = {"xaxis": log_axis("s"), "yaxis": log_axis("m"), "yaxis2": log_axis("deg/h")}
+    found = Figure("", "", traces, layout).layout
+    assert [found[key]["dtick"] for key in layout] == [1, 1, numbered]
+    assert found["yaxis2"].get("tickformat") == (None if numbered == 1 else "~g")
+    assert Figure("", "", traces, {"yaxis": log_axis("m", range=[0.2, 1.4])}).layout["yaxis"]["dtick"] == "D2"
 
 
 def test_a_map_of_many_parameters_keeps_the_width_of_a_phone_for_its_cells():

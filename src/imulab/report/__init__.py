@@ -65,8 +65,10 @@ def _column_kinds(table: ReportTable) -> list[str]:
     kinds = [""] * len(table.columns)
     for number, title in enumerate(table.columns[1:], start=1):
         cells = [row[number] for row in table.rows if row[number] not in ("", "–")]
-        if cells and not any(_NUMBER.match(cell) for cell in cells):
-            kinds[number] = "unit" if title.split()[0] == "unit" else "text"
+        if title.split()[:1] == ["unit"]:
+            kinds[number] = "unit"
+        elif cells and not any(_NUMBER.match(cell) for cell in cells):
+            kinds[number] = "text"
     return kinds
 
 
@@ -177,4 +179,6 @@ def _plain(value: Any) -> str:
         return ", ".join(_plain(item) for item in value if item != "") or "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.9g}"
     return "–" if value is None else str(value)

@@ -34,6 +34,7 @@ TIME = "time, s"
 """Title of an axis of a recording's times."""
 
 
+_FEW_DECADES, _PART_DECADE = 2.0, 0.5  # below the first, 2 and 5 are numbered; below the second, what there is room for
 _TICKS = {"ticks": "outside", "ticklen": 6, "tickcolor": "rgba(0,0,0,0)"}
 
 
@@ -41,7 +42,8 @@ class Figure(Struct, frozen=True):
     """A Plotly figure (traces and layout as plain JSON values), a title, how to read it, and what it shows.
 
     Times since 1970 are drawn from their first on, which the axis names: 1.656e9 s has no digits left for seconds.
-    The numbers of an x axis stand a little below it, off that of the y axis in the corner.
+    The numbers of an x axis stand a little below it, off that of the y axis in the corner; a logarithmic axis of less
+    than two decades has numbers between its powers of ten.
     """
 
     title: str
@@ -55,13 +57,16 @@ class Figure(Struct, frozen=True):
         for key in self.layout:
             if key.startswith("xaxis"):
                 self.layout[key] = {**_TICKS, **self.layout[key]}
+            if key[1:5] == "axis" and (decades := self._decades(key)) < _FEW_DECADES:
+                numbers = {"dtick": "D2"} if decades > _PART_DECADE else {"dtick": None, "nticks": 6}
+                self.layout[key] = {**self.layout[key], **numbers, "tickformat": "~g"}
         axis = self.layout.get("xaxis", {})
-        if axis.get("title") != {"text": TIME}:
+        if axis.get("title", {}).get("text") != TIME:
             return
         start = min((x for trace in self.traces for x in trace.get("x", ()) if x is not None), default=0.0)
         if not is_epoch(start):
             return
-        self.layout["xaxis"] = {**axis, "title": {"text": f"time from {utc(start)} UTC on, s"}}
+        self.layout["xaxis"] = {**axis, "title": {**axis["title"], "text": f"time from {utc(start)} UTC on, s"}}
         if "range" in axis:
             self.layout["xaxis"]["range"] = [x - start for x in axis["range"]]
         for trace in self.traces:
@@ -70,6 +75,19 @@ class Figure(Struct, frozen=True):
         for shape in self.layout.get("shapes", ()):
             if shape.get("xref") == "x":
                 shape |= {"x0": shape["x0"] - start, "x1": shape["x1"] - start}
+
+    def _decades(self, key: str) -> float:
+        """Return over how many powers of ten an axis goes; infinite for one that is not numbered by them."""
+        axis, letter = self.layout[key], key[0]
+        if axis.get("type") != "log" or axis.get("dtick") != 1:
+            return math.inf
+        if "range" in axis:
+            return float(axis["range"][1] - axis["range"][0])
+        drawn = [
+            trace.get(letter, ()) for trace in self.traces if trace.get(f"{letter}axis", letter) == letter + key[5:]
+        ]
+        values = [value for values in drawn for value in values if value is not None and value > 0]
+        return math.log10(max(values) / min(values)) if values else math.inf
 
 
 class ReportTable(Struct, frozen=True):
@@ -131,7 +149,7 @@ def format_uncertain(value: float, uncertainty: float | None, digits: int = 2) -
 
 
 _LEAST, _MOST = 150, 300  # height of a panel on a phone, pixels
-_GAP = 74  # pixels between panels, for ticks and titles
+_GAP = 84  # pixels between panels, for ticks and titles
 _KEY_LINE = 21  # height of a line of the legend, pixels
 _ROW = 14  # height of a row of a map, pixels
 _MOST_NUMBERS = 8  # along an axis of a narrow panel
@@ -167,6 +185,8 @@ def narrow(figure: Figure) -> dict[str, Any] | None:
             changed["yaxis" + panel]["showticklabels"] = True
     notes = [_moved(note, places) for note in layout.get("annotations", [])]
     legend = {**layout.get("legend", {}), "y": 1 + 26 / plot, "yanchor": "bottom"}
+    if "title" in legend:
+        legend["title"] = {**legend["title"], "side": "top"}
     return {
         "layout": {**layout, **changed, "annotations": notes, "legend": legend, "margin": margin},
         "height": round(plot + margin["t"] + margin["b"] + keys * _KEY_LINE),
@@ -223,8 +243,9 @@ SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-
 
 
 def figure_axis(title: str, **more: Any) -> dict[str, Any]:
-    """Return the layout of an axis."""
-    return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", **more}
+    """Return the layout of an axis; its title stands off its numbers, however wide they are."""
+    named = {"title": {"text": title, "standoff": 8}, "automargin": True} if title else {}
+    return {**named, "zeroline": False, "gridcolor": "#e6eaed", **more}
 
 
 def number_axis(title: str, numbers: Sequence[int], **more: Any) -> dict[str, Any]:
@@ -235,11 +256,6 @@ def number_axis(title: str, numbers: Sequence[int], **more: Any) -> dict[str, An
 def log_axis(title: str, **more: Any) -> dict[str, Any]:
     """Return the layout of a logarithmic axis."""
     return figure_axis(title, **{"type": "log", "dtick": 1, "exponentformat": "none"} | more)
-
-
-def short_log_axis(title: str, **more: Any) -> dict[str, Any]:
-    """Return the layout of a logarithmic axis over a decade or two, with numbers at 2 and 5 between the powers."""
-    return log_axis(title, **{"dtick": "D2", "tickformat": "~g"} | more)
 
 
 def scatter(x: Sequence[Any], y: Sequence[Any], mode: str, **more: Any) -> dict[str, Any]:

@@ -140,7 +140,7 @@ def cycle_tables(cycles: list[CycleRow]) -> list[ReportTable]:
                 " ± ".join(format_uncertain(100 * z.value, 100 * (z.standard_uncertainty or 0.0))) if z else "–"
                 for z in (values.get(name) for name in names)
             ]
-            rows.append([str(cycle.power_cycle), key.replace("_", " "), *cells])
+            rows.append([f"{cycle.power_cycle:g}", key.replace("_", " "), *cells])
     return [
         ReportTable(
             "zeta of each power cycle, %",
@@ -203,7 +203,7 @@ def run_table(runs: list[RunRow]) -> ReportTable:
     rows = []
     for index, run in enumerate(runs):
         row = [str(index + 1), " ".join([run.file, *([] if run.window is None else [run.window])])]
-        row += [str(run.power_cycle if name == "cycle" else run.spin_axis) for name in varied]
+        row += [f"{run.power_cycle:g}" if name == "cycle" else run.spin_axis for name in varied]
         if run.role == "static":
             rows.append([*row, "0", "static", *["–"] * (len(columns) - len(row) - 2)])
             continue

@@ -26,7 +26,7 @@ from imulab.procedures.centrifuge.run import LoadedRun
 from imulab.procedures.result import PlannedTest, amount
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
 from imulab.report.plots import Plot
-from imulab.report.traces import BAD, GOOD, LEGEND, Figure, log_axis, short_log_axis
+from imulab.report.traces import BAD, GOOD, LEGEND, Figure, log_axis
 from imulab.units import STANDARD_GRAVITY, from_si, to_si
 
 # Error budget: errors that survive the subtraction of the FOG.
@@ -368,7 +368,7 @@ class Plan(PlannedTest):
         ]  # fmt: skip
         layout = {
             "xaxis": log_axis("specific force, g", tickvals=force),
-            "yaxis": short_log_axis("u(K) / K, %"),
+            "yaxis": log_axis("u(K) / K, %"),
             "legend": LEGEND,
         }
         caption = "u(K) / K: relative standard uncertainty of the drift per specific force."

@@ -26,7 +26,7 @@ from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole, who
 from imulab.recording import Array
 from imulab.report.parameters import ReadingUnit, reading_unit, text_in
 from imulab.report.plots import Plot
-from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis, plain_number, scatter, short_log_axis
+from imulab.report.traces import BAD, GOOD, LEGEND, Figure, figure_axis, log_axis, plain_number, scatter
 from imulab.units import from_si
 
 # Turns by hand against a fence.
@@ -110,7 +110,7 @@ def _plan_figure(
         scatter(x[1], values, mode, name=name, line=line)
         for (name, values), mode, line in zip(curves.items(), ("lines+markers", "lines"), lines, strict=True)
     ]
-    layout = {"xaxis": x[0], "yaxis": short_log_axis(y_title), "legend": LEGEND}
+    layout = {"xaxis": x[0], "yaxis": log_axis(y_title), "legend": LEGEND}
     return Figure(title, caption, traces, layout, message=message)
 
 

@@ -38,11 +38,6 @@ _SCALE = ("#2c4fa3", "#3d8fc4", "#58b5a6", "#a3bf58", "#e0a83c", "#d5663a", "#a8
 """Colours from cold to warm; they differ in lightness too."""
 
 
-def axis_style(title: str, **more: Any) -> dict[str, Any]:
-    """Return a Plotly axis in the style of the reports."""
-    return figure_axis("", **more) | {"title": {"text": title, "standoff": 12}}
-
-
 def temperature_colour(temperature: float, temperatures: Array) -> str:
     """Return the colour of a temperature between the coldest and the warmest, as #rrggbb."""
     low, high = float(temperatures[0]), float(temperatures[-1])
@@ -107,10 +102,10 @@ def grid(
         traces += [{**here, **trace} for trace in cell]
         bottom = row == down - 1
         scale = {"type": "log", "tickvals": _DECADES} if log_time else {"rangemode": "tozero"}
-        layout[f"xaxis{suffix}"] = axis_style(
+        layout[f"xaxis{suffix}"] = figure_axis(
             "s after power-on" if bottom else "", domain=[left, left + width], anchor=f"y{suffix}", **scale
         )
-        layout[f"yaxis{suffix}"] = axis_style(
+        layout[f"yaxis{suffix}"] = figure_axis(
             y_title if column == 0 else "",
             domain=[top - height, top],
             anchor=f"x{suffix}",
@@ -480,8 +475,8 @@ def _by_temperature(drawn: WarmupRecord, table: WarmupTable, kind: str, index: l
         "temperatures alone. Nothing lies far below the repeatability; what is lost in the noise has no point.",
         traces=traces,
         layout={
-            "xaxis": axis_style("power-on temperature, degC", tickvals=knots),
-            "yaxis": axis_style(f"rms, {label}", type="log", dtick="D2" if len(traces) > 9 else 1),
+            "xaxis": figure_axis("power-on temperature, degC", tickvals=knots),
+            "yaxis": figure_axis(f"rms, {label}", type="log", dtick="D2" if len(traces) > 9 else 1),
             "legend": LEGEND,
         },
         height=400,
@@ -517,8 +512,8 @@ def _over_temperature(table: WarmupTable) -> Figure:
     for number, (axis, label) in enumerate(names):
         suffix = "" if number == 0 else "2"
         domain = [0, 1] if len(names) == 1 else [[0, 0.44], [0.56, 1]][number]
-        layout[f"xaxis{suffix}"] = axis_style("power-on temperature, degC", domain=domain, anchor=f"y{suffix}")
-        layout[f"yaxis{suffix}"] = axis_style(f"{axis}, {label}", anchor=f"x{suffix}")
+        layout[f"xaxis{suffix}"] = figure_axis("power-on temperature, degC", domain=domain, anchor=f"y{suffix}")
+        layout[f"yaxis{suffix}"] = figure_axis(f"{axis}, {label}", anchor=f"x{suffix}")
     steps = (
         "A vertical step is a jump at an edge: two power-ons a hair apart are corrected by that much differently."
         if table.model == "interval-cubic"

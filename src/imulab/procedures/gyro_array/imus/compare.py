@@ -351,7 +351,7 @@ def _table(title: str, rows: list[ImuDifference | None], unit: str, factor: floa
         "Root mean square of the difference between an IMU and what others say at its place; stated is what the noise "
         "at rest makes of the first."
     )
-    titles = ["IMU", *(f"{name} {unit}" for name in _COLUMNS), "samples"]
+    titles = ["IMU", *(f"{name}, {unit}" for name in _COLUMNS), "samples"]
     return ReportTable(title, caption, titles, [[str(k + 1), *cells(row)] for k, row in enumerate(rows)])
 
 

@@ -25,10 +25,10 @@ from imulab.report.traces import (
     ReportTable,
     figure_axis,
     format_uncertain,
+    log_axis,
     plain_number,
     rounded,
     scatter,
-    short_log_axis,
 )
 from imulab.units import STANDARD_GRAVITY
 
@@ -170,7 +170,7 @@ def _residuals(record: ImusRecord, sensor: str) -> Figure:
     traces.append(
         scatter(ends, [noise, noise], "lines", name="at rest", line={"color": INK, "dash": "dot", "width": 1.2})
     )
-    layout = {"xaxis": figure_axis(TIME), "yaxis": short_log_axis(f"rms, {unit}"), "legend": LEGEND, "margin": MARGIN}
+    layout = {"xaxis": figure_axis(TIME), "yaxis": log_axis(f"rms, {unit}"), "legend": LEGEND, "margin": MARGIN}
     caption = (
         f"Readings of the {word} less those of the fitted board, rms of 20 stretches of the motion; dotted: noise at "
         "rest. Far above it, the IMUs are not read at one instant, or the board shakes faster than it is sampled."
@@ -197,13 +197,13 @@ def _imus_tables(record: ImusRecord) -> list[ReportTable]:
         table(
             "Where each IMU sits",
             "Positions of the sensing elements from IMU 1, rotation vectors from its frame; standard uncertainties.",
-            [f"{axis} mm" for axis in "xyz"] + [f"rotation {axis} deg" for axis in "xyz"],
+            [f"{axis}, mm" for axis in "xyz"] + [f"rotation {axis}, deg" for axis in "xyz"],
             lambda imu: [*_three(imu.position, 1e3), *_three(imu.rotation, math.degrees(1))],
         ),
         table(
             "Latencies",
             "How much later each triad answers than the gyroscopes of IMU 1.",
-            ["accelerometers ms", "gyroscopes ms"],
+            ["accelerometers, ms", "gyroscopes, ms"],
             lambda imu: [
                 _cell(each.value, each.standard_uncertainty, 1e3) for each in (imu.accel_latency, imu.gyro_latency)
             ],
@@ -211,13 +211,13 @@ def _imus_tables(record: ImusRecord) -> list[ReportTable]:
         table(
             "Biases",
             "Of each IMU, along its own axes.",
-            [f"accel {axis} mg" for axis in "xyz"] + [f"gyro {axis} deg/s" for axis in "xyz"],
+            [f"accel {axis}, mg" for axis in "xyz"] + [f"gyro {axis}, deg/s" for axis in "xyz"],
             lambda imu: [*_three(imu.accel.bias, 1e3 / STANDARD_GRAVITY), *_three(imu.gyro.bias, math.degrees(1))],
         ),
         table(
             "Scale factors",
             "Of each IMU, along its own axes, off nominal; misalignments are in the record.",
-            [f"{sensor} {axis} ppm" for sensor in ("accel", "gyro") for axis in "xyz"],
+            [f"{sensor} {axis}, ppm" for sensor in ("accel", "gyro") for axis in "xyz"],
             lambda imu: [*_three(imu.accel.scale_factor, 1e6, 1.0), *_three(imu.gyro.scale_factor, 1e6, 1.0)],
         ),
     ]

@@ -117,7 +117,7 @@ def _sphere_figure(record: Calibration, data: MagFields) -> Figure:
             scatter(rounded(after[:, i]), rounded(after[:, j]), "markers", name="calibrated", showlegend=shown,
                     marker={"color": GOOD, "size": 7}, text=data.label, hovertemplate=_LABEL, **axes),
         ]  # fmt: skip
-        span = [0.345 * place, 0.345 * place + 0.31]
+        span = [0.36 * place, 0.36 * place + 0.28]
         layout[f"xaxis{number}"] = figure_axis(first, domain=span, range=[-reach, reach], anchor=f"y{number}")
         layout[f"yaxis{number}"] = figure_axis(
             second, range=[-reach, reach], anchor=f"x{number}", scaleanchor=f"x{number}"
