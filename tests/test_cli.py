@@ -201,6 +201,7 @@ def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
     assert 'href="fleet.html"' in index
     for name in ("tumble", "array", "warmup", "centrifuge", "noise"):
         verdict = il.load(tmp_path / "here" / f"{name}.json").verdict
+        assert not any("unit of time" in reason for reason in verdict.reasons)
         assert f'class="state {verdict.state}"' in index
         assert all(reason in unescape(index) for reason in verdict.reasons[:1])
     fleet = "12 of 12 units have their record: 12 good; LINE-0005 is beyond the limits of bias_x; LINE-0005 stands out"

@@ -110,6 +110,11 @@ def test_from_the_plug_to_the_record_with_a_knocked_attitude_dropped(live, new_p
         "Enough attitudes, but the model is too simple: see the warning below.",
         "Enough: make the record.",
     ]
+    words = page.evaluate(
+        """() => import("/static/dom.js").then(({ inWords }) => inWords(
+            "record more (imulab tumble plan --add FILE), or state --mag-order, m/s^2, 'imulab show A -o B'"))"""
+    )
+    assert words == "record more (imulab tumble plan --add FILE), or state “mag order”, m/s², 'imulab show A -o B'"
     numbers = page.locator("section:has(> h2:text-is('Attitudes')) tbody tr td:first-child").all_inner_texts()
     assert "5" not in numbers
     assert len(numbers) >= 14

@@ -273,8 +273,8 @@ def _health(record: ComparisonRecord, a: int) -> Figure:
             traces.append(scatter(at, which, "markers", marker=marker, name=label, hovertemplate=hover))
     return curves(
         title=f"Weight and health of each gyro under robust{axis_suffix(record.model.axes[a])}",
-        caption="Dark: counts for much. White: not in use. Marks: stuck, non-finite, or a bias that jumped and is "
-        "being estimated again.",
+        caption="The stronger the colour, the more it counts. Blank: not in use. Marks: stuck, non-finite, or a bias "
+        "that jumped and is being estimated again.",
         traces=traces,
         x=figure_axis(TIME),
         y={"automargin": True, "autorange": "reversed"},
