@@ -82,8 +82,10 @@ def test_a_hundred_thousand_decimals_of_every_length_are_rounded_as_float_does()
     rng = np.random.default_rng(20261120)
     count = 100_000
     numbers, lengths = rng.integers(10**18, 10**19, count, np.uint64), rng.integers(1, 20, count)
-    digits = [str(number)[:length] for number, length in zip(numbers, lengths, strict=True)]
-    points, powers = rng.integers(0, 20, count), rng.integers(-60, 30, count)
+    zeros = rng.integers(0, 30, count) * rng.integers(0, 2, count)  # before the first digit, in every other number
+    rows = zip(numbers, lengths, zeros, strict=True)
+    digits = ["0" * before + str(number)[:length] for number, length, before in rows]
+    points, powers = rng.integers(0, 20 + zeros), rng.integers(-60, 30, count)
     tokens = [f"{d[:p]}.{d[p:]}" + (f"e{e}" if e > -30 else "") for d, p, e in zip(digits, points, powers, strict=True)]
     answer, found = parse(tokens)
     assert answer[:2] == (count, 0)

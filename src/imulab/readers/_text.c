@@ -196,6 +196,7 @@ static inline const char *plain_number(const char *p, const char *end, double *v
         exponent = point - p;
         count -= exponent;
     }
+    for (; count > 19 && (*first == '0' || *first == '.'); first++) count -= *first == '0'; /* leading zeros */
     if (count == 0 || count > 19) return NULL;
     if (p < end && (*p | 32) == 'e') {
         p++;
