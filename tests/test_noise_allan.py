@@ -42,6 +42,13 @@ def test_sums_of_lags_that_samples_do_not_have_are_refused(sums, lags):
         _allan.fill_squares(np.empty(sums), np.zeros(100), np.array(lags))
 
 
+def test_the_integral_is_the_running_sum_of_samples_less_their_mean_to_the_bit():
+    samples = np.random.default_rng(2).standard_normal(10_000) + 3.0
+    expected = np.cumsum(samples - 2.9)
+    _allan.integrate(samples, 2.9)
+    assert np.array_equal(samples, expected)
+
+
 def test_dense_taus_are_24_a_decade_and_contain_those_of_allantools():
     samples = np.random.default_rng(1).standard_normal(20_000)
     dense = allan_deviation(samples, 10.0, "dense")

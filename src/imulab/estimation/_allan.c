@@ -20,6 +20,20 @@ static double second_differences(const double *x, Py_ssize_t start, Py_ssize_t s
     return (sums[0] + sums[1]) + (sums[2] + sums[3]);
 }
 
+PyDoc_STRVAR(integrate_doc, "integrate(values, mean) -> None\n\n"
+                            "The running sums of a float64 buffer less a mean, in its place.");
+static PyObject *integrate(PyObject *module, PyObject *args) {
+    Py_buffer values;
+    double mean, sum = 0.0;
+    (void)module;
+    if (!PyArg_ParseTuple(args, "w*d", &values, &mean)) return NULL;
+    double *x = values.buf;
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t k = 0; k < values.len / DOUBLE_BYTES; k++) x[k] = sum += x[k] - mean;
+    Py_END_ALLOW_THREADS
+    return done(&values, 1, 1);
+}
+
 PyDoc_STRVAR(fill_squares_doc, "fill_squares(sums, integral, lags) -> None\n\n"
                                "Sums of squared second differences of a float64 buffer at lags, int64.");
 static PyObject *fill_squares(PyObject *module, PyObject *args) {
@@ -46,4 +60,4 @@ static PyObject *fill_squares(PyObject *module, PyObject *args) {
     return done(v, 3, fits);
 }
 
-MODULE(_allan, "The sums of an Allan curve.", METHOD(fill_squares))
+MODULE(_allan, "The sums of an Allan curve.", METHOD(integrate), METHOD(fill_squares))

@@ -15,7 +15,7 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError
 from imulab.estimation import TAUS
-from imulab.estimation._allan import fill_squares
+from imulab.estimation._allan import fill_squares, integrate
 from imulab.estimation.decisions import NOISE_MODEL_REJECTED
 from imulab.estimation.distributions import probability_text
 from imulab.estimation.noise.analysis import Analysis, average, intervals_of
@@ -101,8 +101,7 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
     mean = centred.mean()
     if not math.isfinite(mean):
         raise DataError("Allan deviation: expected finite samples")
-    centred -= mean
-    np.add.accumulate(centred, out=centred)
+    integrate(centred, mean)
     counts = _averages(len(integral), rate, taus)
     squares = np.empty(len(counts))
     fill_squares(squares, integral, counts)

@@ -13,6 +13,7 @@ import numpy as np
 from imulab.device.tables import Fusion
 from imulab.display import Finding, Note, prefixed
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
+from imulab.estimation._allan import integrate
 from imulab.estimation.column_noise import noise_lines
 from imulab.estimation.noise_coefficients import COEFFICIENTS, DeviationCurve, coefficients_dict
 from imulab.estimation.rows import LeftOut, leave_out
@@ -276,9 +277,10 @@ def _allan_covariance(
     covariance = np.zeros((len(elements.axes), n, n))
     for part in np.array_split(starts, -(-m // max(ROWS_AT_ONCE, 4 * size))):
         readings = _readings_si(still, elements, slice(part[0], part[-1] + 2 * size))
-        readings -= rest.bias
         total = np.zeros((len(elements.axes), n, len(readings) + 1))
-        np.cumsum(np.moveaxis(readings, 0, 2), axis=2, out=total[:, :, 1:])  # of each gyro, whose readings lie together
+        total[:, :, 1:] = np.moveaxis(readings, 0, 2)  # those of each gyro lie together
+        for a, i in np.ndindex(rest.bias.shape):
+            integrate(total[a, i, 1:], float(rest.bias[a, i]))
         its = part - part[0]
         difference = (total[:, :, its + 2 * size] - 2 * total[:, :, its + size] + total[:, :, its]) / size
         if aligned is not None:
