@@ -25,6 +25,7 @@ from imulab.estimation.noise.spectrum import (
     variances_of_coefficients,
 )
 from imulab.estimation.noise.terms import NAMES, prepare, terms
+from imulab.units import to_si
 from reference import noise as reference
 
 
@@ -52,6 +53,15 @@ def test_bins_hold_the_mean_squares_of_the_transform():
     np.testing.assert_allclose(found.slow, c, atol=1e-12)
     for first, last, power in zip(spectrum.first, spectrum.last, spectrum.power, strict=True):
         assert power == pytest.approx(np.mean(c[first - 1 : last] ** 2), rel=1e-12)
+
+
+@pytest.mark.parametrize("count", [1000, cosine.WHOLE + 3 * cosine.STRETCH + 7])
+def test_samples_are_converted_to_si_before_they_are_transformed(count):
+    x = np.random.default_rng(3).standard_normal(count)
+    found, expected = transformed(x, 0.01, unit="deg/s"), transformed(to_si(x, "deg/s"), 0.01)
+    for mine, its in zip(found.spectra, expected.spectra, strict=True):
+        assert np.array_equal(mine.power, its.power)
+    assert np.array_equal(found.slow, expected.slow)
 
 
 @pytest.mark.parametrize("count", [1, 7, 500, 1009, 100_003, 9_999_991])

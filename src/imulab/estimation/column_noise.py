@@ -31,7 +31,7 @@ from imulab.estimation.noise_coefficients import (
 )
 from imulab.estimation.rows import Step, deviation_of_steps, find_step, leave_out
 from imulab.estimation.sampling import bridged, mend_stamps, sampling_rate, steady_part
-from imulab.recording import Array, Recording, check_not_resampled, converted
+from imulab.recording import Array, Recording, check_not_resampled
 from imulab.units import from_si, parse_unit, si_unit, to_si
 
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
@@ -260,7 +260,7 @@ def columns_noise(
                 f"noise coefficients: {len(samples)} samples are too few; expected some {FEWEST} samples or more"
             )
         why.append(reason or _unfit(samples, float(curves[-1].deviation[0]) / to_si(1.0, unit)))
-        stretches += [] if why[-1] else [[transformed(converted(samples, unit), 1 / rate)]]
+        stretches += [] if why[-1] else [[transformed(samples, 1 / rate, unit=unit)]]
         del samples  # before the next is made
     fit = [k for k, reason in enumerate(why) if not reason]
     analysed_columns = analyses(stretches, candidates) if fit else []

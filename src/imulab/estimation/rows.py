@@ -56,7 +56,8 @@ def medians(values: NDArray[Any], axis: int = -1) -> Array:
     parted = _partition(np.moveaxis(values, axis, -1) if values.ndim > 1 else values, middle)
     high = parted[..., middle]
     low = high if values.shape[axis] % 2 else parted[..., :middle].max(-1)
-    return np.where(np.isnan(parted[..., middle:].max(-1)), np.nan, (low + high) / 2)
+    unknown = np.isnan(parted[..., middle:].max(-1)) if parted.size and math.isnan(parted.max()) else False
+    return np.where(unknown, np.nan, (low + high) / 2)
 
 
 def quantile(values: NDArray[Any], share: float) -> float:

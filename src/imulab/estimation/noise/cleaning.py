@@ -132,15 +132,17 @@ def knocks_removed(samples: Array, ordered: Array) -> tuple[Array, NDArray[np.in
     if count < _FEWEST_BLOCKS:
         return samples, none
     level = _medians_of(ordered)
-    # The ten samples that are farthest from the median are among the ten smallest and the ten largest.
-    ends = np.abs(np.concatenate([ordered[:, :_FIFTH], ordered[:, -_FIFTH:]], axis=1) - level[:, None])
-    far = np.partition(ends, _FIFTH, axis=1)[:, _FIFTH]
+    # Of the ten samples that are farthest from the median, some are the smallest and the others the largest.
+    below = np.subtract(level, ordered[:, :_FIFTH].T, order="C")
+    above = np.subtract(ordered[:, : -_FIFTH - 1 : -1].T, level, order="C")
+    far = np.maximum.reduce([below[-1], above[-1], *np.minimum(below[:-1], above[-2::-1])])
     around = np.lib.stride_tricks.sliding_window_view(np.pad(level, _AROUND // 2, mode="reflect"), _AROUND)
     off = np.abs(level - medians(around))
     knocked = np.zeros(count, dtype=np.bool_)
     for size, limit in ((off, _KNOCK_OFF / _TO_SIGMA), (far, _LOUD)):
-        usual = limit * quantile(size, 0.95)
-        knocked |= (size > usual) & (quantile(size, 0.9) > 0)  # samples in whole counts hardly ever differ
+        beyond = size > limit * quantile(size, 0.95)
+        if beyond.any() and quantile(size, 0.9) > 0:  # samples in whole counts hardly ever differ
+            knocked |= beyond
     if not 0 < np.count_nonzero(knocked) <= _MOST_KNOCKED * count:
         return samples, none
     # A knock that reaches into the next block includes it.

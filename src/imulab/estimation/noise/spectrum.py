@@ -22,7 +22,7 @@ from imulab.estimation.noise.cleaning import (
     strong_lines_removed,
 )
 from imulab.estimation.rows import distinct
-from imulab.recording import Array
+from imulab.recording import Array, converted, release
 
 # Bins of frequency.
 
@@ -87,6 +87,8 @@ def bins(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 WHOLE, STRETCH = 1 << 22, 1 << 18
 """Most samples that are transformed as a whole; samples of a stretch of a longer log."""
+_TOGETHER = 2
+"""Stretches that are transformed together."""
 _MEANS = 1 << 21
 """Most means that are kept: with more, each is of twice as many samples."""
 _SHARE = 32
@@ -171,18 +173,19 @@ def cosine_coefficients(samples: Array, most: int | None = None) -> Array:
 
 
 def _turned(samples: Array, most: int | None = None) -> NDArray[np.complex128]:
-    """Return ``sqrt(n/2) (c_j - i c_{n-j})`` of samples of shape (n,), j = 0 .. n // 2, or up to `most`."""
-    n = len(samples)
+    """Return ``sqrt(n/2) (c_j - i c_{n-j})`` of samples of shape (..., n), j = 0 .. n // 2, or up to `most`."""
+    n = samples.shape[-1]
     # The Fourier transform of the even samples, then the odd ones backwards, turned, is the cosine transform.
-    ordered = np.concatenate([samples[::2], samples[1::2][::-1]])
-    ordered -= samples.mean()
+    ordered = np.concatenate([samples[..., ::2], samples[..., 1::2][..., ::-1]], axis=-1)
+    ordered -= samples.mean(axis=-1, keepdims=True)
     turned = np.fft.rfft(ordered)
     del ordered
-    low = turned if most is None or most >= len(turned) else turned[: most + 1]
+    low = turned if most is None else turned[..., : most + 1]
+    count = low.shape[-1]
     # Each angle is the sum of a coarse and a fine one, which needs a thousandth of the exponentials.
-    fine, coarse = np.arange(_FINE), _FINE * np.arange(len(low) // _FINE + 1)
+    fine, coarse = np.arange(_FINE), _FINE * np.arange(count // _FINE + 1)
     turn = np.multiply.outer(np.exp(-0.5j * np.pi / n * coarse), np.exp(-0.5j * np.pi / n * fine))
-    low *= turn.ravel()[: len(low)]
+    low *= turn.ravel()[:count]
     return low
 
 
@@ -195,6 +198,8 @@ class Accumulator:
         Time between samples, s.
     despike
         Whether spikes are replaced by the line through the medians around them.
+    long
+        Whether there will be more samples than are transformed as a whole, where that is known.
 
     Examples
     --------
@@ -205,27 +210,22 @@ class Accumulator:
     3000
     """
 
-    def __init__(self, interval: float, despike: bool = True) -> None:
-        self._interval, self._despike = interval, despike
+    def __init__(self, interval: float, despike: bool = True, long: bool = False) -> None:
+        self._interval, self._despike, self._long = interval, despike, long
         self._waiting = np.empty(0)
         self._held = self._spikes = self._stretches = 0
-        self._squares = np.empty(0)
+        self._squares = np.zeros(1)
         self._knocks: list[NDArray[np.int64]] = []
         self._means, self._filled, self._averaged = np.empty(0), 0, 1
 
     def add(self, samples: Array) -> None:
         """Take the next samples, finite, shape (k,)."""
-        if self._stretches or self._held + len(samples) > WHOLE:
-            held = self._waiting[: self._held]
-            stop = len(held) // STRETCH * STRETCH
-            for start in range(0, stop, STRETCH):
-                self._transform(held[start : start + STRETCH])
-            samples = np.concatenate([held[stop:], samples]) if stop < len(held) else samples
+        self._long = self._long or self._held + len(samples) > WHOLE
+        if self._long:
+            rest = self._transform(self._all())
+            samples = np.concatenate([rest, samples]) if len(rest) else samples
             self._waiting, self._held = np.empty(STRETCH), 0
-            stop = len(samples) // STRETCH * STRETCH
-            for start in range(0, stop, STRETCH):
-                self._transform(samples[start : start + STRETCH])
-            samples = samples[stop:]
+            samples = self._transform(samples)
         elif not len(self._waiting):
             self._waiting = np.empty(WHOLE)  # at once: many small arrays would leave holes in the memory
         self._waiting[self._held : self._held + len(samples)] = samples
@@ -288,15 +288,20 @@ class Accumulator:
         spectrum = binned(squares, fine, (first, last), self._interval, count)
         return Stretch((spectrum,), c[:SLOW].copy(), fine[:SLOW], lines, self._spikes, self._knocked())
 
-    def _transform(self, samples: Array) -> None:
-        samples = self._cleaned(samples)
-        self._add_means(samples)
-        squares = _turned(samples).view(np.float64)
-        squares *= squares
-        if self._stretches:
-            squares += self._squares
-        self._squares = squares
-        self._stretches += 1
+    def _transform(self, samples: Array) -> Array:
+        """Add the squares of all whole stretches, some at a time since they share their sines; return the rest."""
+        while many := min(len(samples) // STRETCH, _TOGETHER):
+            stretches = np.empty((many, STRETCH))
+            for stretch, part in zip(stretches, samples[: stretches.size].reshape(stretches.shape), strict=True):
+                stretch[:] = self._cleaned(part)
+                self._add_means(stretch)
+                self._stretches += 1
+            squares = _turned(stretches).view(np.float64)
+            squares *= squares
+            squares[0] += self._squares
+            self._squares = squares.sum(axis=0)
+            samples = samples[stretches.size :]
+        return samples
 
     def _add_means(self, samples: Array) -> None:
         """Add means of samples; their number is a multiple of that of a mean, except at the end of the log."""
@@ -358,12 +363,14 @@ def binned(
     return Spectrum(interval, count, first, last, power, freedom)
 
 
-def transformed(samples: Array, interval: float, despike: bool = True) -> Stretch:
-    """Return the spectra of samples in memory, finite, shape (n,): see `Accumulator`."""
-    gathered = Accumulator(interval, despike)
+def transformed(samples: Array, interval: float, despike: bool = True, unit: str = "1") -> Stretch:
+    """Return the spectra, SI, of samples in a unit, finite, shape (n,): see `Accumulator`."""
+    gathered = Accumulator(interval, despike, long=len(samples) > WHOLE)
     if len(samples) <= WHOLE:
-        return gathered.whole(np.asarray(samples, dtype=np.float64))
-    gathered.add(samples)
+        return gathered.whole(converted(np.asarray(samples, dtype=np.float64), unit))
+    for start in range(0, len(samples), _TOGETHER * STRETCH):
+        gathered.add(converted(samples[start : start + _TOGETHER * STRETCH], unit))
+        release(samples)
     return gathered.stretch()
 
 
