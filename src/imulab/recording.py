@@ -563,6 +563,7 @@ LARGE = 1 << 28
 
 
 _AT_ONCE = 1 << 18  # rows of a column in a temporary file that are converted together
+_KEPT = 1 << 20  # numbers, 8 MB: more than the blocks that a file is read in
 
 
 def is_large(file: str | PathLike[str] | None) -> bool:
@@ -580,6 +581,8 @@ def on_disk(blocks: Iterator[Recording]) -> Recording:
     DataError
         There is no room for the files.
     """
+    # The C library of Linux keeps twice what was once freed; what it gives back is cleared anew for every block.
+    np.empty(_KEPT)
     first = next(blocks)
     files = {name: _file() for name in first.columns}
     notes: dict[str, None] = {}
