@@ -194,10 +194,17 @@ def test_what_to_do_about_outputs_far_off_follows_from_what_explains_them(factor
     assert verdict.next[0].startswith(action)
 
 
-@pytest.mark.parametrize(("size", "unit"), [(1.05, "g"), (1000.0, "mg"), (1.2, "UNIT"), (50.0, "UNIT")])
+@pytest.mark.parametrize(("size", "unit"), [(1.05, "g"), (1000.0, "mg"), (1.4, "UNIT"), (50.0, "UNIT")])
 def test_a_refused_unit_comes_with_the_one_that_would_be_right(size, unit):
     u = size * reference.random_attitudes(np.random.default_rng(9), 30)
     with pytest.raises(DataError, match=rf"is the unit wrong\? --unit accel={unit} states another"):
+        il.fit_tumble(il.find_attitudes(table(u)), order=1, gravity=G)
+
+
+@pytest.mark.parametrize("factor", [0.125, 0.25, 4.0])
+def test_a_refused_range_comes_with_what_to_do_about_ranges(factor):
+    u = factor * G * reference.random_attitudes(np.random.default_rng(9), 30)
+    with pytest.raises(DataError, match=r"expected 9.807 m/s.2: set the range that the driver assumes"):
         il.fit_tumble(il.find_attitudes(table(u)), order=1, gravity=G)
 
 

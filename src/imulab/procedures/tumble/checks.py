@@ -7,7 +7,7 @@ import numpy as np
 from imulab.columns import triad
 from imulab.errors import DataError, RecordError
 from imulab.estimation.decisions import SCALE_OFF_UNIT
-from imulab.estimation.likely_unit import unit_instead
+from imulab.estimation.likely_unit import ANOTHER_RANGE, no_gravity, unit_instead
 from imulab.estimation.rows import median
 from imulab.procedures.tumble import HIGHEST_ORDER
 from imulab.procedures.tumble.attitudes import Attitudes, Motion
@@ -104,10 +104,12 @@ def _check_magnitude(attitudes: Attitudes, gravity: float, zero: Array) -> None:
     force = median(lengths)
     if not gravity / _ANOTHER_UNIT <= force <= _ANOTHER_UNIT * gravity:
         other = unit_instead(force / gravity, unit.symbol, SCALE_OFF_UNIT) or "UNIT"
+        another_range = no_gravity(force, unit.symbol).action == ANOTHER_RANGE
+        mend = ANOTHER_RANGE if another_range else f"is the unit wrong? --unit accel={other} states another"
         raise DataError(
             f"{attitudes.recording.name}: columns accel_x accel_y accel_z: the specific force at rest is about "
             f"{from_si(force, unit.symbol):.4g} {unit.symbol}, expected {from_si(gravity, unit.symbol):.4g} "
-            f"{unit.symbol}: is the unit wrong? --unit accel={other} states another"
+            f"{unit.symbol}: {mend}"
         )
     magnitude = lengths / gravity
     far = (magnitude < 1 / _FARTHEST) | (magnitude > _FARTHEST)
