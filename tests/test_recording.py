@@ -1,5 +1,6 @@
 """Recordings: columns with units, what may be in them, and how messages name the place."""
 
+import mmap
 import sys
 from datetime import datetime, timedelta
 
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from imulab.columns import parse_column_title
 from imulab.errors import DataError, UnitError
-from imulab.recording import Recording, check_finite, check_time
+from imulab.recording import Recording, check_finite, check_time, release
 
 # The vocabulary of native files and the quantities that its columns may hold.
 ALLOWED = {
@@ -264,3 +265,12 @@ def test_frames_without_their_library_say_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(DataError, match="needs pandas or polars, which is not installed: pip install pandas"):
         make(time=[0]).to_frame()
+
+
+@pytest.mark.skipif(not hasattr(mmap, "MADV_DONTNEED"), reason="memory is not given back here")
+def test_the_callers_map_keeps_its_changes(tmp_path):
+    np.arange(8192.0).tofile(tmp_path / "x.bin")
+    mine = np.memmap(tmp_path / "x.bin", np.float64, "c")
+    mine *= 2
+    release(mine)
+    np.testing.assert_array_equal(mine, 2 * np.arange(8192.0))

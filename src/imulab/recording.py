@@ -607,10 +607,13 @@ class _OnDisk(dict[str, Array]):
 
 
 def release(*columns: Array) -> None:
-    """Give back the memory that holds columns of temporary files; what is used again is read again."""
+    """Give back the memory that holds columns of temporary files; what is used again is read again.
+
+    A map that can be written to, a caller's, may hold changes that are in no file: it is left alone.
+    """
     for values in columns:
         base = _map_of(values)
-        if base is not None and hasattr(mmap, "MADV_DONTNEED"):
+        if base is not None and memoryview(base).readonly and hasattr(mmap, "MADV_DONTNEED"):
             base.madvise(mmap.MADV_DONTNEED)
 
 
