@@ -136,7 +136,22 @@ def test_turns_stated_the_other_way_round_are_said_with_those_to_state():
     verdict = il.fit_turns(turned([-1, -2, 1], 1.02), turns="1,2,-1").calibration.verdict
     assert verdict.state == "bad"
     assert verdict.reasons == ("gyro_z turned the other way round than stated: its scale factor is -1.02",)
-    assert verdict.next == ("state its turns as --turns -1,-2,1, positive by the right-hand rule about its own axis",)
+    assert verdict.next == ("state the turns as --turns -1,-2,1, positive by the right-hand rule about their own axis",)
+
+
+def test_turns_to_state_are_those_of_all_axes():
+    parts = [turned([n], axis=axis) for n, axis in ((1, 0), (-1, 1), (1, 2), (-1, 1))]
+    rates = np.vstack([np.column_stack([part.column(f"gyro_{a}") for a in "xyz"]) for part in parts])
+    both = il.Recording.from_arrays(gyro=rates, rate=FREQUENCY, units={"gyro": "deg/s"})
+    verdict = il.fit_turns(both, turns="1,1,1,1").calibration.verdict
+    assert verdict.next[0].startswith("state the turns as --turns 1,-1,1,-1, positive")
+    assert il.fit_turns(both, turns="1,-1,1,-1").calibration.verdict.state == "good"
+
+
+def test_turns_the_other_way_round_in_another_unit_are_doubted_too():
+    reasons = il.fit_turns(turned([-1, -2, 1], 180 / np.pi), turns="1,2,-1").calibration.verdict.reasons
+    assert any("the other way round" in reason for reason in reasons)
+    assert any("is the unit right?" in reason for reason in reasons)
 
 
 def test_the_uncertainty_of_the_clock_is_common_to_all(session):

@@ -410,19 +410,25 @@ def _scale_parameters(axis_turns: Mapping[str, AxisTurns], clock: float | None, 
 def _warn_turns(axis_turns: Mapping[str, AxisTurns], clock: float | None) -> list[str]:
     """Return warnings and notes about scale factors: off the unit, scattered, turned one way, or per clock."""
     messages: list[str] = []
+    made = sorted(
+        (k, n * np.sign(each.scale))
+        for each in axis_turns.values()
+        for k, n in zip(each.motion, each.count, strict=True)
+    )
+    turned = ",".join(f"{count:.0f}" for _, count in made)
     for a, turned_axis in axis_turns.items():
         if turned_axis.scale < 0:
-            opposite = ",".join(f"{-count:.0f}" for count in turned_axis.count)
             messages.append(
                 Bad(
                     f"gyro_{a} turned the other way round than stated: its scale factor is {turned_axis.scale:.3g}",
-                    f"state its turns as --turns {opposite}, positive by the right-hand rule about its own axis",
+                    f"state the turns as --turns {turned}, positive by the right-hand rule about their own axis",
                 )
             )
-        elif abs(turned_axis.scale - 1) > SCALE_OFF_UNIT:
+        off = abs(turned_axis.scale) - 1
+        if abs(off) > SCALE_OFF_UNIT:
             messages.append(
                 Bad(
-                    f"gyro_{a}: the scale factor is off by {100 * (turned_axis.scale - 1):+.3g} %: is the unit right?",
+                    f"gyro_{a}: the scale factor is off by {100 * off:+.3g} %: is the unit right?",
                     "check the unit of the outputs, and the turns stated",
                 )
             )
