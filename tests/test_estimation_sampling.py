@@ -28,7 +28,8 @@ def noise(time, unit="s", seed=1):
         (10.0, "ms", ""),
         (100.0, "us", ""),
         (0.1, "s", ""),
-        (0.2, "s", ""),
+        (0.2, "s", "5000 Hz if it is in ms"),
+        (0.19, "s", ""),
     ],
 )
 def test_a_unit_of_time_that_cannot_be_right_is_said(step, unit, said):

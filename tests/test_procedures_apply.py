@@ -460,7 +460,7 @@ def under_way(size=1.0):
 
 @pytest.mark.parametrize("forces", [turned_over(), under_way()], ids=["turned", "under way"])
 @pytest.mark.parametrize(
-    ("true", "stated"), [("m/s^2", "g"), ("m/s^2", "mg"), ("g", "m/s^2"), ("g", "mg"), ("mg", "g")]
+    ("true", "stated"), [("m/s^2", "g"), ("m/s^2", "mg"), ("g", "m/s^2"), ("g", "mg"), ("mg", "g"), ("mg", "m/s^2")]
 )
 def test_a_unit_in_which_there_is_no_gravity_is_warned_of(true, stated, forces, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -501,7 +501,7 @@ def test_a_still_log_of_10_g_is_no_warning_since_a_centrifuge_shows_it_too():
     at_rest, log = logged(np.full((3000, 3), [0.0, 0.0, G]))
     (note,) = warn_of_unit(loaded(at_rest), log.with_columns({}, dict.fromkeys(AXES, "g")))
     assert isinstance(note, Note)
-    assert "if the unit is at rest, theirs is m/s^2, not g: --unit accel=m/s^2" in note
+    assert "if the sensor is at rest, their unit is m/s^2, not g: --unit accel=m/s^2" in note
 
 
 @pytest.mark.parametrize("unit", ["m/s^2", "g"])
@@ -520,3 +520,12 @@ def test_the_unit_of_a_few_rows_or_of_gaps_is_judged_without_them():
     nothing = replace(stated, columns={name: np.full(4, np.nan) for name in AXES})
     ready = loaded(made)
     assert [len(warn_of_unit(ready, each)) for each in (stated, table, nothing)] == [1, 1, 0]
+    warmth = {"temperature": np.full(len(stated), np.nan)}
+    assert len(warn_of_unit(ready, stated.with_columns(warmth, {"temperature": "degC"}))) == 1
+
+
+def test_counts_stated_as_g_are_asked_for_their_unit():
+    made, log = logged(turned_over())
+    counts = log.with_columns({name: 16384 / G * log.column(name) for name in AXES}, dict.fromkeys(AXES, "g"))
+    (said,) = warn_of_unit(loaded(made), counts)
+    assert "g, more than any accelerometer reads, as counts would be; is their unit, g, right?" in said

@@ -32,9 +32,9 @@ _BLOCKS, _SMALLEST_BLOCK = 100, 100  # blocks whose usual steps show a change of
 _MORE_IN_BURSTS = 10  # times as many steps of a block where stamps come in bursts
 SAME_RATE = 0.05  # relative: parts of a recording whose steps are this close have one rate
 _SLOWEST, _FASTEST = 0.5, 20_000.0  # Hz: at rates beyond, the unit of time is doubted
-_SLOW = 2.0  # Hz: only noted, for long logs are as slow as 1 or 2 kHz in ms titled as s
 TOO_SLOW = 5.0
-"""Rate, Hz, up to which the unit of time is doubted where there are too few samples to go on."""
+"""Rate, Hz, up to which the unit of time is noted, for up to 5 kHz in ms titled s look like this, and doubted where
+there are too few samples to go on."""
 TIME_DOUBTED = "is the unit of time right"
 _USUAL = (10.0, 10_000.0)  # Hz: likely rates, for the guess at the right unit of time
 BRIDGED, FEW = 0.01, 0.001
@@ -343,7 +343,7 @@ def mislabelled(unit: str, rate: float, time: float) -> list[str]:
     A rate that is only rare is a finding where `time`, a stamp in s, would be later than 2099 if it counts from 1970.
     """
     late = time > EPOCHS[1]
-    doubt = doubt_unit_of_time(unit, rate, TOO_SLOW if late else _SLOW)
+    doubt = doubt_unit_of_time(unit, rate, TOO_SLOW)
     if not doubt:
         return []
     kind = Finding if late or not _SLOWEST < rate < _FASTEST else Note
