@@ -56,7 +56,7 @@ def test_a_smaller_model_is_the_least_squares_fit_of_its_own(misalignment, state
 def test_px4_gets_the_best_scale_factors_and_not_those_of_order_3(tmp_path):
     record, _, truth = made(misalignment=False, count=24, sigma=0.02)
     told = []
-    (file,) = export("px4", [record], tmp_path, ExportOptions(lossy=True, tell=told.append))
+    (file,) = export("px4", [record], tmp_path, ExportOptions(lossy=True, device_id=77, tell=told.append))
     values = programs.px4(file)[0]
     error = [values[f"CAL_ACC0_{a}SCALE"] * truth[f"scale_factor_{a.lower()}"] - 1 for a in "XYZ"]
     kept = [truth[f"scale_factor_{a}"] / record.value(f"scale_factor_{a}") - 1 for a in "xyz"]
@@ -91,7 +91,7 @@ def test_too_few_attitudes_to_fit_anew_are_called_so(tmp_path):
     few = {key: value[:5] for key, value in record.data["attitudes"].items() if value is not None}
     told = []
     with_few = replace(record, data={**record.data, "attitudes": few})
-    export("kalibr", [with_few], tmp_path, ExportOptions(lossy=True, tell=told.append))
+    export("kalibr", [with_few], tmp_path, ExportOptions(lossy=True, device_id=77, tell=told.append))
     (line,) = [line for line in told if "whole model" in line]
     assert "the record's 5 attitudes are too few, or not the ones, to fit them to anew" in line
 
