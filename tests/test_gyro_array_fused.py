@@ -102,6 +102,16 @@ def test_spikes(seed):
     assert says(fused, "excluded")
 
 
+def test_each_of_many_gyros_with_the_same_fault_has_a_line_of_its_own():
+    readings = dynamic(1)[0]
+    for gyro, seconds in enumerate((12, 22, 32, 42)):
+        readings[seconds * RATE, gyro] += 300
+    lines = run(readings).health.lines()
+    assert [line.split(" (")[0] for line in lines] == [
+        f"gyro_{gyro}: excluded 1 sample from {seconds} s" for gyro, seconds in enumerate((12, 22, 32, 42), 1)
+    ]
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("elements", [3, 4, 6])
 def test_a_spike_in_the_very_first_sample_is_forgotten_within_1_s(seed, elements):

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imulab.columns import shared_unit
-from imulab.display import Bad, Finding, Note, join_alike, prefixed
+from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.estimation.clock import GAP, read_clock
 from imulab.estimation.noise_coefficients import resolution
@@ -492,9 +492,8 @@ class Health:
         return {self.names[a][i] for a, i, kind in self.events if kind == "stuck"}
 
     def lines(self) -> list[str]:
-        """Return a line for each gyro with a fault, those on gyros excluded alone, and one where none was left."""
-        faulty: list[str] = []
-        excluded: list[tuple[str, str]] = []
+        """Return a line for each gyro that was excluded, stuck, jumped or not finite, and one where none was left."""
+        lines: list[str] = []
         gyros = sorted({(a, i) for a, i, _ in self.events})
         for a, i in gyros:
             parts = [
@@ -502,13 +501,8 @@ class Health:
                 for _, kind in _KINDS
                 if (event := self.events.get((a, i, kind))) is not None
             ]
-            text = f"{'; '.join(parts)} (of {_samples(self.total)})"
-            finding = Finding(text, "check supply, link and range of this gyro")
-            if len(parts) > 1:
-                faulty.append(prefixed(self.names[a][i], finding))
-            else:
-                excluded.append((self.names[a][i], finding))
-        lines = faulty + [prefixed(" ".join(names), finding) for names, finding in join_alike(excluded)]
+            text = f"{self.names[a][i]}: {'; '.join(parts)} (of {_samples(self.total)})"
+            lines.append(Finding(text, "check supply, link and range of this gyro"))
         action = "check supply and link of the gyros that were excluded"
         if self.few > 0:
             text = f"fewer than three gyros left in {_samples(self.few)}: nothing to compare with, equal weights there"
