@@ -287,5 +287,10 @@ def test_findings_on_more_than_three_sensors_that_differ_by_numbers_alone_are_on
     assert names == ["gyro_x_12", "gyro_x_1", "gyro_x_7", "gyro_x_3"]
     assert text == "excluded 1…12 samples (p = 1e-07…12e-07), Hz: 1/f"
     assert (type(text), text.action) == (Finding, "check its supply")
+    thousands = join_alike((str(n), f"port #2: {n},100 of {n}0,000.5 rows, {n}0,20") for n in (9, 10, 11, 12))
+    assert [text for _, text in thousands] == ["port #2: 9,100…12,100 of 90,000.5…120,000.5 rows, 90…120,20"]
+    asked = join_alike((str(n), Finding(f"{n} bad", "check" if n < 3 else "mend")) for n in range(8))
+    assert [(names, text.action) for names, text in asked[-1:]] == [(["3", "4", "5", "6", "7"], "mend")]
+    assert [text.action for _, text in asked[:-1]] == ["check"] * 3
     assert join_alike((name, "dead") for name in ("a", "b")) == [(["a", "b"], "dead")]
     assert join_alike([]) == []

@@ -191,8 +191,13 @@ def _reworded(finding: str, text: str) -> str:
     return type(finding)(text, finding.action) if isinstance(finding, Finding) else text
 
 
-_NUMBER = re.compile(r"(?<![\w^.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?\b")
+_NUMBER = re.compile(r"(?<![\w^.])-?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?\b")
 _APART = 3  # sensors, of which each may have numbers of its own: the axes of a triad
+
+
+def _value(number: str) -> float:
+    """Return the value of a number as a message writes it, with or without commas between thousands."""
+    return float(number.replace(",", ""))
 
 
 def join_alike(findings: Iterable[tuple[str, str]]) -> list[tuple[list[str], str]]:
@@ -205,12 +210,13 @@ def join_alike(findings: Iterable[tuple[str, str]]) -> list[tuple[list[str], str
     >>> join_alike((f"gyro_{n}", f"stuck from {n}.5 s") for n in range(1, 6))
     [(['gyro_1', 'gyro_2', 'gyro_3', 'gyro_4', 'gyro_5'], 'stuck from 1.5…5.5 s')]
     """
-    alike: dict[tuple[type, str], list[tuple[str, str]]] = {}
+    alike: dict[tuple[type, str, tuple[str, ...]], list[tuple[str, str]]] = {}
     for name, finding in findings:
-        text = re.sub(rf"# {_THINGS}\b", r"# \1s", _NUMBER.sub("#", finding))
-        alike.setdefault((type(finding), text), []).append((name, finding))
+        action = getattr(finding, "action", "")
+        parts = tuple(re.sub(rf"^ {_THINGS}\b", r" \1s", part) for part in _NUMBER.split(finding))
+        alike.setdefault((type(finding), action, parts), []).append((name, finding))
     result: list[tuple[list[str], str]] = []
-    for (_, text), members in alike.items():
+    for (_, _, parts), members in alike.items():
         same: dict[str, list[str]] = {}
         for name, finding in members:
             same.setdefault(finding, []).append(name)
@@ -219,8 +225,8 @@ def join_alike(findings: Iterable[tuple[str, str]]) -> list[tuple[list[str], str
             result += [(those, finding) for finding, those in same.items()]
             continue
         columns = zip(*(_NUMBER.findall(finding) for finding in same), strict=True)
-        ranges = ["…".join(dict.fromkeys((min(texts, key=float), max(texts, key=float)))) for texts in columns]
-        whole = "".join(part + number for part, number in zip(text.split("#"), [*ranges, ""], strict=True))
+        ranges = ["…".join(dict.fromkeys((min(texts, key=_value), max(texts, key=_value)))) for texts in columns]
+        whole = "".join(part + number for part, number in zip(parts, [*ranges, ""], strict=True))
         result.append((names, _reworded(members[0][1], whole)))
     return result
 
