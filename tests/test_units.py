@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imulab.errors import UnitError
+from imulab.errors import OptionError, UnitError
+from imulab.quantities import parse_units
 from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_scale_factor, parse_unit, si_unit, to_si
 
 # What one of each unit is in SI (SI brochure, 9th edition, tables 1, 4, 7 and 8; IAU: 1 arcsec = pi/648000 rad; gravity
@@ -168,11 +169,37 @@ def test_an_unknown_unit_is_refused_with_the_known_ones(text):
     assert {*ONE, "K"} <= set(message.split("known units: ")[1].partition(";")[0].split())
 
 
-@pytest.mark.parametrize("text", ["rpm", "rev/s", "mm/s^2", "ft/s^2", "urad/s", "kg", "pT", "mV/g"])
+@pytest.mark.parametrize(
+    "text", ["rpm", "rev/s", "mm/s^2", "ft/s^2", "urad/s", "kg", "pT", "mV/g", "mGal", "degF", "deg/m", "Mrad"]
+)
 def test_another_unit_is_no_slip_of_a_known_one(text):
     with pytest.raises(UnitError) as caught:
         parse_unit(text)
     assert "did you mean" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "guess"),
+    [
+        ("accel=G", "g"),
+        ("accel=M/S^2", "m/s^2"),
+        ("accel=mGal", None),
+        ("gyro=rads", "rad/s"),
+        ("gyro=degps", "deg/s"),
+        ("gyro=DEG/sec", "deg/s"),
+        ("gyro=deg/s2", None),
+        ("gyro=deg/m", None),
+        ("table_angle=degs", None),
+        ("temperature=degF", None),
+        ("temperature=deg C", "degC"),
+        ("mag=nt", "nT"),
+        ("mag=degs", None),
+    ],
+)
+def test_a_guess_is_of_the_columns_quantity_and_of_the_same_size(text, guess):
+    with pytest.raises(OptionError) as caught:
+        parse_units(text, "--unit")
+    assert str(caught.value).partition("; did you mean ")[2] == (f"{guess!r}?" if guess else "")
 
 
 @pytest.mark.parametrize("convert", [lambda unit: to_si(1.0, unit), lambda unit: from_si(1.0, unit)])

@@ -324,7 +324,7 @@ def number_of(value: Any, place: str) -> float:
 def unit_of(text: Any, kind: str, place: str) -> str:
     """Return the symbol of a unit of one kind."""
     try:
-        unit = parse_unit(str(text))
+        unit = parse_unit(str(text), (kind,))
     except UnitError as error:
         raise UnitError(f"{place}: {error}") from None
     if unit.quantity != kind:

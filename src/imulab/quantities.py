@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 
+from imulab.columns import expected_quantities
 from imulab.errors import OptionError, RecordError, UnitError, quoted
 from imulab.units import parse_unit, to_si
 
@@ -282,7 +283,7 @@ def parse_units(text: str, called: str) -> dict[str, str]:
                 f"{called} {quoted(text)}: expected NAME=UNIT, each name once, such as accel=g,gyro=deg/s"
             )
         try:
-            units[name.strip()] = parse_unit(unit).symbol
+            units[name.strip()] = parse_unit(unit, expected_quantities(name.strip()) or ()).symbol
         except UnitError as error:
             raise OptionError(f"{called} {part.strip()}: {error}") from None
     return units

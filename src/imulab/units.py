@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, overload
 
@@ -125,7 +125,7 @@ _SPELLINGS = {
 _ELECTRIC = {"V": ("V", 1.0), "mV": ("V", 1e-3), "A": ("A", 1.0), "mA": ("A", 1e-3)}
 
 
-def parse_unit(text: str, quantities: Iterable[str] = ()) -> Unit:
+def parse_unit(text: str, quantities: Sequence[str] = ()) -> Unit:
     """Return the unit that a symbol stands for.
 
     Parameters
@@ -146,11 +146,20 @@ def parse_unit(text: str, quantities: Iterable[str] = ()) -> Unit:
         unit = _increment(symbol)
     if unit is None:
         known = known_units(*quantities)
-        # Another prefix or quantity is no slip: rpm is not ppm, mm/s^2 not m/s^2.
-        begin, parts = symbol[:2].lower(), symbol.count("/")
-        alike = [name for name in known if name[:2].lower() == begin and name.count("/") == parts]
-        raise UnitError(f"unknown unit {text!r}; known units: {' '.join(known)}{meant(alike, symbol)}")
+        written, parts = _letters(symbol), symbol.count("/")
+        alike = [n for n in known if _letters(n) == written and (quantities or n.count("/") == parts)]
+        raise UnitError(f"unknown unit {text!r}; known units: {' '.join(known)}{meant(alike, symbol, 0.0)}")
     return unit
+
+
+def _letters(symbol: str) -> str:
+    """Return what two spellings of a unit have in common, such as ``degs`` of ``deg/s``, ``DEG/sec`` and ``degps``.
+
+    Another prefix, quantity or size is no spelling: rpm is not ppm, mGal not mg, Mrad not mrad, m/s not m/s^2.
+    """
+    lower = re.sub(r"^M(?=[A-Za-z])", "mega", symbol).lower()
+    short = re.sub(r"p(?=[sh])|(?<=s)ec\b|[^a-z\d]", "", re.sub(r"\d+", "2", lower))
+    return re.sub(r"(?<=.)(.)\1+$", r"\1", short)
 
 
 def known_units(*quantities: str) -> list[str]:
