@@ -187,7 +187,14 @@ def test_no_module_of_other_packages_is_replaced():
 
 @pytest.mark.parametrize(
     ("probability", "text"),
-    [(0.8, "p = 0.8"), (0.0314, "p = 0.031"), (3.21e-5, "p = 3e-05"), (1e-39, "p below 1e-12"), (0.0, "p below 1e-12")],
+    [
+        (0.8, "p = 0.8"),
+        (0.0314, "p = 0.031"),
+        (3.21e-5, "p = 3e-05"),
+        (1e-39, "p below 1e-12"),
+        (0.0, "p below 1e-12"),
+        (float("nan"), "not tested"),
+    ],
 )
 def test_a_probability_is_never_nought_and_has_the_digits_that_it_deserves(probability, text):
     assert d.probability_text(probability) == text

@@ -7,6 +7,7 @@ scipy.special`` would take 0.2 s of processor time, more than most commands need
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -74,8 +75,8 @@ def sine_integral(value: ArrayLike) -> Array:
 
 
 def probability_text(probability: float | None, least: float = 1e-12) -> str:
-    """Return a probability for a sentence: ``p = 0.031``, ``p = 3e-05``, or ``p below 1e-12``."""
-    if probability is None:
+    """Return a probability for a sentence: ``p = 0.031``, ``p = 3e-05``, or ``p below 1e-12``; NaN is not tested."""
+    if probability is None or math.isnan(probability):
         return "not tested"
     digits = 2 if probability >= _SMALL else 1
     return f"p = {probability:.{digits}g}" if probability >= least else f"p below {least:g}"
