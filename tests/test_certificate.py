@@ -394,8 +394,12 @@ def test_a_laboratory_file_that_is_not_there_is_refused_with_how_to_write_one(so
     assert capsys.readouterr().err == f"imulab: {expected}\n"
 
 
-def test_a_record_that_takes_gravity_as_exact_is_sent_to_no_option_that_it_lacks(issue, capsys):
-    assert issue(REVIEWED + STANDARD, WRITTEN / "centrifuge.json") == 2
+@pytest.mark.parametrize("source", ["manifest, taken as exact", "the test's manifest"])
+def test_a_record_that_takes_gravity_as_exact_is_sent_to_no_option_that_it_lacks(issue, capsys, source):
+    record = il.load(WRITTEN / "centrifuge.json")
+    gravity = {**record.model["gravity"], "from": source}
+    replace(record, model={**record.model, "gravity": gravity}).save("centrifuge.json")
+    assert issue(REVIEWED + STANDARD, "centrifuge.json") == 2
     assert "a centrifuge record takes gravity as exact; leave this equipment out" in capsys.readouterr().err
 
 

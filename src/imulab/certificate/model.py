@@ -248,7 +248,7 @@ def _check_gravity(record: Calibration, standard: str, uncertainty: Stated) -> N
         raise RecordError(
             f"{standard}: equipment of gravity, but the record is made without gravity; leave this equipment out"
         )
-    if str(gravity.get("from")).startswith("manifest"):  # a centrifuge: no result depends on how well it is known
+    if "standard_uncertainty" not in gravity:  # a centrifuge: no result depends on how well it is known
         raise RecordError(
             f"{standard}: equipment of gravity, but a {record.procedure} record takes gravity as exact; leave this "
             "equipment out"
