@@ -274,6 +274,15 @@ def test_a_logarithmic_axis_of_less_than_two_decades_is_numbered_between_its_pow
     assert Figure("", "", traces, {"yaxis": log_axis("m", range=[0.2, 1.4])}).layout["yaxis"]["dtick"] == "D2"
 
 
+def test_the_title_of_an_axis_may_be_a_text():
+    epoch = 1.656e9
+    layout = {"xaxis": {"title": "time, s"}, "yaxis": {"title": "rate, deg/s"}}
+    figure = Figure("", "", [{"type": "scatter", "x": [epoch, epoch + 1], "y": [0, 1]}], layout)
+    assert figure.layout["yaxis"]["title"] == {"text": "rate, deg/s"}
+    assert figure.layout["xaxis"]["title"]["text"].startswith("time from 2022-06-23")
+    assert figure.traces[0]["x"] == [0, 1]
+
+
 def test_a_map_of_many_parameters_keeps_the_width_of_a_phone_for_its_cells():
     found = narrow(correlation_map("T", "", np.eye(37), [f"mag_misalignment_{n}" for n in range(37)], height=1092))
     assert found["layout"]["coloraxis"]["colorbar"]["orientation"] == "h"

@@ -55,6 +55,8 @@ class Figure(Struct, frozen=True):
 
     def __post_init__(self) -> None:
         for key in self.layout:
+            if key[1:5] == "axis" and isinstance(title := self.layout[key].get("title"), str):
+                self.layout[key] = {**self.layout[key], "title": {"text": title}}
             if key.startswith("xaxis"):
                 self.layout[key] = {**_TICKS, **self.layout[key]}
             if key[1:5] == "axis" and (decades := self._decades(key)) < _FEW_DECADES:
