@@ -6,6 +6,7 @@ import asyncio
 import http.client
 import json
 import queue
+import re
 import socket
 import threading
 from collections.abc import Coroutine, Iterator
@@ -225,6 +226,12 @@ def test_static_files_come_with_their_kind_and_from_their_folder_alone(running):
         assert kind in answer.headers["content-type"]
     for name in ("../server.py", "..%2fserver.py", "%2e%2e/server.py", "/etc/passwd", "..\\server.py"):
         assert running.ask(f"/static/{name}", **running.key).status == 404
+
+
+def test_no_script_of_the_page_looks_behind_which_older_safaris_do_not_read():
+    scripts = [*Path(server.__file__).parent.rglob("*.js")]
+    assert any(script.name == "dom.js" for script in scripts)
+    assert [script.name for script in scripts if re.search(r"\(\?<[=!]", script.read_text("utf-8"))] == []
 
 
 def test_messages_reach_the_part_and_every_page(running):

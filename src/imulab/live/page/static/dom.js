@@ -37,6 +37,6 @@ export function loadPlotly() {
 
 // A sentence as the page says it: options by the labels of their fields, without the command line's signs, but for
 // commands in parentheses or quotes. To resume a session is for the terminal alone, and has no field.
-export const inWords = text => text.split(/((?<=[('])imulab [^)']+)/).map((part, number) => number % 2 ? part : part
+export const inWords = text => text.split(/([('])(imulab [^)']+)/).map((part, number) => number % 3 ? part : part
   .replace(/--(?!resume\b)([a-z][a-z-]*)/g, (_, name) => `“${name.replaceAll("-", " ")}”`)
   .replace(/(^|\s)-o\b/g, "$1“output”").replace(/\bm\/s\^2\b/g, "m/s²")).join("");
