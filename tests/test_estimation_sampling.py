@@ -1,5 +1,7 @@
 """Sampling rates, units of time, and rows without numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -39,11 +41,24 @@ def test_a_unit_of_time_that_cannot_be_right_is_said(step, unit, said):
 
 
 @pytest.mark.parametrize(
-    ("start", "step", "kind"), [(0, 1.0, Note), (1.7e9, 1.0, Note), (1.7e12, 1.0, Finding), (0, 2.0, Finding)]
+    ("start", "step", "kind"), [(0, 0.4, Note), (1.7e9, 0.4, Note), (1.7e12, 0.4, Finding), (0, 0.5, Finding)]
 )
 def test_a_slow_log_is_only_asked_for_its_unit_of_time_unless_its_dates_are_to_come(start, step, kind):
     _, (line,) = sampling_rate(noise(start + np.arange(1000) * step))
     assert type(line) is kind
+
+
+def test_a_unit_of_time_that_was_stated_is_not_asked_for(tmp_path):
+    """Of samples at 1 kHz in ms titled s every figure would be wrong; who states s has answered that."""
+    slow = noise(np.arange(4000.0))
+    slow = slow.with_columns({"gyro_x": 0.01 * slow.column("gyro_x")}, {})
+    assert il.fit_noise(slow).calibration.verdict.state == "look"
+    assert sampling_rate(replace(slow, time_stated=True))[1] == []
+    assert sampling_rate(il.Recording.from_arrays(gyro_x=slow.column("gyro_x"), rate=1.0, unit="deg/s"))[1] == []
+    il.write(slow, tmp_path / "r.csv")
+    assert sampling_rate(il.read(tmp_path / "r.csv", units={"time": "s"}))[1] == []
+    (line,) = sampling_rate(il.read(tmp_path / "r.csv"))[1]
+    assert "1000 Hz if it is in ms" in line
 
 
 @pytest.mark.parametrize("split", [0.3, 0.5, 0.8])

@@ -458,7 +458,13 @@ def under_way(size=1.0):
     return level * [1, 1, 0] + [0, 0, G]
 
 
-@pytest.mark.parametrize("forces", [turned_over(), under_way()], ids=["turned", "under way"])
+def turning(rate=1.0):
+    """A unit that turns about a level axis at a rate, rad/s."""
+    angle = rate * np.arange(3000) / 50
+    return G * np.column_stack([np.sin(angle), np.cos(angle), np.zeros(3000)])
+
+
+@pytest.mark.parametrize("forces", [turned_over(), under_way(2.5), turning()], ids=["turned", "under way", "turning"])
 @pytest.mark.parametrize(
     ("true", "stated"), [("m/s^2", "g"), ("m/s^2", "mg"), ("g", "m/s^2"), ("g", "mg"), ("mg", "g"), ("mg", "m/s^2")]
 )

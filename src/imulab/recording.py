@@ -88,6 +88,8 @@ class Recording:
         The records that the samples were corrected by, ``NAME sha256:HASH`` each.
     from_file
         Whether a reader made it: messages then advise on files, not on data frames.
+    time_stated
+        Whether the caller stated the unit of time, or the rate: it is not doubted then.
 
     Examples
     --------
@@ -108,6 +110,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     corrected_by: tuple[str, ...] = ()
     from_file: bool = False
+    time_stated: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.metadata, Mapping) and any(isinstance(each, int | float) for each in self.metadata.values()):
@@ -362,7 +365,8 @@ class Recording:
         """
         arrays = {"time": time, "accel": accel, "gyro": gyro, "mag": mag, "temperature": temperature, **columns}
         converted, symbols = columns_of_arrays(arrays, rate=rate, unit=unit, units=units, name=name)
-        return cls(converted, symbols, metadata or {}, name)
+        stated = rate is not None or "time" in (units or {})
+        return cls(converted, symbols, metadata or {}, name, time_stated=stated)
 
     @classmethod
     @checked

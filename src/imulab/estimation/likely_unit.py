@@ -19,10 +19,11 @@ ANOTHER_RANGE = "set the range that the driver assumes to that of the sensor, or
 """What to do where outputs are a simple fraction or multiple of what they should be."""
 _NO_GRAVITY = 0.2  # relative: |f| at rest farther than this off g is no gravity, whatever the zeros of the sensor
 _NEAR_STEP = 0.03  # relative: |f| at rest this near to g in another unit or range makes that the likely one
-_NEAR_GRAVITY = 0.015  # relative: corrected |f| in most seconds this near to g in another unit makes that the right one
+_NEAR_GRAVITY = 0.1  # relative: corrected |f| half the time this near to g in another unit makes that the right one
 _ONE_DIRECTION = 3.0  # deg: a sensor that rests, or is on a centrifuge, turns by less
 _ON_A_CENTRIFUGE = {("g", "m/s^2"), ("m/s^2", "mg")}  # units that 10 g and 100 g look like
 _NO_SENSOR = 1000.0  # g: |f| is no more than this for half of a log
+_AVERAGED = 0.1  # s: vibration is averaged over it; a turn hardly shortens f
 _MOST_SAMPLES, _FEWEST_TIMES = 100_000, 3  # samples that are used; of a log with a rate
 _UNITS = {unit: to_si(1.0, unit) for unit in ("m/s^2", "g", "mg")}
 _OTHERS = {**_UNITS, "ft/s^2": 0.3048}
@@ -54,22 +55,22 @@ def unit_instead(ratio: float, unit: str, near: float, units: Mapping[str, float
 
 
 def doubt_by_correction(recording: Recording, correct: Callable[[Recording], Recording]) -> str:
-    """Return why the unit of accelerometers is doubtful: corrected, most seconds would show gravity in another; or "".
+    """Return why the unit of accelerometers is doubtful: corrected, most of it would show gravity in another; or "".
 
     So it is of a sensor that rests, turns or is under way. A log at many g or in free fall, in its own unit, shows g in
     another by chance only, but for a centrifuge's 10 g and 100 g, which differ from 9.81 m/s^2 and 1000 m/s^2 (mg) by
     as much as biases do: a log of one direction gives a note.
     """
     unit = recording.triad_unit("accel")
-    seconds = _means_of_seconds(recording)
-    if parse_unit(unit).quantity != "acceleration" or not len(seconds):
+    means = _short_means(recording)
+    if parse_unit(unit).quantity != "acceleration" or not len(means):
         return ""
-    force = seconds.triad("accel")
+    force = means.triad("accel")
     usual = median(np.linalg.norm(force, axis=1))
     shown = f"accel_x .. accel_z: |f| is {usual:.4g} {unit}"
     for other in (other for other in _UNITS if other != unit):
         scaled = force * _UNITS[other] / to_si(1.0, unit)
-        known = correct(seconds.with_columns(dict(zip(triad("accel"), scaled.T, strict=True)), {})).triad("accel")
+        known = correct(means.with_columns(dict(zip(triad("accel"), scaled.T, strict=True)), {})).triad("accel")
         known = known[np.isfinite(known).all(axis=1)]  # a law over temperature knows none without it
         size = np.linalg.norm(known, axis=1)
         if not len(size) or not median(np.abs(size / STANDARD_GRAVITY - 1)) < _NEAR_GRAVITY:
@@ -92,14 +93,14 @@ def _widest_angle(directions: Array) -> float:
     return float(np.degrees(np.arccos(np.clip(np.percentile(cosine, 10), -1, 1))))
 
 
-def _means_of_seconds(recording: Recording) -> Recording:
-    """Return the means of accelerometers and temperatures over each second, without rows of no specific force."""
+def _short_means(recording: Recording) -> Recording:
+    """Return means of accelerometers and temperatures over tenths of a second, without rows of no specific force."""
     kept = [name for name in recording.columns if kind_of(name) == "accel" or name.startswith("temperature")]
     rows = np.column_stack([recording.column(name)[:_MOST_SAMPLES] for name in kept])
     rows = rows[np.isfinite(rows[:, [kept.index(name) for name in triad("accel")]]).all(axis=1)]
     time = recording.time
     step = 0.0 if time is None or len(time) < _FEWEST_TIMES else median(np.diff(time))
-    size = max(1, min(round(1 / step), len(rows))) if step > 0 else 1
+    size = max(1, min(round(_AVERAGED / step), len(rows))) if step > 0 else 1
     means = rows[: len(rows) // size * size].reshape(-1, size, len(kept)).mean(axis=1)
     columns = dict(zip(kept, means.T, strict=True))
     return replace(recording, columns=columns, units={name: recording.units[name] for name in kept})

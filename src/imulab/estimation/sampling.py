@@ -32,6 +32,8 @@ _BLOCKS, _SMALLEST_BLOCK = 100, 100  # blocks whose usual steps show a change of
 _MORE_IN_BURSTS = 10  # times as many steps of a block where stamps come in bursts
 SAME_RATE = 0.05  # relative: parts of a recording whose steps are this close have one rate
 _SLOWEST, _FASTEST = 0.5, 20_000.0  # Hz: at rates beyond, the unit of time is doubted
+KILOHERTZ_IN_MS = 2.0
+"""Rate, Hz, up to which samples at 1 or 2 kHz seem to come whose times in ms are titled s."""
 TOO_SLOW = 5.0
 """Rate, Hz, up to which the unit of time is noted, for up to 5 kHz in ms titled s look like this, and doubted where
 there are too few samples to go on."""
@@ -211,7 +213,8 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     lossy = is_lossy(recording)
     start, stop = steady_rows(time, lossy=lossy)
     clock = read_clock(time[start:stop], lossy=lossy)
-    odd = [prefixed(recording.name, line) for line in mislabelled(recording.units["time"], clock.rate, time[0])]
+    odd = mislabelled(recording, clock.rate, float(time[0]), least=KILOHERTZ_IN_MS)
+    odd = [prefixed(recording.name, line) for line in odd]
     if (start, stop) != (0, len(time)):
         return clock.rate, [_change(recording, time, start, stop), *odd]
     count = len(clock.gaps)
@@ -337,16 +340,27 @@ def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
     )
 
 
-def mislabelled(unit: str, rate: float, time: float) -> list[str]:
-    """Return whether the unit of time is right: a finding if the rate, Hz, is no sensor's, a note if it is rare.
+def mislabelled(recording: Recording, rate: float, time: float, *, least: float = _SLOWEST) -> list[str]:
+    """Return whether the unit of time is right: a finding if the rate, Hz, is hardly a sensor's, a note if it is rare.
 
-    A rate that is only rare is a finding where `time`, a stamp in s, would be later than 2099 if it counts from 1970.
+    Parameters
+    ----------
+    recording
+        What is asked; not where its unit of time, or its rate, was stated.
+    rate
+        Its rate, Hz.
+    time
+        One of its stamps, s. A rare rate is a finding where that would be later than 2099 if it counts from 1970.
+    least
+        Rate, Hz, up to which there is a finding. Where time sets every figure, 1 kHz in ms titled s must not pass.
     """
-    late = time > EPOCHS[1]
+    if recording.time_stated:
+        return []
+    unit, late = recording.units["time"], time > EPOCHS[1]
     doubt = doubt_unit_of_time(unit, rate, TOO_SLOW)
     if not doubt:
         return []
-    kind = Finding if late or not _SLOWEST < rate < _FASTEST else Note
+    kind = Finding if late or not least < rate < _FASTEST else Note
     return [
         kind(
             f"{doubt} If not, every figure that depends on time is wrong",

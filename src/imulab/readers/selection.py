@@ -136,7 +136,12 @@ def with_units(blocks: Iterator[Recording], units: Mapping[str, str] | None, nam
         stated = units_of_columns(block.columns, units, name)
         before = {kind_of(c) or c: (block.units[c], unit) for c, unit in stated.items() if block.units[c] != unit}
         notes = [Note(f"{key} is read in {new} as stated, not in {old}") for key, (old, new) in before.items()]
-        yield replace(block, units={**block.units, **stated}, notes=(*block.notes, *notes))
+        yield replace(
+            block,
+            units={**block.units, **stated},
+            notes=(*block.notes, *notes),
+            time_stated=block.time_stated or "time" in stated,
+        )
 
 
 def units_of_columns(columns: Iterable[str], units: Mapping[str, str], name: str) -> dict[str, str]:

@@ -24,6 +24,7 @@ from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.rows import deviation_of_steps, distinct
 from imulab.estimation.sampling import (
     BRIDGED,
+    KILOHERTZ_IN_MS,
     SAME_RATE,
     WIDEST_GAP,
     bridged,
@@ -552,6 +553,7 @@ class _Log:
         bad = [bridged_line(head.name, self._bad, self._rows, self._first_bad)] if self._bad else []
         slow = [part.temperature for part in parts if part.temperature is not None]
         lengths = [part.count for part in parts]
+        timing = mislabelled(head, 1 / interval, float(self._time[0]), least=KILOHERTZ_IN_MS)
         return LongRest(
             head,
             interval,
@@ -560,7 +562,7 @@ class _Log:
             (
                 *(prefixed(head.name, note) for note in self._notes),
                 *bad,
-                *(prefixed(head.name, note) for note in mislabelled(head.units["time"], 1 / interval, self._time[0])),
+                *(prefixed(head.name, note) for note in timing),
                 *self._coarse,
                 *notes_of_gaps(head.name, interval, lengths, filled, self._rows + filled - kept, self._rows),
             ),

@@ -723,7 +723,7 @@ def _notes(blocks: _Blocks, variance: Array, recording: Recording, time: Array) 
     """Return what is odd about the clock of the recording; the steps that are gaps lie in `blocks.broken`."""
     rate = blocks.length / blocks.duration
     lost = 1 - float(np.isfinite(variance).mean())
-    notes = mislabelled(recording.units["time"], rate, time[0])
+    notes = mislabelled(recording, rate, float(time[0]))
     if blocks.broken.any():
         step = np.diff(time)
         gaps = np.flatnonzero(step > max(_GAP_SECONDS, _GAP_STEPS / rate))
