@@ -74,17 +74,17 @@ def sine_integral(value: ArrayLike) -> Array:
     return _elementwise(_distributions.fill_sine_integral, value)
 
 
-def probability_text(probability: float | None, least: float = 1e-12) -> str:
+def probability_text(value: float | None, least: float = 1e-12) -> str:
     """Return a probability for a sentence: ``p = 0.031``, ``p = 3e-05``, or ``p below 1e-12``; NaN is not tested."""
-    if probability is None or math.isnan(probability):
+    if value is None or math.isnan(value):
         return "not tested"
-    digits = 2 if probability >= _SMALL else 1
-    return f"p = {probability:.{digits}g}" if probability >= least else f"p below {least:g}"
+    digits = 2 if value >= _SMALL else 1
+    return f"p = {value:.{digits}g}" if value >= least else f"p below {least:g}"
 
 
-def probability_fact(probability: float | None, least: float = 1e-12) -> str:
+def probability_fact(value: float | None, least: float = 1e-12) -> str:
     """Return a probability as a value beside its label: ``0.031``."""
-    return probability_text(probability, least).removeprefix("p ").removeprefix("= ")
+    return probability_text(value, least).removeprefix("p ").removeprefix("= ")
 
 
 def _elementwise(fill: Callable[..., None], *arguments: ArrayLike) -> Array:
