@@ -123,7 +123,7 @@ def test_autopilots_correct_as_apply_does(tmp_path, target, unit):
 def test_a_file_that_px4_would_ignore_is_said(folder, capsys, device, warned):
     record(9, misalignment=0.0).save("one.json")
     assert main(["export", "--to", "px4", "one.json", "-o", "out", *device]) == 0
-    line = "px4: CAL_ACC0_ID is 0: PX4 ignores this calibration until it is the sensor's number (--device-id)"
+    line = "px4: CAL_ACC0_ID = 0: PX4 ignores this calibration until it is the sensor's number (--device-id)"
     assert (f"imulab: warning: {line}\n" in capsys.readouterr().err) == warned
 
 

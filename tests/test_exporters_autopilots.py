@@ -417,6 +417,16 @@ def test_px4_needs_all_of_the_gyroscopes_too(six_axes, tmp_path):
     assert [values[f"TC_G0_X0_{axis}"] for axis in range(3)] == [0, 0, 0]
 
 
+def test_every_number_that_px4_lacks_is_said_in_one_line(six_axes, tmp_path):
+    told = []
+    file = il.export("px4", six_axes, tmp_path, lossy=True, tell=told.append)[0]
+    names = "TC_A0_ID CAL_ACC0_ID TC_G0_ID CAL_GYRO0_ID"
+    line = f"px4: {names} = 0: PX4 ignores this calibration until it is the sensor's number (--device-id)"
+    assert [message for message in told if "_ID" in message] == [line]
+    comments = [comment for comment in file.read_text(encoding="utf-8").splitlines() if "device id 0" in comment]
+    assert [names in comment for comment in comments] == [True]
+
+
 @pytest.mark.parametrize("target", TARGETS)
 def test_accelerometers_alone_leave_the_programs_gyroscopes_as_they_are(target, chamber, tmp_path):
     text = il.export(target, chamber, tmp_path, lossy=True)[0].read_text()

@@ -441,13 +441,13 @@ def test_px4_knows_magnetometers_by_a_number_of_their_own(tmp_path):
         told = []
         (file,) = il.export("px4", record, tmp_path, lossy=True, tell=told.append, **ids)
         values = parameters_of(file)
-        return values["CAL_ACC0_ID"], values["CAL_MAG0_ID"], [each for each in told if "_ID is 0" in each]
+        return values["CAL_ACC0_ID"], values["CAL_MAG0_ID"], [each for each in told if "_ID = 0" in each]
 
     assert numbers(device_id=77, mag_device_id=88) == (77, 88, [])
     accel, magnetometer, told = numbers(device_id=77)
     assert (accel, magnetometer) == (77, 0)
     assert told == [
-        "px4: CAL_MAG0_ID is 0: PX4 ignores this calibration until it is the sensor's number (--mag-device-id)"
+        "px4: CAL_MAG0_ID = 0: PX4 ignores this calibration until it is the sensor's number (--mag-device-id)"
     ]
 
 

@@ -351,17 +351,22 @@ def _write_px4(
         (name, value, _INT32) if isinstance(value, str) else (name, single_precision(value), _FLOAT)
         for name, value in values
     ]
-    unknown = [name for name, value in values if name.startswith("CAL_") and name.endswith("_ID") and value == "0"]
-    for name in unknown:
-        option = "--mag-device-id" if name == "CAL_MAG0_ID" else "--device-id"
-        options.tell(f"px4: {name} is 0: PX4 ignores this calibration until it is the sensor's number ({option})")
+    unknown = [name for name, value in values if name.endswith("_ID") and value == "0"]
+    by_option = {
+        "--device-id": " ".join(name for name in unknown if name != "CAL_MAG0_ID"),
+        "--mag-device-id": " ".join(name for name in unknown if name == "CAL_MAG0_ID"),
+    }
+    for option, names in by_option.items():
+        if names:
+            options.tell(f"px4: {names} = 0: PX4 ignores this calibration until it is the sensor's number ({option})")
     comments = [
         "PX4 parameters, " + origin[0],
         origin[1],
         "no axes are turned: the record's axes are taken as the sensor's; PX4's body frame is FRD (-g on z at rest)",
         *(
-            f"device id 0: not known; PX4 ignores the calibration until {name} is that of the sensor"
-            for name in unknown
+            f"device id 0: not known; PX4 ignores the calibration until {names} is that of the sensor"
+            for names in by_option.values()
+            if names
         ),
         *remarks,
         "",
