@@ -369,6 +369,26 @@ def test_what_is_wrong_for_every_unit_is_said_once_and_nothing_is_written(issue_
     assert not Path("out").exists()
 
 
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (None, "limits.toml: no such limits file"),
+        ('[tumble]\nbias_q = { upper = 20, unit = "mg" }\n', "limits.toml: tumble: no parameter 'bias_q'"),
+        ('[tumble]\nbias_x = { upper = 20, unit = "mV" }\n', "limits.toml: tumble: bias_x: unit 'mV'"),
+        ('[noise]\naccel_x_white = { upper = 20, unit = "ug/sqrt(Hz)" }\n', "limits.toml: no limits of a parameter of"),
+    ],
+    ids=["no file", "no such parameter", "other unit", "other procedure"],
+)
+def test_limits_that_are_wrong_for_every_unit_are_refused_once(issue_all, capsys, content, expected):
+    if content is not None:
+        Path("limits.toml").write_text(content, encoding="utf-8")
+    assert issue_all(change=("[laboratory]", RULE + "[laboratory]"), options=["--limits", "limits.toml"]) == 2
+    said = capsys.readouterr()
+    assert expected in said.err
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert not Path("out").exists()
+
+
 def test_a_unit_whose_pdf_is_refused_has_no_xml_either(issue_all, capsys):
     assert issue_all(number="漢-{serial}") == 2
     assert "3 of 3 units have no certificate" in capsys.readouterr().err

@@ -25,6 +25,9 @@ from imulab.certificate.model import (
 from imulab.certificate.texts import LANGUAGES
 from imulab.errors import ImulabError, OptionError, RecordError, listed
 from imulab.files import replacing
+from imulab.fleet.limits import load_limits
+from imulab.fleet.run import FleetState, fleet_status
+from imulab.fleet.statistics import parameter_units
 from imulab.fleet.store import Store
 from imulab.procedures.registry import load_sealed
 from imulab.procedures.result import Record, as_record
@@ -125,8 +128,8 @@ def write_fleet_certificates(
     Raises
     ------
     ReadError, OptionError
-        The folder is none of a fleet, a folder cannot be made; the laboratory's file, the limits' rule, the fonts or
-        the key cannot be used.
+        The folder is none of a fleet, a folder cannot be made; the laboratory's file, the limits or their rule, the
+        fonts or the key cannot be used.
 
     Examples
     --------
@@ -146,6 +149,8 @@ def write_fleet_certificates(
     if stated.item.serial is not None and len(units) > 1:
         raise OptionError(f"{lab}: item.serial {stated.item.serial!r}: each unit of a fleet has its own; leave it out")
     _check_common(stated, limits, fonts, sign)
+    if limits is not None:
+        _check_limits(str(limits), fleet_status(folder))
     try:
         Path(output).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -177,6 +182,16 @@ def _check_common(
         from imulab.certificate.signature import signed
 
         signed(b"<trial/>", str(sign), lab.certificate.issued)
+
+
+def _check_limits(limits: str, fleet: FleetState) -> None:
+    """Refuse once limits that no record of a fleet can be held against."""
+    summaries = [row.summary for row in fleet.rows if row.summary is not None]
+    units = parameter_units(summaries)
+    procedures = dict.fromkeys(summary.procedure for summary in summaries) or [""]
+    found = [load_limits(limits, units, only=procedure) for procedure in procedures]
+    if summaries and not any(found):
+        raise OptionError(f"{limits}: no limits of a parameter of these records")
 
 
 def _write(certificate: Certificate, paths: list[Path], fonts: str | Path | None, sign: str | Path | None) -> None:
