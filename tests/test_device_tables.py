@@ -249,8 +249,8 @@ def test_export_writes_exactly_one_blob_and_what_it_holds_is_checked(record, tmp
 def test_two_records_of_one_kind_or_of_two_units_are_refused(record):
     other_axis = madeup.warmup()
     other_axis.sections["table"]["axes"] = ["gyro_y", "accel_x"]
-    with pytest.raises(RecordError, match="two records give a warmup table; a unit has one"):
-        tables_of_all([madeup.warmup(), other_axis])
+    with pytest.raises(RecordError, match=r"a\.json and warmup SN42 each give a table of kind warmup; a unit has one"):
+        tables_of_all([madeup.warmup(), other_axis], files=["a.json", ""])
     other = Calibration(**{**vars(madeup.warmup()), "sensor": {"serial": "SN7"}})
     with pytest.raises(RecordError, match="records of different units: SN42 SN7"):
         tables_of_all([record, other])

@@ -338,21 +338,25 @@ def mag_records():
 
 
 @pytest.mark.parametrize(
-    ("records", "message"),
+    ("records", "message", "expected"),
     [
         (lambda: [in_si(madeup.tumble(1)), in_si(madeup.tumble(2))],
-         "bias and scale factor of accel_x accel_y accel_z"),
+         "bias and scale factor of accel_x accel_y accel_z", "one of them"),
         (lambda: [in_si(madeup.tumble(1, gyro=True), gyro_output_unit="rad/s"),
                   il.fit_rate(il.simulate_rate()).calibration],
-         "bias and scale factor of gyro_x gyro_y gyro_z"),
-        (lambda: [madeup.warmup(), madeup.warmup("knot-cubic")], "the change after power-on of gyro_x gyro_z"),
+         "bias and scale factor of gyro_x gyro_y gyro_z",
+         "{first} alone, or one fitted without gyroscopes (no --with gyro)"),
+        (lambda: [madeup.warmup(), madeup.warmup("knot-cubic")], "the change after power-on of gyro_x gyro_z",
+         "one of them"),
         (lambda: [madeup.centrifuge(), replace(madeup.centrifuge(), created="2001-01-01T00:00:00Z")],
-         "drift under acceleration of dtg_x dtg_y"),
-        (mag_records, "hard and soft iron of mag_x mag_y mag_z"),
+         "drift under acceleration of dtg_x dtg_y", "one of them"),
+        (mag_records, "hard and soft iron of mag_x mag_y mag_z", "one of them"),
     ],
     ids=["tumble", "gyroscopes", "warm-up", "centrifuge", "magnetometers"],
 )  # fmt: skip
-def test_two_records_that_take_off_the_same_error_are_refused(records, message, tmp_path, monkeypatch, capsys):
+def test_two_records_that_take_off_the_same_error_are_refused(
+    records, message, expected, tmp_path, monkeypatch, capsys
+):
     """By `apply` on the command line and in Python, from a blob, and by `export`; unless they are to be so."""
     monkeypatch.chdir(tmp_path)
     first, second = (replace(each, sensor={"serial": "SN42"}) for each in records())
@@ -360,16 +364,22 @@ def test_two_records_that_take_off_the_same_error_are_refused(records, message, 
     second.save("b.json")
     write(TURNED, "flight.csv")
     assert main(["apply", "a.json", "b.json", "flight.csv", "-o", "out.csv"], project=False) == 2
-    said = f"a.json and b.json both take off {message}: expected one of them, or --again (again=True)"
+    said = f"a.json and b.json both take off {message}: expected {expected.format(first='a.json')}"
+    said += ", or --again (again=True)"
     assert f"imulab: {said} if the second was made of what the first left\n" == capsys.readouterr().err
     assert not (tmp_path / "out.csv").exists()
     assert main(["apply", "a.json", "b.json", "flight.csv", "--again", "-o", "out.csv"], project=False) == 0
+    capsys.readouterr()
     (blob,) = il.export("blob", first, "blob")
-    for once in (il.apply(first, TURNED), il.apply(blob, TURNED)):
-        with pytest.raises(RecordError, match=f"both take off {message}: expected one of them"):
+    for once, name in ((il.apply(first, TURNED), f"{first.procedure} SN42"), (il.apply(blob, TURNED), "unit.blob")):
+        what = re.escape(f"{name} and {second.procedure} SN42 both take off {message}: ")
+        with pytest.raises(RecordError, match=what + re.escape(f"expected {expected.format(first=name)}")):
             il.apply(second, once)
     for target in ("c", "blob"):
-        with pytest.raises(RecordError, match=f"both take off {message}: expected one of them"):
+        assert main(["export", "--to", target, "a.json", "b.json", "-o", "out"], project=False) == 2
+        said = f"imulab: a.json and b.json both take off {message}: expected {expected.format(first='a.json')}\n"
+        assert capsys.readouterr().err == said
+        with pytest.raises(RecordError, match=f"{first.procedure} SN42 and {second.procedure} SN42 both take off"):
             il.export(target, [first, second], "out")
     assert not (tmp_path / "out").exists()
 

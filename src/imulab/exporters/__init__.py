@@ -58,6 +58,8 @@ class ExportOptions:
         ``external``: the autopilot turns the magnetometers by a rotation of their own; ``internal``: it does not.
     tell
         Called with a sentence on each loss that was allowed.
+    files
+        The files of the records, by which refusals name them; empty where one has none.
     """
 
     lossy: bool = False
@@ -68,6 +70,7 @@ class ExportOptions:
     mag_mount: str = "external"
     tell: Callable[[str], object] = _nothing
     mag_device_id: int = 0
+    files: Sequence[str] = ()
 
 
 def export(

@@ -86,7 +86,7 @@ def export_blob(records: Sequence[Calibration], folder: Path, options: ExportOpt
     OptionError
         The file cannot be written.
     """
-    data = make_blob(records, tables_of_all(records, options.fusions))
+    data = make_blob(records, tables_of_all(records, options.fusions, options.files))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -116,7 +116,7 @@ def export_c(records: Sequence[Calibration], folder: Path, options: ExportOption
     OptionError
         The folder cannot be written to.
     """
-    tables = tables_of_all(records, options.fusions)
+    tables = tables_of_all(records, options.fusions, options.files)
     blob = make_blob(records, tables)
     words = _words(records, tables, len(blob))
     contents = {

@@ -49,11 +49,14 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Device
     return procedure_of(record).tables(record, fusion)
 
 
-def tables_of_all(records: Sequence[Calibration], fusions: Sequence[Fusion | None] = ()) -> list[DeviceTable]:
+def tables_of_all(
+    records: Sequence[Calibration], fusions: Sequence[Fusion | None] = (), files: Sequence[str] = ()
+) -> list[DeviceTable]:
     """Return the tables of several records of one unit, in their order.
 
     Each is fused by its entry of `fusions`, or as it states where that is None or there are none. The columns of each
-    table hold the SHA-256 of its record, so that a blob names the records that are in it.
+    table hold the SHA-256 of its record, so that a blob names the records that are in it. Refusals name the records by
+    `files`, or by procedure and serial number where that is empty.
 
     Raises
     ------
@@ -64,17 +67,19 @@ def tables_of_all(records: Sequence[Calibration], fusions: Sequence[Fusion | Non
     if len(serials) > 1:
         raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
     given = [
-        (record, table)
-        for record, fusion in zip(records, fusions or [None] * len(records), strict=True)
+        (file or _name(record), replace(table, columns={**table.columns, "record": record.sealed()[0]}))
+        for record, fusion, file in zip(
+            records, fusions or [None] * len(records), files or [""] * len(records), strict=True
+        )
         for table in tables_of(record, fusion)
     ]
-    tables = [replace(table, columns={**table.columns, "record": record.sealed()[0]}) for record, table in given]
+    tables = [table for _, table in given]
     kinds = [table.kind for table in tables]
     check_order(kinds)
-    check_once((_name(record), table.kind, table.columns) for record, table in given)
-    twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
-    if twice:
-        raise RecordError(f"two records give a {twice[0]} table; a unit has one: give one of them")
+    check_once((name, table.kind, table.columns) for name, table in given)
+    if twice := next((kind for kind in kinds if kinds.count(kind) > 1), None):
+        names = " and ".join(name for name, table in given if table.kind == twice)
+        raise RecordError(f"{names} each give a table of kind {twice}; a unit has one: give one of them")
     check_after((table.kind, table.columns, (table.columns["record"],)) for table in tables)
     return tables
 

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
+from imulab.columns import KINDS
 from imulab.errors import RecordError
 
 SENSORS = {"thermal": "accel", "thermal_gyro": "gyro"}
@@ -74,21 +75,29 @@ def check_once(
     RecordError
         Two of them take off the same error of one column.
     """
-    before = {
-        error: line.rpartition(" sha256:")[0]
+    earlier = [
+        (line.rpartition(" sha256:")[0], *section)
         for line in corrected_by
         if isinstance(line, Correction)
         for section in line.sections
-        for error in _list_errors(*section)
-    }
-    for name, kind, columns in sections:
+    ]
+    given = list(sections)
+    triads: dict[str, set[str]] = {}  # of each record, by its hash where a blob tells it, else by its name
+    for name, kind, columns in [*earlier, *given]:
+        triads.setdefault(columns.get("record", name), set()).add(_ERRORS.get(kind, ("", ""))[1])
+    before = {error: (name, columns) for name, kind, columns in earlier for error in _list_errors(kind, columns)}
+    for name, kind, columns in given:
         errors = _list_errors(kind, columns)
         if twice := [error for error in errors if error in before]:
+            first, sensor, expected = before[twice[0]], _ERRORS[kind][1], "one of them"
+            for holder, held in (first, (name, columns)):
+                if sensor in ("gyro", "mag") and "accel" in triads[held.get("record", holder)]:
+                    expected = f"{holder} alone, or one fitted without {KINDS[sensor].sensors} (no --with {sensor})"
             names = " ".join(column for _, column in twice)
             raise RecordError(
-                f"{before[twice[0]]} and {name} both take off {twice[0][0]} of {names}: expected one of them{instead}"
+                f"{first[0]} and {name} both take off {twice[0][0]} of {names}: expected {expected}{instead}"
             )
-        before |= dict.fromkeys(errors, name)
+        before |= dict.fromkeys(errors, (name, columns))
 
 
 def parse_thermals(corrected_by: Iterable[str]) -> list[Thermal]:

@@ -119,7 +119,8 @@ def export(
         load(os.fspath(item)) if isinstance(item, str | PathLike) else as_record(item, "export")
         for item in listed_records
     ]
-    names = [os.fspath(item) if isinstance(item, str | PathLike) else "the record" for item in listed_records]
+    files = [os.fspath(item) if isinstance(item, str | PathLike) else "" for item in listed_records]
+    names = [each or "the record" for each in files]
     named = {"method": method, "memory": memory, "at": at, "gyro_range": gyro_range, "accel_range": accel_range}
     stated = {name: value for name, value in named.items() if value is not None}
     fusions = _choose_fusions(to, stated, loaded) if stated else [None] * len(loaded)
@@ -136,7 +137,8 @@ def export(
     noise_keys: Mapping[str, Any] = _state_noise(noise, file) if isinstance(noise, Calibration) else {}
     if noise and not isinstance(noise, Calibration):
         noise_keys = noise if isinstance(noise, Mapping) else _read_noise(file)
-    options = ExportOptions(lossy, number, noise_keys, file if noise else "", fusions, mag_mount, tell, mag_number)
+    source = file if noise else ""
+    options = ExportOptions(lossy, number, noise_keys, source, fusions, mag_mount, tell, mag_number, files)
     return exporters.export(to, loaded, Path(folder), options)
 
 
