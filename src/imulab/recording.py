@@ -83,7 +83,7 @@ class Recording:
     lines_before
         Lines of the file above data row 1; None where rows are not lines of text.
     notes
-        What the reader did to the data that a user should know.
+        What a user should know: what the reader did to the data, and what `apply` doubts.
     corrected_by
         The records that the samples were corrected by, ``NAME sha256:HASH`` each.
     from_file

@@ -214,8 +214,8 @@ def _with_warnings(
     records: list[Calibration | Blob], chain: Sequence[Loaded], blocks: Iterable[Recording]
 ) -> Iterator[Recording]:
     """Yield blocks; print warnings after the first, and at the end what lay beyond the test."""
-    from imulab.display import Note
-    from imulab.procedures.apply import list_results, warn_before_applying, warn_of_unit
+    from imulab.display import Note, prefixed
+    from imulab.procedures.apply import list_results, warn_before_applying, warn_of_recording
     from imulab.recording import TAKEN_FROM
 
     tests = list_results(records)
@@ -230,10 +230,9 @@ def _with_warnings(
         yield block
         if number == 0:  # after it was corrected: where it is refused, the refusal is the one line there is
             messages = [message for record in records for message in warn_before_applying(record, block)]
-            messages += [message for ready in chain for message in warn_of_unit(ready, block)]
             if power_on := block.metadata.get(TAKEN_FROM):
                 messages.append(Note(f"{block.name}: the power-on temperature was taken from {power_on}"))
-            messages += [f"{block.name}: was corrected before, by {entry}" for entry in block.corrected_by]
+            messages += [prefixed(block.name, each) for ready in chain for each in warn_of_recording(ready, block)]
             for message in dict.fromkeys(messages):
                 warn(message)
     for (record, procedure), count, most in zip(tests, counts, largest, strict=True):

@@ -54,6 +54,7 @@ def unit_instead(ratio: float, unit: str, near: float, units: Mapping[str, float
     return next((other for other in others if abs(ratio * units[other] / to_si(1.0, unit) - 1) < near), "")
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of wild readings
 def doubt_by_correction(recording: Recording, correct: Callable[[Recording], Recording]) -> str:
     """Return why the unit of accelerometers is doubtful: corrected, most of it would show gravity in another; or "".
 
@@ -99,7 +100,7 @@ def _short_means(recording: Recording) -> Recording:
     rows = np.column_stack([recording.column(name)[:_MOST_SAMPLES] for name in kept])
     rows = rows[np.isfinite(rows[:, [kept.index(name) for name in triad("accel")]]).all(axis=1)]
     time = recording.time
-    step = 0.0 if time is None or len(time) < _FEWEST_TIMES else median(np.diff(time))
+    step = 0.0 if time is None or len(time) < _FEWEST_TIMES else median(np.diff(time[:_MOST_SAMPLES]))
     size = max(1, min(round(_AVERAGED / step), len(rows))) if step > 0 else 1
     means = rows[: len(rows) // size * size].reshape(-1, size, len(kept)).mean(axis=1)
     columns = dict(zip(kept, means.T, strict=True))

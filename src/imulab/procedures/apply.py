@@ -13,7 +13,7 @@ from typing import Annotated, Any, Unpack
 from imulab.columns import KINDS, triad
 from imulab.device.tables import DeviceTable, Fusion
 from imulab.device.unit import Blob, DeviceUnit
-from imulab.display import SENTENCES, Note, prefixed
+from imulab.display import SENTENCES, Note
 from imulab.errors import DataError, OptionError, RecordError, listed
 from imulab.estimation.likely_unit import doubt_by_correction
 from imulab.estimation.sampling import whole_where_shared
@@ -216,7 +216,9 @@ def apply(
     """Return data corrected by a record; columns that it does not touch pass unchanged.
 
     The result names the record and its SHA-256 in `corrected_by`, which its file will hold; of a blob these are its own
-    and those of the records in it. A recording that the same record corrected before is refused, unless `again`.
+    and those of the records in it. A recording that the same record corrected before is refused, unless `again`. Its
+    `notes` say where the recording's file names other records that corrected it, whose errors are not known, and where
+    accelerometers are probably in another unit than stated.
 
     Parameters
     ----------
@@ -302,7 +304,11 @@ def apply(
             why = next(iter(_explain_unchanged([ready], recording)), f"{recording.name}: nothing to correct in it")
             raise DataError(why)
         return recording
-    return replace(corrected, corrected_by=(*recording.corrected_by, *_name_corrections(ready, active)))
+    notes = corrected.notes
+    if not isinstance(record, Loaded):  # the command line says it of the first block
+        notes = tuple(dict.fromkeys([*notes, *warn_of_recording(ready, recording)]))
+    by = (*recording.corrected_by, *_name_corrections(ready, active))
+    return replace(corrected, corrected_by=by, notes=notes)
 
 
 def _name_corrections(ready: Loaded, active: Sequence[tuple[str, Mapping[str, Any]]]) -> Iterator[Correction]:
@@ -399,14 +405,18 @@ def warn_before_applying(record: Calibration | Blob, recording: Recording) -> li
     ]
 
 
-def warn_of_unit(ready: Loaded, recording: Recording) -> list[str]:
-    """Return a warning where accelerometers that a record corrects are probably in another unit than stated."""
+def warn_of_recording(ready: Loaded, recording: Recording) -> list[str]:
+    """Return warnings of a recording that a record corrects: its accelerometers' unit, corrections before it was read.
+
+    Of corrections after it was read `check_once` knows what they took off.
+    """
+    before = [f"was corrected before, by {line}" for line in recording.corrected_by if not isinstance(line, Correction)]
     parts = [each for each in ready.sections if each[0].triad == "accel"]
     if not parts or not len(recording) or not all(name in recording for name in triad("accel")):
-        return []
+        return before
     (part, columns), *_ = parts
     doubt = doubt_by_correction(recording, lambda scaled: part.apply(ready.unit, columns, scaled))
-    return [prefixed(recording.name, doubt)] if doubt else []
+    return [doubt, *before] if doubt else before
 
 
 def list_results(records: Iterable[Calibration | Blob]) -> list[tuple[Calibration, Procedure]]:
