@@ -13,7 +13,7 @@ from imulab.cli import main
 from imulab.device.unit import load_blob
 from imulab.display import Note
 from imulab.errors import DataError, RecordError, UnitError
-from imulab.procedures.apply import apply, apply_blocks, loaded, warn_before_applying, warn_of_recording
+from imulab.procedures.apply import apply, apply_blocks, loaded, warn_before_applying, warn_of_unit
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.writers import write
@@ -394,6 +394,7 @@ def test_a_file_that_another_record_corrected_is_said_in_python_too(tmp_path, mo
     (line,) = once.corrected_by
     twice = il.apply(second, "once.csv")
     assert (once.notes, twice.notes) == ((), (f"was corrected before, by {line}",))
+    assert isinstance(twice.notes[0], Note)
     assert il.apply(madeup.centrifuge(), twice).notes == twice.notes
     madeup.centrifuge().save("c.json")
     assert main(["apply", "b.json", "c.json", "once.csv", "-q", "-o", "out.csv"], project=False) == 0
@@ -536,7 +537,7 @@ HEALTHY = {
 def test_a_still_log_of_10_g_is_no_warning_since_a_centrifuge_shows_it_too():
     """With biases of 30 mg, 10 g are as near to 9.81 m/s^2 as a unit at rest; in one position a note says so."""
     at_rest, log = logged(np.full((3000, 3), [0.0, 0.0, G]))
-    (note,) = warn_of_recording(loaded(at_rest), log.with_columns({}, dict.fromkeys(AXES, "g")))
+    (note,) = warn_of_unit(loaded(at_rest), log.with_columns({}, dict.fromkeys(AXES, "g")))
     assert isinstance(note, Note)
     assert "if the sensor is at rest, their unit is m/s^2, not g: --unit accel=m/s^2" in note
 
@@ -545,7 +546,7 @@ def test_a_still_log_of_10_g_is_no_warning_since_a_centrifuge_shows_it_too():
 @pytest.mark.parametrize("forces", HEALTHY.values(), ids=HEALTHY)
 def test_a_healthy_log_is_not_asked_for_its_unit(forces, unit):
     made, log = logged(forces, unit)
-    assert [said for said in warn_of_recording(loaded(made), log) if not isinstance(said, Note)] == []
+    assert [said for said in warn_of_unit(loaded(made), log) if not isinstance(said, Note)] == []
 
 
 def test_the_unit_of_a_few_rows_or_of_gaps_is_judged_without_them():
@@ -556,13 +557,13 @@ def test_the_unit_of_a_few_rows_or_of_gaps_is_judged_without_them():
     table = replace(stated, columns={name: stated.column(name)[:4] for name in AXES})
     nothing = replace(stated, columns={name: np.full(4, np.nan) for name in AXES})
     ready = loaded(made)
-    assert [len(warn_of_recording(ready, each)) for each in (stated, table, nothing)] == [1, 1, 0]
+    assert [len(warn_of_unit(ready, each)) for each in (stated, table, nothing)] == [1, 1, 0]
     warmth = {"temperature": np.full(len(stated), np.nan)}
-    assert len(warn_of_recording(ready, stated.with_columns(warmth, {"temperature": "degC"}))) == 1
+    assert len(warn_of_unit(ready, stated.with_columns(warmth, {"temperature": "degC"}))) == 1
 
 
 def test_counts_stated_as_g_are_asked_for_their_unit():
     made, log = logged(turned_over())
     counts = log.with_columns({name: 16384 / G * log.column(name) for name in AXES}, dict.fromkeys(AXES, "g"))
-    (said,) = warn_of_recording(loaded(made), counts)
+    (said,) = warn_of_unit(loaded(made), counts)
     assert "g, more than any accelerometer reads, as counts would be; is their unit, g, right?" in said

@@ -215,7 +215,7 @@ def _with_warnings(
 ) -> Iterator[Recording]:
     """Yield blocks; print warnings after the first, and at the end what lay beyond the test."""
     from imulab.display import Note, prefixed
-    from imulab.procedures.apply import list_results, warn_before_applying, warn_of_recording
+    from imulab.procedures.apply import list_earlier, list_results, warn_before_applying, warn_of_unit
     from imulab.recording import TAKEN_FROM
 
     tests = list_results(records)
@@ -232,7 +232,8 @@ def _with_warnings(
             messages = [message for record in records for message in warn_before_applying(record, block)]
             if power_on := block.metadata.get(TAKEN_FROM):
                 messages.append(Note(f"{block.name}: the power-on temperature was taken from {power_on}"))
-            messages += [prefixed(block.name, each) for ready in chain for each in warn_of_recording(ready, block)]
+            said = [doubt for ready in chain for doubt in warn_of_unit(ready, block)] + list_earlier(block)
+            messages += [prefixed(block.name, each) for each in said]
             for message in dict.fromkeys(messages):
                 warn(message)
     for (record, procedure), count, most in zip(tests, counts, largest, strict=True):

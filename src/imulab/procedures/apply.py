@@ -306,7 +306,8 @@ def apply(
         return recording
     notes = corrected.notes
     if not isinstance(record, Loaded):  # the command line says it of the first block
-        notes = tuple(dict.fromkeys([*notes, *warn_of_recording(ready, recording)]))
+        earlier = map(Note, list_earlier(recording))  # as it may have to be: a later fit is not doubted for it
+        notes = tuple(dict.fromkeys([*notes, *warn_of_unit(ready, recording), *earlier]))
     by = (*recording.corrected_by, *_name_corrections(ready, active))
     return replace(corrected, corrected_by=by, notes=notes)
 
@@ -405,18 +406,19 @@ def warn_before_applying(record: Calibration | Blob, recording: Recording) -> li
     ]
 
 
-def warn_of_recording(ready: Loaded, recording: Recording) -> list[str]:
-    """Return warnings of a recording that a record corrects: its accelerometers' unit, corrections before it was read.
+def list_earlier(recording: Recording) -> list[str]:
+    """Return a sentence on each correction before a recording was read; `check_once` knows what later ones were."""
+    return [f"was corrected before, by {line}" for line in recording.corrected_by if not isinstance(line, Correction)]
 
-    Of corrections after it was read `check_once` knows what they took off.
-    """
-    before = [f"was corrected before, by {line}" for line in recording.corrected_by if not isinstance(line, Correction)]
+
+def warn_of_unit(ready: Loaded, recording: Recording) -> list[str]:
+    """Return a warning where accelerometers that a record corrects are probably in another unit than stated."""
     parts = [each for each in ready.sections if each[0].triad == "accel"]
     if not parts or not len(recording) or not all(name in recording for name in triad("accel")):
-        return before
+        return []
     (part, columns), *_ = parts
     doubt = doubt_by_correction(recording, lambda scaled: part.apply(ready.unit, columns, scaled))
-    return [doubt, *before] if doubt else before
+    return [doubt] if doubt else []
 
 
 def list_results(records: Iterable[Calibration | Blob]) -> list[tuple[Calibration, Procedure]]:
