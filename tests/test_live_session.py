@@ -112,6 +112,33 @@ def test_what_is_wrong_with_a_unit_is_said_when_it_happens(change, said):
     assert len(warnings) == len(set(warnings))
 
 
+@pytest.mark.parametrize(
+    ("settings", "warned", "times"),
+    [
+        ("gravity=1", "no record can be made of these 9 attitudes: columns accel_x accel_y accel_z: the", 2),
+        ("hold=0.3", "10 times put down without an attitude: each needs 1.8 s at rest", 13),
+        ("hold=1.5", "10 times put down without an attitude: each needs 1.8 s at rest", 8),
+        ("hold=60,move=100,rate=20,noise=500mg", "", 0),
+    ],
+)
+def test_a_simulation_without_a_record_warns_and_comes_to_an_end(
+    settings, warned, times, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    source = f"simulate:speed=0,{settings}"
+    assert main(["live", source, "--plain", "--attitudes", "8", "--save", "rec.csv", "-o", "r.json"]) == 2
+    out, err = capsys.readouterr()
+    ending = warned.partition(" ")[2].partition("9 ")[0] or "no new attitude for 300 s"
+    assert err.startswith("imulab: simulated unit: ")
+    assert err.count("\n") == 1
+    assert ending in err
+    assert "rec.csv keeps" in err
+    assert warned in out
+    assert out.count("no record can be made") + out.count("put down without an attitude") == times
+    assert out.count("(1 to go)") <= 2  # order 1 has 9 parameters
+    assert not (tmp_path / "r.json").exists()
+
+
 @pytest.mark.slow
 def test_a_good_unit_is_not_warned_of(reduced):
     for seed in range(1, 3 if reduced else 6):

@@ -384,10 +384,17 @@ def _show_corrected(runner: Runner, record: Calibration) -> None:
 
 
 def _print_events(runner: Runner, *, typed: bool) -> None:
-    """Print a line for each event, until the target is met or the stream ends."""
+    """Print a line for each event, until the target is met or the stream ends.
+
+    Raises
+    ------
+    DataError
+        A simulated unit is not expected to give a record.
+    """
     while not runner.ended and not runner.session.enough:
         for event in runner.step(_WAIT):
             print(f"{event.time:8.1f} s  {event.text}", flush=True)
+        runner.refuse_hopeless()
 
 
 def _draw_view(runner: Runner, *, typed: bool) -> None:
@@ -406,6 +413,8 @@ def _draw_view(runner: Runner, *, typed: bool) -> None:
             if (asked := runner.asked) is not None and asked.guess is not None and events:
                 for line in (*asked.lines, *asked.guess.toml.splitlines()):
                     screen.console.print(f"  {line}", markup=False, highlight=False)
+            if not usable:
+                runner.refuse_hopeless()
             key = pressed(usable)
             if key == "g":
                 events += runner.take_guess()

@@ -125,6 +125,7 @@ _LOWERS = 0.05  # least relative gain in uncertainty for which a longer hold is 
 _LONGEST = 10.0  # s, the longest hold that is asked for
 _PACE = 0.5  # s between two lengths that are looked at
 _ROUNDS = 4  # of the search for the number of attitudes still needed
+_NAME = "live recording"  # in the messages of its fit
 _SEED = 1  # of the search, so that the same attitudes get the same advice
 _OTHERS = 0.1
 """Weight of a parameter without a target, relative to that of the parameter with the lowest target."""
@@ -164,6 +165,8 @@ class Guide:
         Unit of the outputs.
     metadata
         Head of the stream.
+    refusal
+        Why there is no fit of the attitudes; empty if there is one.
     """
 
     order: int | str = "auto"
@@ -174,6 +177,7 @@ class Guide:
     metadata: Mapping[str, str] = field(default_factory=dict)
     attitudes: list[Attitude] = field(default_factory=list)
     fit: TumbleFit | None = None
+    refusal: str = ""
     _outstanding: Array = field(default_factory=lambda: np.empty((0, 3)))
     _known: bool = False
     _beyond: bool = False
@@ -248,11 +252,22 @@ class Guide:
         )
 
     @property
+    def _fewest(self) -> int:
+        """Number of attitudes without which there is no fit."""
+        return parameter_count(self.order if isinstance(self.order, int) else 1)
+
+    @property
+    def beyond_plan(self) -> float:
+        """Attitudes over those with which a fit is due, as a ratio; 0 with a fit."""
+        due = self._fewest_reliable if self.targets else self.wanted()
+        return 0.0 if self.fit is not None else len(self.kept) / max(due, self._fewest)
+
+    @property
     def missing(self) -> str:
         """What is missing for a record, in a few words; empty if one can be made."""
         if self.fit is not None:
             return ""
-        short = parameter_count(self.order if isinstance(self.order, int) else 1) - len(self.kept)
+        short = self._fewest - len(self.kept)
         if short > 0:
             return f"at least {short} {'more ' if self.kept else ''}attitude{'s' * (short > 1)}"
         return "attitudes that differ more from each other"
@@ -277,14 +292,15 @@ class Guide:
         """Fit the attitudes that are kept."""
         try:
             self.fit = fit_tumble(self._kept_attitudes(), order=self.order, gravity=self.gravity)
-        except ImulabError:
-            self.fit = None
+            self.refusal = ""
+        except ImulabError as error:
+            self.fit, self.refusal = None, str(error).removeprefix(f"{_NAME}: ")
 
     def _kept_attitudes(self) -> Attitudes:
         kept = self.kept
         mean = np.array([each.mean for each in kept])
         columns = {name: mean[:, k].copy() for k, name in enumerate(triad("accel"))}
-        recording = Recording(columns, dict.fromkeys(columns, self.unit), self.metadata, "live recording")
+        recording = Recording(columns, dict.fromkeys(columns, self.unit), self.metadata, _NAME)
         rows = np.arange(1.0, len(kept) + 1)
         return Attitudes(
             mean=mean,

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imulab.errors import OptionError, ReadError
+from imulab.errors import DataError, OptionError, ReadError
 from imulab.files import replacing
 from imulab.gravity import Gravity
 from imulab.live.formats import LineStream, UnknownFormatError
@@ -243,6 +243,7 @@ class Runner:
         session.source = source.name
         for block in recorder.before():
             session.feed(block)
+        self._begin = recorder.last
 
     @classmethod
     def open(
@@ -272,6 +273,17 @@ class Runner:
     def ended(self) -> bool:
         """Whether nothing more will come, or nothing has come for too long."""
         return self.source.ended or self._given_up
+
+    def refuse_hopeless(self) -> None:
+        """End a session with a simulated unit that nobody turns by hand, where no record is to be expected.
+
+        Raises
+        ------
+        DataError
+            None is, and why; the recording so far is kept.
+        """
+        if self.source.by_hand and (why := self.session.hopeless(self._begin)):
+            raise DataError(f"{self.source.name}: {why}. {self.kept()}")
 
     def step(self, wait: float) -> list[Event]:
         """Take the samples that come within `wait` seconds, and return what happened.

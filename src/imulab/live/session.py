@@ -15,7 +15,7 @@ from imulab.columns import triad
 from imulab.errors import DataError, OptionError
 from imulab.gravity import Gravity
 from imulab.live.guide import NEAR, Attitude, Guide, Target
-from imulab.live.holds import BLOCK, SHORTEST, SURE, Hold, Moment, Stillness
+from imulab.live.holds import BLOCK, SHORTEST, SURE, TRIM, Hold, Moment, Stillness
 from imulab.live.stamps import Counts
 from imulab.live.view import FURTHER, HeldValues, KnownUnit, Trouble, View, in_words
 from imulab.procedures.views import parameter_rows
@@ -33,6 +33,8 @@ _WARMING, _PER_MINUTE = 5.0, 2.0  # K since the beginning, and K in a minute, fr
 _MINUTE = 60.0  # s
 _LOST = 0.01  # share of lost samples from which a warning is given
 _FEWEST = 500  # samples from which that share is meaningful
+_SHORT = 10  # times put down without an attitude after which a warning is given
+_REST = (SHORTEST + 2 * TRIM) * BLOCK  # s at rest without which there is no attitude
 
 
 @dataclass
@@ -44,6 +46,7 @@ class Watch:
     _held: Array = field(default_factory=lambda: np.full(3, np.nan))
     _lively: list[bool] = field(default_factory=lambda: [False] * 3)
     _temperatures: list[tuple[float, float]] = field(default_factory=list)
+    _refusals: int = 0
 
     def _once(self, key: str, text: str) -> list[str]:
         if key in self.given_texts:
@@ -58,6 +61,24 @@ class Watch:
     def order(self, text: str) -> list[str]:
         """Return the warning that the model is too simple, the first time that it is."""
         return self._once("order", text) if text else []
+
+    def refusal(self, text: str, count: int, beyond: float) -> list[str]:
+        """Return why the fit is refused, each time that all planned attitudes have come once more."""
+        if int(beyond) <= self._refusals:
+            return []
+        self._refusals = int(beyond)
+        self.given_texts["refusal"] = f"no record can be made of these {count} attitudes: {text}"
+        return [self.given_texts["refusal"]]
+
+    def short(self, count: int) -> list[str]:
+        """Return a warning where the unit was put down so often without an attitude, now and then."""
+        if not count or count % _SHORT:
+            return []
+        self.given_texts["short"] = (
+            f"{count} times put down without an attitude: each needs {_REST:.1f} s at rest; let go of the unit for "
+            f"{2 * _REST:.0f} s, on something that does not shake"
+        )
+        return [self.given_texts["short"]]
 
     def hold(self, hold: Hold, unit: str, gravity: float) -> list[str]:
         """Return a warning where the length of f at rest shows a wrong unit."""
@@ -168,6 +189,8 @@ class Watch:
 # The session: samples in, events out, and a view of its state.
 
 
+_TWICE = 2.0  # the planned attitudes after which a fit that is refused will go on being refused
+_NONE_SINCE = 300.0  # s without an attitude after which none is to be expected; a simulated unit lies for 60 at most
 _STRIP = 100  # tenths of a second that a view shows
 _ADVICE = {
     "waiting": "waiting for samples",
@@ -225,6 +248,7 @@ class Session:
     _strip: deque[tuple[float, ...]] = field(default_factory=lambda: deque(maxlen=_STRIP))
     _accepted: Attitude | None = None
     _dropping: bool = False
+    _put_down: int = 0
     _next: Array | None = None
     _enough: str = ""
     _aside: frozenset[int] = frozenset()
@@ -278,6 +302,15 @@ class Session:
     def enough(self) -> bool:
         """Whether the target is met."""
         return bool(self._enough)
+
+    def hopeless(self, begin: float) -> str:
+        """Return why no record is to be expected of a session since a time, s, as it goes on; empty where one may."""
+        if self.guide.beyond_plan >= _TWICE:
+            return self._watch.given_texts["refusal"]
+        since = begin if self._accepted is None else max(begin, self._accepted.start)
+        if self.enough or self._time - since <= _NONE_SINCE:
+            return ""
+        return self._watch.given_texts.get("short", f"no new attitude for {_NONE_SINCE:.0f} s")
 
     @property
     def next(self) -> Array | None:
@@ -418,6 +451,9 @@ class Session:
                     self._accept(hold)
                     state = "accepted"
         if state != self.state:
+            if state == "moving" and self.state in ("settling", "still") and not self._dropping:
+                self._put_down += 1
+                self._warn(self._watch.short(self._put_down))
             self.state = state
             if state != "accepted":  # which, and what is next, is said already
                 self._say("state", self._advice())
@@ -433,7 +469,7 @@ class Session:
             self._accept(hold)
 
     def _accept(self, hold: Hold) -> None:
-        number = len(self.guide.attitudes) + 1
+        number, self._put_down = len(self.guide.attitudes) + 1, 0
         self._accepted = self._attitude(number, hold)
         self.guide.accept(self._accepted)
         self._say("accepted", f"attitude {number} accepted after {hold.seconds:.1f} s")
@@ -455,6 +491,8 @@ class Session:
                     f"attitude {number} is off by {milli:+.2g} mg: knocked? put it down again, or press u to drop it",
                 )
         self._aside = frozenset(aside)
+        guide = self.guide
+        self._warn(self._watch.refusal(guide.refusal, len(guide.kept), guide.beyond_plan))
         self._warn(self._watch.order(self.guide.too_simple()))
         if not self._aside and self.guide.targets and not self.guide.met:
             self._warn(self._watch.scatter(self.guide.scatter()))
@@ -472,6 +510,7 @@ class Session:
         if self._next is not None:
             left = guide.wanted() - len(guide.kept)
             to_go = f"{'over ' if guide.beyond else ''}{max(left, 1)} to go"
+            to_go = "no record yet" if guide.beyond_plan >= 1 else to_go
             self._say("next", f"next: {self._in_words(self._next)} ({to_go})")
 
     def _in_words(self, up: Array) -> str:
