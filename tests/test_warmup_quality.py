@@ -147,8 +147,9 @@ def test_accelerometers_that_show_no_gravity_are_bad(factor, words):
 
 def test_a_unit_that_cannot_be_is_asked_about():
     cycles = [cycle_of(lambda t: 3600 * flat(t), t, name=f"c{t}{c}") for t in (-20, 0) for c in (1, 2)]
-    found = il.fit_warmup(cycles, temperatures=[-20, 0], settling_time=END).calibration.warnings
-    asked = [message for message in found if "does its column have the right unit?" in message]
+    verdict = il.fit_warmup(cycles, temperatures=[-20, 0], settling_time=END).calibration.verdict
+    assert verdict.state == "bad"
+    asked = [message for message in verdict.reasons if "does its column have the right unit?" in message]
     assert [message.split()[0] for message in asked] == ["gyro_x"]
 
 

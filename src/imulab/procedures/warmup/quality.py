@@ -17,7 +17,7 @@ from imulab.columns import triad
 from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, first_of
 from imulab.estimation.decisions import STILL_DRIFTS
-from imulab.estimation.likely_unit import no_gravity
+from imulab.estimation.likely_unit import STATE_UNIT, no_gravity
 from imulab.estimation.rows import median, medians
 from imulab.procedures.correction_order import parse_thermals
 from imulab.procedures.warmup.cycles import SETTLED, Curves, Cycle
@@ -507,9 +507,9 @@ def _warn_sizes(curves: Curves) -> list[str]:
     """Return messages on changes so large that the column's title probably states a wrong unit."""
     largest = np.nanmax(np.abs(curves.mean), axis=(0, 1))
     return [
-        Finding(
+        Bad(
             f"{axis} changes by {small_text(change, unit)} after power-on: does its column have the right unit?",
-            "correct the unit in the title of this column",
+            STATE_UNIT,
         )
         for axis, change, unit in zip(curves.axes, largest, curves.units, strict=True)
         if change > _IMPROBABLE.get(unit, np.inf)
