@@ -143,6 +143,7 @@ def test_a_dropped_attitude_is_out_of_the_fit():
         ("bais 100 ug", "did you mean 'bias'"),
         ("bias 100 ppm", "acceleration"),
         ("scale_factor -5 ppm", "above 0"),
+        ("bias 100 ug, bias 50 ug", "bias is stated twice; expected one uncertainty for each parameter"),
         ("bias 0.1", "0.1 without a unit: expected one of m/s.2 g mg ug after it, as in bias 100 ug"),
         ("bias 100 ug, scale_factor 2e-4", "2e-4 without a unit: expected one of 1 ppm after it"),
     ],

@@ -55,9 +55,9 @@ def read_targets(text: str | None) -> tuple[Target, ...]:
     Raises
     ------
     OptionError
-        The text is no list of parameters with an uncertainty each.
+        The text is no list of parameters with an uncertainty each, or names one twice.
     """
-    targets = []
+    targets: list[Target] = []
     for part in (text or "").split(",") if text is not None else []:
         match = re.fullmatch(r"\s*([a-z_0-9]+)\s+(.+?)\s*", part)
         if match is None:
@@ -65,6 +65,8 @@ def read_targets(text: str | None) -> tuple[Target, ...]:
         stem = match[1]
         if stem not in _KINDS:
             raise OptionError(f"--target {text!r}: unknown parameter {stem!r}; known: {listed(_KINDS, stem)}")
+        if any(target.stem == stem for target in targets):
+            raise OptionError(f"--target {text!r}: {stem} is stated twice; expected one uncertainty for each parameter")
         kind, unit = _KINDS[stem]
         if not split_quantity(match[2], "--target", f"{stem} 100 {unit}")[1]:
             expected = f"expected one of {' '.join(known_units(kind))} after it, as in {stem} 100 {unit}"
