@@ -318,6 +318,11 @@ def test_a_record_that_was_cut_is_refused():
         (b"time [s],accel_x [g]\n0,1\n", "it is not JSON"),
         (b"\x89PNG\r\n\x1a\n\0\0", "it is not JSON"),
         (b"[" * 100_000, "it is not JSON"),
+        (b"%PDF-1.7\n", "it is a PDF (a certificate?); expected the record that it was made of"),
+        (
+            b'<?xml version="1.0"?>\n<dcc:digitalCalibrationCertificate>',
+            "it is a certificate; expected the record that it was made of",
+        ),
         (b"[1, 2]", 'expected the key "format": "imulab.calibration"'),
         (b'"imulab.calibration"', 'expected the key "format"'),
         (b'{"format": "other"}', 'expected the key "format"'),

@@ -89,7 +89,12 @@ def _content(data: bytes, name: str) -> Any:
             ) from None
         reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
         if not data.lstrip().startswith(b"{"):
-            raise RecordError(f"{name}: not a calibration record: it is not JSON (a recording?)") from None
+            what = "not JSON (a recording?)"
+            if data.startswith(b"%PDF-"):
+                what = "a PDF (a certificate?); expected the record that it was made of"
+            elif b"digitalCalibrationCertificate" in data[:4096]:
+                what = "a certificate; expected the record that it was made of"
+            raise RecordError(f"{name}: not a calibration record: it is {what}") from None
         raise RecordError(f"{name}: not a calibration record: {reason} ({error})") from None
 
 
