@@ -332,6 +332,15 @@ def test_a_folder_in_place_of_a_file_is_refused_with_the_file_in_it(imulab, tmp_
         (tmp_path / "spin").open()
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["tumble fit", "noise fit", "allan", "layout guess", "rate fit", "fleet run -o out", "export --to c -o c.c"],
+)
+def test_no_name_of_a_file_is_refused(imulab, words):
+    done = imulab(*words.split(), "")
+    assert (done.returncode, done.stderr) == (2, "imulab: expected the name of a file, found ''\n")
+
+
 @pytest.mark.parametrize("words", ["warmup simulate --temperatures 0 --cycles 1 --duration 60s", "thermal simulate"])
 def test_recordings_of_before_in_a_folder_are_named(imulab, tmp_path, words):
     (tmp_path / "cycles").mkdir()

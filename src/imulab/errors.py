@@ -64,9 +64,9 @@ def file_name(value: object) -> str | os.PathLike[str]:
     Raises
     ------
     OptionError
-        It is something else.
+        It is something else, or empty.
     """
-    if isinstance(value, str | os.PathLike):
+    if isinstance(value, str | os.PathLike) and str(value):
         return value
     raise OptionError(f"expected the name of a file, found {quoted(value)}")
 
@@ -131,6 +131,8 @@ class OptionError(ImulabError):
 
 def folder_in_place(name: object, what: str = "a file", inside: Iterable[str] = ()) -> str:
     """Return the refusal of a folder in place of a file, which names those files in it that may be meant."""
+    if not str(name):
+        return "expected the name of a file, found ''"
     files = [os.path.join(str(name), each) for each in sorted(inside)]  # noqa: PTH118
     inside_it = f"; it holds {first_of(files, 3)}" if files else ""
     return f"{name}: expected {what}, found a folder{inside_it}"
