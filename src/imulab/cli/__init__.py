@@ -109,6 +109,7 @@ def run() -> None:
         signal.signal(signal.SIGHUP, _terminate)
     if not sys.warnoptions and not os.environ.get("IMULAB_DEBUG"):
         warnings.simplefilter("ignore")  # they name lines of sources, not what a person can mend
+        sys.warnoptions.append("ignore")  # in the processes that are started, too
     closed = _open_closed()
     status = main()
     if "stdout" in closed:  # what could not be written is not tried again at the end, with a traceback
