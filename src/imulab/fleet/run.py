@@ -170,9 +170,9 @@ def run_fleet(
     number = None if workers is None else whole(workers, "workers")
     fleet = manifest if isinstance(manifest, FleetManifest) else load_fleet(os.fspath(manifest))
     folder = os.fspath(folder)
-    store = Store(real_path(folder))
     if not folder:
         raise OptionError("output '': expected the name of a folder to write to")
+    store = Store(real_path(folder))
     if store.folder.exists() and not store.folder.is_dir():
         raise OptionError(f"{folder}: expected a folder to write to, found a file")
     if table is not None:
