@@ -67,10 +67,10 @@ def shared_unit(units: Mapping[str, str], what: str, file: str) -> str:
     """
     symbols = {name: parse_unit(unit).symbol for name, unit in units.items()}
     if len({*symbols.values()}) > 1:
-        found = ", ".join(f"{name} [{unit}]" for name, unit in symbols.items())
+        titles = ", ".join(f"{name} [{unit}]" for name, unit in symbols.items())
         kind = kind_of(next(iter(units))) or next(iter(units))
         stated = f"if a title is wrong, --unit {kind}=UNIT states it for all"
-        raise UnitError(f"{file}: {what} must share one unit, found {found}; {stated}")
+        raise UnitError(f"{file}: {what} must share one unit, found {titles}; {stated}")
     return next(iter(symbols.values()))
 
 

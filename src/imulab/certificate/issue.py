@@ -189,8 +189,8 @@ def _check_limits(limits: str, fleet: FleetState) -> None:
     summaries = [row.summary for row in fleet.rows if row.summary is not None]
     units = parameter_units(summaries)
     procedures = dict.fromkeys(summary.procedure for summary in summaries) or [""]
-    found = [load_limits(limits, units, only=procedure) for procedure in procedures]
-    if summaries and not any(found):
+    limits_by_procedure = [load_limits(limits, units, only=procedure) for procedure in procedures]
+    if summaries and not any(limits_by_procedure):
         raise OptionError(f"{limits}: no limits of a parameter of these records")
 
 

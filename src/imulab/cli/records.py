@@ -232,8 +232,8 @@ def _with_warnings(
             messages = [message for record in records for message in warn_before_applying(record, block)]
             if power_on := block.metadata.get(TAKEN_FROM):
                 messages.append(Note(f"{block.name}: the power-on temperature was taken from {power_on}"))
-            said = [doubt for ready in chain for doubt in warn_of_unit(ready, block)] + list_earlier(block)
-            messages += [prefixed(block.name, each) for each in said]
+            doubts = [doubt for ready in chain for doubt in warn_of_unit(ready, block)] + list_earlier(block)
+            messages += [prefixed(block.name, doubt) for doubt in doubts]
             for message in dict.fromkeys(messages):
                 warn(message)
     for (record, procedure), count, most in zip(tests, counts, largest, strict=True):

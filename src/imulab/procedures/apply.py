@@ -66,19 +66,19 @@ def tables_of_all(
     serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
     if len(serials) > 1:
         raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
-    given = [
+    named_tables = [
         (file or _name(record), replace(table, columns={**table.columns, "record": record.sealed()[0]}))
         for record, fusion, file in zip(
             records, fusions or [None] * len(records), files or [""] * len(records), strict=True
         )
         for table in tables_of(record, fusion)
     ]
-    tables = [table for _, table in given]
+    tables = [table for _, table in named_tables]
     kinds = [table.kind for table in tables]
     check_order(kinds)
-    check_once((name, table.kind, table.columns) for name, table in given)
+    check_once((name, table.kind, table.columns) for name, table in named_tables)
     if twice := next((kind for kind in kinds if kinds.count(kind) > 1), None):
-        names = " and ".join(name for name, table in given if table.kind == twice)
+        names = " and ".join(name for name, table in named_tables if table.kind == twice)
         raise RecordError(f"{names} each give a table of kind {twice}; a unit has one: give one of them")
     check_after((table.kind, table.columns, (table.columns["record"],)) for table in tables)
     return tables

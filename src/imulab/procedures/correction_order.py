@@ -81,12 +81,12 @@ def check_once(
         if isinstance(line, Correction)
         for section in line.sections
     ]
-    given = list(sections)
+    new_sections = list(sections)
     triads: dict[str, set[str]] = {}  # of each record, by its hash where a blob tells it, else by its name
-    for name, kind, columns in [*earlier, *given]:
+    for name, kind, columns in [*earlier, *new_sections]:
         triads.setdefault(columns.get("record", name), set()).add(_ERRORS.get(kind, ("", ""))[1])
     before = {error: (name, columns) for name, kind, columns in earlier for error in _list_errors(kind, columns)}
-    for name, kind, columns in given:
+    for name, kind, columns in new_sections:
         errors = _list_errors(kind, columns)
         if twice := [error for error in errors if error in before]:
             first, sensor, expected = before[twice[0]], _ERRORS[kind][1], "one of them"
