@@ -87,7 +87,7 @@ imulab centrifuge reduce centrifuge/manifest.toml -o centrifuge.json --report ce
         "noise",
         "What must a filter be told of the noise of this unit, and how sure is that?",
         """
-imulab noise simulate --white "0.3 deg/sqrt(h)" --flicker "12 deg/h" --walk "60 deg/h/sqrt(h)" --rate 10 -o rest.csv
+imulab noise simulate --white "0.3 deg/sqrt(h)" --flicker "12 deg/h" --walk "60 deg/h/sqrt(h)" --rate 6 -o rest.csv
 imulab noise fit rest.csv -o noise.json --report noise.html
 imulab noise plan --from noise.json --for walk=10%
 """,
