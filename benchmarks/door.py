@@ -51,9 +51,13 @@ def _fits() -> Iterator[Row]:
     )  # fmt: skip
     yield "`il.fit_tumble`, 38 attitudes, order 1, over scipy's lm by hand", f"{one / peer:.2f} times", "<= 1.5"
     yield "`il.fit_tumble`, 38 attitudes, `auto`, over the same", f"{auto / peer:.1f} times", "<= 6"
-    samples = il.simulate_noise(white="0.3 deg/sqrt(h)", duration="10000 s", columns="gyro_x")
-    (fit,) = seconds(lambda: il.fit_noise(samples), repeats=5, clock=CPU)
+    slow = {"flicker": "12 deg/h", "walk": "60 deg/h/sqrt(h)"}
+    white, coloured = (
+        il.simulate_noise(white="0.3 deg/sqrt(h)", duration="10000 s", columns="gyro_x", **also) for also in ({}, slow)
+    )
+    fit, longer = seconds(lambda: il.fit_noise(white), lambda: il.fit_noise(coloured), repeats=5, clock=CPU)
     yield "`il.fit_noise`, one axis of a million samples", f"{1e3 * fit:.0f} ms", "<= 150 ms"
+    yield "the same with 1/f noise and a random walk", f"{1e3 * longer:.0f} ms", ""
 
 
 _LOOP = r"""

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.fft import dct
+from scipy.fft import dct, dst
 from scipy.signal import butter, cheby1, lfilter
 
 import imulab as il
@@ -173,6 +173,12 @@ def test_a_step_has_its_time_and_size():
     unit = np.zeros(600)
     unit[77:] = 1
     np.testing.assert_allclose(step_coefficients(599, 77, 600), dct(unit, norm="ortho")[1:], atol=1e-12)
+
+
+@pytest.mark.parametrize("grid", [2, 3, 4, 9, 600, 4097])
+def test_steps_are_scored_by_a_sine_transform(grid):
+    weight = np.random.default_rng(grid).standard_normal(grid - 1)
+    np.testing.assert_allclose(cleaning._sums_of_sines(weight, grid), dst(weight, type=1) / 2, atol=1e-10)
 
 
 @pytest.mark.parametrize("model", ["N", "NB", "NK", "NQ"])

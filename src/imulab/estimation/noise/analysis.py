@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from imulab.estimation.decisions import FOLLOWS_COVARIATE, LEVEL_STEP
 from imulab.estimation.distributions import chi_square_tail, normal_cdf
-from imulab.estimation.noise.cleaning import LevelChange, find_steps, step_coefficients
+from imulab.estimation.noise.cleaning import MOST_STEPS, LevelChange, find_steps, step_coefficients
 from imulab.estimation.noise.likelihood import (
     Allowance,
     Band,
@@ -590,7 +590,9 @@ class Analysis:
         """Return the variance of the coefficients in the bins of each spectrum, shapes (b,)."""
         return _split(self.bins.variances(self.values[None])[0], self.spectra)
 
-    def steps(self, stretches: Sequence[Stretch], limit: float = LEVEL_STEP.limit) -> list[tuple[LevelChange, ...]]:
+    def steps(
+        self, stretches: Sequence[Stretch], limit: float = LEVEL_STEP.limit, most: int = MOST_STEPS
+    ) -> list[tuple[LevelChange, ...]]:
         """Return the changes of level of stretches, the analysed ones or earlier ones, under the chosen noise model."""
         steps, start = [], 0
         variances = self.variances()
@@ -601,7 +603,7 @@ class Analysis:
             # Vibration beyond the band, and bins off the model, would show as steps at the ends of the stretch.
             share = counted(replace(each, spectra=self.spectra[start:stop]), many)
             level = np.where(share > 0, level / np.maximum(share, 1e-300), np.inf)
-            steps.append(find_steps(each.slow, level, each.count, each.interval, limit))
+            steps.append(find_steps(each.slow, level, each.count, each.interval, limit, most))
             start = stop
         return steps
 

@@ -27,7 +27,6 @@ _STRONG_SLOW, _SLOW = 1e5, 200
 """The same limit among the lowest coefficients, which show slow noise: a slow sway must not pass for a line."""
 _NOISE = 3.0
 """Noise beside a line, over the median of its squares: their mean is 2.2 medians, and scatters over 100 of them."""
-_MOST_STEPS = 5  # of a stretch: with more, the steps are noise
 _LOWEST, _SURE = (1 << 16) - 1, 4.0
 """Coefficients that show whether there may be a step, and for how many standard deviations of what others add."""
 # Blocks whose median is the usual level around one; fewest blocks; largest share of knocked blocks
@@ -263,8 +262,16 @@ def _sine_coefficients(j: Array, place: float, count: int) -> Array:
     return np.asarray(np.stack([cosine, sine]) * np.sqrt(2 / count) / 4)
 
 
+MOST_STEPS = 5  # of a stretch: with more, the steps are noise
+
+
 def find_steps(
-    slow: Array, variances: Array, count: int, interval: float, limit: float = LEVEL_STEP.limit
+    slow: Array,
+    variances: Array,
+    count: int,
+    interval: float,
+    limit: float = LEVEL_STEP.limit,
+    most: int = MOST_STEPS,
 ) -> tuple[LevelChange, ...]:
     """Return changes of level, found one after the other by size over standard uncertainty under the noise model.
 
@@ -280,23 +287,35 @@ def find_steps(
         Samples of the stretch, n, and the time between them, s.
     limit
         Limit of ``|z|``.
+    most
+        Number of steps that are looked for.
     """
     steps: list[LevelChange] = []
     c, lowest, places = slow, _lowest_places(variances, count), None
-    while len(steps) < _MOST_STEPS and _perhaps_a_step(c, *lowest, count, limit):
+    while len(steps) < most and _perhaps_a_step(c, *lowest, count, limit):
         places = places or _places_of_steps(variances, count)
         place, size, u = _largest_step(c, places, count)
         if not abs(size) > limit * u:
             break
         steps.append(LevelChange(place * interval, size, u))
-        c = c - size * step_coefficients(len(c), place, count)
+        if len(steps) < most:
+            c = c - size * step_coefficients(len(c), place, count)
     return tuple(sorted(steps, key=lambda step: step.time))
 
 
 def step_coefficients(many: int, place: float, count: int) -> Array:
     """Return the coefficients c_1 .. c_J, J = `many`, of a unit step at sample `place` of `count`."""
-    j = np.arange(1, many + 1)
-    return np.asarray(-np.sqrt(2 / count) * np.sin(np.pi * j * place / count) / (2 * np.sin(np.pi * j / (2 * count))))
+    return np.asarray(
+        -np.sqrt(2 / count) * _sines(np.pi * place / count, many) / (2 * _sines(np.pi / (2 * count), many))
+    )
+
+
+def _sines(step: float, many: int) -> Array:
+    """Return ``sin(j step)``, j = 1 .. `many`, by the addition theorem from a coarse and a fine grid of angles."""
+    width = math.isqrt(many) + 1
+    coarse, fine = (np.exp(1j * angle * np.arange(width + 1)) for angle in (step * width, step))
+    sines: Array = (coarse[:, None] * fine[:width]).imag.ravel()[1 : many + 1]
+    return sines
 
 
 def _places_of_steps(variances: Array, count: int) -> tuple[int, Array, Array]:
@@ -340,13 +359,31 @@ def _largest_step(c: Array, places: tuple[int, Array, Array], count: int) -> tup
 def _scores(c: Array, places: tuple[int, Array, Array], count: int) -> tuple[Array, Array]:
     """Return size over squared uncertainty of a step, and ``1/u^2``, at each place, shapes (grid - 1,)."""
     grid, weight, information = places
-    padded = np.zeros(2 * grid)
-    padded[1 : 1 + len(weight)] = c[: len(weight)] * weight
-    score = np.sqrt(2 / count) * np.fft.rfft(padded).imag[1:grid]  # minus the sums of sines
+    score = -np.sqrt(2 / count) * _sums_of_sines(c[: len(weight)] * weight, grid)
     beside = math.ceil(_BLOCK * grid / count)  # places as near to an end as a spike or knock is long are no level
     if 2 * beside < len(score):
         score[:beside] = score[len(score) - beside :] = 0.0
     return score, information
+
+
+def _sums_of_sines(weight: Array, grid: int) -> Array:
+    """Return ``S_q = sum_j w_j sin(pi j q/grid)``, j = 1 .. grid - 1, for q = 1 .. grid - 1.
+
+    With N = grid, ``sin(pi j/N) (w_j + w_N-j) + (w_j - w_N-j)/2`` has the transform ``(S_2k+1 - S_2k-1) - i S_2k``; it
+    is half as long as the odd continuation of w, whose transform holds these sums, too.
+    """
+    padded = np.zeros(grid + 1)
+    padded[1 : 1 + len(weight)] = weight
+    odd = (padded - padded[::-1])[1:-1] / 2
+    padded += padded[::-1]
+    padded[1:-1] *= _sines(np.pi / grid, grid - 1)
+    padded[1:-1] += odd
+    transformed = np.fft.rfft(padded[:-1])
+    transformed.real[0] /= 2
+    sums = np.empty(grid - 1)
+    sums[::2] = transformed.real.cumsum()[: grid // 2]
+    sums[1::2] = -transformed.imag[1 : (grid + 1) // 2]
+    return sums
 
 
 def _cosines(weight: Array, grid: int) -> Array:

@@ -932,7 +932,7 @@ def _steps_for_slow_noise(
     if candidates != CANDIDATES or analysis.letters in _WITHOUT_SLOW:
         return []
     highest = analysis.band.highest
-    steps = analysed(stretches, ("N",), highest).steps(stretches, LEVEL_STEP_PERHAPS.limit)
+    steps = analysed(stretches, ("N",), highest).steps(stretches, LEVEL_STEP_PERHAPS.limit, _FEW_STEPS + 1)
     count = sum(map(len, steps))
     if not 0 < count <= _FEW_STEPS:
         return []
