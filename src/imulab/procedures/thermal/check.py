@@ -37,9 +37,9 @@ from imulab.procedures.result import (
     columns_as_rows,
     warn_made_from,
 )
+from imulab.procedures.thermal.agreement import within_and_between
 from imulab.procedures.thermal.check_gyro import GyroCheck, check_gyros, gyro_figure, select_in_range
 from imulab.procedures.thermal.check_ramp import RampCheck, check_ramp
-from imulab.procedures.thermal.degrees import within_and_between
 from imulab.procedures.thermal.holds import Holds, check_holds, find_holds, prepare_recordings
 from imulab.procedures.thermal.model import AXES, forces
 from imulab.procedures.thermal.record import laws_in_g

@@ -11,7 +11,7 @@ from imulab.columns import triad
 from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, UnitError
 from imulab.gravity import EarthRate
-from imulab.procedures.thermal.degrees import within_and_between
+from imulab.procedures.thermal.agreement import within_and_between
 from imulab.procedures.thermal.figures import axis_groups
 from imulab.procedures.thermal.gyro import RatesAtRest, leave_out_turns, linearise_rates, note_turns, rates_at_rest
 from imulab.procedures.thermal.holds import Holds

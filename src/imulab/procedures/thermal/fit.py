@@ -1,6 +1,6 @@
 """The fit of recordings at several temperatures, from files to the record.
 
-The mathematics is in `solve` (least squares), `degrees` (choice of the laws) and `gyro`.
+The mathematics is in `solve` (least squares), `degrees` (choice of the laws), and `gyro` and `turns` (gyroscopes).
 """
 
 from __future__ import annotations
@@ -37,13 +37,7 @@ from imulab.procedures.thermal.degrees import (
     drift_rates,
     fit_lag_and_loops,
 )
-from imulab.procedures.thermal.gyro import (
-    check_gyroscopes,
-    fit_gyroscopes,
-    nominal_output,
-    rates_at_rest,
-    scale_from_turns,
-)
+from imulab.procedures.thermal.gyro import check_gyroscopes, fit_gyroscopes, rates_at_rest
 from imulab.procedures.thermal.hidden import cover_hidden
 from imulab.procedures.thermal.holds import (
     Holds,
@@ -57,6 +51,7 @@ from imulab.procedures.thermal.model import GROUPS, Laws, forces
 from imulab.procedures.thermal.ramp import are_rest_ramps, fit_ramps
 from imulab.procedures.thermal.record import make_record, with_gyroscopes
 from imulab.procedures.thermal.solve import ThermalProblem, ThermalSolution
+from imulab.procedures.thermal.turns import nominal_output, scale_from_turns
 from imulab.quantities import in_si
 from imulab.readers.streams import one_clock, own_clock
 from imulab.recording import Array, Data, Reading, Recording

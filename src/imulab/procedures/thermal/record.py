@@ -13,23 +13,16 @@ from imulab.estimation.decisions import HOLD_DISAGREEMENT, TEMPERATURE_MISSED
 from imulab.estimation.distributions import probability_fact
 from imulab.estimation.least_squares import coverage_factor
 from imulab.gravity import Gravity, gravity_findings
+from imulab.procedures.thermal.agreement import warn_disagreement
 from imulab.procedures.thermal.degrees import (
     ChosenLaws,
     LagAndLoops,
     describe_degrees,
     list_effects,
     number_temperatures,
-    warn_disagreement,
     warn_lag_and_loops,
 )
-from imulab.procedures.thermal.gyro import (
-    ScaleLaws,
-    ThermalGyroscopes,
-    block_diagonal,
-    joint_covariance,
-    note_turns,
-    rescale_gyroscopes,
-)
+from imulab.procedures.thermal.gyro import ThermalGyroscopes, note_turns
 from imulab.procedures.thermal.hidden import bias_shift_from_unobserved
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import AXES, GROUPS, MISALIGNMENTS, SENSITIVITIES, SHARES, Laws, law_names
@@ -60,6 +53,7 @@ from imulab.procedures.thermal.solve import (
     own_calibrations,
     row_covariance,
 )
+from imulab.procedures.thermal.turns import ScaleLaws, block_diagonal, joint_covariance, rescale_gyroscopes
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.sections import Length, Quantity, StatedGravity, entries
