@@ -232,8 +232,14 @@ def test_the_real_array_is_calibrated(real_data):
     [
         (lambda c: c | {"gyro_2": np.full(12_000, 0.25)}, DataError,
          r"still.csv: column gyro_2: all samples are 0.25: a dead"),
-        (lambda c: c | {"gyro_2": np.where(np.arange(12_000) == 11_999, 0.3, 0.25)}, DataError,
+        (lambda c: c | {"gyro_2": np.where(np.arange(12_000) % 2, 0.5, 0.25)}, DataError,
          r"still.csv: column gyro_2: its means over .* s do not differ: a dead gyro"),
+        (lambda c: c | {"gyro_2": np.where(np.arange(12_000) == 11_999, 0.3, 0.25)}, DataError,
+         r"still.csv: column gyro_2: 11999 samples of 0.25 from row 1 \(line 2\) on, .* a stuck sensor; leave it out"),
+        (
+            lambda c: c | {"gyro_2": np.where(np.abs(np.arange(12_000) - 4500) < 1500, 0.25, c["gyro_2"])},
+            DataError, r"still.csv: column gyro_2: 2999 samples of 0.25 from row 3002 \(line 3003\) on, .* a stuck",
+        ),
         (
             lambda c: c | {"gyro_2": np.where(np.arange(12_000) == 5, np.nan, c["gyro_2"])},
             DataError, r"still.csv: row 6 \(line 7\), column gyro_2: expected a finite number, found nan",
@@ -254,6 +260,50 @@ def test_a_bad_recording_at_rest_is_refused(change, error, text):
     units = {k: "s" if k == "time" else "deg/s" for k in columns}
     with pytest.raises(error, match=text):
         calibrate_array(Recording(columns, units, name="still.csv", lines_before=1))
+
+
+def test_a_gyro_that_sticks_in_motion_is_refused():
+    still, moving, _, _ = array_of(1, 1)
+    columns = dict(moving.columns)
+    columns["gyro_3"] = np.where(np.abs(np.arange(12_000) - 4500) < 500, columns["gyro_3"][4500], columns["gyro_3"])
+    with pytest.raises(
+        DataError, match=r"moving.csv: column gyro_3: 999 samples of .* from row 4002 .* a stuck sensor"
+    ):
+        calibrate_array(still, Recording(columns, moving.units, name="moving.csv"))
+
+
+def test_a_level_that_changes_at_rest_is_said():
+    """Its uncertainty covers the change, 70 times that of the other gyros, and the verdict was good."""
+    still, moving, _, _ = array_of(1, 1)
+    columns = {**still.columns, "gyro_2": still.columns["gyro_2"] + 0.04 * (np.arange(12_000) > 7000)}
+    record = calibrate_array(Recording(columns, still.units, name="still.csv"), moving).calibration
+    (reason,) = record.verdict.reasons
+    assert record.verdict.state == "look"
+    assert re.search(r"still.csv: the level changes at rest: gyro_2 by \+0.0\d+ deg/s near (69|70|71)\.?\d* s;", reason)
+    assert calibrate_array(still, moving).calibration.verdict.state == "good"
+
+
+@pytest.mark.parametrize(("factor", "state"), [(1.06, "good"), (2.0, "bad")])
+def test_a_gyro_of_another_range_shifts_the_scale_of_all(factor, state):
+    still, moving, sensing, _ = array_of(1, 1)
+    moving = Recording({**moving.columns, "gyro_4": factor * moving.columns["gyro_4"]}, moving.units, name="moving.csv")
+    verdict = calibrate_array(still, moving).calibration.verdict
+    assert verdict.state == state
+    if state == "bad":
+        size = np.abs(sensing[:, 0, 0]) * np.where(np.arange(5) == 3, factor, 1.0)
+        relative = size / np.median(size)
+        assert verdict.reasons[0] == (
+            f"moving.csv: in motion gyro_4 reads {relative[3]:.3g} times the rate of most gyros: another range or unit?"
+            f" The scale of the array is the mean of all, and so {100 * (relative.mean() - 1):.2g} % off"
+        )
+
+
+def test_gyros_at_their_limits_together_are_no_repeated_rows():
+    still, moving, _, _ = array_of(1, 1)
+    columns = {name: np.clip(x, -105, 105) if name != "time" else x for name, x in moving.columns.items()}
+    warnings = calibrate_array(still, Recording(columns, moving.units, name="moving.csv")).calibration.warnings
+    assert any("at the end of a gyro's range" in message for message in warnings)
+    assert not any("exact repeats" in message for message in warnings)
 
 
 def test_units_and_motion_that_cannot_serve_are_refused():

@@ -468,3 +468,42 @@ def _long_runs(rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _shown(names: Sequence[str]) -> str:
     return " ".join(names) if len(names) <= 3 else f"{names[0]} .. {names[-1]}"
+
+
+# Columns that stand still for a while.
+
+
+_STUCK, _CHANGING = 50, 0.5  # samples of one value, while in others so many of the steps are none of 0
+_RARELY = 20  # times longer than a column usually takes to change
+
+
+def stuck_run(values: Array, others: Sequence[Array], *, at_ends: bool = True) -> tuple[int, int] | None:
+    """Return first row and length of the longest run of one value, if the column is stuck there while others change.
+
+    Parameters
+    ----------
+    values, others
+        The column and those of the other sensors, shape (m,) each.
+    at_ends
+        Whether a run at the column's largest or smallest value counts, which in motion is the end of its range.
+    """
+    changes = np.flatnonzero(values[1:] != values[:-1]) + 1
+    edges = np.concatenate([[0], changes, [len(values)]])
+    begin, end = edges[(longest := int(np.argmax(np.diff(edges)))) : longest + 2].tolist()
+    length = end - begin
+    usual = (len(values) - length) / max(len(changes), 1)
+    if length <= max(_STUCK, _RARELY * usual) or not others:
+        return None
+    if not at_ends and values[begin] in (values.min(), values.max()):
+        return None
+    changing = [float(np.mean(other[begin + 1 : end] != other[begin : end - 1])) for other in others]
+    return (begin, length) if np.median(changing) > 0 and np.mean(changing) > _CHANGING else None
+
+
+def stuck_message(recording: Recording, name: str, run: tuple[int, int]) -> str:
+    """Return the words for a column that is stuck; `run` is from `stuck_run`."""
+    begin, length = run
+    return (
+        f"column {name}: {length} samples of {recording.columns[name][begin]:g} from {recording.place(begin)} on, "
+        "while others move: a stuck sensor"
+    )

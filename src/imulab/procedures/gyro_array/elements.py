@@ -691,7 +691,7 @@ class Checks:
             ratio = math.exp(float(high.mean() - low.mean()))
             likely = [text for factor, text in _FACTORS.items() if 1 / _NEAR < ratio / factor < _NEAR]
             smaller, larger = (" ".join(row[i] for i in sorted(part.tolist())) for part in (order[:cut], order[cut:]))
-            what = "readings" if moves else "noise"
+            what = "size of the readings" if moves else "noise"
             kind = Bad if moves or min(cut, len(order) - cut) > 1 else Finding
             messages.append(
                 kind(

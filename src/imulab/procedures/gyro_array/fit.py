@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from imulab.device.tables import Fusion
-from imulab.display import Finding, Note, prefixed
-from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
+from imulab.display import Bad, Finding, Note, prefixed
+from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, first_of
 from imulab.estimation._allan import integrate
 from imulab.estimation.column_noise import noise_lines
+from imulab.estimation.decisions import SCALE_OFF_UNIT
 from imulab.estimation.noise_coefficients import COEFFICIENTS, DeviationCurve, coefficients_dict
-from imulab.estimation.rows import LeftOut, leave_out
+from imulab.estimation.rows import LeftOut, find_step, leave_out, stuck_message, stuck_run
 from imulab.estimation.sampling import sampling_rate
 from imulab.procedures.gyro_array.alignment import (
     Alignment,
@@ -46,6 +47,7 @@ _FEWEST_SAMPLES = 200  # at rest whose variances are known
 _FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix
 _OVERLAP = 8  # windows that begin within the length of one
 _CLIPPED_RUN = 3  # equal readings in a row at an end of the range that show a clipped output
+_HARMFUL_STEP = 5.0  # times the uncertainty of a bias, in the median of all gyros
 _SHARED = 0.5  # mean correlation of the elements' noise from which a warning is given
 
 
@@ -112,6 +114,7 @@ def calibrate_array(
     if not averaging_time > 0:
         raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
     checks = _check_readings(still, elements)
+    _refuse_stuck(still, elements)
     left_out = _bridge_rows(still, elements)
     warnings = [prefixed(still.name, note) for note in still.notes]
     warnings += [prefixed(still.name, note) for note in left_out.notes()]
@@ -136,6 +139,7 @@ def calibrate_array(
         )
     noises = {elements.names[a][i]: gyro_noise for a, row in enumerate(rest.noise) for i, gyro_noise in enumerate(row)}
     warnings += [prefixed(still.name, line) for line in noise_lines(noises)]
+    warnings += [prefixed(still.name, line) for line in _warn_steps(still, elements, rest)]
     if noise is None:
         warnings += [Note(f"{still.name}: {line}") for line in unseen(noises, rest)]
     if fusion is not None and fusion.method == "feedback":
@@ -183,6 +187,18 @@ def _check_readings(recording: Recording, elements: Elements) -> Checks:
     return checks
 
 
+def _refuse_stuck(recording: Recording, elements: Elements, *, at_ends: bool = True) -> None:
+    """Refuse a gyro that repeats one reading for a while, while the others change."""
+    for row in elements.names:
+        for name in row:
+            others = [recording.columns[other] for other in row if other != name]
+            if (run := stuck_run(recording.columns[name], others, at_ends=at_ends)) is not None:
+                raise DataError(
+                    f"{recording.name}: {stuck_message(recording, name, run)}; leave it out, or read a part without "
+                    "it (--window)"
+                )
+
+
 def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[str], tuple[float, list[str]]]:
     """Return the longest stretch at rest, a message where that is not the whole recording, and its `sampling_rate`."""
     still = left_out.recording
@@ -221,10 +237,13 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
             f"{len(elements.axes)} as at rest"
         )
     _check_readings(moving, its)
+    _refuse_stuck(moving, its, at_ends=False)  # those are at the end of their range
+    clipped = _clipped_rows(_readings_si(moving, its))
     left_out = _bridge_rows(moving, its)
+    kinds = {kind: rows & ~clipped for kind, rows in left_out.kinds.items()}  # all at their limits repeat themselves
+    left_out = LeftOut(left_out.recording, left_out.names, kinds)
     moving = left_out.recording
     readings = _readings_si(moving, its)
-    clipped = _clipped_rows(readings)
     notes = [prefixed(moving.name, note) for note in moving.notes]
     notes += [prefixed(moving.name, note) for note in left_out.notes()]
     if clipped.any():
@@ -240,7 +259,8 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
     kept = readings[~clipped] - rest.bias
     checks = Checks(its.names)
     checks.watch(kept)
-    notes += [prefixed(moving.name, line) for line in checks.units()]
+    other_units = checks.units()
+    notes += [prefixed(moving.name, line) for line in other_units]
     notes += [Note(f"{moving.name}: {line}; the record puts it right") for line in checks.turned()]
     if len(kept) < _FEWEST_SAMPLES:
         raise DataError(f"{moving.name}: {len(kept)} usable samples in motion; expected {_FEWEST_SAMPLES} or more")
@@ -251,7 +271,44 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
         raise ObservabilityError(f"{moving.name}: {error}") from None
     names = its.names[0] if len(its.axes) == 1 else [f"element {i + 1}" for i in range(its.count)]
     lines = [*latency_notes(alignment, names), *bend_notes(alignment, names)]
+    if truth is None and not other_units:
+        lines += _warn_scales(alignment, its)
     return alignment, [*notes, *(prefixed(moving.name, line) for line in lines)]
+
+
+def _warn_scales(alignment: Alignment, elements: Elements) -> list[str]:
+    """Return a message on gyros whose scale factors lie farther off the others' than those of one range do."""
+    size = np.linalg.norm(alignment.sensing, axis=2).T
+    off = size / np.median(size)
+    far = np.abs(off - 1) > SCALE_OFF_UNIT
+    if not far.any():
+        return []
+    listed = first_of([f"{elements.names[a][i]} reads {off[a, i]:.3g}" for a, i in np.argwhere(far).tolist()], 3)
+    return [
+        Bad(
+            f"in motion {listed} times the rate of most gyros: another range or unit? The scale of the array is the "
+            f"mean of all, and so {100 * abs(float(off.mean()) - 1):.2g} % off",
+            "correct the range or the unit of these columns, or leave them out",
+        )
+    ]
+
+
+def _warn_steps(still: Recording, elements: Elements, rest: AtRest) -> list[str]:
+    """Return a message on gyros whose level changes at rest by much more than the uncertainty of a usual bias."""
+    usual = float(np.median(rest.uncertainty))
+    found = []
+    for name in (name for row in elements.names for name in row):
+        step = find_step(np.asarray(still.column(name), dtype=np.float64))
+        if step is not None and abs(to_si(step.size, still.units[name])) > _HARMFUL_STEP * usual:
+            found.append(f"{name} by {step.size:+.2g} {still.units[name]} near {still.si('time')[step.sample]:.4g} s")
+    if not found:
+        return []
+    return [
+        Finding(
+            f"the level changes at rest: {first_of(found, 3)}; the bias is the mean of both levels",
+            "record again at rest, or read the part after the change (--interval)",
+        )
+    ]
 
 
 def _clipped_rows(readings: Array) -> np.ndarray:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from imulab.display import Finding, Note
 from imulab.errors import DataError, ObservabilityError, UnitError
 from imulab.estimation.clock import GAP
-from imulab.estimation.rows import FAR, REPEATED, LeftOut, leave_out, medians
+from imulab.estimation.rows import FAR, REPEATED, LeftOut, leave_out, medians, stuck_message, stuck_run
 from imulab.procedures.gyro_array.alignment import align, nominal_orientation
 from imulab.procedures.gyro_array.imus.model import ACCEL, GYRO, GYRO_BIAS, NUMBERS, POSITION, RATE, Board, lever
 from imulab.procedures.gyro_array.imus.solve import Measured
@@ -27,7 +27,6 @@ MOVING = math.radians(30.0)
 _BESIDE = 4  # samples beside a reading at its limit, or a gap
 _FEWEST, _SHORTEST = 300, 6  # samples in motion, and of an unbroken run of them
 _FEW_LOST = 0.01  # share of rows without a reading up to which it is a note
-_STUCK, _CHANGING = 50, 0.5  # samples of one value, while in others so many of the steps are none of 0
 _RARER = 0.5  # times as often as throughout: repeats in motion, where those at rest are chance
 _UNLIKE_G, _UNLIKE_RATE, _SKEW = 0.2, 0.3, 3.0
 _NUMBERED = re.compile(r"(accel|gyro)_([xyz])_([1-9][0-9]*)")
@@ -207,19 +206,9 @@ def _check_alive(recording: Recording, names: list[str]) -> None:
             raise DataError(
                 f"{recording.name}: column {name}: all samples are {values[0]:g}: a dead sensor; leave its IMU out"
             )
-        edges = np.flatnonzero(np.diff(values) != 0)
-        longest = int(np.diff(np.concatenate([[-1], edges, [len(values) - 1]])).argmax())
-        begin = int(edges[longest - 1]) + 1 if longest else 0
-        end = int(edges[longest]) if longest < len(edges) else len(values) - 1
-        others = [other for other in names if other[:4] == name[:4] and other != name]
-        if end - begin >= _STUCK and np.median([np.ptp(recording.columns[o][begin:end]) for o in others]) > 0:
-            limit = values[begin] in (values.min(), values.max())
-            changed = np.mean([np.mean(np.diff(recording.columns[o][begin : end + 1]) != 0) for o in others])
-            if changed > _CHANGING and not limit:
-                raise DataError(
-                    f"{recording.name}: column {name}: {end - begin + 1} samples of {values[begin]:g} from "
-                    f"{recording.place(begin)} on, while others move: a stuck sensor; leave its IMU out"
-                )
+        others = [recording.columns[other] for other in names if other[:4] == name[:4] and other != name]
+        if (run := stuck_run(values, others, at_ends=False)) is not None:
+            raise DataError(f"{recording.name}: {stuck_message(recording, name, run)}; leave its IMU out")
 
 
 def _check_units(recording: Recording, accel: Array, rests: list[slice], gravity: float) -> None:
