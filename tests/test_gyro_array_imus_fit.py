@@ -185,8 +185,13 @@ def test_wrong_units_are_refused_by_name():
     with pytest.raises(DataError, match=r"accelerometers of IMU 2: 0\.9.* m/s\^2 at rest"):
         il.calibrate_imus(with_columns(board, **in_g), gravity=G)
     in_rad = {name: np.radians(board.columns[name]) for name in ("gyro_x_2", "gyro_y_2", "gyro_z_2")}
-    with pytest.raises(DataError, match=r"gyroscopes of IMU 2 read 0\.01.* times the rate of the others"):
+    with pytest.raises(
+        DataError, match=r"of IMU 2 disagree .* gyro_x_2 \.\. gyro_z_2 are 57\.3 times too small: is their unit"
+    ):
         il.calibrate_imus(with_columns(board, **in_rad), gravity=G)
+    smaller = {name: board.columns[name] / 2.5 for name in in_rad}
+    with pytest.raises(DataError, match=r"gyroscopes of IMU 2 read 0\.4.* times the rate of the others"):
+        il.calibrate_imus(with_columns(board, **smaller), gravity=G)
     with pytest.raises(UnitError, match="accel_x_1"):
         il.calibrate_imus(replace(board, units={**board.units, "accel_x_1": "deg/s"}), gravity=G)
 

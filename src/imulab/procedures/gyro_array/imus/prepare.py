@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise, permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ _BESIDE = 4  # samples beside a reading at its limit, or a gap
 _FEWEST, _SHORTEST = 300, 6  # samples in motion, and of an unbroken run of them
 _FEW_LOST = 0.01  # share of rows without a reading up to which it is a note
 _RARER = 0.5  # times as often as throughout: repeats in motion, where those at rest are chance
+_LONGEST_TURN, _FEWEST_TURNS = 30.0, 3  # s from rest to rest
+_LEAST_TURN, _UNLIKE_TURN = math.radians(20.0), math.radians(25.0)
 _UNLIKE_G, _UNLIKE_RATE, _SKEW = 0.2, 0.3, 3.0
 _NUMBERED = re.compile(r"(accel|gyro)_([xyz])_([1-9][0-9]*)")
 
@@ -137,6 +140,7 @@ def prepare(recording: Recording, gravity: float) -> Prepared:
     bias = np.concatenate([gyro[part] for part in rests]).mean(axis=0)
     turning = _moving(gyro - bias, size) & ~still
     bad, more = _no_readings(recording, [triad for sensor in names.values() for triad in sensor], rests, turning)
+    _check_frames(recording, time, (accel, gyro - bias), rests, gyro_limit | gap | bad)
     first, kept = _runs(turning & ~_spread(at_limit | gap | bad, _BESIDE))
     clipped = float((at_limit & turning).sum() / max(turning.sum(), 1))
     if len(kept) < _FEWEST:
@@ -221,6 +225,87 @@ def _check_units(recording: Recording, accel: Array, rests: list[slice], gravity
             f"{recording.name}: accelerometers of IMU {k + 1}: {length[k]:.4g} m/s^2 at rest; expected gravity, "
             f"{gravity:.4g} m/s^2: is the unit of accel_x_{k + 1} .. accel_z_{k + 1} right (--unit), or its range?"
         )
+
+
+def _check_frames(
+    recording: Recording, time: Array, readings: tuple[Array, Array], rests: list[slice], broken: NDArray[np.bool_]
+) -> None:
+    """Refuse an IMU whose gyroscopes have another unit, or other axes, than its accelerometers.
+
+    The gyroscopes must turn gravity from rest to rest as the accelerometers read it. Where they do not, but would with
+    another unit, or with axes exchanged or reversed, that is the reason. `readings` are accelerations and rates.
+    """
+    accel, gyro = readings
+    pairs = [
+        (before, after, slice(before.stop - 1, after.start + 1))
+        for before, after in pairwise(rests)
+        if not broken[before.stop - 1 : after.start + 1].any() and time[after.start] - time[before.stop] < _LONGEST_TURN
+    ]
+    for k in range(accel.shape[1]):
+        ends = [(_direction(accel[before, k]), _direction(accel[after, k])) for before, after, _ in pairs]
+        turns = [
+            (time[part], gyro[part, k], begin, end)
+            for (begin, end), (_, _, part) in zip(ends, pairs, strict=True)
+            if float(begin @ end) < math.cos(_LEAST_TURN)
+        ]
+        if len(turns) < _FEWEST_TURNS or (off := _misfit(turns, np.eye(3))) < _UNLIKE_TURN:
+            continue
+        best = min(_FRAMES, key=lambda frame: _misfit(turns, frame.factor * frame.axes))
+        if _misfit(turns, best.factor * best.axes) < off / 3:
+            raise DataError(
+                f"{recording.name}: gyroscopes and accelerometers of IMU {k + 1} disagree by {math.degrees(off):.0f} "
+                f"deg on how gravity turns from rest to rest; they agree {best.words(k + 1)}"
+            )
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What gyroscopes may read instead of the rate: ``rate = factor axes reading``."""
+
+    factor: float
+    axes: Array
+
+    def words(self, number: int) -> str:
+        """Return how the columns of an IMU would be right, and what to check."""
+        names = [f"gyro_{axis}_{number}" for axis in "xyz"]
+        if self.factor != 1.0:
+            size = f"{1 / self.factor:.3g} times too large" if self.factor < 1 else f"{self.factor:.3g} times too small"
+            turned = "" if np.array_equal(self.axes, np.eye(3)) else ", with other axes"
+            return f"if {names[0]} .. {names[2]} are {size}{turned}: is their unit right (--unit)?"
+        read = [f"{'-' if row.sum() < 0 else ''}{names[int(np.abs(row).argmax())]}" for row in self.axes]
+        right = ", ".join(
+            f"{axis} is {name}" for axis, name in zip("xyz", read, strict=True) if name not in names or name[5] != axis
+        )
+        hand = "" if np.linalg.det(self.axes) > 0 else " (left-handed)"
+        return f"if {right}{hand}: are columns of either exchanged, or signs reversed?"
+
+
+_FRAMES = tuple(
+    _Frame(factor, np.diag(signs)[list(order)].astype(np.float64))
+    for factor in (1.0, math.pi / 180, 180 / math.pi)
+    for order in permutations(range(3))
+    for signs in product((1, -1), repeat=3)
+)
+
+
+def _direction(readings: Array) -> Array:
+    mean = readings.mean(axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def _misfit(turns: list[tuple[Array, Array, Array, Array]], frame: Array) -> float:
+    """Return the median angle between gravity after a turn and where the rates turn it, rad."""
+    from scipy.spatial.transform import Rotation
+
+    angles = []
+    for time, rate, begin, end in turns:
+        turn = Rotation.from_rotvec(-(rate[1:] + rate[:-1]) / 2 * np.diff(time)[:, None] @ frame.T)
+        while len(turn) > 1:
+            last = turn[-1:] if len(turn) % 2 else None
+            turn = turn[1::2] * turn[: len(turn) - 1 : 2]
+            turn = turn if last is None else Rotation.concatenate([turn, last])
+        angles.append(math.acos(float(np.clip(turn[0].apply(begin) @ end, -1.0, 1.0))))
+    return float(np.median(angles))
 
 
 def _sensing(recording: Recording, rate: Array, noise: Array) -> Array:
