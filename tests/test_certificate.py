@@ -4,6 +4,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,7 +14,7 @@ from scipy.stats import chi2, multivariate_normal, multivariate_t
 
 import imulab as il
 from imulab.certificate.dcc import dcc_xml
-from imulab.certificate.laboratory import TEMPLATE, load_laboratory
+from imulab.certificate.laboratory import TEMPLATE, day_remarks, load_laboratory
 from imulab.certificate.model import make_certificate
 from imulab.certificate.units import dsi_unit
 from imulab.cli import main
@@ -110,6 +111,46 @@ def test_certificates_of_other_procedures_are_valid_and_shown(issue, schemas, ca
             u = stated[parameter].standard_uncertainty if "…" in expanded else ten * float(expanded)
             assert ten * float(value) == pytest.approx(stated[parameter].value, abs=0.0501 * u)
     assert len([row for row in rows if row[0] in stated]) == len(stated)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_certificate_of_an_array_says_that_its_scale_factors_are_relative(issue, known):
+    """Gyros whose scale is 5 % off: their ratios to the mean are known to 1e-5, which U must not be taken for."""
+    rng = np.random.default_rng(4)
+    time = np.arange(6000) / 100
+    rate = 90 * np.sin(0.9 * time) + 60 * np.sin(2.3 * time)
+    gain, zero = 1.05 + 0.01 * rng.standard_normal(5), 0.1 * rng.standard_normal(5)
+    still, moving = (
+        {f"gyro_{i + 1}": gain[i] * w + zero[i] + 0.05 * rng.standard_normal(6000) for i in range(5)}
+        for w in (0 * time, rate)
+    )
+    units = {"time": "s", **dict.fromkeys(still, "deg/s")}
+    if known:
+        moving["truth_rate"], units["truth_rate"] = rate, "deg/s"
+    recordings = [
+        il.Recording({"time": time, **columns}, {k: units[k] for k in ("time", *columns)}, metadata={"serial": "A1"})
+        for columns in (still, moving)
+    ]
+    fit = il.calibrate_array(*recordings)
+    fit.save("array.json")
+    off = abs(fit.calibration.parameters["scale_factor_1"].value - gain[0])
+    assert (off < 1e-4) == known
+    assert issue(REVIEWED, "array.json") == 0
+    text = Path("cert.xml").read_text(encoding="utf-8")
+    assert ("Scale factors and alignment are relative to the mean of all elements" in text) != known
+    assert "The Earth's rate, up to 15 deg/h along an axis, was not taken off" in text
+    assert "slower noise, which so short a stretch cannot show, could make them up to" in text
+
+
+def test_a_certificate_of_a_board_says_what_its_size_rests_on(issue):
+    board = il.simulate_imus(elements=2, attitudes=3, duration="10 s", rate="50 Hz")
+    record = il.calibrate_imus(board, gravity=9.80665).calibration
+    assert record.sections["size_from"] == "gyro scale"
+    replace(record, sensor={"serial": "B1"}).save("board.json")
+    assert issue(REVIEWED, "board.json") == 0
+    text = Path("cert.xml").read_text(encoding="utf-8")
+    assert "the mean scale factor of all gyroscopes, rest on its nominal value and the tolerance" in text
+    assert "Held near their nominal values, which the recording does not tell: size of the board" in text
 
 
 @pytest.mark.parametrize("name", ["tumble", "thermal_gyro", "centrifuge", "noise"])
@@ -334,7 +375,7 @@ REFUSED = {
     "infinite": (LAB.replace("23.0", "inf"), "conditions[0].value: "),
     "long unit": (
         LAB.replace('"degC"', f'"{"(" * 3000}m{")" * 3000}"'),
-        "conditions[0].unit: expected `str` of length",
+        "conditions[0].unit: expected a text of length",
     ),
     "own number": (
         LAB.replace("location =", 'replaces = "EX-2026-0042"\nreason = "typing"\nlocation ='),
@@ -349,6 +390,12 @@ REFUSED = {
     "gravity": (LAB + STANDARD.replace("1e-6", "1e-3"), "fit again with --gravity 9.81362+-0.001"),
     "gravity's unit": (LAB + STANDARD.replace('"m/s^2"', '"deg"'), "expected a unit of acceleration"),
     "no gravity": (LAB + STANDARD.replace("standard_unc", "#"), "expected standard_uncertainty of gravity"),
+    "rule": (
+        LAB + '[conformity]\nrule = "guard"\nagreed = "a"\nspecification = "b"\n',
+        "conformity.rule: unknown 'guard'; known: simple guarded bands; did you mean 'guarded'?",
+    ),
+    "language": (re.sub(r"(?m)^(language = .*\n)?location =", 'language = "fr"\nlocation =', LAB), "known: en de"),
+    "text for a number": (LAB.replace("value = 23.0", 'value = "23"'), "].value: expected a number, found a text"),
     "not TOML": ("[certificate", "the laboratory file is not TOML"),
 }
 
@@ -624,6 +671,20 @@ def test_show_reads_a_certificate(issue, capsys):
     for changed in (text[:3000], text.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1)):
         Path("hostile.xml").write_text(changed, encoding="utf-8")
         assert main(["show", "hostile.xml"]) == 2
+
+
+@pytest.mark.parametrize(("issued", "expected"), [
+    ("2026-11-25", "certificate.issued 2026-11-25: before the record was made, on 2026-11-28; expected a later day"),
+    ("2026-11-27", ""),  # perhaps the same day, in another time zone
+    ("2026-12-01", ""),
+    ("2999-01-01", "certificate.issued 2999-01-01: in the future; expected the day of issue"),
+])  # fmt: skip
+def test_a_day_of_issue_that_cannot_be_is_warned_of(tmp_path, issued, expected):
+    lab = re.sub(r"(?m)^issued = \S+", f"issued = {issued}", LAB)
+    (tmp_path / "lab.toml").write_text(lab, encoding="utf-8")
+    said = day_remarks(str(tmp_path / "lab.toml"), "2026-11-28T10:00:00Z", date(2026, 12, 1))
+    assert "".join(said).removeprefix(f"{tmp_path / 'lab.toml'}: ")[: len(expected)] == expected
+    assert bool(said) == bool(expected)
 
 
 def test_what_is_still_the_template_s_is_warned_of(tmp_path, monkeypatch, capsys):

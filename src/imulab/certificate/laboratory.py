@@ -9,16 +9,16 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable
-from datetime import date
+from datetime import date, timedelta
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 from msgspec import Meta, Struct
 
 from imulab.certificate.units import dsi_unit
 from imulab.display import first_hidden
-from imulab.errors import ReadError, UnitError, first_of
+from imulab.errors import ReadError, UnitError, first_of, listed
 from imulab.files import load_toml, unit_of
 from imulab.fleet.limits import Rule
 from imulab.quantities import LARGEST
@@ -222,6 +222,18 @@ _NAMES_SOMEBODY = (
 _OF_TUMBLE = ("item.name", "method.name")
 _LARGEST_LOGO = 2_000_000
 _UNKNOWN = re.compile("^Object contains unknown field `(.*)`$")
+_ENUM = re.compile("^Invalid enum value '(.*)'$")
+_CHOICES = {
+    "conformity.rule": get_args(Rule),
+    "location": get_args(Location),
+    "language": get_args(Language),
+    "quantity": ("gravity",),
+}
+_KINDS = {
+    "`float` <=": "a number of at most", "`float` >=": "a number of at least", "`float` >": "a number above",
+    "`float`": "a number", "`str` of length": "a text of length", "`str`": "a text", "`bool`": "true or false",
+    "`date`": "a day", "`array`": "a list", "`object`": "a table", "got": "found",
+}  # fmt: skip
 _MISSING = re.compile("^Object missing required field `(.*)`$")
 
 
@@ -275,6 +287,16 @@ def load_laboratory(path: str) -> Laboratory:
         except UnitError as error:
             raise UnitError(f"{path}: conditions {condition.name}: {error}") from None
     return lab
+
+
+def day_remarks(path: str, created: str, today: date) -> list[str]:
+    """Return a warning of a day of issue before that on which the record was `created`, or after `today`, in UTC."""
+    issued, made, day = load_laboratory(path).certificate.issued, date.fromisoformat(created[:10]), timedelta(days=1)
+    if issued < made - day:
+        return [f"{path}: certificate.issued {issued}: before the record was made, on {made}; expected a later day"]
+    if issued > today + day:
+        return [f"{path}: certificate.issued {issued}: in the future; expected the day of issue"]
+    return []
 
 
 def template_remarks(path: str, parameters: Iterable[str] = (), *, tumbled: bool = True) -> list[str]:
@@ -331,6 +353,11 @@ def _reason(message: str) -> str:
         return f"{place}: unknown key {unknown[1]!r}"
     if missing := _MISSING.match(what):
         return f"{place}: expected {missing[1]}, which is missing"
+    if unlike := _ENUM.match(what):
+        known = next((each for key, each in _CHOICES.items() if place.endswith(key)), ())
+        return f"{place}: unknown {unlike[1]!r}; known: {listed(known, unlike[1])}"
     if "matching regex" in what:
         return f"{place}: expected a text that is not empty and has no space at its ends (a country: DE, two letters)"
+    for name, words in _KINDS.items():
+        what = what.replace(name, words)
     return f"{place}: {what[0].lower()}{what[1:]}"

@@ -12,6 +12,7 @@ from typing import Any, get_args
 from imulab.certificate.digits import printed_unit
 from imulab.certificate.laboratory import Equipment, Language
 from imulab.certificate.model import Certificate
+from imulab.procedures.registry import procedure_of
 
 LANGUAGES = get_args(Language)
 _TEXTS: Mapping[str, tuple[str, str]] = {
@@ -189,9 +190,9 @@ def statements(certificate: Certificate, words: Words) -> Iterator[tuple[str, st
 
 
 def remarks(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
-    """Return what the reader must know besides, each with its language: the verdict's reasons are the record's own."""
+    """Return what the reader must know besides, each with its language; the record's own sentences are English."""
     record = certificate.record
-    reasons = [(reason, "en") for reason in record.verdict.reasons]
+    reasons = [(reason, "en") for reason in (*record.verdict.reasons, *procedure_of(record).reservations(record))]
     if certificate.before is not None:
         reasons += [(f"before the adjustment: {reason}", "en") for reason in certificate.before.record.verdict.reasons]
     others: list[str] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Annotated, Literal
 
 import imulab as il
@@ -62,11 +63,12 @@ def certificate(
         record, output, lab=lab, limits=limits, before=before, language=language, fonts=fonts, sign=sign
     )
     print(f"certificate: {output}")
-    from imulab.certificate.laboratory import template_remarks
+    from imulab.certificate.laboratory import day_remarks, template_remarks
     from imulab.procedures.registry import load
 
     certified = load(record)
-    for remark in template_remarks(lab, certified.parameters, tumbled=certified.procedure == "tumble"):
+    remarks = template_remarks(lab, certified.parameters, tumbled=certified.procedure == "tumble")
+    for remark in [*remarks, *day_remarks(lab, certified.created, datetime.now(UTC).date())]:
         warn(remark)
 
 

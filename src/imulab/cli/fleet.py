@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as encoder
 import sys
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import imulab as il
@@ -107,7 +108,7 @@ def certificate(
     SERIAL.pdf for people and SERIAL.xml for programs. Exit status 2 if a unit has none, with the reason; all others
     are written.
     """
-    from imulab.certificate.laboratory import template_remarks
+    from imulab.certificate.laboratory import day_remarks, template_remarks
 
     units = il.fleet_status(folder).rows
     with progress_bar("certificates", len(units)) as update:
@@ -118,7 +119,8 @@ def certificate(
     certified = next((row.summary for row in units if row.summary and row.unit.serial not in refused), None)
     if certified is not None:
         tumbled = certified.procedure == "tumble"
-        for remark in template_remarks(lab, certified.parameters, tumbled=tumbled):
+        remarks = template_remarks(lab, certified.parameters, tumbled=tumbled)
+        for remark in [*remarks, *day_remarks(lab, certified.created, datetime.now(UTC).date())]:
             warn(remark)
     if not refused:
         return 0

@@ -253,6 +253,10 @@ class Procedure:
         """Return titles and rows of a record's first table; empty for the table of all parameters."""
         return [], []
 
+    def reservations(self, record: Calibration) -> list[str]:
+        """Return what must stand beside the values of a record in a certificate: what they rest on, or do not hold."""
+        return []
+
     def rows(self, record: Calibration) -> Sequence[Row]:
         """Return the parameters in the units in which people read them."""
         from imulab.report.parameters import rows_of

@@ -87,6 +87,10 @@ def at_rest(still: Recording, rate: float, elements: Elements, record: Calibrati
     return AtRest(np.reshape(bias, spread.shape), curves, noise, white, spread, duration, rate), notes
 
 
+SLOWER_NOISE = "slower noise, which so short a stretch cannot show"
+"""In the note of `unseen`."""
+
+
 def unseen(noises: Mapping[str, ColumnNoise], rest: AtRest) -> list[str]:
     """Return a note by how much noise too slow to show could enlarge the uncertainties of the biases."""
     most = max((each.unseen(rest.duration) for each in noises.values()), default=1.0)
@@ -95,7 +99,7 @@ def unseen(noises: Mapping[str, ColumnNoise], rest: AtRest) -> list[str]:
     largest = math.degrees(float(rest.uncertainty.max())) * 3600
     return [
         f"the uncertainties of the biases, up to {largest:.3g} deg/h, hold the noise that {rest.duration:.4g} s show; "
-        f"slower noise, which so short a stretch cannot show, could make them up to {most:.2g} times as large "
+        f"{SLOWER_NOISE}, could make them up to {most:.2g} times as large "
         "(--noise RECORD: the noise of a longer log)"
     ]
 
@@ -107,6 +111,8 @@ _BLOCKS = 20  # parts of a motion whose scatter gives the uncertainties (jackkni
 _WORST = 0.05  # largest uncertainty of a useful alignment, relative and in rad
 _VISIBLE = 25.0  # least variance of the motion over that of the noise, in the direction of least motion
 _NEAR_PERMUTATION = 0.35  # rad
+TRUTH = "truth_rate"
+"""The gauge of an alignment against a known rate."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +199,7 @@ def align(readings: Array, white: Array, truth: Array | None = None, *, strict: 
     bends = [_fit_bend(sensed[:, k], left[:, k], edges) for k in range(size)]
     bend, bend_uncertainty, slope = (np.array([each[k] for each in bends]) for k in range(3))
     uncertainty = _allow_for_bends(sensing, uncertainty, slope.reshape(n, axes), shared=truth is None)
-    gauge = "truth_rate" if truth is not None else "mean over the elements of P_i' A_i = 1, directions of element 1"
+    gauge = TRUTH if truth is not None else "mean over the elements of P_i' A_i = 1, directions of element 1"
     return Alignment(
         sensing, uncertainty, residual, gauge,
         bend=bend.reshape(n, axes, 2), bend_uncertainty=bend_uncertainty.reshape(n, axes, 2),
@@ -371,7 +377,7 @@ def latency_notes(alignment: Alignment, names: Sequence[str]) -> list[str]:
         f"{names[i]} by {1e3 * alignment.latency[i]:+.3g} ms (u {1e3 * alignment.latency_uncertainty[i]:.1g} ms)"
         for i in late
     )
-    than = "the truth" if alignment.gauge == "truth_rate" else "the array's median"
+    than = "the truth" if alignment.gauge == TRUTH else "the array's median"
     return [
         f"readings come later than {than}: {listed}; scale factors and alignment are of readings moved by as much, but "
         "array fuse does not move them: give such an element a column time_i of its own, or mend the logger"

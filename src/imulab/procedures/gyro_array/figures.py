@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import RecordError
+from imulab.procedures.gyro_array.alignment import SLOWER_NOISE, TRUTH
 from imulab.procedures.gyro_array.elements import JUMPED, NON_FINITE, STUCK, unit_of_angle
 from imulab.procedures.gyro_array.imus.figures import exhibits as imus_exhibits
+from imulab.procedures.gyro_array.imus.schema import imus_of
 from imulab.procedures.gyro_array.schema import (
     ArrayRecord,
     ComparisonRecord,
@@ -300,6 +302,23 @@ def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
     """Return the first table of the report: each gyro with its uncertainties, or each method."""
     first = next(item for item in exhibits(record).items if isinstance(item, ReportTable))
     return first.columns, first.rows
+
+
+def reservations(record: Calibration) -> list[str]:
+    """Return what a certificate must say of the values: whose scale they have, and what their uncertainties lack."""
+    earth = "The Earth's rate, up to 15 deg/h along an axis, was not taken off: biases of gyroscopes hold it."
+    if record.model.get("kind") == "imus":
+        board = imus_of(record)
+        nominal = "Positions, and the mean scale factor of all gyroscopes, rest on its nominal value and the tolerance."
+        kept = f"Held near their nominal values, which the recording does not tell: {'; '.join(board.not_determined)}."
+        return [earth, *[nominal] * (board.size_from == "gyro scale"), *[kept] * bool(board.not_determined)]
+    relative = (
+        "Scale factors and alignment are relative to the mean of all elements, of which nothing was measured: no "
+        "uncertainty of theirs is that of a scale factor in rad/s."
+    )
+    gauge = record.model.get("gauge")
+    said = [warning for warning in record.warnings if SLOWER_NOISE in warning]
+    return [earth, *[relative] * (gauge not in (None, TRUTH)), *said]
 
 
 def _calibration(record: ArrayRecord) -> Exhibits:

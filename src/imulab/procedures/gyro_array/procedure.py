@@ -135,6 +135,11 @@ class GyroArrayProcedure(Procedure):
 
         return summary(record)
 
+    def reservations(self, record: Calibration) -> list[str]:
+        from imulab.procedures.gyro_array.figures import reservations
+
+        return reservations(record)
+
     def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
         if _whole(record):
             from imulab.procedures.gyro_array.imus.device import tables_of_board
