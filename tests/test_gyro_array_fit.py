@@ -306,6 +306,34 @@ def test_gyros_at_their_limits_together_are_no_repeated_rows():
     assert not any("exact repeats" in message for message in warnings)
 
 
+@pytest.mark.parametrize("axes", [1, 3])
+@pytest.mark.parametrize(("factor", "text"), [
+    (1.0, ""), (30.0, ""),
+    (np.pi / 180, r"5[678]\.\d times as small as in the record: another unit \(rad/s labelled deg/s"),
+    (3600.0, r"3[56]\d\d times as large as in the record: another unit \(deg/h labelled deg/s"),
+])  # fmt: skip
+def test_a_recording_whose_unit_is_not_the_records_is_told_by_noise_and_biases(axes, factor, text):
+    """In motion, with every gyro in the wrong unit alike: nothing but the record can tell."""
+    still, moving, _, _ = array_of(1, axes)
+    record = calibrate_array(still, moving).calibration
+    columns = {name: x if name == "time" else factor * x for name, x in moving.columns.items()}
+    fused = fuse(Recording(columns, moving.units, name="flight.csv"), FuseOptions(calibration=record))
+    said = [note for note in fused.notes if "in the record: another unit" in note]
+    assert bool(said) == bool(text)
+    assert all(re.search(rf"flight.csv: noise and biases of the gyros are {text}", note) for note in said)
+
+
+def test_turned_on_again_and_filtered_gyros_are_no_other_unit():
+    still, moving, _, _ = array_of(1, 1)
+    record = calibrate_array(still, moving).calibration
+    rng, columns = np.random.default_rng(5), dict(moving.columns)
+    for name in columns.keys() - {"time"}:
+        window = np.ones(40) / 40
+        columns[name] = np.convolve(columns[name] + rng.normal(0, 1.0), window, mode="same")
+    fused = fuse(Recording(columns, moving.units, name="flight.csv"), FuseOptions(calibration=record))
+    assert not any("another unit" in note for note in fused.notes)
+
+
 def test_units_and_motion_that_cannot_serve_are_refused():
     still, _, sensing, _ = array_of(1, 3)
     counts = Recording(still.columns, {k: "s" if k == "time" else "count" for k in still.columns}, name="c.csv")

@@ -526,13 +526,13 @@ _FOLLOWS = 0.81
 _ONE_AXIS = 0.8  # of the explained share
 _APART = 20.0  # times: groups of elements whose readings differ by more have different units
 _WITHIN = 8.0  # times: largest ratio within such a group
-_FACTORS = {
+UNIT_FACTORS = {
     180 / math.pi: "rad/s labelled deg/s, or the other way round",
     3600.0: "deg/h labelled deg/s, or the other way round",
     3600 * 180 / math.pi: "rad/s labelled deg/h, or the other way round",
     1000.0: "thousandths, or the other way round",
 }
-_NEAR = 1.6  # times: a ratio this near to that of two units is that of these units
+NEAR_UNIT = 1.6  # times: a ratio this near to that of two units is that of these units
 _UNTURNED = "array calibrate --moving finds it, and --calibration puts it right"
 
 Map = tuple[tuple[int, int] | None, ...]
@@ -689,7 +689,7 @@ class Checks:
             if high[0] - low[-1] < math.log(_APART) or max(np.ptp(low), np.ptp(high)) > math.log(_WITHIN):
                 continue
             ratio = math.exp(float(high.mean() - low.mean()))
-            likely = [text for factor, text in _FACTORS.items() if 1 / _NEAR < ratio / factor < _NEAR]
+            likely = [text for factor, text in UNIT_FACTORS.items() if 1 / NEAR_UNIT < ratio / factor < NEAR_UNIT]
             smaller, larger = (" ".join(row[i] for i in sorted(part.tolist())) for part in (order[:cut], order[cut:]))
             what = "size of the readings" if moves else "noise"
             kind = Bad if moves or min(cut, len(order) - cut) > 1 else Finding

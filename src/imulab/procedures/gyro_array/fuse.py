@@ -18,7 +18,7 @@ from imulab.arguments import check_fields
 from imulab.device import METHODS, STARTS
 from imulab.device.tables import MOST_COUNT, ArraySettings, Fusion, fusion_of
 from imulab.device.unit import Blob
-from imulab.display import Finding, prefixed
+from imulab.display import Bad, Finding, prefixed
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
 from imulab.estimation.rows import HISTORY, MAD_TO_SIGMA, zero_rows
 from imulab.procedures.gyro_array.elements import (
@@ -26,8 +26,10 @@ from imulab.procedures.gyro_array.elements import (
     FEWEST_ROBUST,
     HELD,
     JUMPED,
+    NEAR_UNIT,
     NON_FINITE,
     STUCK,
+    UNIT_FACTORS,
     ArrayCalibration,
     Checks,
     Elements,
@@ -56,6 +58,7 @@ from imulab.report.traces import (
     Figure,
     ReportTable,
     figure_axis,
+    plain_number,
     rounded,
     scatter,
 )
@@ -421,6 +424,8 @@ def parse_memory(text: str, option: str = "--memory") -> tuple[str | float, int]
 _NEED_THREE = ("robust", "support", "least-squares")
 _MISALIGNED = 0.3  # of a reading: noise of the first element, which explains so much of the others, makes less
 _FOR_NOISE = 10_000  # samples that show the noise where none is stated
+_FOR_SCALE = 1000  # samples whose noise and means are compared with a record's
+_NEAR_BIASES = 4.0  # times: the ratio of biases may be as far off that of noise
 _WITHOUT_UNIT = 16.0  # rad/s in a second, or times the noise: walk of an unknown motion
 
 
@@ -532,7 +537,9 @@ class Fuser:
     before: Array | None = None
     lost: int = 0
     other: list[str] = field(default_factory=list)
-    matrices: Array | None = None
+    held: ArrayCalibration | None = None
+    scale: list[str] = field(default_factory=list)
+    rows: int = 0
 
     def fuse(self, blocks: Iterable[Recording]) -> Iterator[Fused]:
         """Yield the fused rates of consecutive blocks; the result does not depend on where they are cut.
@@ -558,7 +565,7 @@ class Fuser:
                 self._check(block, elements)
                 self._warn_other_unit(block)
                 if isinstance(self.options.calibration, Calibration):
-                    self.matrices = array_calibration(self.options.calibration, elements, block.name).matrices
+                    self.held = array_calibration(self.options.calibration, elements, block.name)
                 self.health = Health(elements.names)
                 self.checks = Checks(elements.names)
             settled = stream is not None and self.clock.settled
@@ -568,6 +575,9 @@ class Fuser:
             self._drop_zeros(readings)
             if self.checks is not None:
                 self.checks.watch(readings)
+            if elements is not None and self.held is not None and not self.rows:
+                self.scale = warn_other_scale(self.held, readings[:_FOR_NOISE], self.clock.rate)
+            self.rows += len(readings)
             fused_before = 0
             if not settled:
                 early = np.concatenate([early, time])
@@ -595,7 +605,7 @@ class Fuser:
         lines = []
         if self.checks is not None:
             lines = self.checks.lines(turned=not self._aligns(), known=known)
-            lines += warn_misaligned(self.checks, self.matrices)
+            lines += self.scale or warn_misaligned(self.checks, None if self.held is None else self.held.matrices)
         if self.lost:
             rows = f"{self.lost} row{'s' * (self.lost > 1)}"
             text = f"{rows} left out: every gyro is exactly zero; the output is nan there"
@@ -656,6 +666,36 @@ class Fuser:
 
     def _open(self, block: Recording, elements: Elements, first: Array) -> Any:
         return open_stream(self.options, elements, self.clock.rate, first[:_FOR_NOISE], block.name)
+
+
+def warn_other_scale(held: ArrayCalibration, readings: Array, rate: float) -> list[str]:
+    """Return a warning where noise and biases are as much smaller or larger than in the record as another unit is.
+
+    Both are taken about the mean of the array, from which motion drops out; filters change the noise, and turning on
+    the biases, but not both by the factor between two units. `readings` have the shape (m, axes, n).
+    """
+    finite = readings[np.isfinite(readings).all(axis=(1, 2))]
+    if len(finite) < _FOR_SCALE or readings.shape[2] < FEWEST_ROBUST:
+        return []
+    aligned = finite if held.matrices is None else np.einsum("iab,mbi->mai", held.matrices, finite)
+    zero = held.bias if held.matrices is None else np.einsum("iab,bi->ai", held.matrices, held.bias)
+    apart = aligned.mean(axis=0)
+    spreads = [np.std(each - each.mean(axis=1, keepdims=True)) for each in (apart, zero)]
+    noise = noise_about_mean(aligned) / (_aligned(held.matrices, held.white) * math.sqrt(rate))
+    ratio = float(np.median(noise))
+    if not (ratio > 0 and spreads[0] > 0 and spreads[1] > 0):
+        return []
+    by_bias, size = float(spreads[0] / spreads[1]), max(ratio, 1 / ratio)
+    unit = next((words for factor, words in UNIT_FACTORS.items() if 1 / NEAR_UNIT < size / factor < NEAR_UNIT), None)
+    if unit is None or not 1 / _NEAR_BIASES < by_bias / ratio < _NEAR_BIASES:
+        return []
+    return [
+        Bad(
+            f"noise and biases of the gyros are {plain_number(size, 3)} times as {'large' if ratio > 1 else 'small'} "
+            f"as in the record: another unit ({unit})? The fused rate is off as much",
+            "correct the unit of the columns (--unit)",
+        )
+    ]
 
 
 def warn_misaligned(checks: Checks, matrices: Array | None) -> list[str]:
