@@ -318,6 +318,12 @@ def test_an_offset_that_ardupilot_does_not_take_is_refused(tmp_path):
         export("ardupilot", [far], tmp_path)
 
 
+def test_ardupilots_file_says_that_a_test_from_its_logs_needs_neutral_parameters(tmp_path):
+    """ArduPilot logs (raw - OFFS) SCAL: what is fitted to that replaces the parameters by the wrong ones."""
+    (file,) = export("ardupilot", [record(misalignment=0.0)], tmp_path)
+    assert "record the test with INS_ACCOFFS 0, INS_ACCSCAL 1 and INS_GYROFFS 0" in file.read_text(encoding="utf-8")
+
+
 # --- noise -------------------------------------------------------------------------------------------------------
 
 

@@ -152,6 +152,7 @@ def test_a_layout_that_changed_counts_as_a_change(tmp_path):
     manifest = write_manifest(tmp_path / "m.csv", [row])
     assert run(manifest, tmp_path / "out").count("done") == 1
     assert run(manifest, tmp_path / "out").kept == 1
+    assert fleet_status(str(tmp_path / "out")).shown()[0].startswith("1 unit of ")
     (tmp_path / "l.toml").write_text(layout + "# said otherwise\n")
     assert run(manifest, tmp_path / "out").kept == 0
 

@@ -442,6 +442,7 @@ def export_ardupilot(records: Sequence[Calibration], folder: Path, options: Expo
     comments = [
         "for Copter 3.4, Plane 3.5 and later: corrected = (raw - OFFS) * SCAL, m/s^2; older versions scale first",
         "gyroscopes: raw - OFFS, rad/s; ArduPilot measures these again at each start unless INS_GYR_CAL is 0",
+        "ArduPilot's logs are corrected outputs: record the test with INS_ACCOFFS 0, INS_ACCSCAL 1 and INS_GYROFFS 0",
         *([_ARDUPILOT_MAG] if held.mag is not None else []),
         *held.lost,
     ]

@@ -80,7 +80,8 @@ class FleetState(Shown):
         """Return how many units are done, failed and missing, the verdicts of their records, and which units failed."""
         counts = ", ".join(f"{self.count(name)} {name}" for name in ("done", "failed", "missing"))
         rows = [[row.unit.serial, "; ".join(row.unit.files), row.reason or ""] for row in self.failures]
-        headline = f"{len(self.rows)} units of {self.manifest.name}: {counts}" + (self.judged and f"; {self.judged}")
+        units = f"{len(self.rows)} unit{'s' * (len(self.rows) != 1)}"
+        headline = f"{units} of {self.manifest.name}: {counts}" + (self.judged and f"; {self.judged}")
         return headline, ["failed", "files", "reason"], rows
 
     def count(self, status: str) -> int:
