@@ -9,7 +9,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.display import Note
 from imulab.errors import DataError
-from imulab.estimation.rows import distinct, find_step, leave_out, median, medians, quantile
+from imulab.estimation.rows import distinct, find_step, leave_out, median, medians, quantile, stuck_run
 from imulab.procedures.tumble.gyro.fit import fit_gyro_triad
 from imulab.recording import Recording
 from test_tumble_attitudes import errors, fitted
@@ -348,3 +348,20 @@ def test_they_are_those_of_numpy(count):
 def test_a_value_that_is_no_number_makes_the_median_of_its_row_none():
     assert np.array_equal(medians(np.array([[1.0, np.nan, 3.0], [1.0, 2.0, 3.0]])), [np.nan, 2.0], equal_nan=True)
     assert distinct(np.empty(0)).size == 0
+
+
+def test_a_coarse_sensor_that_stays_on_a_step_is_not_stuck_and_a_fine_one_is():
+    rng = np.random.default_rng(3)
+    noise, time = rng.standard_normal((4, 12_000)), np.arange(12_000)
+    others = list(noise[1:])
+    drifting = 0.1 * noise[0] + 0.4 * np.sin(time / 2000)  # of steps: it toggles near their ends only
+    assert stuck_run(np.round(drifting), others) is None
+    assert stuck_run(np.round(1.5 * noise[0]), others) is None
+    held = np.where((time >= 3000) & (time < 3500), 1.0, np.round(1.5 * noise[0]))
+    begin, length = stuck_run(held, others)
+    assert abs(begin - 3000) < 5
+    assert 500 <= length < 510
+    assert stuck_run(held, [np.round(0.1 * each) for each in others]) is None  # nobody changes
+    ends = np.where((time >= 3000) & (time < 3500), 9.0, noise[0])
+    assert stuck_run(ends, others) == (3000, 500)
+    assert stuck_run(ends, others, at_ends=False) is None

@@ -474,7 +474,7 @@ def _shown(names: Sequence[str]) -> str:
 
 
 _STUCK, _CHANGING = 50, 0.5  # samples of one value, while in others so many of the steps are none of 0
-_RARELY = 20  # times longer than a column usually takes to change
+_COARSE = 1.5  # rows to a change; beyond, steps are as large as the noise, and staying on one is no fault
 
 
 def stuck_run(values: Array, others: Sequence[Array], *, at_ends: bool = True) -> tuple[int, int] | None:
@@ -492,7 +492,7 @@ def stuck_run(values: Array, others: Sequence[Array], *, at_ends: bool = True) -
     begin, end = edges[(longest := int(np.argmax(np.diff(edges)))) : longest + 2].tolist()
     length = end - begin
     usual = (len(values) - length) / max(len(changes), 1)
-    if length <= max(_STUCK, _RARELY * usual) or not others:
+    if length <= _STUCK or usual > _COARSE or not others:
         return None
     if not at_ends and values[begin] in (values.min(), values.max()):
         return None
